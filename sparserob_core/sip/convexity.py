@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 # thousand entries.
 ROUNDED = 1e-13
 DENSE = 400  # rows up to which a matrix is factored as a dense one, whatever its pattern; ten times more costs 1 s
-FULL = 0.1  # share of entries from which that is so for more rows: sparse factors would fill up
+FULL = 0.1  # share of non-zero entries from which larger matrices are dense too: sparse factors would fill up
 SHOWN = 1000  # rows up to which a refusal computes all eigenvalues; ten times as many take minutes
 STEPS = 60  # steps of the Lanczos method by which a refusal estimates the least eigenvalue of larger matrices
 

@@ -389,7 +389,7 @@ def _branch_and_bound(
         course.examined += bounds.size
         open_ = bounds > goal.closes(best[0])
 
-        # Look for a witness: where separation finds the largest violations, and in the worst cells.
+        # Search for a witness: where separation finds the largest violations, and in the worst cells.
         first, peaks = not leaves, _NOWHERE
         if first and bend is not None and family.worst is not None:
             peaks = family.separated(x)
@@ -407,8 +407,8 @@ def _branch_and_bound(
         if not open_.any():
             return _answers(course, "proven", best, leaves)
 
-        # Cut what is open, as long as cells, their width and time allow: once towards the peaks, then into halves. Rows
-        # under the worst deviations have kinks, not peaks that are smooth.
+        # Divide the open cells, as long as their number, their width and the time allow: once towards the peaks, then
+        # into halves. Rows at their worst deviations have kinks, not smooth peaks.
         worst, at = float(bounds.max()), int(bounds.argmax())
         course.opened(lower[open_], upper[open_])
         course.tell(int(open_.sum()), worst, lower[at], upper[at])
@@ -545,7 +545,7 @@ def _towards(peaks: Separation, lower: Array, upper: Array, bounds: Array, bend:
         cuts = np.array([low, (low + high) / 2, high])
         if away[i, nearest] <= width and 0.0 < short < width / 4:
             inside, grow = min(at - low, high - at), 0.5
-            if inside > width / 8:  # the ends are below the peak by what its curvature makes of the distance
+            if inside > width / 8:  # the peak is higher than the ends by its curvature times the square of the distance
                 curved = max(top - (bounds[i] - bend[i]), 0.0) / bend[i] * (width / inside) ** 2 / 4
                 grow = float(np.clip(2 * SHARE * np.sqrt(curved), *GROWN))
             offsets = short * (1 + grow) ** np.arange(np.ceil(np.log(width / short) / np.log1p(grow)))

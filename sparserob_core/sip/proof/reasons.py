@@ -24,7 +24,7 @@ LOOKED_AT = 2000  # largest number of indices of a family
 NONE = 1e-13  # of a family's largest row: size of a row that the decision does not enter
 PARALLEL = 1e-12  # two unit rows are opposite when their sum is shorter than this
 REAL = 1e-8  # of the numbers that cancel: violation that is no rounding
-DENSE = 200  # rows judged one by one where the image is not the decision itself
+DENSE = 200  # largest number of rows judged one by one, where the image is not the decision itself
 
 
 @dataclass(frozen=True, eq=False)

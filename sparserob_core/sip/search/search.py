@@ -21,7 +21,7 @@ from sparserob_core.sip.search.notifier import Notifier, Standing
 
 Function: TypeAlias = Callable[[Array], object]
 
-KEPT_NUMBERS = 20_000_000  # coordinates in a trace; searches with more keep their values only
+KEPT_NUMBERS = 20_000_000  # largest number of coordinates in a trace; larger searches keep their values only
 
 
 @dataclass(frozen=True, eq=False)
@@ -161,14 +161,14 @@ class CountedObjective:
         self.evaluations = 0
         self.missing = 0  # evaluations that gave NaN
         self.learnt = 0  # points that were known before, which are no evaluations of this search
-        self._gained = 0  # evaluations at the last gain
+        self._gained = 0  # number of evaluations at the last gain
         self._known = np.empty((0, self.domain.dimension)), np.empty(0)
         self._before: dict[tuple[float, ...], float] = {}  # the known values by their points
         self._recalls = 0
         own = rules or Rules()
         self._target, self._patience, self._halt = own.target, own.patience, own.halt
         self.searched: int | None = None
-        self.whole_end = False  # nothing is polished either
+        self.whole_end = False  # whether the search ends without a polish
         self.ended: SearchEnded | EvaluationError | None = None
         self._keeps = self.domain.dimension * self.budget <= KEPT_NUMBERS
         self._points: list[Array] = []
@@ -217,7 +217,7 @@ class CountedObjective:
         values = self._recalled(asked)
         new = np.flatnonzero(np.isnan(values))
         allowed = new[: self.remaining]
-        while len(allowed):  # in one batch, unless patience would end within it
+        while len(allowed):  # in one batch, unless the search may end within it for lack of a gain
             batch = allowed[: self._patient]
             values[batch] = self._values_at(asked[batch])
             self._record(asked[batch], values[batch])

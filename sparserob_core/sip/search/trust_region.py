@@ -17,7 +17,7 @@ SURPLUS = 1.5
 points fit a function with kinks better."""
 POINTS = 99
 """Largest number of points of a model: one and a half times the coefficients of a full quadratic in ten coordinates."""
-ITERATIONS = 40  # of Newton's method for the length of a step
+ITERATIONS = 40  # largest number of Newton steps for the length of a step
 SLOPE_OVER_CURVATURE = 10.0
 """Price of curvature relative to that of slope, where the points do not determine the model."""
 

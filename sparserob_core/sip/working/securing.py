@@ -147,7 +147,7 @@ def secure_in_time(working: Working, ledger: Ledger, prover: Prover, answer: Ans
         due = due or (ledger.proven is None and deadline.left <= RESERVED * longest)
     if not due or _is_secured(ledger):
         return False
-    if not any(rows.size for _, rows, _ in violated):  # it may be proven as it is, and solving takes longer
+    if not any(rows.size for _, rows, _ in violated):  # the answer may be proven as it is, which takes less time
         ledger.prove(answer, found, prover(answer.solution.x, GLANCE // 4))
         if ledger.proven is not None:
             return False

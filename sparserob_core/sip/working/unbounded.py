@@ -24,8 +24,8 @@ from sparserob_core.sip.working.ledger import Ledger, Prover, unproven
 
 Close: TypeAlias = Callable[[SemiInfiniteProgram, Tools, Prover], Result]  # an exchange that closes the gap
 FALLS = 1e-7  # of the largest coefficient: fall of the cost per unit of a direction that is no rounding
-# Coordinates of an index up to which the first rows are those of a grid: with two points along each of ten coordinates
-# there are a thousand.
+# Largest number of moving coordinates for which the first rows are on a grid: two points along each of ten coordinates
+# are a thousand indices.
 FEW = 8
 SHOWN = 6  # largest number of entries of a ray in the message
 

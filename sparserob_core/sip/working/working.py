@@ -32,7 +32,7 @@ THINNER = 1e-3
 # full proofs of minutes that no margin lets succeed.
 ALLOWANCES = 4
 # Share of the tolerated gap that is paid for the errors of a proof, such as those of transition matrices over many
-# orbits. With all of it, nothing is left for the bounds; with a tenth of it, proofs fail that a larger margin allows.
+# orbits. With all of it, nothing is left for the bounds; with a tenth, gaps stay open that a larger margin closes.
 AFFORDED = 0.5
 # Number of active rows at which a margin may cost a quarter of the tolerated gap. With ten times as many, a long arc
 # along a constraint takes twice as many cells; with a tenth, costs of ordinary problems are a relative 2e-8 too high.
