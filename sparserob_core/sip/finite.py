@@ -167,7 +167,20 @@ class FiniteProgram:
         return self.S is None and self.blocks is None and self.curvature is not None
 
     def under(self, G: Array, h: Array) -> FiniteProgram:
-        """Return the program with further rows ``G x <= h``, which follow its own."""
+        """Return the program with further rows, which follow its own.
+
+        Parameters
+        ----------
+        G : ndarray, shape (s, n)
+            Further rows.
+        h : ndarray, shape (s,)
+            Their right-hand sides, ``G x <= h``.
+
+        Returns
+        -------
+        FiniteProgram
+            The program with ``r + s`` rows.
+        """
         own = self.h.size
         G, h = (np.vstack([self.G, G]), np.concatenate([self.h, h])) if own else (G, h)
         more = FiniteProgram(
@@ -189,7 +202,20 @@ class FiniteProgram:
         return more
 
     def curved(self, P: csc_array, q: Array) -> FiniteProgram:
-        """Return the program with another quadratic and linear cost."""
+        """Return the program with another quadratic and linear cost.
+
+        Parameters
+        ----------
+        P : csc_array, shape (n, n)
+            Quadratic cost, symmetric positive semidefinite.
+        q : ndarray, shape (n,)
+            Linear cost.
+
+        Returns
+        -------
+        FiniteProgram
+            The program with this cost.
+        """
         other = replace(self, P=P, q=q)
         if q is self.q:
             other.__dict__.update(steepest=self.steepest, bounded=self.bounded, _sound=self._sound)
@@ -725,6 +751,19 @@ class UncertainRows:
         return np.asarray(self.d + (self.stacked @ x).reshape(self.d.shape))
 
     def excess(self, x: Array, spread: Spread) -> Array:
-        """Return the violation ``(r,)`` of each row at its worst deviation; negative: a margin."""
+        """Return the violation of each row at its worst deviation.
+
+        Parameters
+        ----------
+        x : ndarray, shape (n,)
+            The decision.
+        spread : Spread
+            Set of deviations.
+
+        Returns
+        -------
+        ndarray, shape (r,)
+            Violations; a negative number is a margin.
+        """
         a = self.coefficients(x)
         return np.asarray(self.g @ x - self.h + spread.support(self.factor[:, None] * a[self.part]))

@@ -312,10 +312,18 @@ class ConstraintFamily:
         return proven.enclosure is not None or proven.worst is not None
 
     def formulated(self, formulation: Formulation) -> ConstraintFamily | None:
-        """Return the same constraints with the indices of another formulation; ``None`` where the family lacks that
-        one.
+        """Return the same constraints with the indices of another formulation.
 
-        For a family on which the uncertainty does not act, all formulations have the same constraints.
+        Parameters
+        ----------
+        formulation : Formulation
+            The other formulation.
+
+        Returns
+        -------
+        ConstraintFamily or None
+            The family; ``None`` where this family lacks that formulation. For a family on which the uncertainty does
+            not act, all formulations have the same constraints.
         """
         if formulation == self.formulation:
             return self
@@ -407,7 +415,20 @@ class ConstraintFamily:
 
     @shaped
     def explanation(self, index: Float[Array, " d"], row: int) -> Explanation:
-        """Return the description of one constraint; where the family offers none, its number and index."""
+        """Return the description of one constraint.
+
+        Parameters
+        ----------
+        index : ndarray, shape (d,)
+            Index of the constraint.
+        row : int
+            Row of the family at that index.
+
+        Returns
+        -------
+        Explanation
+            Description by the family; where the family offers none, the row number and the index.
+        """
         if self.explain is not None:
             return self.explain(index, row)
         return Unexplained(f"row {row} of {self.name} at {np.array2string(index, precision=6)}")
@@ -429,8 +450,20 @@ class ConstraintFamily:
 
     @shaped
     def violations(self, x: Float[Array, " n"], indices: Float[Array, "k d"]) -> Float[Array, "k r"]:
-        """Return ``rows(xi) x - rhs(xi)`` at indices ``(k, d)``, as ``(k, r)``; an entry is positive where its row is
-        violated."""
+        """Return the violations ``rows(xi) x - rhs(xi)`` at indices.
+
+        Parameters
+        ----------
+        x : ndarray, shape (n,)
+            The decision.
+        indices : ndarray, shape (k, d)
+            Indices of the family.
+
+        Returns
+        -------
+        ndarray, shape (k, r)
+            Violations; positive where a row is violated.
+        """
         if self.excess is not None:
             return self.excess(x, indices)
         G, h = self.rows_at(indices, x.size)
@@ -725,7 +758,18 @@ class SemiInfiniteProgram:
         return (*own, *self.families)
 
     def mirrored(self, twin: Callable[[SemiInfiniteProgram], OwnUnits]) -> SemiInfiniteProgram:
-        """Return this program with a twin in its own units; the twin is made at its first use."""
+        """Return this program with a twin in its own units, which is made at its first use.
+
+        Parameters
+        ----------
+        twin : callable
+            Maps a program to the same program in its own units, an `OwnUnits`.
+
+        Returns
+        -------
+        SemiInfiniteProgram
+            This program with the twin.
+        """
         made: list[OwnUnits] = []
 
         def once() -> OwnUnits:
@@ -745,7 +789,20 @@ class SemiInfiniteProgram:
         return next(family for family in self.families if family.name == name)
 
     def formulated(self, name: str, formulation: Formulation) -> ConstraintFamily | None:
-        """Return the family with a given name in another formulation; ``None`` where it lacks that one."""
+        """Return a family with the indices of another formulation.
+
+        Parameters
+        ----------
+        name : str
+            Name of the family.
+        formulation : Formulation
+            The other formulation.
+
+        Returns
+        -------
+        ConstraintFamily or None
+            The family; ``None`` where it lacks that formulation.
+        """
         return self.family(name).formulated(formulation)
 
     @cached_property

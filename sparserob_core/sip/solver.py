@@ -358,7 +358,20 @@ class Auto(Solver, Options):
         return self.cones, whole_name(self.cones, self._called_of_cones)
 
     def solve(self, program: QuadraticProgram, accuracy: float) -> Claim:
-        """Return the claim of the ``general`` solver (`Solver.solve`)."""
+        """Return the claim of the ``general`` solver.
+
+        Parameters
+        ----------
+        program : QuadraticProgram
+            The program.
+        accuracy : float
+            Absolute residual to be reached.
+
+        Returns
+        -------
+        Claim
+            The answer.
+        """
         claim: Claim = self.general.solve(program, accuracy)
         return claim
 
@@ -377,7 +390,19 @@ class Failures:
         self._logged = set[tuple[str, str]]()
 
     def add(self, kind: str, reason: str, by: str, count: int = 1) -> None:
-        """Add ``count`` programs of a ``kind`` that ``by`` answered instead, with the ``reason``."""
+        """Add programs that the named solver did not answer.
+
+        Parameters
+        ----------
+        kind : str
+            Kind of the programs.
+        reason : str
+            Reason of the failure.
+        by : str
+            Name of whoever answered them instead.
+        count : int, default 1
+            Number of programs.
+        """
         key = (kind, NUMBERS.sub("#", reason), by)
         known = self._known.get(key, Unanswered(kind, 0, reason, by))
         self._known[key] = replace(known, count=known.count + count)
@@ -428,7 +453,20 @@ class Named(Solver):
         self.solver, self.name, self.instead, self.failures = solver, name, instead, Failures(name)
 
     def solve(self, program: QuadraticProgram, accuracy: float) -> Claim:
-        """Return the claim of the named solver (`Solver.solve`)."""
+        """Return the claim of the named solver.
+
+        Parameters
+        ----------
+        program : QuadraticProgram
+            The program.
+        accuracy : float
+            Absolute residual to be reached.
+
+        Returns
+        -------
+        Claim
+            The answer.
+        """
         return self.solver.solve(program, accuracy)
 
 
@@ -492,8 +530,23 @@ class Asked(Solver):
         return self
 
     def solve(self, program: QuadraticProgram, accuracy: float) -> Claim:
-        """Return the claim of the solver (`Solver.solve`), counted, and in a process of its own where that is
-        needed."""
+        """Return the claim of the solver, or of the solver for cones, and count the call.
+
+        The call runs in a process of its own where the solver may end the process, or where the program is large and
+        time is limited.
+
+        Parameters
+        ----------
+        program : QuadraticProgram
+            The program.
+        accuracy : float
+            Absolute residual to be reached.
+
+        Returns
+        -------
+        Claim
+            The answer.
+        """
         self.calls += 1
         self.failures.calls += 1
         asked = self.cones[0] if program.cones and self.cones is not None else self.solver
@@ -503,7 +556,22 @@ class Asked(Solver):
 
 
 def named(solver: Solver, name: str, instead: Solver) -> Solver:
-    """Return the solver as a `Named` one, with ``instead`` as its substitute; `Auto` is returned as it is."""
+    """Return the solver as a `Named` one.
+
+    Parameters
+    ----------
+    solver : Solver
+        The solver.
+    name : str
+        Its name.
+    instead : Solver
+        Solver that is called where no answer passes the check.
+
+    Returns
+    -------
+    Solver
+        The named solver; `Auto`, and a solver that is named already, are returned unchanged.
+    """
     return solver if isinstance(solver, Auto | Named | Asked) else Named(solver, whole_name(solver, name), instead)
 
 

@@ -145,7 +145,17 @@ def least_of(base: FiniteProgram, G: Array, h: Array) -> Array:
 def least_within(base: FiniteProgram, row: Array) -> float:
     """Return a proven lower bound of ``g'x`` over the bounds and the rows of the program.
 
-    The multipliers of a linear program prove it; ``-inf`` where that program is not solved.
+    Parameters
+    ----------
+    base : FiniteProgram
+        Program whose bounds, rows and equalities hold.
+    row : ndarray, shape (n,)
+        The row ``g``.
+
+    Returns
+    -------
+    float
+        Lower bound by the multipliers of a linear program; ``-inf`` where that program is not solved.
     """
     alone = replace(base, q=row, weights=np.zeros_like(base.weights), P=None, constant=0.0, blocks=None)
     corner = simplex(alone)

@@ -63,8 +63,20 @@ def verdict(proofs: Sequence[Proof], gap: float, tolerance: float) -> tuple[Stat
 def remarked(program: SemiInfiniteProgram, result: Result) -> Result:
     """Return the result with a warning where its claim rests on unproven answers of the families.
 
-    Enclosures and separations of a program that was stated directly are believed, for only its rows can be evaluated.
-    A result without a claim is returned unchanged. Where rows contradict the answers of families, nothing is claimed.
+    Enclosures and separations of a program that was stated directly are believed, for only its rows can be evaluated. A
+    result without a claim is returned unchanged. Where rows contradict the answers of families, nothing is claimed.
+
+    Parameters
+    ----------
+    program : SemiInfiniteProgram
+        The program.
+    result : Result
+        The result.
+
+    Returns
+    -------
+    Result
+        The result, with a longer message, or with the status ``failed`` and without bounds.
     """
     if denied := _denied(program, result):
         return replace(
@@ -116,6 +128,18 @@ def as_bad_as_found(proofs: Sequence[Proof], separations: Sequence[tuple[Constra
     """Return the proofs with the worst violation that separation has found, for families that are not proven.
 
     A refutation ends at the first witness, which need not be the worst.
+
+    Parameters
+    ----------
+    proofs : sequence of Proof
+        Proofs of the families.
+    separations : sequence of (ConstraintFamily, Separation)
+        Separations at the same decision.
+
+    Returns
+    -------
+    list of Proof
+        The proofs.
     """
     found = {family.name: (family, separation) for family, separation in separations}
     return [_worse(proof, *found[proof.family]) if proof.family in found else proof for proof in proofs]
@@ -149,7 +173,22 @@ def worst_of(separations: Sequence[tuple[ConstraintFamily, Separation]]) -> Wors
 
 
 def witness(program: SemiInfiniteProgram, searched: WorstConstraint, proofs: Sequence[Proof]) -> WorstConstraint:
-    """Return the worst constraint that search or proof has found, with the facts that its family adds."""
+    """Return the worst constraint that search or proof has found, with the facts that its family adds.
+
+    Parameters
+    ----------
+    program : SemiInfiniteProgram
+        The program.
+    searched : WorstConstraint
+        The worst constraint that the search has found.
+    proofs : sequence of Proof
+        Proofs of the families.
+
+    Returns
+    -------
+    WorstConstraint
+        The worst of all.
+    """
     found = [
         WorstConstraint(proof.violation, proof.family, proof.index, proof.row, proof.formulation)
         for proof in proofs
@@ -159,7 +198,20 @@ def witness(program: SemiInfiniteProgram, searched: WorstConstraint, proofs: Seq
 
 
 def explained(program: SemiInfiniteProgram, bare: WorstConstraint) -> WorstConstraint:
-    """Return the worst constraint with the facts that its family adds."""
+    """Return the worst constraint with the facts that its family adds.
+
+    Parameters
+    ----------
+    program : SemiInfiniteProgram
+        The program.
+    bare : WorstConstraint
+        The constraint without these facts.
+
+    Returns
+    -------
+    WorstConstraint
+        The constraint.
+    """
     family = program.formulated(bare.constraint, bare.formulation) if bare.constraint else None
     return bare if family is None else family.explanation(bare.index, bare.row).witness(bare)
 

@@ -104,7 +104,22 @@ class Handed(ABC):
         return self.seen(*self._objective.known())
 
     def seen(self, points: Array, values: Array) -> tuple[Array, Array]:
-        """Return points ``(k, d)`` and values ``(k,)`` of the objective in these coordinates and units."""
+        """Return points and values of the objective in these coordinates and units.
+
+        Parameters
+        ----------
+        points : ndarray, shape (k, d)
+            Points of the objective.
+        values : ndarray, shape (k,)
+            Their values.
+
+        Returns
+        -------
+        points : ndarray, shape (k, c)
+            The points in these coordinates.
+        values : ndarray, shape (k,)
+            The values in these units.
+        """
         return self.own(points), self.values(values)
 
     def evaluate(self, points: Array) -> Array:

@@ -65,7 +65,20 @@ class Notifier:
         self._accepted: tuple[Array, float] | None = None
 
     def due(self, evaluations: int, budget: int) -> bool:
-        """Return whether an event is due: by the clock, after a share of the budget, or because many numbers wait."""
+        """Return whether an event is due: by the clock, after a share of the budget, or because many numbers wait.
+
+        Parameters
+        ----------
+        evaluations : int
+            Number of evaluations so far.
+        budget : int
+            Evaluations that the search may spend.
+
+        Returns
+        -------
+        bool
+            True where an event is due.
+        """
         return (
             time.monotonic() - self.notified_at > SECONDS_BETWEEN_EVENTS
             or evaluations - self.notified >= max(1, budget // EVENTS)
@@ -92,7 +105,15 @@ class Notifier:
         self._sketches[str(role)] = Sketch(low, high, rounded)
 
     def publish(self, standing: Standing, notes: Mapping[str, Sequence[tuple[float, float]]]) -> None:
-        """Send one event for all points that were collected; ``notes`` are those of the whole search."""
+        """Send one event for all points that were collected.
+
+        Parameters
+        ----------
+        standing : Standing
+            State of the search.
+        notes : mapping of str to sequence of (float, float)
+            Notes of the whole search: pairs (evaluations so far, value) for each name.
+        """
         fresh = {
             name: rows[self._noted.get(name, 0) :]
             for name, rows in notes.items()

@@ -116,7 +116,20 @@ class Rules:
             raise InputError(f"polish: expected a share of the budget, at least 0 and below 1, got {self.polish!r}")
 
     def share(self, maximiser: Maximiser, target: Target) -> float:
-        """Return the share of the budget that is reserved for a polish."""
+        """Return the share of the budget that is reserved for a polish.
+
+        Parameters
+        ----------
+        maximiser : Maximiser
+            The maximiser, whose own share counts where ``polish`` is ``None``.
+        target : Target
+            Function to be maximised.
+
+        Returns
+        -------
+        float
+            The share, at least 0 and below 1.
+        """
         if self.polish is None:
             return maximiser.polished if target.linear is not None or target.gradient is not None else 0.0
         return self.polish
@@ -347,7 +360,20 @@ class CountedObjective:
         return np.concatenate([points, *self._points]), np.concatenate([values, *self._values])
 
     def report(self, stopped: str, upper_bound: float = np.inf) -> Report:
-        """Return the report of the evaluations so far, with the reason for the end and a proven upper bound."""
+        """Return the report of the evaluations so far.
+
+        Parameters
+        ----------
+        stopped : str
+            Reason for the end of the search.
+        upper_bound : float, default inf
+            Proven upper bound of the maximum.
+
+        Returns
+        -------
+        Report
+            The report.
+        """
         points = self.seen()[0][self.learnt :] if self._keeps else np.empty((0, self.domain.dimension))
         values = np.concatenate([np.empty(0), *self._values])
         seconds = np.repeat([moment for _, moment in self._seconds], [count for count, _ in self._seconds])

@@ -119,7 +119,20 @@ def prices_of(program: SemiInfiniteProgram) -> Array:
 
 @shaped
 def acting(coefficients: Float[Array, "m n"], values: Float[Array, "n k"]) -> np.ndarray:
-    """Return where ``coefficients @ values`` is not 0, ``(m, k)``, except for the rounding of the sum."""
+    """Return where ``coefficients @ values`` is not 0, except for the rounding of the sum.
+
+    Parameters
+    ----------
+    coefficients : ndarray, shape (m, n)
+        Coefficients.
+    values : ndarray, shape (n, k)
+        Values.
+
+    Returns
+    -------
+    ndarray of bool, shape (m, k)
+        True where the product is not 0.
+    """
     return np.asarray(np.abs(coefficients @ values) > ROUNDED * (np.abs(coefficients) @ np.abs(values)))
 
 
@@ -184,7 +197,17 @@ def share_of(program: SemiInfiniteProgram, counted: float) -> float:
 def whole(program: SemiInfiniteProgram, least: float) -> float:
     """Return the smallest count of at least ``least``, except for rounding, where all prices are equal.
 
-    It is a multiple of the price. Where prices differ, ``least`` itself is returned.
+    Parameters
+    ----------
+    program : SemiInfiniteProgram
+        The program.
+    least : float
+        Lower bound of the count, in the user's units.
+
+    Returns
+    -------
+    float
+        A multiple of the price, not more than the largest count; ``least`` itself, at least 0, where prices differ.
     """
     prices = together(program)
     one = _one(prices[prices > 0.0])

@@ -299,6 +299,18 @@ class Ledger:
         """Return the result after a deadline or an interrupt: the best proven decision, or else the best so far.
 
         The latter has the proofs of one look at it, since a proof whose deadline has passed bounds every family once.
+
+        Parameters
+        ----------
+        error : KeyboardInterrupt
+            The deadline or the interrupt.
+        prover : Prover
+            Prover of the families.
+
+        Returns
+        -------
+        Result
+            The result.
         """
         reason = self.tools.deadline.interrupt(error)
         if self.proven is not None:
@@ -351,7 +363,24 @@ class Ledger:
         return self.judged(answer, worst_of(found), proofs, failed.message)
 
     def result(self, status: Status, message: str, answer: Answer, worst: WorstConstraint | None = None) -> Result:
-        """Return a result with this answer, whose bounds are claimed as far as the status allows."""
+        """Return a result with this answer, whose bounds are claimed as far as the status allows.
+
+        Parameters
+        ----------
+        status : Status
+            The status.
+        message : str
+            The reason for the status.
+        answer : Answer
+            The answer.
+        worst : WorstConstraint, optional
+            The most violated constraint.
+
+        Returns
+        -------
+        Result
+            The result.
+        """
         cuts, proven = answer.active, status in ("certified", "verified")
         decided = status not in ("infeasible", "failed")
         cost = self.program.cost(answer.solution.x) if decided else np.nan
@@ -472,8 +501,24 @@ def _units(lower: Array, upper: Array) -> Array:
 
 
 def above(family: ConstraintFamily, found: Separation) -> tuple[Array, np.ndarray, str]:
-    """Return the indices, the rows and the family of violations that are more than the search may leave to the
-    proof."""
+    """Return the violations of a family that are more than the search may leave to the proof.
+
+    Parameters
+    ----------
+    family : ConstraintFamily
+        The family.
+    found : Separation
+        Its most violated constraints.
+
+    Returns
+    -------
+    indices : ndarray, shape (k, d)
+        Indices of the violated constraints.
+    rows : ndarray of int, shape (k,)
+        Their rows.
+    name : str
+        Name of the family.
+    """
     violated = found.violations > ALLOWED
     return found.indices[violated], found.rows[violated], family.name
 

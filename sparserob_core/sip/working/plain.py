@@ -74,7 +74,24 @@ class PlainRows(Working):
 
     @staticmethod
     def start(program: SemiInfiniteProgram, tools: Tools, exact: bool, close: Close) -> PlainRows:
-        """Return a working set without rows, with the first weight of the continuation."""
+        """Return a working set without rows, with the first weight of the continuation.
+
+        Parameters
+        ----------
+        program : SemiInfiniteProgram
+            The program.
+        tools : Tools
+            Components of the run.
+        exact : bool
+            Whether the unregularised problem is solved.
+        close : Close
+            Exchange that closes the gap of another program.
+
+        Returns
+        -------
+        PlainRows
+            The working set.
+        """
         epsilon = 0.0 if tools.regulariser is None else tools.continuation.start
         return PlainRows(program, rows=Rows.none(program.n), epsilon=epsilon, exact=exact, close=close)
 

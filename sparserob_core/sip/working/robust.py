@@ -93,8 +93,24 @@ class RobustRows(Working):
 
     @staticmethod
     def start(program: SemiInfiniteProgram, ledger: Ledger, close: Close) -> RobustRows:
-        """Return a working set with the first indices of every family; the bounds of the decision alone give a lower
-        bound."""
+        """Return a working set with the first indices of every family.
+
+        The bounds of the decision alone give a first lower bound.
+
+        Parameters
+        ----------
+        program : SemiInfiniteProgram
+            Program with deviations.
+        ledger : Ledger
+            Accounts of the method.
+        close : Close
+            Exchange of another program.
+
+        Returns
+        -------
+        RobustRows
+            The working set.
+        """
         assert program.spread is not None
         central, asked = Interior(program.finite, program.spread), ledger.relaxed.counted
         working = RobustRows(program, counterpart=central, close=close, tolerance=ledger.tolerance)
@@ -337,7 +353,20 @@ class RobustRows(Working):
         return Rows(np.zeros((len(self.cuts), 0)), np.zeros(len(self.cuts)), tuple(self.cuts))
 
     def dual(self, answer: RobustAnswer, priced: bool) -> Dual:
-        """Return the bound that the multipliers of an answer prove, with the cuts that prove it."""
+        """Return the bound that the multipliers of an answer prove, with the cuts that prove it.
+
+        Parameters
+        ----------
+        answer : RobustAnswer
+            Answer with multipliers and deviations.
+        priced : bool
+            Whether the cost enters the bound; false for a proof of infeasibility.
+
+        Returns
+        -------
+        Dual
+            The bound, reduced by its rounding error.
+        """
         blocks = self.counterpart.blocks
         at = answer.at
         if not priced:

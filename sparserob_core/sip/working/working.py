@@ -124,8 +124,22 @@ class Working(ABC):
 
     @abstractmethod
     def exchange(self, answer: Answer, violated: Violated, number: int) -> int:
-        """Impose constraints that are violated at an answer, and drop idle ones; return the number of new
-        constraints."""
+        """Impose constraints that are violated at an answer, and drop idle ones.
+
+        Parameters
+        ----------
+        answer : Answer
+            Answer to the relaxed program.
+        violated : Violated
+            Constraints that are violated at it.
+        number : int
+            Number of the round.
+
+        Returns
+        -------
+        int
+            Number of new constraints.
+        """
 
     @abstractmethod
     def impose(self, violated: Violated) -> int:
@@ -139,6 +153,13 @@ class Working(ABC):
     def sharpen(self, ledger: Ledger, answer: Answer) -> bool:
         """Solve the imposed constraints more accurately, where nothing is violated and the gap is open.
 
+        Parameters
+        ----------
+        ledger : Ledger
+            Accounts of the method.
+        answer : Answer
+            Answer to the relaxed program.
+
         Returns
         -------
         bool
@@ -147,8 +168,22 @@ class Working(ABC):
 
     @abstractmethod
     def proven(self, ledger: Ledger, answer: Answer, x: Array) -> Dual:
-        """Return the lower bound by the multipliers of an answer, or by none, with tangents of the cost at ``x
-        (n,)``."""
+        """Return the lower bound by the multipliers of an answer, or by none.
+
+        Parameters
+        ----------
+        ledger : Ledger
+            Accounts of the method.
+        answer : Answer
+            Answer with multipliers.
+        x : ndarray, shape (n,)
+            Decision at which terms of the cost are replaced by tangents.
+
+        Returns
+        -------
+        Dual
+            The bound and its multipliers.
+        """
 
     @abstractmethod
     def choose(
@@ -181,9 +216,21 @@ class Working(ABC):
 
     @abstractmethod
     def tightened(self, ledger: Ledger, answer: Answer, margin: float) -> Answer | None:
-        """Return the optimum of the imposed rows tightened by ``margin``; ``None`` where there is none.
+        """Return the optimum of the imposed rows tightened by a margin.
 
-        ``answer`` is the optimum with a smaller margin.
+        Parameters
+        ----------
+        ledger : Ledger
+            Accounts of the method.
+        answer : Answer
+            Optimum with a smaller margin.
+        margin : float
+            The margin.
+
+        Returns
+        -------
+        Answer or None
+            The optimum; ``None`` where there is none.
         """
 
     @abstractmethod
@@ -209,10 +256,27 @@ class Working(ABC):
         """Return a decision that may be proven before the gap is closed, where one is known."""
 
     def rested(self, ledger: Ledger, answer: Answer, found: Found, number: int) -> tuple[Answer, Found]:
-        """Return the answer with every costly entry at 0, where that closes the gap and violates nothing; else the
-        answer.
+        """Return the answer with every costly entry at 0, where that closes the gap and violates nothing.
 
         Solvers leave small entries where the optimum of a cost is 0, and the relative gap stays open there.
+
+        Parameters
+        ----------
+        ledger : Ledger
+            Accounts of the method.
+        answer : Answer
+            Answer to the relaxed program.
+        found : Found
+            Most violated constraints of each family at the answer.
+        number : int
+            Number of the round.
+
+        Returns
+        -------
+        answer : Answer
+            The new answer, or the same one.
+        found : Found
+            Most violated constraints at it.
         """
         x, other = answer.solution.x, at_rest(self.program, answer.solution.x)
         cost = self.program.cost(other)
@@ -342,8 +406,18 @@ def size_of(program: SemiInfiniteProgram, answer: Answer) -> float:
 def left_open(program: SemiInfiniteProgram, proofs: Sequence[Proof]) -> list[Missed]:
     """Return the violations that proofs could not exclude, each with the index of the largest violation found.
 
-    Nothing is returned where a proof excludes nothing at all, or is about another formulation than the imposed rows.
-    Then no margin would help it.
+    Parameters
+    ----------
+    program : SemiInfiniteProgram
+        The program.
+    proofs : sequence of Proof
+        Proofs of the families.
+
+    Returns
+    -------
+    list of Missed
+        The violations. The list is empty where a proof excludes nothing at all, or is about another formulation than
+        the imposed rows, since no margin would help then.
     """
     missed = [
         Missed(
