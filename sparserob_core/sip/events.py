@@ -276,8 +276,11 @@ class RoundFinished(Event):
         Number of the round.
     epsilon : float
         Weight of the regulariser.
-    lower_bound, upper_bound : float
-        Bounds of the value of the unregularised program; ``-inf`` and ``inf`` while unknown.
+    lower_bound : float
+        Proven lower bound of the value of the unregularised program; ``-inf`` while unknown.
+    upper_bound : float
+        Upper bound of that value, if the decision is feasible: its cost, where the search of this round has found no
+        violation. The decision need not be proven (``proven``). ``inf`` while unknown.
     violation : float
         Largest constraint violation of this round's decision over the continuum.
     worst_family : str
@@ -306,7 +309,7 @@ class RoundFinished(Event):
         Whether the round solved a program with a part of the uncertainty only (methods ``nominal``, ``scenario``). Its
         ``upper_bound`` and ``violation`` then do not apply to the program itself; its lower bound holds for both.
     gap : float, default inf
-        Relative gap of the two bounds (`sip.result.relative_gap`).
+        Relative gap of these two bounds (`sip.result.relative_gap`).
     proven : float, default inf
         Cost of the cheapest decision that was proven so far to meet every constraint.
     measured : str

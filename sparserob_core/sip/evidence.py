@@ -218,8 +218,8 @@ class Leaf:
 class Branch:
     """Division of one part of a `Tree` into two, at one entry of ``S x``.
 
-    The entry is 0 in the first part and counts in the second. Where ``at`` is given, the entry is at most ``at[0]`` in
-    the first part, and at least ``at[1]`` in the second.
+    The entry is 0 in the first part and counts in the second. Where ``at`` is given, the entry is at most its first
+    letter in the first part, and at least its second letter in the second part.
 
     Parameters
     ----------

@@ -208,10 +208,10 @@ class Maximiser(ABC):
 
     @property
     def polished(self) -> float:
-        """Default share of a budget for a local method at the end of a search.
+        """Default share of a budget for a local method at the end of a search: a fifth, unless a class overrides it.
 
-        It applies to `sparserob_core.maximise` and `sparserob_core.ask_tell`. It is 0 where polishing would spoil the
-        maximiser's purpose, such as an upper bound or a reference for comparison.
+        The share applies to `sparserob_core.maximise` and `sparserob_core.ask_tell`. It should be 0 where polishing
+        would spoil the maximiser's purpose, such as an upper bound or a reference for comparison.
         """
         return 0.2
 

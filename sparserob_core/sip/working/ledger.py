@@ -75,7 +75,7 @@ class Answer:
     epsilon : float
         Weight of the regulariser.
     value : float
-        Value of the relaxed program, where it differs from that of the solution.
+        Value of the relaxed program; it may differ from that of the solution.
     """
 
     solution: FiniteSolution
@@ -240,7 +240,7 @@ class Ledger:
         return True
 
     def cheaper(self, answer: Answer) -> bool:
-        """Return whether the answer costs less than the cheapest proven answer."""
+        """Return whether the answer costs less than the cheapest proven answer, or no answer is proven."""
         cost = self.program.cost(answer.solution.x)
         return self.proven is None or cost < self.program.cost(self.proven[0].solution.x)
 
