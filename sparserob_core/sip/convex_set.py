@@ -242,8 +242,8 @@ class ConvexSet(ABC):
     def middle(self) -> Float[Array, " d"]:
         """Return the centre ``(d,)`` about which the set is scaled.
 
-        It is the middle of the bounding box, with 0 along sides that are free. Where the middle is outside of the set,
-        it is the point `amid` the set.
+        The centre is the middle of the bounding box, with 0 along sides that are free. Where the middle is outside of
+        the set, the centre is the point `amid` the set.
 
         Raises
         ------
@@ -300,7 +300,7 @@ class ConvexSet(ABC):
     def gauge(self, points: Float[Array, "*k d"]) -> Float[Array, " *k"]:
         """Return the Minkowski functional of points about the interior point ``m``.
 
-        It is the least ``g`` for which ``m + (x - m) / g`` is in the set.
+        The functional is the least ``g`` for which ``m + (x - m) / g`` is in the set.
 
         Parameters
         ----------
@@ -341,10 +341,10 @@ class ConvexSet(ABC):
     def violation(self, points: Float[Array, "*k d"]) -> Float[Array, " *k"]:
         """Return the signed distance by which points are outside of the set (positive) or inside (negative).
 
-        It is 0 on the boundary, and never below ``max {c'x - h(c) : |c| = 1}``. For a flat set, it is the maximum of
-        ``c'x - h(c)`` over the unit normals of its half-spaces. By default for a curved set, outside it is the distance
-        to the boundary along the ray from the interior point. Inside it is ``(gauge - 1)`` times the radius of a ball
-        that is in the set.
+        The distance is 0 on the boundary, and never below ``max {c'x - h(c) : |c| = 1}``. For a flat set, the distance
+        is the maximum of ``c'x - h(c)`` over the unit normals of its half-spaces. By default for a curved set, the
+        value outside is the distance to the boundary along the ray from the interior point. The value inside is
+        ``(gauge - 1)`` times the radius of a ball that is in the set.
 
         Parameters
         ----------
@@ -433,7 +433,7 @@ class ConvexSet(ABC):
         """Return the gauge of rays about points of the set, and normals where the rays leave the set.
 
         The gauge is ``min {sum lambda : r = sum lambda_i v_i, lambda >= 0}`` over points ``v_i`` of the set, relative
-        to the origin of the ray. It is a linear program with a column for each point. The dual solution of the chosen
+        to the origin of the ray. This linear program has a column for each point. The dual solution of the chosen
         columns is a direction, and its support point is the column to enter (column generation; Dantzig and Wolfe
         1960).
 
@@ -487,7 +487,7 @@ class ConvexSet(ABC):
     def _inner_radius(self) -> float:
         """Radius of a ball about the interior point that is in the set.
 
-        It is the radius for the polytope whose corners are the points where the axes leave the set.
+        The ball lies in the polytope whose corners are the points where the axes leave the set.
         """
         axes = self.normals
         rays = np.vstack([axes, -axes])
@@ -607,8 +607,8 @@ class ConvexSet(ABC):
     ) -> tuple[Float[Array, "*k d"], Float[Array, " *k"]]:
         """Return linear functions of ``y`` that are above the support function near a centre.
 
-        They hold for ``y = centre + sum_j s_j spread_j`` with ``|s_j| <= 1``. The default is the linearisation plus its
-        excess. For a box, the chord is lower.
+        The functions hold for ``y = centre + sum_j s_j spread_j`` with ``|s_j| <= 1``. The default is the linearisation
+        plus its excess. For a box, the chord is lower.
 
         Parameters
         ----------

@@ -1,10 +1,10 @@
 """Convex quadratic forms: a check of each form from outside, before a bound rests on it, and regularisers.
 
 The check does not depend on the units of the variables. A matrix counts as positive semidefinite if a change of its
-diagonal by ``ROUNDED`` of itself, for every entry of the longest row, makes it so. This is more than the rounding error
-of ``L L'`` in any scaling (Higham 2002, section 10.1; Demmel 1989): an entry ``(i, j)`` of such a product is rounded by
-its share of ``sqrt(P_ii P_jj)``. A factorisation without pivoting that meets only positive pivots is the proof, except
-for its own rounding, which is of the same kind (Rump 2006).
+diagonal by ``ROUNDED`` of itself, for every entry of the longest row, makes it so. Such a change exceeds the rounding
+error of ``L L'`` in any scaling (Higham 2002, section 10.1; Demmel 1989): an entry ``(i, j)`` of such a product is
+rounded by its share of ``sqrt(P_ii P_jj)``. A factorisation without pivoting that meets only positive pivots is the
+proof, except for its own rounding, which is of the same kind (Rump 2006).
 """
 
 from __future__ import annotations
@@ -208,8 +208,8 @@ def _descent(P: csc_array) -> Array | None:
 def _bare(P: csc_array, diagonal: Array, bare: np.ndarray) -> Array | None:
     """Return a direction along which the form is negative, for a matrix whose diagonal is not positive.
 
-    It is the unit vector of a negative diagonal entry. Or it combines a diagonal entry of 0 with a variable that is
-    coupled to it. ``None`` where there is neither.
+    The direction is the unit vector of a negative diagonal entry, or combines a diagonal entry of 0 with a variable
+    that is coupled to it. ``None`` where there is neither.
     """
     direction = np.zeros(diagonal.size)
     if diagonal.min() < 0.0:

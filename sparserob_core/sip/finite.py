@@ -489,8 +489,8 @@ class Spread:
     missed : float, default 0
         Relative error with which a deviation is represented.
     still : ndarray of bool, shape (Q,), optional
-        Entries that no control answers, since they deviate by no more than the resolution of doubles. They count like
-        all others, but no proof names them.
+        Entries that no control answers, since they deviate by no more than the resolution of doubles. Such entries
+        count like all others, but no proof names them.
     """
 
     sets: tuple[tuple[int, ConvexSet], ...]
@@ -538,7 +538,7 @@ class Spread:
     def lost(self) -> float:
         """Relative error with which points of the sets represent deviations.
 
-        It is `missed` plus the rounding of points that are far from 0 compared with their deviations.
+        The error is `missed` plus the rounding of points that are far from 0 compared with their deviations.
         """
         moving = self.radii > 0.0 if self.still is None else (self.radii > 0.0) & ~self.still
         far = (np.abs(self.middle) / np.where(moving, self.radii, np.inf)).max(initial=0.0)
@@ -580,8 +580,8 @@ class Spread:
     def named(self, w: Array) -> Array:
         """Return the deviations that a proof may name instead of deviations ``w (..., Q)``.
 
-        They are projected onto the span of the set, and 0 for entries that are `still`. For sets with an interior they
-        are ``w`` itself.
+        The deviations ``w`` are projected onto the span of the set, and set to 0 for entries that are `still`. Sets
+        with an interior leave ``w`` unchanged.
         """
         return self._projected(w) * (1.0 if self.still is None else ~self.still)
 

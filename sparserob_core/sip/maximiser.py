@@ -31,10 +31,10 @@ class LinearBlocks:
     acting : callable
         ``acting()``: truth values ``(D,)``, true for the blocks on which the last evaluated value depends.
     steepest : callable
-        ``steepest(point (d,))``: the point ``(d,)`` with the linear coordinates of every block at a vertex. It is the
-        vertex at which the block has the largest effect, judged from the last evaluated point (the linear maximisation
-        of Frank and Wolfe 1956). A block that acts keeps the piece by which it acts. Moving there never decreases the
-        value while the acting blocks keep their other coordinates. No evaluation is spent.
+        ``steepest(point (d,))``: the point ``(d,)`` with the linear coordinates of every block at a vertex. Each vertex
+        is the one at which the block has the largest effect, judged from the last evaluated point (the linear
+        maximisation of Frank and Wolfe 1956). A block that acts keeps the piece by which it acts. Moving there never
+        decreases the value while the acting blocks keep their other coordinates. No evaluation is spent.
     """
 
     coordinates: np.ndarray
@@ -57,8 +57,8 @@ class Objective(Protocol):
     def block(self) -> int:
         """Number of consecutive coordinates that belong together.
 
-        It is 1, or the number of coordinates of one index where points are tuples of indices. Changing one block at a
-        time is then cheap.
+        The number is 1, or that of the coordinates of one index where points are tuples of indices. Changing one block
+        at a time is then cheap.
         """
 
     @property
@@ -80,8 +80,8 @@ class Objective(Protocol):
     def known(self) -> tuple[Array, Array]:
         """Return the points ``(k, d)`` that were evaluated before the search, and their values ``(k,)``.
 
-        They are the starting point and points known from elsewhere. At the start of the search, ``best_point`` is the
-        best of them.
+        The points are the starting point and points known from elsewhere. At the start of the search, ``best_point`` is
+        the best of them.
         """
 
     @property
@@ -92,8 +92,8 @@ class Objective(Protocol):
     def acting(self) -> Callable[[], np.ndarray] | None:
         """Function that returns which blocks the last evaluated value depends on; ``None`` where that is not known.
 
-        It returns truth values for the ``d / block`` blocks. The other blocks may be moved a little, and usually far,
-        without any change of the value. No evaluation is spent.
+        The function returns truth values for the ``d / block`` blocks. The other blocks may be moved a little, and
+        usually far, without any change of the value. No evaluation is spent.
         """
 
     @property
@@ -210,8 +210,8 @@ class Maximiser(ABC):
     def polished(self) -> float:
         """Default share of a budget for a local method at the end of a search: a fifth, unless a class overrides it.
 
-        The share applies to `sparserob_core.maximise` and `sparserob_core.ask_tell`. It should be 0 where polishing
-        would spoil the maximiser's purpose, such as an upper bound or a reference for comparison.
+        The share applies to `sparserob_core.maximise` and `sparserob_core.ask_tell`. A class should return 0 where
+        polishing would spoil the maximiser's purpose, such as an upper bound or a reference for comparison.
         """
         return 0.2
 

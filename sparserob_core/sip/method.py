@@ -30,9 +30,10 @@ GAP_TOLERANCE = 1e-7  # relative gap at which the gap counts as closed, unless a
 class Continuation(Options):
     """Decreasing weights of the regulariser.
 
-    The weight ``epsilon`` starts at ``start`` and is multiplied by ``factor`` (the paper's ``Regu``). It stops at
-    ``stop`` at the latest, or where a further reduction changes the cost ``J`` by no more than ``tolerance`` (``SC1``).
-    While its gap is open, the method ``exchange`` takes several steps at once, down to an eighth of a weight.
+    The weight ``epsilon`` starts at ``start`` and is multiplied by ``factor`` (the paper's ``Regu``). The decrease ends
+    at ``stop`` at the latest, or where a further reduction changes the cost ``J`` by no more than ``tolerance``
+    (``SC1``). While its gap is open, the method ``exchange`` takes several steps at once, down to an eighth of a
+    weight.
     """
 
     start: float = Field(default=1.0, gt=0.0)
@@ -85,8 +86,8 @@ class Continuation(Options):
 
 
 Rebuild: TypeAlias = Callable[[], tuple[SemiInfiniteProgram, Solver, Regulariser | None]]
-"""Function that makes the program, the solver and the regulariser anew. It can be pickled, and equal functions make
-equal objects."""
+"""Function that makes the program, the solver and the regulariser anew. The function can be pickled, and equal
+functions make equal objects."""
 
 
 @dataclass(frozen=True, eq=False)

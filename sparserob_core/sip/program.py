@@ -68,8 +68,9 @@ class Enclosure:
     split : ndarray of int, shape (k,)
         Coordinate of each cell whose halving promises the largest improvement.
     bend : ndarray, shape (k,), optional
-        Part of each bound that falls with the square of the cell's width. It is given for a family whose index is one
-        number. The separation of such a family then says where cells have to be short, unless its rows have deviations.
+        Part of each bound that falls with the square of the cell's width. The part is given for a family whose index is
+        one number. The separation of such a family then says where cells have to be short, unless its rows have
+        deviations.
     """
 
     bounds: Array
@@ -215,7 +216,8 @@ class ConstraintFamily:
         Maps indices ``(k, d)`` to ``(G (k, r, n), h (k, r))``, the rows and the right-hand sides.
     scale : callable, optional
         ``scale(x)``: factor of `TOLERANCE` that a proof allows at a decision, in the numbers of the rows (`allowed`).
-        Without it the factor is 1. It matters for a row that is smaller than 1, and for an equality in a finer unit.
+        Without it the factor is 1. The factor matters for a row that is smaller than 1, and for an equality in a finer
+        unit.
     chosen : callable, optional
         ``chosen(indices (k, d), rows (k,))``: one row of each index, ``(G (k, n), h (k,))``, where all rows would take
         longer.
@@ -618,7 +620,7 @@ class SemiInfiniteProgram:
         Factor of each entry of ``S x`` in a weighted regulariser, such as the length of a piece.
     activity : ndarray, optional
         Price of an entry of ``S x`` that is not 0, in the user's units, for the first entries or for all
-        (`working.counting`). It is given where a count has a meaning.
+        (`working.counting`). The field is given where a count has a meaning.
     cost_unit : float, default 1
         Value in the user's units of a cost of 1, for a program in its own units.
     image_units : ndarray, shape (k,), optional

@@ -190,8 +190,8 @@ class Result:
     lower_bound : float, default -inf
         Lower bound of the value of the *unregularised* semi-infinite program, always proven.
     upper_bound : float, default inf
-        Upper bound of that value. It is the cost where the status is certified or verified, and infinite where nothing
-        is proven of the decision.
+        Upper bound of that value. The bound is the cost where the status is certified or verified, and infinite where
+        nothing is proven of the decision.
     worst : WorstConstraint, optional
         The most violated constraint at the decision.
     indices : sequence of Cut

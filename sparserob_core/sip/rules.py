@@ -78,7 +78,7 @@ class Progress:
 class Rule:
     """A rule of the paper's algorithm, an object that is called.
 
-    It is a `Schedule`, an `OuterStop`, an `InnerStop` or a `Selection`.
+    Every rule is a `Schedule`, an `OuterStop`, an `InnerStop` or a `Selection`.
     """
 
     @classmethod

@@ -22,9 +22,9 @@ def irreducible(relaxed: RelaxedProgram, rows: Rows, solution: FiniteSolution) -
     """Return rows that cannot hold together although all but any one of them can, with the multipliers that prove it.
 
     A constraint that is impossible by itself, or two constraints that leave nothing between them, are returned at once
-    (`reasons`). Otherwise the deletion filter (Chinneck and Dravnieks 1991) is applied. It leaves every row out once,
-    the least important first. A row stays out if the others are infeasible without it. A row that was needed stays
-    needed when others are removed. A row whose absence could not be judged stays.
+    (`reasons`). Otherwise the deletion filter (Chinneck and Dravnieks 1991) is applied. The filter leaves every row out
+    once, the least important first. A row stays out if the others are infeasible without it. A row that was needed
+    stays needed when others are removed. A row whose absence could not be judged stays.
 
     Parameters
     ----------
@@ -67,8 +67,8 @@ def irreducible(relaxed: RelaxedProgram, rows: Rows, solution: FiniteSolution) -
 def _at_a_vertex(relaxed: RelaxedProgram, rows: Rows, solution: FiniteSolution) -> FiniteSolution:
     """Return a solution whose proof has few rows, where the given proof has many.
 
-    It is a vertex of the multipliers of the least relaxation that makes the program feasible. At a vertex, no more
-    multipliers are positive than there are variables.
+    The new multipliers are at a vertex of the multipliers of the least relaxation that makes the program feasible. At a
+    vertex, no more multipliers are positive than there are variables.
     """
     fixed, size = relaxed.program.finite.h.size, np.count_nonzero(solution.y)
     if size <= MANY:

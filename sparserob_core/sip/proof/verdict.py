@@ -221,8 +221,8 @@ def infeasible_subsystem(
 ) -> tuple[InfeasibleSubsystem, WorstConstraint | None]:
     """Return the reasons for infeasibility, and the most important constraint.
 
-    They are all separate reasons that need no solver. Where there is none, they are the rows that cannot hold together,
-    and the demand of their weighted sum on the decision.
+    All separate reasons that need no solver are returned. Where there is none, the rows that cannot hold together are
+    returned, with the demand of their weighted sum on the decision.
 
     Parameters
     ----------

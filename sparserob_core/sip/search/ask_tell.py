@@ -51,7 +51,7 @@ class Closed(Exception):
 class _Other:
     """The maximiser's side of a search: a thread, the points that it needs, and the answers.
 
-    It holds no reference to `AskTell`, so that the thread ends when an `AskTell` is garbage collected.
+    The object holds no reference to `AskTell`, so that the thread ends when an `AskTell` is garbage collected.
     """
 
     def __init__(self, search: Search) -> None:
@@ -193,9 +193,9 @@ class AskTell:
             Largest number of points; by default all, and 1 with ``fresh``.
         fresh : bool, default False
             Return only points that nobody has received, for several workers. Where the search has none left, points are
-            predicted. They are those that the search would need next if all open points had the worst value so far (the
-            constant liar of Ginsbourger, Le Riche and Carraro 2010). Their values are not counted in the budget where
-            the search does not ask for them.
+            predicted. Predicted points are those that the search would need next if all open points had the worst value
+            so far (the constant liar of Ginsbourger, Le Riche and Carraro 2010). Their values are not counted in the
+            budget where the search does not ask for them.
 
         Returns
         -------

@@ -22,9 +22,9 @@ def block_ascent(objective: Objective, start: Array | None = None) -> bool:
     One step is one evaluation. The linear coordinates of every block go to the vertex at which the block has the
     largest effect (Frank and Wolfe 1956). A convex function has its maximum at a vertex (Mangasarian 1996). Blocks that
     do not act may be moved without loss. Half of them are placed near the acting blocks, at distances from half a side
-    down to its ``2^-40``. This is a line search in all other coordinates at once. The other half is distributed over
-    the box by Kronecker's additive recurrence, and explores the rest. So no step decreases the value. The number of
-    acting blocks is noted as ``acting``.
+    down to its ``2^-40``. So one step is a line search in all other coordinates at once. The other half is distributed
+    over the box by Kronecker's additive recurrence, and explores the rest. So no step decreases the value. The number
+    of acting blocks is noted as ``acting``.
 
     Parameters
     ----------
@@ -136,7 +136,7 @@ class IdleBlocks:
 def _kronecker(dimension: int) -> Array:
     """Return shares ``(dimension,)`` whose multiples modulo 1 fill the unit box evenly.
 
-    They are powers of the root of ``x^(d+1) = x + 1`` (Roberts 2018).
+    The shares are powers of the root of ``x^(d+1) = x + 1`` (Roberts 2018).
     """
     root = 2.0
     for _ in range(64):

@@ -270,7 +270,7 @@ def _cross(seen: _Seen, other: Array) -> bool:
 def _feel(seen: _Seen) -> None:
     """Run a compass search (Hooke and Jeeves 1961).
 
-    It moves one coordinate at a time up or down, by a step of its own that doubles or halves.
+    The search moves one coordinate at a time up or down, by a step of its own that doubles or halves.
     """
     best, value = seen.top.copy(), float(seen.values.max())
     steps = np.full(seen.dimension, 0.1)

@@ -53,7 +53,7 @@ class SearchPart(Handed):
         Parameters
         ----------
         maximiser : Maximiser
-            The maximiser. It receives units of about 1, and indices apart, where it requires them.
+            The maximiser. A maximiser that requires units of about 1, or indices apart, receives them.
         rng : numpy.random.Generator
             Its random numbers.
 

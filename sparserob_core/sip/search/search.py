@@ -279,7 +279,7 @@ class CountedObjective:
     def learn(self, points: Float[Array, "k d"], values: Float[Array, " k"]) -> None:
         """Accept points whose values are known from before; to be called before the first evaluation.
 
-        They are no evaluations of this search, but count for its best point.
+        Known points are no evaluations of this search, but count for its best point.
 
         Parameters
         ----------
@@ -492,9 +492,9 @@ def maximise(
 ) -> Report:
     """Search for the maximum of a target; the last share of the budget polishes the result.
 
-    The maximiser receives only the coordinates that can move. Where none can, it is not called, for the value at the
-    only point is the maximum. It receives units of about 1 where it requires them (`Maximiser`, ``scaled``). An
-    interrupt from the keyboard ends the search, and is recorded in the report.
+    The maximiser receives only the coordinates that can move. Where none can, the maximiser is not called, for the
+    value at the only point is the maximum. A maximiser that requires units of about 1 receives them (`Maximiser`,
+    ``scaled``). An interrupt from the keyboard ends the search, and is recorded in the report.
 
     Parameters
     ----------

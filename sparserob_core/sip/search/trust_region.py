@@ -13,8 +13,8 @@ FIRST, LARGEST = 0.1, 0.3
 SMALLEST = 1e-13
 """Radius in the unit box below which no improvement is possible in double precision."""
 SURPLUS = 1.5
-"""Number of points of a model for each of its coefficients. It is more than interpolation needs, since a few more
-points fit a function with kinks better."""
+"""Number of points of a model for each of its coefficients. Interpolation needs fewer, but a few more points fit a
+function with kinks better."""
 POINTS = 99
 """Largest number of points of a model: one and a half times the coefficients of a full quadratic in ten coordinates."""
 ITERATIONS = 40  # largest number of Newton steps for the length of a step

@@ -139,7 +139,7 @@ def acting(coefficients: Float[Array, "m n"], values: Float[Array, "n k"]) -> np
 def counting(program: SemiInfiniteProgram) -> int:
     """Return the number of first entries of a decision that determine the images that count.
 
-    These are all entries, unless bounds of absolute values follow them.
+    The number is that of all entries, unless bounds of absolute values follow the entries.
     """
     base, images = program.finite, 0 if program.activity is None else program.activity.size
     return program.n if base.S is None else int(np.unique(base.S.tocsr()[:images].indices).size)

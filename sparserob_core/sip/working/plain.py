@@ -168,8 +168,8 @@ class PlainRows(Working):
     def sharpen(self, ledger: Ledger, answer: Answer) -> bool:
         """Improve the lower bound by the unregularised program, and continue without the regulariser.
 
-        It is the last step where the regulariser is not exact at its smallest weight. False is returned where nothing
-        is left to try.
+        This step is the last one, for a regulariser that is not exact at its smallest weight. False is returned where
+        nothing is left to try.
         """
         if self.epsilon == 0.0 or not self.exact:
             return False
@@ -260,8 +260,8 @@ class PlainRows(Working):
     ) -> tuple[Answer, Found, Violated]:
         """Return an answer in which fewer entries count, where there is one.
 
-        It is the answer without the small entries that solvers leave, or a vertex of the relaxed program where no
-        regulariser selects another optimum.
+        The new answer is the old one without the small entries that solvers leave, or a vertex of the relaxed program
+        where no regulariser selects another optimum.
         """
         answer, found, violated = self._sparser(ledger, answer, found, number)
         if not self.exact:

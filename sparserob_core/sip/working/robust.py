@@ -214,8 +214,8 @@ class RobustRows(Working):
     def _undefined(self, x: Array, feasible: bool) -> Violated:
         """Return violated constraints of families that define variables.
 
-        They are sought at the relaxed optimum before it is settled, and between it and the best decision known
-        (Ben-Ameur and Neto 2007). Where the optimum ``x`` is ``feasible``, a better decision is kept.
+        The constraints are sought at the relaxed optimum before it is settled, and between it and the best decision
+        known (Ben-Ameur and Neto 2007). Where the optimum ``x`` is ``feasible``, a better decision is kept.
         """
         program, raw = self.program, self.raw
         if feasible and not (self.best.size and program.cost(self.best) <= program.cost(x)):

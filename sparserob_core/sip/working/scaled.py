@@ -28,8 +28,8 @@ def least_slack(program: SemiInfiniteProgram, tools: Tools, accuracy: float = 1e
     Returns
     -------
     float
-        The amount in the rows' own units. It is negative where the rows have a margin, and infinite where it was not
-        found.
+        The amount in the rows' own units. The amount is negative where the rows have a margin, and infinite where it
+        was not found.
     """
     assert program.spread is not None
     relaxing = Counterpart(program.finite, program.spread, elastic=True, lowest=-ROOM)
@@ -58,8 +58,8 @@ def least_slack(program: SemiInfiniteProgram, tools: Tools, accuracy: float = 1e
 def largest_factor(program: SemiInfiniteProgram, tools: Tools, highest: float, accuracy: float = 1e-9) -> float | None:
     """Return the largest factor by which all deviations can be multiplied so that some decision meets every row.
 
-    With deviations ``f`` times as large, a row is ``g x + w'(C (f x) + f d) <= h``. It is linear in ``f``, in ``f x``
-    for the variables that answer deviations, and in the other variables.
+    With deviations ``f`` times as large, a row is ``g x + w'(C (f x) + f d) <= h``. The row is linear in ``f``, in the
+    product ``f x`` for variables that answer deviations, and in the other variables.
 
     Parameters
     ----------

@@ -102,8 +102,9 @@ def proofs_of(
 def secure_in_time(working: Working, ledger: Ledger, prover: Prover, answer: Answer, found: Found, number: int) -> bool:
     """Prove a tightened decision when it is due, even if the decision of this round is violated.
 
-    It is due as soon as it costs little. With a limit, it is also due at certain shares of the limit, and when the time
-    left is only just enough. Without a limit, it is also due after certain rounds.
+    The decision is due as soon as its margin costs little. With a limit, the decision is also due at certain shares of
+    the limit, and when the time left is only just enough. Without a limit, the decision is also due after certain
+    rounds.
 
     Parameters
     ----------

@@ -1,9 +1,10 @@
 """Programs without an optimum: rays along which the cost falls without bound, and rows that exclude such rays.
 
 A relaxed program may be unbounded below only because few constraints are imposed. The recession program decides whether
-the whole program is unbounded (Rockafellar 1970, section 8). It is the same program with right-hand sides 0, whose
-decision is a direction ``d`` of bounded size with ``P d = 0``. Its value is negative exactly where a feasible convex
-program falls along a ray. Where it is not negative, the indices that prove this bound the relaxed program too.
+the whole program is unbounded (Rockafellar 1970, section 8). The recession program is the same program with right-hand
+sides 0, whose decision is a direction ``d`` of bounded size with ``P d = 0``. Its value is negative exactly where a
+feasible convex program falls along a ray. Where it is not negative, the indices that prove this bound the relaxed
+program too.
 """
 
 from __future__ import annotations
@@ -136,7 +137,7 @@ def _by_family(cuts: Sequence[Cut]) -> list[tuple[Array, np.ndarray, str]]:
 def falls_for_ever(ledger: Ledger, close: Close, prover: Prover, ray: Array) -> Result:
     """Return the result for a program whose cost falls along a ray.
 
-    It has a decision that meets the constraints, where there is one, judged like any other, and no lower bound.
+    The result has a decision that meets the constraints, where there is one, judged like any other, and no lower bound.
 
     Parameters
     ----------

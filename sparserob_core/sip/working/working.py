@@ -378,7 +378,7 @@ class Working(ABC):
 def at_rest(program: SemiInfiniteProgram, x: Array) -> Array:
     """Return the decision ``x (n,)`` with every costly entry at 0.
 
-    These are all entries where images of the decision have a cost. Otherwise they are the entries with a weight or a
+    All entries are set to 0 where images of the decision have a cost. Otherwise only the entries with a weight or a
     square, and not those that only answer deviations.
     """
     base = program.finite
