@@ -1,1 +1,1 @@
-"""The optimisation wing: semi-infinite programs and their exact solution; knows nothing of control."""
+"""Optimisation: semi-infinite programs and their exact solution; this folder does not depend on control."""

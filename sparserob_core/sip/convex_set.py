@@ -1,5 +1,7 @@
-"""Convex sets as the framework sees them: a support function and a maximiser of it; everything else has a default that
-a set overrides where it knows better."""
+"""Convex sets, each described by its support function and a maximiser of it.
+
+All other properties have defaults. A set overrides a default where it knows a better answer.
+"""
 
 from __future__ import annotations
 
@@ -20,20 +22,21 @@ Array: TypeAlias = npt.NDArray[np.float64]
 
 HALVINGS = 60
 RELATIVE = 1e-12  # accuracy of a gauge that is computed from the support function alone
-PIVOTS = 500  # support points asked for at most on the way to one boundary point
-# Of how far a set reaches along a normal: opposite sides that are no further apart are one. With a thousandth of it,
-# gains of 1e12 are looked for on what a set deviates by 1e-12; with ten times as much, what they do could be seen.
+PIVOTS = 500  # largest number of support points computed for one boundary point
+# Opposite sides count as one where their distance is at most this share of the set's extent along the normal. With a
+# thousandth of it, gains of 1e12 are sought for deviations of 1e-12; with ten times as much, their effect is visible.
 CLOSED = 1e-9
 SPIKE = 1e-12  # of the set's extent: half the thickness below which a set counts as one without interior
-TILT = 1e-14  # by which a ray is turned in the choice of pivots, so that no choice is a tie
+TILT = 1e-14  # angle by which a ray is turned in the choice of pivots, so that no choice is a tie
 PLAIN = 3  # dimension up to which a set is sampled by rejection
 MIXING = 8  # steps of hit and run per dimension
-# Of a set's extent: a point that is so near to the boundary is on it but for rounding, and how far it is then drawn
-# inwards. Ten times less, and rounding decides again; ten times more would move the nominal trajectory by what is told.
+# Shares of a set's extent: EDGE is a distance from the boundary that counts as rounding, INWARDS the distance by which
+# such a point is moved inside. With a tenth, rounding decides again; ten times as much would change the nominal
+# trajectory in reported digits.
 EDGE, INWARDS = 1e-13, 1e-12
-# Sides of a box up to which they are added up one after the other, in the order in which NumPy's own sum adds so few.
-# Ten times as many, and sums are rounded in another order; with one for it, sums of two or three numbers, which a proof
-# in several dimensions takes by the million, take thirty times as long.
+# Number of sides of a box up to which they are added one after the other, in the order of NumPy's own sum of so few
+# numbers. With ten times as many, sums are rounded in another order. With 1, sums of two or three numbers take thirty
+# times as long, and a proof in several dimensions takes millions of them.
 FEW = 7
 TRIES = 10_000  # points drawn per wanted point before rejection sampling gives up
 
@@ -45,8 +48,22 @@ def bisect(
     high: Float[Array, " *k"],
     halvings: int = HALVINGS,
 ) -> tuple[Float[Array, " *k"], Float[Array, " *k"]]:
-    """Brackets ``(low, high)`` of the points at which ``beyond`` changes from false to true, one for every entry of the
-    two arrays; the last ``low`` was not beyond, the last ``high`` was, if that held at the start."""
+    """Return brackets of the points at which ``beyond`` changes from false to true, one for each entry.
+
+    Parameters
+    ----------
+    beyond : callable
+        Maps points ``(k,)`` to truth values ``(k,)``.
+    low, high : ndarray, shape (k,)
+        First brackets: ``beyond`` should be false at ``low`` and true at ``high``.
+    halvings : int, default HALVINGS
+        Number of halvings.
+
+    Returns
+    -------
+    low, high : ndarray, shape (k,)
+        The last brackets. If the first brackets were right, ``beyond`` is false at ``low`` and true at ``high``.
+    """
     for _ in range(halvings):
         middle = 0.5 * (low + high)
         out = beyond(middle)
@@ -55,72 +72,92 @@ def bisect(
 
 
 class ConvexSet(ABC):
-    """A closed convex set, described by its support function ``h(c) = max {c'x : x in the set}`` (Rockafellar 1970,
-    section 13).
+    """A closed convex set, described by its support function ``h(c) = max {c'x : x in the set}``.
 
-    Directions and points are arrays ``(..., d)``: any leading axes are kept, ``(k, d)`` gives ``(k,)``. A new kind of
-    set is one class with the three abstract members; the others have defaults that are right for every set with an
-    interior, and a set overrides those that it can answer faster or more exactly.
+    Directions and points are arrays ``(..., d)``. Leading axes are kept: ``(k, d)`` gives ``(k,)``. A new kind of set
+    is one class with the three abstract members `dimension`, `support` and `support_point`. The other members have
+    defaults that are right for every set with an interior. A set overrides those that it can answer faster or more
+    exactly.
+
+    References
+    ----------
+    Rockafellar (1970), Convex Analysis, section 13.
     """
 
     @property
     @abstractmethod
     def dimension(self) -> int:
-        """Dimension of the space that the set lives in."""
+        """Dimension ``d`` of the space that contains the set."""
 
     @abstractmethod
     def support(self, directions: Float[Array, "*k d"]) -> Float[Array, " *k"]:
-        """Support function of directions ``(k, d)``, as ``(k,)``; ``inf`` where the set is unbounded."""
+        """Return the support function of directions ``(k, d)``, as ``(k,)``; ``inf`` where the set is unbounded."""
 
     @abstractmethod
     def support_point(self, directions: Float[Array, "*k d"]) -> Float[Array, "*k d"]:
-        """A maximiser ``(k, d)`` of ``c'x`` for each direction ``(k, d)``; finite wherever the support function is."""
+        """Return a maximiser ``(k, d)`` of ``c'x`` for each direction ``(k, d)``; finite wherever the support function
+        is."""
 
     @shaped
     def continued(self, centre: Float[Array, "k d"], spread: Float[Array, "k d"]) -> Float[Array, " k"] | None:
-        """How large at most, in absolute value, the support function is at complex directions whose entries are within
-        ``spread (k, d)`` of ``centre (k, d)``, where it is continued to an analytic function of all of these; ``inf``
-        where it may not be. ``None``: nothing is known of the set."""
+        """Return upper bounds of the absolute value of the support function at complex directions near a real one.
+
+        The support function is continued to an analytic function of all complex directions within the given distance.
+
+        Parameters
+        ----------
+        centre : ndarray, shape (k, d)
+            Real directions.
+        spread : ndarray, shape (k, d)
+            Largest distance of each complex entry from that of the centre.
+
+        Returns
+        -------
+        ndarray, shape (k,), or None
+            The bounds; ``inf`` where there may be no such continuation. ``None``: nothing is known of the set.
+        """
         return None
 
-    # What shape it is
+    # Shape
 
     @property
     def kind(self) -> str:
-        """What a message calls the set."""
+        """Name of this kind of set in messages."""
         return type(self).__name__.lower()
 
     @property
     def is_box(self) -> bool:
-        """Whether the set is its own `bounding_box`."""
+        """True where the set is its own `bounding_box`."""
         return False
 
     @property
     def is_symmetric(self) -> bool:
-        """Whether the set is known to be symmetric about its `middle`."""
+        """True where the set is known to be symmetric about its `middle`."""
         return self.is_box
 
     @shaped
     def halfspaces(self) -> tuple[Float[Array, "r d"], Float[Array, " r"]] | None:
-        """``(H (r, d), h (r,))`` with the set ``= {x : H x <= h}``, or ``None`` for a curved set."""
+        """Return ``(H (r, d), h (r,))`` with the set ``= {x : H x <= h}``; ``None`` for a curved set."""
         return None
 
     @shaped
     def unit_ball_image(self) -> tuple[Float[Array, " d"], Float[Array, "d d"]] | None:
-        """``(m (d,), L (d, d))`` with the set ``= {m + L z : |z| <= 1}`` and ``L`` regular, or ``None`` for another
+        """Return ``(m (d,), L (d, d))`` with the set ``= {m + L z : |z| <= 1}`` and ``L`` regular; ``None`` for another
         shape."""
         return None
 
     @property
     def normals(self) -> Array:
-        """Orthonormal rows ``(b, d)`` that span every direction in which the support function is finite; here all of
-        them."""
+        """Orthonormal rows ``(b, d)`` that span every direction in which the support function is finite; by default all
+        directions."""
         return np.eye(self.dimension)
 
     @property
     def span(self) -> Array:
-        """Rows ``(r, d)`` that span the directions along which points of a bounded set differ: all of them, but across
-        opposite sides that are no further apart than rounding."""
+        """Rows ``(r, d)`` that span the directions along which points of a bounded set differ.
+
+        By default they span the whole space, except normals of opposite sides whose distance is only rounding.
+        """
         flat, axes = self.halfspaces(), np.eye(self.dimension)
         if flat is None or not self.is_bounded:
             return axes
@@ -130,55 +167,59 @@ class ConvexSet(ABC):
 
     @property
     def frame(self) -> Array:
-        """Rows ``N (b, d)`` that span what `normals` span, in whose coordinates ``c = z N`` the set is about round: it
-        reaches about as far along every ``z`` of the same length. In other units of the set ``z`` stays the same."""
+        """Rows ``N (b, d)`` that span the same space as `normals`, scaled so that the set is nearly round in their
+        coordinates.
+
+        With directions ``c = z N``, the set has about the same extent along every ``z`` of the same length. In other
+        units of the set, ``z`` stays the same.
+        """
         axes = self.normals
         width = self.width(axes)
         return few_digits(axes / np.where((width > 0.0) & np.isfinite(width), width / 2.0, 1.0)[:, None])
 
     @shaped
     def along(self, z: Float[Array, "*k b"]) -> Float[Array, "*k d"]:
-        """The directions ``(k, d)`` with coordinates ``z (k, b)`` in the `frame`."""
+        """Return the directions ``(k, d)`` with coordinates ``z (k, b)`` in the `frame`."""
         return np.asarray(z @ self.frame)
 
     @property
     def factors(self) -> tuple[ConvexSet, ...]:
-        """The sets whose product it is; itself alone where it is none."""
+        """Sets whose Cartesian product is this set; the set itself alone where it is no product."""
         return (self,)
 
     @property
     def is_bounded(self) -> bool:
-        """Whether the support function is finite in every direction."""
+        """True where the support function is finite in every direction."""
         axes = np.eye(self.dimension)
         return bool(np.isfinite(self.support(np.vstack([axes, -axes]))).all())
 
-    # How large it is
+    # Size
 
     def bounding_box(self) -> Box:
-        """The smallest box around the set, with infinite sides where the set has none."""
+        """Return the smallest box around the set; a side is infinite where the set is unbounded."""
         axes = np.eye(self.dimension)
         upper = self.support(axes)
         return Box(np.minimum(-self.support(-axes), upper), upper)
 
     @shaped
     def reach(self, directions: Float[Array, "*k d"]) -> Float[Array, " *k"]:
-        """``max {|c'x| : x in the set}`` of directions ``(..., d)``, as ``(...,)``."""
+        """Return ``max {|c'x| : x in the set}`` for directions ``(..., d)``, as ``(...,)``."""
         farthest: Array = np.maximum(self.support(directions), self.support(-directions))
         return farthest
 
     @shaped
     def width(self, directions: Float[Array, "*k d"]) -> Float[Array, " *k"]:
-        """``max c'x - min c'x`` over the set for directions ``(..., d)``, as ``(...,)``."""
+        """Return ``max c'x - min c'x`` over the set for directions ``(..., d)``, as ``(...,)``."""
         between: Array = self.support(directions) + self.support(-directions)
         return between
 
     @property
     def radius_bound(self) -> float:
-        """An upper bound of the 2-norm of any point: that of the corner of the bounding box."""
+        """Upper bound of the 2-norm of any point: the largest 2-norm in the bounding box."""
         return float(np.linalg.norm(self.reach(np.eye(self.dimension))))
 
     def is_same(self, other: object) -> bool:
-        """Whether another set is this one, or is of the same kind and holds the same numbers, bit by bit."""
+        """Return whether ``other`` is this set, or is of the same kind and holds the same numbers, bit by bit."""
         fields = getattr(self, "__dataclass_fields__", None)
         if other is self or fields is None or type(other) is not type(self):
             return other is self
@@ -186,20 +227,29 @@ class ConvexSet(ABC):
 
     @shaped
     def interior_point(self) -> Float[Array, " d"]:
-        """A point ``(d,)`` of the set, away from its boundary where the set allows; here the mean of support points."""
+        """Return a point ``(d,)`` of the set, away from its boundary where possible; by default the mean of support
+        points."""
         axes = np.eye(self.dimension)
         centre: Array = self.support_point(np.vstack([axes, -axes])).mean(axis=0)
         return centre
 
     @shaped
     def amid(self) -> Float[Array, " d"]:
-        """A point ``(d,)`` amid a bounded set: the same in other units, where that can be had."""
+        """Return a point ``(d,)`` well inside a bounded set, independent of the units where that is possible."""
         return self.interior_point()
 
     @shaped
     def middle(self) -> Float[Array, " d"]:
-        """What the set is scaled about, ``(d,)``: the middle of its bounding box, 0 along sides that are free; a point
-        amid the set where that is not in it. Raises `InputError` where a side is free and 0 is not inside."""
+        """Return the centre ``(d,)`` about which the set is scaled.
+
+        The centre is the middle of the bounding box, with 0 along sides that are free. Where the middle is outside of
+        the set, the centre is the point `amid` the set.
+
+        Raises
+        ------
+        InputError
+            Where a side is free and 0 is not inside.
+        """
         box = self.bounding_box()
         bounded = np.isfinite(box.lower) & np.isfinite(box.upper)
         middle: Array = np.where(
@@ -209,7 +259,7 @@ class ConvexSet(ABC):
         out = float(self.violation(middle))
         if (
             abs(out) <= EDGE * size and bounded.all()
-        ):  # of a triangle it may be halfway along a side: rounding says where
+        ):  # in a triangle it may be the middle of a side, inside or outside by rounding
             within = self.amid()
             inwards: Array = middle + INWARDS * (within - middle)
             return middle if float(self.violation(within)) >= -EDGE * size else inwards
@@ -224,22 +274,43 @@ class ConvexSet(ABC):
         )
 
     def scaled(self, factor: float) -> ConvexSet:
-        """``m + factor (x - m)`` for all ``x`` in the set, ``m`` its `middle`; ``factor >= 0``."""
+        """Return the set of ``m + factor (x - m)`` for all ``x`` in the set, with ``m`` its `middle` and ``factor >=
+        0``."""
         return Scaled(self, self.middle(), factor)
 
     @shaped
     def in_units(self, units: Float[Array, " d"]) -> ConvexSet:
-        """The set of all ``x / units`` for ``x`` in this one; ``units (d,)`` positive. Exact for powers of two."""
+        """Return the set of all ``x / units`` for ``x`` in this set.
+
+        Parameters
+        ----------
+        units : ndarray, shape (d,)
+            Units of the coordinates, positive. Powers of two make the result exact.
+
+        Returns
+        -------
+        ConvexSet
+            The set in these units.
+        """
         return SetInUnits(self, np.asarray(units, dtype=float))
 
-    # Where its boundary is
+    # Boundary
 
     @shaped
     def gauge(self, points: Float[Array, "*k d"]) -> Float[Array, " *k"]:
-        """The Minkowski functional about the interior point: the least ``g (...,)`` for which
-        ``m + (x - m) / g`` is in the set, of points ``(..., d)``.
+        """Return the Minkowski functional of points about the interior point ``m``.
 
-        At most 1 inside, above 1 outside, ``inf`` where the set has no extent towards the point.
+        The functional is the least ``g`` for which ``m + (x - m) / g`` is in the set.
+
+        Parameters
+        ----------
+        points : ndarray, shape (..., d)
+            Points.
+
+        Returns
+        -------
+        ndarray, shape (...,)
+            At most 1 inside, above 1 outside, ``inf`` where the set has no extent towards the point.
         """
         points = np.asarray(points, dtype=float)
         middle = self.interior_point()
@@ -248,14 +319,14 @@ class ConvexSet(ABC):
         if flat is None:
             sizes = self._boundary(np.broadcast_to(middle, rays.shape), rays)[0]
         else:
-            # an interior point may be outside by rounding
+            # rounding may put an interior point outside
             sizes = ratios(rays @ flat[0].T, np.maximum(flat[1] - flat[0] @ middle, 0.0)).max(axis=1, initial=0.0)
         return sizes.reshape(points.shape[:-1])
 
     @shaped
     def normal(self, points: Float[Array, "*k d"]) -> Float[Array, "*k d"]:
-        """Outward normals ``(..., d)``, of any length, at points of the boundary ``(..., d)``; one of them at a
-        corner."""
+        """Return outward normals ``(..., d)``, of any length, at boundary points ``(..., d)``; at a corner one of its
+        normals."""
         points = np.asarray(points, dtype=float)
         flat = self.halfspaces()
         if flat is not None:
@@ -268,12 +339,22 @@ class ConvexSet(ABC):
 
     @shaped
     def violation(self, points: Float[Array, "*k d"]) -> Float[Array, " *k"]:
-        """How far outside (positive) or inside (negative) points ``(..., d)`` are: 0 on the boundary, never below
-        ``max {c'x - h(c) : |c| = 1}``.
+        """Return the signed distance by which points are outside of the set (positive) or inside (negative).
 
-        For a flat set the maximum of ``c'x - h(c)`` over the unit normals of its half-spaces; ``-inf`` when there are
-        none. Here, for a curved set: outside, the distance to the boundary along the ray from the interior point;
-        inside, ``(gauge - 1)`` times the radius of a ball that is in the set.
+        The distance is 0 on the boundary, and never below ``max {c'x - h(c) : |c| = 1}``. For a flat set, the distance
+        is the maximum of ``c'x - h(c)`` over the unit normals of its half-spaces. By default for a curved set, the
+        value outside is the distance to the boundary along the ray from the interior point. The value inside is
+        ``(gauge - 1)`` times the radius of a ball that is in the set.
+
+        Parameters
+        ----------
+        points : ndarray, shape (..., d)
+            Points.
+
+        Returns
+        -------
+        ndarray, shape (...,)
+            Violations; ``-inf`` for a flat set without half-spaces.
         """
         points = np.asarray(points, dtype=float)
         flat = self.halfspaces()
@@ -291,11 +372,24 @@ class ConvexSet(ABC):
 
     @shaped
     def contains(self, points: Float[Array, "*k d"], tolerance: float = 1e-9) -> Bool[np.ndarray, " *k"]:
-        """Whether points ``(..., d)`` violate nothing by more than the absolute ``tolerance``."""
+        """Return whether each point violates nothing by more than an absolute tolerance.
+
+        Parameters
+        ----------
+        points : ndarray, shape (..., d)
+            Points.
+        tolerance : float, default 1e-9
+            Violation that is allowed.
+
+        Returns
+        -------
+        ndarray of bool, shape (...,)
+            True for points of the set.
+        """
         points = np.asarray(points, dtype=float)
         if tolerance < 0.0 or self.halfspaces() is not None:
             return np.asarray(self.violation(points) <= tolerance)
-        inside: npt.NDArray[np.bool_] = np.array(self.gauge(points) <= 1.0)  # how deep is not asked
+        inside: npt.NDArray[np.bool_] = np.array(self.gauge(points) <= 1.0)  # the depth inside is not needed
         if not inside.all():
             inside[~inside] = self.violation(points[~inside]) <= tolerance
         return inside
@@ -304,8 +398,20 @@ class ConvexSet(ABC):
     def chord(
         self, points: Float[Array, "k d"], directions: Float[Array, "k d"]
     ) -> tuple[Float[Array, " k"], Float[Array, " k"]]:
-        """``low (k,) <= 0 <= high (k,)`` such that ``point + s direction`` is in the set for ``low <= s <= high``, of
-        points of the set ``(k, d)`` and directions ``(k, d)``."""
+        """Return the chords of the set through points of it.
+
+        Parameters
+        ----------
+        points : ndarray, shape (k, d)
+            Points of the set.
+        directions : ndarray, shape (k, d)
+            Directions of the chords.
+
+        Returns
+        -------
+        low, high : ndarray, shape (k,)
+            Numbers with ``low <= 0 <= high``, such that ``point + s direction`` is in the set for ``low <= s <= high``.
+        """
         flat = self.halfspaces()
         if flat is None:
             with np.errstate(divide="ignore"):
@@ -324,14 +430,27 @@ class ConvexSet(ABC):
     def _boundary(
         self, origins: Float[Array, "k d"], rays: Float[Array, "k d"]
     ) -> tuple[Float[Array, " k"], Float[Array, "k d"]]:
-        """The gauge ``(k,)`` of ``rays (k, d)`` about points of the set ``origins (k, d)``, and a normal ``(k, d)``
-        where each ray leaves the set.
+        """Return the gauge of rays about points of the set, and normals where the rays leave the set.
 
-        The gauge is ``min {sum lambda : r = sum lambda_i v_i, lambda >= 0}`` over points ``v_i`` of the set seen from
-        the origin: a linear program with a column for each of them. The dual solution of the chosen columns is a
-        direction, and its support point is the column to enter (column generation; Dantzig and Wolfe 1960). The answer
-        is at least the true gauge, so that the ray over its gauge is in the set, by less than `RELATIVE` of it where
-        `PIVOTS` suffice.
+        The gauge is ``min {sum lambda : r = sum lambda_i v_i, lambda >= 0}`` over points ``v_i`` of the set, relative
+        to the origin of the ray. This linear program has a column for each point. The dual solution of the chosen
+        columns is a direction, and its support point is the column to enter (column generation; Dantzig and Wolfe
+        1960).
+
+        Parameters
+        ----------
+        origins : ndarray, shape (k, d)
+            Points of the set.
+        rays : ndarray, shape (k, d)
+            Directions from these points.
+
+        Returns
+        -------
+        sizes : ndarray, shape (k,)
+            The gauge or slightly more, so that the ray over its gauge is in the set. The excess is less than `RELATIVE`
+            of the gauge where `PIVOTS` steps suffice. ``inf`` where the set has no extent along the ray.
+        normals : ndarray, shape (k, d)
+            A normal where each ray leaves the set.
         """
         N = self.normals
         widths = self.width(N) / 2
@@ -342,7 +461,7 @@ class ConvexSet(ABC):
         lengths = np.linalg.norm(rays, axis=1)
         turned = np.where(rays < 0, -1.0, 1.0)
         tilted = rays / np.where(lengths > 0, lengths, 1.0)[:, None] + TILT * turned * (1.0 + np.arange(b) / 7.0)
-        # The first columns stand for the thickness that the set must at least have; none may be left in the end.
+        # The first columns represent the least thickness of a set; none of them may remain in the end.
         columns = SPIKE * turned[:, :, None] * np.eye(b)
         made = np.ones((k, b), dtype=bool)
         open_ = np.flatnonzero(lengths > 0)
@@ -366,30 +485,61 @@ class ConvexSet(ABC):
 
     @cached_property
     def _inner_radius(self) -> float:
-        """The radius of a ball about the interior point that is in the set: that of the polytope whose corners are
-        where the axes leave the set."""
+        """Radius of a ball about the interior point that is in the set.
+
+        The ball lies in the polytope whose corners are the points where the axes leave the set.
+        """
         axes = self.normals
         rays = np.vstack([axes, -axes])
         sizes = self._boundary(np.broadcast_to(self.interior_point(), rays.shape), rays)[0].reshape(2, -1).max(axis=0)
         return float(1.0 / np.linalg.norm(sizes))
 
-    # What its points are, at random
+    # Random points
 
     @shaped
     def sample(self, count: int, rng: np.random.Generator) -> Float[Array, "{count} d"]:
-        """``count`` independent points ``(count, d)`` of a bounded set: uniform in up to three dimensions, unless the
-        set is too thin for rejection; else hit and run (Smith 1984) makes them uniform in the limit only."""
+        """Return independent random points of a bounded set.
+
+        In up to three dimensions the points are uniform, unless the set is too thin for rejection. Otherwise hit and
+        run (Smith 1984) makes them uniform in the limit only.
+
+        Parameters
+        ----------
+        count : int
+            Number of points.
+        rng : numpy.random.Generator
+            Random numbers.
+
+        Returns
+        -------
+        ndarray, shape (count, d)
+            Points of the set.
+        """
         found = self._by_rejection(count, rng) if self.dimension <= PLAIN else None
         return self._hit_and_run(count, rng) if found is None else found
 
     @shaped
     def sample_extreme(self, count: int, rng: np.random.Generator) -> Float[Array, "{count} d"]:
-        """``count`` random extreme points ``(count, d)`` of a bounded set: here the support points of directions that
-        are uniform on the sphere."""
+        """Return random extreme points of a bounded set.
+
+        By default they are the support points of directions that are uniform on the sphere.
+
+        Parameters
+        ----------
+        count : int
+            Number of points.
+        rng : numpy.random.Generator
+            Random numbers.
+
+        Returns
+        -------
+        ndarray, shape (count, d)
+            Extreme points.
+        """
         return self.support_point(rng.normal(size=(count, self.dimension)))
 
     def _by_rejection(self, count: int, rng: np.random.Generator) -> Array | None:
-        """The points of the bounding box that lie in the set; ``None`` where these are too few."""
+        """Return random points of the bounding box that lie in the set; ``None`` where too few of them do."""
         box = self.bounding_box()
         found, drawn = np.empty((0, self.dimension)), 0
         while found.shape[0] < count:
@@ -401,24 +551,42 @@ class ConvexSet(ABC):
         return found[:count]
 
     def _hit_and_run(self, count: int, rng: np.random.Generator) -> Array:
-        """One chain per point, all from the interior point; a chain that cannot move along a line stays where it is."""
+        """Return the ends of ``count`` chains of hit and run, all from the interior point.
+
+        A chain that cannot move along a line stays where it is.
+        """
         points: Array = np.tile(self.interior_point(), (count, 1))
         for _ in range(MIXING * self.dimension):
             directions = rng.normal(size=points.shape)
             points = points + rng.uniform(*self.chord(points, directions))[:, None] * directions
         return points
 
-    # How its support function curves
+    # Curvature of the support function
 
     @shaped
     def linearisation_excess(self, centre: Float[Array, "*k d"], spread: Float[Array, "*k J d"]) -> Float[Array, " *k"]:
-        """How much the support function can exceed its linearisation at ``centre (..., d)``, over
-        ``centre + sum_j s_j spread_j``, ``|s_j| <= 1``.
+        """Return upper bounds of the excess of the support function over its linearisation at a centre.
 
-        ``spread (..., J, d)``; returns ``(...,)``, proven upper bounds of ``h(y) - w'y`` with ``w`` the support point
-        of the centre (0 where the same point stays the maximiser). This default follows from sublinearity of ``h``:
-        with shares ``sum_j a_j <= 1`` of the centre, ``y`` is the sum of the ``a_j centre + s_j spread_j``, each convex
-        in ``s_j``. Of a smooth set it is of second order; sets override it with a tighter one.
+        The bounds hold for ``y = centre + sum_j s_j spread_j`` with ``|s_j| <= 1``.
+
+        Parameters
+        ----------
+        centre : ndarray, shape (..., d)
+            Directions at which the support function is linearised.
+        spread : ndarray, shape (..., J, d)
+            Generators of the set of directions about each centre.
+
+        Returns
+        -------
+        ndarray, shape (...,)
+            Proven upper bounds of ``h(y) - w'y``, with ``w`` the support point of the centre; 0 where the same point
+            stays the maximiser.
+
+        Notes
+        -----
+        This default follows from sublinearity of ``h``. With shares ``sum_j a_j <= 1`` of the centre, ``y`` is the sum
+        of the ``a_j centre + s_j spread_j``, each convex in ``s_j``. For a smooth set the bound is of second order.
+        Sets override it with a tighter one.
         """
         point = self.support_point(centre)[..., None, :]
         along = (point * spread).sum(axis=-1)
@@ -437,11 +605,24 @@ class ConvexSet(ABC):
     def support_majorant(
         self, centre: Float[Array, "*k d"], spread: Float[Array, "*k J d"]
     ) -> tuple[Float[Array, "*k d"], Float[Array, " *k"]]:
-        """A linear function of ``y`` above the support function over ``y = centre + sum_j s_j spread_j``,
-        ``|s_j| <= 1``: a point ``(..., d)`` that ``y`` is multiplied by, and what is added, ``(...,)``.
+        """Return linear functions of ``y`` that are above the support function near a centre.
 
-        ``centre (..., d)``, ``spread (..., J, d)``. The linearisation with its excess will do; of a box the chord is
-        lower.
+        The functions hold for ``y = centre + sum_j s_j spread_j`` with ``|s_j| <= 1``. The default is the linearisation
+        plus its excess. For a box, the chord is lower.
+
+        Parameters
+        ----------
+        centre : ndarray, shape (..., d)
+            Directions.
+        spread : ndarray, shape (..., J, d)
+            Generators of the set of directions about each centre.
+
+        Returns
+        -------
+        point : ndarray, shape (..., d)
+            Slope of the linear function.
+        offset : ndarray, shape (...,)
+            Constant of the linear function: ``h(y) <= point'y + offset``.
         """
         return self.support_point(centre), self.linearisation_excess(centre, spread)
 
@@ -449,19 +630,36 @@ class ConvexSet(ABC):
     def support_minorant(
         self, centre: Float[Array, " d"], spread: Float[Array, "J d"]
     ) -> tuple[float, Float[Array, " J"], Float[Array, "J J"]]:
-        """A quadratic below ``h(centre + sum_j s_j spread_j)`` for ``|s_j| <= 1``: value, gradient ``(J,)`` and Hessian
-        ``(J, J)`` in ``s``.
+        """Return a quadratic function of ``s`` below ``h(centre + sum_j s_j spread_j)`` for ``|s_j| <= 1``.
 
-        ``centre (d,)``, ``spread (J, d)``. The support function is convex, so its linearisation will do; curved sets
-        add what they are sure of.
+        The support function is convex, so its linearisation is such a function, and is the default. Curved sets may add
+        a lower bound of the curvature.
+
+        Parameters
+        ----------
+        centre : ndarray, shape (d,)
+            Direction.
+        spread : ndarray, shape (J, d)
+            Generators of the set of directions about the centre.
+
+        Returns
+        -------
+        value : float
+            Value at ``s = 0``.
+        gradient : ndarray, shape (J,)
+            Gradient at ``s = 0``.
+        hessian : ndarray, shape (J, J)
+            Hessian.
         """
         point = self.support_point(centre[None])[0]
         return float(self.support(centre[None])[0]), spread @ point, np.zeros((spread.shape[0], spread.shape[0]))
 
 
 def chords(centre: Array, reach: Array) -> tuple[Array, Array]:
-    """``share`` and ``excess`` of the chords ``|y| <= share y + excess`` over ``|y - centre| <= reach``: where ``y``
-    keeps its sign, that sign and nothing."""
+    """Return ``share`` and ``excess`` of the chords ``|y| <= share y + excess`` over ``|y - centre| <= reach``.
+
+    Where ``y`` keeps its sign, ``share`` is that sign and ``excess`` is 0.
+    """
     size = np.abs(centre)
     turns = reach > size
     share = np.where(turns, centre / np.where(turns, reach, 1.0), np.sign(centre))
@@ -469,14 +667,34 @@ def chords(centre: Array, reach: Array) -> tuple[Array, Array]:
 
 
 def ratios(sizes: Array, room: Array | float) -> Array:
-    """``size / room`` where the size is positive, ``inf`` where there is no room for it; 0 elsewhere."""
+    """Return ``size / room`` where the size is positive, ``inf`` where the room is then 0; 0 elsewhere."""
     with np.errstate(divide="ignore", invalid="ignore"):
         shares: Array = np.where(sizes > 0, sizes / room, 0.0)
     return shares
 
 
 def as_bound(name: str, value: object, size: int | None = None) -> Array:
-    """A bound vector from a number or a sequence; NaN, texts and truth values are refused, infinities are kept."""
+    """Return a vector of bounds from a number or a sequence.
+
+    Parameters
+    ----------
+    name : str
+        Name of the bound in messages.
+    value : array_like
+        A number, which is repeated, or ``size`` numbers. Infinities are kept.
+    size : int, optional
+        Number of entries; by default that of the value.
+
+    Returns
+    -------
+    ndarray, shape (size,)
+        The vector.
+
+    Raises
+    ------
+    InputError
+        For NaN, texts, truth values, or a wrong number of entries.
+    """
     try:
         if np.asarray(value).dtype.kind in "bSU":
             raise TypeError("no numbers")
@@ -504,15 +722,23 @@ def finite(name: str, value: object, size: int | None) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class Box(ConvexSet):
-    """``{x : lower <= x <= upper}``; an infinite bound leaves that side free.
+    """Box ``{x : lower <= x <= upper}``; an infinite bound leaves that side free.
 
-    ``lower``, ``upper``: ``(d,)``. Raises `InputError` when a bound is NaN, the lengths differ, or the box is empty.
+    Parameters
+    ----------
+    lower, upper : array_like, shape (d,)
+        Bounds of the coordinates.
+
+    Raises
+    ------
+    InputError
+        Where a bound is NaN, the lengths differ, or the box is empty.
     """
 
     lower: Array
     upper: Array
 
-    if TYPE_CHECKING:  # what is given may be a list; what is kept is an array
+    if TYPE_CHECKING:  # an argument may be a list; the field is an array
 
         def __init__(self, lower: npt.ArrayLike, upper: npt.ArrayLike) -> None: ...
 
@@ -535,7 +761,7 @@ class Box(ConvexSet):
     @shaped
     def support(self, directions: Float[Array, "*k d"]) -> Float[Array, " *k"]:
         directions = np.asarray(directions, dtype=float)
-        if self.is_bounded and self.dimension <= FEW:  # side by side, which is what the sum adds up, in its order
+        if self.is_bounded and self.dimension <= FEW:  # side by side, in the order of NumPy's sum
             sides = [(directions[..., i], self.lower[i], self.upper[i]) for i in range(self.dimension)]
             if self._is_centred:
                 return np.asarray(sum(np.abs(side) * high for side, _, high in sides))
@@ -554,7 +780,7 @@ class Box(ConvexSet):
 
     @cached_property
     def _is_centred(self) -> bool:
-        """Whether the box is its own mirror image about 0."""
+        """True where the box is its own mirror image about 0."""
         return bool((self.lower == -self.upper).all())
 
     @shaped
@@ -616,7 +842,7 @@ class Box(ConvexSet):
 
     @shaped
     def sample_extreme(self, count: int, rng: np.random.Generator) -> Float[Array, "{count} d"]:
-        """Each corner equally likely."""
+        """Return ``count`` random corners ``(count, d)``, all equally likely."""
         return np.where(rng.integers(0, 2, size=(count, self.dimension), dtype=np.int8) > 0, self.upper, self.lower)
 
     @shaped
@@ -635,16 +861,45 @@ class Box(ConvexSet):
 
 
 def continued_by_signs(middle: Array, half: Array, centre: Array, spread: Array) -> Array:
-    """`ConvexSet.continued` of ``sum_i middle_i z_i + half_i |z_i|``, in which every ``|z_i|`` is ``z_i`` or ``-z_i``
-    where the sign cannot change."""
+    """Return the bounds of `ConvexSet.continued` for the support function ``sum_i middle_i z_i + half_i |z_i|``.
+
+    Every ``|z_i|`` is replaced by ``z_i`` or ``-z_i`` where the sign of ``z_i`` cannot change. Elsewhere the bound is
+    infinite.
+
+    Parameters
+    ----------
+    middle, half : ndarray, shape (d,)
+        Middle and half width of a box.
+    centre, spread : ndarray, shape (k, d)
+        Real directions, and distances of the complex ones from them.
+
+    Returns
+    -------
+    ndarray, shape (k,)
+        Upper bounds.
+    """
     size = np.abs(centre)
     fixed = (size > spread) | (spread == 0.0) | (half == 0.0)
     return np.where(fixed.all(axis=1), (size + spread) @ (np.abs(middle) + half), np.inf)
 
 
 def continued_by_corners(corners: Array, centre: Array, spread: Array) -> Array:
-    """`ConvexSet.continued` of the largest of ``v'z``, ``v`` one of ``corners (v, d)``: of the one that is best there
-    alone; with the same value where others are equal to it at all of them."""
+    """Return the bounds of `ConvexSet.continued` for the support function ``max_v v'z`` of a polytope.
+
+    The bound is finite where one corner attains the maximum at all directions, alone or with equal copies of it.
+
+    Parameters
+    ----------
+    corners : ndarray, shape (v, d)
+        Corners of the polytope.
+    centre, spread : ndarray, shape (k, d)
+        Real directions, and distances of the complex ones from them.
+
+    Returns
+    -------
+    ndarray, shape (k,)
+        Upper bounds.
+    """
     heights = centre @ corners.T
     best = corners[heights.argmax(axis=1)]
     apart = np.einsum("kvd,kd->kv", np.abs(best[:, None] - corners), spread)
@@ -655,7 +910,15 @@ def continued_by_corners(corners: Array, centre: Array, spread: Array) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class SetInUnits(ConvexSet):
-    """``{x / units : x in base}``: any set in other units ``(d,)``. Made by `ConvexSet.in_units`."""
+    """The set ``{x / units : x in base}``: any set in other units, made by `ConvexSet.in_units`.
+
+    Parameters
+    ----------
+    base : ConvexSet
+        The set.
+    units : ndarray, shape (d,)
+        Units of the coordinates, positive.
+    """
 
     base: ConvexSet
     units: Array
@@ -732,7 +995,7 @@ class SetInUnits(ConvexSet):
 
 
 def projector(span: Array) -> Array:
-    """The orthogonal projector ``(d, d)`` onto what rows ``(r, d)`` span; exact where these are axes."""
+    """Return the orthogonal projector ``(d, d)`` onto the span of rows ``(r, d)``; exact where the rows are axes."""
     d = span.shape[1]
     across = null_space(span) if span.any() else np.eye(d)
     if len(across) in (0, d):
@@ -741,8 +1004,10 @@ def projector(span: Array) -> Array:
 
 
 def null_space(rows: Array) -> Array:
-    """Orthonormal rows ``(r, d)`` that span what is orthogonal to rows ``(k, d)``; the axes that are so, and these
-    exactly."""
+    """Return orthonormal rows ``(r, d)`` that span the orthogonal complement of rows ``(k, d)``.
+
+    Axes that belong to the complement are among them, exactly.
+    """
     axes = ~rows.any(axis=0)
     plain, rest = np.eye(rows.shape[1])[axes], rows[:, ~axes]
     if not rest.size:
@@ -755,8 +1020,10 @@ def null_space(rows: Array) -> Array:
 
 @shaped
 def few_digits(matrix: Float[Array, "b d"]) -> Float[Array, "b d"]:
-    """A matrix ``(b, d)`` with the entries of each column rounded to 24 binary digits of its largest: what ``z`` with
-    as few digits makes of it is exact, and units that are powers of two pass through."""
+    """Return a matrix ``(b, d)`` with each column rounded to 24 binary digits of its largest entry.
+
+    Its products with ``z`` of as few digits are exact, and units that are powers of two commute with the rounding.
+    """
     _, exponents = np.frexp(np.abs(matrix).max(axis=0))
     grid = np.ldexp(1.0, exponents - 24)
     return np.asarray(np.rint(matrix / grid) * grid)
@@ -764,8 +1031,17 @@ def few_digits(matrix: Float[Array, "b d"]) -> Float[Array, "b d"]:
 
 @dataclass(frozen=True, eq=False)
 class Scaled(ConvexSet):
-    """``{about + factor (x - about) : x in base}``, ``about (d,)`` in the base and ``factor >= 0``; what
-    `ConvexSet.scaled` gives for a kind of set that does not scale itself."""
+    """The set ``{about + factor (x - about) : x in base}``: the default of `ConvexSet.scaled`.
+
+    Parameters
+    ----------
+    base : ConvexSet
+        The set.
+    about : ndarray, shape (d,)
+        Centre of the scaling, in the base.
+    factor : float
+        Factor, at least 0.
+    """
 
     base: ConvexSet
     about: Array
@@ -845,8 +1121,26 @@ class Scaled(ConvexSet):
 def vertex_excess(
     vertices: Float[Array, "v d"], centre: Float[Array, "*k d"], spread: Float[Array, "*k J d"], blocks: int = 4096
 ) -> Float[Array, " *k"]:
-    """`ConvexSet.linearisation_excess` of a polytope with ``vertices (v, d)``: how much any other vertex can gain on
-    the centre's best one."""
+    """Return the bounds of `ConvexSet.linearisation_excess` for a polytope with given vertices.
+
+    The excess is the largest gain of any other vertex over the best vertex of the centre.
+
+    Parameters
+    ----------
+    vertices : ndarray, shape (v, d)
+        Vertices of the polytope.
+    centre : ndarray, shape (..., d)
+        Directions at which the support function is linearised.
+    spread : ndarray, shape (..., J, d)
+        Generators of the set of directions about each centre.
+    blocks : int, default 4096
+        Number of directions that are treated at once.
+
+    Returns
+    -------
+    ndarray, shape (...,)
+        Proven upper bounds.
+    """
     flat_centre, flat_spread = centre.reshape(-1, centre.shape[-1]), spread.reshape(-1, *spread.shape[-2:])
     excess = np.empty(flat_centre.shape[0])
     for start in range(0, excess.size, blocks):
@@ -861,7 +1155,7 @@ def vertex_excess(
 
 
 def _is_same(mine: object, other: object) -> bool:
-    """Whether two fields of sets hold the same numbers."""
+    """Return whether two fields of sets hold the same numbers."""
     if isinstance(mine, ConvexSet):
         return mine.is_same(other)
     if isinstance(mine, np.ndarray) or isinstance(other, np.ndarray):

@@ -1,11 +1,10 @@
-"""Convex quadratic forms: each from outside is shown to be convex before a bound rests on it; strictly convex ones
-regularise a program.
+"""Convex quadratic forms: a check of each form from outside, before a bound rests on it, and regularisers.
 
-What is asked does not depend on the units of the variables: a matrix counts as positive semidefinite if a change of its
-diagonal by ``ROUNDED`` of itself, for every entry of the longest row, makes it so. That is more than rounding does to
-``L L'`` in whatever scaling (Higham 2002, section 10.1; Demmel 1989): an entry ``(i, j)`` of such a product is rounded
-by its share of ``sqrt(P_ii P_jj)``. A factorisation without pivoting that meets positive pivots alone is the proof,
-but for its own rounding, which is of the same kind (Rump 2006).
+The check does not depend on the units of the variables. A matrix counts as positive semidefinite if a change of its
+diagonal by ``ROUNDED`` of itself, for every entry of the longest row, makes it so. Such a change exceeds the rounding
+error of ``L L'`` in any scaling (Higham 2002, section 10.1; Demmel 1989): an entry ``(i, j)`` of such a product is
+rounded by its share of ``sqrt(P_ii P_jj)``. A factorisation without pivoting that meets only positive pivots is the
+proof, except for its own rounding, which is of the same kind (Rump 2006).
 """
 
 from __future__ import annotations
@@ -24,23 +23,35 @@ from sparserob_core.sip.convex_set import Array
 if TYPE_CHECKING:
     from scipy.sparse import csc_array
 
-# Of sqrt(P_ii P_jj), in every entry: numbers with 13 digits. Ten times less, and products of long matrices are refused;
-# ten times more, and a lower bound is off by what a certified gap of 1e-9 promises, for rows of a thousand entries.
+# Rounding allowed in every entry, relative to sqrt(P_ii P_jj): 13 digits. With a tenth of it, products of long matrices
+# are refused; with ten times as much, the error of a lower bound may reach a certified gap of 1e-9, for rows of a
+# thousand entries.
 ROUNDED = 1e-13
 DENSE = 400  # rows up to which a matrix is factored as a dense one, whatever its pattern; ten times more costs 1 s
-FULL = 0.1  # share of entries from which that is so for more rows: sparse factors would fill up
-SHOWN = 1000  # rows up to which a refusal computes all eigenvalues; ten times more, and it takes minutes
-STEPS = 60  # of the Lanczos method that a refusal makes beyond that
+FULL = 0.1  # share of non-zero entries from which larger matrices are dense too: sparse factors would fill up
+SHOWN = 1000  # rows up to which a refusal computes all eigenvalues; ten times as many take minutes
+STEPS = 60  # steps of the Lanczos method by which a refusal estimates the least eigenvalue of larger matrices
 
 _convex: WeakValueDictionary[int, csc_array] = WeakValueDictionary()
 
 
 @dataclass(frozen=True, eq=False)
 class ControlImage:
-    """How a decision ``x (n,)`` becomes the values ``S x (k,)`` that the cost is about.
+    """Map from a decision ``x (n,)`` to the values ``S x (k,)`` that the cost is about.
 
-    ``S (k, n)`` sparse; its rows are channel-major: ``channels`` blocks of ``k / channels`` consecutive pieces each.
-    ``lengths (k,)``: how much each entry counts (the length of its piece, in time), positive.
+    Parameters
+    ----------
+    S : csc_array, shape (k, n)
+        Matrix with channel-major rows: ``channels`` blocks of ``k / channels`` consecutive pieces each.
+    channels : int
+        Number of channels.
+    lengths : ndarray, shape (k,)
+        Factor of each entry, the length of its piece in units of time; positive.
+
+    Raises
+    ------
+    InputError
+        Where lengths are not ``k`` positive numbers, or ``k`` is no multiple of ``channels``.
     """
 
     S: csc_array
@@ -63,16 +74,29 @@ class ControlImage:
 
 
 class Regulariser(ABC):
-    """A strictly convex quadratic ``rho(x) = 1/2 x'P x + q'x`` that is added to the cost with a factor that goes to
+    """A strictly convex quadratic ``rho(x) = 1/2 x'P x + q'x``, added to the cost with a weight that decreases to
     zero."""
 
     @abstractmethod
     def quadratic(self, image: ControlImage) -> tuple[csc_array, Array]:
-        """``P (n, n)`` symmetric positive definite, sparse, and ``q (n,)``."""
+        """Return the matrix and the vector of ``rho``.
+
+        Parameters
+        ----------
+        image : ControlImage
+            Map from the decision to the values that the cost is about.
+
+        Returns
+        -------
+        P : csc_array, shape (n, n)
+            Symmetric positive definite matrix.
+        q : ndarray, shape (n,)
+            Linear term.
+        """
 
 
 def require_convex(path: str, matrix: object, size: int) -> csc_array:
-    """Return the matrix of the convex quadratic form ``1/2 x'P x`` in ``size`` variables, to be read only.
+    """Return the matrix of the convex quadratic form ``1/2 x'P x`` in ``size`` variables, made read-only.
 
     A matrix that this function has returned before, or that is convex by construction (`convex_by_construction`), is
     returned at once.
@@ -80,21 +104,22 @@ def require_convex(path: str, matrix: object, size: int) -> csc_array:
     Parameters
     ----------
     path : str
-        What the matrix is called where it is refused.
+        Name of the matrix in messages.
     matrix : array_like or sparse, shape (size, size)
         Any matrix of numbers.
     size : int
-        The number of variables.
+        Number of variables.
 
     Returns
     -------
     csc_array, shape (size, size)
-        The matrix, exactly symmetric: where it is symmetric but for rounding, the mean of it and its transpose.
+        The matrix, exactly symmetric. Where the given matrix is symmetric except for rounding, it is the mean of that
+        matrix and its transpose.
 
     Raises
     ------
     InputError
-        With an entry that is not finite, an asymmetric pair of entries, or a negative eigenvalue.
+        For an entry that is not finite, an asymmetric pair of entries, or a negative eigenvalue.
     """
     from scipy.sparse import csc_array
 
@@ -111,15 +136,18 @@ def require_convex(path: str, matrix: object, size: int) -> csc_array:
 
 
 def convex_by_construction(P: csc_array) -> csc_array:
-    """Return a matrix to be read only that `require_convex` takes without a look: a sum of squares, exactly symmetric,
-    whatever rounding has made of it."""
+    """Return a matrix that `require_convex` accepts without a check, made read-only.
+
+    The caller guarantees that the matrix is a sum of squares, and exactly symmetric, whatever its rounding errors.
+    """
     kept: csc_array = read_only(P)
     _convex[id(kept)] = kept
     return kept
 
 
 def sparse_matrix(path: str, matrix: object) -> csc_array:
-    """Return a matrix of finite real numbers in compressed columns, to be read only; raise `InputError` else."""
+    """Return a matrix of finite real numbers in compressed columns, made read-only; raise `InputError` for anything
+    else."""
     from scipy.sparse import csc_array
 
     try:
@@ -139,22 +167,25 @@ def sparse_matrix(path: str, matrix: object) -> csc_array:
 
 
 def is_semidefinite(P: csc_array) -> bool:
-    """Whether a symmetric matrix is positive semidefinite but for rounding.
+    """Return whether a symmetric matrix is positive semidefinite except for rounding.
 
-    Soundly, but for the rounding of the factorisation: each eigenvalue of the matrix with its diagonal scaled to 1 is
-    at least ``-(ROUNDED + (k + 1) 2^-53) k``, with ``k`` the entries of the longest row of its factor.
+    The answer is sound, except for the rounding of the factorisation. Each eigenvalue of the matrix with its diagonal
+    scaled to 1 is at least ``-(ROUNDED + (k + 1) 2^-53) k``, with ``k`` the number of entries of the longest row of its
+    factor.
     """
     return _descent(P) is None
 
 
 def is_definite(P: csc_array, factor: float = 1.0) -> bool:
-    """Whether a symmetric matrix with a positive diagonal is positive definite once its diagonal is multiplied by a
-    ``factor``: whether elimination without pivoting meets positive pivots alone."""
+    """Return whether a symmetric matrix is positive definite once its positive diagonal is multiplied by ``factor``.
+
+    The test is whether elimination without pivoting meets only positive pivots.
+    """
     return _failing(P, factor) is None
 
 
 def _descent(P: csc_array) -> Array | None:
-    """A direction ``(n,)`` along which the form is negative; ``None`` where it is positive semidefinite but for
+    """Return a direction ``(n,)`` along which the form is negative; ``None`` where it is semidefinite except for
     rounding."""
     diagonal = np.asarray(P.diagonal(), dtype=float)
     bare = np.flatnonzero(~(diagonal > 0.0))
@@ -175,8 +206,11 @@ def _descent(P: csc_array) -> Array | None:
 
 
 def _bare(P: csc_array, diagonal: Array, bare: np.ndarray) -> Array | None:
-    """A direction along which the form is negative, where its diagonal is not positive: that entry alone, or one of 0
-    with another that it is coupled to."""
+    """Return a direction along which the form is negative, for a matrix whose diagonal is not positive.
+
+    The direction is the unit vector of a negative diagonal entry, or combines a diagonal entry of 0 with a variable
+    that is coupled to it. ``None`` where there is neither.
+    """
     direction = np.zeros(diagonal.size)
     if diagonal.min() < 0.0:
         direction[int(np.argmin(diagonal))] = 1.0
@@ -191,8 +225,10 @@ def _bare(P: csc_array, diagonal: Array, bare: np.ndarray) -> Array | None:
 
 
 def _failing(P: csc_array, factor: float) -> Array | None:
-    """A direction ``(n,)`` along which the form with its diagonal times a ``factor`` is not positive; ``None`` where
-    elimination without pivoting meets positive pivots alone."""
+    """Return a direction ``(n,)`` along which the form with its diagonal times ``factor`` is not positive.
+
+    ``None`` where elimination without pivoting meets only positive pivots.
+    """
     n = P.shape[0]
     if n <= DENSE or P.nnz >= FULL * n * n:
         return _failing_dense(P, factor)
@@ -215,6 +251,7 @@ def _failing(P: csc_array, factor: float) -> Array | None:
 
 
 def _failing_dense(P: csc_array, factor: float) -> Array | None:
+    """Return the direction of `_failing`, by a dense Cholesky factorisation."""
     n = P.shape[0]
     entries = P.toarray()
     entries[np.diag_indices(n)] *= factor
@@ -228,7 +265,7 @@ def _failing_dense(P: csc_array, factor: float) -> Array | None:
     from scipy.linalg.lapack import dpotrf
 
     lower, order = dpotrf(entries, lower=True)
-    k = max(int(order) - 1, 0)  # the first so many rows are positive definite, and one more are not
+    k = max(int(order) - 1, 0)  # the leading block of k rows is positive definite, that of k + 1 rows is not
     direction = np.zeros(n)
     direction[k] = 1.0
     direction[:k] = -cho_solve((lower[:k, :k], True), entries[:k, k])
@@ -236,7 +273,7 @@ def _failing_dense(P: csc_array, factor: float) -> Array | None:
 
 
 def _symmetric(path: str, P: csc_array) -> csc_array:
-    """The matrix, exactly symmetric; refused where it is not symmetric but for rounding."""
+    """Return the matrix, made exactly symmetric; raise `InputError` where its asymmetry exceeds rounding."""
     from scipy.sparse import csc_array
 
     if not P.has_canonical_format:
@@ -262,12 +299,15 @@ def _symmetric(path: str, P: csc_array) -> csc_array:
 
 
 def _place(row: int, column: int) -> str:
+    """Return the position of an entry in words."""
     return f"in row {row + 1}, column {column + 1}"
 
 
 def _negative(P: csc_array, direction: Array) -> str:
-    """The least eigenvalue of a matrix whose form is negative along a ``direction``, in words: its own, or, where
-    rounding hides that, the one of the matrix with its diagonal scaled to 1."""
+    """Return in words the least eigenvalue of a matrix whose form is negative along ``direction``.
+
+    Where rounding hides the eigenvalue, that of the matrix with its diagonal scaled to 1 is given.
+    """
     from scipy.sparse import csc_array, diags_array
 
     diagonal = np.asarray(P.diagonal(), dtype=float)
@@ -282,8 +322,11 @@ def _negative(P: csc_array, direction: Array) -> str:
 
 
 def _least(P: csc_array, direction: Array) -> tuple[float, bool]:
-    """The least eigenvalue, and whether it is exact: of a large matrix the least of the form among the unit vectors
-    that some steps of Lanczos span from a ``direction``."""
+    """Return the least eigenvalue, and whether it is exact.
+
+    For a large matrix, it is the least value of the form on unit vectors of a Krylov space (Lanczos) that starts from
+    ``direction``.
+    """
     if P.shape[0] <= SHOWN:
         return float(np.linalg.eigvalsh(P.toarray())[0]), True
     basis = (direction / np.linalg.norm(direction))[:, None]

@@ -1,6 +1,7 @@
-"""The events of a running method or search; whoever receives them cannot disturb it.
+"""Events of a running method or search; a receiver cannot disturb the run.
 
-Arrays in events cannot be written to. What takes time to put together is put together by whoever looks at it (`Batch`).
+Arrays in events cannot be written to. Data that take time to compute are computed when a receiver first reads them
+(`Batch`).
 """
 
 from __future__ import annotations
@@ -22,42 +23,68 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Event:
-    """Something that happened in a run."""
+    """An event in a run."""
 
 
 SKETCHED = 400
-"""Points, boxes or ellipsoids in one sketch, at most."""
+"""Largest number of points, boxes or ellipsoids in one sketch."""
 
 UNCHANGED = 1e-10
-"""Relative change of a value that is rounding. Of 1 700 moves over literal tuples 250 changed g by less than 1e-12, for
-they moved a coordinate that does not enter the row, and all others by more than 1e-7; a thousandth of the limit, or a
-hundred times it, would tell them apart as well, more would hide the last steps of a walk."""
+"""Relative change of a value that counts as rounding. Of 1 700 moves over literal tuples, 250 changed g by less than
+1e-12, for they moved a coordinate that does not enter the row. All others changed g by more than 1e-7. A thousandth of
+the limit, or a hundred times it, would separate the two as well; more would hide the last steps of a search."""
 
 Phase: TypeAlias = Literal["search", "polish"]
-"""Who evaluates: the maximiser, or the local method that has the last share of its budget."""
+"""The evaluating method: the maximiser, or the local method that spends the last share of its budget."""
 
 DECIDING = 4
-"""Indices that are told of each tuple, at most: two decide what is drawn, and may each have a neighbour."""
+"""Largest number of indices reported for each tuple: two determine the picture, and each may have a neighbour."""
 
 Notify: TypeAlias = Callable[[Event], None]
 T = TypeVar("T", bound=Event)
 
 
 def ignore(event: Event) -> None:
-    """The listener that does nothing."""
+    """Ignore an event."""
 
 
 def forwarded(notify: Notify, kind: type[T], complete: Callable[[T], Event]) -> Notify:
-    """A listener that passes every event on to ``notify``, those of one ``kind`` as ``complete`` returns them; `ignore`
-    stays `ignore`."""
+    """Return a listener that passes every event on to ``notify``, and completes the events of one kind.
+
+    Parameters
+    ----------
+    notify : callable
+        Receives the events.
+    kind : type
+        Kind of the events to be completed.
+    complete : callable
+        Returns the event that is passed on instead of one of that kind.
+
+    Returns
+    -------
+    callable
+        The listener; `ignore` where ``notify`` is `ignore`.
+    """
     if notify is ignore:
         return ignore
     return lambda event: notify(complete(event) if isinstance(event, kind) else event)
 
 
 def beside(notify: Notify, stage: str) -> Notify:
-    """A listener to a program beside the one whose rounds are told: of its rounds it passes on that they go on, in this
-    ``stage``, and how its proofs do."""
+    """Return a listener for an auxiliary program, which passes on the progress of its rounds and proofs only.
+
+    Parameters
+    ----------
+    notify : callable
+        Receives the events.
+    stage : str
+        Name of the auxiliary program in the text of `StageProgress`.
+
+    Returns
+    -------
+    callable
+        The listener; `ignore` where ``notify`` is `ignore`.
+    """
     if notify is ignore:
         return ignore
 
@@ -71,7 +98,7 @@ def beside(notify: Notify, stage: str) -> Notify:
 
 
 def frozen(array: Array) -> Array:
-    """A view of an array that cannot be written to."""
+    """Return a view of an array that cannot be written to."""
     view = np.asarray(array).view()
     view.flags.writeable = False
     return view
@@ -79,13 +106,26 @@ def frozen(array: Array) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class Batch:
-    """The evaluations of a search since the last event: ``trace`` and ``moves`` are computed when they are first
-    read.
+    """Evaluations of a search since the last event; ``trace`` and ``moves`` are computed when they are first read.
 
-    ``points`` and ``values`` are the pieces ``(k_i, d)`` and ``(k_i,)`` as they were evaluated, ``moments`` their sizes
-    and seconds since the search began, ``notes`` per name the pairs (evaluations of the search so far, value).
-    ``first`` evaluations came before, the best of which was ``best``; ``origin (d,)`` is where the walk stood then,
-    ``None`` at the start, and ``stood`` the value there.
+    Parameters
+    ----------
+    points : sequence of ndarray, shape (k_i, d)
+        Points, in the pieces in which they were evaluated.
+    values : sequence of ndarray, shape (k_i,)
+        Their values.
+    moments : sequence of (int, float)
+        Size of each piece, and seconds since the search began.
+    notes : mapping of str to sequence of (float, float)
+        For each noted name, the pairs (evaluations of the search so far, value).
+    first : int, default 0
+        Number of evaluations before this batch.
+    best : float, default -inf
+        Largest value of these.
+    origin : ndarray, shape (d,), optional
+        Current point of the search before this batch; ``None`` at the start.
+    stood : float, default nan
+        Value at that point.
     """
 
     points: Sequence[Array] = ()
@@ -99,7 +139,7 @@ class Batch:
 
     @cached_property
     def trace(self) -> Trace:
-        """The evaluations as a `Trace`; ``best`` and ``notes`` count from the beginning of the search."""
+        """Evaluations as a `Trace`; ``best`` and ``notes`` count from the start of the search."""
         if not self.values:
             return Trace(np.empty((0, 0)), np.empty(0), np.empty(0), np.empty(0))
         values = np.concatenate(self.values)
@@ -111,11 +151,11 @@ class Batch:
 
     @cached_property
     def moves(self) -> np.ndarray:
-        """Rows ``(evaluation in the batch, coordinate)``, ``(k, 2)``: where each point differs from where the walk
-        stood.
+        """Coordinates in which each point moved: rows ``(evaluation in the batch, coordinate)``, as ``(k, 2)``.
 
-        That is the point accepted last where the maximiser notes ``accepted``, and the point before where it does not.
-        The first point of a search has moved from nowhere, and is left out.
+        A point has moved in a coordinate where it differs from the current point.
+        The current point is the last accepted point where the maximiser notes ``accepted``, and the previous point
+        where it does not. The first point of a search has no current point, and has no rows.
         """
         points = self.trace.points
         if not len(points):
@@ -127,20 +167,24 @@ class Batch:
 
     @cached_property
     def gains(self) -> Array:
-        """By how much each value is above that where the walk stood ``(k,)``, as `moves` has it; 0 for a move that
-        changed nothing, NaN for the first value of a search."""
+        """Rise ``(k,)`` of each value above the value at the current point; 0 for a move that changed nothing.
+
+        The first value of a search has NaN.
+        """
         return gains(self.trace.values, self.accepted, self.stood)
 
     @property
     def changes(self) -> np.ndarray:
-        """Which of the values ``(k,)`` are others than that where the walk stood: a proposal that leaves the value as
-        it is says nothing of a walk."""
+        """Truth values ``(k,)``: true for each value that differs from the value at the current point.
+
+        A proposal that leaves the value unchanged says nothing of the search.
+        """
         return np.asarray(np.nan_to_num(self.gains) != 0.0)
 
     @property
     def acceptance(self) -> float:
-        """Of the moves that changed the value, the share that the walk accepted; NaN where there was none, or no
-        walk."""
+        """Share of accepted moves among those that changed the value; NaN where there was none, or no rule of
+        acceptance."""
         judged = self.trace.notes.get("accepted", np.empty((0, 2)))[:, 0].astype(int) - 1 - self.first
         judged = judged[(judged >= 0) & (judged < self.gains.size)]
         changing = judged[self.changes[judged]]
@@ -148,7 +192,8 @@ class Batch:
 
     @cached_property
     def accepted(self) -> np.ndarray:
-        """Whether the walk went on from each of the points ``(k,)``; always, where the maximiser does not walk."""
+        """Truth values ``(k,)``: true for each accepted point; all true where the maximiser has no rule of
+        acceptance."""
         accepted = np.ones(len(self.trace.points), dtype=bool)
         rows = self.trace.notes.get("accepted", np.empty((0, 2)))
         which = rows[:, 0].astype(int) - 1 - self.first
@@ -158,15 +203,39 @@ class Batch:
 
 
 def standing_before(accepted: np.ndarray) -> np.ndarray:
-    """Which evaluation a walk stood at before each of them ``(k,)``, by which were ``accepted (k,)``; -1: one from
-    before the first."""
+    """Return the number ``(k,)`` of the evaluation that was the current point before each evaluation.
+
+    Parameters
+    ----------
+    accepted : ndarray of bool, shape (k,)
+        True for the evaluations that were accepted.
+
+    Returns
+    -------
+    ndarray of int, shape (k,)
+        Numbers of evaluations; -1 where the current point is older than the first evaluation.
+    """
     standing = np.maximum.accumulate(np.where(accepted, np.arange(accepted.size), -1))
     return np.concatenate([[-1], standing[:-1]])[: accepted.size]
 
 
 def gains(values: Array, accepted: np.ndarray, stood: float = np.nan) -> Array:
-    """By how much each of the ``values (k,)`` is above that where the walk stood, which was ``stood`` before the first;
-    exactly 0 from ``-inf`` to ``-inf``, and where the two differ by rounding only (`UNCHANGED`)."""
+    """Return the rise of each value above the value at the current point.
+
+    Parameters
+    ----------
+    values : ndarray, shape (k,)
+        Values of the evaluations.
+    accepted : ndarray of bool, shape (k,)
+        True for the evaluations that were accepted.
+    stood : float, default nan
+        Value at the current point before the first evaluation.
+
+    Returns
+    -------
+    ndarray, shape (k,)
+        The rise; exactly 0 from ``-inf`` to ``-inf``, and where two values differ by rounding only (`UNCHANGED`).
+    """
     before = standing_before(accepted)
     at = np.where(before < 0, stood, values[before])
     gained = np.subtract(values, at, out=np.zeros(values.size), where=values != at)
@@ -176,8 +245,16 @@ def gains(values: Array, accepted: np.ndarray, stood: float = np.nan) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class Sketch:
-    """What a maximiser looks at, or has ruled out: points, boxes, or the ellipsoids within boxes, from ``lower (k, d)``
-    to ``upper (k, d)``, equal for points, at most `SKETCHED` of them."""
+    """Points, boxes, or ellipsoids within boxes that a maximiser considers or has ruled out; at most `SKETCHED` of
+    them.
+
+    Parameters
+    ----------
+    lower, upper : ndarray, shape (k, d)
+        Corners of the boxes; the same array for points.
+    rounded : bool, default False
+        Whether the regions are the ellipsoids within the boxes.
+    """
 
     lower: Array
     upper: Array
@@ -185,27 +262,58 @@ class Sketch:
 
     @property
     def points(self) -> bool:
-        """Whether it is points."""
+        """True where the sketch shows points."""
         return self.lower is self.upper
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class RoundFinished(Event):
-    """One round of a method is over: a round of the exchange, or an outer iteration of the method ``sparserob``.
+    """End of one round of the exchange, or of one outer iteration of the method ``sparserob``.
 
-    ``lower_bound`` and ``upper_bound`` enclose the value of the unregularised program (``-inf``, ``inf`` while
-    unknown); ``violation`` is the worst constraint violation of this round's decision over the continuum, reached in
-    ``worst_family``, in the unit ``measured`` where that is known; ``active_indices`` are the rows kept, ``cuts_added``
-    and ``cuts_dropped`` the change since the round before; ``seconds`` since the start.
-
-    ``decision (n,)`` has this ``cost``, of what the method minimises. ``separations``: per family what was found most
-    violated at it, worst first.
-    ``imposed``: the constraints of this round's relaxed program, with their ``multipliers (r,)`` (the multiplier within
-    each `Cut` is not filled); ``added`` and ``dropped``: how they differ from those of the round before.
-    ``gap``: the relative gap of the two bounds (`sip.result.relative_gap`).
-    ``simplified``: it is a round on a program with some of the uncertainty only (methods ``nominal``, ``scenario``),
-    whose ``upper_bound`` and ``violation`` say nothing of the program itself; its lower bound holds for both.
-    ``proven``: the cost of the cheapest decision that was proven so far to meet every constraint.
+    Parameters
+    ----------
+    round : int
+        Number of the round.
+    epsilon : float
+        Weight of the regulariser.
+    lower_bound : float
+        Proven lower bound of the value of the unregularised program; ``-inf`` while unknown.
+    upper_bound : float
+        Upper bound of that value, if the decision is feasible: its cost, where the search of this round has found no
+        violation. The decision need not be proven (``proven``). ``inf`` while unknown.
+    violation : float
+        Largest constraint violation of this round's decision over the continuum.
+    worst_family : str
+        Family of that constraint.
+    active_indices : int
+        Number of rows that are kept.
+    cuts_added, cuts_dropped : int
+        Changes since the round before.
+    relaxed_programs : int
+        Number of relaxed programs solved so far.
+    seconds : float
+        Time since the start, in seconds.
+    cost : float, default nan
+        Cost of the decision, as the method minimises it.
+    decision : ndarray, shape (n,), optional
+        Decision of this round.
+    separations : mapping of str to Separation
+        Most violated constraints of each family at the decision, worst first.
+    imposed : sequence of Cut
+        Constraints of this round's relaxed program. The multiplier within each `Cut` is not filled.
+    multipliers : ndarray, shape (r,)
+        Multipliers of the imposed constraints.
+    added, dropped : sequence of Cut
+        Differences of ``imposed`` from the round before.
+    simplified : bool, default False
+        Whether the round solved a program with a part of the uncertainty only (methods ``nominal``, ``scenario``). Its
+        ``upper_bound`` and ``violation`` then do not apply to the program itself; its lower bound holds for both.
+    gap : float, default inf
+        Relative gap of these two bounds (`sip.result.relative_gap`).
+    proven : float, default inf
+        Cost of the cheapest decision that was proven so far to meet every constraint.
+    measured : str
+        Name of the unit of ``violation``, where it is known.
     """
 
     round: int
@@ -234,12 +342,29 @@ class RoundFinished(Event):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ProofProgress(Event):
-    """A proof over the continuum goes on: ``cells`` of ``family`` are still open, ``bound`` is the violation not yet
-    excluded, in the unit ``measured`` where that is known.
+    """Progress of a proof over the continuum.
 
-    ``examined`` cells were bounded so far, of a ``budget`` after which the proof is given up (0: unknown).
-    ``bound_before`` is the ``bound`` of half a minute ago, NaN while the proof is younger; where it has hardly fallen
-    since, ``hindrance`` says what hinders the proof and what would help, and is empty otherwise.
+    Parameters
+    ----------
+    family : str
+        Name of the family.
+    cells : int
+        Number of open cells.
+    bound : float
+        Violation that is not yet excluded.
+    seconds : float
+        Time since the start of the proof, in seconds.
+    examined : int
+        Number of cells that were bounded so far.
+    budget : int
+        Number of cells after which the proof is given up; 0: unknown.
+    bound_before : float, default nan
+        The ``bound`` of half a minute ago; NaN while the proof is younger.
+    hindrance : str
+        Reason for slow progress and a remedy, where the bound has hardly fallen since ``bound_before``; empty
+        otherwise.
+    measured : str
+        Name of the unit of ``bound``, where it is known.
     """
 
     family: str
@@ -255,27 +380,65 @@ class ProofProgress(Event):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class StageProgress(Event):
-    """A method goes on with a program beside the one whose rounds are told; ``text`` says which up to a colon, and then
-    how far it is."""
+    """Progress of an auxiliary program of a method.
+
+    Parameters
+    ----------
+    text : str
+        Name of the program, a colon, and its progress.
+    """
 
     text: str
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class EvaluationsFinished(Event):
-    """A maximiser has evaluated ``count`` more points, ``total`` so far in this search, of ``budget`` (0: unknown).
+    """Further evaluations of a maximiser.
 
-    ``best_value`` was found at ``best_point (d,)``; ``seconds`` since the search began; ``notes`` are the maximiser's
-    own scalars (temperature, ...), the last of each, and ``sketches`` by their roles what else it has shown of itself
-    since the last event. A new search begins where ``total == count``. ``batch``: every one
-    of these evaluations; they are of one ``phase`` of the search.
+    A search is over the tuples of the method ``sparserob`` in the outer iteration ``round``. Or, where ``family`` is
+    given, it is over the indices of that family, for the most violated one. A new search begins where ``total ==
+    count``.
 
-    What is searched: the tuples of the method ``sparserob`` in the outer iteration ``round`` (from 1) with the weight
-    ``epsilon``, where ``lower_bound`` is proven so far; or, where ``family`` is named, its indices for the most
-    violated one. ``block`` consecutive coordinates of the ``domain`` are one index, of which ``coordinates (c,)`` can
-    move and are not those that stay linear (`LinearBlocks`). ``deciding (count, 4)``: of each of these tuples the
-    indices whose constraints have the largest multipliers, the largest first, -1 where fewer have one
-    (`TupleValue.deciding`); ``(0, 4)`` where that is not known.
+    Parameters
+    ----------
+    count : int
+        Number of evaluations since the last event.
+    total : int
+        Number of evaluations so far in this search.
+    best_value : float
+        Largest value so far.
+    seconds : float
+        Time since the search began, in seconds.
+    notes : mapping of str to float
+        Scalars of the maximiser (temperature, ...), the last of each.
+    budget : int, default 0
+        Evaluations that the search may spend; 0: unknown.
+    best_point : ndarray, shape (d,)
+        Point of the best value.
+    domain : Box, optional
+        Box that is searched.
+    block : int, default 1
+        Number of consecutive coordinates of the domain that are one index.
+    phase : {"search", "polish"}
+        Phase of the search to which all these evaluations belong.
+    family : str
+        Family whose most violated index is sought; empty for a search over tuples.
+    round : int
+        Number of the outer iteration, from 1.
+    epsilon : float, default nan
+        Weight of the regulariser.
+    lower_bound : float, default -inf
+        Lower bound proven so far.
+    batch : Batch
+        All of these evaluations.
+    sketches : mapping of str to Sketch
+        Sketches by their roles, shown since the last event.
+    coordinates : tuple of int, length c
+        Coordinates of an index that can move and that are not kept linear (`LinearBlocks`).
+    deciding : ndarray of int, shape (count, 4)
+        For each tuple, the indices whose constraints have the largest multipliers, largest first
+        (`TupleValue.deciding`). The entry is -1 where fewer have a multiplier. The shape is ``(0, 4)`` where this is
+        not known.
     """
 
     count: int

@@ -1,5 +1,5 @@
-"""What supports a claim: imposed constraints with their multipliers, proofs over the continuum, and why nothing is
-feasible."""
+"""Evidence for a claim: imposed constraints with multipliers, proofs over the continuum, and reasons for
+infeasibility."""
 
 from __future__ import annotations
 
@@ -16,8 +16,21 @@ from sparserob_core.sip.program import TOLERANCE, Formulation
 
 @dataclass(frozen=True, eq=False)
 class Cut:
-    """One imposed constraint: row ``row`` of family ``family`` at ``index (d,)``, with its multiplier in the last
-    relaxed program. ``formulation`` says which form of the family the index belongs to."""
+    """An imposed constraint: row ``row`` of the family ``family`` at ``index``.
+
+    Parameters
+    ----------
+    family : str
+        Name of the family.
+    index : ndarray, shape (d,)
+        Index of the constraint.
+    row : int
+        Row of the family at that index.
+    multiplier : float, default 0
+        Multiplier in the last relaxed program, at least 0.
+    formulation : Formulation, default "reduced"
+        Formulation of the family to which the index belongs.
+    """
 
     family: str
     index: Array
@@ -30,10 +43,22 @@ class Cut:
 
 @dataclass(frozen=True, eq=False)
 class Dual:
-    """Multipliers that prove a lower ``bound`` of the semi-infinite program's value, or of its infeasibility: those of
-    the imposed constraints (in ``cuts``), ``mu (e,)`` of the equalities, and ``z (k,)`` of the image ``S x`` unless
-    ``S`` is the identity; ``fixed (r,)`` are those of the program's fixed rows ``G x <= h``. ``at (n,)``: the decision
-    at which quadratic terms, and norms, of the cost are replaced by their tangents, where there are any.
+    """Multipliers that prove a lower bound of the semi-infinite program's value, or its infeasibility.
+
+    Parameters
+    ----------
+    bound : float
+        The lower bound.
+    cuts : sequence of Cut
+        Imposed constraints with their multipliers.
+    mu : ndarray, shape (e,)
+        Multipliers of the equalities.
+    z : ndarray, shape (k,), optional
+        Multipliers of the image ``S x``; ``None`` where ``S`` is the identity.
+    fixed : ndarray, shape (r,)
+        Multipliers of the program's fixed rows ``G x <= h``.
+    at : ndarray, shape (n,), optional
+        Decision at which quadratic terms and norms of the cost are replaced by their tangents, where there are any.
     """
 
     bound: float
@@ -52,13 +77,30 @@ NO_BOUND = Dual(-np.inf, (), np.zeros(0))
 @final
 @dataclass(frozen=True, eq=False)
 class InfeasibleSubsystem:
-    """Why nothing is feasible, one sentence each: ``reasons`` that suffice alone, or else the ``members`` of an
-    irreducible infeasible subsystem (Chinneck and Dravnieks 1991), which cannot hold together.
+    """Reasons for infeasibility, one sentence each.
 
-    ``amount``: of the members one is violated by at least that many times the norm of its row; infinite where the
-    decision enters none of them. ``others``: how many further reasons or members there are. ``equalities``: whether the
-    program has some, which belong to every subsystem. ``irreducible``: whether no member can be spared. ``demand``:
-    what a weighted sum of the members asks for.
+    Either ``reasons`` holds sentences each of which suffices alone, or ``members`` is an irreducible infeasible
+    subsystem (Chinneck and Dravnieks 1991): constraints that cannot hold together.
+
+    Parameters
+    ----------
+    reasons : tuple of str
+        Sentences each of which suffices alone.
+    members : tuple of str
+        Constraints of the subsystem.
+    amount : float, default inf
+        At least one member is violated by at least this many times the norm of its row. Infinite where the decision
+        enters no member.
+    others : int, default 0
+        Number of further reasons or members that are not listed.
+    equalities : bool, default False
+        Whether the program has equalities, which belong to every subsystem.
+    demand : str
+        Requirement that a weighted sum of the members makes, in words.
+    decides : str, default "decision"
+        Name of the decision in the field of the problem.
+    irreducible : bool, default True
+        Whether every member is needed.
     """
 
     reasons: tuple[str, ...] = ()
@@ -73,7 +115,8 @@ class InfeasibleSubsystem:
     __repr__ = brief
 
     def sentence(self, amounts: bool = True) -> str:
-        """All of it for people; without ``amounts`` where the units of the rows mean nothing to them."""
+        """Return all reasons as one sentence; ``amounts=False`` leaves numbers out where the units of the rows have no
+        meaning."""
         if self.reasons:
             count = len(self.reasons) + self.others
             head = f"{count} separate reasons: " if count > 1 else ""
@@ -95,14 +138,44 @@ class InfeasibleSubsystem:
 
 @dataclass(frozen=True, eq=False)
 class Proof:
-    """What is known of one family at one decision: ``proven`` (no index violates it by more than
-    ``bound <= allowed``), ``refuted`` (``index``, ``row`` violate it by ``violation``) or ``undecided`` (``reason``).
+    """Verdict on one constraint family at one decision.
 
-    ``leaves``: the lower and upper corners ``(k, d)`` of the closed cells that prove it, a subdivision of the family's
-    ``cells``, in lexicographic order; ``None`` unless proven by branch and bound. ``formulation`` is that of the index.
-    ``unit``: what a violation of 1 of that row is in the user's units, called ``measured`` where that is known, and
-    ``units (r,)`` of all rows. ``bound`` is in the units of the program that was solved; ``share`` is what it was in
-    each row's own unit, once it is told in the user's; ``allowed``: the violation that counts as none, likewise.
+    ``proven``: no index violates the family by more than ``bound``, which is at most ``allowed``. ``refuted``: the
+    constraint ``row`` at ``index`` is violated by ``violation``. ``undecided``: see ``reason``.
+
+    Parameters
+    ----------
+    family : str
+        Name of the family.
+    verdict : {"proven", "refuted", "undecided"}
+        The verdict.
+    bound : float
+        Upper bound of the violation, in the units of the program that was solved.
+    violation : float, default -inf
+        Violation of the witness.
+    index : ndarray, shape (d,), optional
+        Index of the witness.
+    row : int, default 0
+        Row of the witness.
+    cells : int, default 0
+        Number of cells that were bounded.
+    reason : str
+        Reason why nothing is decided.
+    leaves : tuple of ndarray, shape (k, d) each, optional
+        Lower and upper corners of the closed cells that are the proof, in lexicographic order. The cells subdivide
+        those of the family. ``None`` unless proven by branch and bound.
+    formulation : Formulation, default "reduced"
+        Formulation to which the index belongs.
+    unit : float, default 1
+        Value in the user's units of a violation of 1 of that row.
+    measured : str
+        Name of that unit, where it is known.
+    units : ndarray, shape (r,), optional
+        Value of a violation of 1 for all rows.
+    share : float, optional
+        The bound in each row's own unit, kept after the proof is reported in the user's units.
+    allowed : float, default TOLERANCE
+        Violation that counts as none, in the units of ``bound``.
     """
 
     family: str
@@ -126,8 +199,16 @@ class Proof:
 
 @dataclass(frozen=True, eq=False)
 class Leaf:
-    """What is known of one part of a `Tree`: multipliers ``dual`` that bound the count there, or, where it is not
-    ``feasible``, prove that nothing is feasible there."""
+    """Result for one part of a `Tree`.
+
+    Parameters
+    ----------
+    dual : Dual
+        Multipliers that bound the count in this part or, where ``feasible`` is false, prove that the part holds no
+        feasible decision.
+    feasible : bool, default True
+        False where the part is proven infeasible.
+    """
 
     dual: Dual
     feasible: bool = True
@@ -135,8 +216,19 @@ class Leaf:
 
 @dataclass(frozen=True, eq=False)
 class Branch:
-    """Entry ``image`` of ``S x`` is 0 in the ``first`` part and counts in the ``second``; or, where ``at`` says two
-    neighbouring letters of an alphabet, it is at most the one and at least the other. The parts are numbers of nodes.
+    """Division of one part of a `Tree` into two, at one entry of ``S x``.
+
+    The entry is 0 in the first part and counts in the second. Where ``at`` is given, the entry is at most its first
+    letter in the first part, and at least its second letter in the second part.
+
+    Parameters
+    ----------
+    image : int
+        Number of the entry.
+    first, second : int
+        Numbers of the nodes that are the two parts.
+    at : tuple of (float, float), optional
+        Two neighbouring letters of an alphabet.
     """
 
     image: int
@@ -146,14 +238,26 @@ class Branch:
 
 
 Tree: TypeAlias = "Sequence[Leaf | Branch]"
-"""The nodes of a branch and bound, the first of which is everything."""
+"""Nodes of a branch and bound; the first node is the whole set of decisions."""
 
 
 @dataclass(frozen=True, eq=False)
 class Sparsest:
-    """What a method that counts knows beside the count: ``norm``, the cost J of its decision, and of an optimum of J,
-    where it has one, the cost ``plain`` and the count ``plain_count``, in the user's units; and the ``tree`` behind its
-    lower bound, in which the images are restricted to ``letters`` where there are any."""
+    """Record of a method that minimises a count, in addition to the count itself; numbers are in the user's units.
+
+    Parameters
+    ----------
+    norm : float
+        Cost J of its decision.
+    plain : float, optional
+        Cost of an optimum of J, where one is known.
+    plain_count : float, optional
+        Count of that optimum.
+    tree : Tree
+        Branch and bound that proves the lower bound.
+    letters : sequence of float, optional
+        Alphabet to which the entries of ``S x`` are restricted, where there is one.
+    """
 
     norm: float
     plain: float | None
@@ -166,11 +270,25 @@ class Sparsest:
 
 @dataclass(frozen=True, eq=False)
 class Activity:
-    """What is proven of the least count of a program (`SemiInfiniteProgram.activity`) over all feasible decisions, as
-    shares of the largest: at least ``lower``, by multipliers ``dual`` of a program of its own or, where that is
-    ``None``, by those of the cost; at most ``upper``, the count of the decision that is returned, or of another one,
-    ``decision``, with the ``proofs`` of it; ``None`` where neither is proven. ``norm``: whether the cost of the program
-    is a sum of absolute values."""
+    """Proven bounds of the least count of a program (`SemiInfiniteProgram.activity`) over all feasible decisions.
+
+    Counts are shares of the largest count.
+
+    Parameters
+    ----------
+    lower : float
+        Lower bound of the least count.
+    upper : float, optional
+        Count of the decision that is returned, or of ``decision``; ``None`` where neither is proven.
+    dual : Dual, optional
+        Multipliers of a program of its own that prove ``lower``; ``None``: the multipliers of the cost prove it.
+    decision : ndarray, shape (n,), optional
+        Another decision whose count is ``upper``.
+    proofs : sequence of Proof
+        Proofs of that decision.
+    norm : bool, default True
+        Whether the cost of the program is a sum of absolute values.
+    """
 
     lower: float
     upper: float | None

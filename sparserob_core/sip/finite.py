@@ -1,9 +1,9 @@
-"""The finite program that is left when finitely many indices are imposed, and a checked answer to it; rows that must
-hold for every deviation.
+"""Finite programs, left when finitely many indices are imposed, with checked solutions; rows that hold for every
+deviation.
 
 A row with deviations is ``g x + w'(C x + d) <= h`` for all ``w`` in a product of convex sets, the `Spread`. Its worst
-deviation is in closed form, ``max_w w'a`` a sum of support functions (Ben-Tal, El Ghaoui and Nemirovski 2009, section
-1.3), so that the left side is a convex function of the decision.
+deviation is known in closed form: ``max_w w'a`` is a sum of support functions (Ben-Tal, El Ghaoui and Nemirovski 2009,
+section 1.3). So the left side is a convex function of the decision.
 """
 
 from __future__ import annotations
@@ -24,37 +24,42 @@ if TYPE_CHECKING:
 
 
 NAN = "finite program: a bound or right-hand side is NaN"
-# Times its value: where more is added up to a square, double precision leaves fewer than ten digits of it. With a
-# thousand times as much the last digits of a gap are rounding; with a thousandth ordinary costs are summed twice.
+# Ratio of the terms of a square to its value. Above it, double precision leaves fewer than ten digits of it. With
+# a thousand times as much, the last digits of a gap are rounding; with a thousandth, ordinary costs are summed twice.
 CANCELS = 1e6
 SIGNS = "finite program: expected weights >= 0 and right-hand sides above -inf"
 
 
 @dataclass(frozen=True, eq=False)
 class Blocks:
-    """Entries of an image that count with their Euclidean norm: ``number (k,)`` is the block of each, -1 for one that
-    counts alone. Entries of one block have one weight."""
+    """Entries of an image that enter the cost by their Euclidean norm, in blocks.
+
+    Parameters
+    ----------
+    number : ndarray of int, shape (k,)
+        Block of each entry, from 0; -1 for an entry that counts alone. Entries of one block have one weight.
+    """
 
     number: np.ndarray
 
     @cached_property
     def entries(self) -> np.ndarray:
-        """The entries ``(e,)`` that are in a block."""
+        """Numbers ``(e,)`` of the entries that are in a block."""
         return np.flatnonzero(self.number >= 0)
 
     @cached_property
     def of(self) -> np.ndarray:
-        """The block ``(e,)`` of each of those."""
+        """Block ``(e,)`` of each entry in `entries`."""
         return np.asarray(self.number[self.entries])
 
     @cached_property
     def first(self) -> np.ndarray:
-        """The first entry ``(b,)`` of every block."""
+        """First entry ``(b,)`` of every block."""
         return np.asarray(self.entries[np.unique(self.of, return_index=True)[1]])
 
     @cached_property
     def table(self) -> np.ndarray:
-        """The entries ``(b, g)`` of every block, -1 where it has fewer than the largest."""
+        """Entries ``(b, g)`` of every block, filled with -1 where a block has fewer than the largest."""
         order = np.argsort(self.of, kind="stable")
         sizes = np.bincount(self.of, minlength=self.first.size)
         table = np.full((sizes.size, int(sizes.max(initial=0))), -1)
@@ -63,13 +68,14 @@ class Blocks:
 
     @shaped
     def norms(self, image: Float[Array, " k"]) -> Float[Array, " b"]:
-        """The norm of every block."""
+        """Return the norm ``(b,)`` of every block of an image ``(k,)``."""
         squares = np.bincount(self.of, image[self.entries] ** 2, self.first.size)
         return np.asarray(np.sqrt(squares), dtype=float)
 
     @shaped
     def directions(self, image: Float[Array, " k"]) -> Float[Array, " k"]:
-        """Every block divided by its norm; 0 where that is 0, and outside of blocks."""
+        """Return an image ``(k,)`` with every block divided by its norm; 0 where the norm is 0, and outside of
+        blocks."""
         answer = np.zeros(image.size)
         norms = self.norms(image)
         answer[self.entries] = image[self.entries] / np.where(norms > 0.0, norms, np.inf)[self.of]
@@ -77,8 +83,10 @@ class Blocks:
 
     @shaped
     def lengths(self, image: Float[Array, " k"]) -> Float[Array, " k"]:
-        """What every entry counts with: the norm of its block in the first entry of it and 0 in the others, its
-        absolute value outside of blocks."""
+        """Return the length ``(k,)`` with which each entry enters the cost.
+
+        Outside of blocks it is the absolute value. The first entry of a block has the norm of the block, the others 0.
+        """
         answer = np.abs(image)
         answer[self.entries] = 0.0
         answer[self.first] = self.norms(image)
@@ -87,14 +95,40 @@ class Blocks:
 
 @dataclass(frozen=True, eq=False)
 class FiniteProgram:
-    """minimise ``sum_k weights_k |(S x)_k| + 1/2 x'P x + q'x + constant``
-    subject to ``lower <= S x <= upper``, ``G x <= h``, ``A x = b``; where there are ``blocks`` of images, each counts
-    with its weight times its Euclidean norm instead.
+    """Convex program with finitely many constraints.
 
-    Shapes: ``q (n,)``, ``P (n, n)`` symmetric positive semidefinite or ``None``, ``S (k, n)`` or ``None`` for the
-    identity, ``weights, lower, upper (k,)`` with ``weights >= 0``, ``G (r, n)``, ``h (r,)``, ``A (e, n)``, ``b (e,)``.
-    Entries of ``lower`` may be ``-inf``, entries of ``upper`` and ``h`` may be ``inf``. Arrays must not be written to
-    after the program is built: what depends on ``S``, ``weights`` and the bounds alone is remembered between programs.
+    Minimise ``sum_k weights_k |(S x)_k| + 1/2 x'P x + q'x + constant`` subject to ``lower <= S x <= upper``, ``G x <=
+    h``, ``A x = b``. Each of the ``blocks`` of images costs its weight times its Euclidean norm instead.
+
+    Parameters
+    ----------
+    q : ndarray, shape (n,)
+        Linear cost.
+    weights : ndarray, shape (k,)
+        Weights of the absolute values, at least 0.
+    lower, upper : ndarray, shape (k,)
+        Bounds of the image; entries may be ``-inf`` and ``inf``.
+    G : ndarray, shape (r, n)
+        Rows of the inequalities.
+    h : ndarray, shape (r,)
+        Right-hand sides of the inequalities; entries may be ``inf``.
+    A : ndarray, shape (e, n)
+        Rows of the equalities.
+    b : ndarray, shape (e,)
+        Right-hand sides of the equalities.
+    P : csc_array, shape (n, n), optional
+        Symmetric positive semidefinite matrix; ``None`` for 0.
+    S : csc_array, shape (k, n), optional
+        Matrix of the image; ``None`` for the identity.
+    constant : float, default 0
+        Constant term of the cost.
+    blocks : Blocks, optional
+        Blocks of images.
+
+    Notes
+    -----
+    Arrays must not be written to after the program is built. Quantities that depend on ``S``, ``weights`` and the
+    bounds alone are shared between programs.
     """
 
     q: Array
@@ -117,21 +151,36 @@ class FiniteProgram:
 
     @cached_property
     def curvature(self) -> Array | None:
-        """The diagonal ``(n,)`` of ``P``, zeros where there is none; ``None`` where it has other entries."""
+        """Diagonal ``(n,)`` of ``P``, zeros where there is no ``P``; ``None`` where ``P`` has entries off the
+        diagonal."""
         return diagonal(self.P, self.n)
 
     @cached_property
     def steepest(self) -> float:
-        """The largest coefficient of the linear cost and of the absolute values."""
+        """Largest coefficient of the linear cost and of the absolute values."""
         return float(max(self.weights.max(initial=0.0), np.abs(self.q).max(initial=0.0)))
 
     @cached_property
     def separable(self) -> bool:
-        """Whether every entry has a cost and bounds for itself: ``S`` the identity, ``P`` diagonal, and no blocks."""
+        """True where every variable has a cost and bounds of its own: ``S`` the identity, ``P`` diagonal, and no
+        blocks."""
         return self.S is None and self.blocks is None and self.curvature is not None
 
     def under(self, G: Array, h: Array) -> FiniteProgram:
-        """The same program under more rows ``G x <= h``, which come after its own."""
+        """Return the program with further rows, which follow its own.
+
+        Parameters
+        ----------
+        G : ndarray, shape (s, n)
+            Further rows.
+        h : ndarray, shape (s,)
+            Their right-hand sides, ``G x <= h``.
+
+        Returns
+        -------
+        FiniteProgram
+            The program with ``r + s`` rows.
+        """
         own = self.h.size
         G, h = (np.vstack([self.G, G]), np.concatenate([self.h, h])) if own else (G, h)
         more = FiniteProgram(
@@ -148,12 +197,25 @@ class FiniteProgram:
             self.constant,
             self.blocks,
         )
-        # what does not depend on the rows
+        # quantities that do not depend on the rows
         more.__dict__.update(curvature=self.curvature, steepest=self.steepest, bounded=self.bounded, _sound=self._sound)
         return more
 
     def curved(self, P: csc_array, q: Array) -> FiniteProgram:
-        """The same program with another quadratic and linear cost."""
+        """Return the program with another quadratic and linear cost.
+
+        Parameters
+        ----------
+        P : csc_array, shape (n, n)
+            Quadratic cost, symmetric positive semidefinite.
+        q : ndarray, shape (n,)
+            Linear cost.
+
+        Returns
+        -------
+        FiniteProgram
+            The program with this cost.
+        """
         other = replace(self, P=P, q=q)
         if q is self.q:
             other.__dict__.update(steepest=self.steepest, bounded=self.bounded, _sound=self._sound)
@@ -161,22 +223,28 @@ class FiniteProgram:
 
     @cached_property
     def bounded(self) -> bool:
-        """Whether all bounds are finite."""
+        """True where all bounds are finite."""
         return bool(np.isfinite(self.lower).all() and np.isfinite(self.upper).all())
 
     @shaped
     def image(self, x: Float[Array, " n"]) -> Float[Array, " k"]:
-        """``S x`` ``(k,)``."""
+        """Return ``S x``, ``(k,)``."""
         return x if self.S is None else np.asarray(self.S @ x, dtype=float)
 
     @shaped
     def objective(self, x: Float[Array, " n"]) -> float:
-        """The cost at ``x``; of squares that cancel rounding may leave less than 0, and they are never less."""
+        """Return the cost at ``x``.
+
+        Rounding may make a square negative where its terms cancel; it is then counted as 0.
+        """
         quadratic = 0.0 if self.P is None else max(0.0, self._square(x)[0])
         return float(self.weights @ self._lengths(x) + self.q @ x) + quadratic + self.constant
 
     def _square(self, x: Array) -> tuple[float, float]:
-        """``1/2 x'P x``, and what its rounding is relative to: summed with more digits where most of it cancels."""
+        """Return ``1/2 x'P x``, and the size to which its rounding error is relative.
+
+        The sum is computed with more digits where most of it cancels.
+        """
         square = 0.5 * float(x @ self._bent(x))
         if self.P is None or self.curvature is not None:
             return square, abs(square)
@@ -190,11 +258,12 @@ class FiniteProgram:
 
     @shaped
     def _lengths(self, x: Float[Array, " n"]) -> Float[Array, " k"]:
+        """Return the length ``(k,)`` with which each entry of the image enters the cost."""
         image = self.image(x)
         return np.abs(image) if self.blocks is None else self.blocks.lengths(image)
 
     def _bent(self, x: Array) -> Array:
-        """``P x``."""
+        """Return ``P x``."""
         if self.curvature is not None:
             return self.curvature * x
         assert self.P is not None
@@ -202,7 +271,7 @@ class FiniteProgram:
 
     @shaped
     def tangent(self, at: Float[Array, " n"]) -> FiniteProgram:
-        """The same program with ``1/2 x'P x`` replaced by its tangent at ``at``, which lies below it."""
+        """Return the program with ``1/2 x'P x`` replaced by its tangent at ``at``, which lies below it."""
         if self.P is None:
             return self
         bent = self._bent(at)
@@ -210,21 +279,22 @@ class FiniteProgram:
 
     @shaped
     def magnitude(self, x: Float[Array, " n"]) -> float:
-        """The sum of the absolute values of the terms of the cost at ``x``: what its rounding is relative to."""
+        """Return the sum of the absolute values of all terms of the cost at ``x``, to which its rounding error is
+        relative."""
         size = np.abs(x)
         quadratic = 0.0 if self.P is None else self._square(x)[1]
         return float(self.weights @ self._lengths(x) + np.abs(self.q) @ size) + quadratic + abs(self.constant)
 
     @shaped
     def added(self, x: Float[Array, " n"]) -> float:
-        """The absolute values of the four terms of the cost at ``x``, added up."""
+        """Return the sum of the absolute values of the four parts of the cost at ``x``."""
         quadratic = 0.0 if self.P is None else self._square(x)[0]
         return float(self.weights @ self._lengths(x)) + abs(float(self.q @ x)) + abs(quadratic) + abs(self.constant)
 
     @shaped
     def residual(self, x: Float[Array, " n"]) -> float:
-        """The largest violation of bounds, rows and equalities at ``x``, each divided by its own scale (see
-        `scaled_violation`)."""
+        """Return the largest violation of bounds, rows and equalities at ``x``, each divided by its scale
+        (`scaled_violation`)."""
         size = np.abs(x)
         worst = 0.0
         if self.G.shape[0]:
@@ -238,17 +308,18 @@ class FiniteProgram:
 
     @shaped
     def missed(self, x: Float[Array, " n"]) -> float:
-        """The largest ``|A x - b|``, each divided by its own scale (see `scaled_violation`); 0 without equalities."""
+        """Return the largest residual ``|A x - b|``, each divided by its scale (`scaled_violation`); 0 without
+        equalities."""
         return scaled_violation(np.abs(self.excess(x)), self.A, self.b, np.abs(x)) if self.b.size else 0.0
 
     @shaped
     def excess(self, x: Float[Array, " n"]) -> Float[Array, " e"]:
-        """``A x - b``, summed with more digits than it is told with."""
+        """Return the residuals ``A x - b``, summed in extended precision."""
         wide = np.longdouble
         return np.asarray(self.A.astype(wide) @ x.astype(wide) - self.b.astype(wide), dtype=float)
 
     def validate(self) -> None:
-        """Raise `InputError` when shapes disagree or a number is not one."""
+        """Raise `InputError` where shapes disagree, or a number is NaN or has a wrong sign."""
         self._demand({"G": (self.h.size, self.n)}, ("G",))
         if not self.h.min(initial=np.inf) > -np.inf:
             raise InputError(NAN if np.isnan(self.h).any() else SIGNS)
@@ -256,7 +327,7 @@ class FiniteProgram:
 
     @cached_property
     def _sound(self) -> bool:
-        """`validate`, but for the rows."""
+        """True where everything except the rows is valid; otherwise `InputError` is raised."""
         k = self.n if self.S is None else int(self.S.shape[0])
         shapes = {"weights": (k,), "lower": (k,), "upper": (k,), "A": (self.b.size, self.n)}
         self._demand(shapes, ("q", "weights", "A", "b"))
@@ -278,7 +349,7 @@ class FiniteProgram:
 
 
 def diagonal(P: csc_array | None, n: int) -> Array | None:
-    """The diagonal ``(n,)`` of a diagonal ``P`` (zeros for ``None``), or ``None`` when ``P`` has other entries."""
+    """Return the diagonal ``(n,)`` of a diagonal ``P``, zeros for ``None``; ``None`` where ``P`` has other entries."""
     if P is None:
         return np.zeros(n)
     columns = np.repeat(np.arange(n), np.diff(P.indptr))
@@ -291,10 +362,26 @@ def diagonal(P: csc_array | None, n: int) -> Array | None:
 def scaled_violation(
     violations: Float[Array, " r"], rows: Float[Array, "r n"], rhs: Float[Array, " r"], size: Float[Array, " n"]
 ) -> float:
-    """``max_i violations_i / max(min(1, |rows_i|), |rhs_i| + |rows_i| size)``.
+    """Return ``max_i violations_i / max(min(1, |rows_i|), |rhs_i| + |rows_i| size)``, at least 0.
 
-    A row of ordinary size is judged by its absolute violation, a short row by the distance to its half-space, and any
-    row leniently only where the numbers that cancel in it are themselves large.
+    A row of norm 1 or more is judged by its absolute violation, a short row by the distance to its half-space. A row is
+    judged less strictly only where the numbers that cancel in it are themselves large.
+
+    Parameters
+    ----------
+    violations : ndarray, shape (r,)
+        Violations of the rows.
+    rows : ndarray, shape (r, n)
+        Rows.
+    rhs : ndarray, shape (r,)
+        Right-hand sides.
+    size : ndarray, shape (n,)
+        Absolute values of the decision.
+
+    Returns
+    -------
+    float
+        The largest scaled violation.
     """
     magnitude = np.where(np.isfinite(rhs), np.abs(rhs), 0.0) + np.abs(rows) @ size
     length = np.minimum(1.0, np.sqrt(np.einsum("ij,ij->i", rows, rows)))
@@ -304,14 +391,23 @@ def scaled_violation(
 
 @dataclass(frozen=True, eq=False)
 class Directions:
-    """Unit vectors ``vectors (r, g)``, each for the block ``block (r,)`` in the order of its entries: the largest of
-    ``d's`` over those of a block is at most its norm."""
+    """Unit vectors of blocks, whose linear functions bound the norms of the blocks from below.
+
+    For a unit vector ``d`` of a block with entries ``s``, ``d's`` is at most the norm of ``s``.
+
+    Parameters
+    ----------
+    block : ndarray of int, shape (r,)
+        Block of each vector.
+    vectors : ndarray, shape (r, g)
+        Unit vectors, in the order of the block's entries.
+    """
 
     block: np.ndarray
     vectors: Array
 
     def joined(self, other: Directions) -> Directions:
-        """These and those of the others that are not among them."""
+        """Return these directions and those of ``other`` that are not among them."""
         block, vectors = np.concatenate([self.block, other.block]), np.vstack([self.vectors, other.vectors])
         _, first = np.unique(np.column_stack([block, np.round(vectors, 12) + 0.0]), axis=0, return_index=True)
         kept = np.sort(first)
@@ -324,18 +420,42 @@ INTERIOR = "interior_point"
 
 @dataclass(frozen=True, eq=False)
 class FiniteSolution:
-    """What was *checked* about a finite program; no number here was taken from a solver unread.
+    """Checked solution of a finite program: no number is taken from a solver without a check.
 
-    ``status``: ``optimal`` (``residual`` and ``gap`` are below the tolerance), ``infeasible`` (``infeasibility`` is
-    proven) or ``failed``. ``value`` is the cost at ``x (n,)``; ``lower_bound`` is proven by weak duality from
-    ``y (r,) >= 0`` (of ``G x <= h``), ``mu (e,)`` (of ``A x = b``) and ``z (k,)`` (of ``s = S x``), with
-    ``P x + q + G'y + A'mu + S'z = 0`` at an optimum. ``residual``: see `FiniteProgram.residual`;
-    ``gap = value - lower_bound``. ``directions``: those that norms of blocks were replaced by, the last time.
-    ``infeasibility``: a proven lower bound of the smallest ``t`` for which
-    ``G_i x <= h_i + t |G_i|`` and ``|A_i x - b_i| <= t |A_i|`` can be met within the bounds. ``attempts``: what was
-    tried and why it was not believed. ``by``: whose answer it is, `CLOSED_FORM`, `DUAL_NEWTON`, `HIGHS`, `NOBODY` or
-    the name of the solver that was asked (`SOLVER`, where it has none). ``unanswered``: why it is not the answer of the
-    solver that was named.
+    Parameters
+    ----------
+    status : {"optimal", "infeasible", "failed"}
+        ``optimal``: ``residual`` and ``gap`` are below the tolerance. ``infeasible``: ``infeasibility`` is proven.
+    x : ndarray, shape (n,)
+        The decision.
+    value : float
+        Cost at the decision.
+    lower_bound : float
+        Lower bound of the optimal value, proven by weak duality from the multipliers.
+    y : ndarray, shape (r,)
+        Multipliers of ``G x <= h``, at least 0. At an optimum, ``P x + q + G'y + A'mu + S'z = 0``.
+    mu : ndarray, shape (e,)
+        Multipliers of ``A x = b``.
+    z : ndarray, shape (k,)
+        Multipliers of ``s = S x``.
+    residual : float
+        Largest scaled violation (`FiniteProgram.residual`).
+    gap : float
+        ``value - lower_bound``.
+    message : str
+        Text for a reader.
+    attempts : tuple of str
+        Methods that were tried, and the reasons why their answers were rejected.
+    infeasibility : float
+        Proven lower bound of the smallest ``t`` for which ``G_i x <= h_i + t |G_i|`` and ``|A_i x - b_i| <= t |A_i|``
+        can be met within the bounds.
+    directions : Directions, optional
+        Last directions that replaced the norms of blocks.
+    by : str
+        Origin of the answer: `CLOSED_FORM`, `DUAL_NEWTON`, `HIGHS`, `NOBODY` or the name of the solver that was called
+        (`SOLVER`, where it has none).
+    unanswered : str
+        Reason why the named solver did not answer.
     """
 
     status: Literal["optimal", "infeasible", "failed"]
@@ -358,11 +478,19 @@ class FiniteSolution:
 @final
 @dataclass(frozen=True, eq=False)
 class Spread:
-    """The set of deviations ``w (Q,)`` from the middle ``(Q,)``: a product of ``sets``, each so many times, in order.
+    """Set of deviations ``w (Q,)`` from its middle ``(Q,)``: a product of convex sets.
 
-    A deviation is what a point of its set has beyond the set's ``middle``; 0 is one. ``missed``: of its size, by how
-    much what is written down of a deviation may miss it. ``still (Q,)``: entries that nothing answers, since they
-    deviate by no more than doubles resolve; they count like all others, but nobody names them in a proof.
+    A deviation is a point of the product minus the middles of the sets; 0 is a deviation.
+
+    Parameters
+    ----------
+    sets : tuple of (int, ConvexSet)
+        Numbers of copies and sets, in the order of the entries of ``w``.
+    missed : float, default 0
+        Relative error with which a deviation is represented.
+    still : ndarray of bool, shape (Q,), optional
+        Entries that no control answers, since they deviate by no more than the resolution of doubles. Such entries
+        count like all others, but no proof names them.
     """
 
     sets: tuple[tuple[int, ConvexSet], ...]
@@ -371,7 +499,7 @@ class Spread:
 
     @cached_property
     def parts(self) -> tuple[tuple[slice, int, ConvexSet, Array], ...]:
-        """Of every set its entries, its copies, itself and its middle ``(q,)``."""
+        """For every set its entries, its number of copies, the set itself and its middle ``(q,)``."""
         found, start = [], 0
         for count, convex in self.sets:
             stop = start + count * convex.dimension
@@ -381,24 +509,24 @@ class Spread:
 
     @property
     def size(self) -> int:
-        """``Q``."""
+        """Number ``Q`` of entries of a deviation."""
         return sum(count * convex.dimension for count, convex in self.sets)
 
     @cached_property
     def middle(self) -> Array:
-        """What deviations are counted from, ``(Q,)``."""
+        """Point ``(Q,)`` from which deviations are counted."""
         middles = [np.tile(middle, count) for _, count, _, middle in self.parts]
         return np.concatenate([np.zeros(0), *middles])
 
     @cached_property
     def inner(self) -> Array:
-        """A deviation that is well inside, ``(Q,)``."""
+        """A deviation ``(Q,)`` well inside the set."""
         points = [np.tile(convex.interior_point() - middle, count) for _, count, convex, middle in self.parts]
         return np.concatenate([np.zeros(0), *points])
 
     @cached_property
     def radii(self) -> Array:
-        """How far each entry comes from 0, ``(Q,)``."""
+        """Largest absolute value ``(Q,)`` of each entry of a deviation."""
         found = [np.zeros(0)]
         for _, count, convex, middle in self.parts:
             axes = np.eye(convex.dimension)
@@ -408,17 +536,21 @@ class Spread:
 
     @cached_property
     def lost(self) -> float:
-        """Of their size, by how much points of the sets that are written down miss the deviations that they stand for:
-        what is `missed`, and rounding of points that are far from 0 beside how far they deviate."""
+        """Relative error with which points of the sets represent deviations.
+
+        The error is `missed` plus the rounding of points that are far from 0 compared with their deviations.
+        """
         moving = self.radii > 0.0 if self.still is None else (self.radii > 0.0) & ~self.still
         far = (np.abs(self.middle) / np.where(moving, self.radii, np.inf)).max(initial=0.0)
         return float(self.missed + np.finfo(float).eps * (1.0 + far))
 
     @cached_property
     def chords(self) -> Array:
-        """How long the set is along each axis through the middle, ``(Q,)``, in parts of the axis: for all ``a`` in its
-        span, the width of the set along ``a`` is at least that times ``|a_i|``. Of a set without an interior the axes
-        are those within its span."""
+        """Length ``(Q,)`` of the set along each axis through the middle, as a multiple of the axis.
+
+        For all ``a`` in the span of the set, the width of the set along ``a`` is at least that length times ``|a_i|``.
+        For a set without an interior, the axes are their projections onto its span.
+        """
         found = [np.zeros(0)]
         for (_, count, convex, middle), within in zip(self.parts, self._projectors, strict=True):
             if convex.is_box:
@@ -432,25 +564,29 @@ class Spread:
 
     @cached_property
     def _projectors(self) -> list[Array]:
-        """Of every set the orthogonal projector ``(q, q)`` onto its span."""
+        """Orthogonal projector ``(q, q)`` onto the span of every set."""
         return [projector(convex.span) for _, _, convex, _ in self.parts]
 
     @property
     def leans(self) -> bool:
-        """Whether a set has no interior, nor is one of fewer coordinates."""
+        """True where a set has no interior, and its span is not spanned by axes."""
         return any(not _is_diagonal(within) for within in self._projectors)
 
     def within(self, a: Array) -> Array:
-        """What ``a (..., Q)`` is within the span of the set, along which all deviations are; 0 on entries that do not
-        deviate, or are `still`."""
+        """Return ``a (..., Q)`` projected onto the span of the set; 0 for entries that do not deviate, or are
+        `still`."""
         return self._projected(a) * (self.chords > 0.0) * (1.0 if self.still is None else ~self.still)
 
     def named(self, w: Array) -> Array:
-        """Deviations ``w (..., Q)`` that a proof may name instead of others: those within the span of the set, and none
-        of what is `still`. Of sets with an interior these are they themselves."""
+        """Return the deviations that a proof may name instead of deviations ``w (..., Q)``.
+
+        The deviations ``w`` are projected onto the span of the set, and set to 0 for entries that are `still`. Sets
+        with an interior leave ``w`` unchanged.
+        """
         return self._projected(w) * (1.0 if self.still is None else ~self.still)
 
     def _projected(self, a: Array) -> Array:
+        """Return ``a (..., Q)`` projected onto the span of the set."""
         found = np.array(a)
         for (part, count, convex, _), within in zip(self.parts, self._projectors, strict=True):
             if not _is_diagonal(within):
@@ -460,16 +596,16 @@ class Spread:
 
     @property
     def is_box(self) -> bool:
-        """Whether every set is a box: the deviations are then those of at most `radii`, entry by entry."""
+        """True where every set is a box; the deviations are then bounded by `radii`, entry by entry."""
         return all(convex.is_box for _, convex in self.sets)
 
     @cached_property
     def is_symmetric(self) -> bool:
-        """Whether with every deviation its opposite is one."""
+        """True where the opposite of every deviation is a deviation."""
         return all(convex.is_symmetric for _, convex in self.sets)
 
     def support(self, a: Array) -> Array:
-        """``max_w w'a (...,)`` of ``a (..., Q)``."""
+        """Return ``max_w w'a``, ``(...,)``, for ``a (..., Q)``."""
         if self.is_box:
             return np.asarray(np.abs(a) @ self.radii)
         total = np.zeros(a.shape[:-1])
@@ -479,14 +615,14 @@ class Spread:
         return total
 
     def holds(self, w: Array) -> bool:
-        """Whether ``w (Q,)`` is a deviation."""
+        """Return whether ``w (Q,)`` is a deviation."""
         return all(
             bool((convex.violation(w[part].reshape(count, -1) + middle) <= 0.0).all())
             for part, count, convex, middle in self.parts
         )
 
     def worst(self, a: Array) -> Array:
-        """A deviation ``(..., Q)`` that attains `support`."""
+        """Return deviations ``(..., Q)`` that attain `support`."""
         if self.is_box:
             return np.asarray(np.sign(a) * self.radii)
         found = np.empty(a.shape)
@@ -497,14 +633,33 @@ class Spread:
 
 
 def _is_diagonal(matrix: Array) -> bool:
+    """Return whether a matrix is diagonal."""
     return np.array_equal(matrix, np.diag(np.diag(matrix)))
 
 
 def gathered(
     row: np.ndarray, column: np.ndarray, value: Array, shape: tuple[int, int]
 ) -> tuple[np.ndarray, np.ndarray, Array]:
-    """Where every row of a sparse table begins, and its columns and values, from entries in any order; those at one
-    place are added up."""
+    """Return the arrays of a sparse table in compressed rows; entries at the same place are added up.
+
+    Parameters
+    ----------
+    row, column : ndarray of int, shape (k,)
+        Place of each entry, in any order.
+    value : ndarray, shape (k,)
+        Value of each entry.
+    shape : tuple of int
+        Shape of the table.
+
+    Returns
+    -------
+    starts : ndarray of int
+        Start of every row.
+    columns : ndarray of int
+        Column of each value.
+    values : ndarray
+        Values, row by row.
+    """
     place = row * np.int64(shape[1]) + column
     order = place.argsort(kind="stable")
     place, value = place[order], value[order]
@@ -516,8 +671,10 @@ def gathered(
 
 
 def table_of(row: np.ndarray, column: np.ndarray, value: Array, shape: tuple[int, int]) -> csr_array:
-    """A sparse table of entries: what ``csr_array`` makes of them too, which for small tables takes three times as long
-    with its checks."""
+    """Return a sparse table of entries, as ``csr_array`` would make it.
+
+    For small tables ``csr_array`` takes three times as long, because of its checks.
+    """
     from scipy.sparse import csr_array
 
     starts, columns, values = gathered(row, column, value, shape)
@@ -527,18 +684,34 @@ def table_of(row: np.ndarray, column: np.ndarray, value: Array, shape: tuple[int
 
 
 def entries_of(table: csr_array) -> tuple[np.ndarray, np.ndarray, Array]:
-    """Rows, columns and values of a sparse table, row by row."""
+    """Return the rows, columns and values of a sparse table, row by row."""
     return np.repeat(np.arange(table.shape[0]), np.diff(table.indptr)), table.indices, table.data
 
 
 @final
 @dataclass(frozen=True, eq=False)
 class UncertainRows:
-    """Rows ``g_r x + factor_r w'(C_p x + d_p) <= h_r`` for every deviation, with ``p = part_r``.
+    """Rows ``g_r x + factor_r w'(C_p x + d_p) <= h_r`` for every deviation ``w``, with ``p = part_r``.
 
-    ``g (r, n)`` and every ``C (Q, n)`` sparse, ``h (r,)``, ``d (p, Q)``. Rows that look opposite ways share a part,
-    with factors of opposite signs. ``exact``: the second half of the rows are the opposites of the first, so that both
-    hold with equality, at every deviation.
+    Rows with opposite normals share a part, with factors of opposite signs.
+
+    Parameters
+    ----------
+    g : csr_array, shape (r, n)
+        Nominal rows.
+    h : ndarray, shape (r,)
+        Right-hand sides.
+    part : ndarray of int, shape (r,)
+        Part of each row.
+    factor : ndarray, shape (r,)
+        Factor of each row.
+    C : tuple of csr_array, shape (Q, n) each
+        Dependence of the coefficients of the deviation on the decision, for each part.
+    d : ndarray, shape (p, Q)
+        Constant coefficients of the deviation, for each part.
+    exact : bool, default False
+        Whether the second half of the rows are the opposites of the first half. The rows then hold with equality, at
+        every deviation.
     """
 
     g: csr_array
@@ -551,7 +724,10 @@ class UncertainRows:
 
     @cached_property
     def equations(self) -> tuple[csr_array, Array]:
-        """Of exact rows ``N x = b``: every row of the first half, then its answers to the deviations, which are 0."""
+        """Equations ``N x = b`` of exact rows.
+
+        Every row of the first half gives its nominal row, then its response to the deviations, which is 0.
+        """
         from scipy.sparse import csr_array, vstack
 
         tables, rhs = [], [np.zeros(0)]
@@ -563,18 +739,31 @@ class UncertainRows:
 
     @cached_property
     def stacked(self) -> csr_array:
-        """The ``C_p``, one below the other, ``(p Q, n)``."""
+        """All ``C_p``, one below the other, ``(p Q, n)``."""
         from scipy.sparse import csr_array, vstack
 
-        if len(self.C) == 1:  # the commonest, which would be there twice
+        if len(self.C) == 1:  # the most frequent case, without a copy
             return self.C[0]
         return csr_array(vstack(self.C)) if self.C else csr_array((0, self.g.shape[1]))
 
     def coefficients(self, x: Array) -> Array:
-        """``C_p x + d_p``, ``(p, Q)``."""
+        """Return ``C_p x + d_p`` for all parts, ``(p, Q)``."""
         return np.asarray(self.d + (self.stacked @ x).reshape(self.d.shape))
 
     def excess(self, x: Array, spread: Spread) -> Array:
-        """By how much the rows are violated at the worst deviation, ``(r,)``; negative: a margin."""
+        """Return the violation of each row at its worst deviation.
+
+        Parameters
+        ----------
+        x : ndarray, shape (n,)
+            The decision.
+        spread : Spread
+            Set of deviations.
+
+        Returns
+        -------
+        ndarray, shape (r,)
+            Violations; a negative number is a margin.
+        """
         a = self.coefficients(x)
         return np.asarray(self.g @ x - self.h + spread.support(self.factor[:, None] * a[self.part]))

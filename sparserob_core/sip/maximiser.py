@@ -1,4 +1,4 @@
-"""The outer maximisation: what a maximiser is, what it is handed, and the report."""
+"""Outer maximisation: the maximiser, the objective that it receives, and the report of its search."""
 
 from __future__ import annotations
 
@@ -15,19 +15,26 @@ from sparserob_core.sip.convex_set import Array, Box
 
 
 class SearchEnded(Exception):
-    """Raised through a maximiser to end its search; a maximiser lets it pass. Its text is `Report.stopped`."""
+    """Exception that ends a search; a maximiser must not catch it. Its text becomes `Report.stopped`."""
 
 
 @dataclass(frozen=True, eq=False)
 class LinearBlocks:
-    """What a function of ``D`` blocks of coordinates says of itself whose blocks count by one linear piece each, at
-    most: as the indices of a tuple do, by the constraints that they impose.
+    """Structure of a function of ``D`` blocks of coordinates, each of which enters by at most one linear piece.
 
-    ``coordinates (d,)``: where a block is linear, as long as its other coordinates stay. ``acting()``: which blocks
-    ``(D,)`` the value at the point that was evaluated last rests on. ``steepest(point (d,))``: that point ``(d,)`` with
-    the linear coordinates of every block at the vertex where the block weighs most, as seen from the point that was
-    evaluated last (the linear maximisation of Frank and Wolfe 1956); a block that acts keeps to what it acts by. To go
-    there while the acting blocks keep their other coordinates never makes the value less. No evaluation is spent.
+    The indices of a tuple are such blocks: they enter by the constraints that they impose.
+
+    Parameters
+    ----------
+    coordinates : ndarray of int, shape (d,)
+        Coordinates in which a block is linear while its other coordinates are fixed.
+    acting : callable
+        ``acting()``: truth values ``(D,)``, true for the blocks on which the last evaluated value depends.
+    steepest : callable
+        ``steepest(point (d,))``: the point ``(d,)`` with the linear coordinates of every block at a vertex. Each vertex
+        is the one at which the block has the largest effect, judged from the last evaluated point (the linear
+        maximisation of Frank and Wolfe 1956). A block that acts keeps the piece by which it acts. Moving there never
+        decreases the value while the acting blocks keep their other coordinates. No evaluation is spent.
     """
 
     coordinates: np.ndarray
@@ -36,104 +43,163 @@ class LinearBlocks:
 
 
 class Objective(Protocol):
-    """What a maximiser is handed: a box, a batched function that counts, and a place for notes.
+    """Objective of a maximiser: a box, a batched function that counts its evaluations, and a place for notes.
 
-    The box has at least one coordinate, and ``lower < upper`` in every one: coordinates with a single value are not
-    shown, and where none can move no maximiser is asked.
+    The box has at least one coordinate, and ``lower < upper`` in each. Coordinates with a single value are hidden.
+    Where none can move, no maximiser is called.
     """
 
     @property
     def domain(self) -> Box:
-        """Where the function is defined, ``d`` coordinates."""
+        """Box on which the function is defined, with ``d`` coordinates."""
 
     @property
     def block(self) -> int:
-        """How many consecutive coordinates belong together: 1, or the coordinates of one index where points are tuples
-        of indices; to change one block at a time is then cheap."""
+        """Number of consecutive coordinates that belong together.
+
+        The number is 1, or that of the coordinates of one index where points are tuples of indices. Changing one block
+        at a time is then cheap.
+        """
 
     @property
     def budget(self) -> int:
-        """Evaluations that the search may spend in all."""
+        """Total number of evaluations that the search may spend."""
 
     @property
     def evaluations(self) -> int:
-        """Evaluations so far."""
+        """Number of evaluations so far."""
 
     @property
     def best_point(self) -> Array:
-        """The best point so far ``(d,)``, a good one to start from; NaN while ``evaluations`` is 0."""
+        """Best point so far ``(d,)``, a good starting point; NaN while ``evaluations`` is 0."""
 
     @property
     def best_value(self) -> float:
-        """The best value so far; ``-inf`` while ``evaluations`` is 0."""
+        """Largest value so far; ``-inf`` while ``evaluations`` is 0."""
 
     def known(self) -> tuple[Array, Array]:
-        """Points ``(k, d)`` that were evaluated before the maximiser was asked, and their values ``(k,)``: its start,
-        and those that are known from elsewhere. ``best_point`` is the best of them then."""
+        """Return the points ``(k, d)`` that were evaluated before the search, and their values ``(k,)``.
+
+        The points are the starting point and points known from elsewhere. At the start of the search, ``best_point`` is
+        the best of them.
+        """
 
     @property
     def differentiable(self) -> bool:
-        """Whether `value_and_gradient` is offered."""
+        """True where `value_and_gradient` is offered."""
 
     @property
     def acting(self) -> Callable[[], np.ndarray] | None:
-        """Which of the ``d / block`` blocks the value at the point that was evaluated last rests on, as truths: the
-        others may be moved a little, and as a rule far, without any change. ``None`` where that is not known. No
-        evaluation is spent."""
+        """Function that returns which blocks the last evaluated value depends on; ``None`` where that is not known.
+
+        The function returns truth values for the ``d / block`` blocks. The other blocks may be moved a little, and
+        usually far, without any change of the value. No evaluation is spent.
+        """
 
     @property
     def linear(self) -> LinearBlocks | None:
-        """In which coordinates its blocks are linear, and where they weigh most; ``None`` where they are not.
-        `block_ascent` is what can be made of it."""
+        """Linear coordinates of the blocks, and their steepest vertices; ``None`` where the blocks are not linear.
+
+        `block_ascent` uses this structure.
+        """
 
     @property
     def remaining(self) -> int:
-        """Evaluations that are left; 0 once the search is ended."""
+        """Number of evaluations left; 0 once the search has ended."""
 
     def evaluate(self, points: Array) -> Array:
-        """Values ``(k,)`` at points ``(k, d)``; NaN comes back as ``-inf``.
+        """Return the values ``(k,)`` at points ``(k, d)``; NaN is replaced by ``-inf``.
 
-        A point outside the domain raises `PluginError`. With fewer than ``k`` evaluations left, the first ``remaining``
-        points are evaluated, recorded, and the search is ended; so it is by a value of ``+inf``: both raise
-        `SearchEnded`, which is not to be caught.
+        With fewer than ``k`` evaluations left, the first ``remaining`` points are evaluated and recorded, and the
+        search ends. A value of ``+inf`` ends the search too.
+
+        Parameters
+        ----------
+        points : ndarray, shape (k, d)
+            Points of the domain.
+
+        Returns
+        -------
+        ndarray, shape (k,)
+            Values.
+
+        Raises
+        ------
+        PluginError
+            Where a point is outside of the domain.
+        SearchEnded
+            Where the search has ended; a maximiser must not catch it.
         """
 
     def value_and_gradient(self, point: Array) -> tuple[float, Array]:
-        """Value and gradient ``(d,)`` at one point ``(d,)``; counts as one evaluation. The gradient is 0 where the
-        value is not finite.
+        """Return the value and the gradient ``(d,)`` at one point ``(d,)``; this counts as one evaluation.
 
-        Raises `InputError` where no gradient is offered, and as `evaluate` does.
+        The gradient is 0 where the value is not finite.
+
+        Raises
+        ------
+        InputError
+            Where no gradient is offered.
+        PluginError, SearchEnded
+            In the cases of `evaluate`.
         """
 
     def accepts(self, current: float, candidate: float, temperature: float, rng: np.random.Generator) -> bool:
-        """Whether a walk goes on from the candidate (the paper's ``SlCr``): Metropolis' rule, unless the method was
-        given another."""
+        """Return whether the search moves to a candidate point (the paper's ``SlCr``).
+
+        The rule is Metropolis' rule unless the method was given another.
+
+        Parameters
+        ----------
+        current, candidate : float
+            Values at the current point and at the candidate.
+        temperature : float
+            Temperature, not negative.
+        rng : numpy.random.Generator
+            Random numbers.
+
+        Returns
+        -------
+        bool
+            True where the candidate becomes the current point.
+        """
 
     def note(self, **scalars: float) -> None:
-        """Pass scalars (temperature, acceptance, ...) to the trace and to observers."""
+        """Record scalars (temperature, acceptance, ...) in the trace, and pass them to observers."""
 
     @property
     def observed(self) -> bool:
-        """Whether anybody looks at sketches; where not, they need not be made. A search must not depend on it."""
+        """True where anybody looks at sketches; otherwise they need not be made. A search must not depend on it."""
 
     def sketch(self, role: str, lower: Array, upper: Array | None = None, rounded: bool = False) -> None:
-        """Show observers what the search looks at, or has ruled out: points ``lower (k, d)``, boxes from ``lower`` to
-        ``upper``, or the ellipsoids within these boxes (``rounded``).
+        """Show observers the points or regions that the search considers or has ruled out.
 
-        ``role`` says in words what they are; of every role the last sketch is shown, of which the first 400 rows. It is
-        no part of the trace, and changes nothing.
+        For each role the last sketch is shown, with its first 400 rows. A sketch is no part of the trace, and changes
+        nothing.
+
+        Parameters
+        ----------
+        role : str
+            Meaning of the rows, in words.
+        lower : ndarray, shape (k, d)
+            Points, or lower corners of boxes.
+        upper : ndarray, shape (k, d), optional
+            Upper corners of boxes; ``None`` for points.
+        rounded : bool, default False
+            Whether the regions are the ellipsoids within the boxes.
         """
 
 
 class Maximiser(ABC):
     """A global maximiser over a box.
 
-    ``scaled``: it is shown a box whose sides have a length of about 1, and values of about 1, in units that are powers
-    of two: the units of the user then change nothing, whatever numbers of its own it compares with. One that only
-    compares values, or has a constant of the user's, as a Lipschitz constant or a temperature, does without.
-    ``apart``: of tuples of indices it is shown every index shifted round its box, so that all of them are apart where
-    it begins, in the middle; one that draws its points at random does without.
-    ``whole``: it makes sense of a function that is constant between whole numbers; one that follows slopes does not.
+    Class attributes declare what it needs. ``scaled`` (false by default): it receives a box with sides of length about
+    1, and values of about 1, in units that are powers of two. The user's units then do not affect the numbers with
+    which it compares. A maximiser that only compares values, or that takes a constant from the user, such as a
+    Lipschitz constant or a temperature, needs no scaling. ``apart`` (false by default): each index of a tuple is
+    shifted round its box, so that all indices differ in the middle of the box, where the maximiser starts. A maximiser
+    that draws its points at random does not need this. ``whole`` (true by default): it can maximise a function that is
+    constant between whole numbers; a maximiser that follows gradients cannot.
     """
 
     scaled: ClassVar[bool] = False
@@ -142,20 +208,37 @@ class Maximiser(ABC):
 
     @property
     def polished(self) -> float:
-        """The share of a budget that goes to a local method at the end of `sparserob_core.maximise` and
-        `sparserob_core.ask_tell`, unless the user says otherwise; 0 where that would spoil what the maximiser is for,
-        such as an upper bound, or being a yardstick."""
+        """Default share of a budget for a local method at the end of a search: a fifth, unless a class overrides it.
+
+        The share applies to `sparserob_core.maximise` and `sparserob_core.ask_tell`. A class should return 0 where
+        polishing would spoil the maximiser's purpose, such as an upper bound or a reference for comparison.
+        """
         return 0.2
 
     @abstractmethod
     def search(self, objective: Objective, rng: np.random.Generator) -> float:
-        """Evaluate until the budget is spent or nothing is left to gain; return a proven upper bound of the maximum, or
-        ``inf``."""
+        """Evaluate the objective until the budget is spent or no improvement is possible.
+
+        Parameters
+        ----------
+        objective : Objective
+            The function, its box and its budget.
+        rng : numpy.random.Generator
+            The only source of random numbers.
+
+        Returns
+        -------
+        float
+            A proven upper bound of the maximum, or ``inf``.
+        """
 
 
 class EvaluationError(SparseRobError):
-    """The function that is maximised raised, or did not return one real number per point, or NaN at all of them;
-    ``report`` holds what was found before."""
+    """Error in the function that is maximised.
+
+    The function raised an exception, did not return one real number per point, or returned NaN at all points.
+    ``report`` holds the results until then.
+    """
 
     def __init__(self, message: str, report: Report) -> None:
         super().__init__(message)
@@ -164,10 +247,23 @@ class EvaluationError(SparseRobError):
 
 @dataclass(frozen=True, eq=False)
 class Trace:
-    """Every evaluation in order: ``points (n, d)``, ``values (n,)``, the running ``best (n,)``, and for each name that
-    was noted the rows ``(evaluations so far, value)`` as ``notes[name] (j, 2)``. ``points`` is empty ``(0, d)`` where
-    all of them would be too many; ``seconds (n,)`` since the search began, when each value was known. After the first
-    ``searched`` of them the local method went on that polishes (``None``: it did not)."""
+    """Every evaluation of a search, in order.
+
+    Parameters
+    ----------
+    points : ndarray, shape (n, d)
+        Points; empty ``(0, d)`` where all of them would be too many.
+    values : ndarray, shape (n,)
+        Values.
+    best : ndarray, shape (n,)
+        Largest value until each evaluation.
+    seconds : ndarray, shape (n,)
+        Seconds from the start of the search until each value was known.
+    notes : mapping of str to ndarray, shape (j, 2)
+        For each noted name, the rows ``(evaluations so far, value)``.
+    searched : int, optional
+        Number of evaluations before the local method took over to polish; ``None``: it did not.
+    """
 
     points: Array
     values: Array
@@ -181,12 +277,31 @@ class Trace:
 
 @dataclass(frozen=True, eq=False)
 class Report:
-    """The outcome of a search: the best evaluated value and where, and a proven ``upper_bound`` of the maximum
-    (``inf``: none).
+    """Outcome of a search.
 
-    ``stopped`` says why the search ended; ``missing`` evaluations gave NaN, which counts as ``-inf``;
-    ``best_point`` is NaN ``(d,)`` when nothing was evaluated. Of a search for the minimum (`ask_tell`) the best value
-    is the least, NaN counts as ``inf``, and what is proven is a ``lower_bound`` of the minimum (``-inf``: none).
+    A search for the minimum (`ask_tell`) has the same record: its best value is the least, NaN counts as ``inf``, and
+    ``lower_bound`` is what was proven.
+
+    Parameters
+    ----------
+    best_value : float
+        Best evaluated value.
+    best_point : ndarray, shape (d,)
+        Point of that value; NaN where nothing was evaluated.
+    evaluations : int
+        Number of evaluations.
+    upper_bound : float
+        Proven upper bound of the maximum; ``inf``: none.
+    trace : Trace
+        All evaluations.
+    stopped : str
+        Reason why the search ended.
+    interrupted : bool, default False
+        Whether the search was interrupted.
+    missing : int, default 0
+        Number of evaluations that gave NaN, which counts as ``-inf``.
+    lower_bound : float, default -inf
+        Proven lower bound of the minimum; ``-inf``: none.
     """
 
     best_value: float

@@ -1,4 +1,4 @@
-"""What a method is, and the tools that it is handed."""
+"""Methods for semi-infinite programs, and the tools that a method receives."""
 
 from __future__ import annotations
 
@@ -22,37 +22,56 @@ from sparserob_core.sip.program import SemiInfiniteProgram
 from sparserob_core.sip.result import Result
 from sparserob_core.sip.solver import Solver
 
-ROUNDING = 1e-12  # relative: what a product of factors is off by; weights that are meant to differ do so by far more
-GAP_TOLERANCE = 1e-7  # relative gap at which the bounds have met, unless a method has another one
+ROUNDING = 1e-12  # relative rounding error of a product of factors; weights that are meant to differ do so by far more
+GAP_TOLERANCE = 1e-7  # relative gap at which the gap counts as closed, unless a method has another one
 
 
 @final
 class Continuation(Options):
-    """How the weight of the regulariser decreases.
+    """Decreasing weights of the regulariser.
 
-    The weight ``epsilon`` goes from ``start`` by ``factor`` (the paper's ``Regu``) down to ``stop`` at the latest, or
-    until the cost ``J`` changes by no more than ``tolerance`` when it is reduced again (``SC1``). The method
-    ``exchange`` takes several steps at once, down to an eighth of a weight, as long as its gap is open.
+    The weight ``epsilon`` starts at ``start`` and is multiplied by ``factor`` (the paper's ``Regu``). The decrease ends
+    at ``stop`` at the latest, or where a further reduction changes the cost ``J`` by no more than ``tolerance``
+    (``SC1``). While its gap is open, the method ``exchange`` takes several steps at once, down to an eighth of a
+    weight.
     """
 
     start: float = Field(default=1.0, gt=0.0)
     """First weight."""
 
     factor: float = Field(default=0.5, gt=0.0, lt=1.0)
-    """Each weight is this times the one before."""
+    """Ratio of each weight to the one before."""
 
     stop: float = Field(default=1e-6, gt=0.0)
-    """Last weight at the latest."""
+    """Smallest weight."""
 
     tolerance: float = Field(default=GAP_TOLERANCE, ge=0.0)
-    """Relative change of the cost below which a smaller weight changes nothing any more."""
+    """Relative change of the cost that counts as none."""
 
     def lighter(self, epsilon: float, j: int = 1, regu: Callable[[float, int], float] | None = None) -> float:
-        """The weight of iteration ``j``, where the one before had ``epsilon``: by the schedule ``regu``, or else
-        ``factor`` times ``epsilon``; not below ``stop``, and ``stop`` where nothing but rounding is between the two:
-        the same program would be solved once more.
+        """Return the weight of iteration ``j``, whose predecessor had the weight ``epsilon``.
 
-        Raises `InputError` for a schedule that does not give a positive weight below ``epsilon``.
+        A weight within rounding of ``stop`` is replaced by ``stop``. Otherwise nearly the same program would be solved
+        once more.
+
+        Parameters
+        ----------
+        epsilon : float
+            Weight of the iteration before.
+        j : int, default 1
+            Number of the iteration.
+        regu : callable, optional
+            Schedule ``regu(epsilon, j)``; by default ``factor * epsilon``.
+
+        Returns
+        -------
+        float
+            The weight, at least ``stop``.
+
+        Raises
+        ------
+        InputError
+            Where the schedule does not return a positive weight below ``epsilon``.
         """
         weight: object = self.factor * epsilon if regu is None else regu(epsilon, j)
         if isinstance(weight, int | float | np.floating) and 0.0 < weight < epsilon:
@@ -67,20 +86,39 @@ class Continuation(Options):
 
 
 Rebuild: TypeAlias = Callable[[], tuple[SemiInfiniteProgram, Solver, Regulariser | None]]
-"""Makes a program, the solver and the regulariser anew; it can be pickled, and equal ones make the same."""
+"""Function that makes the program, the solver and the regulariser anew. The function can be pickled, and equal
+functions make equal objects."""
 
 
 @dataclass(frozen=True, eq=False)
 class Tools:
-    """The components that a config has chosen. ``regulariser`` may be ``None``: the unregularised program is then
-    solved.
+    """Components that the user has chosen for a method.
 
-    ``budget``: evaluations that one search of the maximiser may spend, of which the share ``polish`` goes to a local
-    method at its end (`sip.search.search.Rules`). ``executor``: workers for programs that do not depend on one another;
-    ``None``: solve them here.
-    ``rebuild`` makes the program that the method is handed, its solver and its regulariser anew on a worker, since a
-    program with functions of a user cannot be sent; ``None``: it cannot be made there.
-    ``deadline``: when a method has to end with what it knows.
+    Parameters
+    ----------
+    solver : Solver
+        Solver of the finite programs.
+    maximiser : Maximiser, optional
+        Global maximiser; ``None`` where none was chosen.
+    regulariser : Regulariser, optional
+        Regulariser; ``None``: the unregularised program is solved.
+    continuation : Continuation
+        Weights of the regulariser.
+    budget : int, default 2000
+        Evaluations that one search of the maximiser may spend.
+    polish : float, optional
+        Share of the budget for a local method at the end of a search (`sip.search.search.Rules`).
+    executor : Executor, optional
+        Workers for independent programs; ``None``: the programs are solved in this process.
+    rebuild : Rebuild, optional
+        Makes the method's program, its solver and its regulariser anew on a worker. A program that contains functions
+        of a user cannot be sent there. ``None``: they cannot be made on a worker.
+    rng : numpy.random.Generator
+        Random numbers; seed 0 by default.
+    notify : callable
+        Receives every event; by default events are ignored.
+    deadline : Deadline
+        Time at which a method has to end with its best answer; unlimited by default.
     """
 
     solver: Solver
@@ -97,24 +135,33 @@ class Tools:
 
 
 class ExecutorFactory(ABC):
-    """Opens the workers on which independent programs are solved."""
+    """Source of the workers on which independent programs are solved."""
 
     @property
     def parallel(self) -> bool:
-        """Whether calls are made side by side; if not, it is of no use to send them."""
+        """True where calls run at the same time; where it is false, sending calls to the workers gains nothing."""
         return True
 
     @abstractmethod
     def open(self) -> AbstractContextManager[Executor]:
-        """Workers that live as long as the context; what is submitted to them can be pickled."""
+        """Return a context manager that yields the workers; they live as long as the context.
+
+        Whatever is submitted to the workers can be pickled.
+
+        Returns
+        -------
+        context manager
+            Yields a ``concurrent.futures.Executor``.
+        """
 
 
 class Method(ABC):
-    """A way to solve a semi-infinite program.
+    """A method for semi-infinite programs.
 
-    ``searches``: whether it maximises ``g`` over tuples of indices, so that its `EvaluationsFinished` are about tuples;
-    observers then show the search. ``counts``: whether the cost of its result is the time that a control acts.
-    ``robust``: whether it solves programs whose rows must hold for every deviation (`SemiInfiniteProgram.spread`).
+    Class attributes, all false by default, describe it. ``searches``: it maximises ``g`` over tuples of indices. Its
+    `EvaluationsFinished` are then about tuples, and observers show the search. ``counts``: the cost of its result is
+    the time during which a control acts. ``robust``: it solves programs whose rows must hold for every deviation
+    (`SemiInfiniteProgram`, field ``spread``).
     """
 
     searches: ClassVar[bool] = False
@@ -123,11 +170,24 @@ class Method(ABC):
 
     @abstractmethod
     def solve(self, program: SemiInfiniteProgram, tools: Tools) -> Result:
-        """Return a `Result` for every well-posed program; a status never claims more than was proven."""
+        """Solve a semi-infinite program.
+
+        Parameters
+        ----------
+        program : SemiInfiniteProgram
+            The program.
+        tools : Tools
+            Components that the user has chosen.
+
+        Returns
+        -------
+        Result
+            A result for every well-posed program. Its status never claims more than was proven.
+        """
 
 
 def require_suited(method: Method, program: SemiInfiniteProgram, name: str = "") -> None:
-    """Raise `InputError` for a program with deviations, under feedback, where the method is for plain rows."""
+    """Raise `InputError` where a program has deviations, as under feedback, and the method is for plain rows only."""
     if program.spread is not None and not method.robust:
         raise InputError(
             path="method.name",

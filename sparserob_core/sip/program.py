@@ -1,4 +1,4 @@
-"""Semi-infinite programs: one decision, finitely many terms in the cost, families of uncountably many constraints."""
+"""Semi-infinite programs: one decision, a convex cost, and families of infinitely many constraints."""
 
 from __future__ import annotations
 
@@ -20,24 +20,34 @@ from sparserob_core.sip.convexity import require_convex, sparse_matrix
 from sparserob_core.sip.finite import Blocks, FiniteProgram, Spread, UncertainRows
 
 Formulation: TypeAlias = Literal["reduced", "nominal", "literal", "sampled"]
-"""What an index of a family says. ``reduced``: everything but the uncertainty that is maximised in closed form;
-``nominal``: nothing of the uncertainty; ``literal``: all of it; ``sampled``: the number of a sample."""
+"""Meaning of an index of a family. ``reduced``: the uncertainty that is maximised in closed form is not part of the
+index, the rest is; ``nominal``: nothing uncertain is part of it; ``literal``: all of the uncertainty is part of it;
+``sampled``: the index is the number of a sample."""
 
 
 TOLERANCE = 1e-9  # of a row's own unit: a violation of at most this counts as none (docs/decisions/0016)
-OUTSIDE = 1e-9  # of its sides and its distance from 0: how far outside of an index set rounding may put an index
-NARROW = 1e-12  # of its side: a gap between two cells that is rounding of their corners
-PARTS = 4_000_000  # of a grid between the corners of all cells: 32 MB
-EQUALITY = 1e-12  # of the numbers that are added up: an equality that is missed by at most this counts as met
+OUTSIDE = 1e-9  # of the sides of an index set and its distance from 0: error by which rounding may put an index outside
+NARROW = 1e-12  # of the side of a box: a gap between two cells that is only rounding of their corners
+PARTS = 4_000_000  # largest number of parts of the grid between the corners of all cells: 32 MB
+EQUALITY = 1e-12  # of the numbers that are added up: an equality with at most this residual counts as met
 
 
 @dataclass(frozen=True, eq=False)
 class Separation:
     """The most violated constraints of one family at a decision, worst first.
 
-    ``indices (k, d)``, ``rows (k,)`` the row of the family at that index, ``violations (k,)`` (``rows x - rhs``,
-    negative when satisfied), and ``bound``: a proven upper bound on the family's violation over its whole index set,
-    ``inf`` if none is known. ``formulation`` is that of the indices.
+    Parameters
+    ----------
+    indices : ndarray, shape (k, d)
+        Indices at which the family is violated most.
+    rows : ndarray of int, shape (k,)
+        Row of the family at each index, from 0.
+    violations : ndarray, shape (k,)
+        ``rows x - rhs`` of these constraints; negative where a constraint is satisfied.
+    bound : float, default inf
+        Proven upper bound of the violation of the family over its whole index set; ``inf`` where none is known.
+    formulation : Formulation, default "reduced"
+        Formulation to which the indices belong.
     """
 
     indices: Array
@@ -49,9 +59,19 @@ class Separation:
 
 @dataclass(frozen=True, eq=False)
 class Enclosure:
-    """Proven upper bounds ``(k,)`` of the violation on index cells, and the coordinate ``(k,)`` whose halving would
-    help most. ``bend (k,)``, where it is known: what of the bounds falls with the square of a cell's width, of a family
-    whose index is one number; its separation then says where cells have to be short, unless rows have deviations."""
+    """Proven upper bounds of the violation of a family, one for each cell of the index set.
+
+    Parameters
+    ----------
+    bounds : ndarray, shape (k,)
+        Upper bound of the violation of every row over each cell.
+    split : ndarray of int, shape (k,)
+        Coordinate of each cell whose halving promises the largest improvement.
+    bend : ndarray, shape (k,), optional
+        Part of each bound that falls with the square of the cell's width. The part is given for a family whose index is
+        one number. The separation of such a family then says where cells have to be short, unless its rows have
+        deviations.
+    """
 
     bounds: Array
     split: Array
@@ -60,8 +80,21 @@ class Enclosure:
 
 @dataclass(frozen=True, eq=False)
 class WorstConstraint:
-    """The worst constraint found: by how much it is violated (negative: satisfied with that margin), and which one it
-    is: row ``row`` of family ``constraint`` at ``index (d,)``, an index of that ``formulation``."""
+    """The most violated constraint found at a decision: row ``row`` of family ``constraint`` at ``index``.
+
+    Parameters
+    ----------
+    violation : float
+        Amount by which the constraint is violated; negative: it is satisfied with that margin.
+    constraint : str
+        Name of the family.
+    index : ndarray, shape (d,)
+        Index of the constraint.
+    row : int, default 0
+        Row of the family at that index.
+    formulation : Formulation, default "reduced"
+        Formulation to which the index belongs.
+    """
 
     violation: float
     constraint: str
@@ -74,11 +107,15 @@ class WorstConstraint:
 
 @dataclass(frozen=True, eq=False)
 class Explanation(ABC):
-    """One constraint for people: what it says (``text``), and the sentences that are asked for where nothing is
-    feasible.
+    """Description of one constraint for a reader: its meaning, and sentences for infeasible programs.
 
-    Programs know no more of a constraint than its row; whoever states a family knows what it is about, and tells it in
-    a subclass. ``decides`` is what the field calls the decision.
+    A program knows only the row of a constraint. Whoever states a family knows its meaning, and describes it in a
+    subclass. The class attribute ``decides`` is the name that the field gives to the decision.
+
+    Parameters
+    ----------
+    text : str
+        Meaning of the constraint.
     """
 
     text: str
@@ -86,93 +123,155 @@ class Explanation(ABC):
 
     @abstractmethod
     def witness(self, worst: WorstConstraint) -> WorstConstraint:
-        """The worst constraint, which is this one, with what the field knows of it."""
+        """Return the worst constraint, which is this one, with the facts that the field adds to it."""
 
     def short(self) -> str:
-        """What it asks for, without remarks."""
+        """Return the meaning of the constraint, without notes."""
         return self.text
 
     def of_sample(self, number: int) -> Explanation:
-        """The same constraint for one sample of what is uncertain, whatever it says of another case."""
+        """Return the description of this constraint for one sample of the uncertainty, without its descriptions of
+        other cases."""
         return Unexplained(f"{self.text} (sample {number})")
 
     @property
     def alike(self) -> str:
-        """What it asks for, where other rows of its family ask for the same in another case; empty elsewhere."""
+        """Meaning that the constraint shares with other rows of its family; empty where it shares none."""
         return ""
 
     def beyond(self, amount: float) -> str:
-        """No decision enters the constraint, and it is violated by ``amount``."""
+        """Return the sentence for a constraint that no decision enters and that is violated by ``amount``."""
         return self.out_of_reach(amount, 0.0)
 
     def apart(self, other: Explanation, share: float, amount: float) -> str:
-        """The decision enters this constraint and ``share`` times the ``other`` with opposite signs, and their sum is
-        violated by ``amount``."""
+        """Return the sentence for two constraints that cannot hold together.
+
+        Parameters
+        ----------
+        other : Explanation
+            The second constraint.
+        share : float
+            Factor of the second constraint: in this constraint plus ``share`` times the other the decision cancels.
+        amount : float
+            Violation of that sum, whatever the decision.
+
+        Returns
+        -------
+        str
+            One sentence.
+        """
         return (
             f"{self.text} and {other.text} cannot hold: their sum is violated by at least {amount:.4g}, "
             f"whatever the {self.decides}"
         )
 
     def out_of_reach(self, amount: float, needed: float) -> str:
-        """The constraint alone is violated by ``amount`` at least; it asks the decision to lower the left side by
-        ``needed``."""
+        """Return the sentence for a constraint that no decision satisfies.
+
+        Parameters
+        ----------
+        amount : float
+            Lower bound of the violation.
+        needed : float
+            Amount by which the decision would have to lower the left side.
+
+        Returns
+        -------
+        str
+            One sentence.
+        """
         return f"{self.text} cannot hold: it is violated by at least {amount:.4g}, whatever the {self.decides}"
 
 
 @final
 @dataclass(frozen=True, eq=False)
 class Unexplained(Explanation):
-    """A constraint of a family that does not explain itself."""
+    """Description of a constraint whose family offers none."""
 
     def witness(self, worst: WorstConstraint) -> WorstConstraint:
         return worst
 
 
 def told_apart(one: float, two: float) -> tuple[str, str]:
-    """Two numbers with four digits, or as many as it takes to tell them apart."""
+    """Return two numbers as texts of four digits, or of as many more as make the texts differ."""
     texts = [(f"{one:.{digits}g}", f"{two:.{digits}g}") for digits in range(4, 17)]
     return next((pair for pair in texts if pair[0] != pair[1]), texts[-1])
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ConstraintFamily:
-    """``rows(xi) x <= rhs(xi)`` for every index ``xi`` in a compact box.
+    """Constraints ``rows(xi) x <= rhs(xi)`` for every index ``xi`` in a compact box.
 
-    ``rows`` maps indices ``(k, d)`` to ``(G (k, r, n), h (k, r))``. A violation of at most `TOLERANCE` counts as none,
-    in the numbers of the rows as they are stated: rows of 1e-10 are to be divided by that. The rest is optional, and
-    used when offered:
+    A violation of at most `TOLERANCE` counts as none, in the numbers of the rows as they are stated. So rows of size
+    1e-10 have to be divided by 1e-10. Name, index set and rows are required; the core uses every other field where it
+    is given.
 
-    ``scale(x)``      of what a proof may excuse `TOLERANCE` at a decision, in the numbers of the rows (`allowed`): 1
-        unless a row is smaller than that, or is an equality in a finer unit;
-
-    ``chosen(indices (k, d), rows (k,))``  one row of each index, ``(G (k, n), h (k,))``, where all would take longer;
-    ``worst(x)``      exact separation (a `Separation`);
-    ``enclosure(x, lower (k, d), upper (k, d))``  an `Enclosure` of the violation on cells, for proofs;
-    ``cells``         ``(lower, upper)``, a partition of the index set on whose cells the enclosure converges;
-    ``gradient(x, indices (k, d), rows (k,))``  derivative ``(k, d)`` of ``row x - rhs`` in the index;
-    ``linear (d,)``   whether the right-hand sides are linear, and the rows constant, in a coordinate of the index while
-        the coordinates that are not linear stay (over the set that these stand for, where that is no box);
-    ``steepest(x, indices (k, d), rows (k,))``  the indices with their linear coordinates where the row is violated
-        most, one row per index; a row of -1 stands for the one that is then violated most (a `Separation`, in the order
-        of ``indices``);
-    ``nominal``       the same constraints without the uncertainty;
-    ``sample(count, rng)``  the same constraints for ``count`` sampled uncertainties only;
-    ``literal``       the same constraints with an inner maximisation left to the index, and ``reduced``, from such a
-        family, the way back;
-    ``formulation``   what its indices say (`Formulation`); a cut says it too, so that its index can be understood;
-    ``source``        what the family was made of: never looked at here, handed back to whoever made it;
-    ``hindrance(lower (d,), upper (d,))``  what keeps the enclosure of a cell wide, and what would help, in words;
-    ``row_units (r,)``, ``index_units (d,)``  what a violation of 1 and each coordinate of an index are in the user's
-        units, for a family in units of its own (`OwnUnits`);
-    ``measured (r,)``, ``along``  what these units are called, for every row and for the first coordinate of an index,
-        where that is known;
-    ``explain(index (d,), row)``  one constraint for people (an `Explanation`);
-    ``excess(x, indices (k, d))``  the violations ``(k, r)`` at indices, where no rows need be built for them;
-    ``uncertain(index (d,))``  for rows that must hold for every deviation in the program's `Spread`: these rows. Such a
-        family is not linear in the decision: ``rows`` refuses, ``excess`` is offered, and ``start (k, d)`` are the
-        indices that a method begins with; ``defines``: whether it only bounds variables that the program's ``settle``
-        puts at what bounds them, so that it is never the worst one;
-        ``scaled(factor)``: the same constraints where all deviations are so many times as large.
+    Parameters
+    ----------
+    name : str
+        Name of the family.
+    index_set : Box
+        Set of all indices, in ``d`` dimensions.
+    rows : callable
+        Maps indices ``(k, d)`` to ``(G (k, r, n), h (k, r))``, the rows and the right-hand sides.
+    scale : callable, optional
+        ``scale(x)``: factor of `TOLERANCE` that a proof allows at a decision, in the numbers of the rows (`allowed`).
+        Without it the factor is 1. The factor matters for a row that is smaller than 1, and for an equality in a finer
+        unit.
+    chosen : callable, optional
+        ``chosen(indices (k, d), rows (k,))``: one row of each index, ``(G (k, n), h (k,))``, where all rows would take
+        longer.
+    worst : callable, optional
+        ``worst(x)``: exact separation, a `Separation`.
+    enclosure : callable, optional
+        ``enclosure(x, lower (k, d), upper (k, d))``: an `Enclosure` of the violation on cells, for proofs.
+    cells : tuple of ndarray, optional
+        ``(lower (c, d), upper (c, d))``: a partition of the index set into cells on which the enclosure converges.
+    gradient : callable, optional
+        ``gradient(x, indices (k, d), rows (k,))``: derivative ``(k, d)`` of ``row x - rhs`` in the index.
+    linear : ndarray of bool, shape (d,), optional
+        Coordinates of the index in which right-hand sides are linear and rows are constant while the other coordinates
+        are fixed. A linear coordinate ranges over the set that it stands for, where that set is no box.
+    steepest : callable, optional
+        ``steepest(x, indices (k, d), rows (k,))``: a `Separation` with one row per index, in the order of ``indices``.
+        The linear coordinates of each index are moved to where its row is violated most. A row of -1 stands for the row
+        that is then violated most.
+    nominal : ConstraintFamily, optional
+        The same constraints without the uncertainty.
+    sample : callable, optional
+        ``sample(count, rng)``: the same constraints for ``count`` sampled uncertainties only.
+    literal : ConstraintFamily, optional
+        The same constraints with an inner maximisation left to the index.
+    reduced : ConstraintFamily, optional
+        Of a literal family, the family in which the inner maximisation is done in closed form.
+    explain : callable, optional
+        ``explain(index (d,), row)``: an `Explanation` of one constraint.
+    hindrance : callable, optional
+        ``hindrance(lower (d,), upper (d,))``: the reason for a wide enclosure of a cell and a remedy, in words.
+    row_units : ndarray, shape (r,), optional
+        Value in the user's units of a violation of 1 of each row, for a family in units of its own (`OwnUnits`).
+    index_units : ndarray, shape (d,), optional
+        Value in the user's units of 1 of each coordinate of an index, likewise.
+    measured : sequence of str, length r, optional
+        Name of the unit of every row, where it is known.
+    along : str, optional
+        Name of the unit of the first coordinate of an index, where it is known.
+    uncertain : callable, optional
+        ``uncertain(index (d,))``: the `UncertainRows` at an index, which must hold for every deviation in the program's
+        `Spread`. Such a family is not linear in the decision: ``rows`` refuses, and ``excess`` is offered.
+    excess : callable, optional
+        ``excess(x, indices (k, d))``: the violations ``(k, r)`` at indices, computed without building rows.
+    start : ndarray, shape (k, d), optional
+        Indices that a method imposes first, for a family with ``uncertain`` rows.
+    defines : bool, default False
+        Whether the family only bounds variables that the program's ``settle`` sets to their bounds. Such a family is
+        never the worst one.
+    scaled : callable, optional
+        ``scaled(factor)``: the same constraints with all deviations multiplied by ``factor``.
+    formulation : Formulation, default "reduced"
+        Meaning of the indices. A cut records it too, so that its index can be understood.
+    source : object, optional
+        Object from which the family was made. The core never reads it, and returns it to whoever made the family.
     """
 
     name: str
@@ -209,14 +308,24 @@ class ConstraintFamily:
 
     @property
     def provable(self) -> bool:
-        """Whether anything could prove that a decision meets all of its constraints; of rows alone nothing can."""
+        """True where a proof over the whole index set is possible: the family, or its reduced form, has ``enclosure``
+        or ``worst``."""
         proven = self.reduced or self
         return proven.enclosure is not None or proven.worst is not None
 
     def formulated(self, formulation: Formulation) -> ConstraintFamily | None:
-        """The same constraints with the indices of another formulation; ``None`` where the family does not have it.
+        """Return the same constraints with the indices of another formulation.
 
-        A family on which the uncertainty does not act is the same in all of them.
+        Parameters
+        ----------
+        formulation : Formulation
+            The other formulation.
+
+        Returns
+        -------
+        ConstraintFamily or None
+            The family; ``None`` where this family lacks that formulation. For a family on which the uncertainty does
+            not act, all formulations have the same constraints.
         """
         if formulation == self.formulation:
             return self
@@ -225,8 +334,24 @@ class ConstraintFamily:
 
     @shaped
     def separated(self, x: Float[Array, " n"]) -> Separation:
-        """What `worst` finds at ``x``; raises `InputError` where that is no separation of this family: violations that
-        are no numbers, indices outside of the index set, a bound below a violation."""
+        """Return the separation by `worst` at the decision ``x``, after a check of its fields.
+
+        Parameters
+        ----------
+        x : ndarray, shape (n,)
+            The decision.
+
+        Returns
+        -------
+        Separation
+            The answer of `worst`.
+
+        Raises
+        ------
+        InputError
+            Where the answer is no separation of this family: wrong shapes, violations that are not numbers, indices
+            outside the index set, or a bound below a violation.
+        """
         assert self.worst is not None
         found, box = self.worst(x), self.index_set
         indices, violations = np.asarray(found.indices, dtype=float), np.asarray(found.violations, dtype=float)
@@ -248,8 +373,25 @@ class ConstraintFamily:
 
     @shaped
     def enclosed(self, x: Float[Array, " n"], lower: Float[Array, "k d"], upper: Float[Array, "k d"]) -> Enclosure:
-        """What `enclosure` says of cells; raises `InputError` where that is not one bound for each. One that is no
-        number says nothing, and is infinite."""
+        """Return the bounds of `enclosure` on cells at the decision ``x``, after a check of their shapes.
+
+        Parameters
+        ----------
+        x : ndarray, shape (n,)
+            The decision.
+        lower, upper : ndarray, shape (k, d)
+            Corners of the cells.
+
+        Returns
+        -------
+        Enclosure
+            The answer of `enclosure`. A bound that is NaN proves nothing, and is replaced by infinity.
+
+        Raises
+        ------
+        InputError
+            Where the answer is not one bound and one coordinate for each cell.
+        """
         assert self.enclosure is not None
         found = self.enclosure(x, lower, upper)
         if np.shape(found.bounds) != (len(lower),) or np.shape(found.split) != (len(lower),):
@@ -259,7 +401,8 @@ class ConstraintFamily:
 
     @cached_property
     def partition(self) -> tuple[Array, Array]:
-        """The `cells`, or the whole index set; raises `InputError` where an index is in none of them."""
+        """Corners ``(lower, upper)`` of the `cells`, or of the whole index set; `InputError` where an index lies in no
+        cell."""
         box = self.index_set
         if self.cells is None:
             return box.lower[None], box.upper[None]
@@ -274,13 +417,26 @@ class ConstraintFamily:
 
     @shaped
     def explanation(self, index: Float[Array, " d"], row: int) -> Explanation:
-        """One constraint for people, by its number and index where the family does not explain itself."""
+        """Return the description of one constraint.
+
+        Parameters
+        ----------
+        index : ndarray, shape (d,)
+            Index of the constraint.
+        row : int
+            Row of the family at that index.
+
+        Returns
+        -------
+        Explanation
+            Description by the family; where the family offers none, the row number and the index.
+        """
         if self.explain is not None:
             return self.explain(index, row)
         return Unexplained(f"row {row} of {self.name} at {np.array2string(index, precision=6)}")
 
     def row_unit(self, row: int) -> float:
-        """What a violation of 1 of a row is in the user's units."""
+        """Return the value in the user's units of a violation of 1 of a row."""
         return 1.0 if self.row_units is None else float(self.row_units[row])
 
     def allowed(self, x: Array) -> float:
@@ -288,23 +444,55 @@ class ConstraintFamily:
         return TOLERANCE if self.scale is None else TOLERANCE * self.scale(x)
 
     def measure(self, row: int | None = None) -> str:
-        """What a violation of a row is measured in, or, without one, that of any of them, such as ``m or m/s``; empty
-        where that is not known."""
+        """Return the name of the unit of a row, or without ``row`` the names of all units, such as ``m or m/s``; empty
+        if unknown."""
         if row is not None:
             return self.measured[row] if row < len(self.measured) else ""
         return " or ".join(dict.fromkeys(self.measured)) if all(self.measured) else ""
 
     @shaped
     def violations(self, x: Float[Array, " n"], indices: Float[Array, "k d"]) -> Float[Array, "k r"]:
-        """``rows(xi) x - rhs(xi)`` at indices ``(k, d)``, as ``(k, r)``; positive where violated."""
+        """Return the violations ``rows(xi) x - rhs(xi)`` at indices.
+
+        Parameters
+        ----------
+        x : ndarray, shape (n,)
+            The decision.
+        indices : ndarray, shape (k, d)
+            Indices of the family.
+
+        Returns
+        -------
+        ndarray, shape (k, r)
+            Violations; positive where a row is violated.
+        """
         if self.excess is not None:
             return self.excess(x, indices)
         G, h = self.rows_at(indices, x.size)
         return np.asarray(G @ x - h, dtype=float)
 
     def rows_at(self, indices: Array, n: int) -> tuple[Array, Array]:
-        """The rows ``(k, r, n)`` and right-hand sides ``(k, r)`` at indices ``(k, d)``; raises `InputError` where what
-        `rows` gives is of another shape."""
+        """Return the rows and right-hand sides at indices, after a check of their shapes.
+
+        Parameters
+        ----------
+        indices : ndarray, shape (k, d)
+            Indices of the family.
+        n : int
+            Number of decision variables.
+
+        Returns
+        -------
+        G : ndarray, shape (k, r, n)
+            Rows.
+        h : ndarray, shape (k, r)
+            Right-hand sides.
+
+        Raises
+        ------
+        InputError
+            Where `rows` returns other shapes.
+        """
         G, h = self.rows(indices)
         if np.ndim(G) != 3 or np.shape(G)[::2] != (len(indices), n) or np.shape(G)[:2] != np.shape(h):
             raise InputError(
@@ -315,12 +503,23 @@ class ConstraintFamily:
 
 
 def uncovered(lower: Array, upper: Array, box: Box) -> Array | None:
-    """A point ``(d,)`` of the box that is in none of the cells between corners ``(k, d)``; ``None`` where there is
-    none, or where all cells are on faces of the box, as those of a cube of directions, whose inner points are multiples
-    of others.
+    """Return a point of the box that lies in none of the cells; ``None`` where the cells cover the box.
 
-    Between the corners of all cells the box is a grid, of which every part is in a cell or outside of it; a grid of
-    more than `PARTS` parts is not made, and then the volumes of the cells are compared with that of the box.
+    The corners of all cells divide the box into a grid, and each part of the grid is inside a cell or outside of it. A
+    grid of more than `PARTS` parts is not made. Then the total volume of the cells is compared with that of the box.
+
+    Parameters
+    ----------
+    lower, upper : ndarray, shape (k, d)
+        Corners of the cells.
+    box : Box
+        Box that the cells should cover.
+
+    Returns
+    -------
+    ndarray, shape (d,), or None
+        A point without a cell. ``None`` also where every cell lies on a face of the box. Such cells belong to a cube of
+        directions, whose inner points are multiples of points on its faces.
     """
     lower, upper = np.asarray(lower, dtype=float), np.asarray(upper, dtype=float)
     if lower.ndim != 2 or lower.shape != upper.shape or lower.shape[1:] != box.lower.shape or not lower.size:
@@ -354,7 +553,7 @@ def uncovered(lower: Array, upper: Array, box: Box) -> Array | None:
 
 
 def _apart(corners: Array) -> Array:
-    """Shares of a side in order, those outside of it moved to its ends, of which none are nearer than `NARROW`."""
+    """Return the sorted shares of a side, clipped to [0, 1], without those within `NARROW` of the one before."""
     edges = np.unique(np.clip(corners, 0.0, 1.0))
     kept: Array = edges[np.append(True, np.diff(edges) > NARROW)]
     return kept
@@ -362,8 +561,17 @@ def _apart(corners: Array) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class EqualityErrors:
-    """Upper bounds ``missed (e,)`` of the errors of equalities at a decision, with all rounding counted, and the errors
-    ``allowed (e,)`` that a claim may excuse. ``advice``: the reason for large bounds, and what would help."""
+    """Proven bounds of the residuals of equalities at a decision, and the residuals that a claim may excuse.
+
+    Parameters
+    ----------
+    missed : ndarray, shape (e,)
+        Upper bounds of the residuals, with all rounding counted.
+    allowed : ndarray, shape (e,)
+        Residuals that a claim may excuse.
+    advice : str, optional
+        Reason for large bounds, and a remedy.
+    """
 
     missed: Array
     allowed: Array
@@ -371,35 +579,81 @@ class EqualityErrors:
 
     @property
     def kept(self) -> bool:
-        """Whether every equality holds up to what is allowed."""
+        """True where every equality holds within its allowed residual."""
         return bool((self.missed <= self.allowed).all())
 
 
 @dataclass(frozen=True, eq=False)
 class SemiInfiniteProgram:
-    """minimise ``sum_k weights_k |(S x)_k| + 1/2 x'P x + q'x + constant`` subject to ``lower <= S x <= upper``,
-    ``G x <= h``, ``A x = b`` and every constraint family at every index. A row with an ``h`` of infinity asks for
-    nothing.
+    """Convex semi-infinite program: a convex cost, finitely many linear constraints, and constraint families.
 
-    ``n`` is the number of decision variables; ``P (n, n)`` is symmetric and positive semidefinite but for rounding
-    (`require_convex`), or refused; ``S (k, n)`` is the identity when ``None``; ``lower``, ``upper`` and
-    ``weights`` are numbers or ``(k,)``. ``lengths``: how much each entry of ``S x`` counts in a weighted regulariser
-    (piece lengths), ``(k,)``. ``activity``: what it counts, always in the user's units, that an entry of ``S x`` is not
-    0, of the first entries or all, where that means something (`working.counting`).
-    ``twin`` makes the same program in its own units (`own_units`); ``cost_unit`` is what a cost of 1 is in the user's
-    units, for a program in its own, and ``image_units (k,)`` what 1 of each entry of ``S x`` is.
-    ``blocks (k,)``: images with the same number of at least 0 count together, with their weight times their Euclidean
-    norm; -1 is one that counts alone. ``largest``: the largest possible cost, where it is known
-    (`largest_cost`).
-    ``spread``: the deviations for all of which the ``uncertain`` rows of its families hold;
-    ``guide``: a program that is easier, whose decision begins with so many of the same entries: where a method may look
-    for this one's optimum;
-    ``among``: a program with the same constraints and another cost, whose decision begins with so many of the same
-    entries: which of the decisions that cost as little is to be returned;
-    ``settle(x)``: a decision that meets the same constraints and costs no more, such as one whose bounds are no looser
-    than they must be;
-    ``errors(x)``: proven bounds of the errors of ``A x = b``, where the entries of ``A`` and ``b`` are rounded
-    (`EqualityErrors`).
+    Minimise ``sum_k weights_k |(S x)_k| + 1/2 x'P x + q'x + constant`` subject to ``lower <= S x <= upper``, ``G x <=
+    h``, ``A x = b`` and every constraint of every family at every index.
+
+    Parameters
+    ----------
+    n : int
+        Number of decision variables, at least 1.
+    families : sequence of ConstraintFamily, default ()
+        Constraint families; their names must differ.
+    q : array_like, shape (n,), optional
+        Linear cost; 0 by default.
+    P : array_like or sparse, shape (n, n), optional
+        Quadratic cost, symmetric and positive semidefinite except for rounding (`require_convex`); 0 by default.
+    weights : array_like, scalar or shape (k,), optional
+        Weights of the absolute values, not negative; 0 by default.
+    S : array_like or sparse, shape (k, n), optional
+        Matrix of the image ``S x``; the identity by default.
+    lower, upper : array_like, scalar or shape (k,), default -inf and inf
+        Bounds of ``S x``.
+    G : array_like, shape (r, n), optional
+        Rows of the inequalities, given together with ``h``.
+    h : array_like, shape (r,), optional
+        Right-hand sides of the inequalities. A row with ``h`` infinite has no effect.
+    A : array_like, shape (e, n), optional
+        Rows of the equalities, given together with ``b``.
+    b : array_like, shape (e,), optional
+        Right-hand sides of the equalities.
+    channels : int, default 1
+        Number of channels into which the rows of ``S`` are divided (`ControlImage`).
+    lengths : ndarray, shape (k,), optional
+        Factor of each entry of ``S x`` in a weighted regulariser, such as the length of a piece.
+    activity : ndarray, optional
+        Price of an entry of ``S x`` that is not 0, in the user's units, for the first entries or for all
+        (`working.counting`). The field is given where a count has a meaning.
+    cost_unit : float, default 1
+        Value in the user's units of a cost of 1, for a program in its own units.
+    image_units : ndarray, shape (k,), optional
+        Value in the user's units of 1 of each entry of ``S x``, likewise.
+    constant : float, default 0
+        Constant term of the cost.
+    blocks : array_like of int, shape (k,), optional
+        Block of each entry of ``S x``. Entries with the same number of at least 0 are one block, which costs its weight
+        times its Euclidean norm. An entry with -1 counts alone.
+    largest : float, optional
+        Largest possible cost, where it is known (`largest_cost`).
+    spread : Spread, optional
+        Set of the deviations for all of which the ``uncertain`` rows of the families must hold.
+    settle : callable, optional
+        ``settle(x)``: a decision that meets the same constraints and costs no more, for example one whose bounds are as
+        tight as possible.
+    errors : callable, optional
+        ``errors(x)``: proven bounds of the residuals of ``A x = b`` (`EqualityErrors`), where entries of ``A`` and
+        ``b`` are rounded.
+    guide : tuple of (SemiInfiniteProgram, int), optional
+        An easier program, and the number of first entries that its decision shares with this one. A method may search
+        for the optimum near that of the easier program.
+    among : tuple of (SemiInfiniteProgram, int), optional
+        A program with the same constraints and another cost, and the number of first entries that the two decisions
+        share. Its cost selects one of several decisions that are equally cheap.
+    twin : callable, optional
+        Makes the same program in its own units (`own_units`).
+
+    Raises
+    ------
+    InputError
+        Where a shape is wrong, a number is not finite where it has to be, a weight is negative, ``lower`` is above
+        ``upper``, ``P`` is not convex, or two families have the same name.
     """
 
     n: int
@@ -489,7 +743,7 @@ class SemiInfiniteProgram:
 
     @property
     def own_units(self) -> OwnUnits | None:
-        """The same program in its own units; ``None`` for one that has none, or that was changed since."""
+        """This program in its own units; ``None`` where it has no twin, or was changed after the twin was attached."""
         own = None if self.twin is None else self.twin()
         if own is None or len(own.of) != len(self._parts):
             return None
@@ -497,13 +751,27 @@ class SemiInfiniteProgram:
 
     @property
     def _parts(self) -> tuple[object, ...]:
-        """Everything that the program is but its twin. Its arrays cannot be written to, its families and sets are
-        frozen records of such, so that the same objects are the same program."""
+        """All fields of the program except its twin.
+
+        Arrays cannot be written to, and families and sets are frozen records. So the same objects mean the same
+        program.
+        """
         own = [getattr(self, each.name) for each in fields(self) if each.name not in ("twin", "finite", "families")]
         return (*own, *self.families)
 
     def mirrored(self, twin: Callable[[SemiInfiniteProgram], OwnUnits]) -> SemiInfiniteProgram:
-        """This program with a twin in its own units, which is made when it is first asked for."""
+        """Return this program with a twin in its own units, which is made at its first use.
+
+        Parameters
+        ----------
+        twin : callable
+            Maps a program to the same program in its own units, an `OwnUnits`.
+
+        Returns
+        -------
+        SemiInfiniteProgram
+            This program with the twin.
+        """
         made: list[OwnUnits] = []
 
         def once() -> OwnUnits:
@@ -515,26 +783,42 @@ class SemiInfiniteProgram:
 
     @property
     def image_size(self) -> int:
-        """Entries of ``S x`` that the regulariser is about: those with a length, or all of them."""
+        """Number of entries of ``S x`` in the regulariser: those with a length, or all of them."""
         return self.finite.weights.size if self.lengths is None else int(np.size(self.lengths))
 
     def family(self, name: str) -> ConstraintFamily:
-        """The family of that name."""
+        """Return the family with a given name."""
         return next(family for family in self.families if family.name == name)
 
     def formulated(self, name: str, formulation: Formulation) -> ConstraintFamily | None:
-        """The family of that name whose indices are those of a formulation (`ConstraintFamily.formulated`)."""
+        """Return a family with the indices of another formulation.
+
+        Parameters
+        ----------
+        name : str
+            Name of the family.
+        formulation : Formulation
+            The other formulation.
+
+        Returns
+        -------
+        ConstraintFamily or None
+            The family; ``None`` where it lacks that formulation.
+        """
         return self.family(name).formulated(formulation)
 
     @cached_property
     def origin(self) -> object:
-        """What the program was made of, where whoever made it has said so; ``None`` once anything of it is replaced."""
+        """Object from which the program was made, where its maker has set one; ``None`` after any replacement."""
         return None
 
     @cached_property
     def largest_cost(self) -> float:
-        """The largest possible cost: that of the bounds. Where an entry that costs something has no bound, a million
-        of the largest coefficient, but at most a million. Nothing that is claimed depends on it."""
+        """Largest possible cost within the bounds, used as a scale only: no claim depends on it.
+
+        An entry with a cost may have no bound. Then the value is a million times the largest coefficient, and at most a
+        million.
+        """
         if self.largest is not None:
             return self.largest
         program = self.finite
@@ -554,22 +838,42 @@ class SemiInfiniteProgram:
 
     @shaped
     def cost(self, x: Float[Array, " n"]) -> float:
-        """``J(x)``, recomputed from the data."""
+        """Return the cost ``J(x)``, computed from the data of the program."""
         return self.finite.objective(x)
 
     @shaped
     def added(self, x: Float[Array, " n"]) -> float:
-        """What is added up to ``J(x)``: its absolute values, linear, quadratic and constant terms, each by its absolute
-        value. More than ``|J(x)|`` where they cancel, as where a state is to follow a reference."""
+        """Return the sum of the sizes of the four terms of ``J(x)``: absolute values, linear, quadratic and constant.
+
+        The sum exceeds ``|J(x)|`` where terms cancel, for example where a state has to follow a reference.
+        """
         return self.finite.added(x)
 
 
 @dataclass(frozen=True, eq=False)
 class OwnUnits:
-    """``program``: a program in its own units, every factor a power of two; ``decision (n,)``, ``image (k,)``,
-    ``equalities (e,)``, ``cost``: what one of each is in the user's. Its families know their own
-    (`ConstraintFamily.row_units`). ``of``: all that the program is that it stands for. ``wider``: where these
-    units are for decisions that are small beside their bounds, makes the program in units for all decisions."""
+    """A program in its own units, with the factors that lead back to the user's units; every factor is a power of two.
+
+    The families of the program hold their own factors (`ConstraintFamily.row_unit`).
+
+    Parameters
+    ----------
+    program : SemiInfiniteProgram
+        The program in its own units.
+    decision : ndarray, shape (n,)
+        Value in the user's units of 1 of each decision variable.
+    image : ndarray, shape (k,)
+        The same factor for each entry of ``S x``.
+    equalities : ndarray, shape (e,)
+        The same factor for each equality.
+    cost : float
+        The same factor for the cost.
+    wider : callable, optional
+        Makes the program in units for all decisions, where these units suit only decisions that are small compared with
+        their bounds.
+    of : tuple
+        All fields of the program that this one represents.
+    """
 
     program: SemiInfiniteProgram
     decision: Array
@@ -581,6 +885,7 @@ class OwnUnits:
 
 
 def _vector(name: str, value: object, size: int) -> Array:
+    """Return a vector of ``size`` finite numbers; raise `InputError` otherwise."""
     vector = as_bound(name, value, size)
     if not np.isfinite(vector).all():
         raise InputError(f"{name}: expected finite numbers, got {vector.tolist()}")
@@ -588,7 +893,8 @@ def _vector(name: str, value: object, size: int) -> Array:
 
 
 def _upper(name: str, value: object, size: int) -> Array:
-    """Right-hand sides of inequalities; infinity asks for nothing."""
+    """Return the right-hand sides of inequalities; an entry of infinity is a row without effect, NaN and -inf are
+    refused."""
     vector = as_bound(name, value, size)
     if (vector == -np.inf).any():
         raise InputError(f"{name}: expected numbers, or inf for a row that asks for nothing, got {vector.tolist()}")

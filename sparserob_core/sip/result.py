@@ -1,4 +1,4 @@
-"""What a method returns: a decision, two bounds that are meant to meet, and what was proven of it."""
+"""Result of a method: a decision, a lower and an upper bound of the optimal value, and the proofs."""
 
 from __future__ import annotations
 
@@ -32,24 +32,37 @@ MEANING: Mapping[Status, str] = {
 }
 
 
-# A cost that is left of numbers that cancel is judged as if it were at least this share of them. With a tenth of it,
-# rounding (1e-16 of them, some hundred times) opens a gap of 1e-7; with ten times as much, seven digits of a cost that
-# is a hundred-thousandth of them are not asked for.
+# Where terms of the cost cancel, the gap is relative to at least this share of their sizes. With a tenth of it,
+# rounding (1e-16 of the terms, some hundred times) opens a gap of 1e-7. With ten times as much, fewer than seven digits
+# are demanded of a cost that is a hundred-thousandth of its terms.
 SMALL_COST = 1e-6
 COLUMNS = ("outer", "epsilon", "value", "bound", "seconds")
 NOTE = "note_"
-POINTS = 500_000  # coordinates of tuples that a run keeps
+POINTS = 500_000  # largest number of coordinates of tuples that a run keeps
 
 
 @dataclass(frozen=True, eq=False)
 class SearchTrace:
-    """Every evaluation of ``g``, in order: the outer iteration ``outer (n,)`` and its ``epsilon (n,)``, the
-    ``value (n,)`` of ``g``, the best lower bound ``bound (n,)`` proven until then of the unregularised semi-infinite
-    program, and ``seconds (n,)`` since the start.
+    """Every evaluation of ``g`` in a run, in order.
 
-    ``points (n, d)``: the tuples, ``(n, 0)`` where all of them would be more than `POINTS` numbers. ``notes``: what the
-    maximiser noted, one column ``(n,)`` for each name, NaN where it noted nothing. ``polished (n,)``: whether it was
-    the local method at the end of the search that evaluated.
+    Parameters
+    ----------
+    outer : ndarray, shape (n,)
+        Outer iteration of each evaluation.
+    epsilon : ndarray, shape (n,)
+        Weight of the regulariser.
+    value : ndarray, shape (n,)
+        Value of ``g``.
+    bound : ndarray, shape (n,)
+        Best lower bound of the unregularised semi-infinite program that was proven until then.
+    seconds : ndarray, shape (n,)
+        Time since the start, in seconds.
+    points : ndarray, shape (n, d)
+        Tuples of indices; ``(n, 0)`` where all of them would be more than `POINTS` numbers.
+    notes : mapping of str to ndarray, shape (n,)
+        Scalars that the maximiser noted, one column for each name; NaN where it noted nothing.
+    polished : ndarray of bool, shape (n,)
+        True where the local method at the end of the search evaluated; all false by default.
     """
 
     outer: Array
@@ -69,7 +82,26 @@ class SearchTrace:
 
     @staticmethod
     def of(outer: int, epsilon: float, trace: Trace, bounds: Array, began: float) -> SearchTrace:
-        """One outer iteration, whose search began ``began`` seconds after the start."""
+        """Return the trace of one outer iteration.
+
+        Parameters
+        ----------
+        outer : int
+            Number of the outer iteration.
+        epsilon : float
+            Weight of the regulariser.
+        trace : Trace
+            Evaluations of the search.
+        bounds : ndarray, shape (n,)
+            Best lower bound proven until each evaluation.
+        began : float
+            Seconds from the start of the run to the start of the search.
+
+        Returns
+        -------
+        SearchTrace
+            The trace of this iteration.
+        """
         count = trace.values.size
         notes = {}
         for name, rows in trace.notes.items():
@@ -91,7 +123,7 @@ class SearchTrace:
 
     @property
     def gains(self) -> Array:
-        """By how much each value ``(n,)`` is above that where the walk of its search stood (`sip.events.gains`)."""
+        """Rise ``(n,)`` of each value above that of the point at which its search stood (`sip.events.gains`)."""
         judged = self.notes.get("accepted", np.zeros(self.value.size))
         found = np.full(self.value.size, np.nan)
         for outer in np.unique(self.outer):
@@ -101,7 +133,8 @@ class SearchTrace:
 
     @staticmethod
     def joined(parts: Sequence[SearchTrace]) -> SearchTrace:
-        """All outer iterations."""
+        """Return one trace of all outer iterations, from the traces of each; points are left out where they are too
+        many."""
         outer, epsilon, value, bound, seconds = (
             np.concatenate([getattr(part, name) for part in parts]) for name in COLUMNS
         )
@@ -116,7 +149,8 @@ class SearchTrace:
         return SearchTrace(outer, epsilon, value, bound, seconds, points, notes, polished)
 
     def arrays(self) -> dict[str, Array]:
-        """``evaluations.npz``: the columns, ``points``, ``polished``, and ``note_...`` for each name that was noted."""
+        """Return the arrays of ``evaluations.npz``: the columns, ``points``, ``polished``, and ``note_...`` for each
+        noted name."""
         notes = {f"{NOTE}{name}": column for name, column in self.notes.items()}
         return {
             **{name: getattr(self, name) for name in COLUMNS},
@@ -127,7 +161,7 @@ class SearchTrace:
 
     @staticmethod
     def stored(arrays: Mapping[str, Array]) -> SearchTrace:
-        """The same from `arrays`; raises `KeyError` for a column that is missing."""
+        """Return the trace that `arrays` stored; raise `KeyError` for a missing column."""
         notes = {name.removeprefix(NOTE): column for name, column in arrays.items() if name.startswith(NOTE)}
         outer, epsilon, value, bound, seconds = (arrays[name] for name in COLUMNS)
         points = arrays.get("points", np.zeros((value.size, 0)))
@@ -137,23 +171,67 @@ class SearchTrace:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Result:
-    """The outcome of a method.
+    """Outcome of a method.
 
-    ``cost`` is ``J`` of ``decision`` (no regulariser), ``value`` is ``J + epsilon rho``; ``lower_bound`` and
-    ``upper_bound`` enclose the value of the *unregularised* semi-infinite program. ``lower_bound`` is proven in any
-    case; ``upper_bound`` is the cost where ``status`` is certified or verified, and infinite where nothing is proven of
-    the decision. ``gap``: see `relative_gap`; ``cost_scale`` is what is added up to the cost
-    (`SemiInfiniteProgram.added`). ``dual``: the multipliers behind ``lower_bound``, or behind infeasibility;
-    ``proofs``: what was shown of every constraint family at the decision. ``trace``: for a method that searches, every
-    value of ``g``; ``scenario_bound``: for the scenario approach, what its theory promises. ``stopped``: the limit or
-    the interrupt that ended the method early, in words. ``ray (n,)``: a direction along which the cost falls for ever,
-    where one was found. ``missed``: the most by which the decision misses an equality, relative to the numbers that are
-    added up in it, where there are any; computed, not proven, and at most `EQUALITY` where something is claimed.
-    ``errors``: what is proven of that, where the program offers it and something is claimed.
-    ``activity``: between what the least count of the
-    program lies, where it has one. ``sparsest``: there where the cost is that count, not J.
-    ``solved_by``: whose answers to relaxed programs were believed, and how many (`RelaxedProgram.solved_by`).
-    ``unanswered``: which programs the solver that was named did not answer, and why.
+    Parameters
+    ----------
+    status : Status
+        Claim of the method: one of the keys of `MEANING`.
+    message : str
+        The reason for the status, for a reader.
+    decision : ndarray, shape (n,), optional
+        The decision that is returned; ``None`` where there is none.
+    cost : float, default nan
+        ``J`` at the decision, without the regulariser.
+    value : float, default nan
+        ``J + epsilon rho`` at the decision.
+    epsilon : float, default 0
+        Last weight of the regulariser.
+    lower_bound : float, default -inf
+        Lower bound of the value of the *unregularised* semi-infinite program, always proven.
+    upper_bound : float, default inf
+        Upper bound of that value. The bound is the cost where the status is certified or verified, and infinite where
+        nothing is proven of the decision.
+    worst : WorstConstraint, optional
+        The most violated constraint at the decision.
+    indices : sequence of Cut
+        Imposed constraints of the last relaxed program, with their multipliers.
+    counts : mapping of str to int
+        Numbers of programs, rounds and the like.
+    solved_by : mapping of str to int
+        Solvers whose answers to relaxed programs were accepted, with the number of programs
+        (`RelaxedProgram.solved_by`).
+    unanswered : sequence of Unanswered
+        Programs that the named solver did not answer, and the reasons.
+    history : sequence of RoundFinished
+        One record for each round.
+    trace : SearchTrace, optional
+        Every value of ``g``, for a method that searches.
+    dual : Dual
+        Multipliers that prove ``lower_bound``, or that nothing is feasible.
+    proofs : sequence of Proof
+        Proof of each constraint family at the decision.
+    scenario_bound : ScenarioBound, optional
+        Guarantee of the scenario theory, for the scenario approach.
+    infeasible : InfeasibleSubsystem, optional
+        Reasons for infeasibility.
+    seconds : float
+        Duration, in seconds.
+    cost_scale : float
+        Sum of the sizes of the terms of the cost (`SemiInfiniteProgram.added`).
+    stopped : str
+        The limit or the interrupt that ended the method early, in words; empty otherwise.
+    ray : ndarray, shape (n,), optional
+        Direction along which the cost falls without bound, where one was found.
+    missed : float, optional
+        Largest residual of an equality at the decision, relative to the numbers that are added up in it. The residual
+        is computed and not proven; it is at most `EQUALITY` where something is claimed. ``None`` without equalities.
+    errors : EqualityErrors, optional
+        Proven bounds of these residuals, where the program offers them and something is claimed.
+    activity : Activity, optional
+        Bounds of the least count of the program, where it has a count.
+    sparsest : Sparsest, optional
+        Record of a method whose cost is that count, not ``J``.
     """
 
     status: Status
@@ -185,16 +263,18 @@ class Result:
     sparsest: Sparsest | None = None
 
     def accounted(self, solver: Solver) -> Result:
-        """The same with the account of a solver that was `Named`: what it did not answer, and its calls, those of
-        programs beside the relaxed ones included."""
+        """Return this result with the account of a `Named` solver: its failures, and the number of all its calls.
+
+        The calls include those for programs other than the relaxed ones. The result of any other solver is returned
+        unchanged.
+        """
         if not isinstance(solver, Named):
             return self
         counts = {**self.counts, "solver_calls": solver.failures.calls}
         return replace(self, unanswered=tuple(solver.failures), counts=counts)
 
     def charged(self, others: Iterable[Result]) -> Result:
-        """The same with the programs of ``others``, which were solved on the way, on its account: how many they were,
-        and whose answers."""
+        """Return this result with the relaxed programs of ``others``, solved on the way, added to its counts."""
         solved_by, programs = Counter(self.solved_by), self.counts.get("relaxed_programs", 0)
         for other in others:
             solved_by.update(other.solved_by)
@@ -213,19 +293,31 @@ class Result:
 
     @property
     def _unit(self) -> str:
-        """The unit of the cost after a blank, where it is known."""
+        """Unit of the cost after a blank, where it is known."""
         return ""
 
     @property
     def gap(self) -> float:
-        """The relative gap of the two bounds."""
+        """Relative gap of the two bounds."""
         return relative_gap(self.lower_bound, self.upper_bound, self.cost_scale)
 
 
 def relative_gap(lower: float, upper: float, added: float = 0.0) -> float:
-    """``(upper - lower) / max(|upper|, |lower|)``: 0 when both are equal, infinite when either bound is. Bounds that
-    cross by no more than the proofs allow leave no gap. ``added``: the sum of the absolute numbers that were added up
-    to the cost, `SMALL_COST` of which the gap is relative to at least."""
+    """Return the gap ``(upper - lower) / max(|upper|, |lower|, SMALL_COST * added)`` of two bounds.
+
+    Parameters
+    ----------
+    lower, upper : float
+        Bounds of the optimal value.
+    added : float, default 0
+        Sum of the absolute numbers that were added up to the cost. The gap is relative to at least `SMALL_COST` of it.
+
+    Returns
+    -------
+    float
+        The gap; 0 where the bounds are equal or cross, which they do by no more than the proofs allow; infinite where a
+        bound is infinite.
+    """
     if not (np.isfinite(lower) and np.isfinite(upper)):
         return float("inf")
     return 0.0 if upper <= lower else float((upper - lower) / max(abs(lower), abs(upper), SMALL_COST * added))

@@ -1,6 +1,6 @@
-"""The four pieces of the paper's algorithm that a user may replace: ``Regu``, ``SC1``, ``SC2`` and ``SlCr``.
+"""The four rules of the paper's algorithm that a user may replace: ``Regu``, ``SC1``, ``SC2`` and ``SlCr``.
 
-Each is an object that is called; a plain function with the same arguments serves as well, and under a name too:
+Each rule is an object that is called. A plain function with the same arguments serves as well, also under a name:
 ``RulePlugin(name="mine", factory=Selection.of(function))``.
 """
 
@@ -22,8 +22,23 @@ from sparserob_core.sip.convex_set import Array
 
 @dataclass(frozen=True, eq=False)
 class OuterStep:
-    """What one outer iteration ``j`` ended with: ``epsilon``, the best ``value`` of ``g``, the ``cost`` J of its
-    optimiser ``decision (n,)``, and the lower bound of the semi-infinite program that its multipliers prove."""
+    """Outcome of one outer iteration.
+
+    Parameters
+    ----------
+    j : int
+        Number of the iteration.
+    epsilon : float
+        Weight of the regulariser.
+    value : float
+        Largest value of ``g`` that was found.
+    cost : float
+        Cost J of the optimiser.
+    lower_bound : float
+        Lower bound of the semi-infinite program, proven by the multipliers of the optimiser.
+    decision : ndarray, shape (n,)
+        The optimiser.
+    """
 
     j: int
     epsilon: float
@@ -35,9 +50,19 @@ class OuterStep:
 
 @dataclass(frozen=True, eq=False)
 class Progress:
-    """How a search stands: ``evaluations`` so far, ``best_value``, the last scalars that the maximiser noted
-    (``temperature``, ...), and ``improvements``, the pairs (evaluations so far, best value) at which the best value
-    rose."""
+    """State of a search.
+
+    Parameters
+    ----------
+    evaluations : int
+        Number of evaluations so far.
+    best_value : float
+        Largest value so far.
+    notes : mapping of str to float
+        Last scalars that the maximiser noted (``temperature``, ...).
+    improvements : sequence of (int, float)
+        Pairs (evaluations so far, best value) at which the best value rose.
+    """
 
     evaluations: int
     best_value: float
@@ -45,60 +70,88 @@ class Progress:
     improvements: Sequence[tuple[int, float]]
 
     def gain(self, window: int) -> float:
-        """By how much the best value rose within the last ``window`` evaluations; ``inf`` where there were not so
-        many."""
+        """Return the rise of the best value within the last ``window`` evaluations; ``inf`` where there were fewer."""
         earlier = bisect_right(self.improvements, (self.evaluations - window, np.inf)) - 1
         return np.inf if earlier < 0 or window >= self.evaluations else self.best_value - self.improvements[earlier][1]
 
 
 class Rule:
-    """One of the four pieces of the paper's loop, an object that is called: a `Schedule`, an `OuterStop`, an
-    `InnerStop` or a `Selection`."""
+    """A rule of the paper's algorithm, an object that is called.
+
+    Every rule is a `Schedule`, an `OuterStop`, an `InnerStop` or a `Selection`.
+    """
 
     @classmethod
     def of(cls, function: Callable[..., object]) -> type[Self]:
-        """A class of rules of this kind, without options, that answer with a plain function."""
+        """Return a class of rules of this kind, without options, whose answers are those of a plain function."""
         own = {"__call__": staticmethod(function), "__reduce__": lambda rule: (_rule, (cls, function))}
         named = {"__doc__": function.__doc__, "__module__": function.__module__}
         return type(function.__name__, (cls,), {**own, **named})
 
 
 def _rule(kind: type[Rule], function: Callable[..., object]) -> Rule:
-    """A rule that was pickled."""
+    """Return a rule made from a function, for unpickling."""
     return kind.of(function)()
 
 
 class Schedule(Rule, ABC):
-    """``Regu``: the weight of the regulariser in the next outer iteration."""
+    """``Regu``: the rule for the weight of the regulariser in the next outer iteration."""
 
     @abstractmethod
     def __call__(self, epsilon: float, j: int) -> float:
-        """The weight in iteration ``j = 1, 2, ...`` where iteration ``j - 1`` had ``epsilon``; smaller, and
-        positive."""
+        """Return the weight of iteration ``j``; positive, and smaller than ``epsilon``.
+
+        Parameters
+        ----------
+        epsilon : float
+            Weight of iteration ``j - 1``.
+        j : int
+            Number of the iteration, from 1.
+
+        Returns
+        -------
+        float
+            The weight.
+        """
 
 
 class OuterStop(Rule, ABC):
-    """``SC1``: when the optimisers of successive outer iterations are near enough to one another."""
+    """``SC1``: the rule that stops the outer iterations, once successive optimisers are near enough to one another."""
 
     @abstractmethod
     def __call__(self, steps: Sequence[OuterStep]) -> bool:
-        """Whether to stop after these outer iterations, of which there is at least one."""
+        """Return whether to stop after these outer iterations, of which there is at least one."""
 
 
 class InnerStop(Rule, ABC):
-    """``SC2``: when one global maximisation has gone on for long enough; its budget bounds it in any case."""
+    """``SC2``: the rule that stops one global maximisation; the budget bounds it in any case."""
 
     @abstractmethod
     def __call__(self, progress: Progress) -> bool:
-        """Whether to stop the search; asked after every batch of evaluations."""
+        """Return whether to stop the search; called after every batch of evaluations."""
 
 
 class Selection(Rule, ABC):
-    """``SlCr``: whether a walk goes on from a candidate."""
+    """``SlCr``: the rule by which a search moves to a candidate point."""
 
     @abstractmethod
     def __call__(self, current: float, candidate: float, temperature: float, rng: np.random.Generator) -> bool:
-        """Whether the candidate's value replaces the current one, at a temperature that is not negative."""
+        """Return whether the candidate replaces the current point.
+
+        Parameters
+        ----------
+        current, candidate : float
+            Values of ``g`` at the two points.
+        temperature : float
+            Temperature, not negative.
+        rng : numpy.random.Generator
+            Random numbers.
+
+        Returns
+        -------
+        bool
+            True where the candidate becomes the current point.
+        """
 
 
 @final
@@ -106,7 +159,7 @@ class Geometric(Schedule, Options):
     """``factor`` times the weight before: the paper's ``2^-j`` times the first, for the factor 1/2."""
 
     factor: float = Field(default=0.5, gt=0.0, lt=1.0)
-    """What the weight is multiplied by."""
+    """Ratio of each weight to the one before."""
 
     def __call__(self, epsilon: float, j: int) -> float:
         return self.factor * epsilon
@@ -117,7 +170,7 @@ class Accelerating(Schedule, Options):
     """``factor^j`` times the weight before: the paper's ``Regu(epsilon, j) = 2^-j epsilon`` applied again and again."""
 
     factor: float = Field(default=0.5, gt=0.0, lt=1.0)
-    """What the weight is multiplied by."""
+    """Ratio of the weights in iteration 1; in iteration j the ratio is the j-th power of it."""
 
     def __call__(self, epsilon: float, j: int) -> float:
         return self.factor**j * epsilon
@@ -125,11 +178,10 @@ class Accelerating(Schedule, Options):
 
 @final
 class OptimisersSettle(OuterStop, Options):
-    """The norm of the difference of successive optimisers is at most ``tolerance``, relative to the norm of the last
-    one or 1."""
+    """A distance of successive optimisers of at most ``tolerance``, relative to the norm of the last one or 1."""
 
     tolerance: float = Field(default=1e-3, ge=0.0)
-    """Norm of the difference of successive optimisers, relative to the last one's norm or 1."""
+    """Distance of successive optimisers, relative to the norm of the last one or 1."""
 
     def __call__(self, steps: Sequence[OuterStep]) -> bool:
         if len(steps) < 2:
@@ -140,10 +192,10 @@ class OptimisersSettle(OuterStop, Options):
 
 @final
 class CostsSettle(OuterStop, Options):
-    """The cost ``J`` of successive optimisers changes by at most ``tolerance``, relative to it or 1."""
+    """A change of the cost ``J`` of successive optimisers of at most ``tolerance``, relative to the last cost or 1."""
 
     tolerance: float = Field(default=1e-6, ge=0.0)
-    """Difference of successive costs, relative to the last one or 1."""
+    """Difference of successive costs, relative to the last cost or 1."""
 
     def __call__(self, steps: Sequence[OuterStep]) -> bool:
         return len(steps) >= 2 and abs(steps[-1].cost - steps[-2].cost) <= self.tolerance * max(
@@ -153,10 +205,10 @@ class CostsSettle(OuterStop, Options):
 
 @final
 class Iterations(OuterStop, Options):
-    """After ``count`` outer iterations."""
+    """A fixed number ``count`` of outer iterations."""
 
     count: int = Field(default=10, ge=1)
-    """Outer iterations."""
+    """Number of outer iterations."""
 
     def __call__(self, steps: Sequence[OuterStep]) -> bool:
         return len(steps) >= self.count
@@ -164,10 +216,10 @@ class Iterations(OuterStop, Options):
 
 @final
 class Evaluations(InnerStop, Options):
-    """After ``count`` evaluations; ``None``: when the budget is spent."""
+    """A fixed number ``count`` of evaluations; ``None``: the whole budget."""
 
     count: int | None = Field(default=None, ge=1)
-    """Evaluations of one search; null: its budget."""
+    """Number of evaluations of one search; null: its budget."""
 
     def __call__(self, progress: Progress) -> bool:
         return self.count is not None and progress.evaluations >= self.count
@@ -175,8 +227,8 @@ class Evaluations(InnerStop, Options):
 
 @final
 class TemperatureFloor(InnerStop, Options):
-    """When the temperature that an annealing maximiser notes is at most ``floor``; other maximisers note none, and are
-    not stopped."""
+    """A temperature of at most ``floor``, as noted by an annealing maximiser; other maximisers note none, and are not
+    stopped."""
 
     floor: float = Field(default=1e-6, ge=0.0)
     """Temperature at which an annealing maximiser stops."""
@@ -187,13 +239,13 @@ class TemperatureFloor(InnerStop, Options):
 
 @final
 class Stalled(InnerStop, Options):
-    """When the best value rose by no more than ``tolerance`` within the last ``window`` evaluations."""
+    """A rise of the best value of no more than ``tolerance`` within the last ``window`` evaluations."""
 
     window: int = Field(default=200, ge=1)
-    """Evaluations that are looked back upon."""
+    """Number of last evaluations in which the best value has to rise."""
 
     tolerance: float = Field(default=1e-9, ge=0.0)
-    """Rise of the best value within the window that is no rise."""
+    """Rise of the best value within the window that counts as none."""
 
     def __call__(self, progress: Progress) -> bool:
         return progress.gain(self.window) <= self.tolerance
@@ -201,8 +253,8 @@ class Stalled(InnerStop, Options):
 
 @final
 class Metropolis(Selection, Options):
-    """Accept what is not worse, and what is worse by ``delta`` with probability ``exp(-delta / temperature)``
-    (Metropolis et al. 1953)."""
+    """Acceptance of a candidate that is not worse, and of one worse by ``delta`` with probability ``exp(-delta /
+    temperature)`` (Metropolis et al. 1953)."""
 
     def __call__(self, current: float, candidate: float, temperature: float, rng: np.random.Generator) -> bool:
         if candidate >= current:
@@ -212,7 +264,8 @@ class Metropolis(Selection, Options):
 
 @final
 class Threshold(Selection, Options):
-    """Accept what is worse by no more than the temperature (threshold accepting: Dueck and Scheuer 1990)."""
+    """Acceptance of a candidate that is worse by no more than the temperature (threshold accepting: Dueck and Scheuer
+    1990)."""
 
     def __call__(self, current: float, candidate: float, temperature: float, rng: np.random.Generator) -> bool:
         return candidate >= current - temperature
@@ -220,7 +273,7 @@ class Threshold(Selection, Options):
 
 @final
 class Improvement(Selection, Options):
-    """Accept only what is not worse."""
+    """Acceptance of a candidate that is not worse."""
 
     def __call__(self, current: float, candidate: float, temperature: float, rng: np.random.Generator) -> bool:
         return candidate >= current

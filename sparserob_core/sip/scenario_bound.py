@@ -1,4 +1,4 @@
-"""What the scenario theory says of a decision that was made for random scenarios: a probability, never a worst case."""
+"""Scenario theory for a decision made for random scenarios: bounds of a probability, never of a worst case."""
 
 from __future__ import annotations
 
@@ -17,13 +17,26 @@ SURE = 1e-6  # the probability beta of drawing scenarios for which a bound fails
 @final
 @dataclass(frozen=True)
 class ScenarioBound:
-    """With confidence ``1 - beta`` over the draw of ``scenarios``, one more uncertainty drawn by the same law breaks a
-    constraint with probability at most ``before`` (Campi and Garatti 2008: from the number ``variables`` of decision
-    variables alone) and at most ``after`` (Campi and Garatti 2018: from the number ``support`` of imposed constraints
-    that carry a multiplier, which the support constraints are among).
+    """Bounds of the probability that a new uncertainty breaks a constraint, with confidence ``1 - beta`` over the
+    scenarios.
 
-    Both are for convex programs whose optimiser is unique, ``after`` also supposes non-degeneracy; 1 means that nothing
-    is said.
+    The new uncertainty is drawn by the same law as the scenarios. Both bounds hold for convex programs with a unique
+    optimiser; ``after`` also supposes non-degeneracy. A bound of 1 states nothing.
+
+    Parameters
+    ----------
+    scenarios : int
+        Number of scenarios.
+    variables : int
+        Number of decision variables.
+    support : int
+        Number of imposed constraints with a multiplier; the support constraints are among them.
+    beta : float
+        Probability that a bound fails.
+    before : float
+        Bound from ``variables`` alone (Campi and Garatti 2008).
+    after : float
+        Bound from ``support`` (Campi and Garatti 2018).
     """
 
     scenarios: int
@@ -35,7 +48,7 @@ class ScenarioBound:
 
     @property
     def sentence(self) -> str:
-        """The bound in words, and what it is about."""
+        """The bounds in words, with their meaning."""
         known = f"{at_most(self.before)} from the {self.variables} decision variables alone"
         if self.before == 1.0:
             known = f"nothing from the {self.variables} decision variables alone, for which these are too few scenarios"
@@ -47,14 +60,35 @@ class ScenarioBound:
 
 
 def at_most(bound: float) -> str:
-    """An upper bound in ``(0, infinity)`` to two digits, rounded up."""
+    """Return an upper bound in ``(0, infinity)`` as a text of two digits, rounded up."""
     digits = 1 - int(np.floor(np.log10(bound)))
     return f"{np.ceil(round(bound * 10.0**digits, 9)) / 10.0**digits:.2g}"
 
 
 def scenario_bound(scenarios: int, variables: int, support: int, beta: float = SURE) -> ScenarioBound:
-    """The bounds before and after a scenario program was solved; raises `InputError` for counts and probabilities that
-    make no sense."""
+    """Return the bounds of a scenario program, from before and after its solution.
+
+    Parameters
+    ----------
+    scenarios : int
+        Number of scenarios, at least 1.
+    variables : int
+        Number of decision variables, at least 1.
+    support : int
+        Number of imposed constraints with a multiplier, at least 0.
+    beta : float, default SURE
+        Probability that a bound fails, between 0 and 1.
+
+    Returns
+    -------
+    ScenarioBound
+        Both bounds.
+
+    Raises
+    ------
+    InputError
+        Where a count or the probability is out of its range.
+    """
     return ScenarioBound(
         scenarios,
         variables,
@@ -66,11 +100,14 @@ def scenario_bound(scenarios: int, variables: int, support: int, beta: float = S
 
 
 def bound_before(scenarios: int, variables: int, beta: float = SURE) -> float:
-    """The ``epsilon`` with ``sum_{i < n} C(S, i) epsilon^i (1 - epsilon)^(S - i) = beta``; 1 when ``S < n``.
+    """Return the ``epsilon`` with ``sum_{i < n} C(S, i) epsilon^i (1 - epsilon)^(S - i) = beta``; 1 when ``S < n``.
 
-    Campi and Garatti (2008), SIAM J. Optim. 19, 1211-1230, Theorem 1; ``S`` scenarios,
-    ``n`` decision variables. The sum is a binomial tail, so ``epsilon`` is a quantile of the beta distribution with
-    ``n`` and ``S - n + 1``.
+    ``S`` is the number of scenarios, ``n`` that of decision variables. The sum is a binomial tail, so ``epsilon`` is a
+    quantile of the beta distribution with parameters ``n`` and ``S - n + 1``.
+
+    References
+    ----------
+    Campi and Garatti (2008), SIAM J. Optim. 19, 1211-1230, Theorem 1.
     """
     from scipy.special import betaincinv
 
@@ -81,12 +118,16 @@ def bound_before(scenarios: int, variables: int, beta: float = SURE) -> float:
 
 
 def bound_after(scenarios: int, support: int, beta: float = SURE) -> float:
-    """The ``epsilon = 1 - t`` with ``beta / (S + 1) sum_{m=k}^S C(m, k) t^(m-k) = C(S, k) t^(S-k)``; 1 when ``k >= S``.
+    """Return ``epsilon = 1 - t`` with ``beta / (S + 1) sum_{m=k}^S C(m, k) t^(m-k) = C(S, k) t^(S-k)``; 1 when ``k >=
+    S``.
 
-    Campi and Garatti (2018), "Wait-and-judge", Math. Program. 167, 155-189, Theorem 1; ``S`` scenarios, ``k`` support
-    constraints. The finite sum is ``epsilon^(-k-1) P(X > k)`` with ``X`` binomial of ``S + 1`` trials and probability
-    ``epsilon``, which makes the equation ``beta P(X > k) = (k + 1) P(X = k + 1)``; the ratio of the two sides is
-    monotone in ``epsilon``. It grows with ``k``.
+    ``S`` is the number of scenarios, ``k`` that of support constraints. The finite sum is ``epsilon^(-k-1) P(X > k)``
+    with ``X`` binomial of ``S + 1`` trials and probability ``epsilon``. So the equation reads ``beta P(X > k) = (k + 1)
+    P(X = k + 1)``. The ratio of the two sides is monotone in ``epsilon``. The bound grows with ``k``.
+
+    References
+    ----------
+    Campi and Garatti (2018), "Wait-and-judge", Math. Program. 167, 155-189, Theorem 1.
     """
     from scipy.optimize import brentq
 
@@ -99,13 +140,13 @@ def bound_after(scenarios: int, support: int, beta: float = SURE) -> float:
 
 
 def _log_ratio(scenarios: int, support: int, level: float, epsilon: float) -> float:
-    """``log((k + 1) P(X = k + 1) / P(X > k)) - log(beta)``: decreasing in ``epsilon``."""
+    """Return ``log((k + 1) P(X = k + 1) / P(X > k)) - log(beta)``, which decreases in ``epsilon``."""
     m = np.arange(support + 1, scenarios + 2)
     return float(-np.logaddexp.reduce(_log_terms(scenarios, support, epsilon, m)) + np.log(support + 1) - level)
 
 
 def _log_terms(scenarios: int, support: int, epsilon: float, m: np.ndarray) -> np.ndarray:
-    """``log(P(X = m) / P(X = k + 1))``."""
+    """Return ``log(P(X = m) / P(X = k + 1))``."""
     from scipy.special import gammaln
 
     def log_choose(j: np.ndarray | int) -> np.ndarray:

@@ -1,5 +1,8 @@
-"""What an inner convex solver is asked, and what it claims; nothing of it is believed before `check`. Who answers the
-finite programs of a run: whoever is quickest (`Auto`), or the solver that was named (`Named`)."""
+"""Inner convex solvers: quadratic programs, the answers that a solver claims, and the choice of the solver.
+
+No answer is used before it was checked. The finite programs of a run are answered by the quickest method (`Auto`), or
+by the solver that the user named (`Named`).
+"""
 
 from __future__ import annotations
 
@@ -24,14 +27,14 @@ if TYPE_CHECKING:
     from scipy.sparse import csc_array
 
 
-# Of the numbers that are added up in a residual: 64 units of rounding (Higham 2002, section 3.1). Ten times less, and
-# an optimum to the last bit of numbers of a million is none; ten times more, and a digit that there is is given away.
+# Rounding allowed in a residual, relative to the numbers added up in it: 64 units (Higham 2002, section 3.1). With a
+# tenth of it, an optimum to the last bit of numbers of a million is refused; with ten times as much, a digit is wasted.
 ROUNDING = 2.0**-46
 logger = logging.getLogger("sparserob")
 AUTO = "auto"  # the name of `Auto`
-# Multiplications in a factorisation, about, from which a program is solved in a process of its own where time is
-# limited: a tenth of a second for all iterations. Ten times as many take as long as a limit may be missed by on a busy
-# machine; for a tenth the process itself, some milliseconds, would be noticed.
+# Approximate number of multiplications in a factorisation from which a program is solved in a process of its own where
+# time is limited: a tenth of a second for all iterations. Ten times as many take as long as a limit may be exceeded on
+# a busy machine. With a tenth, the start of the process, some milliseconds, would be noticed.
 LONG = 1e7
 SHORTCUTS = frozenset({CLOSED_FORM, DUAL_NEWTON, HIGHS})
 NUMBERS = re.compile(r"[-+]?\d[\d.]*(?:[eE][-+]?\d+)?")
@@ -39,13 +42,34 @@ NUMBERS = re.compile(r"[-+]?\d[\d.]*(?:[eE][-+]?\d+)?")
 
 @dataclass(frozen=True, eq=False)
 class QuadraticProgram:
-    """minimise ``1/2 x'P x + q'x`` subject to ``G x <= h``, ``A x = b``, ``lower <= x <= upper``, and to ``cones``
-    where there are any, which is for solvers alone that say that they are ``conic``.
+    """A convex quadratic program, possibly with second-order cones.
 
-    ``n`` variables, ``r`` rows, ``e`` equalities; ``r`` and ``e`` may be 0, the arrays are then empty and none is
-    missing. ``P`` is the whole symmetric matrix, not one triangle of it, positive semidefinite, and often 0. ``h`` and
-    ``b`` are finite; bounds may be infinite, and equal. Matrices are of scipy's sparse class ``csc_array``; some
-    solvers want ``csc_matrix`` or ``toarray()``. Nothing of it is to be changed.
+    Minimise ``1/2 x'P x + q'x`` subject to ``G x <= h``, ``A x = b``, ``lower <= x <= upper`` and the ``cones``. Only
+    solvers that declare ``conic`` receive programs with cones. There are ``n`` variables, ``r`` rows and ``e``
+    equalities; ``r`` and ``e`` may be 0, and the arrays are then empty, never missing. No array may be changed.
+
+    Parameters
+    ----------
+    P : csc_array, shape (n, n)
+        The whole symmetric matrix, not one triangle of it; positive semidefinite, and often 0.
+    q : ndarray, shape (n,)
+        Linear cost.
+    G : csc_array, shape (r, n)
+        Rows of the inequalities.
+    h : ndarray, shape (r,)
+        Right-hand sides of the inequalities, finite.
+    A : csc_array, shape (e, n)
+        Rows of the equalities.
+    b : ndarray, shape (e,)
+        Right-hand sides of the equalities, finite.
+    lower, upper : ndarray, shape (n,)
+        Bounds, infinite where there is none; they may be equal.
+    cones : tuple of ndarray of int, default ()
+        Variables of each second-order cone.
+
+    Notes
+    -----
+    Matrices are of scipy's sparse class ``csc_array``. Some solvers need ``csc_matrix`` or ``toarray()``.
     """
 
     P: csc_array
@@ -65,19 +89,33 @@ class QuadraticProgram:
     upper: Array
     """``(n,)``, ``inf`` where there is no bound."""
     cones: tuple[np.ndarray, ...] = ()
-    """The variables of each second-order cone: the first is at least the Euclidean norm of the others. No variable is
-    in two of them."""
+    """Variables of each second-order cone: the first is at least the Euclidean norm of the others. The cones share no
+    variable."""
 
     @property
     def work(self) -> float:
-        """About how many multiplications a factorisation takes: every entry of the rows meets those of its column, or
-        of its row where these are fewer; and a hundredth of those of a solver that makes everything dense."""
+        """Approximate number of multiplications of one factorisation.
+
+        Every entry of the rows is multiplied with the entries of its column, or of its row where these are fewer. A
+        hundredth of the work of a dense factorisation is added.
+        """
         n, r = self.q.size, self.h.size + self.b.size
         return float((self.G.nnz + self.A.nnz) * (1 + min(n, r)) + 0.01 * (n + r) ** 3)
 
     def slope_missed(self, slope: Array) -> Array:
-        """By how much the slope ``(n,)`` of the Lagrangian of all that is no cone misses what it may be, ``(n,)``: 0,
-        and in a cone's variables a point of that cone."""
+        """Return the stationarity residual ``(n,)`` of a gradient of the Lagrangian.
+
+        Parameters
+        ----------
+        slope : ndarray, shape (n,)
+            Gradient of the Lagrangian without the terms of the cones.
+
+        Returns
+        -------
+        ndarray, shape (n,)
+            The absolute value of each entry. For the variables of a cone, the residual is in the first entry: the
+            amount by which the gradient is outside of the cone.
+        """
         missed = np.abs(slope)
         for cone in self.cones:
             missed[cone] = 0.0
@@ -87,19 +125,36 @@ class QuadraticProgram:
 
 @dataclass(frozen=True, eq=False)
 class Claim:
-    """What a solver says: ``x (n,)``, and multipliers with ``P x + q + G'z + A'y + z_box = 0``; in the variables of a
-    cone that sum is the multiplier of the cone, and is in the cone.
+    """Answer of a solver, not yet checked: a point, multipliers and a status.
 
-    ``z (r,)`` of the rows is at least 0, and 0 where a row is not active. ``y (e,)`` of the equalities has any sign.
-    ``z_box (n,)`` of the bounds is at most 0 at a lower and at least 0 at an upper bound, and 0 between them. Solvers
-    that maximise, or that write ``G x >= h``, have some of these signs reversed.
+    The multipliers satisfy ``P x + q + G'z + A'y + z_box = 0``. In the variables of a cone this sum is the multiplier
+    of the cone, and lies in the cone. Solvers that maximise, or that write ``G x >= h``, have some of these signs
+    reversed.
 
-    ``status`` is ``solved``, ``infeasible`` (then ``z, y`` may carry the Farkas ray: ``z >= 0``, and ``G'z + A'y``
-    together with the bounds proves that no ``x`` exists), or ``failed`` for everything else, an unbounded program too.
-    Arrays of a claim that is not ``solved`` may hold NaN; ``message`` is for a reader.
+    Parameters
+    ----------
+    status : {"solved", "infeasible", "failed"}
+        ``infeasible``: ``z`` and ``y`` may hold the Farkas ray. Then ``z >= 0``, and ``G'z + A'y`` together with the
+        bounds proves that no ``x`` exists. ``failed``: everything else, an unbounded program too.
+    x : ndarray, shape (n,)
+        The point.
+    z : ndarray, shape (r,)
+        Multipliers of the rows: at least 0, and 0 where a row is not active.
+    y : ndarray, shape (e,)
+        Multipliers of the equalities, of any sign.
+    z_box : ndarray, shape (n,)
+        Multipliers of the bounds: at most 0 at a lower bound, at least 0 at an upper bound, and 0 between them.
+    message : str
+        Text for a reader.
 
-    An example: minimise ``x1^2/2 + x2^2/2 - 5 x1 + x2`` subject to ``x1 + x2 <= 1``, ``x1 - x2 = 1``,
-    ``0 <= x <= 2``. The optimum is ``x = (1, 0)``, where ``P x + q = (-4, 1)``; ``z = 1.5`` and ``y = 2.5`` balance it:
+    Notes
+    -----
+    Arrays of a claim that is not ``solved`` may hold NaN.
+
+    Examples
+    --------
+    Minimise ``x1^2/2 + x2^2/2 - 5 x1 + x2`` subject to ``x1 + x2 <= 1``, ``x1 - x2 = 1``, ``0 <= x <= 2``. The optimum
+    is ``x = (1, 0)``, where ``P x + q = (-4, 1)``. The multipliers ``z = 1.5`` and ``y = 2.5`` balance it:
 
     >>> import numpy as np
     >>> P, q = np.eye(2), np.array([-5.0, 1.0])
@@ -110,7 +165,7 @@ class Claim:
 
     Without the row: ``x = (2, 1)``, ``y = 2``, ``z_box = (1, 0)``. Without the equality: ``x = (1, 0)``, ``z = 4``,
     ``z_box = (0, -5)``. With the bounds alone: ``x = (2, 0)``, ``z_box = (3, -1)``, positive at the upper bound of
-    ``x1`` and negative at the lower one of ``x2``.
+    ``x1`` and negative at the lower bound of ``x2``.
     """
 
     status: Literal["solved", "infeasible", "failed"]
@@ -121,16 +176,45 @@ class Claim:
     message: str = ""
 
     def judged(self, program: QuadraticProgram, accuracy: float) -> Claim:
-        """The same as ``solved`` where its residuals say so, whatever word the solver ended with: one that stops at its
-        last iteration, since double precision has no digits left, has solved the program. Arrays of wrong sizes, or
-        with entries that are not finite, solve nothing; ``infeasible`` stays."""
+        """Return this claim as ``solved`` where its residuals are small enough, whatever status the solver reported.
+
+        A solver that stops at its last iteration, because double precision has no more digits, has solved the program.
+        Arrays of wrong sizes, or with entries that are not finite, solve nothing. The status ``infeasible`` stays.
+
+        Parameters
+        ----------
+        program : QuadraticProgram
+            The program that was solved.
+        accuracy : float
+            Largest residual allowed.
+
+        Returns
+        -------
+        Claim
+            This claim, or a copy of it with the status ``solved``.
+        """
         if self.status != "failed" or not self.met(program, accuracy):
             return self
         return replace(self, status="solved", message=f"{self.message}, with an answer that holds")
 
     def met(self, program: QuadraticProgram, accuracy: float) -> bool:
-        """Whether rows, bounds, slopes, signs of multipliers and the gap of the two objectives are missed by at most
-        ``accuracy``, or by the rounding of the largest numbers that are added up in them."""
+        """Return whether all residuals are at most ``accuracy``, or rounding errors.
+
+        Checked are rows, equalities, bounds, cones, stationarity, signs of multipliers, and the gap of the two
+        objectives. Rounding errors are relative to the largest numbers that are added up in a residual.
+
+        Parameters
+        ----------
+        program : QuadraticProgram
+            The program that was solved.
+        accuracy : float
+            Largest residual allowed.
+
+        Returns
+        -------
+        bool
+            False also for arrays of wrong sizes, or with entries that are not finite.
+        """
         x, z, y, box = self.x, self.z, self.y, self.z_box
         pairs = ((x, program.q), (z, program.h), (y, program.b), (box, program.q))
         if not all(np.shape(got) == want.shape and np.isfinite(got).all() for got, want in pairs):
@@ -166,11 +250,12 @@ class Claim:
 
 
 class Solver(ABC):
-    """An inner convex solver: one quadratic program in, one claim out.
+    """An inner convex solver, which answers one quadratic program at a time.
 
-    Capabilities, declared by the adapter: ``warm_start`` (starts from its last solution), ``sparse`` (exploits sparse
-    rows), ``conic`` (takes programs with ``cones``, second-order ones). ``aborts``: on some programs its compiled code
-    ends the process, so that it is asked in a process of its own where the system has one.
+    An adapter declares its capabilities as class attributes, all false by default. ``warm_start``: it starts from its
+    last solution. ``sparse``: it exploits sparse rows. ``conic``: it accepts programs with second-order ``cones``.
+    ``aborts``: its compiled code ends the process on some programs. Such a solver runs in a process of its own where
+    the system has one.
     """
 
     warm_start: ClassVar[bool] = False
@@ -180,24 +265,47 @@ class Solver(ABC):
 
     @property
     def delegate(self) -> str:
-        """The name of the solver to which it hands every program on; ``""`` unless it is a way to several: tables and
-        messages tell it beside its own."""
+        """Name of the solver that answers every program for this one; empty unless this is an interface to several
+        solvers.
+
+        Tables and messages show it next to the solver's own name.
+        """
         return ""
 
     @abstractmethod
     def solve(self, program: QuadraticProgram, accuracy: float) -> Claim:
-        """Solve to the absolute residuals ``accuracy``; never raise for a program that is merely hard.
+        """Solve a program to the absolute residuals ``accuracy``; never raise for a program that is only hard.
 
-        Rows arrive with unit norm and the cost with its largest linear coefficient near 1. A claim that is not
-        ``solved`` may still carry the last iterate: it is checked all the same. With ``infeasible``, ``z, y`` may carry
-        the Farkas ray.
+        Parameters
+        ----------
+        program : QuadraticProgram
+            The program. Its rows have unit norm, and the largest linear coefficient of its cost is near 1.
+        accuracy : float
+            Absolute residual to be reached.
+
+        Returns
+        -------
+        Claim
+            The answer. A claim that is not ``solved`` may hold the last iterate, which is checked too. A claim with
+            ``infeasible`` may hold the Farkas ray in ``z`` and ``y``.
         """
 
 
 @dataclass(frozen=True)
 class Unanswered:
-    """How many programs of a ``kind`` the solver that was named did not answer, why, in the words of the first, and by
-    whom they were answered instead."""
+    """Programs of one kind that the named solver did not answer.
+
+    Parameters
+    ----------
+    kind : str
+        Kind of the programs.
+    count : int
+        Number of programs.
+    reason : str
+        Reason of the first failure.
+    by : str
+        Name of whoever answered them instead.
+    """
 
     kind: str
     count: int
@@ -207,18 +315,21 @@ class Unanswered:
 
 @final
 class Auto(Solver, Options):
-    """No solver by name: the optimum in closed form where no row is active, Newton's method on the dual from the last
-    solution, the simplex method for linear programs with thousands of entries; and ``general`` for what is left. All of
-    them are checked alike."""
+    """No solver by name: every program is answered by the quickest method that suits it, and all answers are checked
+    alike.
+
+    The methods are the optimum in closed form where no row is active, Newton's method on the dual from the last
+    solution, and the simplex method for linear programs with thousands of entries. The solver ``general`` answers the
+    rest.
+    """
 
     sparse: ClassVar[bool] = True
 
     general: Any = Field(default={"name": "piqp"}, json_schema_extra={"component": "solver"})
-    """The solver that is asked where none of these answers."""
+    """The solver for programs that none of these methods answers."""
 
     cones: Any = Field(default={"name": "clarabel"}, json_schema_extra={"component": "solver"})
-    """The solver that is asked where norms of groups are in the cost; one that is not conic leaves these to
-    ``general``."""
+    """The solver for costs with norms of groups; a solver that is not conic leaves these programs to ``general``."""
 
     _called: str = PrivateAttr(default=SOLVER)
     _called_of_cones: str = PrivateAttr(default=SOLVER)
@@ -236,27 +347,42 @@ class Auto(Solver, Options):
 
     @property
     def called(self) -> str:
-        """The name of the ``general`` solver."""
+        """Name of the ``general`` solver."""
         return whole_name(self.general, self._called)
 
     @property
     def of_cones(self) -> tuple[Solver, str] | None:
-        """The solver of ``cones`` and its name, if it is conic."""
+        """Solver for ``cones`` and its name; ``None`` where it is not conic."""
         if not isinstance(self.cones, Solver) or not self.cones.conic:
             return None
         return self.cones, whole_name(self.cones, self._called_of_cones)
 
     def solve(self, program: QuadraticProgram, accuracy: float) -> Claim:
-        """See `Solver.solve`: the claim of the ``general`` solver."""
+        """Return the claim of the ``general`` solver.
+
+        Parameters
+        ----------
+        program : QuadraticProgram
+            The program.
+        accuracy : float
+            Absolute residual to be reached.
+
+        Returns
+        -------
+        Claim
+            The answer.
+        """
         claim: Claim = self.general.solve(program, accuracy)
         return claim
 
 
 @final
 class Failures:
-    """What the solver that was named did not answer, of how many ``calls`` in all: reasons that differ in their numbers
-    alone are one. ``name``: the solver's; the first program of each kind that another one answers is then logged as it
-    happens, so that no command and no function of Python has to remember to tell it."""
+    """Account of a named solver: the number of its calls, and the programs that it did not answer.
+
+    Reasons that differ only in their numbers count as one. With a ``name``, the first program of each kind that another
+    solver answers is logged at once. So no command has to report it.
+    """
 
     def __init__(self, name: str = "") -> None:
         self.calls, self.name = 0, name
@@ -264,7 +390,19 @@ class Failures:
         self._logged = set[tuple[str, str]]()
 
     def add(self, kind: str, reason: str, by: str, count: int = 1) -> None:
-        """Note that programs of a ``kind`` were answered by somebody else."""
+        """Add programs that the named solver did not answer.
+
+        Parameters
+        ----------
+        kind : str
+            Kind of the programs.
+        reason : str
+            Reason of the failure.
+        by : str
+            Name of whoever answered them instead.
+        count : int, default 1
+            Number of programs.
+        """
         key = (kind, NUMBERS.sub("#", reason), by)
         known = self._known.get(key, Unanswered(kind, 0, reason, by))
         self._known[key] = replace(known, count=known.count + count)
@@ -273,12 +411,21 @@ class Failures:
             logger.warning("solver %s did not answer a %s program, %s did: %s", self.name, kind, by, reason)
 
     def without_log(self) -> Failures:
-        """Itself, which logs nothing any more: in a worker, whose account whoever has sent it work goes on with."""
+        """Return this account, which logs nothing from now on; for a worker, whose account is continued by its
+        sender."""
         self.name = ""
         return self
 
     def resume(self, calls: int, missed: Iterable[Unanswered]) -> None:
-        """Go on from an account that was kept before, and was told then."""
+        """Continue from an account that was stored before and has been logged then.
+
+        Parameters
+        ----------
+        calls : int
+            Number of calls in the stored account.
+        missed : iterable of Unanswered
+            Programs of the stored account.
+        """
         self.calls += calls
         for one in missed:
             self._logged.add((one.kind, one.by))
@@ -288,7 +435,7 @@ class Failures:
         return iter(tuple(self._known.values()))
 
     def since(self, before: tuple[Unanswered, ...]) -> tuple[Unanswered, ...]:
-        """What was added to ``before``, an earlier ``tuple`` of the same."""
+        """Return the programs that were added after ``before``, an earlier ``tuple`` of this account."""
         counts = {replace(one, count=0): one.count for one in before}
         new = (replace(one, count=one.count - counts.get(replace(one, count=0), 0)) for one in self)
         return tuple(one for one in new if one.count)
@@ -296,24 +443,52 @@ class Failures:
 
 @final
 class Named(Solver):
-    """A solver that was named: it answers every finite program. Where no answer of it is believed, ``instead`` is
-    asked, and ``failures`` says so, in the log too."""
+    """A solver that the user named: it answers every finite program.
+
+    Where none of its answers passes the check, ``instead`` is called. The account ``failures`` records this, and logs
+    it.
+    """
 
     def __init__(self, solver: Solver, name: str, instead: Solver) -> None:
         self.solver, self.name, self.instead, self.failures = solver, name, instead, Failures(name)
 
     def solve(self, program: QuadraticProgram, accuracy: float) -> Claim:
-        """See `Solver.solve`."""
+        """Return the claim of the named solver.
+
+        Parameters
+        ----------
+        program : QuadraticProgram
+            The program.
+        accuracy : float
+            Absolute residual to be reached.
+
+        Returns
+        -------
+        Claim
+            The answer.
+        """
         return self.solver.solve(program, accuracy)
 
 
 @final
 class Asked(Solver):
-    """A solver, and the account of what it is asked: the number of ``calls`` of it, and its ``failures``.
+    """A solver with an account of its calls, and with the solvers that may answer before it or instead of it.
 
-    ``name``: whose its answers are. ``quick``: who may answer before it is asked (`CLOSED_FORM`, `DUAL_NEWTON` from the
-    last solution, `HIGHS`). ``instead``: who is asked where no answer of it is believed. ``cones``: who is asked for a
-    program with second-order cones, and the name: itself, if it is conic and nobody else is given.
+    Parameters
+    ----------
+    solver : Solver
+        The solver.
+    name : str
+        Name under which its answers are recorded.
+    quick : frozenset of str
+        Methods that may answer before the solver is called: `CLOSED_FORM`, `DUAL_NEWTON` from the last solution,
+        `HIGHS`.
+    instead : Asked, optional
+        Solver that is called where no answer of this one passes the check.
+    failures : Failures, optional
+        Account of unanswered programs; a new one by default.
+    cones : tuple of (Solver, str), optional
+        Solver for programs with second-order cones, and its name. By default this is the solver itself, if it is conic.
     """
 
     def __init__(
@@ -332,8 +507,11 @@ class Asked(Solver):
 
     @staticmethod
     def of(solver: Solver) -> Asked:
-        """What a solver is asked: of `Auto` and of one that nobody has named, only what it is needed for; of one that
-        was `Named`, everything. The dual Newton method starts from the last solution in any case."""
+        """Return a solver with the account that its kind needs.
+
+        `Auto`, and a solver that nobody named, answers only what the quick methods do not. A `Named` solver answers
+        everything. The dual Newton method always starts from the last solution.
+        """
         match solver:
             case Asked():
                 return solver
@@ -345,14 +523,30 @@ class Asked(Solver):
         return Asked(solver)
 
     def until(self, deadline: Deadline) -> Asked:
-        """Itself, no longer waited for from the ``deadline`` on, nor is who is asked instead."""
+        """Return this solver, after a ``deadline`` was set for it and for the solver called instead."""
         self.deadline = deadline
         if self.instead is not None:
             self.instead.until(deadline)
         return self
 
     def solve(self, program: QuadraticProgram, accuracy: float) -> Claim:
-        """See `Solver.solve`."""
+        """Return the claim of the solver, or of the solver for cones, and count the call.
+
+        The call runs in a process of its own where the solver may end the process, or where the program is large and
+        time is limited.
+
+        Parameters
+        ----------
+        program : QuadraticProgram
+            The program.
+        accuracy : float
+            Absolute residual to be reached.
+
+        Returns
+        -------
+        Claim
+            The answer.
+        """
         self.calls += 1
         self.failures.calls += 1
         asked = self.cones[0] if program.cones and self.cones is not None else self.solver
@@ -362,16 +556,32 @@ class Asked(Solver):
 
 
 def named(solver: Solver, name: str, instead: Solver) -> Solver:
-    """The solver as one that was `Named`; `Auto` is no solver by name."""
+    """Return the solver as a `Named` one.
+
+    Parameters
+    ----------
+    solver : Solver
+        The solver.
+    name : str
+        Its name.
+    instead : Solver
+        Solver that is called where no answer passes the check.
+
+    Returns
+    -------
+    Solver
+        The named solver; `Auto`, and a solver that is named already, are returned unchanged.
+    """
     return solver if isinstance(solver, Auto | Named | Asked) else Named(solver, whole_name(solver, name), instead)
 
 
 def whole_name(solver: object, name: str) -> str:
-    """What a solver of that name is told as: with the one to which it hands its programs on, where that is another."""
+    """Return the name of a solver for messages, with the name of its delegate in parentheses where it has one."""
     delegate = solver.delegate if isinstance(solver, Solver) else ""
     return f"{name} ({delegate})" if delegate else name
 
 
 def quickest(solver: Solver) -> Solver:
-    """Who answers instead of a solver that was `Named`, for what is drawn of a run and is no part of it."""
+    """Return the substitute of a `Named` solver, or the solver itself; used for pictures, which are no part of
+    the run."""
     return solver.instead if isinstance(solver, Named) else solver

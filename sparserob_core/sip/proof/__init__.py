@@ -1,1 +1,1 @@
-"""What is proven of a decision over the whole continuum, or of infeasibility, and the words for it."""
+"""Proofs of a decision over the whole continuum, and of infeasibility, and the sentences that report them."""

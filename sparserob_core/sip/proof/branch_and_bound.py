@@ -19,9 +19,9 @@ from sparserob_core.sip.limits.deadline import Deadline, OutOfTime
 from sparserob_core.sip.program import TOLERANCE, ConstraintFamily, SemiInfiniteProgram, Separation
 
 CELLS = 400_000  # cells examined per family before the proof is given up
-BATCH = 4096  # cells bounded at a time, worst first
-PROBED = 16  # centres of the worst cells at which a witness is looked for, per batch
-# halvings after which a witness is also climbed to: a cell's centre may be far from the worst corner of a set
+BATCH = 4096  # cells bounded at a time
+PROBED = 16  # number of worst cells at whose centres a witness is sought
+# Halvings after which an ascent also searches for a witness: a cell's centre may be far from the worst corner of a set.
 CLIMBED = (
     3,
     6,
@@ -31,17 +31,17 @@ CLIMBED = (
     30,
 )
 FIRST_BATCH, QUICK = 16, 0.25  # cells bounded first, and the seconds that a batch may take, where time is limited
-OFTEN = 1.0  # seconds after which a batch that is not over is told of
-STALLED, ADVANCED = 30.0, 0.99  # a worst bound that has not fallen below this share within so many seconds is stuck
+OFTEN = 1.0  # seconds between events within a round of bounding
+STALLED, ADVANCED = 30.0, 0.99  # a proof is stuck if its worst bound has not fallen to this share within these seconds
 MORE = "more seconds (limits.seconds) would help"
 ADVICE = "a larger method.tolerance would help, as it keeps decisions farther away, or narrower index sets"
-REST, TINY = 8, 1e-5  # halvings without progress after which a bound below `TINY` of its unit is taken for rounding
-# Of what a tiny bound is too large by, what may still fall with a cell. With ten times as much, what a proof leaves
-# open is told as more than it is, and decisions are kept away by as much; with a tenth there are as many cells more.
+REST, TINY = 8, 1e-5  # halvings without progress after which a bound below `TINY` of its unit counts as rounding
+# Share of the excess of a tiny bound that may still fall with the size of a cell. With ten times as much, a proof
+# reports a larger bound than necessary, and decisions keep a larger distance; with a tenth, more cells are needed.
 FALLING = 0.06
-MOVES = 24  # steps of such a climb at most
-MOST_CUT = 32  # open cells that are cut towards peaks
-SHARE, GROWN = 0.8, (1 / 16, 1.0)  # of what such parts may be long; how much longer each is than the one before
+MOVES = 24  # largest number of steps of such an ascent
+MOST_CUT = 32  # largest number of open cells that are divided towards peaks
+SHARE, GROWN = 0.8, (1 / 16, 1.0)  # share of the allowed length of such parts; relative growth from part to part
 _NOWHERE = Separation(np.zeros((0, 1)), np.zeros(0, dtype=int), np.zeros(0))
 
 
@@ -52,8 +52,28 @@ def prove(
     cells: int | Mapping[str, int] = CELLS,
     deadline: Deadline | None = None,
 ) -> tuple[Proof, ...]:
-    """Prove or refute every family at ``x (n,)``, one `Proof` each; past the deadline with one look at each.
-    ``cells`` may be examined of each at most, or as many as are told by the names of families."""
+    """Prove or refute every family at a decision.
+
+    Past the deadline, every family is bounded once.
+
+    Parameters
+    ----------
+    program : SemiInfiniteProgram
+        The program.
+    x : ndarray, shape (n,)
+        The decision.
+    notify : callable
+        Receives events; by default events are ignored.
+    cells : int or mapping of str to int, default CELLS
+        Largest number of cells for each family, or these numbers by the names of families.
+    deadline : Deadline, optional
+        Time at which the proof ends.
+
+    Returns
+    -------
+    tuple of Proof
+        One proof for each family.
+    """
     time_left = deadline or Deadline()
     budgets = {
         family.name: cells if isinstance(cells, int) else cells.get(family.name, 0) for family in program.families
@@ -62,7 +82,7 @@ def prove(
     found: list[tuple[ConstraintFamily, Proof]] = []
     try:
         found.extend((one, _prove(one, x, notify, budgets[one.name], time_left)) for one in proven)
-    except OutOfTime as error:  # of families that are left not even one look would come to its end
+    except OutOfTime as error:  # there is no time to bound the remaining families even once
         found += [(one, _begun_only(one, error, time_left)) for one in proven[len(found) :]]
     return tuple(
         replace(
@@ -85,12 +105,38 @@ def supremum(
     cells: int = CELLS,
     deadline: Deadline | None = None,
 ) -> Supremum:
-    """The largest violation of a family over its whole index set, between one that an index reaches and a proven bound:
-    the proof that stops at a violation is asked for a number.
+    """Enclose the largest violation of a family over its whole index set.
 
-    A cell is closed where its enclosure is within ``tolerance`` times the best violation met so far, or times ``least``
-    where that is larger. Past the deadline, or when ``cells`` were examined, the two sides are farther apart, and hold
-    all the same. Raises `NotEnclosable` for a family that offers no enclosure.
+    A proof stops at the first violation; this function computes the largest one. A cell is closed where its enclosure
+    is within ``tolerance`` times the largest violation found so far, or times ``least`` where that is larger. Past the
+    deadline, or after ``cells`` cells, the two bounds are farther apart, but they hold.
+
+    Parameters
+    ----------
+    family : ConstraintFamily
+        The family.
+    x : ndarray, shape (n,)
+        The decision.
+    tolerance : float
+        Relative tolerance.
+    least : float, default 0
+        Smallest size to which the tolerance is relative.
+    notify : callable
+        Receives events.
+    cells : int, default CELLS
+        Largest number of cells.
+    deadline : Deadline, optional
+        Time at which the search ends.
+
+    Returns
+    -------
+    Supremum
+        A violation that an index attains, and a proven upper bound.
+
+    Raises
+    ------
+    NotEnclosable
+        For a family that offers no enclosure.
     """
     if family.enclosure is None:
         raise NotEnclosable(f"{family.name} offers no enclosure")
@@ -103,9 +149,27 @@ def prove_family(
 ) -> Proof:
     """Bound the violation of one family over its whole index set.
 
-    Cells whose enclosure is at most `ConstraintFamily.allowed` are closed, the others halved; the centres of the worst
-    are probed for a witness, and where that takes long one is climbed to. At the deadline, or when it is interrupted
-    from the keyboard (of which the deadline takes note), a proof ends undecided, with what is left.
+    Cells whose enclosure is at most `ConstraintFamily.allowed` are closed, the others halved. The centres of the worst
+    cells are probed for a witness. Where that takes long, an ascent searches for one. At the deadline, or after an
+    interrupt from the keyboard, which the deadline records, the proof ends undecided, with the bound reached.
+
+    Parameters
+    ----------
+    family : ConstraintFamily
+        The family.
+    x : ndarray, shape (n,)
+        The decision.
+    notify : callable
+        Receives events.
+    cells : int, default CELLS
+        Largest number of cells.
+    deadline : Deadline, optional
+        Time at which the proof ends.
+
+    Returns
+    -------
+    Proof
+        The verdict on the family.
     """
     time_left = deadline or Deadline()
     try:
@@ -115,7 +179,7 @@ def prove_family(
 
 
 def _prove(family: ConstraintFamily, x: Array, notify: Notify, cells: int, deadline: Deadline) -> Proof:
-    """`prove_family`; raises `OutOfTime` where not even one look comes to its end by the deadline."""
+    """Return the proof of one family; raise `OutOfTime` where the deadline comes before every cell was bounded once."""
     try:
         if family.enclosure is None:
             return _by_separation(family, x)
@@ -133,20 +197,38 @@ def _prove(family: ConstraintFamily, x: Array, notify: Notify, cells: int, deadl
 
 
 def _begun_only(family: ConstraintFamily, error: KeyboardInterrupt, deadline: Deadline) -> Proof:
-    """The proof of a family that was interrupted, of which the deadline takes note."""
+    """Return the undecided proof of a family that was interrupted, and record the interrupt in the deadline."""
     deadline.interrupt(error)
     reason = f"{family.name}: its proof had begun only; {more(deadline)}"
     return Proof(family.name, "undecided", np.inf, reason=reason)
 
 
 def more(deadline: Deadline) -> str:
-    """What would help where the time was over: more of the limit, or, where a key was pressed, to wait."""
+    """Return in words the remedy where time is over: a larger limit or, after an interrupt, more time."""
     return MORE if deadline.bounded and not deadline.pressed else "more time would help"
 
 
 @dataclass(eq=False)
 class Course:
-    """How the proof of one family goes on: what it has examined of its budget, and how its worst bound has fallen."""
+    """Progress of the proof of one family: the cells examined of its budget, and the fall of its worst bound.
+
+    Parameters
+    ----------
+    family : ConstraintFamily
+        The family.
+    notify : callable
+        Receives events.
+    budget : int
+        Largest number of cells.
+    deadline : Deadline
+        Time at which the proof ends.
+    started, told : float
+        Time of the start and of the last event, in seconds.
+    examined : int
+        Number of cells bounded so far.
+    fall : deque of (float, float)
+        Times and worst bounds of the last half minute.
+    """
 
     family: ConstraintFamily
     notify: Notify
@@ -157,10 +239,11 @@ class Course:
     examined: int = 0
     fall: deque[tuple[float, float]] = field(default_factory=deque)
     along: str = ""
-    """Where along the first coordinate, the time of a path constraint, cells are open: the wall that is ridden."""
+    """Part of the first coordinate, the time of a path constraint, in which cells are open, in words."""
 
     def opened(self, lower: Array, upper: Array) -> None:
-        """Note the open cells ``(k, d)``: how much of the first coordinate they cover, and from where to where."""
+        """Record the length and the range of the first coordinate that the open cells, with corners ``(k, d)``,
+        cover."""
         factor = 1.0 if self.family.index_units is None else float(self.family.index_units[0])
         ends, box = factor * np.stack([lower[:, 0], upper[:, 0]]), self.family.index_set
         whole = factor * float(box.upper[0] - box.lower[0]) if box.dimension else 0.0
@@ -173,8 +256,19 @@ class Course:
         self.along = f"open along {covered:.3g} of {whole:.3g}{unit}, from {starts[0]:.5g} to {reached[-1]:.5g}{unit}"
 
     def tell(self, cells: int, bound: float, lower: Array, upper: Array, pending: int = 0) -> None:
-        """Tell that ``cells`` are open, of which the worst, from ``lower (d,)`` to ``upper (d,)``, has this bound;
-        ``pending`` cells have been examined since they were counted."""
+        """Send an event about the open cells.
+
+        Parameters
+        ----------
+        cells : int
+            Number of open cells.
+        bound : float
+            Bound of the worst of them.
+        lower, upper : ndarray, shape (d,)
+            Corners of the worst cell.
+        pending : int, default 0
+            Number of cells that were examined since the last count.
+        """
         now = time.perf_counter()
         self.fall.append((now, bound))
         while len(self.fall) > 1 and self.fall[1][0] <= now - STALLED:
@@ -196,7 +290,7 @@ class Course:
         )
 
     def hindrance(self, bound: float, lower: Array, upper: Array) -> str:
-        """What hinders the proof, and what would help: at the worst cell, in the user's units."""
+        """Return in words what hinders the proof at the worst cell, and a remedy, in the user's units."""
         advice = "" if self.family.hindrance is None else self.family.hindrance(lower, upper)
         if self.deadline.passed:
             advice = f"there was no time to halve it; {more(self.deadline)}, or a larger method.tolerance"
@@ -211,43 +305,60 @@ class Course:
 
 @dataclass(frozen=True)
 class NoViolation:
-    """The question whether anything is violated by more than ``allowed``: cells are closed where nothing is, and a
-    violation of more than `TOLERANCE` ends the search. What lies between the two may be rounding."""
+    """Goal of a proof: to decide whether anything is violated by more than ``allowed``.
+
+    Cells are closed where nothing is, and a violation of more than `TOLERANCE` ends the search. A violation between the
+    two may be rounding.
+    """
 
     allowed: float = TOLERANCE
 
     def closes(self, best: float) -> float:
-        """The bound up to which a cell is closed, where ``best`` was met."""
+        """Return the bound up to which a cell is closed, where ``best`` is the largest violation found."""
         return self.allowed
 
     def ends(self, best: float) -> bool:
-        """Whether what was met answers the question."""
+        """Return whether the largest violation found decides the question."""
         return best > TOLERANCE
 
 
 @dataclass(frozen=True)
 class Within:
-    """The question how large the largest violation is, to a ``tolerance`` relative to it, or to ``least`` where that is
+    """Goal of a supremum: the largest violation, to a ``tolerance`` relative to it, or to ``least`` where that is
     larger."""
 
     tolerance: float
     least: float
 
     def closes(self, best: float) -> float:
-        """As `NoViolation.closes`."""
+        """Return the bound up to which a cell is closed, where ``best`` is the largest violation found."""
         return best + self.tolerance * max(abs(best), self.least)
 
     def ends(self, best: float) -> bool:
-        """As `NoViolation.ends`."""
+        """Return false: a supremum is known only when all cells are closed."""
         return False
 
 
 @dataclass(frozen=True, eq=False)
 class Supremum:
-    """The largest violation of a family, between ``lower``, reached by ``row`` at ``index (d,)``, and ``upper``, proven
-    over the continuum. ``reason``: what hindered the two from being as close as was asked for, empty where they are.
+    """Enclosure of the largest violation of a family over its whole index set.
 
-    ``leaves``: lower and upper corners ``(k, d)`` of the cells that prove it, and the proven bounds ``(k,)`` there.
+    Parameters
+    ----------
+    lower : float
+        Violation of ``row`` at ``index``.
+    upper : float
+        Upper bound, proven over the continuum.
+    index : ndarray, shape (d,)
+        Index that attains ``lower``.
+    row : int
+        Row that attains ``lower``.
+    cells : int
+        Number of cells bounded.
+    leaves : tuple of ndarray
+        Lower and upper corners ``(k, d)`` of the cells that prove the bound, and their bounds ``(k,)``.
+    reason : str
+        Reason why the two bounds are farther apart than required; empty where they are not.
     """
 
     lower: float
@@ -264,7 +375,7 @@ class Supremum:
 def _branch_and_bound(
     family: ConstraintFamily, x: Array, course: Course, goal: NoViolation | Within
 ) -> tuple[Proof, Supremum]:
-    """What is known of one family, as an answer to whether anything is violated, and as a number."""
+    """Return what is known of one family after branch and bound, as a proof and as a supremum."""
     box = family.index_set
     lower, upper = family.partition
     best, known = (-np.inf, lower[0], 0), np.full(lower.shape[0], np.inf)
@@ -278,7 +389,7 @@ def _branch_and_bound(
         course.examined += bounds.size
         open_ = bounds > goal.closes(best[0])
 
-        # Look for a witness: where separation finds the largest violations, and in the worst cells.
+        # Search for a witness: where separation finds the largest violations, and in the worst cells.
         first, peaks = not leaves, _NOWHERE
         if first and bend is not None and family.worst is not None:
             peaks = family.separated(x)
@@ -296,8 +407,8 @@ def _branch_and_bound(
         if not open_.any():
             return _answers(course, "proven", best, leaves)
 
-        # Cut what is open, as long as cells, their width and time allow: once towards the peaks, then into halves. Rows
-        # under the worst deviations have kinks, not peaks that are smooth.
+        # Divide the open cells, as long as their number, their width and the time allow: once towards the peaks, then
+        # into halves. Rows at their worst deviations have kinks, not smooth peaks.
         worst, at = float(bounds.max()), int(bounds.argmax())
         course.opened(lower[open_], upper[open_])
         course.tell(int(open_.sum()), worst, lower[at], upper[at])
@@ -329,7 +440,8 @@ def _answers(
     leaves: list[tuple[Array, Array, Array]],
     reason: str = "",
 ) -> tuple[Proof, Supremum]:
-    """Both answers, where ``best`` was met and ``leaves`` were closed, or left open where it is undecided."""
+    """Return the proof and the supremum, where ``best`` was found and ``leaves`` were closed, or left open if
+    undecided."""
     lower, upper, bounds = _in_order(leaves)
     top, name, (violation, index, row) = float(bounds.max(initial=-np.inf)), course.family.name, best
     proof = Proof(
@@ -348,25 +460,31 @@ def _answers(
 
 
 def _at_rest(slacks: Sequence[float]) -> bool:
-    """Whether what a tiny worst bound allows beyond the worst index that was met no longer falls with the size of the
-    cells: then it is made of rounding."""
+    """Return whether a tiny worst bound no longer approaches the largest violation found as cells shrink.
+
+    The difference is then rounding.
+    """
     return len(slacks) > 2 * REST and slacks[-1] <= TINY and slacks[-1] > ADVANCED * slacks[-1 - REST]
 
 
 def _is_rounding(bound: float, bend: float, limit: float) -> bool:
-    """Whether a tiny bound of a cell with one coordinate is above the ``limit`` by what does not fall with its width,
-    the values at its ends with their rounding: no shorter one with that end is closed."""
+    """Return whether the excess of a tiny bound over the ``limit`` is rounding, for a cell with one coordinate.
+
+    Such an excess does not fall with the cell's width: it comes from the values at the cell's ends. No shorter cell
+    with that end is closed.
+    """
     return bound <= TINY and bend <= FALLING * (bound - limit)
 
 
 def _bounded(course: Course, x: Array, lower: Array, upper: Array) -> tuple[Array, Array, Array | None]:
-    """Bounds ``(k,)`` of cells, the coordinates ``(k,)`` to halve, and what falls with the square of their widths
-    ``(k,)``, where that is known; infinite for cells that there was no time for.
+    """Return bounds ``(k,)`` of cells, the coordinates ``(k,)`` to halve, and the parts ``(k,)`` quadratic in the
+    widths.
 
-    In batches, so that memory does not grow with their number. Only where a deadline is set are batches as small as
-    the time that they take asks for: what a cell costs is not known before, and a result that has no limit shall not
-    depend on how fast the machine is. Cells that differ in their first coordinate only share their work (`enclose`),
-    so that those go into one batch.
+    The last is ``None`` where it is not known. Bounds are infinite for cells for which there was no time. Cells are
+    bounded in batches, so that memory does not grow with their number. Only where a deadline is set do the batches
+    depend on the time that they take: the cost of a cell is not known before, and a result without a limit must not
+    depend on the speed of the machine. Cells that differ in their first coordinate only share work (`enclose`), so they
+    belong to one batch.
     """
     family, count = course.family, lower.shape[0]
     bounds, split, bend = np.full(count, np.inf), (upper - lower).argmax(axis=1), np.full(count, np.inf)
@@ -375,7 +493,7 @@ def _bounded(course: Course, x: Array, lower: Array, upper: Array) -> tuple[Arra
     order, ends = _together(lower, upper) if count > size else (np.arange(count), np.array([count]))
     while start < count and not (start and course.deadline.passed):
         began, stop = time.perf_counter(), min(start + size, count)
-        if hurried:  # to the end of what shares its work, unless that is far
+        if hurried:  # to the end of the group that shares work, unless that is far
             stop = min(int(ends[np.searchsorted(ends, stop)]), start + BATCH)
         part = order[start:stop]
         enclosed = family.enclosed(x, lower[part], upper[part])
@@ -393,8 +511,11 @@ def _bounded(course: Course, x: Array, lower: Array, upper: Array) -> tuple[Arra
 
 
 def _together(lower: Array, upper: Array) -> tuple[np.ndarray, np.ndarray]:
-    """An order ``(k,)`` of cells in which those that differ in their first coordinate only stand together, and where
-    each such group ends; cells with no other coordinate in the order that they have, of which each may be an end."""
+    """Return an order ``(k,)`` of cells that groups those that differ in their first coordinate only, and the ends of
+    groups.
+
+    Cells with no other coordinate keep their order, and each may be an end.
+    """
     count = lower.shape[0]
     if lower.shape[1] == 1:
         return np.arange(count), np.arange(1, count + 1)
@@ -404,11 +525,13 @@ def _together(lower: Array, upper: Array) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _towards(peaks: Separation, lower: Array, upper: Array, bounds: Array, bend: Array) -> tuple[Array, Array] | None:
-    """Cells ``(k, 1)``, those beside or around a peak cut at once into parts that are as short there as they must be
-    and longer the farther they are from it, the others halved; ``None`` where no cell or too many would be cut so.
+    """Return cells ``(k, 1)`` after a division towards the peaks of the violation; ``None`` where it does not apply.
 
-    From ``D`` to ``(1 + g) D`` beside a smooth peak of height ``v`` and curvature ``c`` the bound is about
-    ``v - c D^2 / 2 + b (g D)^2 / 8``, with ``b`` the bound of the second derivative: so ``g = 2 sqrt(c / b)`` will do.
+    A cell near or around a peak is divided at once into parts that are short at the peak and longer with the distance
+    from it. The others are halved. ``None`` is returned where no cell would be divided so, or too many are open.
+
+    From ``D`` to ``(1 + g) D`` next to a smooth peak of height ``v`` and curvature ``c``, the bound is about ``v - c
+    D^2 / 2 + b (g D)^2 / 8``, with ``b`` the bound of the second derivative. So ``g = 2 sqrt(c / b)`` suffices.
     """
     if not peaks.violations.size or lower.shape[0] > MOST_CUT:
         return None
@@ -422,7 +545,7 @@ def _towards(peaks: Separation, lower: Array, upper: Array, bounds: Array, bend:
         cuts = np.array([low, (low + high) / 2, high])
         if away[i, nearest] <= width and 0.0 < short < width / 4:
             inside, grow = min(at - low, high - at), 0.5
-            if inside > width / 8:  # the ends are below the peak by what its curvature makes of the distance
+            if inside > width / 8:  # the peak is higher than the ends by its curvature times the square of the distance
                 curved = max(top - (bounds[i] - bend[i]), 0.0) / bend[i] * (width / inside) ** 2 / 4
                 grow = float(np.clip(2 * SHARE * np.sqrt(curved), *GROWN))
             offsets = short * (1 + grow) ** np.arange(np.ceil(np.log(width / short) / np.log1p(grow)))
@@ -438,6 +561,7 @@ def _towards(peaks: Separation, lower: Array, upper: Array, bounds: Array, bend:
 
 
 def _probe(family: ConstraintFamily, x: Array, lower: Array, upper: Array, bounds: Array) -> tuple[float, Array, int]:
+    """Return the largest violation at the centres of the worst cells, its index and its row."""
     worst = np.argsort(-bounds, kind="stable")[:PROBED]
     centres = (lower[worst] + upper[worst]) / 2
     values = family.violations(x, centres)
@@ -446,8 +570,10 @@ def _probe(family: ConstraintFamily, x: Array, lower: Array, upper: Array, bound
 
 
 def _climb(family: ConstraintFamily, x: Array, lower: Array, upper: Array) -> tuple[float, Array, int]:
-    """The largest violation that a climb from the middle of one cell finds, its index and row: steps along every axis
-    and along all of them."""
+    """Return the largest violation that an ascent from the middle of one cell finds, its index and its row.
+
+    Its steps are along every axis, and along all axes together.
+    """
     box, point, radius = family.index_set, (lower + upper) / 2, upper - lower
     best = (-np.inf, point, 0)
     for _ in range(MOVES):
@@ -466,15 +592,15 @@ def _climb(family: ConstraintFamily, x: Array, lower: Array, upper: Array) -> tu
 
 
 def _in_order(leaves: list[tuple[Array, Array, Array]]) -> tuple[Array, Array, Array]:
-    """All leaves, by their lower and then by their upper corners, and their bounds."""
+    """Return the corners of all leaves, sorted by lower and then by upper corners, and their bounds."""
     lower, upper, bounds = (np.concatenate(parts) for parts in zip(*leaves, strict=True))
     order = np.lexsort(np.hstack([lower, upper]).T[::-1])
     return lower[order], upper[order], bounds[order]
 
 
 def _halved(lower: Array, upper: Array, split: Array) -> tuple[Array, Array] | None:
-    """Both halves of every cell along its coordinate ``split``; ``None`` when a cell is too narrow to be halved in
-    floating point."""
+    """Return both halves of every cell along its coordinate ``split``; ``None`` where a cell is too narrow for floating
+    point."""
     rows = np.arange(split.size)
     middle = (lower[rows, split] + upper[rows, split]) / 2
     if ((middle <= lower[rows, split]) | (middle >= upper[rows, split])).any():
@@ -486,8 +612,11 @@ def _halved(lower: Array, upper: Array, split: Array) -> tuple[Array, Array] | N
 
 
 def _by_separation(family: ConstraintFamily, x: Array) -> Proof:
-    """For families without an enclosure: believe a proven bound of their separation, but for what both
-    ends of the index set say, otherwise leave it open."""
+    """Return the proof of a family without an enclosure, from its separation.
+
+    A proven bound of the separation is believed, except where the rows at the ends of the index set contradict it.
+    Otherwise the family stays undecided.
+    """
     if family.worst is None:
         return Proof(
             family.name,
@@ -500,7 +629,7 @@ def _by_separation(family: ConstraintFamily, x: Array) -> Proof:
     index, row = (found.indices[0], int(found.rows[0])) if found.violations.size else (None, 0)
     ends = np.stack([family.index_set.lower, family.index_set.upper])
     met = _probe(family, x, ends, ends, np.zeros(2)) if np.isfinite(ends).all() else (-np.inf, ends[0], 0)
-    if met[0] > max(violation, TOLERANCE):  # what it says is believed, but not against its own rows
+    if met[0] > max(violation, TOLERANCE):  # the separation is believed, but not against the family's own rows
         violation, index, row = met
     if violation > TOLERANCE:
         return Proof(family.name, "refuted", np.inf, violation, index, row)
@@ -518,4 +647,5 @@ def _by_separation(family: ConstraintFamily, x: Array) -> Proof:
 
 
 def _shown(point: Array) -> str:
+    """Return a point as a short text."""
     return np.array2string(point, precision=4, separator=", ", threshold=8)

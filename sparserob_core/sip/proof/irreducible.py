@@ -1,4 +1,4 @@
-"""Of the constraints that cannot hold together, few enough to be read: none of them can be spared."""
+"""Irreducible infeasible subsystems: constraints that cannot hold together, none of which can be left out."""
 
 from __future__ import annotations
 
@@ -13,18 +13,34 @@ from sparserob_core.sip.inner.vertex import simplex
 from sparserob_core.sip.proof.reasons import reasons
 from sparserob_core.sip.relaxed.relaxed import RelaxedProgram, Rows
 
-# Rows of a proof from which on one of fewer is looked for first: each that is left out costs a program. With a tenth of
-# them a vertex is sought for what takes a moment; with ten times as many the filter has minutes of work.
+# Number of rows above which a proof with fewer rows is sought first: the filter solves a program for each row.
+# With a tenth of it, a vertex is sought where the filter takes a moment; with ten times as many, it takes minutes.
 MANY = 40
 
 
 def irreducible(relaxed: RelaxedProgram, rows: Rows, solution: FiniteSolution) -> tuple[Rows, FiniteSolution]:
-    """Rows that cannot hold together although all but any one of them can, with the multipliers that prove it.
+    """Return rows that cannot hold together although all but any one of them can, with the multipliers that prove it.
 
-    One constraint that is impossible by itself, or two that leave nothing between them, where there are such
-    (`reasons`). Else the deletion filter (Chinneck and Dravnieks 1991): every row is left out once, the least important
-    first, and stays out if nothing is feasible without it either; a row that was needed stays needed when others leave.
-    A row whose absence could not be judged stays.
+    A constraint that is impossible by itself, or two constraints that leave nothing between them, are returned at once
+    (`reasons`). Otherwise the deletion filter (Chinneck and Dravnieks 1991) is applied. The filter leaves every row out
+    once, the least important first. A row stays out if the others are infeasible without it. A row that was needed
+    stays needed when others are removed. A row whose absence could not be judged stays.
+
+    Parameters
+    ----------
+    relaxed : RelaxedProgram
+        The relaxed program.
+    rows : Rows
+        Rows that cannot hold together.
+    solution : FiniteSolution
+        Solution whose multipliers prove that.
+
+    Returns
+    -------
+    rows : Rows
+        Rows of the subsystem.
+    solution : FiniteSolution
+        Solution with the multipliers that prove it.
     """
     fixed = relaxed.program.finite.h.size
     plain = _self_evident(relaxed, solution)
@@ -49,8 +65,11 @@ def irreducible(relaxed: RelaxedProgram, rows: Rows, solution: FiniteSolution) -
 
 
 def _at_a_vertex(relaxed: RelaxedProgram, rows: Rows, solution: FiniteSolution) -> FiniteSolution:
-    """The same proven by few rows, where there are many: by a vertex of the multipliers of the least relaxation that
-    leaves something, of which no more are positive than there are variables."""
+    """Return a solution whose proof has few rows, where the given proof has many.
+
+    The new multipliers are at a vertex of the multipliers of the least relaxation that makes the program feasible. At a
+    vertex, no more multipliers are positive than there are variables.
+    """
     fixed, size = relaxed.program.finite.h.size, np.count_nonzero(solution.y)
     if size <= MANY:
         return solution
@@ -67,7 +86,8 @@ def _at_a_vertex(relaxed: RelaxedProgram, rows: Rows, solution: FiniteSolution) 
 
 
 def _self_evident(relaxed: RelaxedProgram, solution: FiniteSolution) -> tuple[Rows, FiniteSolution] | None:
-    """The rows of the first reason that needs no solver, if they are rows of this program."""
+    """Return the rows of the first reason that needs no solver, with its multipliers, if they are rows of this
+    program."""
     base = relaxed.program.finite
     for reason in reasons(relaxed.program):
         if relaxed.program.family(reason.rows.cuts[0].family).reduced is not None:

@@ -1,5 +1,7 @@
-"""Reasons why nothing is feasible that need no solver: a constraint that no decision meets, and two that leave nothing
-between them."""
+"""Reasons for infeasibility that need no solver.
+
+Either no decision meets one constraint, or two constraints leave nothing between them.
+"""
 
 from __future__ import annotations
 
@@ -18,17 +20,32 @@ from sparserob_core.sip.program import ConstraintFamily, Explanation, SemiInfini
 from sparserob_core.sip.relaxed.relaxed import Rows
 
 Kind: TypeAlias = Literal["beyond every decision", "nothing between", "out of reach"]
-LOOKED_AT = 2000  # indices of a family at most
-NONE = 1e-13  # of its largest row, a row that the decision does not enter
+LOOKED_AT = 2000  # largest number of indices of a family
+NONE = 1e-13  # of a family's largest row: size of a row that the decision does not enter
 PARALLEL = 1e-12  # two unit rows are opposite when their sum is shorter than this
-REAL = 1e-8  # of the numbers that cancel, a violation that is no rounding
-DENSE = 200  # rows judged one by one where the image is not the decision itself
+REAL = 1e-8  # of the numbers that cancel: violation that is no rounding
+DENSE = 200  # largest number of rows judged one by one, where the image is not the decision itself
 
 
 @dataclass(frozen=True, eq=False)
 class Reason:
-    """Rows that nothing satisfies, with multipliers ``(r,)`` that prove it, and the sentence that says so. ``amount``:
-    the sum's violation; ``about``: the same for all reasons of which the worst says enough."""
+    """Rows that no decision satisfies, with multipliers that prove it.
+
+    Parameters
+    ----------
+    kind : str
+        Kind of the reason.
+    rows : Rows
+        The rows.
+    multipliers : ndarray, shape (r,)
+        Multipliers of the rows.
+    amount : float
+        Violation of the weighted sum of the rows.
+    text : str
+        Sentence that states the reason.
+    about : tuple of str
+        Key that similar reasons share; only the worst of them is reported.
+    """
 
     kind: Kind
     rows: Rows
@@ -39,8 +56,11 @@ class Reason:
 
 
 def reasons(program: SemiInfiniteProgram) -> list[Reason]:
-    """What is impossible at the corners and centres of every family's cells, at most one reason for every row of a
-    family, and of rows that ask for the same in several cases the worst."""
+    """Return the constraints that are impossible at the corners and centres of every family's cells.
+
+    There is at most one reason for every row of a family. Of rows that mean the same in several cases, only the worst
+    is returned.
+    """
     found = [
         reason
         for family in program.families
@@ -48,13 +68,14 @@ def reasons(program: SemiInfiniteProgram) -> list[Reason]:
         for reason in _of_family(program.finite, family.reduced or family)
     ]
     worst: dict[tuple[str, ...], Reason] = {}
-    for reason in found:  # none is told twice
+    for reason in found:  # none is reported twice
         if reason.about not in worst or reason.amount > worst[reason.about].amount:
             worst[reason.about] = reason
     return list(worst.values())
 
 
 def _of_family(base: FiniteProgram, family: ConstraintFamily) -> Iterator[Reason]:
+    """Yield the reasons among the rows of one family."""
     indices = _looked_at(family)
     if not indices.shape[0]:
         return
@@ -90,8 +111,22 @@ def _of_family(base: FiniteProgram, family: ConstraintFamily) -> Iterator[Reason
 
 
 def least_of(base: FiniteProgram, G: Array, h: Array) -> Array:
-    """Proven lower bounds ``(r,)`` of ``G x - h`` over the bounds of the program; ``-inf`` for rows that were not
-    looked at."""
+    """Return proven lower bounds of ``G x - h`` over the bounds of the program.
+
+    Parameters
+    ----------
+    base : FiniteProgram
+        Program whose bounds hold.
+    G : ndarray, shape (r, n)
+        Rows.
+    h : ndarray, shape (r,)
+        Right-hand sides.
+
+    Returns
+    -------
+    ndarray, shape (r,)
+        Lower bounds; ``-inf`` for rows that were not examined.
+    """
     if base.S is None:
         with np.errstate(invalid="ignore"):
             low, high = np.where(G == 0.0, 0.0, G * base.lower), np.where(G == 0.0, 0.0, G * base.upper)
@@ -108,14 +143,27 @@ def least_of(base: FiniteProgram, G: Array, h: Array) -> Array:
 
 
 def least_within(base: FiniteProgram, row: Array) -> float:
-    """A proven lower bound of ``g'x`` over the bounds and the rows of the program, by the multipliers of a linear
-    program; ``-inf`` where that is not solved."""
+    """Return a proven lower bound of ``g'x`` over the bounds and the rows of the program.
+
+    Parameters
+    ----------
+    base : FiniteProgram
+        Program whose bounds, rows and equalities hold.
+    row : ndarray, shape (n,)
+        The row ``g``.
+
+    Returns
+    -------
+    float
+        Lower bound by the multipliers of a linear program; ``-inf`` where that program is not solved.
+    """
     alone = replace(base, q=row, weights=np.zeros_like(base.weights), P=None, constant=0.0, blocks=None)
     corner = simplex(alone)
     return dual_bound(alone, corner.y, corner.mu, corner.z) if corner.status == "optimal" else -np.inf
 
 
 def _looked_at(family: ConstraintFamily) -> Array:
+    """Return the indices ``(k, d)`` at which the rows of a family are examined."""
     if family.cells is None:
         return np.zeros((0, family.index_set.dimension))
     lower, upper = family.cells
@@ -125,8 +173,11 @@ def _looked_at(family: ConstraintFamily) -> Array:
 
 
 def _opposite(G: Array, h: Array, size: Array) -> Iterator[tuple[int, int, Array, Array]]:
-    """Pairs of rows that look opposite ways: their numbers, the weight ``(k,)`` of the second, and by how much ``(k,)``
-    their sum is violated."""
+    """Yield pairs of rows with opposite normals.
+
+    Each item holds the numbers of the two rows, the weight ``(k,)`` of the second, and the violation ``(k,)`` of their
+    sum.
+    """
     count = h.shape[1]
     for one in range(count):
         for two in range(one + 1, count):
@@ -148,6 +199,7 @@ def _reason(
     multipliers: Array,
     amount: float | None = None,
 ) -> Reason:
+    """Return the reason given by rows ``which`` at index number ``at``."""
     cuts = tuple(
         Cut(family.name, indices[at], row, float(m), family.formulation)
         for row, m in zip(which, multipliers, strict=True)
@@ -159,11 +211,31 @@ def _reason(
 
 
 def _told(family: ConstraintFamily, cut: Cut) -> Explanation:
+    """Return the description of a cut's constraint."""
     return family.explanation(cut.index, cut.row)
 
 
 def sentence(kind: Kind, family: ConstraintFamily, rows: Rows, multipliers: Array, amount: float) -> str:
-    """The reason for people, as far as the family can tell it: in the user's units."""
+    """Return the sentence that states a reason, in the user's units as far as the family knows them.
+
+    Parameters
+    ----------
+    kind : str
+        Kind of the reason.
+    family : ConstraintFamily
+        Family of the rows.
+    rows : Rows
+        The rows.
+    multipliers : ndarray, shape (r,)
+        Multipliers of the rows.
+    amount : float
+        Violation of the weighted sum.
+
+    Returns
+    -------
+    str
+        The sentence.
+    """
     units = [family.row_unit(cut.row) for cut in rows.cuts]
     amount = amount * units[0]
     told = [_told(family, cut) for cut in rows.cuts]

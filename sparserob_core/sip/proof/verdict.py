@@ -1,4 +1,4 @@
-"""What may be said of a run: the status that its proofs allow, its worst constraint, and why nothing is feasible."""
+"""Status that the proofs of a run allow, its worst constraint, and the reasons for infeasibility."""
 
 from __future__ import annotations
 
@@ -21,14 +21,31 @@ from sparserob_core.sip.program import (
 from sparserob_core.sip.relaxed.relaxed import Rows
 from sparserob_core.sip.result import MEANING, Result, Status
 
-# Of the largest entry of a row: by how much the same row may differ where it is chosen among others. Ten times more,
-# and a bound is off by more than a gap that is certified; ten times less, and sums in another order are refused.
+# Difference allowed between a row and the same row chosen among others, relative to its largest entry. With ten times
+# as much, the error of a bound exceeds a certified gap; with a tenth, sums in another order are refused.
 CHOSEN = 1e-9
-NAMED = 6  # reasons, or members of an infeasible subsystem, that are named; of these those with the largest multipliers
+NAMED = 6  # largest number of reasons, or of members with the largest multipliers, that are named
 
 
 def verdict(proofs: Sequence[Proof], gap: float, tolerance: float) -> tuple[Status, str]:
-    """The status that the proofs and the gap allow, and a sentence."""
+    """Return the status that proofs and gap allow, and a sentence.
+
+    Parameters
+    ----------
+    proofs : sequence of Proof
+        One proof for each family.
+    gap : float
+        Relative gap of the bounds.
+    tolerance : float
+        Largest gap of a certified result.
+
+    Returns
+    -------
+    status : Status
+        The status.
+    message : str
+        Sentence for a reader.
+    """
     refuted = [
         f"{proof.family} is violated by {proof.violation * proof.unit:.4g} {proof.measured}".rstrip()
         for proof in proofs
@@ -44,9 +61,23 @@ def verdict(proofs: Sequence[Proof], gap: float, tolerance: float) -> tuple[Stat
 
 
 def remarked(program: SemiInfiniteProgram, result: Result) -> Result:
-    """The same result with a word on what its claim rests on that nobody has proven: the enclosures and separations of
-    a program that was stated as it is, whose rows can be evaluated only. Nothing is added where nothing is claimed; and
-    where rows deny what families have said, nothing is claimed."""
+    """Return the result with a warning where its claim rests on unproven answers of the families.
+
+    Enclosures and separations of a program that was stated directly are believed, for only its rows can be evaluated. A
+    result without a claim is returned unchanged. Where rows contradict the answers of families, nothing is claimed.
+
+    Parameters
+    ----------
+    program : SemiInfiniteProgram
+        The program.
+    result : Result
+        The result.
+
+    Returns
+    -------
+    Result
+        The result, with a longer message, or with the status ``failed`` and without bounds.
+    """
     if denied := _denied(program, result):
         return replace(
             result,
@@ -65,8 +96,11 @@ def remarked(program: SemiInfiniteProgram, result: Result) -> Result:
 
 
 def _denied(program: SemiInfiniteProgram, result: Result) -> str:
-    """How the rows of families deny what these have said, in words: a witness that meets its row, or, where multipliers
-    are those of chosen rows, other rows at the same indices. Empty where they deny nothing."""
+    """Return in words how the rows of a family contradict its answers; empty where they do not.
+
+    A witness may satisfy its row. Or chosen rows, on which multipliers rest, may differ from the rows at the same
+    indices.
+    """
     worst, x = result.worst, result.decision
     if result.status == "refuted" and worst is not None and worst.constraint and x is not None:
         family = program.formulated(worst.constraint, worst.formulation)
@@ -91,12 +125,28 @@ def _denied(program: SemiInfiniteProgram, result: Result) -> str:
 
 
 def as_bad_as_found(proofs: Sequence[Proof], separations: Sequence[tuple[ConstraintFamily, Separation]]) -> list[Proof]:
-    """A refutation ends at the first witness: of what is not proven, tell the worst that the separation finds."""
+    """Return the proofs with the worst violation that separation has found, for families that are not proven.
+
+    A refutation ends at the first witness, which need not be the worst.
+
+    Parameters
+    ----------
+    proofs : sequence of Proof
+        Proofs of the families.
+    separations : sequence of (ConstraintFamily, Separation)
+        Separations at the same decision.
+
+    Returns
+    -------
+    list of Proof
+        The proofs.
+    """
     found = {family.name: (family, separation) for family, separation in separations}
     return [_worse(proof, *found[proof.family]) if proof.family in found else proof for proof in proofs]
 
 
 def _worse(proof: Proof, family: ConstraintFamily, found: Separation) -> Proof:
+    """Return the proof, or the refutation by the separation's violation where that is worse."""
     if proof.verdict == "proven" or not found.violations.size or found.violations[0] <= max(proof.violation, TOLERANCE):
         return proof
     return replace(
@@ -112,7 +162,8 @@ def _worse(proof: Proof, family: ConstraintFamily, found: Separation) -> Proof:
 
 
 def worst_of(separations: Sequence[tuple[ConstraintFamily, Separation]]) -> WorstConstraint:
-    """The most violated constraint that the separations of all families have found; what defines a value is none."""
+    """Return the most violated constraint that the separations of all families have found; families that define values
+    are ignored."""
     found = [
         WorstConstraint(float(s.violations[0]), family.name, s.indices[0], int(s.rows[0]), family.formulation)
         for family, s in separations
@@ -122,7 +173,22 @@ def worst_of(separations: Sequence[tuple[ConstraintFamily, Separation]]) -> Wors
 
 
 def witness(program: SemiInfiniteProgram, searched: WorstConstraint, proofs: Sequence[Proof]) -> WorstConstraint:
-    """The worst constraint that search or proof has met, explained."""
+    """Return the worst constraint that search or proof has found, with the facts that its family adds.
+
+    Parameters
+    ----------
+    program : SemiInfiniteProgram
+        The program.
+    searched : WorstConstraint
+        The worst constraint that the search has found.
+    proofs : sequence of Proof
+        Proofs of the families.
+
+    Returns
+    -------
+    WorstConstraint
+        The worst of all.
+    """
     found = [
         WorstConstraint(proof.violation, proof.family, proof.index, proof.row, proof.formulation)
         for proof in proofs
@@ -132,7 +198,20 @@ def witness(program: SemiInfiniteProgram, searched: WorstConstraint, proofs: Seq
 
 
 def explained(program: SemiInfiniteProgram, bare: WorstConstraint) -> WorstConstraint:
-    """The worst constraint with what its family knows of it."""
+    """Return the worst constraint with the facts that its family adds.
+
+    Parameters
+    ----------
+    program : SemiInfiniteProgram
+        The program.
+    bare : WorstConstraint
+        The constraint without these facts.
+
+    Returns
+    -------
+    WorstConstraint
+        The constraint.
+    """
     family = program.formulated(bare.constraint, bare.formulation) if bare.constraint else None
     return bare if family is None else family.explanation(bare.index, bare.row).witness(bare)
 
@@ -140,9 +219,28 @@ def explained(program: SemiInfiniteProgram, bare: WorstConstraint) -> WorstConst
 def infeasible_subsystem(
     program: SemiInfiniteProgram, rows: Rows, y: Array, amount: float
 ) -> tuple[InfeasibleSubsystem, WorstConstraint | None]:
-    """Why nothing is feasible, from Farkas multipliers ``y`` of the fixed rows and then of ``rows``: every separate
-    reason that needs no solver; where there is none, the rows that cannot hold together, and what they ask of the
-    decision against what it can give. With it the constraint that matters most.
+    """Return the reasons for infeasibility, and the most important constraint.
+
+    All separate reasons that need no solver are returned. Where there is none, the rows that cannot hold together are
+    returned, with the demand of their weighted sum on the decision.
+
+    Parameters
+    ----------
+    program : SemiInfiniteProgram
+        The program.
+    rows : Rows
+        Imposed rows.
+    y : ndarray
+        Farkas multipliers of the fixed rows, then of ``rows``.
+    amount : float
+        Proven infeasibility, in multiples of the norms of the rows.
+
+    Returns
+    -------
+    found : InfeasibleSubsystem
+        The reasons.
+    worst : WorstConstraint or None
+        The most important constraint.
     """
     from sparserob_core.sip.proof.reasons import least_of, least_within, reasons, sentence
 
@@ -151,8 +249,8 @@ def infeasible_subsystem(
     active = np.flatnonzero(multipliers > 0)
     if active.size == 1 and not equalities and (program.finite.S is not None or not found) and len(found) < 2:
         i = int(active[0])
-        # more is known where the decision has more than bounds of its own (a polytope of controls): by Farkas'
-        # multipliers, or by a linear program in which nothing but this row counts
+        # Where the decision has more than bounds of its own (a polytope of controls), Farkas' multipliers, or a linear
+        # program whose cost is this row alone, give a larger bound.
         norms = np.linalg.norm(np.vstack([program.finite.G, rows.G]), axis=1)
         farkas = amount * float(y @ norms / multipliers[i])
         known = float(least_of(program.finite, rows.G[[i]], rows.h[[i]])[0])
@@ -175,14 +273,14 @@ def infeasible_subsystem(
 def _together(
     program: SemiInfiniteProgram, rows: Rows, multipliers: Array, order: np.ndarray, amount: float
 ) -> InfeasibleSubsystem:
-    """Several rows that cannot hold together: each by name, and the sum of them that proves it."""
+    """Return several rows that cannot hold together, by their descriptions, with the weighted sum that proves it."""
     from sparserob_core.sip.proof.reasons import least_of, least_within
 
     told = [_explanation(program, rows.cuts[i]) for i in order[:NAMED]]
     units = np.array([program.family(cut.family).row_unit(cut.row) for cut in rows.cuts])
     y = multipliers / units
     share = 1.0 / y.max()
-    y, weights = y * share, multipliers * share  # of rows in the user's units, and in their own
+    y, weights = y * share, multipliers * share  # for rows in the user's units, and in their own
     asked = -float(weights[order] @ rows.h[order])
     together = weights[order] @ rows.G[order]
     known = float(least_of(program.finite, together[None], np.array([-asked]))[0])
@@ -203,9 +301,11 @@ def _together(
 
 
 def _worst_at(program: SemiInfiniteProgram, cut: Cut, violation: float) -> WorstConstraint:
+    """Return the worst constraint at a cut, with the facts that its family adds."""
     return explained(program, WorstConstraint(violation, cut.family, cut.index, cut.row, cut.formulation))
 
 
 def _explanation(program: SemiInfiniteProgram, cut: Cut) -> Explanation:
+    """Return the description of a cut's constraint."""
     family = program.formulated(cut.family, cut.formulation) or program.family(cut.family)
     return family.explanation(cut.index, cut.row)

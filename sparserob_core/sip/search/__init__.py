@@ -1,1 +1,1 @@
-"""Global maximisation of a function over a box: accounts, local search, and events."""
+"""Global maximisation of a function over a box: counted evaluations, local search, and events."""

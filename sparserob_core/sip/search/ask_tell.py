@@ -1,9 +1,9 @@
-"""A search whose function is evaluated by somebody else: points are asked for, values are told.
+"""A search whose function is evaluated by the caller: ``ask`` returns points, and ``tell`` receives their values.
 
-The maximiser runs in a thread, and never at the same time as whoever asks: `AskTell.ask` waits until it wants values or
-has ended, and it waits until they are told. So every maximiser can be asked, as it is. A thread cannot be written to a
-file; but a search is repeatable, so what was told is all there is to keep: another thread, told the same, comes to
-the same point.
+The maximiser runs in a thread, and never at the same time as the caller. `AskTell.ask` waits until the maximiser needs
+values or has ended; the maximiser waits until it receives them. So every maximiser can be used without a change. A
+thread cannot be stored in a file. But a search is repeatable, so only the received values are stored: another thread
+that receives the same values comes to the same point.
 """
 
 from __future__ import annotations
@@ -32,8 +32,8 @@ Key: TypeAlias = tuple[float, ...]
 
 FORMAT = 1
 WORDS = {np.inf: "inf", -np.inf: "-inf"}
-GRACE = 5.0  # seconds that a maximiser may take to end; a tenth may be less than one of its steps in many coordinates
-LATER = {  # keys that older states do not have
+GRACE = 5.0  # seconds that a maximiser may take to end; in many coordinates one of its steps may take a tenth or more
+LATER = {  # keys that older states lack, with their defaults
     "minimise": False,
     "integer": [],
     "logarithmic": [],
@@ -44,13 +44,15 @@ LATER = {  # keys that older states do not have
 
 
 class Closed(Exception):
-    """Raised through a maximiser whose search nobody will ask again."""
+    """Exception that ends a maximiser whose search was closed."""
 
 
 @final
 class _Other:
-    """The side of the maximiser: what it wants, and what it is answered. It knows nothing of `AskTell`, so that one
-    that is forgotten ends its thread."""
+    """The maximiser's side of a search: a thread, the points that it needs, and the answers.
+
+    The object holds no reference to `AskTell`, so that the thread ends when an `AskTell` is garbage collected.
+    """
 
     def __init__(self, search: Search) -> None:
         self._search = search
@@ -68,7 +70,7 @@ class _Other:
     def _run(self) -> None:
         try:
             self.wanted.put(self._search(self._values))
-        except BaseException as error:  # noqa: BLE001  it is raised where somebody asks
+        except BaseException as error:  # noqa: BLE001  `ask` raises it in the caller's thread
             ours = isinstance(error, EvaluationError) and isinstance(error.__cause__, InputError)
             self.wanted.put(error.__cause__ or error if ours else error)
 
@@ -82,23 +84,25 @@ class _Other:
 
 @final
 class _Values:
-    """Values that were told and not yet used, by their points. A value is used once, in the order in which it was
-    told, so that a point that is asked for twice is evaluated twice; ``repeats``: it answers as often as its point is
-    asked for."""
+    """Values that were received and not yet used, by their points.
+
+    Values are used once, in the order of their arrival, so that a point that the search needs twice is evaluated twice.
+    With ``repeats``, a value answers as often as its point is needed.
+    """
 
     def __init__(self, repeats: bool) -> None:
         self._repeats = repeats
         self._numbers: dict[Key, deque[int]] = {}
         self._last: dict[Key, int] = {}
-        self.unused: dict[int, None] = {}  # numbers of values, in the order in which they were told
+        self.unused: dict[int, None] = {}  # numbers of values, in the order of their arrival
 
     def add(self, key: Key, number: int) -> None:
-        """Take note of a value by its number."""
+        """Add a value by its number."""
         self._numbers.setdefault(key, deque()).append(number)
         self.unused[number] = None
 
     def use(self, key: Key) -> int | None:
-        """The number of a value at a point; ``None`` where there is none."""
+        """Return the number of a value at a point, and mark it as used; ``None`` where there is none."""
         waiting = self._numbers.get(key)
         if waiting:
             self._last[key] = waiting.popleft()
@@ -111,10 +115,10 @@ class _Values:
 class AskTell:
     """A search by hand: ``points = search.ask()``, ``search.tell(points, values)``, until ``search.done``.
 
-    ``ask`` gives the same points until they are told, in another process too: `state` is plain data, from which
-    `sparserob_core.ask_tell` goes on, with a larger budget too; pickled, and taken out again, it goes on likewise. For
-    several workers, ``ask(1, fresh=True)`` gives what nobody was given. Values are told in any order, and in part.
-    A search that is no longer wanted is closed with `close`, by leaving a ``with`` block, or by being forgotten. Its
+    ``ask`` returns the same points until their values are received. A search continues in another process too: `state`
+    is plain data from which `sparserob_core.ask_tell` continues, also with a larger budget. A pickled search continues
+    likewise. For several workers, ``ask(1, fresh=True)`` returns a point that nobody else has received. Values are
+    accepted in any order, and in part. `close`, the end of a ``with`` block, or garbage collection ends a search. The
     methods may be called from several threads.
     """
 
@@ -137,10 +141,10 @@ class AskTell:
         told, self._owed = ([], []) if state is None else _told(state, self._about, self.domain)
         for point, value in told:
             self._take(point, value)
-        self._batch: list[Key] | None = None  # what the search waits for, and the values of it that are known
-        self._answers: list[float | None] = []
-        self._ahead: list[Key] = []  # given to idle workers, before the search wants it
-        self._given: Counter[Key] = Counter()  # given to somebody, and not told
+        self._batch: list[Key] | None = None  # points for which the search waits
+        self._answers: list[float | None] = []  # their values, as far as they are known
+        self._ahead: list[Key] = []  # points given to idle workers before the search needs them
+        self._given: Counter[Key] = Counter()  # points given out, without a value yet
         if state is not None:
             out, ahead = _out(state, self.domain)
             self._given.update(out)
@@ -150,40 +154,58 @@ class AskTell:
         self._finalizer = weakref.finalize(self, self._other.close)
 
     def __repr__(self) -> str:
-        """How far it is; nothing is asked of the search for it."""
+        """Return the progress of the search, without a call of the maximiser."""
         best = f"{'least' if self._about['minimise'] else 'best'} value {self.best_value:.9g}"
         return f"AskTell: {self.evaluations} of {self._about['budget']} evaluations, {best}"
 
     @property
     def done(self) -> bool:
-        """Whether the search has ended: nothing is left to ask for. Raises what the maximiser has raised."""
+        """True where the search has ended, and no point is left to ask for; an error of the maximiser is raised
+        here."""
         with self._lock:
             return self._waiting() is None
 
     @property
     def evaluations(self) -> int:
-        """Values told so far."""
+        """Number of values received so far."""
         return len(self._values)
 
     @property
     def best_value(self) -> float:
-        """The best value so far, the least one with ``minimise``; ``-inf`` (``inf``) before the first one. NaN is never
-        the best."""
+        """Best value so far, with ``minimise`` the least; ``-inf`` (``inf``) before the first value. NaN is never the
+        best."""
         return self._sign * float(self._usable().max(initial=-np.inf))
 
     @property
     def best_point(self) -> Array:
-        """The best point so far ``(d,)``; NaN before the first value."""
+        """Best point so far ``(d,)``; NaN before the first value."""
         return self._points[int(self._usable().argmax())].copy() if self._values else self.domain.lower * np.nan
 
     def ask(self, k: int | None = None, fresh: bool = False) -> Array:
-        """The points ``(j, d)`` whose values come next, ``k`` at most; ``(0, d)`` when the search has ended.
+        """Return the points whose values the search needs next.
 
-        There are fewer than ``k`` where the maximiser must know values before it goes on; most want one point at a
-        time. ``fresh``: only points that nobody was given, one unless ``k`` says more, for several workers. Where the
-        search has none left, these are the ones that it would want next if those that are out had the worst value so
-        far (the constant liar of Ginsbourger, Le Riche and Carraro 2010); their values come on top of the budget where
-        the search does not ask for them. Raises `InputError` for a ``k`` below 1, and what the maximiser has raised.
+        There are fewer than ``k`` points where the maximiser needs values before it continues. Most maximisers need one
+        at a time.
+
+        Parameters
+        ----------
+        k : int, optional
+            Largest number of points; by default all, and 1 with ``fresh``.
+        fresh : bool, default False
+            Return only points that nobody has received, for several workers. Where the search has none left, points are
+            predicted. Predicted points are those that the search would need next if all open points had the worst value
+            so far (the constant liar of Ginsbourger, Le Riche and Carraro 2010). Their values are not counted in the
+            budget where the search does not ask for them.
+
+        Returns
+        -------
+        ndarray, shape (j, d)
+            The points; ``(0, d)`` when the search has ended.
+
+        Raises
+        ------
+        InputError
+            For a ``k`` below 1. An error of the maximiser is raised here too.
         """
         if k is not None and not is_whole(k, 1):
             raise InputError(f"ask: expected a number of points of at least 1, got {k!r}")
@@ -199,10 +221,19 @@ class AskTell:
             return np.array(keys, dtype=float).reshape(-1, self.domain.dimension)
 
     def tell(self, points: Array, values: Array) -> None:
-        """The values ``(j,)`` at points ``(j, d)`` that were asked for, in any order, and all of them or some; NaN and
-        ``-inf`` where there is none. A single point ``(d,)`` has a number.
+        """Receive values at points that were asked for, in any order, all of them or some.
 
-        Raises `InputError` for points that were not asked for, or were told already; nothing is taken then.
+        Parameters
+        ----------
+        points : array_like, shape (j, d) or (d,)
+            Points that `ask` returned.
+        values : array_like, shape (j,), or a number for a single point
+            Their values; NaN or ``-inf`` where there is none.
+
+        Raises
+        ------
+        InputError
+            For points that were not asked for, or that have a value already; then no value is accepted.
         """
         try:
             given, told = np.atleast_2d(np.array(points, dtype=float)), np.atleast_1d(np.array(values, dtype=float))
@@ -215,7 +246,7 @@ class AskTell:
             )
         keys = _keys(given)
         with self._lock:
-            if self._owed:  # of a state, which the search first asks for again
+            if self._owed:  # values of a state, for which the search first asks again
                 self._waiting()
             for key, count in Counter(keys).items():
                 if count > self._given[key]:
@@ -230,17 +261,27 @@ class AskTell:
             self._answer()
 
     def report(self) -> Report:
-        """The report of the search; before its end, what is known by now. Values are those that were told: with
-        ``minimise`` the best is the least. Raises what the maximiser has raised."""
+        """Return the report of the search, or before its end the results so far.
+
+        With ``minimise``, values are those that were received, and the best is the least. An error of the maximiser is
+        raised here.
+        """
         return self._end if self.done and isinstance(self._end, Report) else self._so_far("the search has not ended")
 
     def state(self) -> dict[str, Any]:
-        """Everything told so far, as plain data that JSON can hold, and which points are out.
+        """Return everything that the search needs to continue, as plain data that JSON can hold.
 
-        ``aside``: the numbers of the values that the search has not asked for by itself. ``out``: the points that were
-        given and have no value yet, which another process may tell; `ask` gives those of them again that the search
-        waits for, and ``ask(fresh=True)`` none. ``ahead``: the numbers of those that it does not wait for. Where
-        whoever has them will never tell, empty lists let them go.
+        Returns
+        -------
+        dict
+            Points, values and the arguments of the search, and where there are any: ``aside``, the numbers of the
+            values that the search itself has not asked for; ``out``, the points that were given out and have no value
+            yet; ``ahead``, the numbers of those of them that the search does not wait for.
+
+        Notes
+        -----
+        Another process may deliver the values of ``out``. There, `ask` returns those points again for which the search
+        waits; ``ask(fresh=True)`` returns none of them. Where their values will never arrive, empty lists release them.
         """
         with self._lock:
             numbers = [WORDS.get(value, None if np.isnan(value) else value) for value in self._values]
@@ -257,7 +298,7 @@ class AskTell:
             return {"format": FORMAT, **self._about, **rows, **{name: row for name, row in apart.items() if row}}
 
     def close(self) -> None:
-        """End the search, if it has not; what was told can still be read."""
+        """End the search, if it has not ended; its values can still be read."""
         self._finalizer()
         with self._lock:
             if self._end is None:
@@ -277,7 +318,7 @@ class AskTell:
         self.close()
 
     def _waiting(self) -> list[Key] | None:
-        """The points of the batch that have no value yet; ``None`` when the search has ended."""
+        """Return the points of the batch that have no value yet; ``None`` when the search has ended."""
         while self._end is None and self._batch is None:
             wanted = self._other.wanted.get()
             if isinstance(wanted, np.ndarray):
@@ -294,7 +335,7 @@ class AskTell:
         return list(dict.fromkeys(waiting)) if self._ranges.integer else waiting
 
     def _answer(self) -> None:
-        """Give the search the values that it waits for, where all of them are known."""
+        """Send the search the values for which it waits, where all of them are known."""
         for row, key in enumerate(self._batch or ()):
             if self._answers[row] is None and (number := self._known.use(key)) is not None:
                 self._answers[row] = self._sign * self._values[number]
@@ -306,7 +347,7 @@ class AskTell:
             self._other.answers.put(values)
 
     def _demand_owed(self, missing: list[Key]) -> None:
-        """Refuse a state that holds what the search has asked for, and does not ask for now."""
+        """Refuse a state whose values belong to points that the search does not ask for now."""
         owed = [number for number in self._owed if number in self._known.unused]
         self._owed = []
         if not owed or isinstance(self._end, BaseException):
@@ -318,8 +359,8 @@ class AskTell:
         self._end = InputError(f"state: {wrong}it is another maximiser, another version, or one that is not repeatable")
 
     def _fresh(self, waiting: list[Key], k: int) -> list[Key]:
-        """Points ``k`` at most that nobody was given: of those that the search waits for, then of those that it would
-        want next."""
+        """Return at most ``k`` points that nobody has received: first those the search waits for, then predicted
+        ones."""
         out = Counter(self._given)
         keys: list[Key] = []
         for key in waiting:
@@ -335,7 +376,8 @@ class AskTell:
         return keys
 
     def _wanted_next(self, waiting: list[Key]) -> list[Key]:
-        """What another search, told everything and that all points that are out have the worst value so far, wants."""
+        """Return the points that another search needs next, which receives all values and the worst value for every
+        open point."""
         usable = self._usable()
         worst = float(usable[np.isfinite(usable)].min(initial=np.inf))
         lie = worst if np.isfinite(worst) else -np.inf
@@ -367,7 +409,7 @@ class AskTell:
         return Report(self.best_value, self.best_point, self.evaluations, np.inf, trace, stopped)
 
     def _turned(self, report: Report) -> Report:
-        """The maximiser's report in the coordinates and with the sign of whoever asks."""
+        """Return the maximiser's report in the caller's coordinates and with the caller's sign."""
         trace = replace(
             report.trace,
             points=self._ranges.shown(report.trace.points),
@@ -386,13 +428,13 @@ class AskTell:
         )
 
     def _usable(self) -> Array:
-        """The values as those of a maximisation ``(n,)``; NaN is ``-inf``."""
+        """Return the values ``(n,)`` with the sign of a maximisation; NaN is ``-inf``."""
         values = self._sign * np.array(self._values, dtype=float)
         return np.where(np.isnan(values), -np.inf, values)
 
 
 def _taken_out(again: Callable[..., AskTell], state: Mapping[str, Any], closed: bool) -> AskTell:
-    """A search that was pickled."""
+    """Return a search that was pickled."""
     search = again(state=state)
     if closed:
         search.close()
@@ -409,13 +451,15 @@ def _searching(search: Search) -> Iterator[_Other]:
 
 
 def _keys(points: Array) -> list[Key]:
-    """Points as what can be looked up."""
+    """Return points as keys of a dictionary."""
     return [tuple(point) for point in points.tolist()]
 
 
 def _told(state: object, about: Mapping[str, Any], domain: Box) -> tuple[list[tuple[Array, float]], Iterable[int]]:
-    """The points and values of a state, and the numbers of those that the search must ask for again; raises
-    `InputError` where it is malformed, or of another search."""
+    """Return the points and values of a state, and the numbers of those that the search must ask for again.
+
+    Raises `InputError` where the state is malformed, or belongs to another search.
+    """
     if not isinstance(state, Mapping) or state.get("format") != FORMAT:
         raise InputError(path="state", expected=f"what `state()` gave, format {FORMAT}", got=_short(state))
     for key, ours in about.items():
@@ -445,8 +489,10 @@ def _told(state: object, about: Mapping[str, Any], domain: Box) -> tuple[list[tu
 
 
 def _out(state: Mapping[str, Any], domain: Box) -> tuple[list[Key], list[Key]]:
-    """The points of a state that are out, and those of them that the search does not wait for; raises `InputError`
-    where they are malformed."""
+    """Return the open points of a state, and those of them for which the search does not wait.
+
+    Raises `InputError` where they are malformed.
+    """
     out, ahead = state.get("out", []), state.get("ahead", [])
     try:
         points = np.array(out, dtype=float).reshape(len(out), domain.dimension)

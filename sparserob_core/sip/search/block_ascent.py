@@ -1,5 +1,7 @@
-"""Ascent of a function whose blocks of coordinates are linear in some of them: vertices there, a search with idle
-blocks in the others."""
+"""Ascent of a function whose blocks of coordinates are linear in some coordinates.
+
+The linear coordinates go to vertices; idle blocks search in the other coordinates.
+"""
 
 from __future__ import annotations
 
@@ -8,23 +10,39 @@ import numpy as np
 from sparserob_core.sip.convex_set import Array, Box
 from sparserob_core.sip.maximiser import LinearBlocks, Objective
 
-GAIN = 1e-9  # relative: what a step must gain to count as one
-PATIENCE = 12  # steps without a gain at least, before the ascent ends
+GAIN = 1e-9  # relative improvement from which a step counts as a gain
+PATIENCE = 12  # least number of steps without a gain before the ascent ends
 OCTAVES = 40.0  # halvings of a side from the farthest to the nearest neighbour of a block that acts
 GOLDEN = (5.0**0.5 - 1.0) / 2.0
 
 
 def block_ascent(objective: Objective, start: Array | None = None) -> bool:
-    """Climb from ``start (d,)``, or from the best point, of an objective that is linear in blocks (`Objective.linear`)
-    until nothing near the blocks that act is a gain; where it is not, or the value there is not finite, do nothing.
+    """Climb until no point near the acting blocks improves the objective; the objective must be linear in blocks.
 
-    One step is one evaluation. The linear coordinates of every block go to the vertex at which the block weighs most
-    (Frank and Wolfe 1956; for the maximum of a convex function, which is at a vertex: Mangasarian 1996). Blocks that do
-    not act may be moved without loss: one half of them is placed beside those that act, at distances from half a side
-    down to its ``2^-40``, which is a line search in all other coordinates at once; the other half is spread over the
-    box, by the additive recurrence of Kronecker, and finds what is not yet known. So no step makes the value less.
-    Notes ``acting``, how many blocks act. Returns whether it has climbed to where neighbours were tried and
-    none is a gain, which they are not where every block acts; ends by `SearchEnded` when the budget is spent.
+    One step is one evaluation. The linear coordinates of every block go to the vertex at which the block has the
+    largest effect (Frank and Wolfe 1956). A convex function has its maximum at a vertex (Mangasarian 1996). Blocks that
+    do not act may be moved without loss. Half of them are placed near the acting blocks, at distances from half a side
+    down to its ``2^-40``. So one step is a line search in all other coordinates at once. The other half is distributed
+    over the box by Kronecker's additive recurrence, and explores the rest. So no step decreases the value. The number
+    of acting blocks is noted as ``acting``.
+
+    Parameters
+    ----------
+    objective : Objective
+        The function; nothing is done where its ``linear`` is ``None``.
+    start : ndarray, shape (d,), optional
+        Starting point; by default the best point. Nothing is done where the value there is not finite.
+
+    Returns
+    -------
+    bool
+        True where the ascent has ended with neighbours tried and no improvement found. False where nothing was done, or
+        where no neighbour could be tried, as all blocks act.
+
+    Raises
+    ------
+    SearchEnded
+        Where the budget is spent.
     """
     linear = objective.linear
     if linear is None or (start is None and not np.isfinite(objective.best_value)):
@@ -43,22 +61,22 @@ def block_ascent(objective: Objective, start: Array | None = None) -> bool:
         still, tried = (0, 0.0) if gained else (still + 1, tried + idle.neighbours(acts))
         if reached >= value:
             best, value = trial, reached
-        else:  # by rounding only: see the last point's inner solution again
+        else:  # lower by rounding only: restore the inner solution of the last point
             objective.evaluate(best[np.newaxis])
     return bool(np.isfinite(tried))
 
 
 class IdleBlocks:
-    """Where the blocks of a function are placed that do not act: beside those that do, and spread over the box.
+    """Positions for the blocks that do not act: near the acting blocks, and distributed over the box.
 
     Parameters
     ----------
     domain : Box
-        The box ``(d,)`` of the function.
+        Box ``(d,)`` of the function.
     block : int
-        Coordinates of a block.
+        Number of coordinates of a block.
     linear : LinearBlocks, optional
-        The coordinates that are not placed, since they are linear; none of them without it.
+        Its linear coordinates are not placed; without it, all coordinates are placed.
     """
 
     def __init__(self, domain: Box, block: int, linear: LinearBlocks | None = None) -> None:
@@ -66,18 +84,32 @@ class IdleBlocks:
         self.lower, self.upper = domain.lower.reshape(shape), domain.upper.reshape(shape)
         moves = (self.upper > self.lower)[0]
         self.others = np.flatnonzero(moves if linear is None else moves & ~linear.coordinates.reshape(shape)[0])
-        self.faces = linear is None  # half of those that are spread go there: no uniform point is near a vertex
-        self.beside, self.spread = 0, 0  # how many of each have been placed
+        self.faces = linear is None  # half of the distributed blocks go there: no uniform point is near a vertex
+        self.beside, self.spread = 0, 0  # blocks placed so far near acting blocks, and over the box
         self.shares = _kronecker(self.others.size)
 
     def neighbours(self, acts: np.ndarray) -> float:
-        """How many neighbours of each block that acts one step tries in each coordinate; ``inf`` where none can be."""
+        """Return the number of neighbours that one step tries for each acting block in each coordinate; ``inf`` where
+        none can be."""
         directions = acts.sum() * self.others.size
         beside = (acts.size - acts.sum() + 1) // 2
         return float(beside / directions) if beside and directions else np.inf
 
     def placed(self, point: Array, acts: np.ndarray) -> Array:
-        """The point with its idle blocks beside those that act, and spread over the box."""
+        """Return a point with its idle blocks moved, near the acting blocks and over the box.
+
+        Parameters
+        ----------
+        point : ndarray, shape (d,)
+            The point.
+        acts : ndarray of bool, shape (D,)
+            True for the blocks that act.
+
+        Returns
+        -------
+        ndarray, shape (d,)
+            The point with the acting blocks unchanged.
+        """
         blocks, lower, upper = point.reshape(self.lower.shape).copy(), self.lower, self.upper
         idle, acting = np.flatnonzero(~acts), np.flatnonzero(acts)
         if not self.others.size:
@@ -102,8 +134,10 @@ class IdleBlocks:
 
 
 def _kronecker(dimension: int) -> Array:
-    """Shares ``(dimension,)`` whose multiples modulo 1 fill the unit box evenly: powers of the root of
-    ``x^(d+1) = x + 1`` (Roberts 2018)."""
+    """Return shares ``(dimension,)`` whose multiples modulo 1 fill the unit box evenly.
+
+    The shares are powers of the root of ``x^(d+1) = x + 1`` (Roberts 2018).
+    """
     root = 2.0
     for _ in range(64):
         root = (1.0 + root) ** (1.0 / (dimension + 1))

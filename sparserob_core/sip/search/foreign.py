@@ -1,4 +1,5 @@
-"""Other people's optimisers as maximisers: those that are asked and told, and functions that minimise from a start."""
+"""Optimisers of other packages as maximisers: optimisers with ``ask`` and ``tell``, and functions that minimise from a
+start."""
 
 from __future__ import annotations
 
@@ -11,22 +12,23 @@ from sparserob_core.errors import PluginError
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.maximiser import Maximiser, Objective
 
-WORST = 1e20  # what is told where the function has no value; some optimisers compute with it
+WORST = 1e20  # loss where the function has no value; it is finite, since some optimisers compute with it
 
 
 class Asked(Protocol):
-    """An optimiser that minimises: ``asked = ask()``, ``tell(asked, loss)``, as those of cma, nevergrad and optuna."""
+    """An optimiser that minimises by ``asked = ask()`` and ``tell(asked, loss)``, as those of cma, nevergrad and
+    optuna."""
 
     def ask(self) -> Any:
-        """What is to be evaluated: one point, several, or something that a point can be read from."""
+        """Return the next candidate: one point, several points, or an object from which points can be read."""
 
     def tell(self, asked: Any, losses: Any, /) -> Any:
-        """The loss of one point, or a list of the losses of several."""
+        """Receive the loss of one point, or a list of the losses of several."""
 
 
 @final
 class FromAskTell(Maximiser):
-    """See `from_ask_tell`."""
+    """A maximiser made from an optimiser with ``ask`` and ``tell`` (`from_ask_tell`)."""
 
     scaled: ClassVar[bool] = True
 
@@ -34,7 +36,7 @@ class FromAskTell(Maximiser):
         self.create, self.read = create, read
 
     def search(self, objective: Objective, rng: np.random.Generator) -> float:
-        """See `sparserob_core.Maximiser`."""
+        """Spend the budget; return ``inf``, for nothing is proven."""
         unit = _Unit(objective)
         while objective.remaining:
             optimiser = self.create(objective.domain.dimension, objective.remaining, rng)
@@ -51,7 +53,7 @@ class FromAskTell(Maximiser):
 
 @final
 class FromMinimiser(Maximiser):
-    """See `from_minimiser`."""
+    """A maximiser made from a function that minimises (`from_minimiser`)."""
 
     scaled: ClassVar[bool] = True
 
@@ -59,7 +61,7 @@ class FromMinimiser(Maximiser):
         self.minimise = minimise
 
     def search(self, objective: Objective, rng: np.random.Generator) -> float:
-        """See `sparserob_core.Maximiser`."""
+        """Spend the budget; return ``inf``, for nothing is proven."""
         unit = _Unit(objective)
         start = unit.best if objective.evaluations else np.full(objective.domain.dimension, 0.5)
         while objective.remaining:
@@ -74,22 +76,43 @@ class FromMinimiser(Maximiser):
 def from_ask_tell(
     create: Callable[[int, int, np.random.Generator], Asked], read: Callable[[Any], Any] = np.asarray
 ) -> Maximiser:
-    """A maximiser from an optimiser that is asked and told.
+    """Return a maximiser made from an optimiser with ``ask`` and ``tell``, which minimises over the unit box.
 
-    ``create(d, budget, rng)`` makes one that *minimises* over the unit box ``[0, 1]^d``; draw its seed from ``rng``.
-    ``read(optimiser.ask())`` is one point ``(d,)``, whose loss is told as a number, or points ``(k, d)``, whose losses
-    are told as a list; points outside are moved to the box. Where it has a method ``stop`` that says so, it is made
-    anew until the budget is spent. A loss is the value with the other sign, and at most 1e20.
+    A loss is the negative value, and at most 1e20. Points outside of the box are moved to it.
+
+    Parameters
+    ----------
+    create : callable
+        ``create(d, budget, rng)`` makes an optimiser over ``[0, 1]^d``; its seed should be drawn from ``rng``. If the
+        optimiser has a method ``stop`` that returns true, a new one is made, until the budget is spent.
+    read : callable, default numpy.asarray
+        ``read(optimiser.ask())`` is one point ``(d,)``, whose loss is passed to ``tell`` as a number, or points ``(k,
+        d)``, whose losses are passed as a list.
+
+    Returns
+    -------
+    Maximiser
+        The maximiser.
     """
     return FromAskTell(create, read)
 
 
 def from_minimiser(minimise: Callable[[Callable[[Any], float], Array], object]) -> Maximiser:
-    """A maximiser from a function ``minimise(f, x0)``, such as those of scipy.
+    """Return a maximiser made from a function ``minimise(f, x0)``, such as those of scipy.
 
-    It minimises over the unit box, from its centre or from the best point so far, and anew from random points until the
-    budget is spent; what it returns is not looked at. ``f`` takes one point ``(d,)``; points outside are moved to the
-    box.
+    The function minimises over the unit box, first from its centre or from the best point so far, then from random
+    points until the budget is spent.
+
+    Parameters
+    ----------
+    minimise : callable
+        ``minimise(f, x0)``. ``f`` takes one point ``(d,)``; a point outside of the box is moved to it. The return value
+        is ignored.
+
+    Returns
+    -------
+    Maximiser
+        The maximiser.
     """
     return FromMinimiser(minimise)
 
@@ -103,9 +126,12 @@ class _Unit:
 
     @property
     def best(self) -> Array:
+        """Best point so far ``(d,)`` in the unit box."""
         return np.asarray(np.clip((self.objective.best_point - self.lower) / self.width, 0.0, 1.0))
 
     def losses(self, points: Array) -> Array:
+        """Return the losses ``(k,)``, at most `WORST` in size, at points ``(k, d)``, which are moved to the unit
+        box."""
         inside = np.clip(np.nan_to_num(points, nan=0.5), 0.0, 1.0)
         placed = np.clip(self.lower + inside * self.width, self.lower, self.objective.domain.upper)
         return np.clip(-self.objective.evaluate(placed), -WORST, WORST)

@@ -1,5 +1,5 @@
-"""What a maximiser is handed: the objective in the coordinates that can move, in units in which its box and its values
-are of ordinary size, and with the indices of a tuple apart in its middle."""
+"""Objectives as a maximiser receives them: without fixed coordinates, in units of ordinary size, or with indices
+apart."""
 
 from __future__ import annotations
 
@@ -15,12 +15,15 @@ from sparserob_core.errors import PluginError
 from sparserob_core.sip.convex_set import Array, Box
 from sparserob_core.sip.maximiser import LinearBlocks, Objective
 
-LEAST, LARGEST = 2.0**-1000, 2.0**1000  # units beyond these leave no room for what is computed with them
+LEAST, LARGEST = 2.0**-1000, 2.0**1000  # with units beyond these, products of numbers overflow or underflow
 
 
 class Handed(ABC):
-    """An `Objective` in coordinates of its own: points ``(k, c)`` of its ``domain`` are `full` ones ``(k, d)`` of the
-    objective behind it, which `own` leads back from; everything else is passed on. The accounts stay behind it."""
+    """An `Objective` in other coordinates than the objective behind it, which counts the evaluations.
+
+    `full` maps points ``(k, c)`` of this ``domain`` to points ``(k, d)`` of the objective behind it, and `own` maps
+    them back. All other calls are passed on.
+    """
 
     domain: Box
     block: int
@@ -30,62 +33,63 @@ class Handed(ABC):
 
     @abstractmethod
     def full(self, points: Array) -> Array:
-        """Points ``(k, d)`` of the objective."""
+        """Return the points ``(k, d)`` of the objective for points ``(k, c)`` of this domain."""
 
     @abstractmethod
     def own(self, points: Array) -> Array:
-        """Points ``(k, c)`` of the domain."""
+        """Return the points ``(k, c)`` of this domain for points ``(k, d)`` of the objective."""
 
     def marked(self, truths: np.ndarray) -> np.ndarray:
-        """Which coordinates are meant ``(c,)``, of those of the objective ``(d,)``."""
+        """Return the truth values ``(c,)`` of these coordinates, from those ``(d,)`` of the objective."""
         return truths
 
     def slope(self, gradient: Array) -> Array:
-        """A gradient of the objective ``(d,)`` as one of this ``(c,)``."""
+        """Return the gradient ``(c,)`` in these coordinates, from the gradient ``(d,)`` of the objective."""
         return gradient
 
     def values(self, values: Array) -> Array:
-        """Values of the objective ``(k,)`` as those of this."""
+        """Return the values ``(k,)`` in these units, from the values ``(k,)`` of the objective."""
         return values
 
     @property
     def budget(self) -> int:
-        """See `Objective`."""
+        """Total number of evaluations that the search may spend."""
         return self._objective.budget
 
     @property
     def evaluations(self) -> int:
-        """See `Objective`."""
+        """Number of evaluations so far."""
         return self._objective.evaluations
 
     @property
     def remaining(self) -> int:
-        """See `Objective.remaining`."""
+        """Number of evaluations left; 0 once the search has ended."""
         return self._objective.remaining
 
     @property
     def best_point(self) -> Array:
-        """See `Objective`."""
+        """Best point so far ``(c,)``; NaN while ``evaluations`` is 0."""
         return np.asarray(self.own(self._objective.best_point[np.newaxis])[0])
 
     @property
     def best_value(self) -> float:
-        """See `Objective`."""
+        """Largest value so far, in these units; ``-inf`` while ``evaluations`` is 0."""
         return float(self.values(np.array([self._objective.best_value]))[0])
 
     @property
     def differentiable(self) -> bool:
-        """See `Objective.differentiable`."""
+        """True where `value_and_gradient` is offered."""
         return self._objective.differentiable
 
     @property
     def acting(self) -> Callable[[], np.ndarray] | None:
-        """See `Objective.acting`."""
+        """Function that returns the acting blocks (`Objective.acting`); ``None`` where they are not known."""
         return self._objective.acting
 
     @cached_property
     def linear(self) -> LinearBlocks | None:
-        """See `Objective.linear`."""
+        """Linear coordinates of the blocks, in these coordinates (`Objective.linear`); ``None`` where there are
+        none."""
         behind = self._objective.linear
         if behind is None:
             return None
@@ -96,46 +100,70 @@ class Handed(ABC):
         return LinearBlocks(self.marked(behind.coordinates), behind.acting, steepest)
 
     def known(self) -> tuple[Array, Array]:
-        """See `Objective.known`."""
+        """Return the points ``(k, c)`` that were evaluated before the search, and their values ``(k,)``."""
         return self.seen(*self._objective.known())
 
     def seen(self, points: Array, values: Array) -> tuple[Array, Array]:
-        """Points ``(k, d)`` and values ``(k,)`` of the objective as they are here."""
+        """Return points and values of the objective in these coordinates and units.
+
+        Parameters
+        ----------
+        points : ndarray, shape (k, d)
+            Points of the objective.
+        values : ndarray, shape (k,)
+            Their values.
+
+        Returns
+        -------
+        points : ndarray, shape (k, c)
+            The points in these coordinates.
+        values : ndarray, shape (k,)
+            The values in these units.
+        """
         return self.own(points), self.values(values)
 
     def evaluate(self, points: Array) -> Array:
-        """See `Objective.evaluate`."""
+        """Return the values ``(k,)`` at points ``(k, c)`` (`Objective.evaluate`)."""
         return self.values(self._objective.evaluate(self.full(np.asarray(points, dtype=float))))
 
     def value_and_gradient(self, point: Array) -> tuple[float, Array]:
-        """See `Objective.value_and_gradient`."""
+        """Return the value and the gradient ``(c,)`` at one point ``(c,)`` (`Objective.value_and_gradient`)."""
         value, gradient = self._objective.value_and_gradient(self.full(np.asarray(point, dtype=float)[np.newaxis])[0])
         return float(self.values(np.array([value]))[0]), self.slope(gradient)
 
     def accepts(self, current: float, candidate: float, temperature: float, rng: np.random.Generator) -> bool:
-        """See `Objective.accepts`."""
+        """Return whether the search moves to a candidate (`Objective.accepts`)."""
         return self._objective.accepts(current, candidate, temperature, rng)
 
     def note(self, **scalars: float) -> None:
-        """See `Objective.note`."""
+        """Record scalars in the trace, and pass them to observers."""
         self._objective.note(**scalars)
 
     @property
     def observed(self) -> bool:
-        """See `Objective.observed`."""
+        """True where anybody looks at sketches."""
         return self._objective.observed
 
     def sketch(self, role: str, lower: Array, upper: Array | None = None, rounded: bool = False) -> None:
-        """See `Objective.sketch`."""
+        """Show observers points or regions, mapped to the coordinates of the objective (`Objective.sketch`)."""
         self._objective.sketch(role, self.full(lower), None if upper is None else self.full(upper), rounded)
 
 
 @final
 class Moving(Handed):
-    """The coordinates ``moves`` ``(c,)``, ``c >= 1``, of a point ``(d,)``; each of the others keeps its only value.
+    """The objective in the coordinates that can move; each of the others keeps its only value.
 
-    The ``domain`` has ``lower < upper`` everywhere, so that no maximiser sees a degenerate box. ``block``: where the
-    same coordinates of every index can move, as many as these are; otherwise 1. ``asker``: who searches, for messages.
+    The ``domain`` has ``lower < upper`` everywhere, so that no maximiser receives a degenerate box. The ``block`` is
+    the number of moving coordinates of an index, where they are the same in every index; otherwise it is 1.
+
+    Parameters
+    ----------
+    objective : Objective
+        The objective in all coordinates ``(d,)``.
+    moves : ndarray of int, shape (c,)
+        Coordinates that can move, at least one.
+    asker : str
+        Name of the maximiser in messages.
     """
 
     def __init__(self, objective: Objective, moves: NDArray[np.intp], asker: str) -> None:
@@ -146,7 +174,7 @@ class Moving(Handed):
         self.block = _block(objective.block, moves, objective.domain.dimension)
 
     def full(self, points: Array) -> Array:
-        """See `Handed.full`."""
+        """Return points ``(k, d)`` with the fixed coordinates filled in; raise `PluginError` for a wrong shape."""
         moved = np.asarray(points, dtype=float)
         if moved.ndim != 2 or moved.shape[1] != self._moves.size:
             raise PluginError(f"{self._asker}: points: expected shape (k, {self._moves.size}), got {moved.shape}")
@@ -155,41 +183,48 @@ class Moving(Handed):
         return full
 
     def own(self, points: Array) -> Array:
-        """See `Handed.own`."""
+        """Return the moving coordinates ``(k, c)`` of points ``(k, d)``."""
         return points[:, self._moves]
 
     def marked(self, truths: np.ndarray) -> np.ndarray:
-        """See `Handed.marked`."""
+        """Return the truth values ``(c,)`` of the moving coordinates."""
         return truths[self._moves]
 
     def slope(self, gradient: Array) -> Array:
-        """See `Handed.slope`."""
+        """Return the gradient ``(c,)`` in the moving coordinates."""
         return gradient[self._moves]
 
     @property
     def _whole(self) -> bool:
-        """Whether the blocks are those of the full objective, as far as they can move."""
+        """True where the blocks are those of the full objective, without their fixed coordinates."""
         return self.domain.dimension // self.block == self._fixed.size // self._objective.block
 
     @property
     def acting(self) -> Callable[[], np.ndarray] | None:
-        """See `Objective.acting`."""
+        """Function that returns the acting blocks; ``None`` where the blocks differ from those of the objective."""
         return self._objective.acting if self._whole else None
 
     @cached_property
     def linear(self) -> LinearBlocks | None:
-        """See `Objective.linear`."""
+        """Linear coordinates of the blocks; ``None`` where the blocks differ from those of the objective."""
         return super().linear if self._whole else None
 
 
 @final
 class Scaled(Handed):
-    """Other units: every side of the box has a length of about 1, and the first value that is neither 0 nor infinite a
-    size of about 1.
+    """The objective in units in which the box and the values are of size 1.
 
-    All units are powers of two, so that no number is rounded: in other units of the user, which differ by powers of
-    two, a search makes the same walk to the last bit. What is noted is passed on as it is; a rule that accepts is asked
-    in the user's units. ``values (k,)``: those that are known already.
+    Every side of the box has a length of about 1. The first value that is neither 0 nor infinite has a size of about 1.
+    All units are powers of two, so that no number is rounded. In other units of the user that differ by powers of two,
+    a search has the same trajectory, to the last bit. Notes are passed on unchanged; a rule of acceptance receives the
+    user's units.
+
+    Parameters
+    ----------
+    objective : Objective
+        The objective in the user's units.
+    values : ndarray, shape (k,)
+        Values that are already known.
     """
 
     def __init__(self, objective: Objective, values: Array) -> None:
@@ -201,29 +236,29 @@ class Scaled(Handed):
         self._learn(values)
 
     def full(self, points: Array) -> Array:
-        """See `Handed.full`."""
+        """Return points ``(k, d)`` in the user's units."""
         return np.asarray(points * self.sides)
 
     def own(self, points: Array) -> Array:
-        """See `Handed.own`."""
+        """Return points ``(k, d)`` in units of size 1."""
         return np.asarray(points / self.sides)
 
     def values(self, values: Array) -> Array:
-        """See `Handed.values`; the first that has a size is the unit."""
+        """Return values ``(k,)`` in their unit, which is set by the first value that is neither 0 nor infinite."""
         self._learn(values)
         return values / (self.value or 1.0)
 
     def slope(self, gradient: Array) -> Array:
-        """See `Handed.slope`."""
+        """Return the gradient ``(d,)`` in units of size 1."""
         return np.asarray(gradient * (self.sides / (self.value or 1.0)))
 
     def accepts(self, current: float, candidate: float, temperature: float, rng: np.random.Generator) -> bool:
-        """See `Objective.accepts`."""
+        """Return whether the search moves to a candidate; the rule receives the user's units."""
         unit = self.value or 1.0
         return self._objective.accepts(current * unit, candidate * unit, temperature * unit, rng)
 
     def _learn(self, values: Array) -> None:
-        """Take the unit of the values from the first of them that has a size."""
+        """Set the unit of the values by the first of them that is neither 0 nor infinite."""
         usable = np.isfinite(values) & (values != 0.0)
         if not self.value and usable.any():
             self.value = float(power_of_two(np.abs(values[usable][:1]))[0])
@@ -231,12 +266,12 @@ class Scaled(Handed):
 
 @final
 class Apart(Handed):
-    """Every index of a tuple shifted round its box by as much of its own: in the middle of the box, where all of them
-    would be one, they are apart, as evenly as so many can be.
+    """The objective with every index of a tuple shifted cyclically in its box, each by another amount.
 
-    A search that begins in the middle and cuts one coordinate after the other sees nothing of a tuple otherwise but
-    what one index shows. The first coordinates, times as a rule, are in the middles of as many equal parts; the others
-    follow the sequence of Roberts (2018). What is at the end of a side is beside what is at its beginning.
+    In the middle of the box all indices of a tuple would be equal. After the shifts they differ there, as evenly as
+    possible. Otherwise a search that begins in the middle, and divides one coordinate after the other, learns no more
+    from a tuple than from one index. The first coordinates, usually times, are in the middles of equally many equal
+    parts of the side. The others follow the sequence of Roberts (2018). The two ends of a side become neighbours.
     """
 
     def __init__(self, objective: Objective) -> None:
@@ -253,20 +288,20 @@ class Apart(Handed):
         self._shift = np.mod(places - 0.5, 1.0) * self._sides
 
     def full(self, points: Array) -> Array:
-        """See `Handed.full`."""
+        """Return the points ``(k, d)`` with every index shifted."""
         return self._moved(points, self._shift)
 
     def own(self, points: Array) -> Array:
-        """See `Handed.own`."""
+        """Return the points ``(k, d)`` with the shifts undone."""
         return self._moved(points, -self._shift)
 
     @cached_property
     def linear(self) -> LinearBlocks | None:
-        """None: a vertex is at both ends of a side."""
+        """``None``: after the shifts, a vertex is at both ends of a side."""
         return None
 
     def sketch(self, role: str, lower: Array, upper: Array | None = None, rounded: bool = False) -> None:
-        """See `Objective.sketch`; boxes are where their middles are, as far as these are within the domain."""
+        """Show observers points or regions; a box is placed by its middle, and cut off at the domain."""
         if upper is None:
             super().sketch(role, lower)
             return
@@ -281,7 +316,7 @@ class Apart(Handed):
 
 
 def _block(block: int, moves: NDArray[np.intp], dimension: int) -> int:
-    """How many coordinates of each index can move, where these are the same in every index; otherwise 1."""
+    """Return the number of moving coordinates of an index, where they are the same in every index; otherwise 1."""
     free = np.zeros(dimension, dtype=bool)
     free[moves] = True
     of_index = free.reshape(-1, block)
@@ -289,5 +324,5 @@ def _block(block: int, moves: NDArray[np.intp], dimension: int) -> int:
 
 
 def power_of_two(sizes: Array) -> Array:
-    """The powers of two next below positive ``sizes (k,)``."""
+    """Return the largest powers of two that do not exceed positive ``sizes (k,)``."""
     return np.clip(np.exp2(np.frexp(sizes)[1] - 1.0), LEAST, LARGEST)

@@ -1,4 +1,4 @@
-"""The last share of a budget: local ascents from the best points that a global search has left."""
+"""Polish, the last share of a budget: local ascents from the best points of a global search."""
 
 from __future__ import annotations
 
@@ -15,26 +15,35 @@ from sparserob_core.sip.search.separable import separable_maxima
 from sparserob_core.sip.search.trust_region import TrustRegion
 
 MODELLED = 30
-"""Most coordinates for which quadratics are fitted."""
+"""Largest number of coordinates for which quadratics are fitted."""
 APART = 0.03
-"""Starts differ by this share of the box at least, in some coordinate."""
+"""Least difference of two starts in some coordinate, as a share of the box."""
 STARTS = 30
 AFFORDED = 8
-"""Evaluations left for each coordinate, of which a crossing takes one: with fewer the next start gains more."""
+"""Least number of remaining evaluations for each coordinate, of which a crossing takes one. With fewer, the next start
+gains more."""
 CONSIDERED = 2000
-"""Best evaluated points among which starts and neighbours are looked for."""
+"""Number of best evaluated points among which starts and neighbours are chosen."""
 LONGEST = 20.0
-"""The unit box as a quasi-Newton method sees it, whose first step has length 1."""
+"""Side of the unit box in the coordinates of a quasi-Newton method, whose first step has length 1."""
 
 
 def polish(objective: Objective, points: Array, values: Array) -> None:
-    """Climb from the best of the evaluated ``points (k, d)`` with ``values (k,)`` until the budget is spent or nothing
-    is left to gain.
+    """Climb from the best evaluated points until the budget is spent or no improvement is possible.
 
-    With gradients: L-BFGS-B (Byrd, Lu, Nocedal and Zhu 1995), first in the blocks that act, where these are known.
-    Then, up to 30 coordinates, the derivative-free `TrustRegion`; beyond, a compass search that moves one coordinate,
-    hence one block, at a time. Starts are the best points, then the next best that lie apart; one that its recent
-    progress cannot bring to the top is given up. Nothing is done without a finite value.
+    With gradients, the first method is L-BFGS-B (Byrd, Lu, Nocedal and Zhu 1995), at first in the acting blocks, where
+    these are known. Then follows, up to 30 coordinates, the derivative-free `TrustRegion`. Beyond, a compass search
+    moves one coordinate, hence one block, at a time. Starts are the best points, then the next best that lie apart. A
+    start is given up where its recent progress cannot bring it to the top. Nothing is done without a finite value.
+
+    Parameters
+    ----------
+    objective : Objective
+        The objective, with the remaining budget.
+    points : ndarray, shape (k, d)
+        Evaluated points.
+    values : ndarray, shape (k,)
+        Their values.
     """
     finite = np.isfinite(values)
     if not finite.any():
@@ -52,7 +61,7 @@ def polish(objective: Objective, points: Array, values: Array) -> None:
 
 
 class _Seen:
-    """The evaluated points in the unit box, and a function that adds to them."""
+    """Evaluated points in the unit box, and functions that add to them."""
 
     def __init__(self, objective: Objective, points: Array, values: Array) -> None:
         self.objective = objective
@@ -63,7 +72,7 @@ class _Seen:
         self.values = values.copy()
 
     def starts(self) -> Array:
-        """The best points that lie apart from one another, best first."""
+        """Return the best points that lie apart from one another, best first."""
         order = np.argsort(-self.values, kind="stable")
         chosen = self.points[order[:1]]
         for point in self.points[order[1:]]:
@@ -75,29 +84,32 @@ class _Seen:
 
     @property
     def top(self) -> Array:
-        """The best point."""
+        """Best point ``(d,)``."""
         best: Array = self.points[self.values.argmax()]
         return best
 
     def below(self, start: Array) -> tuple[Array, Array]:
-        """A point and everything that is no better."""
+        """Return the points and values that are no better than ``start``, itself included."""
         own = self.value_of(start)
         kept = self.values <= own
         return self.points[kept], self.values[kept]
 
     def value_of(self, point: Array) -> float:
+        """Return the value of an evaluated point."""
         return float(self.values[(self.points == point).all(axis=1)].max())
 
     def place(self, point: Array) -> Array:
-        """The point of the domain."""
+        """Return the point of the domain for a point of the unit box."""
         return np.clip(self.lower + point * self.width, self.lower, self.objective.domain.upper)
 
     def evaluate(self, point: Array) -> float:
+        """Return the value at a point of the unit box, and record it."""
         value = float(self.objective.evaluate(self.place(point)[np.newaxis])[0])
         self._add(point, value)
         return value
 
     def with_gradient(self, point: Array) -> tuple[float, Array]:
+        """Return the value and the gradient at a point of the unit box, and record the value."""
         value, gradient = self.objective.value_and_gradient(self.place(point))
         self._add(point, value)
         return value, gradient * self.width
@@ -108,7 +120,7 @@ class _Seen:
 
 
 def _ascend(seen: _Seen) -> None:
-    """L-BFGS-B from every start; a value of ``-inf`` is shown to it as the lowest that is finite."""
+    """Run L-BFGS-B from every start; a value of ``-inf`` is replaced by the lowest finite value."""
     lowest = float(seen.values.min())
 
     def descent(scaled: Array) -> tuple[float, Array]:
@@ -122,12 +134,12 @@ def _ascend(seen: _Seen) -> None:
 
 
 def _ascend_with_idle_blocks(seen: _Seen, acting: Callable[[], np.ndarray]) -> None:
-    """L-BFGS-B in the blocks that act, from the best point, while the idle ones are placed anew for every evaluation
+    """Run L-BFGS-B in the acting blocks from the best point, while every evaluation moves the idle blocks
     (`IdleBlocks`).
 
-    A value rests on few blocks of many, and the gradient in the others is 0. To move these costs nothing. Wherever `g`
-    is below its maximum, some index is violated, so that an idle block that comes near it acts; it then joins the
-    ascent. Nothing is done where every block acts.
+    A value depends on a few of many blocks, and the gradient in the others is 0. Moving these costs nothing. Wherever
+    ``g`` is below its maximum, some index is violated, so that an idle block near that index acts. The block then joins
+    the ascent. Nothing is done where every block acts.
     """
     if not seen.objective.remaining:
         return
@@ -143,12 +155,22 @@ def _ascend_with_idle_blocks(seen: _Seen, acting: Callable[[], np.ndarray]) -> N
 
 
 class _NewcomerError(Exception):
-    """An idle block acts at the best point."""
+    """Exception that reports an idle block that acts at the best point."""
 
 
 @dataclass(frozen=True, eq=False)
 class _Standing:
-    """A point ``(d,)`` of the unit box, its value, and the blocks ``(D,)`` that act there."""
+    """A point of an ascent.
+
+    Parameters
+    ----------
+    point : ndarray, shape (d,)
+        Point of the unit box.
+    value : float
+        Its value.
+    acts : ndarray of bool, shape (D,)
+        True for the blocks that act there.
+    """
 
     point: Array
     value: float
@@ -156,8 +178,8 @@ class _Standing:
 
 
 class _BlockLoss:
-    """The loss in the coordinates ``free (d,)`` of the blocks that act at a point ``start``, and its slope; ``best`` is
-    the best point until now."""
+    """Loss and its gradient in the coordinates ``free (d,)`` of the blocks that act at ``start``; ``best`` is the best
+    point."""
 
     def __init__(self, seen: _Seen, acting: Callable[[], np.ndarray], idle: IdleBlocks, start: _Standing) -> None:
         self.seen, self.acting, self.idle, self.start, self.best = seen, acting, idle, start, start
@@ -177,7 +199,7 @@ class _BlockLoss:
 
 
 def _minimise(loss: Callable[[Array], tuple[float, Array]], start: Array, most: int) -> None:
-    """L-BFGS-B in the unit box from ``start (c,)``, with ``most`` evaluations."""
+    """Minimise a loss by L-BFGS-B in the unit box, from ``start (c,)`` with at most ``most`` evaluations."""
     from scipy.optimize import minimize
 
     minimize(
@@ -191,10 +213,10 @@ def _minimise(loss: Callable[[Array], tuple[float, Array]], start: Array, most: 
 
 
 def _climb(seen: _Seen) -> None:
-    """The trust region from every start; what a start found is crossed with the best.
+    """Climb by the trust region from every start, and cross each result with the best point.
 
-    After the first, the maxima of a separable function that goes through the values are crossed likewise: of one that
-    is separable, or nearly so, these are near the highest hill, however many hills there are.
+    After the first start, the maxima of a separable function fitted to the values are crossed likewise. Where the
+    function is separable or nearly so, they are near the highest hill, however many hills there are.
     """
     _climb_and_cross(seen, seen.top)
     for guess in separable_maxima(seen.points, seen.values):
@@ -205,13 +227,14 @@ def _climb(seen: _Seen) -> None:
 
 
 def _climb_and_cross(seen: _Seen, start: Array) -> None:
+    """Climb from a start, then cross the result with the best point as long as that improves it."""
     found = _climb_from(seen, start)
     while _cross(seen, found):
         found = _climb_from(seen, seen.top)
 
 
 def _climb_from(seen: _Seen, start: Array) -> Array:
-    """The end of an ascent, which goes on while it may still come out on top."""
+    """Return the end ``(d,)`` of an ascent, which stops once it can no longer exceed the best value."""
     points, values = seen.below(start)
     region, progress, window = TrustRegion(2 * APART), [float(values.max())], 2 * seen.dimension + 4
     while seen.objective.remaining:
@@ -229,8 +252,10 @@ def _climb_from(seen: _Seen, start: Array) -> Array:
 
 
 def _cross(seen: _Seen, other: Array) -> bool:
-    """Whether the best point gains by blocks of another local maximum, each tried alone: those of a nearly separable
-    function may be exchanged."""
+    """Return whether blocks of another local maximum, each tried alone, improve the best point.
+
+    Local maxima of a nearly separable function may exchange blocks.
+    """
     crossed = False
     for block in np.unique(seen.blocks):
         best = seen.top
@@ -243,8 +268,10 @@ def _cross(seen: _Seen, other: Array) -> bool:
 
 
 def _feel(seen: _Seen) -> None:
-    """Compass search (Hooke and Jeeves 1961): one coordinate at a time up or down, by a step of its own that doubles or
-    halves."""
+    """Run a compass search (Hooke and Jeeves 1961).
+
+    The search moves one coordinate at a time up or down, by a step of its own that doubles or halves.
+    """
     best, value = seen.top.copy(), float(seen.values.max())
     steps = np.full(seen.dimension, 0.1)
     stride = _stride(seen.dimension)
@@ -264,8 +291,8 @@ def _feel(seen: _Seen) -> None:
 
 
 def _stride(dimension: int) -> int:
-    """A step through all coordinates in an order that is spread over them: next to the golden section, and without
-    common factor."""
+    """Return a step through all coordinates whose order mixes them well: near the golden section, without a common
+    factor."""
     stride = max(1, round(0.618 * dimension))
     while np.gcd(stride, dimension) > 1:
         stride += 1

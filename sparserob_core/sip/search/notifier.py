@@ -1,4 +1,4 @@
-"""The events of one search: batches now and then, not one event for every evaluation."""
+"""Events of one search: an event from time to time, not one for every evaluation."""
 
 from __future__ import annotations
 
@@ -13,15 +13,30 @@ from sparserob_core.sip.convex_set import Array, Box
 from sparserob_core.sip.events import SKETCHED, Batch, EvaluationsFinished, Notify, Phase, Sketch, frozen
 
 SECONDS_BETWEEN_EVENTS = 0.05
-EVENTS = 20  # of one search, at least, where it asks for its points one after the other
-NUMBERS_BETWEEN_EVENTS = 2**21  # coordinates that wait for the next event
+EVENTS = 20  # least number of events of one search that evaluates its points one after the other
+NUMBERS_BETWEEN_EVENTS = 2**21  # largest number of coordinates that wait for the next event
 
 
 @final
 @dataclass(frozen=True, eq=False)
 class Standing:
-    """Where a search stands: its evaluations and budget, the best point ``(d,)`` with its value, coordinates per
-    index, and who searches."""
+    """State of a search.
+
+    Parameters
+    ----------
+    evaluations : int
+        Number of evaluations so far.
+    budget : int
+        Evaluations that the search may spend.
+    best_value : float
+        Largest value so far.
+    best_point : ndarray, shape (d,)
+        Point of that value.
+    block : int
+        Number of coordinates of one index.
+    phase : {"search", "polish"}
+        Who evaluates.
+    """
 
     evaluations: int
     budget: int
@@ -33,7 +48,8 @@ class Standing:
 
 @final
 class Notifier:
-    """Keeps the points of which no event was sent yet, without copying them, and where the walk stands."""
+    """Collector of the points for which no event was sent yet, without copies, and of the current point of the
+    search."""
 
     def __init__(self, notify: Notify, domain: Box) -> None:
         self.notify, self.domain = notify, Box(frozen(domain.lower), frozen(domain.upper))
@@ -49,7 +65,20 @@ class Notifier:
         self._accepted: tuple[Array, float] | None = None
 
     def due(self, evaluations: int, budget: int) -> bool:
-        """Whether it is time for an event: for the clock, after a share of the budget, or for the memory."""
+        """Return whether an event is due: by the clock, after a share of the budget, or because many numbers wait.
+
+        Parameters
+        ----------
+        evaluations : int
+            Number of evaluations so far.
+        budget : int
+            Evaluations that the search may spend.
+
+        Returns
+        -------
+        bool
+            True where an event is due.
+        """
         return (
             time.monotonic() - self.notified_at > SECONDS_BETWEEN_EVENTS
             or evaluations - self.notified >= max(1, budget // EVENTS)
@@ -65,18 +94,26 @@ class Notifier:
         self._last = points[-1], float(values[-1])
 
     def note(self, scalars: Mapping[str, float]) -> None:
-        """Where a maximiser notes that it has accepted the last point, the walk stands there."""
+        """Make the last point the current point of the search, where the maximiser notes that it has accepted it."""
         if scalars.get("accepted") and self._last[0] is not None:
             self._accepted = self._last[0], self._last[1]
 
     def sketch(self, role: str, lower: Array, upper: Array | None, rounded: bool) -> None:
-        """Keep a sketch for the next event; the last one of a role is the one that counts."""
+        """Keep a sketch for the next event; only the last sketch of a role is sent."""
         low = frozen(np.array(lower[:SKETCHED], dtype=float))
         high = low if upper is None else frozen(np.array(upper[:SKETCHED], dtype=float))
         self._sketches[str(role)] = Sketch(low, high, rounded)
 
     def publish(self, standing: Standing, notes: Mapping[str, Sequence[tuple[float, float]]]) -> None:
-        """One event for all that was collected; ``notes`` are those of the whole search."""
+        """Send one event for all points that were collected.
+
+        Parameters
+        ----------
+        standing : Standing
+            State of the search.
+        notes : mapping of str to sequence of (float, float)
+            Notes of the whole search: pairs (evaluations so far, value) for each name.
+        """
         fresh = {
             name: rows[self._noted.get(name, 0) :]
             for name, rows in notes.items()

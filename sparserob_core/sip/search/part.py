@@ -15,17 +15,18 @@ from sparserob_core.sip.search.search import KEPT_NUMBERS, ask
 
 @final
 class SearchPart(Handed):
-    """An objective with a budget of its own, for a maximiser that lets others search.
+    """Objective with a budget of its own, for a maximiser that lets other maximisers search.
 
     Parameters
     ----------
     objective : Objective
-        What the whole search is for, which keeps the accounts.
+        Objective of the whole search, which counts all evaluations.
     budget : int
         Evaluations that this part may spend, of those that remain.
-    points, values : Array
-        Points ``(k, d)`` and values ``(k,)`` that it knows from the start. A value that it asks for again is taken from
-        these and costs nothing, as often as its budget says.
+    points : ndarray, shape (k, d)
+        Points whose values are known from the start.
+    values : ndarray, shape (k,)
+        Their values. A known value is returned without an evaluation, at most as often as the budget allows.
 
     Examples
     --------
@@ -39,72 +40,88 @@ class SearchPart(Handed):
         self._points, self._values = points, values
         self._before = {point.tobytes(): float(value) for point, value in zip(points, values, strict=True)}
         self.found: list[tuple[Array, Array]] = []
-        """Points ``(k, d)`` and values ``(k,)`` of every batch that it has evaluated; only of its best point where all
-        of them would be too many."""
+        """Points ``(k, d)`` and values ``(k,)`` of every batch that was evaluated; only the best point where all would
+        be too many."""
         self._keeps = self.domain.dimension * budget <= KEPT_NUMBERS
         top = int(values.argmax()) if values.size else -1
         self._best_value = float(values[top]) if values.size else -np.inf
         self._best_point = points[top].copy() if values.size else np.full(self.domain.dimension, np.nan)
 
     def run(self, maximiser: Maximiser, rng: np.random.Generator) -> None:
-        """Let a maximiser search until the budget of the part is spent or nothing is left to gain.
+        """Let a maximiser search until the budget of the part is spent or no improvement is possible.
 
         Parameters
         ----------
         maximiser : Maximiser
-            Who searches; in units of about 1, and with indices apart, where it asks for these.
+            The maximiser. A maximiser that requires units of about 1, or indices apart, receives them.
         rng : numpy.random.Generator
-            What it draws from.
+            Its random numbers.
 
         Raises
         ------
         SearchEnded
             Where the whole search has ended.
         PluginError
-            For a maximiser that raises, or returns no number.
+            Where the maximiser raises an error, or returns no number.
         """
         with suppress(_PartEnded):
             ask(maximiser, self, rng)
 
     def full(self, points: Array) -> Array:
-        """See `Handed.full`."""
+        """Return the points unchanged: the part has the coordinates of the whole search."""
         return points
 
     def own(self, points: Array) -> Array:
-        """See `Handed.own`."""
+        """Return the points unchanged: the part has the coordinates of the whole search."""
         return points
 
     @property
     def budget(self) -> int:
-        """See `Objective`."""
+        """Evaluations that the part may spend, with the values known from the start."""
         return self._budget + len(self._values)
 
     @property
     def evaluations(self) -> int:
-        """See `Objective`."""
+        """Evaluations of the part so far, with the values known from the start."""
         return self._spent + len(self._values)
 
     @property
     def remaining(self) -> int:
-        """See `Objective.remaining`."""
+        """Evaluations that are left to the part."""
         return min(self._budget - self._spent, self._objective.remaining)
 
     @property
     def best_point(self) -> Array:
-        """See `Objective`."""
+        """Best point of the part so far ``(d,)``; NaN before the first value."""
         return self._best_point.copy()
 
     @property
     def best_value(self) -> float:
-        """See `Objective`."""
+        """Largest value of the part so far; ``-inf`` before the first value."""
         return self._best_value
 
     def known(self) -> tuple[Array, Array]:
-        """See `Objective.known`."""
+        """Return the points ``(k, d)`` and values ``(k,)`` that are known from the start."""
         return self._points, self._values
 
     def evaluate(self, points: Array) -> Array:
-        """See `Objective.evaluate`."""
+        """Return the values ``(k,)`` at points ``(k, d)``, from the known values where possible.
+
+        Parameters
+        ----------
+        points : ndarray, shape (k, d)
+            Points of the domain.
+
+        Returns
+        -------
+        ndarray, shape (k,)
+            Values.
+
+        Raises
+        ------
+        SearchEnded
+            Where the budget of the part is spent, or the whole search has ended.
+        """
         asked = np.array(points, dtype=float)
         values = np.full(len(asked), np.nan)
         if self._before and self._recalls < self._budget:
@@ -120,7 +137,8 @@ class SearchPart(Handed):
         return values
 
     def value_and_gradient(self, point: Array) -> tuple[float, Array]:
-        """See `Objective.value_and_gradient`."""
+        """Return the value and the gradient ``(d,)`` at one point ``(d,)``; this counts as one evaluation of the
+        part."""
         if self.remaining <= 0:
             raise _PartEnded("the budget of the part is spent")
         value, gradient = self._objective.value_and_gradient(point)
@@ -139,4 +157,4 @@ class SearchPart(Handed):
 
 
 class _PartEnded(SearchEnded):
-    """The end of a part, after which the whole goes on."""
+    """Exception that ends a part; the whole search continues."""

@@ -1,4 +1,5 @@
-"""The ranges of a search by hand: whole and logarithmic coordinates, which the maximiser is shown as a plain box."""
+"""Ranges of a search with ``ask`` and ``tell``: whole and logarithmic coordinates, shown to the maximiser as a plain
+box."""
 
 from __future__ import annotations
 
@@ -13,17 +14,28 @@ from sparserob_core.errors import InputError
 from sparserob_core.shapes import Float, shaped
 from sparserob_core.sip.convex_set import Array, Box
 
-HALF = 0.5  # a whole number is what rounds to it, so that all of a range, its ends too, are equally long
+HALF = 0.5  # an interval of length 1 rounds to each whole number of a range, at its ends too
 
 
 @final
 @dataclass(frozen=True, eq=False)
 class Ranges:
-    """A box ``domain`` in whose coordinates ``integer`` there are whole numbers only, and whose coordinates
-    ``logarithmic`` are searched by their logarithms.
+    """A box with integer and logarithmic coordinates.
 
-    Raises `InputError` for a coordinate that there is not, for an integer coordinate without two whole bounds, and for
-    a logarithmic one that is not positive.
+    Parameters
+    ----------
+    domain : Box
+        The box.
+    integer : sequence of int, default ()
+        Coordinates that take whole numbers only.
+    logarithmic : sequence of int, default ()
+        Coordinates that are searched by their logarithms.
+
+    Raises
+    ------
+    InputError
+        For a coordinate that does not exist, an integer coordinate without whole bounds, or a logarithmic coordinate
+        that is not positive.
     """
 
     domain: Box
@@ -55,12 +67,12 @@ class Ranges:
 
     @property
     def plain(self) -> bool:
-        """Every coordinate is searched as it is."""
+        """True where every coordinate is searched as it is."""
         return not (self.integer or self.logarithmic)
 
     @property
     def searched(self) -> Box:
-        """The box that a maximiser is shown."""
+        """Box that the maximiser searches."""
         lower, upper = self.domain.lower.copy(), self.domain.upper.copy()
         moving = [i for i in self.integer if lower[i] < upper[i]]
         lower[moving] -= HALF
@@ -73,7 +85,7 @@ class Ranges:
 
     @shaped
     def shown(self, points: Float[Array, "k d"]) -> Float[Array, "k d"]:
-        """Points of the box ``domain`` for points of the box that is searched."""
+        """Return the points of ``domain`` that belong to points of the box that is searched."""
         if self.plain:
             return np.array(points, dtype=float)
         shown = np.array(points, dtype=float)
@@ -84,7 +96,7 @@ class Ranges:
 
     @shaped
     def hidden(self, points: Float[Array, "k d"]) -> Float[Array, "k d"]:
-        """Points of the box that is searched, which are `shown` as these."""
+        """Return points of the box that is searched to which points of ``domain`` belong."""
         hidden = np.array(points, dtype=float)
         hidden[:, self.integer] = np.round(hidden[:, self.integer])
         hidden[:, self.logarithmic] = np.log(hidden[:, self.logarithmic])

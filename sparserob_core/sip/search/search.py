@@ -1,4 +1,4 @@
-"""A search for a maximum: the objective that keeps the accounts for a maximiser, and the search itself."""
+"""Search for a maximum: the objective that counts evaluations for a maximiser, and the search itself."""
 
 from __future__ import annotations
 
@@ -21,16 +21,32 @@ from sparserob_core.sip.search.notifier import Notifier, Standing
 
 Function: TypeAlias = Callable[[Array], object]
 
-KEPT_NUMBERS = 20_000_000  # coordinates in a trace; searches with more keep their values only
+KEPT_NUMBERS = 20_000_000  # largest number of coordinates in a trace; larger searches keep their values only
 
 
 @dataclass(frozen=True, eq=False)
 class Target:
-    """What is maximised: ``function`` maps points ``(k, d)`` of a bounded ``domain`` to ``k`` numbers.
+    """Function to be maximised over a bounded box.
 
-    ``gradient`` maps the point ``(d,)`` that was evaluated last to the gradient ``(d,)`` there; ``None`` if there is
-    none. ``block`` consecutive coordinates belong together, may be ``linear``, and some of them may be known to be
-    ``acting`` (`Objective`). Raises `InputError` for an unbounded domain or blocks that do not fill it.
+    Parameters
+    ----------
+    function : callable
+        Maps points ``(k, d)`` of the domain to ``k`` numbers.
+    domain : Box
+        Bounded box.
+    gradient : callable, optional
+        Maps the point ``(d,)`` that was evaluated last to the gradient ``(d,)`` there; ``None`` if there is none.
+    block : int, default 1
+        Number of consecutive coordinates that belong together, a divisor of ``d``.
+    linear : LinearBlocks, optional
+        Linear coordinates of the blocks (`Objective.linear`).
+    acting : callable, optional
+        Returns the blocks on which the last value depends (`Objective.acting`).
+
+    Raises
+    ------
+    InputError
+        For an unbounded domain, or blocks that do not fill it.
     """
 
     function: Function
@@ -59,14 +75,32 @@ class Target:
 
 @dataclass(frozen=True, eq=False)
 class Rules:
-    """What a search obeys beside its budget: when it stops (``SC2``), what a walk accepts (``SlCr``), the share of its
-    budget that goes to a local method at the end, and the ``seconds`` after which no evaluation begins. It ends at a
-    value of at least ``target``, after ``patience`` evaluations in a row that gained nothing, and where ``halt`` says
-    so, which is asked after every batch; its polish ends with it.
+    """Rules of a search, in addition to its budget.
 
-    ``polish``: ``None`` is what the maximiser says of itself (`Maximiser.polished`) where the target has a gradient, or
-    blocks that are linear: a local method finds in ten evaluations there what no search finds that only compares
-    values; and 0 elsewhere.
+    Parameters
+    ----------
+    stop : callable, optional
+        Rule ``SC2``: ``stop(progress)`` is true where the search has to stop.
+    selection : callable, default Metropolis
+        Rule ``SlCr``: whether a search moves to a candidate.
+    polish : float, optional
+        Share of the budget for a local method at the end, at least 0 and below 1. ``None``: the maximiser's own share
+        (`Maximiser.polished`) where the target has a gradient or linear blocks, and 0 elsewhere. With a gradient or
+        linear blocks, a local method finds in ten evaluations what no search finds that only compares values.
+    seconds : float, default inf
+        Time after which no evaluation begins.
+    target : float, default inf
+        Value at which the search ends.
+    patience : int, optional
+        Number of successive evaluations without a gain after which the search ends.
+    halt : callable, optional
+        Called after every batch; the search ends where it returns true. The polish ends with the search, as it does at
+        ``target`` and after ``patience``.
+
+    Raises
+    ------
+    InputError
+        For a ``polish`` that is no such share.
     """
 
     stop: Callable[[Progress], bool] | None = None
@@ -82,15 +116,46 @@ class Rules:
             raise InputError(f"polish: expected a share of the budget, at least 0 and below 1, got {self.polish!r}")
 
     def share(self, maximiser: Maximiser, target: Target) -> float:
-        """The share of the budget that is kept for a polish."""
+        """Return the share of the budget that is reserved for a polish.
+
+        Parameters
+        ----------
+        maximiser : Maximiser
+            The maximiser, whose own share counts where ``polish`` is ``None``.
+        target : Target
+            Function to be maximised.
+
+        Returns
+        -------
+        float
+            The share, at least 0 and below 1.
+        """
         if self.polish is None:
             return maximiser.polished if target.linear is not None or target.gradient is not None else 0.0
         return self.polish
 
 
 class CountedObjective:
-    """An `Objective` that keeps the accounts itself, so that a maximiser cannot misreport. Raises `InputError` for a
-    budget below 1. ``asker``: who searches, for messages."""
+    """An `Objective` that counts its evaluations itself, so that a maximiser cannot misreport them.
+
+    Parameters
+    ----------
+    target : Target
+        Function to be maximised.
+    budget : int
+        Evaluations that the search may spend, at least 1.
+    rules : Rules, optional
+        Rules of the search.
+    notify : callable
+        Receives events.
+    asker : str
+        Name of the maximiser in messages.
+
+    Raises
+    ------
+    InputError
+        For a budget below 1.
+    """
 
     def __init__(
         self,
@@ -109,14 +174,14 @@ class CountedObjective:
         self.evaluations = 0
         self.missing = 0  # evaluations that gave NaN
         self.learnt = 0  # points that were known before, which are no evaluations of this search
-        self._gained = 0  # evaluations at the last gain
+        self._gained = 0  # number of evaluations at the last gain
         self._known = np.empty((0, self.domain.dimension)), np.empty(0)
-        self._before: dict[tuple[float, ...], float] = {}  # the same by its points
+        self._before: dict[tuple[float, ...], float] = {}  # the known values by their points
         self._recalls = 0
         own = rules or Rules()
         self._target, self._patience, self._halt = own.target, own.patience, own.halt
         self.searched: int | None = None
-        self.whole_end = False  # nothing is polished either
+        self.whole_end = False  # whether the search ends without a polish
         self.ended: SearchEnded | EvaluationError | None = None
         self._keeps = self.domain.dimension * self.budget <= KEPT_NUMBERS
         self._points: list[Array] = []
@@ -130,31 +195,33 @@ class CountedObjective:
 
     @property
     def late(self) -> bool:
-        """Whether the time of the search is over."""
+        """True where the time of the search is over."""
         return time.monotonic() >= self._ends
 
     @property
     def remaining(self) -> int:
-        """Evaluations that are left; none once the search is ended, so that who swallows the end still comes to one."""
+        """Evaluations that are left; 0 once the search has ended, so that a maximiser that catches `SearchEnded` ends
+        too."""
         return 0 if self.ended is not None else self.budget - self.evaluations
 
     @property
     def differentiable(self) -> bool:
-        """See `Objective.differentiable`."""
+        """True where the target has a gradient."""
         return self.target.gradient is not None
 
     @property
     def acting(self) -> Callable[[], np.ndarray] | None:
-        """See `Objective.acting`."""
+        """Function that returns the acting blocks of the target (`Objective.acting`)."""
         return self.target.acting
 
     @property
     def linear(self) -> LinearBlocks | None:
-        """See `Objective.linear`."""
+        """Linear coordinates of the target's blocks (`Objective.linear`)."""
         return self.target.linear
 
     def evaluate(self, points: Float[Array, "k d"]) -> Float[Array, " k"]:
-        """See `Objective.evaluate`."""
+        """Return the values ``(k,)`` at points ``(k, d)``, record them, and end the search where it is due
+        (`Objective.evaluate`)."""
         if self.ended is not None:
             raise self.ended
         if self._notifier is not None and self._notifier.due(self.evaluations, self.budget):
@@ -163,7 +230,7 @@ class CountedObjective:
         values = self._recalled(asked)
         new = np.flatnonzero(np.isnan(values))
         allowed = new[: self.remaining]
-        while len(allowed):  # in one batch, unless patience would end within it
+        while len(allowed):  # in one batch, unless the search may end within it for lack of a gain
             batch = allowed[: self._patient]
             values[batch] = self._values_at(asked[batch])
             self._record(asked[batch], values[batch])
@@ -176,8 +243,10 @@ class CountedObjective:
         return values
 
     def _recalled(self, points: Array) -> Array:
-        """The values ``(k,)`` that are known from before, no more of them than the budget, so that whoever asks for
-        nothing else comes to an end; NaN where there is none."""
+        """Return the values ``(k,)`` that are known from before; NaN elsewhere.
+
+        At most as many values as the budget are recalled, so that a maximiser that asks for nothing else ends too.
+        """
         values = np.full(len(points), np.nan)
         if self._before and self._recalls < self.budget:
             values[:] = [self._before.get(tuple(point), np.nan) for point in points.tolist()]
@@ -186,7 +255,7 @@ class CountedObjective:
 
     @property
     def _patient(self) -> int:
-        """How many evaluations may still gain nothing."""
+        """Number of further evaluations that may bring no gain."""
         return self.budget if self._patience is None else max(1, self._patience - self.evaluations + self._gained)
 
     def _judge(self) -> None:
@@ -208,8 +277,17 @@ class CountedObjective:
             raise self._end(SearchEnded("the time limit of the search is reached"))
 
     def learn(self, points: Float[Array, "k d"], values: Float[Array, " k"]) -> None:
-        """Take points over whose values are known from before: they are no evaluations of this search, and count for
-        its best point. To be called before the first evaluation."""
+        """Accept points whose values are known from before; to be called before the first evaluation.
+
+        Known points are no evaluations of this search, but count for its best point.
+
+        Parameters
+        ----------
+        points : ndarray, shape (k, d)
+            Points of the domain.
+        values : ndarray, shape (k,)
+            Their values; NaN counts as ``-inf``.
+        """
         known, self.learnt = np.where(np.isnan(values), -np.inf, values), len(values)
         self._known = self._checked(points), known
         self._before = dict(zip(map(tuple, self._known[0].tolist()), known.tolist(), strict=True))
@@ -221,17 +299,17 @@ class CountedObjective:
         self._judge()
 
     def begin(self, start: Float[Array, "k d"]) -> None:
-        """Evaluate the points that the search starts from."""
+        """Evaluate the points ``(k, d)`` at which the search starts."""
         self.evaluate(start)
         self._known = self.seen()
 
     def known(self) -> tuple[Float[Array, "k d"], Float[Array, " k"]]:
-        """See `Objective.known`."""
+        """Return the points ``(k, d)`` that were known before the maximiser was called, and their values ``(k,)``."""
         return self._known
 
     @shaped
     def value_and_gradient(self, point: Float[Array, " d"]) -> tuple[float, Float[Array, " d"]]:
-        """See `Objective.value_and_gradient`."""
+        """Return the value and the gradient ``(d,)`` at one point (`Objective.value_and_gradient`)."""
         if self.target.gradient is None:
             raise InputError("gradient: this objective offers none")
         value = float(self.evaluate(np.asarray(point)[np.newaxis])[0])
@@ -243,12 +321,12 @@ class CountedObjective:
         return value, slope
 
     def accepts(self, current: float, candidate: float, temperature: float, rng: np.random.Generator) -> bool:
-        """See `Objective.accepts`."""
+        """Return the answer of the rule ``SlCr`` (`Objective.accepts`)."""
         selection = (self.rules or Rules()).selection
         return bool(_of_rule("slcr", lambda: selection(current, candidate, temperature, rng)))
 
     def note(self, **scalars: float) -> None:
-        """See `Objective.note`."""
+        """Record scalars in the trace, and pass them to observers."""
         for name, value in scalars.items():
             self._notes.setdefault(name, []).append((self.evaluations - self.learnt, float(value)))
         if self._notifier is not None:
@@ -256,24 +334,25 @@ class CountedObjective:
 
     @property
     def observed(self) -> bool:
-        """See `Objective.observed`."""
+        """True where observers receive events."""
         return self._notifier is not None
 
     def sketch(self, role: str, lower: Array, upper: Array | None = None, rounded: bool = False) -> None:
-        """See `Objective.sketch`."""
+        """Show observers the points or regions that the search considers (`Objective.sketch`)."""
         if self._notifier is not None:
             self._notifier.sketch(role, lower, upper, rounded)
 
     def polish(self, reserved: int) -> None:
-        """Open the search again, for its last part: ``reserved`` evaluations more, without a rule that stops it."""
+        """Open the search again for its last part, with ``reserved`` further evaluations and without a stopping
+        rule."""
         self.notify_observers()
         self.searched = self.evaluations
         self.ended, self.budget, self.rules = None, self.evaluations + reserved, None
 
     @shaped
     def seen(self) -> tuple[Float[Array, "n d"], Float[Array, " n"]]:
-        """Every evaluated point ``(n, d)`` and its value ``(n,)``; only the best one where all of them would be too
-        many."""
+        """Return every evaluated point ``(n, d)`` and its value ``(n,)``; only the best one where all of them would be
+        too many."""
         if not self._keeps:
             return self.best_point[np.newaxis], np.array([self.best_value])
         own = slice(0, self.learnt)
@@ -281,7 +360,20 @@ class CountedObjective:
         return np.concatenate([points, *self._points]), np.concatenate([values, *self._values])
 
     def report(self, stopped: str, upper_bound: float = np.inf) -> Report:
-        """What has been found so far."""
+        """Return the report of the evaluations so far.
+
+        Parameters
+        ----------
+        stopped : str
+            Reason for the end of the search.
+        upper_bound : float, default inf
+            Proven upper bound of the maximum.
+
+        Returns
+        -------
+        Report
+            The report.
+        """
         points = self.seen()[0][self.learnt :] if self._keeps else np.empty((0, self.domain.dimension))
         values = np.concatenate([np.empty(0), *self._values])
         seconds = np.repeat([moment for _, moment in self._seconds], [count for count, _ in self._seconds])
@@ -292,7 +384,7 @@ class CountedObjective:
         return Report(self.best_value, self.best_point, own, upper_bound, trace, stopped, missing=self.missing)
 
     def notify_observers(self) -> None:
-        """Send what was evaluated since the last event."""
+        """Send an event for the evaluations since the last event."""
         if self._notifier is not None and self.evaluations > self._notifier.notified:
             phase: Phase = "search" if self.searched is None else "polish"
             standing = Standing(self.evaluations, self.budget, self.best_value, self.best_point, self.block, phase)
@@ -334,7 +426,7 @@ class CountedObjective:
         return values
 
     def _called(self, function: Function, argument: Array, shape: tuple[int, ...]) -> Array:
-        """What the user's function returns, of the right shape; whatever it raises ends the search."""
+        """Return the values of the user's function, checked for shape; an error of the function ends the search."""
         try:
             returned = np.asarray(function(argument))
             if np.iscomplexobj(returned):
@@ -375,7 +467,7 @@ class CountedObjective:
 
 
 def _of_rule(name: str, ask: Callable[[], object]) -> object:
-    """What a rule answers; what it raises is not the maximiser's fault."""
+    """Return the answer of a rule; raise `PluginError` in the rule's name where it fails."""
     try:
         return ask()
     except (SparseRobError, KeyboardInterrupt):
@@ -398,16 +490,45 @@ def maximise(
     start: Array | None = None,
     known: tuple[Array, Array] | None = None,
 ) -> Report:
-    """Search for the maximum of a target with ``budget`` evaluations at most; the last share of them polishes what was
-    found.
+    """Search for the maximum of a target; the last share of the budget polishes the result.
 
-    The maximiser sees the coordinates that can move, and is not asked where none can: the value at the only point is
-    then the maximum. It sees them in units of about 1 where it asks for these (`Maximiser.scaled`).
-    ``start (d,)`` or ``(k, d)`` is evaluated before it begins; ``known``: points ``(k, d)`` and values ``(k,)`` from
-    before, which are no evaluations. An interrupt from the keyboard ends the search; the report says so. Raises
-    `EvaluationError` when the function raises or does not return numbers, `InputError` for a wrong budget,
-    `PluginError` for a maximiser that raises, leaves the domain, or claims an upper bound that is no number or that an
-    evaluated value refutes.
+    The maximiser receives only the coordinates that can move. Where none can, the maximiser is not called, for the
+    value at the only point is the maximum. A maximiser that requires units of about 1 receives them (`Maximiser`,
+    ``scaled``). An interrupt from the keyboard ends the search, and is recorded in the report.
+
+    Parameters
+    ----------
+    target : Target
+        Function to be maximised.
+    maximiser : Maximiser
+        The maximiser.
+    budget : int
+        Largest number of evaluations.
+    rng : numpy.random.Generator
+        Random numbers.
+    rules : Rules, optional
+        Rules of the search.
+    notify : callable
+        Receives events; by default events are ignored.
+    start : ndarray, shape (d,) or (k, d), optional
+        Points that are evaluated first.
+    known : tuple of ndarray, optional
+        Points ``(k, d)`` and values ``(k,)`` from before, which are no evaluations.
+
+    Returns
+    -------
+    Report
+        Outcome of the search.
+
+    Raises
+    ------
+    EvaluationError
+        Where the function raises an error or does not return numbers.
+    InputError
+        For a wrong budget.
+    PluginError
+        For a maximiser that raises an error, leaves the domain, or claims an upper bound that is no number or that an
+        evaluated value refutes.
     """
     rules = rules or Rules()
     name = name_of(maximiser)
@@ -438,7 +559,7 @@ def maximise(
             stopped = f"{stopped}; then polished"
             from sparserob_core.sip.search.local_search import polish
 
-            if not block_ascent(shown):  # whose end no local method improves that knows less of the blocks
+            if not block_ascent(shown):  # no local method that knows less of the blocks improves its result
                 points, values = objective.seen()
                 scaled = Scaled(shown, values)
                 polish(scaled, *scaled.seen(points[:, moves], values))
@@ -458,8 +579,31 @@ def maximise(
 
 
 def ask(maximiser: Maximiser, objective: Objective, rng: np.random.Generator) -> float:
-    """Let a maximiser search, in the units and with the indices apart that it asks for, and return the upper bound that
-    it claims; what it raises, other than an error of this project, is its fault."""
+    """Let a maximiser search, in the units and coordinates that it requires, and return the upper bound that it claims.
+
+    An error that it raises is reported as its fault (`PluginError`), unless it is an error of this project.
+
+    Parameters
+    ----------
+    maximiser : Maximiser
+        The maximiser.
+    objective : Objective
+        The objective, in the user's units.
+    rng : numpy.random.Generator
+        Random numbers.
+
+    Returns
+    -------
+    float
+        Claimed upper bound of the maximum, or ``inf``.
+
+    Raises
+    ------
+    SearchEnded
+        Where the search has ended.
+    PluginError
+        Where the maximiser raises another error, or returns no number.
+    """
     name = name_of(maximiser)
     if maximiser.apart and objective.acting is not None:  # a tuple of indices
         objective = Apart(objective)
@@ -476,12 +620,12 @@ def ask(maximiser: Maximiser, objective: Objective, rng: np.random.Generator) ->
 
 
 def name_of(maximiser: Maximiser) -> str:
-    """What messages call a maximiser."""
+    """Return the name of a maximiser for messages."""
     return str(getattr(maximiser, "origin", f"maximiser {type(maximiser).__name__}"))
 
 
 def _only_value(objective: CountedObjective) -> float:
-    """The value at the only point of a domain in which nothing moves."""
+    """Return the value at the only point of a domain in which no coordinate can move."""
     if objective.evaluations:
         return objective.best_value
     return float(objective.evaluate(objective.domain.lower[np.newaxis])[0])

@@ -1,4 +1,4 @@
-"""Where a sum of functions of one coordinate each, fitted to evaluated points, has its maximum."""
+"""Maxima of separable functions, sums of functions of one coordinate each, that are fitted to evaluated points."""
 
 from __future__ import annotations
 
@@ -9,25 +9,32 @@ import numpy as np
 from sparserob_core.sip.convex_set import Array
 
 KNOTS = (40, 20, 10)
-"""Of a function of one coordinate: twice as many resolve hills of half the width, and need twice as many points."""
+"""Numbers of knots of a function of one coordinate. Twice as many resolve hills of half the width, and need twice as
+many points."""
 POINTS = 1.5
-"""Points for each unknown of a fit: with fewer, noise of what is not separable decides where the maximum is."""
+"""Points for each unknown of a fit. With fewer, the part of the values that is not separable determines the maximum."""
 RIDGE = 1e-3
-"""Against constants that the functions may exchange, and knots without points; a thousand times more flattens hills."""
+"""Regularisation of constants that the functions may exchange, and of knots without points. A value a thousand times
+larger flattens hills."""
 
 
 def separable_maxima(points: Array, values: Array) -> Iterator[Array]:
     """Yield the maxima ``(d,)`` of sums of functions of one coordinate each, fitted to evaluated points.
 
-    The functions are piecewise linear, the fits least squares; the finest comes first, and those are left out for which
-    the points are too few. Nothing in one dimension, and where the values are all equal.
+    The functions are piecewise linear, and fitted by least squares. The finest comes first; those for which there are
+    too few points are left out. Nothing is yielded in one dimension, or where all values are equal.
 
     Parameters
     ----------
-    points : Array
-        Points ``(k, d)`` of the unit box.
-    values : Array
-        Their values ``(k,)``; those that are not finite do not count.
+    points : ndarray, shape (k, d)
+        Points of the unit box.
+    values : ndarray, shape (k,)
+        Their values; values that are not finite are ignored.
+
+    Yields
+    ------
+    ndarray, shape (d,)
+        Maximum of a fitted sum, in the unit box.
     """
     finite = np.isfinite(values)
     points, values = points[finite], values[finite]

@@ -1,5 +1,4 @@
-"""A trust region without derivatives, driven one step at a time: it proposes a point, the caller evaluates it and tells
-the value."""
+"""A trust region without derivatives, one step at a time: it proposes a point, and the caller reports the value."""
 
 from __future__ import annotations
 
@@ -10,69 +9,85 @@ import numpy as np
 from sparserob_core.sip.convex_set import Array
 
 FIRST, LARGEST = 0.1, 0.3
-"""Largest radius to begin with, and ever, as shares of the box."""
+"""Largest first radius, and largest radius, as shares of the box."""
 SMALLEST = 1e-13
-"""A radius in the unit box below which doubles leave nothing to gain."""
+"""Radius in the unit box below which no improvement is possible in double precision."""
 SURPLUS = 1.5
-"""Points of a model for each of its coefficients: more than interpolation needs, since a function with kinks is fitted
-better by a few more."""
+"""Number of points of a model for each of its coefficients. Interpolation needs fewer, but a few more points fit a
+function with kinks better."""
 POINTS = 99
-"""Most points of a model: those of a full quadratic in ten coordinates."""
-ITERATIONS = 40  # of Newton's method for the length of a step
+"""Largest number of points of a model: one and a half times the coefficients of a full quadratic in ten coordinates."""
+ITERATIONS = 40  # largest number of Newton steps for the length of a step
 SLOPE_OVER_CURVATURE = 10.0
-"""How much cheaper slope is than curvature where the points leave a choice."""
+"""Price of curvature relative to that of slope, where the points do not determine the model."""
 
 
 class _Quadratic(NamedTuple):
-    """``gradient's + 1/2 s'hessian s`` for steps ``s`` from the best point."""
+    """Quadratic ``gradient's + 1/2 s'hessian s`` of steps ``s`` from the best point."""
 
     gradient: Array
     hessian: Array
 
     def gain(self, step: Array) -> float:
+        """Return the value of the quadratic at a step ``(d,)``."""
         return float(self.gradient @ step + 0.5 * step @ self.hessian @ step)
 
 
 @final
 class TrustRegion:
-    """Climbs from the best of the evaluated points of a unit box, with a quadratic through it and its nearest
-    neighbours.
+    """Derivative-free ascent in a unit box, from the best evaluated point, with a quadratic model of its neighbours.
 
     The caller scales its coordinates to ``[0, 1]`` and alternates::
 
-        point = region.propose(points, values)     # None: nothing left to gain
+        point = region.propose(points, values)     # None: no improvement is possible
         region.tell(value at the point)            # and appends both to its points and values
 
-    The model takes the nearest points there are; beyond the current scale they weigh like the inverse cube of their
-    distance, because the error of a quadratic grows like the cube. With as many points as coefficients it interpolates,
-    with fewer it is the one of least norm, in which curvature counts far more than slope (after Powell's NEWUOA 2006),
-    with more it is a least-squares fit. It is maximised in the ball of the radius and in the box. A step that gains
-    less than a quarter of its promise halves the radius, one that gains more than three quarters may double it, as in
-    dlib's trust region (King 2017). After a step that failed, directions that the neighbours do not span are tried
-    first.
+    Parameters
+    ----------
+    radius : float, default 0
+        First radius; 0: it is taken from the distances of the neighbours.
 
-    Smooth maxima are reached faster than linearly, kinks linearly. A step costs 0.1 to 0.2 ms up to five coordinates,
-    of the order of 10 ms at thirty, where a model is also far from determined. Nothing is proven: what it finds is a
-    local maximum. A neighbour with the value ``-inf`` counts as the lowest of the others.
+    Notes
+    -----
+    The model uses the nearest points. Beyond the current scale their weight is the inverse cube of their distance,
+    because the error of a quadratic grows like the cube. With as many points as coefficients the model interpolates.
+    With fewer points it is the model of least norm, in which curvature counts far more than slope (after Powell's
+    NEWUOA 2006). With more points it is a least-squares fit. The model is maximised in the ball of the radius and in
+    the box. A step that gains less than a quarter of the predicted gain halves the radius. A step that gains more than
+    three quarters may double it, as in dlib's trust region (King 2017). After a failed step, directions that the
+    neighbours do not span are tried first.
+
+    Smooth maxima are reached faster than linearly, kinks linearly. A step costs 0.1 to 0.2 ms up to five coordinates.
+    At thirty it costs of the order of 10 ms, and the points are far too few to determine the model. Nothing is proven:
+    the result is a local maximum. A neighbour with the value ``-inf`` counts as the lowest of the others.
     """
 
     def __init__(self, radius: float = 0.0) -> None:
         self.radius = radius
-        """Current radius; 0: taken from the spread of the neighbours by the next proposal."""
+        """Current radius; 0: the next proposal takes it from the distances of the neighbours."""
         self.promise = 0.0
-        """Gain over the best value that the model expects of the last proposal."""
+        """Gain over the best value that the model predicts for the last proposal."""
         self._best, self._length = -np.inf, 0.0
         self._spanning, self._failed, self._hopeless = False, False, False
 
     def restart(self) -> None:
-        """Forget the radius: another point, farther away than that, has become the best."""
+        """Forget the radius, since another point that is farther away than the radius has become the best."""
         self.radius, self._failed, self._hopeless = 0.0, False, False
 
     def propose(self, points: Array, values: Array) -> Array | None:
-        """The next point ``(d,)``, given ``points (n, d)`` and ``values (n,)``, ``n >= 1``; ``None`` when there is
-        nothing left to gain.
+        """Return the next point to evaluate.
 
-        The best value must be finite.
+        Parameters
+        ----------
+        points : ndarray, shape (n, d)
+            Evaluated points of the unit box, at least one.
+        values : ndarray, shape (n,)
+            Their values; the largest must be finite.
+
+        Returns
+        -------
+        ndarray, shape (d,), or None
+            The point; ``None`` where no improvement is possible.
         """
         top = int(values.argmax())
         if values[top] > self._best:
@@ -96,12 +111,12 @@ class TrustRegion:
                     return point
             if self._hopeless:
                 break
-            # A model without promise is believed only when another one, of a tenth of the size, agrees.
+            # A model that predicts no gain is accepted only when another one, of a tenth of the size, agrees.
             self.radius, self._failed, self._hopeless = 0.1 * self.radius, True, True
         return None
 
     def tell(self, value: float) -> None:
-        """The value at the point that was proposed last."""
+        """Receive the value at the point that was proposed last, and adapt the radius."""
         if self._spanning:
             return
         gained = (value - self._best) / self.promise
@@ -113,7 +128,7 @@ class TrustRegion:
 
 
 def _neighbours(points: Array, values: Array, top: int) -> tuple[Array, Array, Array]:
-    """Offsets, distances and differences of value of the nearest points to point ``top``, nearest first."""
+    """Return offsets, distances and differences of value of the points nearest to point ``top``, nearest first."""
     dimension = points.shape[1]
     offsets = points - points[top]
     squares = np.einsum("ij,ij->i", offsets, offsets)
@@ -132,7 +147,7 @@ def _neighbours(points: Array, values: Array, top: int) -> tuple[Array, Array, A
 
 
 def _fit(offsets: Array, distances: Array, rises: Array, radius: float) -> _Quadratic:
-    """The quadratic through the best point that fits its neighbours."""
+    """Return the quadratic through the best point that fits its neighbours."""
     count, dimension = offsets.shape
     if count == 0:
         return _Quadratic(np.zeros(dimension), np.zeros((dimension, dimension)))
@@ -151,7 +166,7 @@ def _fit(offsets: Array, distances: Array, rises: Array, radius: float) -> _Quad
 
 
 def _missing_direction(offsets: Array, distances: Array, radius: float, lower: Array, upper: Array) -> Array | None:
-    """A step of length ``radius`` in the direction that the points nearby span least, or ``None`` when they span the
+    """Return a step of length ``radius`` in the direction that the near points span least; ``None`` where they span the
     space."""
     near = offsets[distances <= 5.0 * radius] / radius
     if not len(near):
@@ -164,11 +179,26 @@ def _missing_direction(offsets: Array, distances: Array, radius: float, lower: A
 
 
 def highest_in_ball_and_box(gradient: Array, hessian: Array, radius: float, lower: Array, upper: Array) -> Array:
-    """A step ``s (d,)`` with ``|s| <= radius``, ``lower <= s <= upper`` that makes ``gradient's + 1/2 s'hessian s``
-    large; ``lower <= 0 <= upper``.
+    """Return a step that makes ``gradient's + 1/2 s'hessian s`` large, in a ball and a box.
 
-    Exact while no bound of the box is met. A coordinate that would leave the box is fixed at its bound, and the rest is
-    solved again in the ball that is left, at most ``d`` times.
+    The step is the maximum as long as it meets no bound of the box. A coordinate that would leave the box is fixed at
+    its bound. The rest is solved again in the remaining ball, at most ``d`` times.
+
+    Parameters
+    ----------
+    gradient : ndarray, shape (d,)
+        Gradient.
+    hessian : ndarray, shape (d, d)
+        Hessian.
+    radius : float
+        Radius of the ball, ``|s| <= radius``.
+    lower, upper : ndarray, shape (d,)
+        Bounds of the step, ``lower <= 0 <= upper``.
+
+    Returns
+    -------
+    ndarray, shape (d,)
+        The step ``s``.
     """
     step = np.zeros(gradient.size)
     free = ~(((lower >= 0.0) & (gradient < 0.0)) | ((upper <= 0.0) & (gradient > 0.0)))
@@ -189,8 +219,22 @@ def highest_in_ball_and_box(gradient: Array, hessian: Array, radius: float, lowe
 
 
 def highest_in_ball(gradient: Array, hessian: Array, radius: float) -> Array:
-    """The ``s (d,)`` with ``|s| <= radius`` that maximises ``gradient's + 1/2 s'hessian s`` (More and Sorensen
-    1983)."""
+    """Return the maximiser of ``gradient's + 1/2 s'hessian s`` over ``|s| <= radius`` (More and Sorensen 1983).
+
+    Parameters
+    ----------
+    gradient : ndarray, shape (d,)
+        Gradient.
+    hessian : ndarray, shape (d, d)
+        Hessian.
+    radius : float
+        Radius of the ball.
+
+    Returns
+    -------
+    ndarray, shape (d,)
+        The maximiser ``s``.
+    """
     curvature, basis = np.linalg.eigh(-hessian)
     slope = basis.T @ gradient
     lowest = float(curvature[0])
@@ -212,8 +256,10 @@ def highest_in_ball(gradient: Array, hessian: Array, radius: float) -> Array:
 
 
 def _on_the_sphere(slope: Array, curvature: Array, radius: float, least: float) -> Array:
-    """``slope / (curvature + shift)`` of length ``radius``, ``shift > least``: Newton on the inverse of the length,
-    from the left."""
+    """Return ``slope / (curvature + shift)`` of length ``radius`` with ``shift >= least``.
+
+    Newton's method on the inverse of the length finds the shift from the left.
+    """
     shift = least
     for _ in range(ITERATIONS):
         inner = slope / (curvature + shift)

@@ -1,1 +1,1 @@
-"""What an exchange works with: the imposed constraints, how they are solved, and the accounts of what is known."""
+"""Working sets of an exchange: the imposed constraints, their solution, and the accounts of a method."""

@@ -1,9 +1,9 @@
-"""How often entries of ``S x`` are not 0: the counted program, and what a convex one proves of it.
+"""Number of entries of ``S x`` that are not 0: the counted program, and the lower bound by a convex program.
 
 The count ``sum_k activity_k [s_k != 0]``, ``s = S x``, is not convex. The largest convex function below ``[s != 0]`` on
-``[lower, upper]`` with 0 inside is ``max(s, 0) / upper + max(-s, 0) / |lower|``; an entry whose bounds exclude 0 always
-counts. So a semi-infinite program with that cost, and every constraint as it was, bounds the count of every feasible
-decision from below: with one symmetric range and the L1 norm as the cost it is the same program.
+``[lower, upper]`` with 0 inside is ``max(s, 0) / upper + max(-s, 0) / |lower|``. An entry whose bounds exclude 0 always
+counts. So a semi-infinite program with that cost and the same constraints bounds the count of every feasible decision
+from below. With one symmetric range and the L1 norm as the cost, it is the same program.
 """
 
 from __future__ import annotations
@@ -19,17 +19,25 @@ from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.finite import FiniteProgram
 from sparserob_core.sip.program import SemiInfiniteProgram
 
-DUST = 1e-5  # of an entry's range: so much is what solvers leave where 0 is meant; nothing is claimed without a proof
-MISSED = 1e-6  # of one count, by which a whole number of them may be missed
-ROUNDED = 1e-12  # of the terms of which an entry is a sum: that much counts as 0, since it is rounding
+DUST = 1e-5  # of an entry's range: what solvers leave of an entry that should be 0; nothing is claimed without a proof
+MISSED = 1e-6  # of one price: rounding error of a whole number of them
+ROUNDED = 1e-12  # of the terms of which an entry is a sum: an entry of this size is rounding, and counts as 0
 
 
 @final
 @dataclass(frozen=True, eq=False)
 class Counted:
-    """``program``: the same constraints with the convex cost below the count, in the cost's own unit; ``certain``: what
-    is counted whatever the decision, in the user's units; ``tilt (k,)``: the part of the cost that is linear in
-    ``S x``."""
+    """Convex program whose optimal value bounds the count from below.
+
+    Parameters
+    ----------
+    program : SemiInfiniteProgram
+        The same constraints with the convex cost below the count, in the cost's own unit.
+    certain : float
+        Count of the entries that always count, in the user's units.
+    tilt : ndarray, shape (k,)
+        Coefficients of the part of the cost that is linear in ``S x``.
+    """
 
     program: SemiInfiniteProgram
     certain: float
@@ -37,7 +45,7 @@ class Counted:
 
 
 def counted_below(program: SemiInfiniteProgram) -> Counted:
-    """The program whose cost, and ``certain``, are below the count at every feasible decision."""
+    """Return the convex program whose cost plus ``certain`` is at most the count at every feasible decision."""
     prices = prices_of(program)
     finite, tilt, certain = convex_below(program.finite, prices / program.cost_unit)
     cost = finite.weights, finite.q
@@ -48,8 +56,26 @@ def counted_below(program: SemiInfiniteProgram) -> Counted:
 def convex_below(
     base: FiniteProgram, prices: Array, on: np.ndarray | None = None
 ) -> tuple[FiniteProgram, Array, float]:
-    """The finite program with the convex cost below the count of its images ``(k,)``, the ``tilt (k,)`` of that cost,
-    and what is counted in any case: images whose bounds exclude 0, and those that are ``on``."""
+    """Return the finite program with the convex cost below the count of its images.
+
+    Parameters
+    ----------
+    base : FiniteProgram
+        The program.
+    prices : ndarray, shape (k,)
+        Price of each image that is not 0.
+    on : ndarray of bool, shape (k,), optional
+        Images that count in any case.
+
+    Returns
+    -------
+    program : FiniteProgram
+        The program with the convex cost.
+    tilt : ndarray, shape (k,)
+        Coefficients of the part of the cost that is linear in the images.
+    certain : float
+        Count of the images that are ``on`` or whose bounds exclude 0.
+    """
     always = (base.lower > 0.0) | (base.upper < 0.0)
     always = always if on is None else always | on
     up, down = slopes(base.lower, base.upper)
@@ -63,15 +89,28 @@ def convex_below(
 
 @shaped
 def slopes(lower: Float[Array, " k"], upper: Float[Array, " k"]) -> tuple[Float[Array, " k"], Float[Array, " k"]]:
-    """``(up, down)``: what the convex function below ``[s != 0]`` costs per unit above and below 0. Where one side is
-    forbidden its slope is that of the other; where there is no bound it is 0."""
+    """Return the slopes ``(up, down)`` of the convex function below ``[s != 0]``, above and below 0.
+
+    Where one side is forbidden, its slope is that of the other side. Where there is no bound, the slope is 0.
+
+    Parameters
+    ----------
+    lower, upper : ndarray, shape (k,)
+        Bounds of the images.
+
+    Returns
+    -------
+    up, down : ndarray, shape (k,)
+        Cost per unit above 0, and per unit below 0.
+    """
     with np.errstate(divide="ignore"):
         up, down = np.where(upper > 0.0, 1.0 / upper, 0.0), np.where(lower < 0.0, -1.0 / lower, 0.0)
     return np.where(upper > 0.0, up, down), np.where(lower < 0.0, down, up)
 
 
 def prices_of(program: SemiInfiniteProgram) -> Array:
-    """What every entry of ``S x`` counts when it is not 0, ``(k,)``, in the user's units; zeros where none counts."""
+    """Return the price ``(k,)`` of every entry of ``S x`` that is not 0, in the user's units; 0 for entries that do not
+    count."""
     prices = np.zeros(program.finite.weights.size)
     if program.activity is not None:
         prices[: program.activity.size] = program.activity
@@ -80,19 +119,34 @@ def prices_of(program: SemiInfiniteProgram) -> Array:
 
 @shaped
 def acting(coefficients: Float[Array, "m n"], values: Float[Array, "n k"]) -> np.ndarray:
-    """Where ``coefficients @ values`` is not 0, ``(m, k)``, but for the rounding of that sum itself."""
+    """Return where ``coefficients @ values`` is not 0, except for the rounding of the sum.
+
+    Parameters
+    ----------
+    coefficients : ndarray, shape (m, n)
+        Coefficients.
+    values : ndarray, shape (n, k)
+        Values.
+
+    Returns
+    -------
+    ndarray of bool, shape (m, k)
+        True where the product is not 0.
+    """
     return np.asarray(np.abs(coefficients @ values) > ROUNDED * (np.abs(coefficients) @ np.abs(values)))
 
 
 def counting(program: SemiInfiniteProgram) -> int:
-    """How many entries of a decision make the images that count: the first ones, all that there are unless bounds of
-    absolute values follow them."""
+    """Return the number of first entries of a decision that determine the images that count.
+
+    The number is that of all entries, unless bounds of absolute values follow the entries.
+    """
     base, images = program.finite, 0 if program.activity is None else program.activity.size
     return program.n if base.S is None else int(np.unique(base.S.tocsr()[:images].indices).size)
 
 
 def completed(program: SemiInfiniteProgram, entries: Array) -> Array:
-    """The decision ``(n,)`` that begins with ``entries``, and whose others are as small as bounds of the images
+    """Return the decision ``(n,)`` that begins with ``entries``, and whose others are as small as bounds of images
     allow."""
     base, size = program.finite, entries.size
     if program.n == size:
@@ -105,24 +159,25 @@ def completed(program: SemiInfiniteProgram, entries: Array) -> Array:
 
 
 def count(program: SemiInfiniteProgram, x: Array) -> float:
-    """The count of a decision ``x (n,)``, in the user's units: entries that make one vector count together."""
+    """Return the count of a decision ``x (n,)``, in the user's units; entries of one vector count together."""
     base = program.finite
     terms = np.abs(x) if base.S is None else abs(base.S) @ np.abs(x)
     return count_of(program, np.abs(base.image(x)) > ROUNDED * terms)
 
 
 def count_of(program: SemiInfiniteProgram, acts: np.ndarray) -> float:
-    """The count, in the user's units, where these images ``(k,)`` are not 0."""
+    """Return the count, in the user's units, where the images ``acts (k,)`` are not 0."""
     return math.fsum(together(program)[np.unique(vectors(program)[acts & (prices_of(program) > 0.0)])])
 
 
 def together(program: SemiInfiniteProgram) -> Array:
-    """What counts together, ``(g,)``: every block of entries, and every entry that counts alone; 0 where none does."""
+    """Return the price ``(g,)`` of every block of entries and of every entry that counts alone; 0 for numbers without
+    one."""
     return np.asarray(np.bincount(vectors(program), prices_of(program)), dtype=float)
 
 
 def vectors(program: SemiInfiniteProgram) -> np.ndarray:
-    """With which others each image counts, ``(k,)``: the number of the first image of its vector."""
+    """Return for each image ``(k,)`` the number of the first image of its vector, with which it counts."""
     alone, blocks = np.arange(program.finite.weights.size), program.finite.blocks
     if blocks is None:
         return alone
@@ -132,7 +187,7 @@ def vectors(program: SemiInfiniteProgram) -> np.ndarray:
 
 
 def share_of(program: SemiInfiniteProgram, counted: float) -> float:
-    """What a count is of the largest."""
+    """Return a count as a share of the largest count."""
     prices = together(program)
     prices = prices[prices > 0.0]
     one = _one(prices)
@@ -140,8 +195,20 @@ def share_of(program: SemiInfiniteProgram, counted: float) -> float:
 
 
 def whole(program: SemiInfiniteProgram, least: float) -> float:
-    """The least count that is at least ``least`` but for rounding, where all that count, count the same: a whole number
-    of them. ``least`` itself otherwise."""
+    """Return the smallest count of at least ``least``, except for rounding, where all prices are equal.
+
+    Parameters
+    ----------
+    program : SemiInfiniteProgram
+        The program.
+    least : float
+        Lower bound of the count, in the user's units.
+
+    Returns
+    -------
+    float
+        A multiple of the price, not more than the largest count; ``least`` itself, at least 0, where prices differ.
+    """
     prices = together(program)
     one = _one(prices[prices > 0.0])
     if not one:
@@ -150,13 +217,16 @@ def whole(program: SemiInfiniteProgram, least: float) -> float:
 
 
 def _one(prices: Array) -> float:
-    """What all count, where that is the same; else 0."""
+    """Return the common price of all entries; 0 where prices differ."""
     return float(prices.mean()) if prices.size and np.ptp(prices) <= ROUNDED * prices.max() else 0.0
 
 
 def tidied(program: SemiInfiniteProgram, x: Array) -> Array:
-    """The decision ``x (n,)`` with entries of ``S x`` that are nearly 0, or nearly a bound, moved there, where they
-    count; ``x`` itself where nothing is to be moved. It is as good as the constraints say: look at them again."""
+    """Return the decision ``x (n,)`` with entries of ``S x`` that are nearly 0, or nearly at a bound, moved there.
+
+    Only entries that count are moved to 0. Where the count would not fall, or the program is too large, ``x`` itself is
+    returned. The new decision may violate constraints, which must be checked again.
+    """
     base, prices = program.finite, prices_of(program)
     reach = np.maximum(np.abs(base.lower), np.abs(base.upper))
     image = base.image(x)
@@ -165,7 +235,7 @@ def tidied(program: SemiInfiniteProgram, x: Array) -> Array:
     if not (near & (image != 0.0)).any():
         return x
     if (np.abs(image) <= DUST * reach).all():
-        return np.zeros_like(x)  # least squares would leave rounding, and a cost that is not exactly 0
+        return np.zeros_like(x)  # least squares would leave rounding errors, and a cost that is not exactly 0
     if base.S is None:
         return np.where(near, 0.0, x)
     if x.size > LARGE:
@@ -174,7 +244,7 @@ def tidied(program: SemiInfiniteProgram, x: Array) -> Array:
         targets = np.where(near, 0.0, np.where(image > 0.0, base.upper, base.lower))
         still = near | (np.isfinite(targets) & (np.abs(image - targets) <= DUST * np.abs(targets)))
     rows = base.S[np.flatnonzero(still)].toarray()
-    alone = np.count_nonzero(rows, axis=1) == 1  # images of one entry, which are 0 exactly where it is
+    alone = np.count_nonzero(rows, axis=1) == 1  # images of one entry, which are 0 exactly where the entry is 0
     moved, free = x.copy(), np.ones(x.size, dtype=bool)
     free[np.abs(rows[alone & near[still]]).argmax(axis=1)] = False
     moved[~free] = 0.0
@@ -183,9 +253,28 @@ def tidied(program: SemiInfiniteProgram, x: Array) -> Array:
 
 
 def met(program: SemiInfiniteProgram, x: Array, G: Array, h: Array) -> Array:
-    """The decision ``x (n,)`` with its equalities, and the rows ``G x = h (r,)`` that an earlier one was held by, met
-    to rounding, by those entries alone that are neither 0 nor at a bound; ``x`` itself where there is nothing to meet.
-    Where entries were moved to 0, this is what they gave to rows at their limit, taken over by the others."""
+    """Return the decision ``x (n,)`` with its equalities, and the rows ``G x = h``, satisfied to rounding.
+
+    Only entries that are neither 0 nor at a bound are changed. The rows are those that an earlier decision satisfied
+    with equality. Where entries were moved to 0, the others make up for their part in these rows. Where there is
+    nothing to satisfy, ``x`` itself is returned.
+
+    Parameters
+    ----------
+    program : SemiInfiniteProgram
+        The program.
+    x : ndarray, shape (n,)
+        The decision.
+    G : ndarray, shape (r, n)
+        Rows.
+    h : ndarray, shape (r,)
+        Their values at the earlier decision.
+
+    Returns
+    -------
+    ndarray, shape (n,)
+        The decision.
+    """
     base = program.finite
     if not base.b.size + h.size or (base.S is not None and x.size > LARGE):
         return x
@@ -209,4 +298,4 @@ def met(program: SemiInfiniteProgram, x: Array, G: Array, h: Array) -> Array:
 
 
 REFINED = 3
-LARGE = 2000  # variables that images are solved for
+LARGE = 2000  # largest number of variables for which images are solved

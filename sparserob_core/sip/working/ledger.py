@@ -1,4 +1,4 @@
-"""The accounts of a method: the best lower bound, the rounds that were told, and what may be claimed at the end."""
+"""Accounts of a method: the best lower bound, the rounds, and the claims at the end."""
 
 from __future__ import annotations
 
@@ -29,18 +29,18 @@ from sparserob_core.sip.proof.verdict import as_bad_as_found, infeasible_subsyst
 from sparserob_core.sip.relaxed.relaxed import RelaxedProgram, Rows
 from sparserob_core.sip.result import MEANING, Result, Status, relative_gap
 
-ROUNDING = 1e-13  # of the terms of a cost, with which it is evaluated
-CRUDE = 1e-8  # of bounds, rows and equalities, relative to their scale, at a decision of which nothing is claimed
-# Of the tolerance: a violation that was met though it is proven not to be there. With 1 rounding alone might deny a
-# proof; with ten times as much a violation of ten tolerances is claimed to be none.
+ROUNDING = 1e-13  # rounding error of a cost, relative to its terms
+CRUDE = 1e-8  # relative residual of bounds, rows and equalities at a decision without a claim
+# Multiple of the tolerance: a violation above it contradicts a proof. With 1, rounding alone might contradict a proof;
+# with ten times as much, a violation of twenty tolerances is claimed to be none.
 CONTRADICTS = 2.0
-ALLOWED = TOLERANCE / 2  # a violation that the search may leave to the proof
+ALLOWED = TOLERANCE / 2  # violation that the search may leave to the proof
 
 Violated: TypeAlias = Sequence[tuple[Array, np.ndarray, str]]  # indices (k, d), rows (k,) and the name of a family
 
 
 class Prover(Protocol):
-    """What is proven of a decision ``x (n,)`` with at most ``cells`` cells for every family."""
+    """Function that proves the families at a decision ``x (n,)``, with at most ``cells`` cells for each family."""
 
     def __call__(self, x: Array, cells: int = CELLS) -> Sequence[Proof]: ...
 
@@ -49,12 +49,12 @@ Found: TypeAlias = Sequence[tuple[ConstraintFamily, Separation]]
 
 
 def unproven(x: Array, cells: int = CELLS) -> Sequence[Proof]:
-    """The prover of a program of which only the bounds are wanted."""
+    """Return no proof: the prover of a program of which only the bounds are needed."""
     return ()
 
 
 def prover_of(program: SemiInfiniteProgram, tools: Tools) -> Prover:
-    """The prover of every family of a program, which tells how it goes on and ends at the deadline of the tools."""
+    """Return the prover of all families of a program, which sends events and ends at the deadline of the tools."""
 
     def prover(x: Array, cells: int = CELLS) -> Sequence[Proof]:
         return prove(program, x, tools.notify, cells, tools.deadline)
@@ -64,8 +64,19 @@ def prover_of(program: SemiInfiniteProgram, tools: Tools) -> Prover:
 
 @dataclass(frozen=True, eq=False)
 class Answer:
-    """An answer to a relaxed program: the checked ``solution``, the ``rows`` that were imposed, and the weight
-    ``epsilon`` of the regulariser. ``value``: of the relaxed program, where it is not that of the solution."""
+    """Answer to a relaxed program.
+
+    Parameters
+    ----------
+    solution : FiniteSolution
+        The checked solution.
+    rows : Rows
+        The imposed rows.
+    epsilon : float
+        Weight of the regulariser.
+    value : float
+        Value of the relaxed program; it may differ from that of the solution.
+    """
 
     solution: FiniteSolution
     rows: Rows
@@ -74,24 +85,41 @@ class Answer:
 
     @property
     def multipliers(self) -> Array:
-        """The multipliers ``(r,)`` of the imposed rows; zeros where the solution has none."""
+        """Multipliers ``(r,)`` of the imposed rows; zeros where the solution has none."""
         count, y = self.rows.h.size, self.solution.y
         return y[y.size - count :] if y.size >= count else np.zeros(count)
 
     @property
     def active(self) -> tuple[Cut, ...]:
-        """The imposed constraints that carry a multiplier, with it."""
+        """Imposed constraints with a positive multiplier, which is filled in."""
         pairs = zip(self.rows.cuts, self.multipliers, strict=True)
         return tuple(replace(cut, multiplier=float(m)) for cut, m in pairs if m > 0.0)
 
 
 @dataclass(eq=False)
 class Ledger:
-    """What a method has learned of ``program``: ``dual``, the multipliers of the best lower bound; ``history``, the
-    rounds told; ``best``, the last answer that no search refuted, or else the last one; ``proven``, the cheapest answer
-    of which every family is proven, with the proofs, where there is one.
+    """Knowledge of a method about its program.
 
-    ``tolerance``: the relative gap at which the bounds have met.
+    Parameters
+    ----------
+    program : SemiInfiniteProgram
+        The program.
+    relaxed : RelaxedProgram
+        Its relaxed program.
+    tools : Tools
+        Components of the run.
+    tolerance : float
+        Relative gap at which the bounds have met.
+    started : float
+        Time of the start, in seconds.
+    dual : Dual
+        Multipliers of the best lower bound.
+    history : list of RoundFinished
+        All rounds.
+    best : Answer, optional
+        The last answer that no search refuted, or else the last answer.
+    proven : tuple, optional
+        The cheapest answer at which every family is proven, with its separations and proofs.
     """
 
     program: SemiInfiniteProgram
@@ -108,7 +136,7 @@ class Ledger:
 
     @property
     def lower(self) -> float:
-        """The best lower bound proven so far."""
+        """Best lower bound proven so far."""
         return self.dual.bound
 
     def improve(self, dual: Dual) -> None:
@@ -116,22 +144,37 @@ class Ledger:
         self.dual = max(self.dual, dual, key=lambda one: one.bound)
 
     def open(self, x: Array) -> bool:
-        """Whether the gap between the lower bound and the cost of ``x (n,)`` is open."""
+        """Return whether the gap between the lower bound and the cost of ``x (n,)`` is open."""
         return self.gap(x) > self.tolerance
 
     def gap(self, x: Array) -> float:
-        """The relative gap of the lower bound to the cost of ``x (n,)``."""
+        """Return the relative gap between the lower bound and the cost of ``x (n,)``."""
         return relative_gap(self.lower, self.program.cost(x), self.program.added(x))
 
     def _resolved_gap(self, x: Array) -> float:
-        """The relative gap at ``x (n,)`` where its cost is as much more as it may be rounded down: of squares that
-        cancel nearly all of it may be rounding, and then nothing is known to close."""
+        """Return the relative gap at ``x (n,)`` with the cost increased by its possible rounding error.
+
+        Where squares cancel, nearly all of the cost may be rounding. Then the gap is not known to be closed.
+        """
         rounded = np.finfo(float).eps * self.program.finite.magnitude(x)
         return relative_gap(self.lower, self.program.cost(x) + rounded, self.program.added(x))
 
     def tell(self, number: int, answer: Answer, found: Found, upper: float, kept: int) -> None:
-        """Tell of a round: its answer, what was found most violated at it, an upper bound that it suggests, and how
-        many rows were kept."""
+        """Record a round, and send its event.
+
+        Parameters
+        ----------
+        number : int
+            Number of the round.
+        answer : Answer
+            Answer to the relaxed program.
+        found : Found
+            Most violated constraints of each family at the answer.
+        upper : float
+            Upper bound that the round suggests.
+        kept : int
+            Number of rows kept.
+        """
         worst, x = worst_of(found), answer.solution.x
         added, dropped = _change(self.history[-1].imposed if self.history else (), answer.rows.cuts)
         event = RoundFinished(
@@ -164,12 +207,26 @@ class Ledger:
         self.tools.notify(event)
 
     def keep(self, answer: Answer, found: Found = ()) -> None:
-        """The answer to return should the method be stopped now, with what was found most violated at it."""
+        """Keep the answer that is returned if the method is stopped now, with its most violated constraints."""
         self.best, self._found = answer, found
 
     def prove(self, answer: Answer, found: Found, proofs: Sequence[Proof]) -> bool:
-        """Keep an answer that these proofs show to be feasible, if it is the cheapest so far; ``False`` where they do
-        not show that."""
+        """Keep an answer if these proofs show that it is feasible and it is the cheapest so far.
+
+        Parameters
+        ----------
+        answer : Answer
+            The answer.
+        found : Found
+            Most violated constraints of each family at the answer.
+        proofs : sequence of Proof
+            Proofs at the answer.
+
+        Returns
+        -------
+        bool
+            False where the proofs do not show that the answer is feasible.
+        """
         if len(proofs) != len(self.program.families) or any(proof.verdict != "proven" for proof in proofs):
             return False
         x = answer.solution.x
@@ -183,13 +240,29 @@ class Ledger:
         return True
 
     def cheaper(self, answer: Answer) -> bool:
-        """Whether nothing that costs as little as an answer is proven."""
+        """Return whether the answer costs less than the cheapest proven answer, or no answer is proven."""
         cost = self.program.cost(answer.solution.x)
         return self.proven is None or cost < self.program.cost(self.proven[0].solution.x)
 
     def judged(self, answer: Answer, worst: WorstConstraint, proofs: Sequence[Proof], ending: str = "") -> Result:
-        """The result with the decision of ``answer``: what the proofs, the gap and the comparison of the bounds allow.
-        ``ending``: why the method came to an end, where it was not by its own rules."""
+        """Return the result with the decision of an answer, and the status that proofs, gap and bounds allow.
+
+        Parameters
+        ----------
+        answer : Answer
+            The answer.
+        worst : WorstConstraint
+            The most violated constraint that was found.
+        proofs : sequence of Proof
+            Proofs at the answer.
+        ending : str
+            Reason for the end of the method, where it was not by its own rules.
+
+        Returns
+        -------
+        Result
+            The result.
+        """
         x, deadline = answer.solution.x, self.tools.deadline
         status, message = verdict(proofs, self._resolved_gap(x), self.tolerance)
         for what, missed, most in self._fixed(x, strictly=status in ("certified", "verified")):
@@ -209,20 +282,36 @@ class Ledger:
         return replace(result, proofs=tuple(proofs), errors=errors, stopped=ending if ending == deadline.reason else "")
 
     def _errors(self, x: Array) -> EqualityErrors | None:
-        """Proven errors of the equalities at ``x (n,)``; ``None`` where the program offers none."""
+        """Return the proven errors of the equalities at ``x (n,)``; ``None`` where the program offers none."""
         return None if self.program.errors is None else self.program.errors(x)
 
     def _fixed(self, x: Array, strictly: bool) -> Iterator[tuple[str, float, float]]:
-        """What is no family: a name, by how much ``x (n,)`` misses it, and by how much it may. ``strictly``: as much as
-        a claim allows, else what a decision may that is worth returning."""
+        """Yield the residuals of all constraints that are no family: a name, the residual at ``x (n,)``, and its limit.
+
+        With ``strictly``, the limit is that of a claim; otherwise it is that of a decision worth returning.
+        """
         finite = self.program.finite
         yield "its equalities", finite.missed(x), EQUALITY if strictly else CRUDE
         yield "its bounds or rows", finite.residual(x), TOLERANCE if strictly else CRUDE
         yield "its bounds", _beyond(self.program, x) if strictly else 0.0, TOLERANCE
 
     def stopped(self, error: KeyboardInterrupt, prover: Prover) -> Result:
-        """The result where time is over or a key was pressed: the best decision that was proven, or else the best so
-        far, with what one look at it proves (a proof whose deadline has passed looks at every family once)."""
+        """Return the result after a deadline or an interrupt: the best proven decision, or else the best so far.
+
+        The latter has the proofs of one look at it, since a proof whose deadline has passed bounds every family once.
+
+        Parameters
+        ----------
+        error : KeyboardInterrupt
+            The deadline or the interrupt.
+        prover : Prover
+            Prover of the families.
+
+        Returns
+        -------
+        Result
+            The result.
+        """
         reason = self.tools.deadline.interrupt(error)
         if self.proven is not None:
             answer, found, proofs = self.proven
@@ -248,8 +337,10 @@ class Ledger:
         return self.judged(self.best, worst_of(self._found), proofs, reason)
 
     def without(self, answer: Answer) -> Result:
-        """The result where the relaxed program has no usable answer: ``infeasible`` with the reason where that is
-        proven, else ``failed``."""
+        """Return the result where the relaxed program has no usable answer.
+
+        The status is ``infeasible`` with its reasons where that is proven, and ``failed`` otherwise.
+        """
         solution = answer.solution
         if solution.status != "infeasible":
             return self.result("failed", solution.message, answer)
@@ -262,15 +353,34 @@ class Ledger:
         return replace(self.result("infeasible", found.sentence(), answer, worst), infeasible=found)
 
     def salvaged(self, failed: Result) -> Result:
-        """The result of the decision that is proven, with what it ``failed`` for, where a relaxed program was not
-        solved after there was one; else the result itself."""
+        """Return the result of the proven decision in place of one that ``failed``, with the reason of the failure.
+
+        Where no decision is proven, or the result has not failed, the result itself is returned.
+        """
         if failed.status != "failed" or self.proven is None:
             return failed
         answer, found, proofs = self.proven
         return self.judged(answer, worst_of(found), proofs, failed.message)
 
     def result(self, status: Status, message: str, answer: Answer, worst: WorstConstraint | None = None) -> Result:
-        """A result with this answer; the bounds are claimed as far as the status allows."""
+        """Return a result with this answer, whose bounds are claimed as far as the status allows.
+
+        Parameters
+        ----------
+        status : Status
+            The status.
+        message : str
+            The reason for the status.
+        answer : Answer
+            The answer.
+        worst : WorstConstraint, optional
+            The most violated constraint.
+
+        Returns
+        -------
+        Result
+            The result.
+        """
         cuts, proven = answer.active, status in ("certified", "verified")
         decided = status not in ("infeasible", "failed")
         cost = self.program.cost(answer.solution.x) if decided else np.nan
@@ -305,7 +415,7 @@ class Ledger:
 
 
 def _change(before: Sequence[Cut], now: Sequence[Cut]) -> tuple[tuple[Cut, ...], tuple[Cut, ...]]:
-    """The constraints that were added and those that were dropped."""
+    """Return the constraints that were added and those that were dropped."""
     old, new = ({(cut.family, cut.index.tobytes(), cut.row): cut for cut in cuts} for cuts in (before, now))
     return tuple(cut for key, cut in new.items() if key not in old), tuple(
         cut for key, cut in old.items() if key not in new
@@ -313,8 +423,7 @@ def _change(before: Sequence[Cut], now: Sequence[Cut]) -> tuple[tuple[Cut, ...],
 
 
 def contradiction(worst: WorstConstraint) -> str:
-    """Words where a search has met a violation in a family that was proven, by more than rounding makes of its
-    tolerance; empty where all is well."""
+    """Return a message where a search has found a violation of a proven family, beyond rounding; empty otherwise."""
     if not worst.violation > CONTRADICTS * TOLERANCE:
         return ""
     return (
@@ -324,13 +433,26 @@ def contradiction(worst: WorstConstraint) -> str:
 
 
 def alarm(program: SemiInfiniteProgram, dual: Dual, x: Array) -> str:
-    """Words where the lower bound is above the cost of a proven decision ``x (n,)`` by more than the tolerances of the
-    proofs allow: then one of the two is wrong. Empty where all is well.
+    """Return a message where the lower bound exceeds the cost of a proven decision by more than tolerances allow.
 
-    A decision that violates its rows by ``v`` may cost ``y'v`` less than the optimum, for the multipliers ``y`` of
-    the bound: by weak duality ``lower <= J(x) + y'(G x - h) + mu'(A x - b)``. What is allowed is that sum with the
-    tolerance of each proven row in place of its violation, that of each bound (1e-9 of the smallest number that it
-    compares) where it is missed, with the real residuals of the fixed rows and equalities, and rounding.
+    One of the two is then wrong. A decision that violates its rows by ``v`` may cost ``y'v`` less than the optimum, for
+    the multipliers ``y`` of the bound. By weak duality, ``lower <= J(x) + y'(G x - h) + mu'(A x - b)``. The allowed
+    difference is that sum, with these violations: for each proven row its tolerance; for each violated bound at most
+    1e-9 of the smallest number that it compares; for fixed rows and equalities the real residuals. Rounding is added.
+
+    Parameters
+    ----------
+    program : SemiInfiniteProgram
+        The program.
+    dual : Dual
+        Multipliers of the lower bound.
+    x : ndarray, shape (n,)
+        The proven decision.
+
+    Returns
+    -------
+    str
+        The message; empty where all is well.
     """
     base, cost = program.finite, program.cost(x)
     allowed = ROUNDING * base.magnitude(x)
@@ -353,13 +475,14 @@ def alarm(program: SemiInfiniteProgram, dual: Dual, x: Array) -> str:
 
 
 def _missed(base: FiniteProgram, x: Array) -> tuple[Array, Array]:
-    """By how much the image of ``x (n,)`` misses its bounds ``(k,)``, and what is rounding of that."""
+    """Return the amounts ``(k,)`` by which the image of ``x (n,)`` violates its bounds, and their rounding errors
+    ``(k,)``."""
     image, terms = base.image(x), np.abs(x) if base.S is None else abs(base.S) @ np.abs(x)
     return np.maximum(np.maximum(base.lower - image, image - base.upper), 0.0), ROUNDING * terms
 
 
 def _beyond(program: SemiInfiniteProgram, x: Array) -> float:
-    """The largest miss of a bound by the image of ``x (n,)``, in the bound's own unit, less rounding."""
+    """Return the largest violation of a bound by the image of ``x (n,)``, in the bound's own unit, less rounding."""
     missed, rounding = _missed(program.finite, x)
     units = _units(program.finite.lower, program.finite.upper)
     shares = np.maximum(missed - rounding, 0.0) / np.where(units > 0.0, units, 1.0)
@@ -367,8 +490,10 @@ def _beyond(program: SemiInfiniteProgram, x: Array) -> float:
 
 
 def _units(lower: Array, upper: Array) -> Array:
-    """The units ``(k,)`` of bounds: the smallest of their sizes and of the width between them that is not 0 (decision
-    16); 0 where there is none."""
+    """Return the units ``(k,)`` of bounds; 0 where there is none.
+
+    The unit is the smallest number that is not 0 among the sizes of the two bounds and their distance (decision 16).
+    """
     with np.errstate(invalid="ignore"):
         sizes = np.abs(np.stack([lower, upper, upper - lower]))
     units = np.where(np.isfinite(sizes) & (sizes > 0.0), sizes, np.inf).min(axis=0)
@@ -376,13 +501,30 @@ def _units(lower: Array, upper: Array) -> Array:
 
 
 def above(family: ConstraintFamily, found: Separation) -> tuple[Array, np.ndarray, str]:
-    """The indices, rows and family of what is violated by more than the search may leave to the proof."""
+    """Return the violations of a family that are more than the search may leave to the proof.
+
+    Parameters
+    ----------
+    family : ConstraintFamily
+        The family.
+    found : Separation
+        Its most violated constraints.
+
+    Returns
+    -------
+    indices : ndarray, shape (k, d)
+        Indices of the violated constraints.
+    rows : ndarray of int, shape (k,)
+        Their rows.
+    name : str
+        Name of the family.
+    """
     violated = found.violations > ALLOWED
     return found.indices[violated], found.rows[violated], family.name
 
 
 def witnesses(program: SemiInfiniteProgram, proofs: Sequence[Proof]) -> Violated:
-    """What proofs have met that is violated, as constraints to impose."""
+    """Return the violated constraints that proofs have found, as constraints to impose."""
     return [
         (proof.index[None], np.array([proof.row]), proof.family)
         for proof in proofs

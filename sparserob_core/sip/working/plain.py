@@ -1,5 +1,7 @@
-"""Imposed rows that are linear in the decision: dropped when they have been idle, solved with a regulariser that is as
-light as it must be."""
+"""Imposed rows that are linear in the decision.
+
+Idle rows are dropped. The relaxed program is solved with a regulariser whose weight is as small as necessary.
+"""
 
 from __future__ import annotations
 
@@ -23,17 +25,17 @@ from sparserob_core.sip.working.counting import count, met, tidied
 from sparserob_core.sip.working.ledger import ALLOWED, Answer, Found, Ledger, Prover, Violated, above
 from sparserob_core.sip.working.working import Missed, Working, fits
 
-# Rounds that a row may stay without a multiplier before it is dropped. With one, rows come and go; with ten times as
-# many, solving takes longer the more rounds there were.
+# Number of rounds without a multiplier after which a row is dropped. With 1, rows are dropped and imposed in turn; with
+# ten times as many, solving takes longer the more rounds there were.
 IDLE_ROUNDS = 3
-# Rounds after which rows are only added, so that nothing can cycle. With a tenth of them walls with bends solve more
-# rows than they need; ten times as many are more rounds than there are.
+# Number of rounds after which rows are only added, so that nothing can cycle. With a tenth, curved constraints keep
+# more rows than they need; ten times as many are more rounds than any run has.
 DROPPING_ROUNDS = 40
-# Of a weight, what the steps of the continuation that are taken at once may leave. With ten times as much steps are
-# made one by one, three times as many programs; with half of it programs of badly scaled numbers are left verified.
+# Least ratio of two weights when several steps of the continuation are taken at once. With ten times as much, every
+# step is taken alone, with three times as many programs; with half, badly scaled programs end verified, not certified.
 FASTEST = 1 / 8
-CRUDE = 1e-4  # residual and relative gap of a relaxed solution that a round can do with
-SPARSIFYING = 60  # rounds after which no vertex is looked for any more
+CRUDE = 1e-4  # residual and relative gap of a relaxed solution that is accurate enough for a round
+SPARSIFYING = 60  # number of rounds after which no vertex is sought
 
 Close: TypeAlias = Callable[[SemiInfiniteProgram, Tools, Prover], Result]  # an exchange that closes the gap
 
@@ -41,10 +43,26 @@ Close: TypeAlias = Callable[[SemiInfiniteProgram, Tools, Prover], Result]  # an 
 @final
 @dataclass(eq=False)
 class PlainRows(Working):
-    """The imposed ``rows``, since how many rounds each is ``idle (r,)``, the weight ``epsilon`` of the regulariser, and
-    a solution with these rows as the next ``guess``. ``exact``: the regulariser is only as heavy as the unregularised
-    problem allows, else as the last weight of the continuation. ``close``: the exchange of another program. ``sheds``:
-    whether idle rows are dropped."""
+    """Working set of rows that are linear in the decision.
+
+    Parameters
+    ----------
+    rows : Rows
+        The imposed rows.
+    epsilon : float
+        Weight of the regulariser.
+    exact : bool
+        Whether the weight decreases until it does not change the unregularised problem. Otherwise the last weight of
+        the continuation is used.
+    close : Close, optional
+        Exchange that closes the gap of another program.
+    idle : ndarray of int, shape (r,)
+        Number of rounds for which each row has had no multiplier.
+    guess : FiniteSolution, optional
+        Solution with these rows, from which the next one starts.
+    sheds : bool
+        Whether idle rows are dropped.
+    """
 
     rows: Rows = field(default_factory=lambda: Rows.none(0))
     epsilon: float = 0.0
@@ -56,21 +74,43 @@ class PlainRows(Working):
 
     @staticmethod
     def start(program: SemiInfiniteProgram, tools: Tools, exact: bool, close: Close) -> PlainRows:
-        """No rows, and the first weight of the continuation."""
+        """Return a working set without rows, with the first weight of the continuation.
+
+        Parameters
+        ----------
+        program : SemiInfiniteProgram
+            The program.
+        tools : Tools
+            Components of the run.
+        exact : bool
+            Whether the unregularised problem is solved.
+        close : Close
+            Exchange that closes the gap of another program.
+
+        Returns
+        -------
+        PlainRows
+            The working set.
+        """
         epsilon = 0.0 if tools.regulariser is None else tools.continuation.start
         return PlainRows(program, rows=Rows.none(program.n), epsilon=epsilon, exact=exact, close=close)
 
     @property
     def size(self) -> int:
+        """Number of imposed rows."""
         return int(self.rows.h.size)
 
     def relax(self, ledger: Ledger, prover: Prover, last: bool) -> Answer | Result:
-        """Where the cost falls for ever, as it may without enough rows: those that stop it, where there are any."""
+        """Return the optimum under the imposed rows, or the final result where there is none.
+
+        Without enough rows the cost may fall without bound. Then rows that prevent this are imposed, where there are
+        any.
+        """
         answer = self._regularised(ledger)
         while answer.solution.status == "failed" and not usable(answer.solution) and not last:
             from sparserob_core.sip.working.unbounded import bounding_rows, falls_for_ever, first_rows
 
-            self.sheds = self.sheds and not self.size  # what was dropped may be what bounds it
+            self.sheds = self.sheds and not self.size  # a dropped row may be the one that bounds the program
             if self.impose(first_rows(self.program)):
                 answer = self._regularised(ledger)
                 continue
@@ -84,9 +124,11 @@ class PlainRows(Working):
         return answer if usable(answer.solution) else ledger.without(answer)
 
     def _regularised(self, ledger: Ledger) -> Answer:
-        """The relaxed program, with lighter and lighter regularisers while the cost still changes and the gap is open,
-        several steps of the continuation at once; for the regularised problem, step by step down to the last
-        weight."""
+        """Return the optimum of the relaxed program with decreasing weights of the regulariser.
+
+        The weight decreases while the cost still changes and the gap is open, by several steps of the continuation at
+        once. For the regularised problem, it decreases step by step to the last weight.
+        """
         solution, regu = self._solve(ledger, self.epsilon), ledger.tools.continuation
         steps = max(1, int(np.log(FASTEST) / np.log(regu.factor))) if self.exact else 1
         while usable(solution) and self.epsilon > regu.stop and (not self.exact or ledger.open(solution.x)):
@@ -105,7 +147,7 @@ class PlainRows(Working):
         return Answer(solution, self.rows, self.epsilon, solution.value)
 
     def _solve(self, ledger: Ledger, epsilon: float) -> FiniteSolution:
-        """The relaxed program with this weight; its multipliers improve the lower bound."""
+        """Return the solution of the relaxed program with a given weight; its multipliers improve the lower bound."""
         solution = ledger.relaxed.solve(self.rows, epsilon, self.margin, self.guess)
         while solution.status == "infeasible" and self.thin():
             solution = ledger.relaxed.solve(self.rows, epsilon, self.margin, None)
@@ -116,16 +158,19 @@ class PlainRows(Working):
         return solution
 
     def _plain(self, ledger: Ledger) -> FiniteSolution:
-        """The unregularised relaxed program: only its multipliers are wanted, for the lower bound."""
-        guess = self.guess if self.program.n >= MANY else None  # of the multipliers, where the simplex method begins
+        """Return the solution of the unregularised relaxed program; its multipliers improve the lower bound."""
+        guess = self.guess if self.program.n >= MANY else None  # its multipliers are the start of the simplex method
         plain = ledger.relaxed.solve(self.rows, 0.0, self.margin, guess)
         if usable(plain):
             ledger.improve(ledger.relaxed.lower_bound(self.rows, plain))
         return plain
 
     def sharpen(self, ledger: Ledger, answer: Answer) -> bool:
-        """The lower bound of the plain program, then to go on without the regulariser, which is not exact at its
-        lightest."""
+        """Improve the lower bound by the unregularised program, and continue without the regulariser.
+
+        This step is the last one, for a regulariser that is not exact at its smallest weight. False is returned where
+        nothing is left to try.
+        """
         if self.epsilon == 0.0 or not self.exact:
             return False
         plain = self._plain(ledger)
@@ -136,12 +181,12 @@ class PlainRows(Working):
         return True
 
     def exchange(self, answer: Answer, violated: Violated, number: int) -> int:
-        """Rows that have been slack for a while are dropped when others are added."""
+        """Impose violated rows, and drop rows that were idle for some rounds; return the number of new rows."""
         fresh = self._unknown(violated)
         if not fresh.h.size:
             return 0
         known, added = answer.multipliers, np.zeros(fresh.h.size)
-        y = np.concatenate([known, np.zeros(self.rows.h.size - known.size)])  # none of what was imposed since
+        y = np.concatenate([known, np.zeros(self.rows.h.size - known.size)])  # zeros for rows imposed since
         idle = np.where(y > 0.0, 0, self.idle + 1)
         keep = (idle < IDLE_ROUNDS) | (number > DROPPING_ROUNDS) | (not self.sheds)
         self.rows = self.rows.take(keep).joined(fresh)
@@ -151,6 +196,7 @@ class PlainRows(Working):
         return added.size
 
     def impose(self, violated: Violated) -> int:
+        """Impose rows that no answer contains yet; return the number of new rows."""
         fresh = self._unknown(violated)
         self.rows = self.rows.joined(fresh)
         self.guess = None if self.guess is None else _with_more(self.guess, fresh.h.size)
@@ -158,9 +204,11 @@ class PlainRows(Working):
         return int(fresh.h.size)
 
     def knows(self, missed: Missed) -> bool:
+        """Return whether a constraint is imposed."""
         return not self._unknown([(missed.at, missed.row, missed.family)]).h.size
 
     def _unknown(self, violated: Violated) -> Rows:
+        """Return the rows of violated constraints that are not imposed."""
         known, fresh = {(cut.family, cut.row, cut.index.tobytes()) for cut in self.rows.cuts}, Rows.none(self.program.n)
         for indices, rows, family in violated:
             new = np.array(
@@ -171,23 +219,27 @@ class PlainRows(Working):
         return fresh
 
     def priced(self, answer: Answer) -> float:
+        """Return the increase of an answer's cost when all rows are moved by 1 along their normals, to first order."""
         return float(answer.multipliers @ answer.rows.norms)
 
     @property
     def longest(self) -> float:
+        """Largest norm of an imposed row."""
         return float(self.rows.norms.max(initial=0.0))
 
     @property
     def unit(self) -> float:
-        """That of the decision: a row is moved by a margin of 1 as far as by a decision of that size."""
+        """Unit of margins: the largest bound of the decision, and at most 1."""
         reach = np.maximum(np.abs(self.program.finite.lower), np.abs(self.program.finite.upper))
         return min(1.0, float(np.where(np.isfinite(reach), reach, 1.0).max()))
 
     def distance(self, missed: Missed) -> float:
+        """Return the distance by which a violated row has to be moved along its normal."""
         row = rows_at(self.program, missed.family, missed.at, missed.row)
         return missed.violation / max(float(np.linalg.norm(row.G)), np.finfo(float).tiny)
 
     def tightened(self, ledger: Ledger, answer: Answer, margin: float) -> Answer | None:
+        """Return the optimum of the imposed rows tightened by ``margin``; ``None`` where there is none."""
         guess = _with_more(answer.solution, self.rows.h.size - answer.rows.h.size)
         solution = ledger.relaxed.solve(self.rows, self.epsilon, margin, guess)
         if not usable(solution):
@@ -196,27 +248,34 @@ class PlainRows(Working):
         return Answer(solution, self.rows, self.epsilon, solution.value)
 
     def candidate(self, answer: Answer) -> Answer | None:
+        """Return ``None``: no decision other than the answer is known."""
         return None
 
     def proven(self, ledger: Ledger, answer: Answer, x: Array) -> Dual:
+        """Return the lower bound by the multipliers of an answer, with tangents of the cost at ``x (n,)``."""
         return ledger.relaxed.lower_bound(answer.rows, replace(answer.solution, x=x))
 
     def choose(
         self, ledger: Ledger, answer: Answer, found: Found, number: int, prover: Prover
     ) -> tuple[Answer, Found, Violated]:
-        """One of which fewer entries count, where solvers leave dust or any optimum will do: the answer without its
-        dust, or a vertex of the relaxed program where no regulariser chooses another optimum."""
+        """Return an answer in which fewer entries count, where there is one.
+
+        The new answer is the old one without the small entries that solvers leave, or a vertex of the relaxed program
+        where no regulariser selects another optimum.
+        """
         answer, found, violated = self._sparser(ledger, answer, found, number)
         if not self.exact:
             self._plain(ledger)
         return answer, found, violated
 
     def _sparser(self, ledger: Ledger, answer: Answer, found: Found, number: int) -> tuple[Answer, Found, Violated]:
+        """Return an answer with a smaller count, its violations, and the constraints that a rejected candidate
+        violates."""
         program, x = self.program, answer.solution.x
         if program.activity is None or (number > SPARSIFYING and answer.epsilon == 0.0):
             return answer, found, ()
         held, closed = answer.rows.G[answer.multipliers > 0.0], not ledger.open(x)
-        candidates = [met(program, tidied(program, x), held, held @ x)]  # dust may be all that is between the bounds
+        candidates = [met(program, tidied(program, x), held, held @ x)]  # small entries may keep the gap open
         if closed and answer.epsilon == 0.0 and program.finite.P is None and program.blocks is None:
             rows = answer.rows
             plain = ledger.relaxed.finite(rows.G, rows.h - self.margin * rows.norms, 0.0)
@@ -230,7 +289,7 @@ class PlainRows(Working):
             beyond = [one for family, separation in looked if (one := above(family, separation))[1].size]
             room = 0.5 * min(0.0, worst_of(found).violation)
             if self.allowed and worst_of(looked).violation > room:
-                continue  # a proof has asked for room, which the answer leaves and this one does not
+                continue  # a proof needs a margin, which the answer has and this candidate lacks
             if not beyond:
                 value = program.cost(other) if answer.epsilon == 0.0 else answer.value
                 kept = replace(answer, solution=replace(answer.solution, x=other), value=value), looked
@@ -241,13 +300,15 @@ class PlainRows(Working):
 
 
 def _with_more(solution: FiniteSolution, rows: int) -> FiniteSolution:
-    """A solution as a guess where so many rows stand behind those that it knows."""
+    """Return a solution as a starting point for a program with ``rows`` further rows."""
     return replace(solution, y=np.concatenate([solution.y, np.zeros(rows)]))
 
 
 def usable(solution: FiniteSolution) -> bool:
-    """Whether a relaxed solution is good for a round: a crude optimiser costs rounds, but no claim rests on its
-    accuracy."""
+    """Return whether a relaxed solution is accurate enough for a round.
+
+    An inaccurate optimiser costs rounds, but no claim depends on its accuracy.
+    """
     scale = max(1.0, abs(solution.value))
     return solution.status == "optimal" or (
         solution.status == "failed" and solution.residual <= CRUDE and solution.gap <= CRUDE * scale

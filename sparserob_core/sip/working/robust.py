@@ -1,9 +1,9 @@
-"""Imposed rows that must hold for every deviation: times are exchanged, deviations are all in the relaxed program.
+"""Imposed rows that must hold for every deviation: indices are exchanged, deviations are all in the relaxed program.
 
-The relaxed program is the robust counterpart at the imposed indices (`inner.simplex`, or `inner.central` where that
-is quicker). The lower bound is that of cuts: every row with a multiplier, at the deviation that its multipliers say
+The relaxed program is the robust counterpart at the imposed indices (`inner.simplex`, or `inner.central` where that is
+quicker). The lower bound is that of cuts: every row with a multiplier, at the deviation that its multipliers determine
 (weak duality over the bounds of the program). Nothing is dropped: a row has variables of its own, and the last basis,
-from which the next solution starts, goes through them.
+from which the next solution starts, contains them.
 """
 
 from __future__ import annotations
@@ -32,27 +32,50 @@ from sparserob_core.sip.working.plain import Close
 from sparserob_core.sip.working.securing import GLANCE, SPARED
 from sparserob_core.sip.working.working import Missed, Working, size_of
 
-ROUNDING = 2.0**-46  # of the numbers of which a bound is made
-SHARES = (0.1, 0.5, 1.0)  # of the way from the best decision known to the relaxed optimum, where rows are sought
-ENDED = 0.05  # seconds after the end of the time, when it is over for certain
-CUTS = 4  # rows at each of these shares
-CHOOSING = 30  # rounds of a second objective
-MANY = 4000  # variables of a second objective. With ten times as many the simplex method takes minutes where the first
-# objective takes seconds (100 pieces, two states: 10 000); with ten times fewer six states on twelve pieces go without.
-COARSE, SHARPER = 10.0, 0.1  # share of the cost to which the first round is solved, and how much closer the next ones
-FINEST = 0.1  # share of the tolerance to which the last rounds are solved
-FARKAS = 1e-9  # a weighted sum of rows is violated by more than that: nothing is feasible
+ROUNDING = 2.0**-46  # rounding error of a bound, relative to the numbers that are added up in it
+SHARES = (0.1, 0.5, 1.0)  # points from the best decision known to the relaxed optimum at which rows are sought
+ENDED = 0.05  # seconds after the deadline when it has passed for certain
+CUTS = 4  # largest number of rows at each of these points
+CHOOSING = 30  # largest number of rounds of a second objective
+# Largest number of variables of a second objective. With ten times as many, the simplex method takes minutes where the
+# first objective takes seconds (100 pieces, two states: 10 000); a tenth excludes six states on twelve pieces.
+MANY = 4000
+COARSE, SHARPER = 10.0, 0.1  # accuracy of the first round as a share of the cost, and its factor from round to round
+FINEST = 0.1  # accuracy of the last rounds as a share of the tolerance
+FARKAS = 1e-9  # least violation of a weighted sum of rows that proves infeasibility
 
 
 @final
 @dataclass(eq=False)
 class RobustRows(Working):
-    """The imposed indices of every family and the ``counterpart`` at them, with all rows of an index as ``cuts``.
+    """Working set of rows that must hold for every deviation.
 
-    ``accuracy``: to which share of the cost a round is solved, where the method can choose; ``price``: of a margin of
-    1, the last time. ``raw``, ``best``: the relaxed optimum before it is settled, and the best decision known, of a
-    program with a guide. ``calls``: whose answers there were; ``asked``: who solves the counterparts, where a solver
-    was named. ``close``: the exchange of another program.
+    Parameters
+    ----------
+    counterpart : Counterpart or Interior
+        Robust counterpart at the imposed indices.
+    close : Close, optional
+        Exchange of another program.
+    cuts : list of Cut
+        All rows of every imposed index.
+    known : set
+        Families and indices that are imposed.
+    raw : ndarray, shape (n,)
+        Relaxed optimum before it is settled.
+    best : ndarray, shape (n,)
+        Best decision known, for a program with a guide; empty otherwise.
+    tolerance : float
+        Relative gap at which the bounds have met.
+    accuracy : float
+        Share of the cost to which a round is solved, where the solver can choose.
+    price : float
+        Price of a margin of 1 in the last round.
+    calls : Counter of str
+        Numbers of answers by their origin.
+    asked : Asked, optional
+        Solver of the counterparts, where the user named one.
+    guided : bool
+        Whether the guide was used.
     """
 
     counterpart: Counterpart | Interior = field(kw_only=True)
@@ -70,7 +93,24 @@ class RobustRows(Working):
 
     @staticmethod
     def start(program: SemiInfiniteProgram, ledger: Ledger, close: Close) -> RobustRows:
-        """What every family begins with, and what the bounds of the decision prove alone."""
+        """Return a working set with the first indices of every family.
+
+        The bounds of the decision alone give a first lower bound.
+
+        Parameters
+        ----------
+        program : SemiInfiniteProgram
+            Program with deviations.
+        ledger : Ledger
+            Accounts of the method.
+        close : Close
+            Exchange of another program.
+
+        Returns
+        -------
+        RobustRows
+            The working set.
+        """
         assert program.spread is not None
         central, asked = Interior(program.finite, program.spread), ledger.relaxed.counted
         working = RobustRows(program, counterpart=central, close=close, tolerance=ledger.tolerance)
@@ -86,7 +126,7 @@ class RobustRows(Working):
         return working
 
     def by_simplex(self) -> None:
-        """From now on by the simplex method, which takes all there is, or by the solver that was named."""
+        """Continue with the simplex method, which solves every counterpart, or with the named solver."""
         if isinstance(self.counterpart, Counterpart):
             return
         known = self.counterpart.blocks
@@ -95,8 +135,22 @@ class RobustRows(Working):
             self.counterpart.add(block)
 
     def solve(self, margin: float, accuracy: float, seconds: float = np.inf) -> RobustAnswer:
-        """The optimum with the rows tightened by a margin, about as accurate; not solved where ``seconds`` do not
-        suffice."""
+        """Return the optimum with the rows tightened by a margin.
+
+        Parameters
+        ----------
+        margin : float
+            The margin.
+        accuracy : float
+            Approximate accuracy of the cost.
+        seconds : float, default inf
+            Limit of time, after which the answer is not solved.
+
+        Returns
+        -------
+        RobustAnswer
+            The answer.
+        """
         if isinstance(self.counterpart, Interior):
             answer = self.counterpart.solve(margin, accuracy, seconds)
             self.calls[INTERIOR] += 1
@@ -107,15 +161,18 @@ class RobustRows(Working):
         return answer
 
     def relax(self, ledger: Ledger, prover: Prover, last: bool) -> Answer | Result:
-        """Where rows that are tightened leave nothing, less and less so, and in the end the proof that nothing is
-        feasible; of a program with a guide the best decision known, once, where that closes the gap."""
+        """Return the optimum under the imposed rows, or the final result where there is none.
+
+        Where tightened rows are infeasible, the margin is reduced; in the end infeasibility is proven. For a program
+        with a guide, the best decision known is returned once, where it closes the gap.
+        """
         self._guide(ledger)
         program = self.program
         size = program.largest_cost if ledger.best is None else size_of(program, ledger.best)
         while not (found := self.solve(self.margin, self.accuracy * size, left(ledger.tools))).solved:
             self._count(ledger)
             if ledger.tools.deadline.passed:
-                if found.x.size:  # broken off: what it has come to is what is known
+                if found.x.size:  # the solution was interrupted: its last decision is the best known
                     ledger.best = ledger.best or self._told(ledger, found)
                 ledger.tools.deadline.check()
             if isinstance(self.counterpart, Interior):
@@ -134,7 +191,7 @@ class RobustRows(Working):
         return answer
 
     def _guide(self, ledger: Ledger) -> None:
-        """Begin where the program's guide ends: with its times, and with what its optimum defines."""
+        """Solve the program's guide, and impose its indices and the constraints that its optimum defines."""
         program, tools = self.program, ledger.tools
         if program.guide is None or self.guided:
             return
@@ -155,9 +212,11 @@ class RobustRows(Working):
         self.impose(self._undefined(self.best, False))
 
     def _undefined(self, x: Array, feasible: bool) -> Violated:
-        """Where the bounds that a family defines are exceeded at the relaxed optimum, before they are settled, and
-        between it and the best decision known (Ben-Ameur and Neto 2007); where that is ``feasible``, a better one is
-        kept."""
+        """Return violated constraints of families that define variables.
+
+        The constraints are sought at the relaxed optimum before it is settled, and between it and the best decision
+        known (Ben-Ameur and Neto 2007). Where the optimum ``x`` is ``feasible``, a better decision is kept.
+        """
         program, raw = self.program, self.raw
         if feasible and not (self.best.size and program.cost(self.best) <= program.cost(x)):
             self.best = x
@@ -178,15 +237,20 @@ class RobustRows(Working):
         return violated
 
     def candidate(self, answer: Answer) -> Answer | None:
+        """Return the best decision known, for a program with a guide."""
         return self._at(answer, self.best) if self.best.size else None
 
     @property
     def size(self) -> int:
+        """Number of imposed rows."""
         return len(self.cuts)
 
     def exchange(self, answer: Answer, violated: Violated, number: int) -> int:
-        """With new rows the worst deviations of those that are imposed, and where these are all known a closer
-        solution."""
+        """Impose violated rows; return the number of changes.
+
+        The worst deviations of imposed rows are added too. Where all of them are known, the next solution is more
+        accurate.
+        """
         x = answer.solution.x
         if not any(rows.size for _, rows, _ in violated):
             return 0
@@ -197,14 +261,15 @@ class RobustRows(Working):
         return added + self._closer(answer, worst, bool(added)) + self.counterpart.sharpen(x)
 
     def sharpen(self, ledger: Ledger, answer: Answer) -> bool:
-        """By what a program's guide does not tell, by a closer solution, or by the worst deviations."""
+        """Add constraints that the guide does not contain, more accuracy, or the worst deviations; return false where
+        none remain."""
         x, undefined = answer.solution.x, 0
         if self.program.guide is not None:
             undefined = self.impose(self._undefined(x, True))
         return bool(undefined + self._closer(answer, 0.0, bool(undefined)) + self.counterpart.sharpen(x))
 
     def _closer(self, answer: Answer, violation: float, added: bool) -> bool:
-        """Whether the next round can be more accurate; it is where what was added changes little."""
+        """Return whether the next round can be more accurate; it is where new constraints change little."""
         if not self.counterpart.approximate or self.accuracy <= FINEST * self.tolerance:
             return False
         if not added or self.price * violation < self.accuracy * size_of(self.program, answer):
@@ -212,10 +277,11 @@ class RobustRows(Working):
         return True
 
     def impose(self, violated: Violated) -> int:
+        """Impose all rows of violated indices; return the number of new indices."""
         return sum(self.add(self.program.family(name), indices) for indices, _, name in violated)
 
     def add(self, family: ConstraintFamily, indices: Array) -> int:
-        """Impose all rows of a family at indices ``(k, d)``; how many indices were new."""
+        """Impose all rows of a family at indices ``(k, d)``; return the number of new indices."""
         assert family.uncertain is not None
         added = 0
         for index in indices:
@@ -230,32 +296,36 @@ class RobustRows(Working):
         return added
 
     def knows(self, missed: Missed) -> bool:
+        """Return whether an index is imposed."""
         return (missed.family, missed.at[0].tobytes()) in self.known
 
     def priced(self, answer: Answer) -> float:
+        """Return the sum of the multipliers: the price of a margin of 1."""
         return float(answer.multipliers.sum())
 
     @property
     def longest(self) -> float:
-        """Margins are in the rows' own units."""
+        """1: margins are in the rows' own units."""
         return 1.0
 
     @property
     def unit(self) -> float:
+        """1: margins are in the rows' own units."""
         return 1.0
 
     def distance(self, missed: Missed) -> float:
+        """Return the violation, since margins are in the rows' own units."""
         return missed.violation
 
     def tightened(self, ledger: Ledger, answer: Answer, margin: float) -> Answer | None:
-        """No more accurate than its distance costs."""
+        """Return the optimum of the imposed rows tightened by ``margin``, no more accurate than its margin costs."""
         accuracy = min(self.accuracy, SHARPER * SPARED) * size_of(self.program, answer)
         found = self.solve(margin, accuracy, left(ledger.tools))
         self._count(ledger)
         return self._told(ledger, found) if found.solved else None
 
     def _told(self, ledger: Ledger, found: RobustAnswer) -> Answer:
-        """The decision of an answer, with the bound that its multipliers prove."""
+        """Return the decision of a solved counterpart; the bound of its multipliers improves the lower bound."""
         self.raw = np.clip(found.x, self.program.finite.lower, self.program.finite.upper)
         dual, none = self.dual(found, priced=True), np.zeros(0)
         ledger.improve(dual)
@@ -263,15 +333,15 @@ class RobustRows(Working):
         return self._at(Answer(solution, self._rows, 0.0, np.inf), self._settled(self.raw))
 
     def _settled(self, x: Array) -> Array:
-        """A decision within its bounds, and what families define at what they say."""
+        """Return a decision within its bounds, with the variables that families define at their values."""
         settled = x if self.program.settle is None else self.program.settle(x)
         if self.program.finite.residual(settled) > TOLERANCE:
-            # what is settled is beyond its bounds: then so is what it stands for
+            # a settled variable outside of its bounds means that the quantity it bounds is outside too
             settled = np.clip(settled, self.program.finite.lower, self.program.finite.upper)
         return settled
 
     def _at(self, answer: Answer, x: Array) -> Answer:
-        """An answer with another decision."""
+        """Return an answer with another decision."""
         value, bound = self.program.cost(x), answer.solution.lower_bound
         residual = self.program.finite.residual(x)
         solution = replace(answer.solution, x=x, value=value, residual=residual, gap=value - bound)
@@ -279,11 +349,24 @@ class RobustRows(Working):
 
     @property
     def _rows(self) -> Rows:
-        """The imposed rows by name; what they are depends on the deviations."""
+        """Imposed rows by name; their coefficients depend on the deviations."""
         return Rows(np.zeros((len(self.cuts), 0)), np.zeros(len(self.cuts)), tuple(self.cuts))
 
     def dual(self, answer: RobustAnswer, priced: bool) -> Dual:
-        """What the multipliers of an answer prove, with the cuts that prove it."""
+        """Return the bound that the multipliers of an answer prove, with the cuts that prove it.
+
+        Parameters
+        ----------
+        answer : RobustAnswer
+            Answer with multipliers and deviations.
+        priced : bool
+            Whether the cost enters the bound; false for a proof of infeasibility.
+
+        Returns
+        -------
+        Dual
+            The bound, reduced by its rounding error.
+        """
         blocks = self.counterpart.blocks
         at = answer.at
         if not priced:
@@ -301,7 +384,7 @@ class RobustRows(Working):
 
     @property
     def at_rest(self) -> Dual:
-        """What the bounds of the decision prove alone, without a multiplier."""
+        """Lower bound by the bounds of the decision alone, without a multiplier."""
         rows, size = len(self.cuts), self.counterpart.spread.size
         none = RobustAnswer(
             True, "", np.zeros(0), np.zeros(rows), np.zeros((rows, size)), np.zeros(self.program.finite.b.size)
@@ -309,7 +392,8 @@ class RobustRows(Working):
         return self.dual(none, priced=True)
 
     def refuted(self, answer: RobustAnswer) -> Dual | None:
-        """What the multipliers of an answer prove of all decisions alike: that there is none; or nothing."""
+        """Return the proof, by the multipliers of an answer, that no decision is feasible; ``None`` where they prove
+        nothing."""
         total = float(answer.y.sum() + np.abs(answer.mu).sum())
         if not 0.0 < total < np.inf:
             return None
@@ -317,7 +401,7 @@ class RobustRows(Working):
         return dual if dual.bound > FARKAS else None
 
     def _infeasible(self, ledger: Ledger, said: str) -> Result:
-        """``infeasible`` where multipliers prove it, else ``failed``."""
+        """Return the result ``infeasible`` where multipliers prove it, and ``failed`` otherwise."""
         none = np.zeros(0)
         relaxing = Counterpart(self.program.finite, self.counterpart.spread, elastic=True, asked=self.asked)
         for block in self.counterpart.blocks:
@@ -336,7 +420,7 @@ class RobustRows(Working):
         return ledger.result("failed", f"the relaxed program was not solved: {said}", answer)
 
     def _refuted(self, ledger: Ledger, answer: RobustAnswer, dual: Dual) -> Result:
-        """Nothing is feasible, as these multipliers prove."""
+        """Return the result ``infeasible`` with the multipliers that prove it."""
         solution = FiniteSolution(
             "infeasible",
             answer.x,
@@ -357,19 +441,24 @@ class RobustRows(Working):
         return replace(ledger.result("infeasible", reason.sentence(), found, worst), infeasible=reason)
 
     def _count(self, ledger: Ledger) -> None:
+        """Record the number of answers in the accounts."""
         ledger.relaxed.solves = self.calls.total()
         if self.asked is None:
             ledger.relaxed.counted.calls = ledger.relaxed.solves
         ledger.relaxed.solved_by.update(self.calls - ledger.relaxed.solved_by)
 
     def proven(self, ledger: Ledger, answer: Answer, x: Array) -> Dual:
+        """Return the lower bound by the bounds of the decision alone."""
         return self.at_rest
 
     def choose(
         self, ledger: Ledger, answer: Answer, found: Found, number: int, prover: Prover
     ) -> tuple[Answer, Found, Violated]:
-        """The one that is best by the second objective of the program, `SemiInfiniteProgram.among`, among those that
-        cost at most the lower bound and half of the tolerance more, once this one has been proven."""
+        """Return the best decision by the second objective of the program (``among``), once this decision has been
+        proven.
+
+        The choice is among decisions whose cost is at most the lower bound plus half of the tolerance.
+        """
         second, x = self.program.among, answer.solution.x
         violated = any(above(*one)[1].size for one in found)
         if second is None or second[0].n > MANY or violated or ledger.open(x):
@@ -385,8 +474,10 @@ class RobustRows(Working):
         return self._at(answer, decision), looked, ()
 
     def _preferred(self, ledger: Ledger, answer: Answer, second: SemiInfiniteProgram, shared: int) -> Array | None:
-        """The optimum of the ``second`` program, whose decision begins with so many of the same entries: the rows that
-        are active, and one more of the cost."""
+        """Return the optimum of the ``second`` program under the active rows and one more row of the cost.
+
+        ``shared`` is the number of first entries that the two decisions share.
+        """
         program, tools, spread = self.program, replace(ledger.tools, notify=ignore), self.counterpart.spread
         weights = np.append(program.finite.weights[:shared], np.zeros(second.n - shared))
         most = max(ledger.lower, 0.0) * (1.0 + 0.5 * ledger.tolerance)
@@ -415,7 +506,7 @@ class RobustRows(Working):
         return x[:shared] if program.settle is None else program.settle(x[:shared])
 
     def _violated(self, second: SemiInfiniteProgram, x: Array) -> Violated:
-        """Of the times that are imposed here, those that a decision of the ``second`` program violates."""
+        """Return the indices imposed here that a decision of the ``second`` program violates."""
         found = []
         for family in second.families:
             held = {cut.index.tobytes(): cut.index for cut in self.cuts if cut.family == family.name}
@@ -427,12 +518,13 @@ class RobustRows(Working):
 
 
 def left(tools: Tools) -> float:
-    """The seconds that a solution may take."""
+    """Return the seconds that a solution may take."""
     return np.inf if tools.deadline.left is None else tools.deadline.left + ENDED
 
 
 def _reason(program: SemiInfiniteProgram, dual: Dual) -> tuple[InfeasibleSubsystem, WorstConstraint | None]:
-    """The constraints that cannot hold together, those with the largest multipliers first."""
+    """Return the constraints that cannot hold together, those with the largest multipliers first, and the first of
+    them."""
     units = {family.name: family for family in program.families}
     order = sorted(dual.cuts, key=lambda cut: -cut.multiplier)
     told = [units[cut.family].explanation(cut.index[: units[cut.family].index_set.dimension], cut.row) for cut in order]

@@ -1,4 +1,4 @@
-"""Uncertain rows that are relaxed, or deviations that are scaled, as far as they must or can be."""
+"""Least relaxation of uncertain rows, and largest scaling of deviations."""
 
 from __future__ import annotations
 
@@ -9,13 +9,28 @@ from sparserob_core.sip.method import Tools
 from sparserob_core.sip.program import SemiInfiniteProgram
 from sparserob_core.sip.working.robust import left
 
-ROOM = 1e3  # units of the rows that they may have to spare
-SLACKENED = 200  # rounds at most
+ROOM = 1e3  # largest margin of the rows, in their own units
+SLACKENED = 200  # largest number of rounds
 
 
 def least_slack(program: SemiInfiniteProgram, tools: Tools, accuracy: float = 1e-9) -> float:
-    """By how much all rows must be relaxed alike, in their own units, until some decision meets them; negative where
-    they have that much to spare. Infinite where that was not found."""
+    """Return the least amount by which all rows must be relaxed alike until some decision meets them.
+
+    Parameters
+    ----------
+    program : SemiInfiniteProgram
+        Program with deviations.
+    tools : Tools
+        Components of the run; their deadline is checked.
+    accuracy : float, default 1e-9
+        Accuracy in the rows' own units.
+
+    Returns
+    -------
+    float
+        The amount in the rows' own units. The amount is negative where the rows have a margin, and infinite where it
+        was not found.
+    """
     assert program.spread is not None
     relaxing = Counterpart(program.finite, program.spread, elastic=True, lowest=-ROOM)
     families = [family for family in program.families if not family.defines and family.uncertain is not None]
@@ -41,11 +56,26 @@ def least_slack(program: SemiInfiniteProgram, tools: Tools, accuracy: float = 1e
 
 
 def largest_factor(program: SemiInfiniteProgram, tools: Tools, highest: float, accuracy: float = 1e-9) -> float | None:
-    """The largest factor up to ``highest`` by which all deviations can be multiplied so that some decision meets every
-    row, to ``accuracy`` in their own units; ``None`` where the rows do not tell, or nothing was found.
+    """Return the largest factor by which all deviations can be multiplied so that some decision meets every row.
 
-    Where the deviations are ``f`` times as large, a row is ``g x + w'(C (f x) + f d) <= h``: linear in ``f``, in
-    ``f x`` of the variables that answer deviations, and in the others.
+    With deviations ``f`` times as large, a row is ``g x + w'(C (f x) + f d) <= h``. The row is linear in ``f``, in the
+    product ``f x`` for variables that answer deviations, and in the other variables.
+
+    Parameters
+    ----------
+    program : SemiInfiniteProgram
+        Program with deviations.
+    tools : Tools
+        Components of the run; their deadline is checked.
+    highest : float
+        Upper bound of the factor.
+    accuracy : float, default 1e-9
+        Accuracy in the rows' own units.
+
+    Returns
+    -------
+    float or None
+        The factor; ``None`` where the families do not offer scaled rows, or where nothing was found.
     """
     families = [family for family in program.families if not family.defines]
     if program.spread is None or any(family.scaled is None or family.start is None for family in families):

@@ -1,9 +1,10 @@
-"""Programs without an optimum: rays along which the cost falls for ever, and the rows that stop it where there are any.
+"""Programs without an optimum: rays along which the cost falls without bound, and rows that exclude such rays.
 
-A relaxed program may be unbounded below only because few constraints are imposed. Whether the whole program is, its
-recession program says (Rockafellar 1970, section 8): the same program with right-hand sides 0, whose decision is a
-direction ``d`` of bounded size with ``P d = 0``. Its value is negative exactly where a convex program that is feasible
-falls along a ray; where it is not, the indices that prove it bound the relaxed program too.
+A relaxed program may be unbounded below only because few constraints are imposed. The recession program decides whether
+the whole program is unbounded (Rockafellar 1970, section 8). The recession program is the same program with right-hand
+sides 0, whose decision is a direction ``d`` of bounded size with ``P d = 0``. Its value is negative exactly where a
+feasible convex program falls along a ray. Where it is not negative, the indices that prove this bound the relaxed
+program too.
 """
 
 from __future__ import annotations
@@ -23,15 +24,16 @@ from sparserob_core.sip.result import Result, Status
 from sparserob_core.sip.working.ledger import Ledger, Prover, unproven
 
 Close: TypeAlias = Callable[[SemiInfiniteProgram, Tools, Prover], Result]  # an exchange that closes the gap
-FALLS = 1e-7  # of the largest coefficient: a cost per unit of a direction that is no rounding
-# Coordinates of an index up to which the first rows are those of a grid: with two points along each of ten coordinates
-# there are a thousand.
+FALLS = 1e-7  # of the largest coefficient: fall of the cost per unit of a direction that is no rounding
+# Largest number of moving coordinates for which the first rows are on a grid: two points along each of ten coordinates
+# are a thousand indices.
 FEW = 8
-SHOWN = 6  # numbers of a ray that are written into the message
+SHOWN = 6  # largest number of entries of a ray in the message
 
 
 def recession_program(program: SemiInfiniteProgram) -> SemiInfiniteProgram:
-    """The cost along directions ``d`` of size at most 1 that stay within the program however far one goes."""
+    """Return the program of the cost along directions ``d`` of size at most 1 in which the constraints are never
+    left."""
     base, images = program.finite, program.finite.weights.size
     n, empty = program.n, (np.zeros((0, program.n)), np.zeros(0))
     size = (np.vstack([np.eye(n), -np.eye(n)]), np.ones(2 * n)) if base.S is not None else empty
@@ -56,6 +58,8 @@ def recession_program(program: SemiInfiniteProgram) -> SemiInfiniteProgram:
 
 
 def _homogeneous(family: ConstraintFamily) -> ConstraintFamily:
+    """Return the family with right-hand sides 0."""
+
     def rows(indices: Array) -> tuple[Array, Array]:
         G, h = family.rows(indices)
         return G, np.zeros_like(h)
@@ -64,14 +68,17 @@ def _homogeneous(family: ConstraintFamily) -> ConstraintFamily:
 
 
 def _has_bounds(program: SemiInfiniteProgram) -> bool:
-    """Whether every entry of the decision has two bounds."""
+    """Return whether every entry of the decision has two finite bounds."""
     return program.finite.S is None and program.finite.bounded
 
 
 def first_rows(program: SemiInfiniteProgram) -> list[tuple[Array, np.ndarray, str]]:
-    """Rows that mostly bound a relaxed program without any: of every family as many indices as the decision has
-    variables, and one more, dense at the faces of the index set, where polynomials and cosines grow most (nodes of
-    Chebyshev). Nothing where the bounds of the decision do so."""
+    """Return rows that usually make an unbounded relaxed program bounded.
+
+    A family has at least one index more than the decision has variables, if at most `FEW` coordinates of its index can
+    move; otherwise it has one index. The indices are dense at the faces of the index set, where polynomials and cosines
+    grow most (nodes of Chebyshev). Nothing is returned where the decision has bounds.
+    """
     chosen: list[tuple[Array, np.ndarray, str]] = []
     if _has_bounds(program):
         return chosen
@@ -91,7 +98,24 @@ def first_rows(program: SemiInfiniteProgram) -> list[tuple[Array, np.ndarray, st
 def bounding_rows(
     program: SemiInfiniteProgram, tools: Tools, close: Close
 ) -> tuple[Array | None, list[tuple[Array, np.ndarray, str]]]:
-    """A ray ``(n,)`` along which the cost falls for ever; or ``None`` and the indices that let it fall along none."""
+    """Return a ray along which the cost falls without bound, or rows that exclude such rays.
+
+    Parameters
+    ----------
+    program : SemiInfiniteProgram
+        The program.
+    tools : Tools
+        Components of the run.
+    close : Close
+        Exchange that closes the gap of the recession program.
+
+    Returns
+    -------
+    ray : ndarray, shape (n,), or None
+        The ray, where there is one.
+    rows : list
+        Indices, rows and names of families that exclude a ray, where none was found.
+    """
     base = program.finite
     if _has_bounds(program):
         return None, []
@@ -104,14 +128,33 @@ def bounding_rows(
 
 
 def _by_family(cuts: Sequence[Cut]) -> list[tuple[Array, np.ndarray, str]]:
+    """Return the constraints of cuts as indices, rows and names, grouped by families."""
     names = dict.fromkeys(cut.family for cut in cuts)
     groups = [[cut for cut in cuts if cut.family == name] for name in names]
     return [(np.array([c.index for c in group]), np.array([c.row for c in group]), group[0].family) for group in groups]
 
 
 def falls_for_ever(ledger: Ledger, close: Close, prover: Prover, ray: Array) -> Result:
-    """The result for a program whose cost falls along a ray: a decision that meets its constraints, where there is one,
-    judged like any other; without a lower bound."""
+    """Return the result for a program whose cost falls along a ray.
+
+    The result has a decision that meets the constraints, where there is one, judged like any other, and no lower bound.
+
+    Parameters
+    ----------
+    ledger : Ledger
+        Accounts of the method.
+    close : Close
+        Exchange that finds a feasible decision.
+    prover : Prover
+        Prover of the families.
+    ray : ndarray, shape (n,)
+        The ray.
+
+    Returns
+    -------
+    Result
+        The result.
+    """
     program, tools = ledger.program, ledger.tools
     feasible = replace(program, q=None, P=None, weights=None, blocks=None, constant=0.0, families=program.families)
     result = close(feasible, replace(tools, regulariser=None), prover)

@@ -1,7 +1,7 @@
-"""The working set of an exchange: imposed constraints, and the margin by which they are tightened.
+"""Working set of an exchange: the imposed constraints, and the margin by which they are tightened.
 
-What is imposed differs: rows that are linear in the decision (`working.plain`), or rows that must hold for every
-deviation (`working.robust`); so does who solves them. The rules of margins do not, and stand here.
+Imposed constraints are rows that are linear in the decision (`working.plain`), or rows that must hold for every
+deviation (`working.robust`). Their solvers differ too. The rules of margins are the same, and are in this module.
 """
 
 from __future__ import annotations
@@ -20,28 +20,39 @@ from sparserob_core.sip.result import SMALL_COST, Result
 from sparserob_core.sip.separation.separation import separate
 from sparserob_core.sip.working.ledger import ALLOWED, Answer, Found, Ledger, Prover, Violated, above
 
-# The least margin but 0, and the largest, in units of the decision's bounds where those are below 1. The least one is
-# the rounding of rows: one that is five times larger costs most of the tolerated gap where rows are as dear as a
-# million, a smaller one is not seen. A largest one that is ten times smaller does not get beyond what solvers leave of
-# a row (1e-7 at worst); one that is ten times larger is seen in the sixth digit of a cost.
+# The least positive margin, and the largest, in units of the decision's bounds where those are below 1. The least is
+# the rounding of rows: five times as much costs most of the tolerated gap where multipliers are a million; less has no
+# effect. With a tenth of it, the largest is below the residuals of solvers (1e-7 at worst); ten times as much changes
+# the sixth digit of a cost.
 SMALLEST_MARGIN, LARGEST_MARGIN = 2.0**-52, 1e-6
-# Share of a margin that leaves nothing feasible, which is tried next. With a tenth for it a set as thin as 1e-8 takes
-# three times as many programs; with a millionth for it the margin of such a set is below what solvers leave.
+# Factor of the next margin after one that leaves nothing feasible. With a tenth as factor, a set as thin as 1e-8 takes
+# three times as many programs; with a millionth, the margin of such a set is below the residuals of solvers.
 THINNER = 1e-3
-# Times that a proof is helped over rounding. The first helps nearly always; ten times as many are full proofs, of
-# minutes, of what no margin will show.
+# Largest number of margins raised for the rounding of a proof. The first suffices nearly always; ten times as many are
+# full proofs of minutes that no margin lets succeed.
 ALLOWANCES = 4
-# Of the tolerated gap, what is paid for what a proof must allow for, as what transitions are off by over many orbits.
-# With all of it nothing is left for the bounds; with a tenth of it gaps stay open that a larger margin closes.
+# Share of the tolerated gap that is paid for the errors of a proof, such as those of transition matrices over many
+# orbits. With all of it, nothing is left for the bounds; with a tenth, gaps stay open that a larger margin closes.
 AFFORDED = 0.5
-# Active rows at which a margin may cost a quarter of the tolerated gap. With ten times as many, a day on a wall takes
-# twice as many cells; with a tenth of them, costs of ordinary problems are 2e-8 of themselves above the least.
+# Number of active rows at which a margin may cost a quarter of the tolerated gap. With ten times as many, a long arc
+# along a constraint takes twice as many cells; with a tenth, costs of ordinary problems are a relative 2e-8 too high.
 MANY_ACTIVE = 32
 
 
 class Missed(NamedTuple):
-    """The largest violation of a family that was met, or that is not excluded, and its index ``(1, d)`` and row
-    ``(1,)``."""
+    """Largest violation of a family that was found, or that is not excluded.
+
+    Parameters
+    ----------
+    violation : float
+        The violation.
+    family : str
+        Name of the family.
+    at : ndarray, shape (1, d)
+        Its index.
+    row : ndarray of int, shape (1,)
+        Its row.
+    """
 
     violation: float
     family: str
@@ -50,16 +61,32 @@ class Missed(NamedTuple):
 
     @staticmethod
     def most(family: ConstraintFamily, separation: Separation) -> Missed:
-        """The largest violation that was found of a family."""
+        """Return the largest violation of a family that its separation has found."""
         largest = float(separation.violations.max(initial=0.0))
         return Missed(largest, family.name, separation.indices[:1], separation.rows[:1])
 
 
 @dataclass(eq=False)
 class Working(ABC):
-    """Constraints of ``program`` that are imposed, with the ``margin`` by which rows are tightened, the ``floor`` that
-    it must not fall below and the ``most`` that it may be; whether there is a ``slater`` point for it, how often
-    rounding was ``allowed`` for, and how often a share of a limit has asked that a decision be ``secured``."""
+    """Imposed constraints of a program, and the margin by which their rows are tightened.
+
+    Parameters
+    ----------
+    program : SemiInfiniteProgram
+        The program.
+    margin : float
+        Margin by which rows are tightened.
+    floor : float
+        Lower bound of the margin.
+    most : float
+        Upper bound of the margin.
+    slater : bool
+        Whether there is a Slater point for the margin.
+    allowed : int
+        Number of times that the margin was raised to allow for rounding.
+    secured : int
+        Number of times that a proven decision was due, by its price or by the share of a limit that has passed.
+    """
 
     program: SemiInfiniteProgram
     margin: float = 0.0
@@ -72,71 +99,185 @@ class Working(ABC):
     @property
     @abstractmethod
     def size(self) -> int:
-        """How many rows are imposed."""
+        """Number of imposed rows."""
 
     @abstractmethod
     def relax(self, ledger: Ledger, prover: Prover, last: bool) -> Answer | Result:
-        """The optimum under the imposed constraints, whose multipliers improve the lower bound; the result where there
-        is none."""
+        """Return the optimum under the imposed constraints, or the final result where there is no optimum.
+
+        The multipliers of the optimum improve the lower bound.
+
+        Parameters
+        ----------
+        ledger : Ledger
+            Accounts of the method.
+        prover : Prover
+            Prover of the families.
+        last : bool
+            Whether this is the last round.
+
+        Returns
+        -------
+        Answer or Result
+            The optimum, or the result.
+        """
 
     @abstractmethod
     def exchange(self, answer: Answer, violated: Violated, number: int) -> int:
-        """Impose what is ``violated`` at an ``answer``, and drop what has been idle; how much is new."""
+        """Impose constraints that are violated at an answer, and drop idle ones.
+
+        Parameters
+        ----------
+        answer : Answer
+            Answer to the relaxed program.
+        violated : Violated
+            Constraints that are violated at it.
+        number : int
+            Number of the round.
+
+        Returns
+        -------
+        int
+            Number of new constraints.
+        """
 
     @abstractmethod
     def impose(self, violated: Violated) -> int:
-        """Impose constraints of which no answer speaks yet; how many were new."""
+        """Impose constraints that no answer contains yet; return the number of new constraints."""
 
     @abstractmethod
     def knows(self, missed: Missed) -> bool:
-        """Whether that constraint is imposed."""
+        """Return whether a constraint is imposed."""
 
     @abstractmethod
     def sharpen(self, ledger: Ledger, answer: Answer) -> bool:
-        """Nothing is violated but the bounds have not met: solve more closely what is imposed; ``False`` when nothing
-        is left to try."""
+        """Solve the imposed constraints more accurately, where nothing is violated and the gap is open.
+
+        Parameters
+        ----------
+        ledger : Ledger
+            Accounts of the method.
+        answer : Answer
+            Answer to the relaxed program.
+
+        Returns
+        -------
+        bool
+            False where nothing is left to try.
+        """
 
     @abstractmethod
     def proven(self, ledger: Ledger, answer: Answer, x: Array) -> Dual:
-        """What is proven with the multipliers of an answer, or none, where the cost is touched at ``x (n,)``."""
+        """Return the lower bound by the multipliers of an answer, or by none.
+
+        Parameters
+        ----------
+        ledger : Ledger
+            Accounts of the method.
+        answer : Answer
+            Answer with multipliers.
+        x : ndarray, shape (n,)
+            Decision at which terms of the cost are replaced by tangents.
+
+        Returns
+        -------
+        Dual
+            The bound and its multipliers.
+        """
 
     @abstractmethod
     def choose(
         self, ledger: Ledger, answer: Answer, found: Found, number: int, prover: Prover
     ) -> tuple[Answer, Found, Violated]:
-        """Of the decisions that cost as little, the one that is preferred, with what was found at it; or the same
-        answer and what that one violates."""
+        """Return the preferred one of the decisions that cost equally little.
+
+        Parameters
+        ----------
+        ledger : Ledger
+            Accounts of the method.
+        answer : Answer
+            Answer to the relaxed program.
+        found : Found
+            Most violated constraints of each family at the answer.
+        number : int
+            Number of the round.
+        prover : Prover
+            Prover of the families.
+
+        Returns
+        -------
+        answer : Answer
+            The preferred answer, or the same one.
+        found : Found
+            Most violated constraints at it.
+        violated : Violated
+            Constraints that the preferred decision violates, where the same answer is returned.
+        """
 
     @abstractmethod
     def tightened(self, ledger: Ledger, answer: Answer, margin: float) -> Answer | None:
-        """The optimum of the imposed rows, tightened by so much; ``None`` where there is none. ``answer``: where they
-        are tightened less."""
+        """Return the optimum of the imposed rows tightened by a margin.
+
+        Parameters
+        ----------
+        ledger : Ledger
+            Accounts of the method.
+        answer : Answer
+            Optimum with a smaller margin.
+        margin : float
+            The margin.
+
+        Returns
+        -------
+        Answer or None
+            The optimum; ``None`` where there is none.
+        """
 
     @abstractmethod
     def priced(self, answer: Answer) -> float:
-        """What the cost of an answer grows by when all rows are tightened by 1, to first order."""
+        """Return the increase of an answer's cost when all rows are tightened by 1, to first order."""
 
     @property
     @abstractmethod
     def longest(self) -> float:
-        """By how much the row that changes most is moved by a margin of 1."""
+        """Largest change of a row's right-hand side by a margin of 1."""
 
     @property
     @abstractmethod
     def unit(self) -> float:
-        """The unit of margins."""
+        """Unit of margins."""
 
     @abstractmethod
     def distance(self, missed: Missed) -> float:
-        """The margin that makes good what was missed."""
+        """Return the margin that removes a violation."""
 
     @abstractmethod
     def candidate(self, answer: Answer) -> Answer | None:
-        """A decision that may be proven as it is while the bounds have not met, where one is known."""
+        """Return a decision that may be proven before the gap is closed, where one is known."""
 
     def rested(self, ledger: Ledger, answer: Answer, found: Found, number: int) -> tuple[Answer, Found]:
-        """The answer with nothing left of what costs, where that closes the gap and violates nothing: of a cost whose
-        optimum is 0 solvers leave dust, and no relative gap is closed at dust."""
+        """Return the answer with every costly entry at 0, where that closes the gap and violates nothing.
+
+        Solvers leave small entries where the optimum of a cost is 0, and the relative gap stays open there.
+
+        Parameters
+        ----------
+        ledger : Ledger
+            Accounts of the method.
+        answer : Answer
+            Answer to the relaxed program.
+        found : Found
+            Most violated constraints of each family at the answer.
+        number : int
+            Number of the round.
+
+        Returns
+        -------
+        answer : Answer
+            The new answer, or the same one.
+        found : Found
+            Most violated constraints at it.
+        """
         x, other = answer.solution.x, at_rest(self.program, answer.solution.x)
         cost = self.program.cost(other)
         if answer.epsilon or not ledger.open(x) or not ledger.lower <= cost < self.program.cost(x):
@@ -152,8 +293,10 @@ class Working(ABC):
         return replace(answer, solution=solution, value=cost), looked
 
     def thin(self) -> bool:
-        """Nothing is feasible: the margin, not the program, may be at fault, as of a thin set or where there is no
-        Slater point. Less of it from now on; ``False`` where there is none."""
+        """Reduce the margin, after it left nothing feasible; return false where there is no margin.
+
+        The program may be feasible without it: its feasible set may be thin, or there may be no Slater point.
+        """
         if self.margin <= 0.0:
             return False
         self.most = THINNER * self.margin if THINNER * self.margin >= SMALLEST_MARGIN else 0.0
@@ -161,8 +304,11 @@ class Working(ABC):
         return True
 
     def pay(self, ledger: Ledger, answer: Answer) -> None:
-        """Tighten the rows as much as a tenth of the tolerated gap pays for, and up to four tenths where many rows are
-        active at once: a wall that is ridden takes cells all along it, the fewer the farther the control keeps away."""
+        """Tighten the rows by as much as a tenth of the tolerated gap pays for.
+
+        Up to four tenths are paid where many rows are active at once. Near a constraint that is active for a long time,
+        a proof needs many cells, and fewer of them at a larger distance.
+        """
         if not self.slater or not self.size:
             return
         active = int((answer.multipliers > 0.0).sum())
@@ -173,8 +319,11 @@ class Working(ABC):
             self.margin = min(max(margin, self.floor), self.most)
 
     def tighten(self, found: Found) -> bool:
-        """Imposed rows that are violated nonetheless, by the solver's accuracy: tighten by twice as much; ``False``
-        when that does not help."""
+        """Tighten the rows where imposed rows are violated because of the solver's accuracy.
+
+        The margin becomes twice the largest of these violations, or twice the present margin. False is returned where
+        that does not help.
+        """
         violated = [one for each in found if (one := Missed.most(*each)).violation > ALLOWED and self.knows(one)]
         if not violated or not self.slater or self.floor >= self.most:
             return False
@@ -184,8 +333,25 @@ class Working(ABC):
         return True
 
     def allow_for(self, ledger: Ledger, answer: Answer, proofs: Sequence[Proof]) -> bool:
-        """Nothing is violated, but a proof must allow for rounding and cannot show it: tighten by as much; ``False``
-        where that is more than rounding, and more than the tolerated gap pays for, or was tried."""
+        """Increase the margin by what a proof leaves open, where nothing is violated.
+
+        A proof has to allow for rounding.
+
+        Parameters
+        ----------
+        ledger : Ledger
+            Accounts of the method.
+        answer : Answer
+            Answer to the relaxed program.
+        proofs : sequence of Proof
+            Proofs at the answer.
+
+        Returns
+        -------
+        bool
+            False where the amount is more than rounding and more than the tolerated gap pays for, or was tried too
+            often.
+        """
         if any(proof.verdict == "refuted" for proof in proofs) or not self.slater:
             return False
         missed = [self.distance(one) for one in left_open(self.program, proofs)]
@@ -198,8 +364,11 @@ class Working(ABC):
         return True
 
     def _affords(self, ledger: Ledger, answer: Answer, margin: float) -> bool:
-        """Whether the tolerated gap pays for a margin beyond the largest, where no such margin left nothing feasible.
-        What no multiplier prices may cost anything."""
+        """Return whether the tolerated gap pays for a margin above the largest, where no such margin left nothing
+        feasible.
+
+        A margin without a price from multipliers is refused, for its cost is unknown.
+        """
         price = self.priced(answer)
         return self.most >= LARGEST_MARGIN and 0.0 < price * margin <= AFFORDED * ledger.tolerance * size_of(
             self.program, answer
@@ -207,8 +376,11 @@ class Working(ABC):
 
 
 def at_rest(program: SemiInfiniteProgram, x: Array) -> Array:
-    """The decision ``x (n,)`` with everything that costs at 0: all of it where images of it do, and else the entries
-    with a weight or a square, not those that only answer deviations."""
+    """Return the decision ``x (n,)`` with every costly entry at 0.
+
+    All entries are set to 0 where images of the decision have a cost. Otherwise only the entries with a weight or a
+    square, and not those that only answer deviations.
+    """
     base = program.finite
     if base.S is not None:
         return np.zeros_like(x)
@@ -220,20 +392,33 @@ def at_rest(program: SemiInfiniteProgram, x: Array) -> Array:
 
 
 def fits(ledger: Ledger, x: Array) -> bool:
-    """Whether a decision closes the gap and keeps everything that is no family."""
+    """Return whether a decision closes the gap and satisfies all constraints that are no family."""
     base = ledger.program.finite
     return not ledger.open(x) and base.missed(x) <= EQUALITY and base.residual(x) <= ALLOWED
 
 
 def size_of(program: SemiInfiniteProgram, answer: Answer) -> float:
-    """What a gap at an answer is relative to."""
+    """Return the size to which a gap at an answer is relative."""
     x = answer.solution.x
     return max(SMALL_COST * program.added(x), abs(program.cost(x)))
 
 
 def left_open(program: SemiInfiniteProgram, proofs: Sequence[Proof]) -> list[Missed]:
-    """What proofs could not exclude, each with where the largest violation was met; nothing where one of them excludes
-    nothing at all, or speaks of another formulation than the imposed rows: then no distance would help it."""
+    """Return the violations that proofs could not exclude, each with the index of the largest violation found.
+
+    Parameters
+    ----------
+    program : SemiInfiniteProgram
+        The program.
+    proofs : sequence of Proof
+        Proofs of the families.
+
+    Returns
+    -------
+    list of Missed
+        The violations. The list is empty where a proof excludes nothing at all, or is about another formulation than
+        the imposed rows, since no margin would help then.
+    """
     missed = [
         Missed(
             proof.violation if proof.verdict == "refuted" else proof.bound,
