@@ -204,7 +204,7 @@ def test_bounds_over_turns_hold_what_both_systems_add_and_are_close(name, short)
 @pytest.mark.parametrize("name", ["box", "triangle"])
 def test_rows_of_no_integral_see_one_system_where_turns_integrate(name):
     plain, times = random_system(np.random.default_rng(4), 3), np.array([0.0, 0.2, 0.9, 1.3, HORIZON])
-    plain = LinearSystem(*(part[0] for part in plain.matrices(np.zeros((1, 0)))))
+    plain = LinearSystem(*(part[0] for part in plain.phases[0].matrices(np.zeros((1, 0)))))
     first, second = (plain.accumulating(share * np.array([[1.0, 0.5, 0.0]]), np.zeros((1, 1))) for share in (0.0, 1.0))
     grid = merge_grids(UNEVEN.breakpoints, UNEVEN.breakpoints, switches=(0.9,))
     turning = Response(SwitchedSystem([(0.9, first), (HORIZON, second)]), grid, np.zeros(4))
