@@ -14,7 +14,7 @@ from scipy.integrate import quad
 from scipy.linalg import expm
 from scipy.optimize import brentq
 
-from sparserob_core.control.problem.system import LinearSystem, SwitchedSystem
+from sparserob_core.control.problem.system import LinearSystem, SwitchedSystem, System
 from sparserob_core.control.reach import measurable
 from sparserob_core.control.response.response import Response, merge_grids
 from sparserob_core.control.sets.sets import Ellipsoid, NormBall, Polytope
@@ -205,7 +205,8 @@ def test_bounds_over_turns_hold_what_both_systems_add_and_are_close(name, short)
 def test_rows_of_no_integral_see_one_system_where_turns_integrate(name):
     plain, times = random_system(np.random.default_rng(4), 3), np.array([0.0, 0.2, 0.9, 1.3, HORIZON])
     plain = LinearSystem(*(part[0] for part in plain.phases[0].matrices(np.zeros((1, 0)))))
-    first, second = (plain.accumulating(share * np.array([[1.0, 0.5, 0.0]]), np.zeros((1, 1))) for share in (0.0, 1.0))
+    rates = [(share * np.array([[1.0, 0.5, 0.0]]), np.zeros((1, 1))) for share in (0.0, 1.0)]
+    first, second = (System((plain.phases[0].accumulating(*one),)) for one in rates)
     grid = merge_grids(UNEVEN.breakpoints, UNEVEN.breakpoints, switches=(0.9,))
     turning = Response(SwitchedSystem([(0.9, first), (HORIZON, second)]), grid, np.zeros(4))
     alone = Response(plain, merge_grids(UNEVEN.breakpoints, UNEVEN.breakpoints), np.zeros(3))
