@@ -149,8 +149,7 @@ class WorstCase:
             model = model.held(zero if model.bound.contains(zero) else model.bound.interior_point())
         response, exact = self.response, self._exactly
         if system.parameters is not None:
-            known = system.at(system.parameters.interior_point())
-            response = Response(known, response.grid, response.initial_state)
+            response = response.at(system.parameters.interior_point())
         if system.varies:
             return replace(self, response=response, disturbance=model, initial=None, shared=None, execution=exact)
         return WorstCase(response, self.dictionary, model, names=self.names, execution=exact)

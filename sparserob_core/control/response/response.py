@@ -1016,6 +1016,12 @@ class Response:
         return Response(self.system, self.grid, initial_state, self.propagate, self.propagator)
 
     @shaped
+    def at(self, parameter: Float[Array, " nu"]) -> Response:
+        """Return the responses of the known system at one parameter: these where there are no parameters."""
+        system = self.system.at(parameter)
+        return self if system is self.system else Response(system, self.grid, self.initial_state)
+
+    @shaped
     def steps(self, parameters: Float[Array, "v nu"]) -> Steps:
         """`Propagator.steps`."""
         return self.propagator.steps(parameters)

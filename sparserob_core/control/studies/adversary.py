@@ -265,7 +265,7 @@ Way: TypeAlias = _Way | _VaryingWay
 
 def _way(response: Response, parameter: Array, time: float, direction: Array) -> Way:
     if response.grid.varying:
-        response = Response(response.system.at(parameter), response.grid, response.initial_state)
+        response = response.at(parameter)
         return _VaryingWay(VaryingMotion(response.propagator, response.initial_state), direction, time)
     return _Way.of(response, parameter, time, direction)
 

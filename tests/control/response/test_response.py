@@ -331,3 +331,13 @@ def test_what_an_initial_state_gives_is_the_exponential(seed, states, pieces):
     free = response.weights(times, directions, np.zeros((5, 0))).free
     exact = np.stack([expm(A.T * t) @ c for t, c in zip(times, directions, strict=True)])
     assert np.abs(free - exact).max() <= 1e-12 * np.abs(exact).max()
+
+
+def test_a_known_system_at_a_parameter_keeps_all_that_is_remembered_of_it():
+    """An uncertain one becomes the known one there; nothing is propagated anew where there is nothing to choose."""
+    grid, start = merge_grids(np.array([0.0, 0.5, 1.0]), np.array([0.0, 1.0])), np.array([1.0])
+    uncertain = LinearSystem(lambda p: np.array([[-p[0]]]), [[1.0]], parameters=Box([1.0], [3.0]))
+    there = Response(uncertain, grid, start).at(np.array([2.0]))
+    times, rows, none = np.array([0.75]), np.ones((1, 1)), np.zeros((1, 0))
+    assert there.weights(times, rows, none).free[0, 0] == pytest.approx(np.exp(-1.5), rel=1e-14)
+    assert there.at(np.zeros(0)) is there
