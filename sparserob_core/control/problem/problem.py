@@ -325,8 +325,10 @@ class OptimalControlProblem(Term):
         system = self.system
         if system.powers is not None:
             self._check_expanded()
+        if system.dependence is None:
+            return
         for i, end in enumerate(self.terminal):
-            if not isinstance(end, Equality) or system.dependence is None:
+            if not isinstance(end, Equality):
                 continue
             for parameter, state in np.argwhere(system.dependence.reached).tolist():
                 if state in end.fixed:
@@ -363,16 +365,18 @@ class OptimalControlProblem(Term):
         if not shares.any():
             return None
         sets = [one if isinstance(one, ConvexSet) else one.set for one in (*self.path, *self.terminal_sets)]
+        timed = self._in_time()
         refused = {
             "fixed final values, which an error of execution misses: a terminal set such as box": bool(
                 self.terminal_equalities
             ),
-            "parameters in another set than a box": not self._is_boxed(),
+            "parameters in another set than a box": timed is None,
             "measurable disturbances in a curved set where the system has pieces, a delay or parameters": any(
                 one.halfspaces() is None for one in filter(None, [self.measurable])
             )
             and (bool(self.system.switches) or self.system.delay > 0.0 or self.system.parameter_count > 0),
-            "curved sets of states with parameters that the state does not depend on affinely": self._is_expanded()
+            "curved sets of states with parameters that the state does not depend on affinely": timed is not None
+            and timed.powers is not None
             and any(one.halfspaces() is None for one in sets),
         }
         for beside, given in refused.items():
@@ -380,17 +384,12 @@ class OptimalControlProblem(Term):
                 raise InputError(path="execution", expected=f"none beside {beside}", got=f"{shares.tolist()}")
         return shares
 
-    def _is_boxed(self) -> bool:
-        """Return True where the parameters are in a bounded box, or there are no parameters."""
+    def _in_time(self) -> System | None:
+        """Return the system as one whose entries depend on the time; ``None`` where its parameters are in no box."""
         try:
-            _ = self.system.in_time(self.horizon)
+            return self.system.in_time(self.horizon)
         except InputError:
-            return False
-        return True
-
-    def _is_expanded(self) -> bool:
-        """Return True where the state is no affine function of the parameters, which are in a box."""
-        return self._is_boxed() and self.system.in_time(self.horizon).powers is not None
+            return None
 
     def _state(self) -> Array:
         """Return the centre ``(d,)`` of the initial states; raise `InputError`."""
