@@ -56,8 +56,7 @@ class FollowedRows:
         the system changes with time for another reason."""
         if self.running is not None:
             return self.running.system
-        system = self.problem.system
-        return None if system.varies or system.switches else system
+        return self.problem.system if self.problem.system.is_constant else None
 
     @property
     def are_possible(self) -> bool:

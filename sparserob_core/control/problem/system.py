@@ -159,6 +159,11 @@ class System:
         """
         return () if self.varies else tuple(phase.begin for phase in self.phases[1:])
 
+    @property
+    def is_constant(self) -> bool:
+        """True where the same matrices hold all the time: the entries do not depend on it, and there is one phase."""
+        return not self.varies and len(self.phases) == 1
+
     @cached_property
     def forced(self) -> System:
         """The system whose drift is the last column of ``B``, with a control that is always 1.

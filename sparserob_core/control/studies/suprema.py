@@ -184,7 +184,7 @@ def followed(
     classes = problem.classes
     alike = len(classes) <= 1 and problem.disturbance_breakpoints is None
     erring = problem.execution is not None and theta.any()  # what stands still is delivered as it is commanded
-    if system.varies or len(system.phases) > 1 or system.parameter_count or not alike or erring:
+    if not system.is_constant or system.parameter_count or not alike or erring:
         return None
     changes: Array | None = None
     if classes == {"piecewise_constant"}:

@@ -762,3 +762,9 @@ def test_a_copy_of_a_system_is_the_same_plant(copied):
         assert type(other) is type(system) and other.horizon == system.horizon and other.delay == system.delay
         parameter = np.full(system.parameter_count, 0.3)
         alike(matrices_at(other, 0.75, parameter), matrices_at(system, 0.75, parameter))
+
+
+def test_a_plant_is_constant_where_one_set_of_matrices_holds_all_the_time():
+    undriven = VaryingSystem.of([["t"]], [[1.0]], 2.0)
+    assert OSCILLATOR.is_constant and UNCERTAIN.is_constant and OSCILLATOR.with_delay(0.5).is_constant
+    assert not switched().is_constant and not varying().is_constant and not undriven.is_constant
