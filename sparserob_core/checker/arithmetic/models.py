@@ -264,6 +264,17 @@ def kepler_series(anomaly: arb_series, eccentricity: float, length: int) -> arb_
     return arb_series(E, length)
 
 
+def matrix_at(entry: Any, p: np.ndarray) -> np.ndarray:
+    """Return a matrix of a system, an array or a function, at its arguments ``p (n,)``, numbers of any kind."""
+    if not callable(entry):
+        return np.asarray(entry)
+    try:
+        with np.errstate(all="ignore"):
+            return np.asarray(entry(p), dtype=object)
+    except (TypeError, ValueError, ArithmeticError, AttributeError) as error:
+        raise Unchecked(f"an entry of the system cannot be expanded: {error}") from error
+
+
 def kepler_root(anomaly: arb, e: arb) -> arb:
     """Return a ball that contains the ``E`` with ``E - e sin E = M`` for a number ``M``.
 

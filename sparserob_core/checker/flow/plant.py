@@ -5,10 +5,11 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any, final
+from typing import final
 
 import numpy as np
 
+from sparserob_core.checker.arithmetic.models import matrix_at
 from sparserob_core.checker.outcome import Unchecked
 from sparserob_core.control.problem.phase import Phase
 from sparserob_core.control.problem.system import System
@@ -58,13 +59,4 @@ def called(phase: Phase, p: np.ndarray) -> np.ndarray:
     """Return ``[A B c E]``, ``(d, d + w)``, of a phase at the time and the parameters ``p (1 + nu,)``, numbers of any
     kind."""
     given, parts = p if phase.timed else p[1:], [phase.entry(name) for name in ("A", "B", "c", "E")]
-    return np.hstack([_called(part, given) for part in parts if part is not None])
-
-
-def _called(entry: Any, p: np.ndarray) -> np.ndarray:
-    if not callable(entry):
-        return np.asarray(entry)
-    try:
-        return np.asarray(entry(p), dtype=object)
-    except (TypeError, ValueError, ArithmeticError, AttributeError) as error:
-        raise Unchecked(f"an entry of the system cannot be expanded: {error}") from error
+    return np.hstack([matrix_at(part, given) for part in parts if part is not None])

@@ -17,7 +17,7 @@ import numpy as np
 from sparserob_core.control.policies.measurements import Measurements
 from sparserob_core.control.problem.cost import Quadratic
 from sparserob_core.control.problem.names import Names
-from sparserob_core.control.problem.phase import Phase
+from sparserob_core.control.problem.phase import PARTS, Phase
 from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.control.problem.system import System
 from sparserob_core.control.problem.terms.integral import Accumulated, IntegralConstraint
@@ -171,7 +171,7 @@ class RunningIntegrals:
         """Return the running integrals of a problem as given by the user, with one known system; ``None`` for other
         problems."""
         system = problem.system
-        if not problem.integral or system.varies or system.switches or system.parameters is not None:
+        if not problem.integral or not system.is_constant or system.parameters is not None:
             return None
         coordinates, _ = _coordinates(problem)
         whole = _with(system.phases[0], [(one.h, one.g) for one in coordinates])
@@ -181,7 +181,7 @@ class RunningIntegrals:
     def is_beside(self, phase: Phase, d: int) -> bool:
         """Return True where a phase agrees with this system in the first ``d`` states, whatever is integrated with
         them."""
-        pairs = [(phase.entry(name), self.system.phases[0].entry(name)) for name in ("A", "B", "E", "c")]
+        pairs = [(phase.entry(name), self.system.phases[0].entry(name)) for name in PARTS]
         if phase.domain is not None or any((one is None) != (other is None) for one, other in pairs):
             return False
         return all(one is None or np.array_equal(np.asarray(one)[:d], np.asarray(other)[:d]) for one, other in pairs)

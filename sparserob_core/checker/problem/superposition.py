@@ -21,9 +21,10 @@ from typing import TYPE_CHECKING, Any, final
 
 import numpy as np
 
+from sparserob_core.checker.arithmetic.models import matrix_at
 from sparserob_core.checker.outcome import Unchecked
 from sparserob_core.checker.problem.integrals import with_zeros
-from sparserob_core.control.problem.phase import Phase
+from sparserob_core.control.problem.phase import PARTS, Phase
 from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.control.problem.system import System
 from sparserob_core.control.problem.terms.integral import IntegralConstraint
@@ -35,7 +36,6 @@ from sparserob_core.sip.convex_set import Array
 if TYPE_CHECKING:
     from sparserob_core.control.problem.terms.windows import PathConstraint
 
-NAMES = ("A", "B", "E", "c")
 NO_PLANE = "the checker knows parameters beside the time that the state depends on affinely"
 
 
@@ -156,7 +156,7 @@ class ParameterExpansion:
         d, nu = self.system.states, len(self.middle)
         steady, own, driven = np.zeros((d, d), dtype=bool), np.zeros((nu, d, d), dtype=bool), np.zeros((nu, d), bool)
         for phase in self.system.phases:
-            for name in NAMES:
+            for name in PARTS:
                 entry = phase.entry(name)
                 if entry is None:
                     continue
@@ -265,8 +265,7 @@ def _called(entry: object, arguments: list[Any]) -> np.ndarray:
     """Return a matrix at the time and the parameters, numbers of any kind."""
     p = np.empty(len(arguments), dtype=object)
     p[:] = arguments
-    with np.errstate(all="ignore"):
-        return np.asarray(entry(p) if callable(entry) else entry, dtype=object)
+    return matrix_at(entry, p)
 
 
 def _above(exact: Fraction) -> float:
@@ -276,7 +275,7 @@ def _above(exact: Fraction) -> float:
 
 
 def _larger(parts: ParameterExpansion, phase: Phase) -> Phase:
-    made = {name: Larger(parts, name, phase.entry(name)) for name in NAMES if phase.entry(name) is not None}
+    made = {name: Larger(parts, name, phase.entry(name)) for name in PARTS if phase.entry(name) is not None}
     times = Box([phase.begin], [phase.until])
     return Phase(made["A"], made["B"], made["E"], times, ("t",), made.get("c"), phase.begin, phase.until, timed=True)
 

@@ -26,7 +26,6 @@ Value: TypeAlias = Any
 """A float, or anything else with arithmetic, such as a `TaylorModel`."""
 Table: TypeAlias = "np.ndarray"
 Exponents: TypeAlias = tuple[int, ...]
-PARTS = ("A", "B", "E", "c")
 MOST_POWERS = 8
 """The degree in all parameters together up to which an entry counts as a polynomial in them: of twice as many an
 expansion that holds them is too large, and as an analytic function it needs no more than it shows."""

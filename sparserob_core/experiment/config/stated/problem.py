@@ -14,7 +14,7 @@ import numpy as np
 from sparserob_core.control.problem.cost import Cost
 from sparserob_core.control.problem.expression import ExpressionMatrix
 from sparserob_core.control.problem.names import Names
-from sparserob_core.control.problem.phase import Phase
+from sparserob_core.control.problem.phase import PARTS, Phase
 from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.control.problem.system import System
 from sparserob_core.control.problem.terms.repeat import widths
@@ -148,7 +148,7 @@ def _matrix_keys(phase: Phase) -> dict[str, Any]:
 
 def _defined_keys(phases: Sequence[Phase]) -> dict[str, Any]:
     """Return the definitions that the entries of phases use; all phases share them."""
-    entries = [getattr(one, name) for one in phases for name in ("A", "B", "E", "c")]
+    entries = [getattr(one, name) for one in phases for name in PARTS]
     defined = next((one.defined for one in entries if isinstance(one, ExpressionMatrix) and one.defined), ())
     return {"define": {name: one.text for name, one in defined}} if defined else {}
 
