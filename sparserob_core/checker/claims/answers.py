@@ -148,7 +148,7 @@ class VerifiedFeedback:
 
     def support(self, responses: list[arb]) -> arb:
         """Return the support value of all deviations in the direction ``responses (Q,)``; 0 without any."""
-        return self.loop.deviations.support(responses) if responses else balls([0.0])[0]
+        return self.loop.deviations.support(responses) if responses else ball(0.0)
 
     def heights(self, parts: Sequence[arb_mat], rows: arb_mat) -> list[arb]:
         """Return the largest ``c'u`` over all deviations, ``(r,)``, for every row ``c`` of ``rows (r, m)``.

@@ -242,12 +242,16 @@ class Case:
             return None
         return Beside(window, basis, gains, self.control.breakpoints.tolist(), self.pieces, entering)
 
+    @property
+    def nominal_parameter(self) -> list[float]:
+        """The parameter ``(nu,)`` of the nominal trajectory, at which the middle of the disturbance is propagated."""
+        bound = self.problem.system.parameters
+        return [] if bound is None else nominal_point(bound).tolist()
+
     @cached_property
     def price(self) -> Price:
         """The cost of the problem."""
-        bound = self.problem.system.parameters
-        flow = self.flows.at([] if bound is None else nominal_point(bound).tolist())
-        return Price(self.problem, self.control, flow, self.clock)
+        return Price(self.problem, self.control, self.flows.at(self.nominal_parameter), self.clock)
 
     @cached_property
     def duality(self) -> Duality:

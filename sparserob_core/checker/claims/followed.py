@@ -8,7 +8,7 @@ from typing import final
 
 import numpy as np
 
-from sparserob_core.checker.arithmetic.balls import above, balls, below
+from sparserob_core.checker.arithmetic.balls import above, ball, balls, below
 from sparserob_core.checker.claims.case import Case
 from sparserob_core.checker.claims.window import ConstraintWindow
 from sparserob_core.checker.outcome import Broken, Unchecked
@@ -70,7 +70,7 @@ class FollowedRow:
         piece does not meet the window at the time."""
         case, window, (state, gains) = self.case, self.window, self.window.split(self.direction)
         offset, _ = window.moved(time, time)
-        total = -sum((a * b for a, b in zip(balls(state), offset, strict=True)), balls([0.0])[0])
+        total = -sum((a * b for a, b in zip(balls(state), offset, strict=True)), ball(0.0))
         if window.is_mixed:
             ends = case.control.breakpoints
             piece = int(np.clip(np.searchsorted(ends, inside, side="right") - 1, 0, case.control.pieces - 1))

@@ -21,7 +21,6 @@ from sparserob_core.checker.cost.duality import EFFORT, ConstraintRow
 from sparserob_core.checker.outcome import Broken, Unchecked
 from sparserob_core.checker.problem.timing import before
 from sparserob_core.checker.sets.known import known
-from sparserob_core.control.problem.cost import nominal_point
 from sparserob_core.sip.convex_set import Array
 
 if TYPE_CHECKING:
@@ -70,14 +69,14 @@ def weighted(case: Case, data: object) -> tuple[list[tuple[float, ConstraintRow]
     nu = numbers(listed(data, "equalities"), "equalities")
     if nu.shape != (0 if case.answering else len(case.equalities),):  # under feedback they are constraints
         raise Broken(f"{nu.size} multipliers of equalities, expected {len(case.equalities)}")
-    bound = case.problem.system.parameters
-    middle = [] if bound is None else nominal_point(bound).tolist()  # where the middle of the disturbance is followed
     for multiplier, (state, value) in zip(nu.tolist(), case.equalities, strict=False):
         direction = np.eye(case.problem.system.states)[state]
         if case.followed.are_best:
             row = _along_adjoint(case, direction, case.problem.horizon, ball(value), disturbed=False)
         else:
-            row = case.duality.row(direction, case.problem.horizon, middle, ball(value), disturbed=False)
+            row = case.duality.row(
+                direction, case.problem.horizon, case.nominal_parameter, ball(value), disturbed=False
+            )
         # a disturbance of one point counts; where none may reach the state, any member of its set may stand for it
         rows.append((multiplier, replace(row, constant=row.constant + pushed_by_middle(case, state))))
     if case.control.functions >= case.control.pieces:  # every piece has a function of its own

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from sparserob_core.checker.arithmetic.balls import balls
+from sparserob_core.checker.arithmetic.balls import ball, balls
 from sparserob_core.checker.arithmetic.series import exactly, stacked
 from sparserob_core.checker.claims.answers import NamedDeviations, commanded, feedback_of
 from sparserob_core.checker.claims.case import EQUALS, Case, number, numbers, shaped
@@ -122,7 +122,7 @@ def witnessed(case: Case, data: Mapping[str, Any]) -> tuple[arb, float]:
         delivered = case.sources.delivered_at(parameter.tolist())
         if delivered is not None:
             low, high = delivered.added(window.split(direction)[0], time)
-            value = value + balls([low])[0].union(balls([high])[0])
+            value = value + ball(low).union(ball(high))
     return value - limit, slack
 
 
@@ -145,11 +145,11 @@ def _farthest(
 
     ``direction`` is ``(c, gain)``, and ``u`` is the control on a ``piece``; where it is ``None``, ``gain'u`` is left
     out."""
-    (c, gain), none, strayed = direction, balls([0.0])[0], case.sources.strayed_at(parameter)
+    (c, gain), none, strayed = direction, ball(0.0), case.sources.strayed_at(parameter)
     assert strayed is not None
     row = case.duality.row(c, time, parameter, none)
     low, high = strayed.added(c, time)
-    total = row.constant + balls([low])[0].union(balls([high])[0])
+    total = row.constant + ball(low).union(ball(high))
     for slope, control in zip(row.slope, case.pieces, strict=True):
         total = total + sum((a * u for a, u in zip(slope, control.entries(), strict=True)), none)
     if piece is None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from fractions import Fraction
 from functools import cached_property
 from itertools import pairwise
@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, final
 import numpy as np
 
 from sparserob_core.checker.arithmetic.balls import ball, balls, largest, rational, smallest
+from sparserob_core.checker.arithmetic.remembered import remembered
 from sparserob_core.checker.arithmetic.series import exactly, stacked
 from sparserob_core.checker.cost.duality import ConstraintRow
 from sparserob_core.checker.outcome import Unchecked
@@ -37,8 +38,6 @@ class GainsBound:
     loop: VerifiedLoop
     answers: np.ndarray
     control: ConvexSet
-    _inverses: dict[tuple[int, ...], tuple[arb_mat, list[int]]] = field(default_factory=dict, repr=False)
-    _pushes: dict[tuple[tuple[Fraction, ...], ...], Pushed] = field(default_factory=dict, repr=False)
 
     def of(self, rows: Sequence[tuple[float, ConstraintRow]]) -> arb:
         """Return an upper bound of how much the gains can lower the sum of ``rows`` times their multipliers."""
@@ -90,6 +89,7 @@ class GainsBound:
             groups = [*rest, mine]
         return [(sorted(members), *self._inverse(tuple(sorted(members)))) for members, _ in groups]
 
+    @remembered()
     def _inverse(self, members: tuple[int, ...]) -> tuple[arb_mat, list[int]]:
         """Return a generalised inverse ``(q, J d)`` of the matrix from the blocks to the states measured at these
         breakpoints.
@@ -97,33 +97,31 @@ class GainsBound:
         From the measurements of any deviations it gives deviations of the blocks with the same measurements. The second
         value is the numbers of the blocks.
         """
-        if members not in self._inverses:
-            blocks = sorted({block for j in members for block in self.loop.seen[j] if self._segments[block]})
-            d = self.loop.outputs
-            table: list[list[arb]] = []
-            for j in members:
-                seen = self.loop.seen[j]
-                lists = {block: _onto(push, self._segments[block]) for block, push in seen.items() if block in blocks}
-                table += [
-                    [x for block in blocks for x in (lists[block][s] if block in lists else self._none_of(block))]
-                    for s in range(d)
-                ]
-            groups = [self._pushed(block) for block in blocks]
-            pattern = np.vstack(
-                [np.hstack([g.pattern & (b in self.loop.seen[j]) for g, b in zip(groups, blocks, strict=True)])
-                 for j in members]
-            )  # fmt: skip
-            most = max(group.states for group in groups)
-            rows = [(d * (k + 1), most) for k in range(len(members))]
-            ends = np.cumsum([group.pattern.shape[1] for group in groups]).tolist()
-            columns = [(end, group.entries) for end, group in zip(ends, groups, strict=True)]
-            reach = np.array([float(length) for block in blocks for _, length in self._segments[block]])
-            self._inverses[members] = SeenDeviations(stacked(table), pattern, rows, columns, reach).inverse(), blocks
-        return self._inverses[members]
+        blocks = sorted({block for j in members for block in self.loop.seen[j] if self._segments[block]})
+        d = self.loop.outputs
+        table: list[list[arb]] = []
+        for j in members:
+            seen = self.loop.seen[j]
+            lists = {block: _onto(push, self._segments[block]) for block, push in seen.items() if block in blocks}
+            table += [
+                [x for block in blocks for x in (lists[block][s] if block in lists else self._none_of(block))]
+                for s in range(d)
+            ]
+        groups = [self._pushed(block) for block in blocks]
+        pattern = np.vstack(
+            [np.hstack([g.pattern & (b in self.loop.seen[j]) for g, b in zip(groups, blocks, strict=True)])
+             for j in members]
+        )  # fmt: skip
+        most = max(group.states for group in groups)
+        rows = [(d * (k + 1), most) for k in range(len(members))]
+        ends = np.cumsum([group.pattern.shape[1] for group in groups]).tolist()
+        columns = [(end, group.entries) for end, group in zip(ends, groups, strict=True)]
+        reach = np.array([float(length) for block in blocks for _, length in self._segments[block]])
+        return SeenDeviations(stacked(table), pattern, rows, columns, reach).inverse(), blocks
 
     def _none_of(self, block: int) -> list[arb]:
         """Return zeros, one for each of the segments of a block."""
-        return [balls([0.0])[0]] * len(self._segments[block])
+        return [ball(0.0)] * len(self._segments[block])
 
     def _pushed(self, block: int) -> Pushed:
         """Return which states can measure the deviations of a block; each state measures its own initial deviation."""
@@ -132,10 +130,12 @@ class GainsBound:
             return Pushed(np.ones((loop.outputs, len(vectors)), dtype=bool), loop.outputs, len(vectors))
         if loop.initial is not None and block == loop.deviations.begun:
             return Pushed(np.array([[bool(v) for v in row] for row in vectors]).T, len(vectors), len(vectors))
-        key = tuple(map(tuple, vectors))
-        if key not in self._pushes:
-            self._pushes[key] = loop.pushed(vectors)
-        return self._pushes[key]
+        return self._pushed_along(vectors)
+
+    @remembered(key=lambda self, vectors: tuple(map(tuple, vectors)))
+    def _pushed_along(self, vectors: list[list[Fraction]]) -> Pushed:
+        """Return which states can measure deviations along some directions."""
+        return self.loop.pushed(vectors)
 
     @cached_property
     def _segments(self) -> list[list[tuple[list[Fraction], arb]]]:

@@ -426,7 +426,7 @@ def _sum(parts: Sequence[Enclosed]) -> Enclosed:
 
 def accumulate_exactly(values: Array) -> Array:
     """Return the sums of the first ``0, 1, ..., N`` of ``values (N, q)``, each rounded once."""
-    sums = [accumulate(balls(column), initial=balls([0.0])[0]) for column in values.T]
+    sums = [accumulate(balls(column), initial=ball(0.0)) for column in values.T]
     return np.array([[float(x) for x in column] for column in sums]).reshape(-1, len(values) + 1).T
 
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, TypeAlias, final
 
 import numpy as np
 
-from sparserob_core.checker.arithmetic.balls import above, balls
+from sparserob_core.checker.arithmetic.balls import above, ball, balls
 from sparserob_core.checker.sets.shape import Facet, Shape
 from sparserob_core.sip.convex_set import Array
 
@@ -83,4 +83,4 @@ def halfspaces(shape: Shape, point: Array) -> list[Facet]:
 def _least(normal: Array, low: Array, high: Array) -> arb:
     """Return the least ``a'p`` on a box."""
     ends = zip(normal, balls(normal), balls(low), balls(high), strict=True)
-    return sum((c * (a if weight > 0 else b) for weight, c, a, b in ends), balls([0.0])[0])
+    return sum((c * (a if weight > 0 else b) for weight, c, a, b in ends), ball(0.0))

@@ -226,7 +226,7 @@ class Shape(ABC):
         bound of the first two terms of a component.
         """
         tilt = [
-            s + balls([float(np.clip(-float(s), -float(down.lower()), float(up.lower())))])[0]
+            s + ball(float(np.clip(-float(s), -float(down.lower()), float(up.lower()))))
             for up, down, s in zip(ups, downs, slope, strict=True)
         ]
         return -self.support([-t for t in tilt])
@@ -337,4 +337,4 @@ def total(terms: Iterable[arb]) -> arb:
 
 def along(point: Sequence[float] | Array, direction: Sequence[arb]) -> arb:
     """Return the scalar product of exact numbers with balls."""
-    return total(balls([a])[0] * c for a, c in zip(point, direction, strict=True) if a)
+    return total(ball(a) * c for a, c in zip(point, direction, strict=True) if a)

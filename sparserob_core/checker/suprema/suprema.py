@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, final
 
 import numpy as np
 
-from sparserob_core.checker.arithmetic.balls import above, balls, below
+from sparserob_core.checker.arithmetic.balls import above, ball, balls, below
 from sparserob_core.checker.claims.case import Case, listed, number, numbers, shaped
 from sparserob_core.checker.claims.cells import Work
 from sparserob_core.checker.claims.claims import judged, precision_of
@@ -149,7 +149,7 @@ def _margin(asked: SupremumRow, entry: Mapping[str, Any], sign: float, high: flo
         return
     written = sign * number(entry, "wall")
     size = max(1.0, abs(float(asked.wall.mid())))
-    if not abs(balls([written])[0] - asked.wall) <= FIGURES * size:
+    if not abs(ball(written) - asked.wall) <= FIGURES * size:
         raise Broken(f"a wall at {wall!r} is written, it is at {sign * float(asked.wall.mid())!r}")
     if high is None:
         if margin is not None:
@@ -181,7 +181,7 @@ def _witnessed(case: Case, asked: SupremumRow, entry: Mapping[str, Any], row: Fo
     fine, on_grid = _following(case, changes, signal)
     state = reached(fine, time, parameter, on_grid, entry.get("deviation"))
     direction = window.split(asked.direction)[0]
-    total = sum((a * x for a, x in zip(balls(direction), state, strict=True)), balls([0.0])[0])
+    total = sum((a * x for a, x in zip(balls(direction), state, strict=True)), ball(0.0))
     return below(total + low), above(total + high)
 
 
