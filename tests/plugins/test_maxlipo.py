@@ -139,14 +139,27 @@ def test_values_of_any_size_and_minus_infinity_are_survived():
     assert sr.maximise(wild, SQUARE, "maxlipo", budget=120, polish=0.0).best_value > -0.1
 
 
+def whole_bound(rng):
+    """Seconds of the processor that the bound of a thousand points takes at a thousand candidates, all pairs of them:
+    what a step of dlib computes, and about the time of one."""
+    points, candidates, heights = rng.random((1000, 2)), rng.random((1000, 2)), rng.random((1000, 1))
+    begin = time.process_time()
+    squares = 3.0 * (points[:, :1] - candidates[:, 0]) ** 2 + 2.0 * (points[:, 1:] - candidates[:, 1]) ** 2
+    (np.sqrt(0.1 + squares) + heights).min(axis=0)
+    return time.process_time() - begin
+
+
 @pytest.mark.slow
-def test_the_time_per_evaluation_stays_below_a_fifth_of_that_of_dlib():
-    # dlib takes 12.5 ms at a thousand evaluations in two coordinates, on slower ground than a test may assume.
-    ticks = []
+def test_the_time_per_evaluation_stays_below_a_fifth_of_the_whole_bound():
+    # dlib itself stands beside it in tests/benchmarks; both times here are of one machine, a slow one as well
+    ticks, whole = [], []
+    rng = np.random.default_rng(0)
 
     def holder(x):
+        if len(ticks) % 50 == 0:
+            whole.append(whole_bound(rng))
         ticks.append(time.process_time())
         return np.abs(np.sin(x[:, 0]) * np.cos(x[:, 1]) * np.exp(np.abs(1 - np.hypot(x[:, 0], x[:, 1]) / np.pi)))
 
     sr.maximise(holder, sr.Box([-10.0] * 2, [10.0] * 2), "maxlipo", budget=1000, polish=0.0)
-    assert (ticks[-1] - ticks[0]) / len(ticks) < 2.5e-3
+    assert (ticks[-1] - ticks[0] - sum(whole[1:])) / len(ticks) < np.median(whole) / 5
