@@ -94,7 +94,19 @@ class TimeLimitError(SparseRobError):
 
 class NotEnclosable(InputError):
     """A function of the parameters has no rigorous enclosure on a cell: a singularity, or an operation that is not
-    supported."""
+    supported. ``along``: the parameter in which a narrower cell helps most, where that is known."""
+
+    def __init__(
+        self,
+        message: str = "",
+        *,
+        path: str | Path = (),
+        expected: str = "",
+        got: str = "",
+        along: int | None = None,
+    ) -> None:
+        super().__init__(message, path=path, expected=expected, got=got)
+        self.along = along
 
 
 class PluginError(SparseRobError):

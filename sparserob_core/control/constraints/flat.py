@@ -387,7 +387,7 @@ class FlatConstraint(StateConstraint):
         upper)``, ``(k, 1 + nu)`` each."""
         points = self.samples.apart(np.concatenate([[self.start], self.samples.cuts, [self.stop]]))
         starts, stops = (points[:-1], points[1:]) if points.size > 1 else (points, points)
-        box, parts = self.index_set, self.functionals.response.propagator.parts
+        box, parts = self.index_set, self.functionals.response.propagator.laws
         lower = np.hstack([starts[:, None], np.tile(box.lower[1:], (starts.size, 1))])
         upper = np.hstack([stops[:, None], np.tile(box.upper[1:], (starts.size, 1))])
         return (lower, upper) if parts is None else parts.cut(lower, upper)

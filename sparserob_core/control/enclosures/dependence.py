@@ -18,7 +18,7 @@ import numpy as np
 
 from sparserob_core.control.enclosures.elementary import eccentric_anomaly
 from sparserob_core.control.enclosures.matrix_exponential import EPSILON
-from sparserob_core.control.enclosures.taylor import TaylorSpace
+from sparserob_core.control.enclosures.taylor import OUTWARD, TaylorSpace, taylor_space
 from sparserob_core.errors import InputError
 from sparserob_core.sip.convex_set import Array
 
@@ -29,6 +29,9 @@ Exponents: TypeAlias = tuple[int, ...]
 MOST_POWERS = 8
 """The degree in all parameters together up to which an entry counts as a polynomial in them: of twice as many an
 expansion that holds them is too large, and as an analytic function it needs no more than it shows."""
+MOST_ON_CELL, NUMBERS_ON_CELL = 6, 80
+"""The degree on a cell of parameters, and the coefficients times states, at most: of twice as many a cell takes three
+times as long, of half as many there are three times as many cells."""
 Part: TypeAlias = "dict[Exponents, Value]"
 """The coefficients of the monomials of one degree, as far as there are any."""
 
@@ -458,20 +461,37 @@ class Spread:
         """How many states there are in all."""
         return self.d * self.space.size
 
+    def on_cell(self, low: Array, high: Array, ends: Array, law: Array) -> tuple[Spread, np.ndarray]:
+        """Return how the state depends on the parameters of a cell, and which coefficients of the law it keeps.
+
+        Parameters
+        ----------
+        low, high : Array
+            Ends ``(nu,)`` of the cell.
+        ends : Array
+            Times ``(s + 1,)`` between which the law is looked at.
+        law : Array
+            How large the coefficients ``(s, M, d, d + n)`` of ``[A B E]`` on the cell are at most.
+
+        Returns
+        -------
+        Spread, np.ndarray
+            The polynomials on the cell; and the numbers of the monomials of this space that are of their degree. What
+            is beyond is `left`.
+        """
+        nu = self.space.nu
+        degrees = [one for one in range(1, MOST_ON_CELL + 1) if self.d * comb(nu + one, nu) <= NUMBERS_ON_CELL]
+        space = taylor_space(nu, max([1, *degrees]))
+        kept = np.flatnonzero(self.space.degrees <= space.degree)
+        beyond = law[:, self.space.degrees > space.degree].sum(axis=1)
+        if self.left is not None:
+            beyond = beyond + self.left.over(ends)
+        left = Left(ends, beyond * OUTWARD) if beyond.any() else None
+        return Spread(self.d, space, (low + high) / 2, (high - low) / 2, self.powers, left), kept
+
     def shares(self, parameters: Array) -> Array:
         """``delta (k, nu)`` of parameters ``(k, nu)``."""
         return np.asarray((parameters - self.centre) / np.where(self.units > 0.0, self.units, 1.0))
-
-    def directions(self, directions: Array, parameters: Array) -> Array:
-        """Directions ``(k, d)`` at parameters ``(k, nu)`` as such on the larger state, ``(k, states)``."""
-        powers = self.space.monomials(self.shares(parameters))
-        return np.asarray((powers[:, :, None] * directions[:, None]).reshape(len(directions), self.states))
-
-    def seen(self, states: Array, parameters: Array) -> Array:
-        """The states ``(k, ..., d)`` at parameters ``(k, nu)`` of larger ones ``(k, ..., states)``."""
-        powers = self.space.monomials(self.shares(parameters))
-        apart = states.reshape(*states.shape[:-1], self.space.size, self.d)
-        return np.asarray(np.einsum("ka,k...ad->k...d", powers, apart))
 
     def filled(self, first: Array) -> Array:
         """What all coefficients become, ``(k, states, states)``, from what the constant ones do, ``(k, states, d)``."""

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
 from itertools import combinations_with_replacement
 from typing import TYPE_CHECKING, NoReturn, final
 
@@ -64,6 +64,12 @@ class Face:
 
         size = self.target.size
         return csr_array((self.sign, (self.target, np.arange(size))), shape=(size, size))
+
+
+@cache
+def taylor_space(nu: int, degree: int) -> TaylorSpace:
+    """Return the one space of polynomials in ``nu`` variables up to a ``degree``."""
+    return TaylorSpace(nu, degree)
 
 
 @final

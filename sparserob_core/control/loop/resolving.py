@@ -97,7 +97,7 @@ class Plan:
         much at most an error of the state grows in the value; ``None`` where the state does not tell it."""
         problem, response, signal = self.known.problem, self.known.response, self.known.functionals.disturbance
         numbers = np.flatnonzero(response.grid.control_piece == piece).tolist()
-        if response.propagator.spread:  # which parameters did it is not known
+        if response.propagator.laws is not None:  # which parameters did it is not known
             return None
         if problem.disturbance is None or signal is None or signal.starts is None or len(numbers) != 1:
             return None

@@ -75,10 +75,6 @@ class Motion(Protocol):
         """About how fast it moves: cells of a time shorter than its reciprocal are short."""
 
     @property
-    def recentred(self) -> Array | None:
-        """What makes of the coefficients of its states those on the cell, ``(M, M)``; ``None`` where they are."""
-
-    @property
     def influence(self) -> Array:
         """How much every parameter has to do with what is left out, ``(nu,)``; it only guides the halving."""
 
@@ -161,8 +157,6 @@ class CellEnclosure:
         """Bounds ``(k, r)`` at single times, and how much of them each parameter accounts for, ``(k, r, nu)``."""
         states = self._states(times, pieces)
         coefficients = np.einsum("ri,kai->kra", self._rows, states)
-        if self.lifted.recentred is not None:
-            coefficients = coefficients @ self.lifted.recentred.T
         if self.moving is not None:
             coefficients[:, :, 0] += self.moving.at(times + self.lifted.grid.elapsed)
         space = self.lifted.space
@@ -361,11 +355,12 @@ def enclose(
         low, high = lower[members[0], 1:], upper[members[0], 1:]
         try:
             cell = cell_over(low, high)
-        except NotEnclosable:
+        except NotEnclosable as error:
             middle, radius = (low + high) / 2, (high - low) / 2
             radius[:nu] *= TINY
             cell_over(middle - radius, middle + radius)
-            bounds[members], split[members] = np.inf, 1 + int(np.argmax((high - low)[:nu]))
+            widest = int(np.argmax((high - low)[:nu])) if error.along is None else error.along
+            bounds[members], split[members] = np.inf, 1 + widest
             continue
         bounds[members], bend, spread = cell.bounds(lower[members, 0], upper[members, 0])
         coordinates = np.concatenate([np.arange(1 + nu), 1 + nu + np.flatnonzero(high[nu:] > low[nu:])])

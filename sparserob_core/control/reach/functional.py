@@ -20,7 +20,6 @@ from sparserob_core.control.reach.support import InitialSupport, Support, Suppor
 from sparserob_core.control.reach.varying_motion import (
     SpreadMotion,
     SpreadSupport,
-    Truncation,
     VaryingMotion,
     VaryingSupport,
 )
@@ -494,49 +493,14 @@ class WorstCase:
         if key not in self._legs:
             cell = (low + high) / 2, (high - low) / 2
             legs: tuple[Leg, ...]
-            if response.propagator.parts is not None:
-                part = response.propagator.parts.holding(low, high)
-                if part is None:
-                    raise NotEnclosable("a cell of parameters lies in two parts of their box")
-                truncation = self._truncations[part]
-                legs = (SpreadMotion(truncation.motion, truncation.spread, truncation, low, high),)
+            if response.propagator.laws is not None:
+                legs = (SpreadMotion.of(response.propagator.on_cell(low, high), response.initial_state),)
             elif response.grid.varying:
                 legs = (VaryingMotion(response.propagator, response.initial_state),)
             else:
                 legs = lift_legs(response.system, response.grid, response.initial_state, *cell)
             remember(self._legs, key, legs, LEGS_KEPT)
         return self._legs[key]
-
-    @cached_property
-    def _truncations(self) -> tuple[Truncation, ...]:
-        """What an expansion in the parameters leaves out, on each of their parts."""
-        found = []
-        for spread, every in self.response.propagator.spread:
-            begun = np.append(self.response.initial_state, np.zeros(spread.states - spread.d))
-            found.append(Truncation(VaryingMotion(every, begun), spread))
-        return tuple(found)
-
-    def beyond(self, far: Array) -> Array:
-        """What an expansion in the parameters leaves out of any state, ``(d,)``, of a control that goes as ``far (m,)``
-        as it may; nothing where there is none."""
-        if not self._truncations:
-            return np.zeros(self.response.initial_state.size)
-        axes, model, begun = (
-            np.eye(self.response.initial_state.size),
-            self.disturbance,
-            np.abs(self.response.initial_state),
-        )
-        if self.initial is not None:
-            begun = begun + self.initial.reach(axes)
-        pushed = np.zeros(self.response.system.disturbances)
-        if model is not None:
-            pushed = model.bound.reach(np.eye(model.channels))
-        known = np.abs(self.known).max(axis=1)
-        delivered = np.maximum(far, known[: far.size])
-        if self.execution is not None:  # of what is missed as much is left out as of what is commanded
-            delivered = (1.0 + self.execution.shares) * delivered
-        inputs = np.concatenate([delivered, known[far.size :], pushed])
-        return np.asarray(np.max([one.at_most(begun, inputs) for one in self._truncations], axis=0))
 
     @cached_property
     def _frozen(self) -> dict[bytes, LiftedSystem]:

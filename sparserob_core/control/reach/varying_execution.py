@@ -7,7 +7,7 @@ the sum is nowhere further above its chord than that says.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import final
@@ -34,13 +34,14 @@ from sparserob_core.control.reach.varying_motion import (
     VaryingMotion,
 )
 from sparserob_core.control.response.lifted import LiftedSystem
-from sparserob_core.control.response.response import Response
+from sparserob_core.control.response.response import Propagator, Response, unique_rows
 from sparserob_core.control.response.varying.expansion import Kernel
-from sparserob_core.control.response.varying.spread import Parts
 from sparserob_core.control.sets.integrals import CUTS, HALVINGS, absolute, integrated
 from sparserob_core.shapes import Float, shaped
 from sparserob_core.sip.convex_set import Array, ConvexSet
 
+POINTS_KEPT = 256  # parameters whose errors are remembered: twice the points of a lattice of parameters
+CELLS_KEPT = 16  # cells of parameters whose errors are: those of all rows of a few constraints
 STEP = 1e-6  # of the horizon, over which a slope is a difference: a tenth of it shows what integrals are rounded to
 
 
@@ -63,16 +64,17 @@ class VaryingExecution(Execution):
         """`Execution.none`; what is remembered is of these shares."""
         return replace(self, shares=np.zeros(self.shares.size), _lengths={}, _reaching={})
 
-    def followed(self) -> VaryingExecution | SpreadExecution:
-        """`Execution.followed`: the errors of all coefficients, which are followed as states are, on every part."""
-        parts, every = self.response.propagator.parts, []
-        if parts is None:
+    def followed(self) -> VaryingExecution | UncertainExecution:
+        """`Execution.followed`: where there are parameters, at each of them and on cells of them."""
+        if self.response.propagator.laws is None:
             return self
-        for spread, of in self.response.propagator.spread:
-            response = Response(of.system, of.grid, np.zeros(spread.states), shared=of)
-            felt = np.tile(self.felt, spread.space.size)
-            every.append(replace(self, response=response, felt=felt, _lengths={}, _ways={}, _reaching={}))
-        return SpreadExecution(self.response, self.breakpoints, self.shares, self.felt, parts, tuple(every))
+        return UncertainExecution(self.response, self.breakpoints, self.shares, self.felt, self)
+
+    def following(self, propagator: Propagator, initial_state: Array) -> VaryingExecution:
+        """Return the errors along states ``(d,)`` or their coefficients ``(M d,)``, that a propagator moves."""
+        response = Response(propagator.system, propagator.grid, initial_state, shared=propagator)
+        felt = np.tile(self.felt, initial_state.size // self.felt.size)
+        return replace(self, response=response, felt=felt, _lengths={}, _ways={}, _reaching={})
 
     def over(
         self,
@@ -291,38 +293,37 @@ class VaryingExecution(Execution):
 
 @final
 @dataclass(frozen=True, eq=False)
-class SpreadExecution(Execution):
-    """`Execution` of a system whose state is a polynomial in its parameters: on each of the ``parts`` of their box that
-    of all coefficients, ``every`` of them. Directions are those on the coefficients, followed by the number of their
-    part (`seen`)."""
+class UncertainExecution(Execution):
+    """`Execution` of a system that changes with time and has parameters: ``known`` is that of a known one, to be made
+    for each parameter and on each cell. Directions are followed by their parameters (`seen`)."""
 
-    parts: Parts
-    every: tuple[VaryingExecution, ...]
+    known: VaryingExecution
+    _at: dict[bytes, VaryingExecution] = field(default_factory=dict, repr=False)
+    _on: dict[bytes, tuple[SpreadMotion, VaryingExecution]] = field(default_factory=dict, repr=False)
 
-    def none(self) -> SpreadExecution:
+    def none(self) -> UncertainExecution:
         """`Execution.none`."""
-        return replace(self, shares=np.zeros(self.shares.size), every=tuple(one.none() for one in self.every))
+        return replace(self, shares=np.zeros(self.shares.size), known=self.known.none(), _at={}, _on={})
 
     @property
-    def around(self) -> SpreadExecution:
+    def around(self) -> UncertainExecution:
         """`VaryingExecution.around`."""
-        every = tuple(one.around for one in self.every)
-        return replace(self, shares=every[0].shares, every=every)
+        around = self.known.around
+        return self if around is self.known else replace(self, shares=around.shares, known=around, _at={}, _on={})
 
     def seen(self, directions: Array, parameters: Array) -> Array:
-        """`Execution.seen`: those on all coefficients, and the number of the part."""
-        found = np.zeros((len(directions), self.parts.every[0][0].states + 1))
-        if self.shares.any():  # else there may be no parameters
-            found[:, -1] = self.parts.of(parameters)
-            for part, here in self._apart(found):
-                found[here, :-1] = self.parts.every[part][0].directions(directions[here], parameters[here])
-        return found
+        """`Execution.seen`: with the parameters behind them."""
+        return np.hstack([directions, parameters])
 
-    @staticmethod
-    def _apart(directions: Array) -> list[tuple[int, np.ndarray]]:
-        """The parts that directions are on, and the numbers of those in each."""
-        which = directions[:, -1]
-        return [(int(part), np.flatnonzero(which == part)) for part in np.unique(which).tolist()]
+    def at(self, parameter: Array) -> VaryingExecution:
+        """Return the errors of the known system at a ``parameter (nu,)``; the last ones are remembered."""
+        if not self.shares.any():  # there may be no parameters
+            return self.known
+        key = parameter.tobytes()
+        if key not in self._at:
+            found = self.known.following(self.response.propagator.at_point(parameter), self.response.initial_state)
+            remember(self._at, key, found, POINTS_KEPT)
+        return self._at[key]
 
     def over(
         self,
@@ -334,51 +335,50 @@ class SpreadExecution(Execution):
         """`Execution.over`."""
         assert isinstance(leg, SpreadMotion)
         assert joined is None  # refused beside curved sets
-        part = self.parts.holding(leg.low, leg.high)
-        assert part is not None  # the motion is one within a part
-        return SpreadExecutionSupport(self.every[part].reaching(control), rows, leg)
+        key = id(leg).to_bytes(8)  # of a leg that is kept beside
+        if key not in self._on:
+            every = self.known.following(leg.motion.propagator, leg.motion.initial_state)
+            remember(self._on, key, (leg, every), CELLS_KEPT)
+        return SpreadExecutionSupport(self._on[key][1].reaching(control), rows, leg)
+
+    def _each(
+        self, directions: Array, found: Array, of: Callable[[VaryingExecution, np.ndarray, Array], Array]
+    ) -> Array:
+        """Fill what is ``found (k, ...)`` with what it is ``of`` the errors at every parameter."""
+        d = self.felt.size
+        unique, which = unique_rows(directions[:, d:])
+        for number, parameter in enumerate(unique):
+            here = np.flatnonzero(which == number)
+            found[here] = of(self.at(parameter), here, directions[here, :d])
+        return found
 
     @shaped
     def lengths(self, times: Float[Array, " k"], directions: Float[Array, "k d"]) -> Float[Array, "k n"]:
         """`Execution.lengths`."""
         found = np.empty((times.size, self.size))
-        for part, here in self._apart(directions):
-            found[here] = self.every[part].lengths(times[here], directions[here, :-1])
-        return found
+        return self._each(directions, found, lambda one, here, c: one.lengths(times[here], c))
 
     def given(self, times: Array, directions: Array) -> Array:
         """`Execution.given`."""
-        found = np.empty(times.size)
-        for part, here in self._apart(directions):
-            found[here] = self.every[part].given(times[here], directions[here, :-1])
-        return found
+        return self._each(directions, np.empty(times.size), lambda one, here, c: one.given(times[here], c))
 
     @shaped
     def added(
         self, control: Float[Array, "m K"], times: Float[Array, " k"], directions: Float[Array, "k d"]
     ) -> Float[Array, " k"]:
         """`Execution.added`."""
-        found = np.empty(times.size)
-        for part, here in self._apart(directions):
-            found[here] = self.every[part].added(control, times[here], directions[here, :-1])
-        return found
+        return self._each(directions, np.empty(times.size), lambda one, here, c: one.added(control, times[here], c))
 
     def sampled(self, control: Array, times: Array, directions: Array) -> Array:
         """`Execution.sampled`."""
-        found = np.empty(times.size)
-        for part, here in self._apart(directions):
-            found[here] = self.every[part].sampled(control, times[here], directions[here, :-1])
-        return found
+        return self._each(directions, np.empty(times.size), lambda one, here, c: one.sampled(control, times[here], c))
 
     @shaped
     def slope(
         self, control: Float[Array, "m K"], times: Float[Array, " k"], directions: Float[Array, "k d"]
     ) -> Float[Array, " k"]:
         """`Execution.slope`."""
-        found = np.empty(times.size)
-        for part, here in self._apart(directions):
-            found[here] = self.every[part].slope(control, times[here], directions[here, :-1])
-        return found
+        return self._each(directions, np.empty(times.size), lambda one, here, c: one.slope(control, times[here], c))
 
     @shaped
     def enclosed(
@@ -386,9 +386,7 @@ class SpreadExecution(Execution):
     ) -> Float[Array, "k 2"]:
         """`Execution.enclosed`."""
         found = np.empty((times.size, 2))
-        for part, here in self._apart(directions):
-            found[here] = self.every[part].enclosed(control, times[here], directions[here, :-1])
-        return found
+        return self._each(directions, found, lambda one, here, c: one.enclosed(control, times[here], c))
 
 
 @final
@@ -510,7 +508,7 @@ class SpreadExecutionSupport:
         for position, pattern in enumerate(patterns):
             here, row = np.nonzero(which == position)
             free, corners = np.flatnonzero(pattern == 0.0), _corners(pattern)
-            powers = space.monomials(corners) @ self.motion.recentred  # of the coefficients in all parameters
+            powers = space.monomials(corners)
             directions = (powers[:, :, None] * self.rows[row][:, None, None, :]).reshape(len(row) * len(corners), -1)
             bounds = of.execution.enclosed(of.control, np.repeat(times[here], len(corners)), directions)
             bounds = bounds.reshape(len(row), len(corners), 2)
@@ -553,7 +551,7 @@ class SpreadExecutionSupport:
         """What errors add along every coefficient on the cell, at most, ``(k, r, M)``."""
         reached = self.every.reached[self._pieces(times)].reshape(times.size, self.motion.space.size, -1)
         along = np.einsum("rd,kad->kra", np.abs(self.rows), reached)
-        return np.asarray(along @ np.abs(self.motion.recentred).T * OUTWARD)
+        return np.asarray(along * OUTWARD)
 
     def _pieces(self, times: Array) -> np.ndarray:
         return np.asarray(np.minimum(self.every.motion.place(times), self.every.motion.origin.size - 1))

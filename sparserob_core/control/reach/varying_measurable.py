@@ -11,7 +11,7 @@ import numpy as np
 from sparserob_core.control.enclosures.taylor import Combination
 from sparserob_core.control.reach.measurable import AT_ONCE, MeasurableSupport
 from sparserob_core.control.reach.support import Support
-from sparserob_core.control.reach.varying_execution import SpreadExecution, VaryingExecution
+from sparserob_core.control.reach.varying_execution import UncertainExecution, VaryingExecution
 from sparserob_core.control.reach.varying_motion import (
     SpreadMotion,
     SpreadSupport,
@@ -67,7 +67,7 @@ class VaryingMeasurable:
         return np.asarray((box.lower + box.upper) / 2)
 
     @cached_property
-    def errors(self) -> VaryingExecution | SpreadExecution:
+    def errors(self) -> VaryingExecution | UncertainExecution:
         """How far disturbances may be from the middle: rounded outwards where that is not 0."""
         shares, bound, through = np.ones(1), None, None
         if self.bound.is_box:

@@ -32,6 +32,7 @@ from sparserob_core.control.reach.disturbance_support import over_faces, summed
 from sparserob_core.control.response.disturbance import DisturbanceModel
 from sparserob_core.control.response.response import Propagator, TimeGrid
 from sparserob_core.control.response.varying.expansion import Expansion, Flow
+from sparserob_core.errors import NotEnclosable
 from sparserob_core.sip.convex_set import Array, ConvexSet
 
 KNOWN = TaylorSpace(0, 0)
@@ -91,10 +92,6 @@ class VaryingMotion:
     def starts(self) -> np.ndarray:
         """Every state is a block."""
         return np.arange(self.states)
-
-    @property
-    def recentred(self) -> None:
-        """There are no cells."""
 
     @property
     def influence(self) -> Array:
@@ -542,11 +539,26 @@ class Truncation:
         return self.norms(rates)
 
     @cached_property
-    def _sizes(self) -> Array:
-        """The norms of the coefficients of ``A`` of every degree on every piece, ``(K, D + 1)``."""
+    def _norms(self) -> Array:
+        """The norms of the coefficients of ``A`` on every piece, ``(K, M)``."""
         d, space = self.spread.d, self.spread.space
         first = self.motion.most[:, :, :d].reshape(-1, space.size, d, d) / self.units[:, None] * self.units
-        norms = first.sum(axis=3).max(axis=2)
+        return np.asarray(first.sum(axis=3).max(axis=2))
+
+    @property
+    def influence(self) -> Array:
+        """How far every parameter moves the law, ``(nu,)``: ``A`` over the horizon, and inputs as shares."""
+        d, space, lengths = self.motion.states, self.spread.space, self.motion.grid.lengths
+        inputs = self.motion.most[:, :, d:].reshape(lengths.size, space.size, self.spread.d, -1)
+        pushed = (inputs / self.units[:, None]).max(axis=2, initial=0.0).max(axis=0)
+        shares = (pushed / np.maximum(pushed[0], TINY)).max(axis=1, initial=0.0)
+        shares[0] = 0.0
+        return np.asarray((lengths @ self._norms + np.minimum(shares, 1.0)) @ space.exponents)
+
+    @cached_property
+    def _sizes(self) -> Array:
+        """The norms of the coefficients of ``A`` of every degree on every piece, ``(K, D + 1)``."""
+        space, norms = self.spread.space, self._norms
         return np.stack([norms[:, space.degrees == j].sum(axis=1) for j in range(space.degree + 1)], axis=1)
 
     @cached_property
@@ -643,29 +655,41 @@ class Truncation:
     def _under(self) -> dict[bytes, Array]:
         return {}
 
-    def at_most(self, begun: Array, inputs: Array) -> Array:
-        """The same at the end of the horizon of whatever begins at no more than ``begun (d,)`` and is driven so all the
-        time, ``inputs (m + mw,)``: ``(d,)``."""
-        pieces, size = self.motion.grid.pieces, self.spread.space.degree + 1
-        driven = self.driven(np.tile(inputs, (pieces, 1)))
-        pushed = (np.einsum("kij,kj->ki", self._within, driven) * self.motion.grid.lengths[:, None]).sum(axis=0)
-        pushed[0] += (begun / self.units).max(initial=0.0)
-        most = self._carried.max(axis=0)
-        norms = np.array([sum(most[j - i] * pushed[i] for i in range(j + 1)) for j in range(size)])
-        added = self._added(np.tile(norms, (pieces, 1)), driven, self._off[1] @ inputs)
-        return self.growth * float(added.sum()) * self.units * OUTWARD
-
 
 @dataclass(frozen=True, eq=False)
 class SpreadMotion:
-    """The `Motion` over a cell ``[low, high]`` of parameters, ``(nu,)`` each, by the ``motion`` of all coefficients;
-    they stay those in ``delta``, of which `recentred` makes those on the cell."""
+    """The `Motion` over a cell of parameters, by that of all coefficients on it, and what is beyond their degree, in a
+    ``truncation``. ``influence (nu,)`` as in `Motion`."""
 
-    motion: VaryingMotion
-    spread: Spread
     truncation: Truncation
-    low: Array
-    high: Array
+    influence: Array
+
+    @staticmethod
+    def of(propagator: Propagator, initial_state: Array) -> SpreadMotion:
+        """Return the motion of a system over the cell that its coefficients are expanded on.
+
+        Raises `NotEnclosable` where the cell is so wide that what is beyond the degree grows without a bound.
+        """
+        assert propagator.expansion is not None
+        spread = propagator.expansion.spread
+        assert spread is not None
+        begun = np.append(initial_state, np.zeros(spread.states - spread.d))
+        truncation = Truncation(VaryingMotion(propagator, begun), spread)
+        influence = truncation.influence
+        if not np.isfinite(truncation.growth):
+            wide = "the state moves too far on a cell of parameters"
+            raise NotEnclosable(wide, along=int(influence.argmax()))
+        return SpreadMotion(truncation, influence)
+
+    @property
+    def motion(self) -> VaryingMotion:
+        """That of all coefficients."""
+        return self.truncation.motion
+
+    @property
+    def spread(self) -> Spread:
+        """How the state is expanded."""
+        return self.truncation.spread
 
     @property
     def grid(self) -> TimeGrid:
@@ -693,24 +717,9 @@ class SpreadMotion:
         return np.arange(self.states)
 
     @property
-    def influence(self) -> Array:
-        """What is left out does not depend on the cell."""
-        return np.zeros(self.space.nu)
-
-    @property
     def norm(self) -> float:
         """That of all coefficients."""
         return self.motion.norm
-
-    @cached_property
-    def recentred(self) -> Array:
-        """`Motion.recentred`."""
-        return self.spread.recentred(self.low, self.high)
-
-    @cached_property
-    def _most(self) -> Array:
-        """What every coefficient may add up to on the cell, ``(M,)``."""
-        return np.asarray(np.abs(self.recentred).sum(axis=0) * OUTWARD)
 
     def nodes(self, control: Array) -> Array:
         """`Motion.nodes`."""
@@ -735,17 +744,17 @@ class SpreadMotion:
         return np.asarray(found + rows @ self.truncation.under(control).T * OUTWARD)
 
     def along_cell(self, rows: Array) -> Array:
-        """Rows ``(r, d)`` as those of every coefficient on the cell, on all coefficients, ``(r M, states)``."""
-        found = self.recentred[None, :, :, None] * rows[:, None, None, :]
+        """Rows ``(r, d)`` as those of every coefficient, on all coefficients, ``(r M, states)``."""
+        found = np.eye(self.space.size)[None, :, :, None] * rows[:, None, None, :]
         return np.asarray(found.reshape(len(rows) * self.space.size, -1))
 
     def sizes(self, rows: Array) -> Array:
         """Rows ``(r, d)`` on sizes of states as such on sizes of all coefficients, ``(r, states)``."""
-        return np.asarray((self._most[None, :, None] * rows[:, None, :]).reshape(len(rows), -1))
+        return np.tile(rows, self.space.size)
 
     def folded(self, sizes: Array) -> Array:
         """What sizes ``(K, states)`` of all coefficients add up to, ``(K, d)``."""
-        return np.asarray(np.einsum("a,kad->kd", self._most, sizes.reshape(len(sizes), self.space.size, -1)))
+        return np.asarray(sizes.reshape(len(sizes), self.space.size, -1).sum(axis=1) * OUTWARD)
 
     def _apart(self, states: Array) -> Array:
         return states.reshape(len(states), self.space.size, self.states)

@@ -42,7 +42,7 @@ from sparserob_core.control.enclosures.decoupling import (
 )
 from sparserob_core.control.enclosures.flows import Flows
 from sparserob_core.control.enclosures.matrix_exponential import rounding
-from sparserob_core.control.enclosures.taylor import TaylorSpace
+from sparserob_core.control.enclosures.taylor import TaylorSpace, taylor_space
 from sparserob_core.control.problem.phase import Phase
 from sparserob_core.control.problem.system import LinearSystem, System
 from sparserob_core.control.response.response import TINY, Response, TimeGrid
@@ -330,10 +330,6 @@ class LiftedSystem:
         exact = square * (along + product(norms, reach.departure.on(twice).T).T)
         by_mode = np.minimum(square * reach.peak.on(twice), 2.0 * reach.integral.on(once))
         return np.asarray(np.minimum(exact, product(norms, by_mode.T).T))
-
-    @property
-    def recentred(self) -> None:
-        """The coefficients of its states are those on the cell."""
 
     @property
     def influence(self) -> Array:
@@ -704,10 +700,5 @@ def frozen(phase: Phase, grid: TimeGrid, initial_state: Array, parameter: Array)
     )
 
 
-_SPACES: dict[int, TaylorSpace] = {}
-
-
 def _space(nu: int) -> TaylorSpace:
-    if nu not in _SPACES:
-        _SPACES[nu] = TaylorSpace(nu, DEGREES.get(nu, 2))
-    return _SPACES[nu]
+    return taylor_space(nu, DEGREES.get(nu, 2))

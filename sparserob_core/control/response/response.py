@@ -17,12 +17,12 @@ from typing import NamedTuple
 import numpy as np
 
 from sparserob_core.control.enclosures.cache import remember
-from sparserob_core.control.enclosures.dependence import Spread
 from sparserob_core.control.enclosures.flows import FEW_STATES, Exponentials, Leaps
 from sparserob_core.control.enclosures.matrix_exponential import EPSILON, transitions
 from sparserob_core.control.problem.system import System
-from sparserob_core.control.response.varying.expansion import Expansion, Flow
-from sparserob_core.control.response.varying.spread import Parts, expanded
+from sparserob_core.control.response.varying.expansion import Expansion
+from sparserob_core.control.response.varying.spread import Parts, law_of
+from sparserob_core.errors import NotEnclosable
 from sparserob_core.shapes import Float, Int, shaped
 from sparserob_core.sip.convex_set import Array
 
@@ -361,7 +361,8 @@ class Stretches:
 @dataclass(frozen=True, eq=False)
 class Propagator:
     """What the responses of one system on one time grid share, from whatever initial state: transition matrices, and
-    functionals as weights. ``propagate``: the exponentials of a known system whose matrix has a structure.
+    functionals as weights. ``propagate``: the exponentials of a known system whose matrix has a structure. ``given``:
+    the system as polynomials in time, where that is made already.
 
     What a functional gives to every piece has two ways: of a known system on equal pieces it depends on the age of a
     piece alone (`Impulses`); else rows go back from piece to piece.
@@ -370,8 +371,9 @@ class Propagator:
     system: System
     grid: TimeGrid
     propagate: Exponentials | None = None
+    given: Expansion | None = None
     _steps: dict[bytes, Steps] = field(default_factory=dict, repr=False)
-    _flows: dict[bytes, Flow] = field(default_factory=dict, repr=False)
+    _flows: dict[bytes, tuple[Array, Array]] = field(default_factory=dict, repr=False)
     _exponentials: dict[int, Leaps] = field(default_factory=dict, repr=False)
 
     @cached_property
@@ -400,35 +402,63 @@ class Propagator:
         return modes
 
     @cached_property
-    def parts(self) -> Parts | None:
-        """Of a system that changes with time and whose state is no affine function of its parameters, the parts of
-        their box, on each of which it is expanded."""
-        return None if self.system.powers is None else expanded(self.system)
+    def laws(self) -> Parts | None:
+        """How the law of a system that changes with time depends on its parameters, on parts of their box; ``None``
+        where the state is an affine function of them, or there are none."""
+        return None if self.system.powers is None else law_of(self.system)
 
     @cached_property
-    def spread(self) -> tuple[tuple[Spread, Propagator], ...]:
-        """How the state is expanded on each of the `parts`, and what all coefficients do; nothing where there are
-        none."""
-        every = () if self.parts is None else self.parts.every
-        return tuple((how, Propagator(system, self.grid)) for how, system in every)
+    def _of_laws(self) -> tuple[Expansion, ...]:
+        """The law on each of the `laws`, as polynomials in time and parameters."""
+        return () if self.laws is None else tuple(Expansion.of(system) for _, system in self.laws.every)
 
-    def by_part(self, parameters: Array) -> list[tuple[np.ndarray, Spread, Propagator]]:
-        """Of parameters ``(k, nu)`` the numbers of those in every part, how it is expanded, and what all coefficients
-        do; parts that have none are left out."""
-        assert self.parts is not None
-        which = self.parts.of(parameters)
-        return [(np.flatnonzero(which == part), *self.spread[part]) for part in np.unique(which).tolist()]
+    def on_cell(self, low: Array, high: Array) -> Propagator:
+        """Return what all coefficients of the state do on a cell ``[low, high]`` of parameters, within one part.
+
+        Raises `NotEnclosable` where the cell lies in several of the parts on which the law is expanded.
+        """
+        assert self.laws is not None
+        part = self.laws.holding(low, high)
+        if part is None:
+            raise NotEnclosable("a cell of parameters lies in two parts of their box")
+        found = self._of_laws[part].on_cell(self.laws.every[part][0], low, high)
+        return Propagator(self.system, self.grid, given=found)
+
+    def at_point(self, parameter: Array) -> Propagator:
+        """Return what the known system at a parameter ``(nu,)`` does."""
+        assert self.laws is not None
+        part = int(self.laws.of(parameter[None])[0])
+        found = self._of_laws[part].at_point(self.laws.every[part][0], parameter)
+        return Propagator(self.system, self.grid, given=found)
+
+    def over(self, starts: Array, stops: Array, parameters: Array) -> tuple[Array, Array]:
+        """Return what intervals ``(k,)`` make of the state and of inputs at ``parameters (k, nu)``.
+
+        Returns
+        -------
+        Array, Array
+            The transitions ``(k, d, d)``; and what inputs that stay the same bring, those of the disturbance after the
+            others, ``(k, d, m + mw)``. Nothing is proven by them.
+        """
+        if self.laws is None:
+            assert self.expansion is not None
+            flow = self.expansion.flow(starts, stops)
+            return flow.state, np.concatenate([flow.control, flow.disturbance], axis=2)
+        which, found = self.laws.of(parameters), []
+        for part in np.unique(which).tolist():
+            here, how = np.flatnonzero(which == part), self.laws.every[part][0]
+            powers = how.space.monomials(how.shares(parameters[here]))
+            found.append((here, self._of_laws[part].at_parameters(starts[here], stops[here], powers)))
+        state, inputs = _joined_parts(found)
+        return state, inputs
 
     @shaped
     def steps(self, parameters: Float[Array, "v nu"]) -> Steps:
-        """Matrices and whole-piece transitions at parameters ``(v, nu)``, of all coefficients on the first of the
-        `parts` where there are any; remembered for the last few calls."""
-        if self.spread:
-            return self.spread[0][1].steps(np.zeros((1, 0)))
+        """Matrices and whole-piece transitions at parameters ``(v, nu)``; remembered for the last few calls."""
         # no parameters: any number of rows has the same bytes
         key = bytes(str(parameters.shape), "ascii") + parameters.tobytes()
-        if key not in self._steps and self.expansion is not None:
-            remember(self._steps, key, self._varying_steps(self.expansion), STEPS_KEPT)
+        if key not in self._steps and self.system.varies:
+            remember(self._steps, key, self._varying_steps(parameters), STEPS_KEPT)
         if key not in self._steps:
             every = [mode.matrices(parameters) for mode in self.system.modes]
             A, B, E = (
@@ -464,54 +494,29 @@ class Propagator:
             self._exponentials[mode] = Leaps(self.system.modes[mode].matrices(np.zeros((1, 0)))[0][0])
         return self._exponentials[mode]
 
-    def _varying_weights(
-        self,
-        expansion: Expansion,
-        times: Array,
-        directions: Array,
-        how: Spread | None = None,
-        parameters: Array | None = None,
-    ) -> Weights:
-        """`weights` of a system that changes with time, without an input matrix for every index; of all coefficients
-        where the state is a polynomial in ``parameters (k, nu)``, and ``directions`` are those of its values: within a
-        piece rows are theirs, and at its beginning those on the coefficients."""
-        steps, pieces = self.steps(np.zeros((1, 0))), self.grid.locate(times)
+    def _varying_weights(self, times: Array, directions: Array, parameters: Array) -> Weights:
+        """`weights` of a system that changes with time, without an input matrix for every index."""
+        unique, which = unique_rows(parameters)
+        steps, pieces, expansion = self.steps(unique), self.grid.locate(times), self.expansion
         order = np.argsort(-pieces, kind="stable")
         rows, at = np.array(directions, dtype=float)[order], pieces[order]
         begun = self.grid.breakpoints[at]
-        if how is None or parameters is None:
-            distinct, which = np.unique(np.stack([begun, np.maximum(times[order], begun)]), axis=1, return_inverse=True)
-            key, which = distinct.tobytes(), which.reshape(-1)
-            if key not in self._flows:
-                remember(self._flows, key, expansion.flow(distinct[0], distinct[1]), FLOWS_KEPT)
-            over = self._flows[key]
-            state, both = over.state[which], np.concatenate([over.control, over.disturbance], axis=2)[which]
+        if expansion is None:
+            state, both = self.over(begun, np.maximum(times[order], begun), parameters[order])
         else:
-            powers = how.space.monomials(how.shares(parameters[order]))
-            state, both = expansion.at_parameters(begun, np.maximum(times[order], begun), powers)
+            distinct, each = np.unique(np.stack([begun, np.maximum(times[order], begun)]), axis=1, return_inverse=True)
+            key, each = distinct.tobytes(), each.reshape(-1)
+            if key not in self._flows:
+                remember(self._flows, key, self.over(distinct[0], distinct[1], parameters[:0]), FLOWS_KEPT)
+            state, both = (part[each] for part in self._flows[key])
         found = np.zeros((times.size, self.grid.pieces, both.shape[2]))
         found[np.arange(times.size), at] = (rows[:, None] @ both)[:, 0]
         rows = (rows[:, None] @ state)[:, 0]
-        if how is not None and parameters is not None:
-            rows = how.directions(rows, parameters[order])
-        pushes, Phi = self._pushes, steps.Phi[0]
-        last = int(at[0]) if at.size else 0
-        reaching = np.searchsorted(-at, -np.arange(last)).tolist()
-        for piece in range(last - 1, -1, -1):
-            part = rows[: reaching[piece]]
-            found[: reaching[piece], piece] = part @ pushes[piece]
-            rows[: reaching[piece]] = part @ Phi[piece]
+        self._by_recursion(steps.pushed, which[order], at, rows, found)
         back = np.empty_like(order)
         back[order] = np.arange(order.size)
-        channels = expansion.channels[0]
+        channels = self.system.controls
         return Weights(rows[back], found[back, :, :channels], found[back, :, channels:])
-
-    @cached_property
-    def _pushes(self) -> Array:
-        """What a piece of a system that changes with time makes of an input, ``(L, d, m + mw)``."""
-        steps = self.steps(np.zeros((1, 0)))
-        both = np.concatenate([self.grid.of_modes(part[0]) for part in (steps.B, steps.E)], axis=2)
-        return np.asarray(both * self.grid.lengths[:, None, None])
 
     @cached_property
     def marks(self) -> Array:
@@ -519,34 +524,53 @@ class Propagator:
         these that is a breakpoint but for rounding counts as that, unless another law takes over there: then what
         moves the state jumps, however near a breakpoint is."""
         breaks = self.grid.breakpoints
-        if self.spread:
-            return np.unique(np.concatenate([every.marks for _, every in self.spread]))
-        if self.expansion is None:
-            return breaks
-        return np.union1d(_joined(breaks, self.expansion.ends[1:-1]), self.expansion.ends[list(self.expansion.turns)])
+        every = self._of_laws if self.expansion is None else (self.expansion,)
+        for one in every:
+            breaks = np.union1d(_joined(breaks, one.ends[1:-1]), one.ends[list(one.turns)])
+        return breaks
 
     @cached_property
     def expansion(self) -> Expansion | None:
-        """The system as polynomials in time, where it changes with time; that of all coefficients on the first of the
-        `parts` where there are any."""
-        if self.spread:
-            return self.spread[0][1].expansion
-        return Expansion.of(self.system) if self.system.varies else None
+        """The system as polynomials in time, where it changes with time and is known."""
+        if self.given is not None:
+            return self.given
+        return Expansion.of(self.system) if self.system.varies and self.laws is None else None
 
     @property
     def slack(self) -> float:
         """`Expansion.slack` of a system that changes with time, the largest one of all parts."""
-        every = [one.expansion for _, one in self.spread] or [self.expansion]
-        return max(0.0 if one is None else one.slack for one in every)
+        every = (self.expansion, *self._of_laws)
+        missed = 0.0 if self.laws is None else self.laws.missed
+        return missed + max(0.0 if one is None else one.slack for one in every)
 
-    def _varying_steps(self, expansion: Expansion) -> Steps:
+    def _varying_steps(self, parameters: Array) -> Steps:
         """Steps of a system that changes with time, whose pieces are modes: ``Gamma`` is the length of a piece, and
         ``B`` and ``E`` of a mode are what a piece makes of an input, per time."""
-        flow, lengths = expansion.flow(self.grid.breakpoints[:-1], self.grid.breakpoints[1:]), self.grid.lengths
-        A = expansion.average(self.grid.breakpoints)
-        Gamma = np.eye(A.shape[1]) * lengths[:, None, None]
-        B, E = (np.hstack(list(part / lengths[:, None, None])) for part in (flow.control, flow.disturbance))
-        return Steps(A[None], B[None], E[None], flow.state[None], Gamma[None], self._modes)
+        points = parameters if self.laws is not None else parameters[:1]
+        count, pieces, breaks, lengths = len(points), self.grid.pieces, self.grid.breakpoints, self.grid.lengths
+        both = np.tile(breaks[:-1], count), np.tile(breaks[1:], count)
+        state, pushes = self.over(*both, np.repeat(points, pieces, axis=0))
+        d, m = state.shape[1], self.system.controls
+        A = self._averages(points)
+        Gamma = np.broadcast_to(np.eye(d) * lengths[:, None, None], (count, pieces, d, d))
+        rates = (pushes.reshape(count, pieces, d, -1) / lengths[:, None, None]).swapaxes(1, 2)
+        B, E = (np.ascontiguousarray(part).reshape(count, d, -1) for part in (rates[..., :m], rates[..., m:]))
+        return Steps(A, B, E, state.reshape(count, pieces, d, d), Gamma, self._modes)
+
+    def _averages(self, points: Array) -> Array:
+        """About what ``A`` is on the pieces at parameters ``(v, nu)``, ``(v, L, d, d)``."""
+        breaks = self.grid.breakpoints
+        if self.laws is None:
+            assert self.expansion is not None
+            return self.expansion.average(breaks)[None]
+        which, d = self.laws.of(points), self.system.states
+        found = np.empty((len(points), self.grid.pieces, d, d))
+        for number, part in enumerate(which.tolist()):
+            how = self.laws.every[part][0]
+            powers = how.space.monomials(how.shares(points[number : number + 1]))[0]
+            first = self._of_laws[part].average(breaks)[:, :, :d].reshape(self.grid.pieces, -1, d, d)
+            found[number] = np.einsum("a,kaij->kij", powers, first)
+        return found
 
     def _varying_adjoint(
         self, expansion: Expansion, times: Array, directions: Array
@@ -578,16 +602,8 @@ class Propagator:
 
         ``times (k,)``, ``directions (k, d)``, ``parameters (k, nu)`` give ``free (k, d) = e^{A't} c``,
         ``gains (k, L, d) = int_{piece, s < t} e^{A'(t-s)} c ds``, and the input matrices ``B (k, d, J m)``,
-        ``E (k, d, J mw)`` at the parameters, those of several modes side by side (`TimeGrid.through`). Where there are
-        `parts` they are on all coefficients.
+        ``E (k, d, J mw)`` at the parameters, those of several modes side by side (`TimeGrid.through`).
         """
-        if self.spread:
-            none, found = np.zeros((times.size, 0)), []
-            for here, how, every in self.by_part(parameters):
-                rows = how.directions(directions[here], parameters[here])
-                found.append((here, every.adjoint(times[here], rows, none[here])))
-            free, gains, B, E = _joined_parts(found)
-            return free, gains, B, E
         if self.expansion is not None:
             return self._varying_adjoint(self.expansion, times, directions)
         if self.aged(parameters.shape[1]):
@@ -603,16 +619,8 @@ class Propagator:
     ) -> Weights:
         """The functional ``c'x(t)`` of each index as weights on what is given and on inputs: `adjoint` and
         `TimeGrid.through`, without ``(k, L, d)`` numbers."""
-        if self.spread:
-            found = []
-            for here, how, every in self.by_part(parameters):
-                assert every.expansion is not None
-                one = every._varying_weights(every.expansion, times[here], directions[here], how, parameters[here])
-                # at the beginning nothing depends on parameters
-                found.append((here, one._replace(free=one.free[:, : how.d])))
-            return Weights(*_joined_parts(found))
-        if self.expansion is not None:
-            return self._varying_weights(self.expansion, times, directions)
+        if self.system.varies:
+            return self._varying_weights(times, directions, parameters)
         if self.aged(parameters.shape[1]):
             channels = self.steps(np.zeros((1, 0))).B.shape[2]
             free, (control, disturbance) = self._by_age(times, directions, self.inputs, channels)
@@ -878,27 +886,26 @@ class Outputs:
     @cached_property
     def _over_pieces(self) -> tuple[Array, Array] | None:
         """Of a system that changes with time, what the beginning of its piece makes of every time: of the state,
-        ``(T, r, d)``, and of what acts, ``(T, r, m)``."""
-        expansion = self.propagator.expansion
-        if expansion is None:
+        ``(v, T, r, d)``, and of what acts, ``(v, T, r, m)``."""
+        if not self.propagator.system.varies:
             return None
-        begun = self.propagator.grid.breakpoints[self.within[0]]
-        flow = expansion.flow(begun, np.maximum(self.times, begun))
-        return self.H @ flow.state, self.H @ flow.control
+        begun, count = self.propagator.grid.breakpoints[self.within[0]], len(self.points)
+        stops, each = np.maximum(self.times, begun), np.repeat(self.points, begun.size, axis=0)
+        both = self.propagator.over(np.tile(begun, count), np.tile(stops, count), each)
+        flow, driven = ((self.H @ one).reshape(count, begun.size, len(self.H), -1) for one in both)
+        return flow, driven[..., : self.propagator.system.controls]
 
     def at(self, response: Response, control: Array) -> Array:
         """``(v, r, T)`` from the initial state of a response, under a control ``(m, K)`` on its own pieces."""
-        if self.propagator.spread:
-            return self._spread(response, control)
         steps, grid = self.propagator.steps(self.points), self.propagator.grid
         if self.propagator.aged(self.points.shape[1]) and self.propagator.block(steps) > 1:
             return self._in_blocks(response.initial_state, grid.inputs(control))[None]
         if self._over_pieces is not None:
             flow, driven = self._over_pieces
-            nodes, inputs = response.nodes(control, self.points)[0], grid.inputs(control).T
+            nodes, inputs = response.nodes(control, self.points), grid.inputs(control).T
             pieces = self.within[0]
-            held = np.einsum("trm,tm->rt", driven, inputs[pieces])
-            return np.asarray(np.einsum("tri,ti->rt", flow, nodes[pieces]) + held)[None]
+            held = np.einsum("vtrm,tm->vrt", driven, inputs[pieces])
+            return np.asarray(np.einsum("vtri,vti->vrt", flow, nodes[:, pieces]) + held)
         nodes, drive = response.nodes(control, self.points), grid.driven(steps.B, grid.inputs(control))
         pieces, which = self.within[0], self._kinds[2]
         flow, driven = (part[:, which] for part in self._steps)
@@ -906,29 +913,6 @@ class Outputs:
             "vtri,vti->vrt", driven, drive[:, pieces]
         )
         return np.asarray(found)
-
-    def _spread(self, response: Response, control: Array) -> Array:
-        """`at` of a system whose state is a polynomial in its parameters: from the values of this at the breakpoints
-        on, as of a known one."""
-        grid, pieces = self.propagator.grid, self.within[0]
-        nodes, inputs = response.nodes(control, self.points), grid.inputs(control).T[pieces]
-        flow, driven = self._at_points
-        found = np.einsum("vtri,vti->vrt", flow, nodes[:, pieces])
-        return np.asarray(found + np.einsum("vtrm,tm->vrt", driven, inputs))
-
-    @cached_property
-    def _at_points(self) -> tuple[Array, Array]:
-        """`_over_pieces` of a system whose state is a polynomial in its parameters, at each of the points, ``(v, T, r,
-        d)`` and ``(v, T, r, m)``."""
-        begun, count, found = self.propagator.grid.breakpoints[self.within[0]], self.times.size, []
-        stops = np.maximum(self.times, begun)
-        for here, how, every in self.propagator.by_part(self.points):
-            powers = np.repeat(how.space.monomials(how.shares(self.points[here])), count, axis=0)
-            assert every.expansion is not None
-            both = every.expansion.at_parameters(np.tile(begun, here.size), np.tile(stops, here.size), powers)
-            found.append((here, tuple((self.H @ one).reshape(here.size, count, len(self.H), -1) for one in both)))
-        flow, driven = _joined_parts(found)
-        return flow, driven[..., : self.propagator.system.controls]
 
     def _in_blocks(self, initial_state: Array, inputs: Array) -> Array:
         """``(r, T)`` from inputs ``(m, L)``."""
@@ -1043,9 +1027,9 @@ class Response:
     def numbers(self, parameters: int) -> int:
         """How many numbers `weights` of one index make at once, with so many ``parameters``."""
         system, grid = self.system, self.grid
-        if self.propagator.spread:
-            return int(grid.pieces * self.propagator.spread[0][0].states)
         width = system.states if parameters else system.controls + system.disturbances
+        if self.propagator.laws is not None:  # transitions of every piece
+            width *= system.states + system.controls + system.disturbances
         return int(grid.pieces * width)
 
     def flows(self, durations: Array) -> tuple[Array, Array]:
@@ -1090,8 +1074,6 @@ class Response:
         disturbances), ``disturbance (v, mw, M)`` on the disturbance's pieces or ``None``, ``deviations (v, d)`` of the
         initial state.
         """
-        if self.propagator.spread:
-            return self._spread_states(control, parameters, disturbance, deviations)
         steps = self.steps(parameters)
         count = max(part.shape[0] for part in (parameters, disturbance, deviations) if part is not None)
         drive = self.grid.driven(steps.B, self.grid.inputs(control))
@@ -1120,22 +1102,6 @@ class Response:
         for piece, length in enumerate(lengths):
             path[:, piece + 1] += moved(steps.Phi[:, length], path[:, piece])
         return path
-
-    def _spread_states(
-        self, control: Array, parameters: Array, disturbance: Array | None, deviations: Array | None
-    ) -> Array:
-        """`states` of a system whose state is a polynomial in its parameters."""
-        count = max(part.shape[0] for part in (parameters, disturbance, deviations) if part is not None)
-        each, states = np.broadcast_to(parameters, (count, parameters.shape[1])), []
-        for here, how, every in self.propagator.by_part(each):
-            more = np.zeros(how.states - how.d)
-            begun = Response(every.system, every.grid, np.append(self.initial_state, more), shared=every)
-            given = (None if one is None else one if len(one) == 1 else one[here] for one in (disturbance, deviations))
-            pushed, off = given
-            off = None if off is None else np.hstack([off, np.zeros((len(off), more.size))])
-            found = begun.states(control, np.zeros((1, 0)), pushed, off)
-            states.append((here, (how.seen(np.broadcast_to(found, (here.size, *found.shape[1:])), each[here]),)))
-        return _joined_parts(states)[0]
 
     def nodes(self, control: Array, parameters: Array) -> Array:
         """`states` without a disturbance, remembered for the last control, since all constraints ask for them."""

@@ -122,7 +122,7 @@ class InitialPlane:
             return np.zeros(times.size)
         columns = response.weights(times, directions, parameters).free[:, list(self.states)] * self.radius
         sizes = added_up(self.centred, times, directions, parameters) + np.abs(columns).sum(axis=1)
-        return np.asarray((SHARE + response.propagator.slack) * sizes + np.abs(directions) @ self.beyond)
+        return np.asarray((SHARE + response.propagator.slack) * sizes)
 
     def _off_at(self, cut: Cut) -> float:
         """What a row that holds with equality may be off by, under feedback; 0 for others, which are wider by that."""
@@ -258,15 +258,6 @@ class InitialPlane:
     def centred(self) -> Transcription:
         """The problem from the centre of the plane."""
         return from_state(self.model, self._state(np.zeros(2)))
-
-    @cached_property
-    def beyond(self) -> Array:
-        """What an expansion in the parameters leaves out of any state, ``(d,)``, wherever in the plane it begins."""
-        far = np.abs(self._state(np.zeros(2)))
-        far[list(self.states)] += np.abs(self.radius)
-        control = self.model.problem.control
-        reach = control.reach(np.eye(control.dimension))
-        return self.centred.functionals.from_state(far).beyond(reach)
 
     def _state(self, z: Array) -> Array:
         state = np.array(self.model.problem.initial_state, dtype=float)

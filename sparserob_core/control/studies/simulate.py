@@ -100,10 +100,8 @@ def walk(
 def _motion(response: Response, parameters: Array) -> Motion:
     """The way to follow a system that takes the least: ``parameters (n, nu)`` are those of the trajectories."""
     grid, system = response.grid, response.system
-    if response.propagator.spread:
-        return _InParameters(response, parameters)
     if grid.varying:
-        return _InTime(response)
+        return _InTime(response, parameters)
     many = grid.distinct(grid.lengths)[0].size * 4 * system.states**2 > HELD
     if many and not parameters.shape[1] and grid.mode is None:
         return _Apart(response)
@@ -166,11 +164,16 @@ class _Apart:
 
 
 class _InTime:
-    """A known system that changes with time: the transitions of the pieces."""
+    """A system that changes with time: the transitions of the pieces, of each trajectory at its parameters."""
 
-    def __init__(self, response: Response) -> None:
-        self.steps, grid = response.steps(np.zeros((1, 0))), response.grid
-        self.B, self.E = list(grid.of_modes(self.steps.B[0])), list(grid.of_modes(self.steps.E[0]))
+    def __init__(self, response: Response, parameters: Array) -> None:
+        each = parameters.shape[1] > 0
+        steps, self.lengths = response.steps(parameters if each else parameters[:1]), response.grid.lengths
+        inputs, m = steps.inputs, response.system.controls
+        self.Phi, self.B, self.E = (
+            [np.moveaxis(one, 0, -1) if each else one[0] for one in np.moveaxis(table, 1, 0)]
+            for table in (steps.Phi, inputs[..., :m], inputs[..., m:])
+        )
 
     def enter(self, states: Array) -> Array:
         return np.ascontiguousarray(states.T)
@@ -179,37 +182,8 @@ class _InTime:
         return state
 
     def step(self, piece: int, state: Array, control: Array, disturbance: Array) -> Array:
-        drive = self.B[piece] @ control + self.E[piece] @ disturbance
-        return np.asarray(self.steps.Phi[0, piece] @ state + self.steps.Gamma[0, piece] @ drive)
-
-
-class _InParameters:
-    """A system that changes with time and whose state is a polynomial in its parameters, on parts of their box: all
-    coefficients, of each trajectory those of its part."""
-
-    def __init__(self, response: Response, parameters: Array) -> None:
-        self.parameters, self.parts = parameters, response.propagator.by_part(parameters)
-        self.motions = [
-            _InTime(Response(every.system, every.grid, np.zeros(how.states), shared=every))
-            for _, how, every in self.parts
-        ]
-        self.more = self.parts[0][1].states - self.parts[0][1].d
-
-    def enter(self, states: Array) -> Array:
-        return np.vstack([states.T, np.zeros((self.more, len(states)))])
-
-    def leave(self, state: Array) -> Array:
-        found = np.empty((state.shape[0] - self.more, state.shape[1]))
-        for here, how, _ in self.parts:
-            found[:, here] = how.seen(state[:, here].T, self.parameters[here]).T
-        return found
-
-    def step(self, piece: int, state: Array, control: Array, disturbance: Array) -> Array:
-        found = np.empty(state.shape)
-        for (here, _, _), motion in zip(self.parts, self.motions, strict=True):
-            mine = (one if one.shape[1] == 1 else one[:, here] for one in (control, disturbance))
-            found[:, here] = motion.step(piece, state[:, here], *mine)
-        return found
+        drive = _times(self.B[piece], control) + _times(self.E[piece], disturbance)
+        return np.asarray(_times(self.Phi[piece], state) + self.lengths[piece] * drive)
 
 
 def delivered(command: Array, errors: Array) -> Callable[[int, Array], Array]:
@@ -235,7 +209,8 @@ def trajectories_at_once(response: Response, uncertain: bool) -> int:
     """How many trajectories are held in memory together."""
     grid, system = response.grid, response.system
     signals = HELD // (max(1, system.disturbances) * (int(grid.disturbance_piece.max()) + 1))
-    flows = HELD // (grid.distinct(grid.lengths)[0].size * 4 * system.states**2) if uncertain else signals
+    kinds = grid.pieces if grid.varying else grid.distinct(grid.lengths)[0].size
+    flows = HELD // (kinds * 4 * system.states**2) if uncertain else signals
     return int(np.clip(min(signals, flows), 16, 4096))
 
 

@@ -420,6 +420,61 @@ class Expansion:
         total = every.sum(axis=1)  # smallest terms first
         return np.asarray(total.swapaxes(1, 2).reshape(count, size * own, wide))
 
+    def on_cell(self, law: Spread, low: Array, high: Array) -> Expansion:
+        """Return the expansion of the state on a cell of parameters, on the same segments, from that of the law.
+
+        Parameters
+        ----------
+        law : Spread
+            How the law depends on the parameters, in the part of them that this expansion is of.
+        low, high : Array
+            Ends ``(nu,)`` of the cell, which lies in that part.
+
+        Returns
+        -------
+        Expansion
+            The system of all coefficients of the state, as polynomials that are from -1 to 1 on the cell. What the law
+            has beyond their degree is in the `Spread.left` of its ``spread``.
+        """
+        d, moved, (given, lost) = law.d, law.recentred(low, high), self._law(law)
+        sizes = np.abs(given).sum(axis=1)
+        rest = np.einsum("ab,sbij->saij", np.abs(moved), lost + rounding(8 * law.space.size) * sizes)
+        every = np.einsum("ab,snbij->snaij", moved, given)
+        how, kept = law.on_cell(low, high, self.ends, np.abs(every).sum(axis=1) + rest)
+        space = how.space
+        place = np.array([space.index[tuple(one)] for one in law.space.exponents[kept].tolist()], dtype=int)
+        table = np.zeros((*every.shape[:2], space.size, *every.shape[3:]))
+        table[:, :, place] = every[:, :, kept]
+        beside = np.zeros((len(rest), space.size, *rest.shape[2:]))
+        beside[:, place] = rest[:, kept] * (1.0 + 1e-9)
+        return Expansion(
+            self.ends,
+            _filled(space, table),
+            _filled(space, beside[:, None])[:, 0],
+            np.tile(self.units[:d], space.size),
+            np.ones((len(rest), how.states)),
+            self.channels,
+            self.turns,
+            how,
+        )
+
+    def at_point(self, law: Spread, parameter: Array) -> Expansion:
+        """Return the expansion of the known system at a ``parameter (nu,)``, from that of the law, which depends on the
+        parameters as ``law`` says."""
+        powers = law.space.monomials(law.shares(parameter[None]))[0]
+        given, lost = self._law(law)
+        every, rest = np.einsum("a,snaij->snij", powers, given), np.einsum("a,saij->sij", np.abs(powers), lost)
+        rest = rest + rounding(8 * powers.size) * np.einsum("a,saij->sij", np.abs(powers), np.abs(given).sum(axis=1))
+        units, ones = self.units[: law.d], np.ones((len(rest), law.d))
+        return Expansion(self.ends, every, rest, units, ones, self.channels, self.turns)
+
+    def _law(self, law: Spread) -> tuple[Array, Array]:
+        """The coefficients of the law in time and parameters, ``(s, p + 1, M, d, d + m + mw)``, and what those of every
+        parameter leave out, ``(s, M, d, d + m + mw)``."""
+        lost = np.concatenate([self.remainder[..., : law.d], self.remainder[..., self.units.size :]], axis=2)
+        shape = law.space.size, law.d, lost.shape[2]
+        return self._first.reshape(*self._first.shape[:2], *shape), lost.reshape(len(lost), *shape)
+
     def _within(self, segments: np.ndarray, starts: Array, stops: Array) -> tuple[Array, ...]:
         """`flow` of intervals within one segment each, with control and disturbance side by side."""
         length = stops - starts
@@ -603,6 +658,17 @@ def _tail(sizes: Array, shares: Array, summed: int | None = None) -> tuple[int, 
             if (tail <= IDLE).all():
                 break
     return terms, tail
+
+
+def _filled(space: TaylorSpace, law: Array) -> Array:
+    """``[A F]`` of all coefficients of the state, ``(s, p, M d, M d + n)``, from the coefficients ``(s, p, M, d, d +
+    n)`` of that of the state."""
+    left, right, target = space.products
+    count, orders, size, d, wide = law.shape
+    A = np.zeros((count, orders, size, size, d, d))
+    A[:, :, target, right] = law[:, :, left, :, :d]
+    whole = A.swapaxes(3, 4).reshape(count, orders, size * d, size * d)
+    return np.concatenate([whole, law[..., d:].reshape(count, orders, size * d, wide - d)], axis=3)
 
 
 def _spread_of(system: System) -> Spread | None:

@@ -1,19 +1,18 @@
-"""The state of a system that changes with time as a polynomial in its parameters: how far it is expanded, and on which
-parts of their box."""
+"""The law of a system that changes with time as a polynomial in its parameters: how far it is expanded, and on which
+parts of their box. States are expanded on cells of these, each by itself (`Expansion.on_cell`)."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise, product
 from math import comb
-from typing import NamedTuple, final
+from typing import final
 from weakref import WeakKeyDictionary, ref
 
 import numpy as np
 
-from sparserob_core.control.enclosures.dependence import MOST_POWERS, Left, Split, Spread
-from sparserob_core.control.enclosures.taylor import TaylorSpace
+from sparserob_core.control.enclosures.dependence import Left, Split, Spread
+from sparserob_core.control.enclosures.taylor import taylor_space
 from sparserob_core.control.problem.phase import Phase, PhaseInUnits
 from sparserob_core.control.problem.system import System
 from sparserob_core.control.response.varying.discs import NAMES, Cauchy, beyond, cauchy
@@ -22,28 +21,27 @@ from sparserob_core.control.sets.sets import Box
 from sparserob_core.errors import InputError
 from sparserob_core.sip.convex_set import Array
 
-LEFT = ((1e-14, 64), (1e-12, 100), (1e-10, 140))
-"""Of the state, what is beyond the degree is about, and with how many coefficients times states at most: the first that
-is reached. A proof needs 1e-8, and norms are counted many times on the way; of twice as many numbers a run takes some
-five times as long."""
-MOST_ORDERS = 60  # the degree, at most, of one state and one parameter: nearly as many numbers as `LEFT` allows first
+LEFT = (1e-14, 1e-12, 1e-10)
+"""Of the state, what is beyond the degree of the law is about: the first that is reached. A proof needs 1e-8."""
+NUMBERS = 400  # coefficients times states of a law; twice as many are matrices of 5 MB on each of its segments
 MOST_TERMS = 30  # the degree where entries are no polynomials: what 40 of them leave less is below what is rounded
-FURTHER = 40  # degrees beyond, of which what is left out is added up: of norms of a few the rest is far below `LEFT`
-LOOKS = 17  # times at which the coefficients of A are looked at; of an estimate, with which nothing is proven
-FAR = 600.0  # exponents of what is too far in any case, whose exponential is a number
-MOST_PARTS = 64  # of the box: an expansion of each takes as long as one of the whole, and each is proven alone
+LOOKS = 17  # times at which coefficients are looked at, to choose a parameter; nothing is proven with them
+DEGREE = 4  # of the coefficients that are looked at then
+MOST_PARTS = 64  # of the box: each is proven alone
 _KNOWN: WeakKeyDictionary[Phase, dict[tuple[object, ...], Parts]] = WeakKeyDictionary()
 
 
 @final
 @dataclass(frozen=True, eq=False)
 class Parts:
-    """A box of parameters in parts, and how the state depends on the parameters of each: ``every`` of them, how, and
+    """A box of parameters in parts, and how the law depends on the parameters of each: ``every`` of them, how, and
     the known system of all coefficients. ``edges``: where the parts of every parameter begin and end; the parts are
-    all their products, those of the last parameter one after another. All have the same polynomials."""
+    all their products, those of the last parameter one after another. All have the same polynomials. ``missed``: what
+    these leave of states is about, as a share."""
 
     edges: tuple[Array, ...]
     every: tuple[tuple[Spread, System], ...]
+    missed: float
 
     def of(self, parameters: Array) -> np.ndarray:
         """The part that each of ``parameters (k, nu)`` is in, ``(k,)``; at an edge any one that has it."""
@@ -81,48 +79,39 @@ class Parts:
         return np.concatenate(found[0]), np.concatenate(found[1])
 
 
-class Looks(NamedTuple):
-    """How far parameters move the state of a system: about the integrals of the norms of all coefficients of ``A`` of
-    the degrees 1, 2, ..., of which what is beyond a degree is about that of the exponential, ``paces``; what every
-    parameter has in them, ``shares (nu,)``; units of the states, ``scale (d,)``; and of entries that are no
-    polynomials, ``analytic``, what bounds the rest of their series."""
+def law_of(system: System) -> Parts:
+    """Return how the law of a system depends on its parameters, on parts of their box.
 
-    paces: Array
-    shares: Array
-    scale: Array
-    analytic: Cauchy | None
-
-
-def expanded(system: System) -> Parts:
-    """How the state of a system depends on its parameters: parts of their box, as many as take the least work; raises
-    `InputError` where too many were needed."""
+    Of entries that are polynomials there is one part, and nothing is left out. Others are power series, and parts are
+    as small as these need to be. Raises `InputError` where that takes too many parts.
+    """
     first, *others = system.phases
     kept, box = _KNOWN.setdefault(first, {}), system.box
     key = system.horizon, box.lower.tobytes(), box.upper.tobytes(), *((phase.begin, ref(phase)) for phase in others)
     if key not in kept:
-        kept[key] = _expanded(system) if system.stated is system else _in_units(system)
+        kept[key] = _made(system) if system.stated is system else _in_units(system)
     return kept[key]
 
 
-def _expanded(system: System) -> Parts:
-    """`expanded` of a system in the units that it is stated in."""
+def _made(system: System) -> Parts:
+    """`law_of` a system in the units that it is stated in."""
     edges, looks, degree = _parted(system)
     every = []
     for part, look in zip(_boxes(system, edges), looks, strict=True):
         centre, units = part.deviations
         assert part.powers is not None
-        left = None if look.analytic is None else look.analytic.left(degree)
-        how = Spread(system.states, TaylorSpace(centre.size, degree), centre, units, part.powers, left)
+        left = None if look is None else look.left(degree)
+        how = Spread(system.states, taylor_space(centre.size, degree), centre, units, part.powers, left)
         every.append((how, part.superposed(how)))
-    return Parts(edges, tuple(every))
+    return Parts(edges, tuple(every), max((_share(system, look, degree) for look in looks), default=0.0))
 
 
 def _in_units(system: System) -> Parts:
-    """`expanded` of one in its own units, which are powers of two: the same polynomials, in these units."""
+    """`law_of` a system in its own units, which are powers of two: the same polynomials, in these units."""
     law = system.phases[0]
     assert isinstance(law, PhaseInUnits)
     time, units = law.clock, law.units[1:]
-    known, every = expanded(system.stated), list[tuple[Spread, System]]()
+    known, every = law_of(system.stated), list[tuple[Spread, System]]()
     of = {name: law.factors[name] * np.ones(law._shape(name)) for name in NAMES if law.entry(name) is not None}
     for how, part in known.every:
         size, left = how.space.size, how.left
@@ -132,7 +121,8 @@ def _in_units(system: System) -> Parts:
         drift = np.tile(of["c"], (size, 1)) if "c" in of else 1.0
         scaled = part.in_units(whole[0], whole[1], whole[2], np.zeros(0), drift, time)
         every.append((replace(how, centre=how.centre / units, units=how.units / units, left=left), scaled))
-    return Parts(tuple(edges / one for edges, one in zip(known.edges, units, strict=True)), tuple(every))
+    edges = tuple(ends / one for ends, one in zip(known.edges, units, strict=True))
+    return Parts(edges, tuple(every), known.missed)
 
 
 def _boxes(system: System, edges: tuple[Array, ...]) -> list[System]:
@@ -142,39 +132,35 @@ def _boxes(system: System, edges: tuple[Array, ...]) -> list[System]:
     return [system] if len(corners) == 1 else [system.with_parameters(Box(low, high)) for low, high in corners]
 
 
-def _parted(system: System) -> tuple[tuple[Array, ...], list[Looks], int]:
-    """Where the parts of every parameter begin and end, how far they move the state, and the degree: of 1, 2, 4, ...
-    parts, halved along the parameter that moves the state most, those that take the least work, which is about that of
-    the square of how many numbers an expansion has."""
+def _parted(system: System) -> tuple[tuple[Array, ...], list[Cauchy | None], int]:
+    """Where the parts of every parameter begin and end, what bounds the rest of the series of their entries, and the
+    degree of these: of 1, 2, 4, ... parts, halved along the parameter that has most in what is left."""
     box, powers, d = system.box, system.powers, system.states
     assert powers is not None
-    nu, best, first = box.dimension, None, _looks(system)
-    paces = first.paces / float(MOST_PARTS) ** np.arange(1, first.paces.size + 1)  # of the smallest parts there may be
-    counts, hopeless = (
-        np.ones(nu, dtype=int),
-        _degree([first._replace(paces=paces, analytic=None)], nu, d, powers) is None,
-    )
-    while not hopeless and counts.prod() <= MOST_PARTS and (best is None or counts.prod() * d**2 < best[0]):
+    nu, counts = box.dimension, np.ones(box.dimension, dtype=int)
+    while counts.prod() <= MOST_PARTS:
         ends = zip(box.lower.tolist(), box.upper.tolist(), counts.tolist(), strict=True)
         edges = tuple(_edges(*one) for one in ends)
-        looks = [_looks(part) for part in _boxes(system, edges)] if counts.prod() > 1 else [first]
-        degree = _degree(looks, nu, d, powers)
-        if degree is not None:
-            work = counts.prod() * (d * comb(nu + degree, nu)) ** 2
-            if best is not None and work >= best[0]:
-                break
-            best = work, edges, looks, degree
-        counts[int(np.max([one.shares for one in looks], axis=0).argmax())] *= 2
-    if best is not None:
-        return best[1:]
+        boxes = _boxes(system, edges)
+        looks = [cauchy(part) if beyond(part, powers).any() else None for part in boxes]
+        for left, degree in product(LEFT, range(max(1, powers), MOST_TERMS + 1)):
+            if d * comb(nu + degree, nu) <= NUMBERS and all(_share(system, one, degree) <= left for one in looks):
+                return edges, looks, degree
+        counts[int(np.max([_slopes(part) for part in boxes], axis=0).argmax())] *= 2
     raise InputError(
         path="system.parameters",
-        expected="a box, beside the time t and in A, over which the state has an expansion of at most"
-        f" {LEFT[-1][1]} numbers, in at most {MOST_PARTS} parts: fewer parameters, smaller intervals, or a shorter"
-        " horizon",
-        got=f"parameters that move the state by up to e^{first.paces.sum():.2g}"
-        + ("" if first.analytic is None else ", and entries that are no polynomials in them"),
+        expected="a box, beside the time t, on which the entries are power series in the parameters of at most"
+        f" {NUMBERS} numbers times states, in at most {MOST_PARTS} parts: fewer parameters, or smaller intervals",
+        got="entries that are no polynomials in them, and turn too much for that",
     )
+
+
+def _share(system: System, look: Cauchy | None, degree: int) -> float:
+    """About what series leave of states, as a share; nothing of polynomials."""
+    if look is None:
+        return 0.0
+    A = np.max([np.abs(np.asarray(one.A, dtype=float)) for one in system.at(system.deviations[0]).modes], axis=0)
+    return (degree + 1) * look.share(degree, balanced(A, system.horizon))
 
 
 def _edges(low: float, high: float, count: int) -> Array:
@@ -184,52 +170,15 @@ def _edges(low: float, high: float, count: int) -> Array:
     return found
 
 
-def _degree(looks: Sequence[Looks], nu: int, d: int, powers: int) -> int | None:
-    """The degree of the expansion; ``None`` where it would have too many numbers. What is beyond grows as states do,
-    and meets states that grew: by the exponential of the paces each. Of series of entries as many products are beyond
-    as the degree is."""
-    paces = np.max([one.paces for one in looks], axis=0)
-    rest = tails(paces, MOST_ORDERS, FURTHER) * np.exp(min(2.0 * paces.sum(), FAR))
-    analytic = [(one.analytic, one.scale) for one in looks if one.analytic is not None]
-    for left, most in LEFT:
-        for degree in range(max(1, powers), (MOST_TERMS if analytic else MOST_ORDERS) + 1):
-            if rest[degree] > left or d * comb(nu + degree, nu) > most:
-                continue
-            if all((degree + 1) * entries.share(degree, scale) <= left for entries, scale in analytic):
-                return degree
-    return None
-
-
-def _looks(system: System) -> Looks:
-    """How far its parameters move the state of a system."""
-    (centre, units), powers = system.deviations, system.powers
-    assert powers is not None
-    nu, d = centre.size, system.states
-    A = np.max([np.abs(np.asarray(one.A, dtype=float)) for one in system.at(centre).modes], axis=0)
-    orders = [n for n in range(MOST_TERMS + 1) if d * comb(nu + n, nu) <= LEFT[-1][1]]
-    analytic = cauchy(system) if beyond(system, powers).any() else None
-    most = MOST_POWERS if analytic is None else orders[-1]
-    scale, paces, shares = balanced(A, system.horizon), np.zeros(1 + max(powers, most)), np.zeros(nu)
+def _slopes(system: System) -> Array:
+    """How much every parameter has to do with what entries are beside their constant coefficients, ``(nu,)``."""
+    (centre, units), found = system.deviations, np.zeros(system.box.dimension)
     for law in system.phases:
-        begin, until = law.begin, law.until
-        for time in np.linspace(begin, until, LOOKS).tolist():
-            parts = Split.of(law.entry("A"), time, centre, units, most).parts
-            for key, table in parts.items():
-                size = float((np.abs(table.astype(float)) * scale / scale[:, None]).sum(axis=1).max())
-                paces[sum(key)] += size * (until - begin) / LOOKS
-                shares += np.array(key) * size * (until - begin) / LOOKS
-            for name in () if analytic is None else ("B", "E", "c"):  # whose series must end too
-                parts = {} if law.entry(name) is None else Split.of(law.entry(name), time, centre, units, most).parts
-                sizes = {key: float(np.abs(table.astype(float)).max(initial=0.0)) for key, table in parts.items()}
-                whole = max(sum(sizes.values()), np.finfo(float).tiny)
-                shares += sum((np.array(key) * size / whole / LOOKS for key, size in sizes.items()), np.zeros(nu))
-    return Looks(paces[1:], shares, scale, analytic)
-
-
-def tails(paces: Array, degree: int, further: int) -> Array:
-    """The sums ``(degree + 1,)`` of the coefficients of ``exp(sum_b paces[b - 1] z^b)`` beyond 0, 1, ..., ``degree``,
-    as far as ``further`` ones."""
-    found, count = [1.0], paces.size
-    for n in range(1, degree + further + 1):
-        found.append(sum((b * float(paces[b - 1]) * found[n - b] for b in range(1, min(n, count) + 1)), 0.0) / n)
-    return np.cumsum(found[::-1])[::-1][1 : degree + 2]
+        for time, name in product(np.linspace(law.begin, law.until, LOOKS).tolist(), NAMES):
+            if (entry := law.entry(name)) is None:
+                continue
+            parts = Split.of(entry, time, centre, units, DEGREE).parts
+            sizes = {key: float(np.abs(table.astype(float)).max(initial=0.0)) for key, table in parts.items()}
+            whole = max(sum(sizes.values()), np.finfo(float).tiny)
+            found += sum((np.array(key) * size / whole for key, size in sizes.items()), np.zeros(found.size))
+    return found

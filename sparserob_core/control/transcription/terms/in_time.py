@@ -11,7 +11,7 @@ import numpy as np
 
 from sparserob_core.control.enclosures.dependence import Dependence
 from sparserob_core.control.problem.problem import OptimalControlProblem
-from sparserob_core.control.response.varying.spread import expanded
+from sparserob_core.control.response.varying.spread import law_of
 from sparserob_core.errors import InputError, NotEnclosable
 from sparserob_core.sip.convex_set import Array
 
@@ -47,7 +47,7 @@ def within_reach(problem: OptimalControlProblem) -> OptimalControlProblem | str:
         system = problem.system.in_time(problem.horizon)
         found, depends = replace(problem, system=system), system.dependence
         if system.powers is not None:
-            expanded(system.forced)
+            law_of(system.forced)
         elif depends is not None:
             corners_of_box(depends)
             system.superposed(depends)
