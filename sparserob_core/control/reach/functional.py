@@ -494,13 +494,27 @@ class WorstCase:
             cell = (low + high) / 2, (high - low) / 2
             legs: tuple[Leg, ...]
             if response.propagator.laws is not None:
-                legs = (SpreadMotion.of(response.propagator.on_cell(low, high), response.initial_state),)
+                legs = (self._on_cell(low, high),)
             elif response.grid.varying:
                 legs = (VaryingMotion(response.propagator, response.initial_state),)
             else:
                 legs = lift_legs(response.system, response.grid, response.initial_state, *cell)
             remember(self._legs, key, legs, LEGS_KEPT)
         return self._legs[key]
+
+    def _on_cell(self, low: Array, high: Array) -> SpreadMotion:
+        """The motion over a cell of parameters; how far states grow on the smallest cell around it is not asked
+        again."""
+        around = [growth for a, b, growth in self._grown if (a <= low).all() and (high <= b).all()]
+        known, response = min(around, default=None), self.response
+        leg = SpreadMotion.of(response.propagator.on_cell(low, high), response.initial_state, known)
+        if known is None:
+            self._grown.append((low, high, leg.truncation.growth))
+        return leg
+
+    @cached_property
+    def _grown(self) -> list[tuple[Array, Array, float]]:
+        return []
 
     @cached_property
     def _frozen(self) -> dict[bytes, LiftedSystem]:

@@ -17,7 +17,7 @@ leave (`Left`) is there too: that of ``A`` times all coefficients of the state, 
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -268,19 +268,29 @@ class VaryingMotion:
         ones, and with ``P`` the largest norm of them, each in the units of the pieces that end at both marks, and ``e``
         the sum of what all steps are off by in these, ``P^2 e / (1 - P e)`` more."""
         (units, off), first = self._steps_off, self._stretches[1]
-        count, d = units.shape
-        every, found = np.empty((count, d, d)), np.zeros((count + 1, first.size, d))
-        for k, step in enumerate(self.flow.state):
-            every[:k] = step @ every[:k]
-            every[k] = np.diag(units[k])
-            begun = first[first <= k]
-            found[k + 1, : begun.size] = np.maximum.reduceat(np.abs(every[: k + 1]).sum(axis=2), begun, axis=0)
+        found = np.zeros((len(units) + 1, first.size, self.states))
+        for mark, sums in enumerate(self.sums()):
+            begun = first[first < mark]
+            if mark:
+                found[mark, : begun.size] = np.maximum.reduceat(sums[1:], begun, axis=0)
+        found = self.expansion.of_all(found)
         before = np.concatenate([units[:1], units[:-1]])
         ends = np.concatenate([units[:1], units])
         largest = max(1.0, float((found / ends[:, None]).max()))
         share = largest * float((off * (before / units).max(axis=1)).sum())
         more = largest * share / (1.0 - share) if share < 0.5 else np.inf
         return found + np.where(found > 0.0, more * ends[:, None], 0.0)
+
+    def sums(self) -> Iterator[Array]:
+        """Yield, mark after mark, what the transitions to it from every mark up to it make of states that are at most 1
+        in the units of the piece before, ``(marks, d)``; of coefficients of polynomials, of the constant ones."""
+        units, own = self._steps_off[0], self.expansion.own
+        every = np.empty((len(units) + 1, self.states, own))
+        for mark in range(len(every)):
+            if mark:
+                every[:mark] = self.flow.state[mark - 1] @ every[:mark]
+            every[mark] = np.diag(units[max(mark - 1, 0)])[:, :own]
+            yield np.abs(every[: mark + 1]).sum(axis=2)
 
     def grown(self, pieces: np.ndarray, width: Array, sizes: Array) -> Array:
         """What states of at most ``sizes (k, d)`` may become within a ``width (k,)`` of a piece, ``(k, d)``: by the
@@ -514,10 +524,11 @@ class VaryingSupport:
 @dataclass(frozen=True, eq=False)
 class Truncation:
     """What an expansion leaves out of states that a ``motion`` of all coefficients tells of; in the norm of the units
-    of the first block of these."""
+    of the first block of these. ``known``: the `growth` on a cell around this one, where that is known."""
 
     motion: VaryingMotion
     spread: Spread
+    known: float | None = None
 
     @cached_property
     def units(self) -> Array:
@@ -607,25 +618,23 @@ class Truncation:
         on as in `VaryingMotion.carries`; in each of several norms, in which a degree ``j`` counts ``ratio^j``, so that
         it is off by that over this."""
         motion, space, d = self.motion, self.spread.space, self.spread.d
-        steps, marks, units = motion.flow.state, motion.grid.breakpoints, motion.expansion.units
+        marks = motion.grid.breakpoints
         counted = np.array(RATIOS)[:, None] ** np.arange(space.degree + 1)
-        every, found = np.empty((marks.size, motion.states, d)), np.empty((marks.size, space.degree + 1))
-        largest, ahead, first = np.ones(counted.shape[0]), np.zeros((counted.shape[0], marks.size - 1)), np.eye(d)
-        for k in range(marks.size):
-            if k:
-                every[:k] = steps[k - 1] @ every[:k]
-                ahead[:, k - 1] = counted @ self.norms((np.abs(steps[k - 1][:, :d]) * self.units).sum(axis=1))
-            every[k, :d], every[k, d:] = first, 0.0
-            norms = self.norms((np.abs(every[: k + 1]) * self.units).sum(axis=2))
-            found[k], largest = norms.max(axis=0), np.maximum(largest, (norms @ counted.T).max(axis=0))
-        error = np.array([motion.expansion.off(marks[:-1], marks[1:], ratio) for ratio in RATIOS])
-        share = largest * (error + rounding(units.size) * (ahead + error)).sum(axis=1) * OUTWARD
+        found, largest = np.empty((marks.size, space.degree + 1)), np.ones(counted.shape[0])
+        for mark, sums in enumerate(motion.sums()):
+            norms = self.norms(sums)
+            found[mark], largest = norms.max(axis=0), np.maximum(largest, (norms @ counted.T).max(axis=0))
+        ahead = counted @ self.norms((np.abs(motion.flow.state[:, :, :d]) * self.units).sum(axis=2)).T
+        error = motion.expansion.off(marks[:-1], marks[1:], RATIOS)
+        share = largest * (error + rounding(motion.states) * (ahead + error)).sum(axis=1) * OUTWARD
         near = np.where(share < 0.5, largest * share / np.where(share < 0.5, 1.0 - share, 1.0), np.inf)
         return np.asarray((found + (near[:, None] / counted).min(axis=0)) * OUTWARD)
 
     @cached_property
     def growth(self) -> float:
-        """The norm of the transitions from any time to any later one, at any parameter."""
+        """The norm of the transitions from any time to any later one, at any parameter; at most this."""
+        if self.known is not None:
+            return self.known
         sizes = self._sizes.sum(axis=1) + self._off[0]
         ends = float(np.exp((sizes * self.motion.grid.lengths).max()) * OUTWARD)
         marks = self._carried[:-1]
@@ -665,16 +674,16 @@ class SpreadMotion:
     influence: Array
 
     @staticmethod
-    def of(propagator: Propagator, initial_state: Array) -> SpreadMotion:
+    def of(propagator: Propagator, initial_state: Array, growth: float | None) -> SpreadMotion:
         """Return the motion of a system over the cell that its coefficients are expanded on.
 
-        Raises `NotEnclosable` where the cell is so wide that what is beyond the degree grows without a bound.
+        ``growth`` is that of a cell around this one, where it is known. Raises `NotEnclosable` where the cell is so wide that what is beyond the degree grows without a bound.
         """
         assert propagator.expansion is not None
         spread = propagator.expansion.spread
         assert spread is not None
         begun = np.append(initial_state, np.zeros(spread.states - spread.d))
-        truncation = Truncation(VaryingMotion(propagator, begun), spread)
+        truncation = Truncation(VaryingMotion(propagator, begun), spread, growth)
         influence = truncation.influence
         if not np.isfinite(truncation.growth):
             wide = "the state moves too far on a cell of parameters"

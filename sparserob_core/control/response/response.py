@@ -8,7 +8,7 @@ On every piece of the merged time grid the inputs are constant, so the state fol
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import pairwise
@@ -431,26 +431,39 @@ class Propagator:
         found = self._of_laws[part].at_point(self.laws.every[part][0], parameter)
         return Propagator(self.system, self.grid, given=found)
 
-    def over(self, starts: Array, stops: Array, parameters: Array) -> tuple[Array, Array]:
-        """Return what intervals ``(k,)`` make of the state and of inputs at ``parameters (k, nu)``.
+    def over(self, starts: Array, stops: Array, points: Array) -> tuple[Array, Array]:
+        """Return what intervals ``(k,)`` make of the state and of inputs at each of the parameters ``points (v, nu)``.
 
         Returns
         -------
         Array, Array
-            The transitions ``(k, d, d)``; and what inputs that stay the same bring, those of the disturbance after the
-            others, ``(k, d, m + mw)``. Nothing is proven by them.
+            The transitions ``(v, k, d, d)``; and what inputs that stay the same bring, those of the disturbance after
+            the others, ``(v, k, d, m + mw)``. Nothing is proven by them.
         """
         if self.laws is None:
             assert self.expansion is not None
             flow = self.expansion.flow(starts, stops)
-            return flow.state, np.concatenate([flow.control, flow.disturbance], axis=2)
-        which, found = self.laws.of(parameters), []
-        for part in np.unique(which).tolist():
-            here, how = np.flatnonzero(which == part), self.laws.every[part][0]
-            powers = how.space.monomials(how.shares(parameters[here]))
-            found.append((here, self._of_laws[part].at_parameters(starts[here], stops[here], powers)))
+            return flow.state[None], np.concatenate([flow.control, flow.disturbance], axis=2)[None]
+        found = [(here, of.at_parameters(starts, stops, powers[:, None])) for here, of, powers in self._by_part(points)]
         state, inputs = _joined_parts(found)
         return state, inputs
+
+    def _along(self, starts: Array, stops: Array, parameters: Array) -> tuple[Array, Array]:
+        """`over` of intervals each at its own of the ``parameters (k, nu)``, ``(k, d, d)`` and ``(k, d, m + mw)``."""
+        found = []
+        for here, of, powers in self._by_part(parameters):
+            both = of.at_parameters(starts[here], stops[here], powers[None])
+            found.append((here, (both[0][0], both[1][0])))
+        state, inputs = _joined_parts(found)
+        return state, inputs
+
+    def _by_part(self, points: Array) -> Iterator[tuple[np.ndarray, Expansion, Array]]:
+        """Of parameters ``(v, nu)`` the numbers of those in every part, the law there, and their monomials."""
+        assert self.laws is not None
+        which = self.laws.of(points)
+        for part in np.unique(which).tolist():
+            here, how = np.flatnonzero(which == part), self.laws.every[part][0]
+            yield here, self._of_laws[part], how.space.monomials(how.shares(points[here]))
 
     @shaped
     def steps(self, parameters: Float[Array, "v nu"]) -> Steps:
@@ -502,13 +515,13 @@ class Propagator:
         rows, at = np.array(directions, dtype=float)[order], pieces[order]
         begun = self.grid.breakpoints[at]
         if expansion is None:
-            state, both = self.over(begun, np.maximum(times[order], begun), parameters[order])
+            state, both = self._along(begun, np.maximum(times[order], begun), parameters[order])
         else:
             distinct, each = np.unique(np.stack([begun, np.maximum(times[order], begun)]), axis=1, return_inverse=True)
             key, each = distinct.tobytes(), each.reshape(-1)
             if key not in self._flows:
                 remember(self._flows, key, self.over(distinct[0], distinct[1], parameters[:0]), FLOWS_KEPT)
-            state, both = (part[each] for part in self._flows[key])
+            state, both = (part[0, each] for part in self._flows[key])
         found = np.zeros((times.size, self.grid.pieces, both.shape[2]))
         found[np.arange(times.size), at] = (rows[:, None] @ both)[:, 0]
         rows = (rows[:, None] @ state)[:, 0]
@@ -548,14 +561,13 @@ class Propagator:
         ``B`` and ``E`` of a mode are what a piece makes of an input, per time."""
         points = parameters if self.laws is not None else parameters[:1]
         count, pieces, breaks, lengths = len(points), self.grid.pieces, self.grid.breakpoints, self.grid.lengths
-        both = np.tile(breaks[:-1], count), np.tile(breaks[1:], count)
-        state, pushes = self.over(*both, np.repeat(points, pieces, axis=0))
-        d, m = state.shape[1], self.system.controls
+        state, pushes = self.over(breaks[:-1], breaks[1:], points)
+        d, m = state.shape[2], self.system.controls
         A = self._averages(points)
         Gamma = np.broadcast_to(np.eye(d) * lengths[:, None, None], (count, pieces, d, d))
-        rates = (pushes.reshape(count, pieces, d, -1) / lengths[:, None, None]).swapaxes(1, 2)
+        rates = (pushes / lengths[:, None, None]).swapaxes(1, 2)
         B, E = (np.ascontiguousarray(part).reshape(count, d, -1) for part in (rates[..., :m], rates[..., m:]))
-        return Steps(A, B, E, state.reshape(count, pieces, d, d), Gamma, self._modes)
+        return Steps(A, B, E, state, Gamma, self._modes)
 
     def _averages(self, points: Array) -> Array:
         """About what ``A`` is on the pieces at parameters ``(v, nu)``, ``(v, L, d, d)``."""
@@ -563,13 +575,11 @@ class Propagator:
         if self.laws is None:
             assert self.expansion is not None
             return self.expansion.average(breaks)[None]
-        which, d = self.laws.of(points), self.system.states
+        d = self.system.states
         found = np.empty((len(points), self.grid.pieces, d, d))
-        for number, part in enumerate(which.tolist()):
-            how = self.laws.every[part][0]
-            powers = how.space.monomials(how.shares(points[number : number + 1]))[0]
-            first = self._of_laws[part].average(breaks)[:, :, :d].reshape(self.grid.pieces, -1, d, d)
-            found[number] = np.einsum("a,kaij->kij", powers, first)
+        for here, of, powers in self._by_part(points):
+            first = of.average(breaks)[:, :, :d].reshape(self.grid.pieces, -1, d, d)
+            found[here] = np.einsum("va,kaij->vkij", powers, first)
         return found
 
     def _varying_adjoint(
@@ -889,10 +899,8 @@ class Outputs:
         ``(v, T, r, d)``, and of what acts, ``(v, T, r, m)``."""
         if not self.propagator.system.varies:
             return None
-        begun, count = self.propagator.grid.breakpoints[self.within[0]], len(self.points)
-        stops, each = np.maximum(self.times, begun), np.repeat(self.points, begun.size, axis=0)
-        both = self.propagator.over(np.tile(begun, count), np.tile(stops, count), each)
-        flow, driven = ((self.H @ one).reshape(count, begun.size, len(self.H), -1) for one in both)
+        begun = self.propagator.grid.breakpoints[self.within[0]]
+        flow, driven = (self.H @ one for one in self.propagator.over(begun, np.maximum(self.times, begun), self.points))
         return flow, driven[..., : self.propagator.system.controls]
 
     def at(self, response: Response, control: Array) -> Array:

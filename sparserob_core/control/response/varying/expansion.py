@@ -203,16 +203,25 @@ class Expansion:
 
     @shaped
     def at_parameters(
-        self, starts: Float[Array, " k"], stops: Float[Array, " k"], powers: Float[Array, "k M"]
-    ) -> tuple[Float[Array, "k d d"], Float[Array, "k d n"]]:
-        """What each of the intervals makes of states and of inputs, those of the disturbance after the others, where
-        the states are coefficients of polynomials whose monomials are ``powers (k, M)``: of the values of these.
+        self, starts: Float[Array, " k"], stops: Float[Array, " k"], powers: Float[Array, "v k1 M"]
+    ) -> tuple[Float[Array, "v k d d"], Float[Array, "v k d n"]]:
+        """Return what intervals make of the state and of inputs, of a law that is a polynomial in its parameters.
 
-        A system of few states, which is that of all coefficients at a parameter, but for products beyond the degree;
-        in it all is at most what it is in that of all coefficients, so that it is off by no more.
+        Parameters
+        ----------
+        starts, stops : Array
+            Times ``(k,)``.
+        powers : Array
+            Monomials ``(v, k, M)`` at the parameters of every interval, or ``(v, 1, M)`` where these are the same.
+
+        Returns
+        -------
+        Array, Array
+            The transitions ``(v, k, d, d)``; and what inputs that stay the same bring, those of the disturbance after
+            the others, ``(v, k, d, n)``.
         """
-        own = self.own
-        state, inputs = np.tile(np.eye(own), (starts.size, 1, 1)), np.zeros((starts.size, own, sum(self.channels)))
+        own, shape = self.own, (len(powers), starts.size)
+        state, inputs = np.tile(np.eye(own), (*shape, 1, 1)), np.zeros((*shape, own, sum(self.channels)))
         first = self.segment_of(starts)
         last = np.clip(np.searchsorted(self.ends, stops, side="left") - 1, first, self.ends.size - 2)
         for n in range(int((last - first).max(initial=-1)) + 1):
@@ -222,29 +231,31 @@ class Expansion:
             segments = first[here] + n
             begun = np.maximum(starts[here], self.ends[segments])
             ended = np.where(segments < last[here], self.ends[segments + 1], stops[here])
-            step = self._of_values(segments, begun, ended, powers[here])
-            state[here] = step[..., :own] @ state[here]
-            inputs[here] = step[..., :own] @ inputs[here] + step[..., own:]
+            step = self._of_values(segments, begun, ended, powers if powers.shape[1] == 1 else powers[:, here])
+            state[:, here] = step[..., :own] @ state[:, here]
+            inputs[:, here] = step[..., :own] @ inputs[:, here] + step[..., own:]
         return state, inputs
 
     def _of_values(self, segments: np.ndarray, starts: Array, stops: Array, powers: Array) -> Array:
-        """`at_parameters` of intervals within one segment each, side by side, ``(k, d, d + n)``."""
-        size, own, there = powers.shape[1], self.own, self._there
-        both = np.column_stack([segments, powers[:, there]])
-        _, first, which = np.unique(both, axis=0, return_index=True, return_inverse=True)
-        which, given = which.reshape(-1), self._first
-        given = given.reshape(*given.shape[:2], size, own, given.shape[3])[:, :, there]
-        values = np.einsum("ka,knaij->knij", powers[first][:, there], given[segments[first]])[which]
-        length = stops - starts
-        moved = self._moved(segments, starts, length)
-        law = (moved @ values.reshape(*values.shape[:2], -1)).reshape(values.shape) * length[:, None, None, None]
+        """`at_parameters` of intervals within one segment each, side by side, ``(v, k, d, d + n)``."""
+        size, own, there, length = powers.shape[2], self.own, self._there, stops - starts
+        distinct, which = np.unique(segments, return_inverse=True)
+        given = self._first[distinct].reshape(distinct.size, DEGREE + 1, size, own, -1)[:, :, there]
+        shape = (len(powers), starts.size, DEGREE + 1, own, given.shape[4])
+        if powers.shape[1] == 1:
+            values = np.einsum("va,snaij->vsnij", powers[:, 0, there], given)[:, which.reshape(-1)]
+        else:
+            values = np.einsum("vka,knaij->vknij", powers[:, :, there], given[which.reshape(-1)])
+        moved = self._moved(segments, starts, length) * length[:, None, None]
+        law = (moved @ values.reshape(*shape[:3], -1)).reshape(-1, *shape[2:])
         units = self.units[:own, None]
         sizes = (np.abs(law[..., :own]) * units[:, 0] / units).sum(axis=3).max(axis=2)
         pushes = np.abs(law[..., own:]) / units
         most = pushes.sum(axis=1).max(axis=1)
         shares = (pushes / np.where(most > 0.0, most, np.inf)[:, None, None]).max(axis=(2, 3), initial=0.0)
         terms, _ = _tail(sizes, shares)
-        return self._summed(law[..., :own], law[..., own:], terms, DEGREE, 1)
+        found = self._summed(law[..., :own], law[..., own:], terms, DEGREE, 1)
+        return found.reshape(*shape[:2], own, -1)
 
     @cached_property
     def _there(self) -> np.ndarray:
@@ -386,12 +397,23 @@ class Expansion:
         apart = sums.reshape(*sums.shape[:-1], -1, self.own).max(axis=-1)
         return np.asarray((apart * ratio**self.spread.space.degrees).sum(axis=-1))
 
-    def off(self, starts: Array, stops: Array, ratio: float) -> Array:
-        """What transitions over intervals within one segment each are off by, ``(k,)``, in the norm in which a degree
-        more counts ``ratio`` times as much."""
+    def off(self, starts: Array, stops: Array, ratios: Sequence[float]) -> Array:
+        """What transitions over intervals within one segment each are off by, in the norms in which a degree more
+        counts one of the ``ratios (r,)`` times as much, ``(r, k)``."""
         segments, length = self.segment_of((starts + stops) / 2), stops - starts
         table = segments, *self._recentred(segments, starts, length, length), length
-        return self._majorant(*table, ratio, self._majorant(*table)).error
+        summed = self._majorant(*table)
+        return np.array([self._majorant(*table, ratio, summed).error for ratio in ratios])
+
+    def of_all(self, sizes: Array) -> Array:
+        """What all states make at most, ``(..., d)``, from the ``sizes (..., d)`` that the first ones make: of
+        coefficients of polynomials the sums over products."""
+        if self.spread is None:
+            return sizes
+        left, _, target = self.spread.space.products
+        below = np.zeros((self.spread.space.size, self.spread.space.size))
+        below[target, left] = 1.0
+        return np.asarray((below @ sizes.reshape(*sizes.shape[:-1], -1, self.own)).reshape(sizes.shape))
 
     def _summed(self, A: Array, driven: Array, terms: int, degree: int, size: int) -> Array:
         """The sum ``(k, size own, own + n)`` of the series of ``x' = A x + driven`` from those of ``A (k, p, size own,
