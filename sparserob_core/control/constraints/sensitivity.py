@@ -17,7 +17,6 @@ from sparserob_core.control.constraints.state import StateConstraint
 from sparserob_core.control.reach.functional import CHUNK
 from sparserob_core.control.response.response import Response, TimeGrid
 from sparserob_core.control.response.sensitivity_system import tangent
-from sparserob_core.control.response.varying.expansion import Expansion
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.relaxed.index_gradient import differences
 
@@ -149,8 +148,9 @@ class Sensitivity:
             signals = by_block.worst(self._entered(weights, at))
         force = at.force(self.constraint.functionals.on_grid(x), signals)
         in_time, in_parameters, states = at.in_time(force), at.in_parameters(force), at.states(force)
-        if self._response.propagator.expansion is not None:
-            in_time = self._changing(self._response.propagator.expansion, times[:, 0], at, x, signals)
+        if self._response.system.varies:
+            in_time = self._changing(times[:, 0], parameters, at, x, signals)
+            in_parameters = self._differing(times[:, 0], parameters, at, x, signals)
         if closed:
             sigma = self._sigma_slopes(times[:, 0], parameters, at)
             in_time, in_parameters, states = in_time + sigma[0], in_parameters + sigma[1], states + sigma[2]
@@ -220,11 +220,26 @@ class Sensitivity:
         A = np.stack(every, axis=1)[np.arange(times.size), mode[pieces]]
         return response.adjoint(times, (c[:, None] @ A)[:, 0], parameters)[:2]
 
-    def _changing(self, expansion: Expansion, times: Array, at: Functional, x: Array, signals: Array | None) -> Array:
+    def _differing(self, times: Array, parameters: Array, at: Functional, x: Array, signals: Array | None) -> Array:
+        """`Functional.in_parameters` of a system that changes with time, by differences of ``c'x(t)``."""
+        control, box = self.constraint.functionals.on_grid(x), self.constraint.parameters
+
+        def value(p: Array, of: np.ndarray) -> Array:
+            known = self._response.weights(times[of], at.direction[of], p)
+            found = (known.free * at.start[of]).sum(axis=1) + np.einsum("klm,ml->k", known.control, control)
+            if signals is not None:
+                found = found + np.einsum("klw,kwl->k", known.disturbance, signals[of])
+            return np.asarray(found)
+
+        if not self._nu:
+            return np.zeros((times.size, 0))
+        return differences(value, parameters, box.box.lower, box.box.upper)
+
+    def _changing(self, times: Array, parameters: Array, at: Functional, x: Array, signals: Array | None) -> Array:
         """`Functional.in_time` of a system that changes with time, ``c'(A(t) x(t) + B(t) u + E(t) w)``."""
-        A, inputs = expansion.at(times)
+        A, inputs = self._response.propagator.law_at(times, parameters)
         along, pushes = (at.direction[:, None] @ A)[:, 0], (at.direction[:, None] @ inputs)[:, 0]
-        known = self._response.weights(times, along, np.zeros((times.size, 0)))
+        known = self._response.weights(times, along, parameters)
         control = self.constraint.functionals.on_grid(x)
         acting = control[:, at.now].T
         found = (known.free * at.start).sum(axis=1) + np.einsum("klm,ml->k", known.control, control)

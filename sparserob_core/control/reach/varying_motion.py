@@ -677,7 +677,8 @@ class SpreadMotion:
     def of(propagator: Propagator, initial_state: Array, growth: float | None) -> SpreadMotion:
         """Return the motion of a system over the cell that its coefficients are expanded on.
 
-        ``growth`` is that of a cell around this one, where it is known. Raises `NotEnclosable` where the cell is so wide that what is beyond the degree grows without a bound.
+        ``growth`` is that of a cell around this one, where it is known. Raises `NotEnclosable` where the cell is so
+        wide that what is beyond the degree grows without a bound.
         """
         assert propagator.expansion is not None
         spread = propagator.expansion.spread

@@ -582,26 +582,45 @@ class Propagator:
             found[here] = np.einsum("va,kaij->vkij", powers, first)
         return found
 
-    def _varying_adjoint(
-        self, expansion: Expansion, times: Array, directions: Array
-    ) -> tuple[Array, Array, Array, Array]:
+    def law_at(self, times: Array, parameters: Array) -> tuple[Array, Array]:
+        """Return ``A (k, d, d)`` and ``[B E] (k, d, m + mw)`` of a system that changes with time, at times ``(k,)`` and
+        ``parameters (k, nu)``; nothing is proven by them."""
+        if self.laws is None:
+            assert self.expansion is not None
+            return self.expansion.at(times)
+        found, d = [], self.system.states
+        for here, of, powers in self._by_part(parameters):
+            both = (one.reshape(here.size, -1, d, one.shape[2]) for one in of.at(times[here]))
+            A, inputs = (np.einsum("ka,kaij->kij", powers, one) for one in both)
+            found.append((here, (A[..., :d], inputs)))
+        A, inputs = _joined_parts(found)
+        return A, inputs
+
+    def _varying_adjoint(self, times: Array, directions: Array, parameters: Array) -> tuple[Array, Array, Array, Array]:
         """`adjoint` of a system that changes with time; the part of a piece before a time has a ``B`` and an ``E`` of
         its own."""
-        steps, pieces = self.steps(np.zeros((1, 0))), self.grid.locate(times)
+        unique, which = unique_rows(parameters)
+        steps, pieces, m = self.steps(unique), self.grid.locate(times), self.system.controls
         begun, every = self.grid.breakpoints[pieces], np.arange(times.size)
-        over = expansion.flow(begun, np.maximum(times, begun))
+        ends = np.maximum(times, begun)
+        if self.laws is None:
+            state, pushes = (one[0] for one in self.over(begun, ends, unique))
+        else:
+            state, pushes = self._along(begun, ends, parameters)
         d, L = directions.shape[1], self.grid.pieces
         gains, rows = np.zeros((times.size, L, d)), directions.astype(float)
         length = self.grid.lengths[pieces]
         gains[every, pieces] = rows * length[:, None]
-        B, E = (np.repeat(part, times.size, axis=0) for part in (steps.B, steps.E))
-        for table, part in ((B, over.control), (E, over.disturbance)):
+        B, E = steps.B[which], steps.E[which]
+        for table, part in ((B, pushes[..., :m]), (E, pushes[..., m:])):
             table.reshape(times.size, d, L, -1)[every, :, pieces] = part / length[:, None, None]
-        rows = (rows[:, None] @ over.state)[:, 0]
+        rows = (rows[:, None] @ state)[:, 0]
         for piece in range(int(pieces.max(initial=0)) - 1, -1, -1):
-            active = pieces > piece
+            active = np.flatnonzero(pieces > piece)
             gains[active, piece] = rows[active] * self.grid.lengths[piece]
-            rows[active] = rows[active] @ steps.Phi[0, piece]
+            over = steps.Phi[:, piece]
+            known = len(over) == 1
+            rows[active] = rows[active] @ over[0] if known else (rows[active, None] @ over[which[active]])[:, 0]
         return rows, gains, B, E
 
     @shaped
@@ -614,8 +633,8 @@ class Propagator:
         ``gains (k, L, d) = int_{piece, s < t} e^{A'(t-s)} c ds``, and the input matrices ``B (k, d, J m)``,
         ``E (k, d, J mw)`` at the parameters, those of several modes side by side (`TimeGrid.through`).
         """
-        if self.expansion is not None:
-            return self._varying_adjoint(self.expansion, times, directions)
+        if self.system.varies:
+            return self._varying_adjoint(times, directions, parameters)
         if self.aged(parameters.shape[1]):
             free, (gains,) = self._by_age(times, directions, self._every_state)
             which, steps = np.zeros(times.size, dtype=int), self.steps(np.zeros((1, 0)))

@@ -32,10 +32,10 @@ def tangent(response: Response) -> Response:
     ``(c, 0, ..., 0)``.
 
     Its states are ``1 + nu`` blocks of ``d``; its ``B`` and ``E`` hold those of the system and their derivatives, block
-    below block. A known system is its own.
+    below block. A known system is its own, and so is one that changes with time.
     """
     system, blocks = response.system, 1 + response.system.parameter_count
-    if blocks == 1:
+    if blocks == 1 or system.varies:
         return response
     larger = System(tuple(_larger(phase) for phase in system.phases), system.parameters)
     return Response(

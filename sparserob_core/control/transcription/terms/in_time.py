@@ -11,6 +11,7 @@ import numpy as np
 
 from sparserob_core.control.enclosures.dependence import Dependence
 from sparserob_core.control.problem.problem import OptimalControlProblem
+from sparserob_core.control.response.varying.expansion import Expansion
 from sparserob_core.control.response.varying.spread import law_of
 from sparserob_core.errors import InputError, NotEnclosable
 from sparserob_core.sip.convex_set import Array
@@ -47,7 +48,8 @@ def within_reach(problem: OptimalControlProblem) -> OptimalControlProblem | str:
         system = problem.system.in_time(problem.horizon)
         found, depends = replace(problem, system=system), system.dependence
         if system.powers is not None:
-            law_of(system.forced)
+            for _, law in law_of(system.forced).every:
+                Expansion.of(law)
         elif depends is not None:
             corners_of_box(depends)
             system.superposed(depends)
