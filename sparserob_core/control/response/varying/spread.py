@@ -28,6 +28,7 @@ MOST_TERMS = 30  # the degree where entries are no polynomials: what 40 of them 
 LOOKS = 17  # times at which coefficients are looked at, to choose a parameter; nothing is proven with them
 DEGREE = 4  # of the coefficients that are looked at then
 MOST_PARTS = 64  # of the box: each is proven alone
+FAR = 700.0  # exponent by which parameters move the state, whose exponential is still a number
 _KNOWN: WeakKeyDictionary[Phase, dict[tuple[object, ...], Parts]] = WeakKeyDictionary()
 
 
@@ -137,7 +138,14 @@ def _parted(system: System) -> tuple[tuple[Array, ...], list[Cauchy | None], int
     degree of these: of 1, 2, 4, ... parts, halved along the parameter that has most in what is left."""
     box, powers, d = system.box, system.powers, system.states
     assert powers is not None
-    nu, counts = box.dimension, np.ones(box.dimension, dtype=int)
+    nu, counts, far = box.dimension, np.ones(box.dimension, dtype=int), _exponent(system)
+    if far > FAR:
+        raise InputError(
+            path="system.parameters",
+            expected="a box, beside the time t and in A, over which the state has an expansion in double precision:"
+            " smaller intervals, or a shorter horizon",
+            got=f"parameters that move the state by up to e^{far:.2g}",
+        )
     while counts.prod() <= MOST_PARTS:
         ends = zip(box.lower.tolist(), box.upper.tolist(), counts.tolist(), strict=True)
         edges = tuple(_edges(*one) for one in ends)
@@ -153,6 +161,21 @@ def _parted(system: System) -> tuple[tuple[Array, ...], list[Cauchy | None], int
         f" {NUMBERS} numbers times states, in at most {MOST_PARTS} parts: fewer parameters, or smaller intervals",
         got="entries that are no polynomials in them, and turn too much for that",
     )
+
+
+def _exponent(system: System) -> float:
+    """By which exponent parameters may move the state: the integral of the norms of all coefficients of ``A`` but the
+    constant one."""
+    (centre, units), found = system.deviations, 0.0
+    A = np.max([np.abs(np.asarray(one.A, dtype=float)) for one in system.at(centre).modes], axis=0)
+    scale = balanced(A, system.horizon)
+    for law in system.phases:
+        for time in np.linspace(law.begin, law.until, LOOKS).tolist():
+            parts = Split.of(law.entry("A"), time, centre, units, DEGREE).parts
+            sizes = [np.abs(table.astype(float)) * scale / scale[:, None] for key, table in parts.items() if any(key)]
+            rate = sum(float(one.sum(axis=1).max()) for one in sizes)
+            found += rate * (law.until - law.begin) / LOOKS
+    return found
 
 
 def _share(system: System, look: Cauchy | None, degree: int) -> float:
