@@ -578,9 +578,15 @@ class Propagator:
         d = self.system.states
         found = np.empty((len(points), self.grid.pieces, d, d))
         for here, of, powers in self._by_part(points):
-            first = of.average(breaks)[:, :, :d].reshape(self.grid.pieces, -1, d, d)
-            found[here] = np.einsum("va,kaij->vkij", powers, first)
+            key = id(of).to_bytes(8)  # of one of the laws, which stay
+            if key not in self._middles:
+                self._middles[key] = of.average(breaks).reshape(self.grid.pieces, -1, d, d)
+            found[here] = np.einsum("va,kaij->vkij", powers, self._middles[key])
         return found
+
+    @cached_property
+    def _middles(self) -> dict[bytes, Array]:
+        return {}
 
     def law_at(self, times: Array, parameters: Array) -> tuple[Array, Array]:
         """Return ``A (k, d, d)`` and ``[B E] (k, d, m + mw)`` of a system that changes with time, at times ``(k,)`` and
@@ -592,7 +598,7 @@ class Propagator:
         for here, of, powers in self._by_part(parameters):
             both = (one.reshape(here.size, -1, d, one.shape[2]) for one in of.at(times[here]))
             A, inputs = (np.einsum("ka,kaij->kij", powers, one) for one in both)
-            found.append((here, (A[..., :d], inputs)))
+            found.append((here, (A, inputs)))
         A, inputs = _joined_parts(found)
         return A, inputs
 

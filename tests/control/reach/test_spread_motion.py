@@ -84,7 +84,9 @@ def test_cells_of_time_end_where_a_segment_of_any_part_does() -> None:
     breaks = np.linspace(0.0, 3.0, 3)
     propagator = Propagator(system, merge_grids(breaks, breaks, varying=True))
     assert propagator.laws is not None
-    every = [(Expansion.of(one).ends, propagator.laws.ends(part)) for part, (_, one) in enumerate(propagator.laws.every)]
+    every = [
+        (Expansion.of(one).ends, propagator.laws.ends(part)) for part, (_, one) in enumerate(propagator.laws.every)
+    ]
     assert len({ends.size for ends, _ in every}) > 1
     for ends, cell in every:
         assert np.isin(ends, propagator.marks).all()
@@ -217,7 +219,11 @@ def test_norms_of_coefficients_hold_what_transitions_are_off_by(off: float, monk
         wrong, flow = np.zeros((1, 7, 1)), truncation.motion.flow
         wrong[0, 6] = off
         truncation.motion.__dict__["flow"] = flow._replace(state=flow.state - spread.filled(wrong))
-        monkeypatch.setattr(Expansion, "off", lambda _, starts, stops, ratio: np.full((len(ratio), starts.size), off * np.array(ratio)[:, None] ** 6))
+        monkeypatch.setattr(
+            Expansion,
+            "off",
+            lambda _, starts, stops, ratio: np.full((len(ratio), starts.size), off * np.array(ratio)[:, None] ** 6),
+        )
     turned = (np.cos(2 * marks[:, None]) - np.cos(2 * marks)) / 2  # of the integral of p sin(2 t), from one to another
     still = np.exp(-(marks[:, None] - marks) / 2 + centre[0] * turned)
     found = truncation._carried

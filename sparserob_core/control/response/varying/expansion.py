@@ -283,16 +283,17 @@ class Expansion:
         return np.clip(np.searchsorted(self.ends, times, side="right") - 1, 0, self.ends.size - 2)
 
     @shaped
-    def at(self, times: Float[Array, " k"]) -> tuple[Float[Array, "k d d"], Float[Array, "k d n"]]:
-        """``A`` and ``[B E]`` at times ``(k,)``, for what asks which way the state goes; nothing is proven by them."""
-        segments, d = self.segment_of(times), self.units.size
+    def at(self, times: Float[Array, " k"]) -> tuple[Float[Array, "k d own"], Float[Array, "k d n"]]:
+        """``A`` and ``[B E]`` at times ``(k,)``, for what asks which way the state goes; nothing is proven by them. Of
+        coefficients of polynomials the columns of ``A`` that make the others."""
+        segments, d = self.segment_of(times), self.own
         begin, end = self.ends[segments], self.ends[segments + 1]
         powers = ((2.0 * times - begin - end) / (end - begin))[:, None] ** np.arange(DEGREE + 1)
-        law = np.einsum("kn,knij->kij", powers, self.coefficients[segments])
+        law = np.einsum("kn,knij->kij", powers, self._first[segments])
         return law[..., :d], law[..., d:]
 
     @shaped
-    def average(self, times: Float[Array, " T"]) -> Float[Array, "k d d"]:
+    def average(self, times: Float[Array, " T"]) -> Float[Array, "k d own"]:
         """About what ``A`` is between ``times (k + 1,)``: at the middles, for what asks how fast the system is."""
         return self.at((times[:-1] + times[1:]) / 2)[0]
 
