@@ -135,7 +135,7 @@ def _boxes(system: System, edges: tuple[Array, ...]) -> list[System]:
 
 def _parted(system: System) -> tuple[tuple[Array, ...], list[Cauchy | None], int]:
     """Where the parts of every parameter begin and end, what bounds the rest of the series of their entries, and the
-    degree of these: of 1, 2, 4, ... parts, halved along the parameter that has most in what is left."""
+    degree of these: of 1, 2, 4, ... parts, halved along the parameter in which that leaves least."""
     box, powers, d = system.box, system.powers, system.states
     assert powers is not None
     nu, counts, far = box.dimension, np.ones(box.dimension, dtype=int), _exponent(system)
@@ -146,21 +146,31 @@ def _parted(system: System) -> tuple[tuple[Array, ...], list[Cauchy | None], int
             " smaller intervals, or a shorter horizon",
             got=f"parameters that move the state by up to e^{far:.2g}",
         )
+    highest = max(
+        n for n in range(max(1, powers), MOST_TERMS + 1) if n <= max(1, powers) or d * comb(nu + n, nu) <= NUMBERS
+    )
     while counts.prod() <= MOST_PARTS:
-        ends = zip(box.lower.tolist(), box.upper.tolist(), counts.tolist(), strict=True)
-        edges = tuple(_edges(*one) for one in ends)
-        boxes = _boxes(system, edges)
-        looks = [cauchy(part) if beyond(part, powers).any() else None for part in boxes]
-        for left, degree in product(LEFT, range(max(1, powers), MOST_TERMS + 1)):
-            if d * comb(nu + degree, nu) <= NUMBERS and all(_share(system, one, degree) <= left for one in looks):
+        edges, looks = _looked(system, counts)
+        for left, degree in product(LEFT, range(max(1, powers), highest + 1)):
+            if all(_share(system, one, degree) <= left for one in looks):
                 return edges, looks, degree
-        counts[int(np.max([_slopes(part) for part in boxes], axis=0).argmax())] *= 2
+        finer = [counts * (1 + one) for one in np.eye(nu, dtype=int)]
+        counts = min(finer, key=lambda one: max(_share(system, look, highest) for look in _looked(system, one)[1]))
     raise InputError(
         path="system.parameters",
         expected="a box, beside the time t, on which the entries are power series in the parameters of at most"
         f" {NUMBERS} numbers times states, in at most {MOST_PARTS} parts: fewer parameters, or smaller intervals",
         got="entries that are no polynomials in them, and turn too much for that",
     )
+
+
+def _looked(system: System, counts: np.ndarray) -> tuple[tuple[Array, ...], list[Cauchy | None]]:
+    """The ends of so many parts of every parameter, and what bounds the rest of the series of entries on each part."""
+    box, powers = system.box, system.powers
+    assert powers is not None
+    ends = zip(box.lower.tolist(), box.upper.tolist(), counts.tolist(), strict=True)
+    edges = tuple(_edges(*one) for one in ends)
+    return edges, [cauchy(part) if beyond(part, powers).any() else None for part in _boxes(system, edges)]
 
 
 def _exponent(system: System) -> float:
@@ -190,18 +200,4 @@ def _edges(low: float, high: float, count: int) -> Array:
     """The ends of ``count`` equal parts of an interval."""
     found = np.linspace(low, high, count + 1)
     found[0], found[-1] = low, high
-    return found
-
-
-def _slopes(system: System) -> Array:
-    """How much every parameter has to do with what entries are beside their constant coefficients, ``(nu,)``."""
-    (centre, units), found = system.deviations, np.zeros(system.box.dimension)
-    for law in system.phases:
-        for time, name in product(np.linspace(law.begin, law.until, LOOKS).tolist(), NAMES):
-            if (entry := law.entry(name)) is None:
-                continue
-            parts = Split.of(entry, time, centre, units, DEGREE).parts
-            sizes = {key: float(np.abs(table.astype(float)).max(initial=0.0)) for key, table in parts.items()}
-            whole = max(sum(sizes.values()), np.finfo(float).tiny)
-            found += sum((np.array(key) * size / whole for key, size in sizes.items()), np.zeros(found.size))
     return found
