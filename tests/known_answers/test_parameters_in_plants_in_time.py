@@ -90,6 +90,21 @@ TWO["problem"]["system"] = {
     "parameters": {"p": [-0.05, 0.08], "q": [-0.02, 0.02]},
 }
 TWO["problem"]["path"], TWO["problem"]["terminal"] = [{"box": [0.45], "from": 1.2}], [{"box": [0.15]}]
+THREE: Config = copy.deepcopy(TWO)  # far beyond what one expansion of the state holds
+THREE["problem"]["system"] = {
+    "A": [["-0.5 - p*sin(2*t) - q*t + r"]],
+    "B": [["1 + p*r"]],
+    "E": [[1]],
+    "parameters": {"p": [-0.2, 0.3], "q": [-0.1, 0.1], "r": [-0.15, 0.15]},
+}
+THREE["problem"].update(path=[{"box": [1.3]}], terminal=[{"box": [0.3]}])
+FRACTIONS: Config = copy.deepcopy(THREE)  # a pole at some six times the half of an interval
+FRACTIONS["problem"]["system"] = {
+    "A": [["-0.5/(1 + p) - q*t + r"]],
+    "B": [["1"]],
+    "E": [[1]],
+    "parameters": {"p": [-0.15, 0.15], "q": [-0.1, 0.1], "r": [-0.1, 0.1]},
+}
 """A state at one parameter is ``x(t) = int exp(a(t) - a(s)) (...) ds``: what of that each of the two has."""
 CLOSED: dict[str, tuple[Callable[..., np.ndarray], Callable[..., float]]] = {
     "decay": (lambda t, p: -t / 2 - p * (1 - np.cos(2 * t)) / 2, lambda p: 1 + p * p),
@@ -98,6 +113,11 @@ CLOSED: dict[str, tuple[Callable[..., np.ndarray], Callable[..., float]]] = {
         lambda t, p, q: -t / 2 - p * (1 - np.cos(2 * t)) / 2 - q * t**2 / 2 + p * q * t,
         lambda p, q: 1 + p * p,
     ),
+    "three": (
+        lambda t, p, q, r: -t / 2 - p * (1 - np.cos(2 * t)) / 2 - q * t**2 / 2 + r * t,
+        lambda p, q, r: 1 + p * r,
+    ),
+    "fractions": (lambda t, p, q, r: -t / 2 / (1 + p) - q * t**2 / 2 + r * t, lambda p, q, r: 1.0),
 }
 
 
@@ -157,6 +177,15 @@ def test_two_parameters_in_the_plant_cost_what_their_closed_form_says(
     outcome = solved(TWO, tmp_path / "run")
     assert outcome.result.status == "certified"
     assert outcome.result.cost == pytest.approx(least(TWO, "two", 5), rel=1e-4)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["three", "fractions"])
+def test_three_parameters_that_move_the_state_far_cost_what_their_closed_form_says(name: str, tmp_path: Path) -> None:
+    config = THREE if name == "three" else FRACTIONS
+    outcome = solved(config, tmp_path / "run")
+    assert outcome.result.status == "certified"
+    assert outcome.result.cost == pytest.approx(least(config, name, 5), rel=1e-3)
 
 
 SPRING: Config = {

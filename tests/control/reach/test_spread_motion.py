@@ -11,14 +11,16 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import sparserob_core as sr
+from sparserob_core.control.enclosures import dependence
 from sparserob_core.control.enclosures.dependence import Spread
 from sparserob_core.control.enclosures.taylor import TaylorSpace
-from sparserob_core.control.reach.varying_motion import Truncation, VaryingMotion
+from sparserob_core.control.reach.varying_motion import SpreadMotion, Truncation, VaryingMotion
 from sparserob_core.control.response.response import Outputs, Propagator, Response, merge_grids
 from sparserob_core.control.response.varying import spread as expansions
 from sparserob_core.control.response.varying.discs import cauchy
 from sparserob_core.control.response.varying.expansion import Expansion
 from sparserob_core.control.transcription.transcribe import prepare
+from sparserob_core.errors import NotEnclosable
 
 BOX = sr.Box([-0.3], [0.6])
 SYSTEM = sr.VaryingSystem.of([["-0.5 - p*sin(2*t)"]], [["1 + p^2"]], 3.0, [[1]], parameters=BOX, names=["p"])
@@ -233,3 +235,119 @@ def test_norms_of_coefficients_hold_what_transitions_are_off_by(off: float, monk
             largest = exact[k, : k + 1].max()
             assert found[k, degree] >= largest * (1.0 - 1e-13)
             assert off or found[k, degree] <= largest * (1.0 + 1e-9) + 1e-12 / 2.0**degree
+
+
+LOW, HIGH = np.array([0.15, -0.05]), np.array([0.22, 0.03])
+
+
+@pytest.fixture(scope="module")
+def pushed() -> Propagator:
+    breaks = np.linspace(0.0, 3.0, 4)
+    return Propagator(PUSHED, merge_grids(breaks, breaks, varying=True))
+
+
+def entries(t: float, p: float, q: float) -> np.ndarray:
+    """``[A B E]`` of `PUSHED`."""
+    A = [[0.0, 1.0], [-(1 + p * np.sin(2 * t)) - q, -1 / (4 + q)]]
+    return np.hstack([A, [[0.0], [1 + p**2 * np.cos(t)]], [[q], [1.0]]])
+
+
+def seen_at(expansion: Expansion, t: float, powers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """``[A B E]`` at a time from the coefficients of an expansion with these monomials, and what is left out."""
+    (k,) = expansion.segment_of(np.array([t]))
+    share = (2 * t - expansion.ends[k] - expansion.ends[k + 1]) / (expansion.ends[k + 1] - expansion.ends[k])
+    law = np.einsum("n,nij->ij", share ** np.arange(expansion.coefficients.shape[1]), expansion.coefficients[k])
+    both = []
+    for table, weights in ((law, powers), (expansion.remainder[k], np.abs(powers))):
+        first = np.hstack([table[:, :2], table[:, expansion.units.size :]])
+        both.append(np.einsum("a,aij->ij", weights, first.reshape(powers.size, 2, -1)))
+    return both[0], both[1]
+
+
+def test_the_law_on_a_cell_is_that_of_its_parameters_but_for_what_it_says(pushed: Propagator) -> None:
+    expansion, rng = pushed.on_cell(LOW, HIGH).expansion, np.random.default_rng(8)
+    assert expansion is not None
+    assert expansion.spread is not None
+    for t, *shares in rng.uniform([0.0, -1.0, -1.0], [3.0, 1.0, 1.0], (40, 3)).tolist():
+        p, q = (LOW + HIGH) / 2 + (HIGH - LOW) / 2 * np.array(shares)
+        law, left = seen_at(expansion, t, expansion.spread.space.monomials(np.array([shares]))[0])
+        beyond = 0.0 if expansion.spread.left is None else expansion.spread.left.over(np.array([t, t]))[0]
+        off = np.abs(law - entries(t, float(p), float(q)))
+        assert (off <= left + beyond).all()
+        assert off.max() < 1e-9
+
+
+def test_what_a_cell_leaves_of_its_law_is_counted_and_nothing_else(
+    pushed: Propagator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(dependence, "NUMBERS_ON_CELL", 6)  # so few that the degree is 1, and q/(4 + q) and p^2 are not
+    expansion = pushed.on_cell(LOW, HIGH).expansion
+    assert expansion is not None
+    assert expansion.spread is not None
+    assert expansion.spread.space.degree == 1
+    assert expansion.spread.left is not None
+    r, s = (HIGH - LOW) / 2
+    left = expansion.spread.left.over(np.array([0.0, 0.3]))[0]
+    assert r**2 <= left[1, 2] <= 1.3 * r**2  # of 1 + p^2 cos t
+    assert s**2 / 4.05**3 <= left[1, 1] <= 1.3 * s**2 / 3.9**3  # of -1 / (4 + q)
+    assert left[0].max() < 1e-15
+    assert left[1, 0] < 1e-15
+
+
+def test_a_known_plant_at_a_parameter_is_what_the_law_is_there(pushed: Propagator) -> None:
+    expansion, rng = pushed.at_point(np.array([0.27, 0.02])).expansion, np.random.default_rng(9)
+    assert expansion is not None
+    for t in rng.uniform(0.0, 3.0, 20).tolist():
+        law, left = seen_at(expansion, t, np.ones(1))
+        off = np.abs(law - entries(t, 0.27, 0.02))
+        assert (off <= left + 1e-13).all()
+        assert left.max() < 1e-12
+        A, inputs = pushed.law_at(np.array([t]), np.array([[0.27, 0.02]]))
+        assert np.hstack([A[0], inputs[0]]) == pytest.approx(entries(t, 0.27, 0.02), abs=1e-12)
+
+
+def test_cells_whose_state_moves_too_far_say_along_which_parameter() -> None:
+    law = [["p*sin(2*t) + q"]]
+    box = sr.Box([-3.0, -0.1], [3.0, 0.1])
+    system = sr.VaryingSystem.of(law, [[1]], 3.0, parameters=box, names=["p", "q"])
+    breaks = np.linspace(0.0, 3.0, 4)
+    propagator = Propagator(system, merge_grids(breaks, breaks, varying=True))
+    with pytest.raises(NotEnclosable) as raised:
+        SpreadMotion.of(propagator.on_cell(box.lower, box.upper), np.ones(1), None)
+    assert raised.value.along == 0
+    wide = SpreadMotion.of(propagator.on_cell(np.array([0.0, -0.1]), np.array([0.5, 0.1])), np.ones(1), None)
+    inside = SpreadMotion.of(propagator.on_cell(np.array([0.2, 0.0]), np.array([0.3, 0.1])), np.ones(1), None)
+    # transitions over [s, t] are exp(p (cos 2s - cos 2t) / 2 + q (t - s)), at most on the larger cell
+    t = np.linspace(0.0, 3.0, 301)
+    turned, passed = (np.cos(2 * t[:, None]) - np.cos(2 * t)) / 2, t - t[:, None]
+    for leg, p, q in ((wide, (0.0, 0.5), (-0.1, 0.1)), (inside, (0.2, 0.3), (0.0, 0.1))):
+        most = max(np.exp(a * turned + b * passed)[passed >= 0.0].max() for a in p for b in q)
+        assert most <= leg.truncation.growth <= 3.0 * most
+    assert inside.truncation.growth <= wide.truncation.growth
+
+
+def test_derivatives_in_time_and_parameters_are_those_of_differences() -> None:
+    problem = sr.OptimalControlProblem(
+        system=PUSHED,
+        horizon=3.0,
+        initial_state=[1.0, -0.5],
+        control=sr.Box([-1.0], [1.0]),
+        disturbance=sr.Box([-0.1], [0.1]),
+        path=[sr.Box([-2.0, -2.0], [2.0, 2.0])],
+    )
+    pieces, rng = sr.Dictionary.indicators(np.linspace(0.0, 3.0, 7)), np.random.default_rng(10)
+    (family,) = prepare(problem, pieces, pieces).program.families
+    box, x = family.index_set, rng.uniform(-1.0, 1.0, 6)
+    indices = rng.uniform(box.lower + 0.01, box.upper - 0.01, (30, 3))
+    indices = indices[np.abs(indices[:, 0] / 0.5 - np.rint(indices[:, 0] / 0.5)) > 0.02]
+    assert family.gradient is not None
+
+    def value(at: np.ndarray) -> np.ndarray:
+        G, h = family.rows(at)
+        return np.asarray(G[:, 0] @ x - h[:, 0])
+
+    found = family.gradient(x, indices, np.zeros(len(indices), dtype=int))
+    for axis in range(3):
+        step = 1e-6 * np.eye(3)[axis]
+        exact = (value(indices + step) - value(indices - step)) / 2e-6
+        assert found[:, axis] == pytest.approx(exact, abs=1e-6)
