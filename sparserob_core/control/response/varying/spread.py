@@ -25,7 +25,7 @@ LEFT = (1e-14, 1e-12, 1e-10)
 """Of the state, what is beyond the degree of the law is about: the first that is reached. A proof needs 1e-8."""
 NUMBERS = 400  # coefficients times states of a law; twice as many are matrices of 5 MB on each of its segments
 MOST_TERMS = 30  # the degree where entries are no polynomials: what 40 of them leave less is below what is rounded
-LOOKS = 17  # times at which coefficients are looked at, to choose a parameter; nothing is proven with them
+LOOKS = 17  # times at which coefficients are looked at; nothing is proven with them
 DEGREE = 4  # of the coefficients that are looked at then
 MOST_PARTS = 64  # of the box: each is proven alone
 FAR = 700.0  # exponent by which parameters move the state, whose exponential is still a number
@@ -97,14 +97,14 @@ def law_of(system: System) -> Parts:
 def _made(system: System) -> Parts:
     """`law_of` a system in the units that it is stated in."""
     edges, looks, degree = _parted(system)
-    every = []
+    every, scale = [], _scale(system)
     for part, look in zip(_boxes(system, edges), looks, strict=True):
         centre, units = part.deviations
         assert part.powers is not None
         left = None if look is None else look.left(degree)
         how = Spread(system.states, taylor_space(centre.size, degree), centre, units, part.powers, left)
         every.append((how, part.superposed(how)))
-    return Parts(edges, tuple(every), max((_share(system, look, degree) for look in looks), default=0.0))
+    return Parts(edges, tuple(every), max(_share(look, degree, scale) for look in looks))
 
 
 def _in_units(system: System) -> Parts:
@@ -138,7 +138,9 @@ def _parted(system: System) -> tuple[tuple[Array, ...], list[Cauchy | None], int
     degree of these: of 1, 2, 4, ... parts, halved along the parameter in which that leaves least."""
     box, powers, d = system.box, system.powers, system.states
     assert powers is not None
-    nu, counts, far = box.dimension, np.ones(box.dimension, dtype=int), _exponent(system)
+    nu, counts, lowest = box.dimension, np.ones(box.dimension, dtype=int), max(1, powers)
+    scale = _scale(system)
+    far = _exponent(system, scale)
     if far > FAR:
         raise InputError(
             path="system.parameters",
@@ -146,21 +148,20 @@ def _parted(system: System) -> tuple[tuple[Array, ...], list[Cauchy | None], int
             " smaller intervals, or a shorter horizon",
             got=f"parameters that move the state by up to e^{far:.2g}",
         )
-    highest = max(
-        n for n in range(max(1, powers), MOST_TERMS + 1) if n <= max(1, powers) or d * comb(nu + n, nu) <= NUMBERS
-    )
-    while counts.prod() <= MOST_PARTS:
+    degrees = [n for n in range(lowest, MOST_TERMS + 1) if d * comb(nu + n, nu) <= NUMBERS]
+    while degrees and counts.prod() <= MOST_PARTS:
         edges, looks = _looked(system, counts)
-        for left, degree in product(LEFT, range(max(1, powers), highest + 1)):
-            if all(_share(system, one, degree) <= left for one in looks):
+        for left, degree in product(LEFT, degrees):
+            if all(_share(one, degree, scale) <= left for one in looks):
                 return edges, looks, degree
         finer = [counts * (1 + one) for one in np.eye(nu, dtype=int)]
-        counts = min(finer, key=lambda one: max(_share(system, look, highest) for look in _looked(system, one)[1]))
+        counts = min(finer, key=lambda one: max(_share(look, degrees[-1], scale) for look in _looked(system, one)[1]))
     raise InputError(
         path="system.parameters",
         expected="a box, beside the time t, on which the entries are power series in the parameters of at most"
-        f" {NUMBERS} numbers times states, in at most {MOST_PARTS} parts: fewer parameters, or smaller intervals",
-        got="entries that are no polynomials in them, and turn too much for that",
+        f" {NUMBERS} numbers times states, in at most {MOST_PARTS} parts: fewer parameters or states, or smaller"
+        " intervals",
+        got="entries that turn too much for that" if degrees else f"{d * comb(nu + lowest, nu)} numbers at least",
     )
 
 
@@ -173,12 +174,16 @@ def _looked(system: System, counts: np.ndarray) -> tuple[tuple[Array, ...], list
     return edges, [cauchy(part) if beyond(part, powers).any() else None for part in _boxes(system, edges)]
 
 
-def _exponent(system: System) -> float:
+def _scale(system: System) -> Array:
+    """Units of the states, ``(d,)``, in which no entry of ``A`` at the middle of the parameters is large."""
+    A = np.max([np.abs(np.asarray(one.A, dtype=float)) for one in system.at(system.deviations[0]).modes], axis=0)
+    return balanced(A, system.horizon)
+
+
+def _exponent(system: System, scale: Array) -> float:
     """By which exponent parameters may move the state: the integral of the norms of all coefficients of ``A`` but the
     constant one."""
     (centre, units), found = system.deviations, 0.0
-    A = np.max([np.abs(np.asarray(one.A, dtype=float)) for one in system.at(centre).modes], axis=0)
-    scale = balanced(A, system.horizon)
     for law in system.phases:
         for time in np.linspace(law.begin, law.until, LOOKS).tolist():
             parts = Split.of(law.entry("A"), time, centre, units, DEGREE).parts
@@ -188,12 +193,9 @@ def _exponent(system: System) -> float:
     return found
 
 
-def _share(system: System, look: Cauchy | None, degree: int) -> float:
-    """About what series leave of states, as a share; nothing of polynomials."""
-    if look is None:
-        return 0.0
-    A = np.max([np.abs(np.asarray(one.A, dtype=float)) for one in system.at(system.deviations[0]).modes], axis=0)
-    return (degree + 1) * look.share(degree, balanced(A, system.horizon))
+def _share(look: Cauchy | None, degree: int, scale: Array) -> float:
+    """About what series leave of states in units ``scale (d,)``, as a share; nothing of polynomials."""
+    return 0.0 if look is None else (degree + 1) * look.share(degree, scale)
 
 
 def _edges(low: float, high: float, count: int) -> Array:
