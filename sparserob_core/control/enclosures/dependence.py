@@ -503,7 +503,7 @@ class Spread:
 
     def recentred(self, low: Array, high: Array) -> Array:
         """What makes of the coefficients of a polynomial in ``delta`` those, ``(M, M)``, of it on a cell ``[low,
-        high]`` of parameters, from -1 to 1 in each; which is a little wider than the cell."""
+        high]`` of parameters, from -1 to 1 in each: of the cell but for what is rounded."""
         units = np.where(self.units > 0.0, self.units, 1.0)
         middle, radius = (low + high) / 2, (high - low) / 2
         c = (middle - self.centre) / units

@@ -40,6 +40,7 @@ WITHOUT_PROOF = (
     "measurable disturbances are proven only beside parameters in a box over which the state can be expanded in them,"
     " and where it is no affine function of these only for sets with flat sides"
 )
+HALVINGS = 8  # of a part of the parameters, after which states that still have no bound on a cell have none
 LEGS_KEPT = 256  # cells of parameters whose lifted systems are kept
 Leg: TypeAlias = LiftedSystem | VaryingMotion | SpreadMotion
 CHUNK = 4_000_000  # entries of a gain array that are built at once (32 MB)
@@ -505,16 +506,59 @@ class WorstCase:
     def _on_cell(self, low: Array, high: Array) -> SpreadMotion:
         """The motion over a cell of parameters; how far states grow on the smallest cell around it is not asked
         again."""
-        around = [growth for a, b, growth in self._grown if (a <= low).all() and (high <= b).all()]
-        known, response = min(around, default=None), self.response
-        leg = SpreadMotion.of(response.propagator.on_cell(low, high), response.initial_state, known)
+        propagator, begun = self.response.propagator, self.response.initial_state
+        assert propagator.laws is not None
+        part = propagator.laws.holding(low, high)  # of which units are
+        around = [growth for own, a, b, growth in self._grown if own == part and (a <= low).all() and (high <= b).all()]
+        known = min(around, default=None)
+        leg = SpreadMotion.of(propagator.on_cell(low, high), begun, known)
         if known is None:
-            self._grown.append((low, high, leg.truncation.growth))
+            self._grown.append((part, low, high, leg.truncation.growth))
         return leg
 
     @cached_property
-    def _grown(self) -> list[tuple[Array, Array, float]]:
+    def _grown(self) -> list[tuple[int | None, Array, Array, float]]:
         return []
+
+    def _growth(self, low: Array, high: Array, halvings: int) -> float:
+        """The norm of the transitions at any parameter of a cell, at most; ``inf`` where smaller cells have none."""
+        try:
+            return self._on_cell(low, high).truncation.growth
+        except NotEnclosable as error:
+            if error.along is None or not halvings:
+                return np.inf
+            ends = low.copy(), high.copy()
+            for end in ends:
+                end[error.along] = (low[error.along] + high[error.along]) / 2
+            return max(self._growth(low, ends[1], halvings - 1), self._growth(ends[0], high, halvings - 1))
+
+    def beyond(self, far: Array) -> Array:
+        """What a law leaves out of its series in the parameters, of any state, ``(d,)``, under a control that goes as
+        ``far (m,)`` as it may; nothing where entries are polynomials."""
+        laws, found = self.response.propagator.laws, np.zeros(self.response.initial_state.size)
+        if laws is None or all(how.left is None for how, _ in laws.every):
+            return found
+        begun, inputs = self._largest(far)
+        for part, (how, _) in enumerate(laws.every):
+            if how.left is not None:
+                growth = self._growth(*laws.ends(part), HALVINGS)
+                off = self.response.propagator.left_out(part, begun, inputs, growth)
+                found = np.maximum(found, off)
+        return found
+
+    def _largest(self, far: Array) -> tuple[Array, Array]:
+        """How large the initial state ``(d,)`` and all inputs ``(m + constants + mw,)`` may be under such a control."""
+        begun, model = np.abs(self.response.initial_state), self.disturbance
+        if self.initial is not None:
+            begun = begun + self.initial.reach(np.eye(begun.size))
+        pushed = np.zeros(self.response.system.disturbances)
+        if model is not None:
+            pushed = model.bound.reach(np.eye(model.channels))
+        known = np.abs(self.known).max(axis=1)
+        delivered = np.maximum(far, known[: far.size])
+        if self.execution is not None:  # of what is missed as much is left out as of what is commanded
+            delivered = (1.0 + self.execution.shares) * delivered
+        return begun, np.concatenate([delivered, known[far.size :], pushed])
 
     @cached_property
     def _frozen(self) -> dict[bytes, LiftedSystem]:

@@ -558,13 +558,17 @@ class Truncation:
 
     @property
     def influence(self) -> Array:
-        """How far every parameter moves the law, ``(nu,)``: ``A`` over the horizon, and inputs as shares."""
+        """How far every parameter moves the law over the horizon, ``(nu,)``."""
         d, space, lengths = self.motion.states, self.spread.space, self.motion.grid.lengths
         inputs = self.motion.most[:, :, d:].reshape(lengths.size, space.size, self.spread.d, -1)
-        pushed = (inputs / self.units[:, None]).max(axis=2, initial=0.0).max(axis=0)
-        shares = (pushed / np.maximum(pushed[0], TINY)).max(axis=1, initial=0.0)
-        shares[0] = 0.0
-        return np.asarray((lengths @ self._norms + np.minimum(shares, 1.0)) @ space.exponents)
+        pushed = (inputs / self.units[:, None]).max(axis=(2, 3), initial=0.0)
+        return np.asarray(lengths @ (self._norms + pushed) @ space.exponents)
+
+    @property
+    def growing(self) -> int:
+        """The parameter that moves ``A`` most, which alone decides how far states grow."""
+        moved = self.motion.grid.lengths @ self._norms @ self.spread.space.exponents
+        return int(moved.argmax())
 
     @cached_property
     def _sizes(self) -> Array:
@@ -685,11 +689,12 @@ class SpreadMotion:
         assert spread is not None
         begun = np.append(initial_state, np.zeros(spread.states - spread.d))
         truncation = Truncation(VaryingMotion(propagator, begun), spread, growth)
-        influence = truncation.influence
-        if not np.isfinite(truncation.growth):
+        with np.errstate(over="ignore", invalid="ignore"):  # of a cell that is too wide
+            bounded = np.isfinite(truncation.growth)
+        if not bounded:
             wide = "the state moves too far on a cell of parameters"
-            raise NotEnclosable(wide, along=int(influence.argmax()))
-        return SpreadMotion(truncation, influence)
+            raise NotEnclosable(wide, along=truncation.growing)
+        return SpreadMotion(truncation, truncation.influence)
 
     @property
     def motion(self) -> VaryingMotion:

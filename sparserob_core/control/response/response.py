@@ -431,6 +431,29 @@ class Propagator:
         found = self._of_laws[part].at_point(self.laws.every[part][0], parameter)
         return Propagator(self.system, self.grid, given=found)
 
+    def left_out(self, part: int, begun: Array, inputs: Array, growth: float) -> Array:
+        """Return what the law leaves out of any state at any parameter of a part, ``(d,)``, at most.
+
+        Parameters
+        ----------
+        part : int
+            The part of the parameters.
+        begun, inputs : Array
+            How large the initial state ``(d,)`` and the inputs ``(m + mw,)`` are at most.
+        growth : float
+            How far states grow between two times at most, in the units of the part.
+        """
+        assert self.laws is not None
+        how, law = self.laws.every[part][0], self._of_laws[part]
+        left, d = how.left, how.d
+        assert left is not None
+        units, pushes = law.units[:d], law.largest_inputs(how) @ inputs / law.units[:d]
+        state = growth * (float((begun / units).max()) + float(np.diff(law.ends) @ pushes.max(axis=1)))
+        A = (left.sizes[:, :, :d] * units).sum(axis=2) / units
+        entered = left.sizes[:, :, d:] @ inputs / units
+        rate = state * A.max(axis=1) + entered.max(axis=1)
+        return np.asarray(growth * float(np.diff(left.ends) @ rate) * units * (1.0 + 1e-9))
+
     def over(self, starts: Array, stops: Array, points: Array) -> tuple[Array, Array]:
         """Return what intervals ``(k,)`` make of the state and of inputs at each of the parameters ``points (v, nu)``.
 
@@ -553,8 +576,7 @@ class Propagator:
     def slack(self) -> float:
         """`Expansion.slack` of a system that changes with time, the largest one of all parts."""
         every = (self.expansion, *self._of_laws)
-        missed = 0.0 if self.laws is None else self.laws.missed
-        return missed + max(0.0 if one is None else one.slack for one in every)
+        return max(0.0 if one is None else one.slack for one in every)
 
     def _varying_steps(self, parameters: Array) -> Steps:
         """Steps of a system that changes with time, whose pieces are modes: ``Gamma`` is the length of a piece, and

@@ -115,14 +115,14 @@ class InitialPlane:
 
     def off(self, times: Array, directions: Array, parameters: Array) -> Array:
         """What rows ``c'x(t)``, ``directions (k, d)``, may be off by, wherever in the plane they begin, ``(k,)``: by
-        rounding, what steps of a system that changes with time are, and what an expansion in the parameters leaves
-        out; 0 for a system that does not change with time."""
+        rounding, what steps of a system that changes with time are, and what its law leaves out of its series in the
+        parameters; 0 for a system that does not change with time."""
         response = self.centred.response
-        if response.propagator.expansion is None or not times.size:
+        if not response.system.varies or not times.size:
             return np.zeros(times.size)
         columns = response.weights(times, directions, parameters).free[:, list(self.states)] * self.radius
         sizes = added_up(self.centred, times, directions, parameters) + np.abs(columns).sum(axis=1)
-        return np.asarray((SHARE + response.propagator.slack) * sizes)
+        return np.asarray((SHARE + response.propagator.slack) * sizes + np.abs(directions) @ self.beyond)
 
     def _off_at(self, cut: Cut) -> float:
         """What a row that holds with equality may be off by, under feedback; 0 for others, which are wider by that."""
@@ -258,6 +258,15 @@ class InitialPlane:
     def centred(self) -> Transcription:
         """The problem from the centre of the plane."""
         return from_state(self.model, self._state(np.zeros(2)))
+
+    @cached_property
+    def beyond(self) -> Array:
+        """What a law leaves out of its series in the parameters, of any state, ``(d,)``, from anywhere in the plane."""
+        far = np.abs(self._state(np.zeros(2)))
+        far[list(self.states)] += np.abs(self.radius)
+        control = self.model.problem.control
+        reach = control.reach(np.eye(control.dimension))
+        return self.centred.functionals.from_state(far).beyond(reach)
 
     def _state(self, z: Array) -> Array:
         state = np.array(self.model.problem.initial_state, dtype=float)

@@ -33,11 +33,11 @@ def rounded_down(model: Transcription, result: Result, tolerance: float | None, 
     and `SHARE`, bound what the rounding of all of them does to the bound (Higham 2002, section 3.1). A piece of the
     control whose push is below its price by more than that is 0 in the bound, whatever is rounded (`_pushed`). What a
     multiplier of the wrong sign may be off by is subtracted too (`_neglected`). Transitions are off by a share of their
-    own (`_moving`). With fewer functions than pieces
-    multipliers of the pieces are off by rounding too (`_slipped`). Signals of measurable
-    disturbances under feedback prove what they lead to, not what they were composed for (`_missed`); where they do not
-    prove that nothing is feasible, that is not claimed. ``prices (n,)`` are those of the decision, where the bound is
-    one of what its sizes cost at them.
+    own (`_moving`), and by what a law leaves out of its series in the parameters (`_beyond`). With fewer functions than
+    pieces multipliers of the pieces are off by rounding too (`_slipped`). Signals of measurable disturbances under
+    feedback prove what they lead to, not what they were composed for (`_missed`); where they do not prove that nothing
+    is feasible, that is not claimed. ``prices (n,)`` are those of the decision, where the bound is one of what its
+    sizes cost at them.
     """
     if result.status == "infeasible" and np.subtract(*_missed(model, result)) >= 0.0:
         return replace(result, status="failed", message=UNPROVEN, infeasible=None, lower_bound=-np.inf)
@@ -45,7 +45,7 @@ def rounded_down(model: Transcription, result: Result, tolerance: float | None, 
         return result
     share = SHARE + _moving(model)
     lost = share * (_added(model, result, share, prices) + _quadratic(model, result) + result.lower_bound)
-    lost += _neglected(model, result) + _missed(model, result)[0] + _slipped(model, result)
+    lost += _neglected(model, result) + _beyond(model, result) + _missed(model, result)[0] + _slipped(model, result)
     lowered = max(0.0, result.lower_bound - lost)
     dual = replace(result.dual, bound=min(result.dual.bound, lowered))
     answer = replace(result, lower_bound=lowered, dual=dual)
@@ -120,6 +120,15 @@ def _pushed(model: Transcription, prices: Array | None, weights: Array, multipli
         clear = (np.abs(push) + share * off < prices) & (finite.lower <= 0.0) & (finite.upper >= 0.0)
         sizes[clear.reshape(m, -1)[:, grid.control_piece[grid.decided]].T] = 0.0
     return float(sizes.sum())
+
+
+def _beyond(model: Transcription, result: Result) -> float:
+    """What a law leaves out of its series in the parameters, of all rows with a multiplier, at most."""
+    off, lost = model.functionals.beyond(_far(model.problem.control)), 0.0
+    if off.any():
+        for cut, said in zip(result.dual.cuts, model.explained(result.dual.cuts), strict=True):
+            lost += 0.0 if said is None else abs(cut.multiplier) * float(np.abs(said.direction[: off.size]) @ off)
+    return lost
 
 
 def _missed(model: Transcription, result: Result) -> tuple[float, float]:

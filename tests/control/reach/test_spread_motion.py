@@ -95,7 +95,7 @@ def test_cells_of_time_end_where_a_segment_of_any_part_does() -> None:
         assert np.isin(propagator.on_cell(*cell).marks, propagator.marks).all()
 
 
-PARTS = expansions.Parts((np.array([0.0, 1.0, 3.0]), np.array([-1.0, 0.0])), ((None, None),) * 2, 0.0)  # type: ignore[arg-type]
+PARTS = expansions.Parts((np.array([0.0, 1.0, 3.0]), np.array([-1.0, 0.0])), ((None, None),) * 2)  # type: ignore[arg-type]
 
 
 def test_every_parameter_and_every_cell_within_one_has_its_part() -> None:
@@ -351,3 +351,71 @@ def test_derivatives_in_time_and_parameters_are_those_of_differences() -> None:
         step = 1e-6 * np.eye(3)[axis]
         exact = (value(indices + step) - value(indices - step)) / 2e-6
         assert found[:, axis] == pytest.approx(exact, abs=1e-6)
+
+
+def test_what_a_law_leaves_out_of_its_series_is_in_no_state_more_than_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(expansions, "LEFT", (1e-2,))  # so much that the degree is low
+    system = RELAXING.in_phases([replace(phase) for phase in RELAXING.phases])
+    problem = sr.OptimalControlProblem(
+        system=system, horizon=2.0, initial_state=[1.0], control=sr.Box([-2.0], [2.0]), path=[sr.Box([-9.0], [9.0])]
+    )
+    pieces = sr.Dictionary.indicators(np.linspace(0.0, 2.0, 5))
+    (constraint,) = prepare(problem, pieces, pieces).constraints
+    functionals, points = constraint.functionals, np.linspace(-0.2, 0.3, 31)
+    states = functionals.response.states(np.full((1, 4), -2.0), points[:, None])[:, :, 0]
+    exact = relaxed(functionals.response.grid.breakpoints, points[:, None])
+    off, said = np.abs(states - exact).max(), functionals.beyond(np.array([2.0]))[0]
+    assert 1e-6 < off <= said <= 1e3 * off
+    least = functionals.beyond(np.array([0.0]))[0]
+    assert 0.0 < least < said
+    assert replace(functionals, initial=sr.Box([-1.0], [1.0])).beyond(np.array([2.0]))[0] > said
+    (polynomial,) = prepare(replace(problem, system=SYSTEM, horizon=3.0), pieces_of(3.0), pieces_of(3.0)).constraints
+    assert not polynomial.functionals.beyond(np.array([2.0])).any()
+
+
+def pieces_of(horizon: float) -> sr.Dictionary:
+    return sr.Dictionary.indicators(np.linspace(0.0, horizon, 5))
+
+
+def test_growth_is_asked_of_the_part_that_a_cell_is_in(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(expansions, "LEFT", (1e-3,))
+    monkeypatch.setattr(expansions, "NUMBERS", 14)
+    law = [["0", "exp(3*p)"], ["-1", "-0.1*t"]]
+    system = sr.VaryingSystem.of(law, [[0], [1]], 1.0, parameters=sr.Box([-1.0], [1.0]), names=["p"])
+    problem = sr.OptimalControlProblem(
+        system=system,
+        horizon=1.0,
+        initial_state=[0.1, 0.0],
+        control=sr.Box([-1.0], [1.0]),
+        path=[sr.Box([-9.0] * 2, [9.0] * 2)],
+    )
+    (constraint,) = prepare(problem, pieces_of(1.0), pieces_of(1.0)).constraints
+    functionals = constraint.functionals
+    laws = functionals.response.propagator.laws
+    assert laws is not None
+    units = [Expansion.of(one).units[:2].tolist() for _, one in laws.every]
+    edge = next(k for k in range(len(units) - 1) if units[k] != units[k + 1])
+    before = functionals.legs(*laws.ends(edge))[0]
+    point = laws.ends(edge)[1]  # which is in the part after
+    after = functionals.legs(point, point)[0]
+    assert isinstance(before, SpreadMotion)
+    assert isinstance(after, SpreadMotion)
+    assert after.truncation.known is None
+    narrow = laws.ends(edge)[0], laws.ends(edge)[0] * 0.75 + point * 0.25
+    inside = functionals.legs(*narrow)[0]
+    assert isinstance(inside, SpreadMotion)
+    assert inside.truncation.known == before.truncation.growth
+
+
+def test_cells_on_which_inputs_vanish_are_halved_where_states_grow() -> None:
+    law = [["7 + 0.1*sin(t) + 0.05*(q + 0.3*q^2)"]]
+    box = sr.Box([-1.0, -3.0], [1.0, 3.0])
+    system = sr.VaryingSystem.of(law, [["p"]], 3.0, parameters=box, names=["p", "q"])
+    breaks = np.linspace(0.0, 3.0, 4)
+    propagator = Propagator(system, merge_grids(breaks, breaks, varying=True))
+    low, high = np.array([0.0, -3.0]), np.array([1e-3, 3.0])
+    with pytest.raises(NotEnclosable) as raised:
+        SpreadMotion.of(propagator.on_cell(low, high), np.ones(1), None)
+    assert raised.value.along == 1
+    leg = SpreadMotion.of(propagator.on_cell(low, np.array([1e-3, -2.99])), np.ones(1), None)
+    assert leg.influence[0] < 0.01  # falls with the cell

@@ -483,13 +483,18 @@ class Expansion:
 
     def at_point(self, law: Spread, parameter: Array) -> Expansion:
         """Return the expansion of the known system at a ``parameter (nu,)``, from that of the law, which depends on the
-        parameters as ``law`` says."""
+        parameters as ``law`` says; what is left out of the series in the parameters is not in its remainder."""
         powers = law.space.monomials(law.shares(parameter[None]))[0]
         given, lost = self._law(law)
         every, rest = np.einsum("a,snaij->snij", powers, given), np.einsum("a,saij->sij", np.abs(powers), lost)
         rest = rest + rounding(8 * powers.size) * np.einsum("a,saij->sij", np.abs(powers), np.abs(given).sum(axis=1))
         units, ones = self.units[: law.d], np.ones((len(rest), law.d))
         return Expansion(self.ends, every, rest, units, ones, self.channels, self.turns)
+
+    def largest_inputs(self, law: Spread) -> Array:
+        """How large ``[B E]`` is at any parameter and time of every segment, at most, ``(s, d, m + mw)``."""
+        given, lost = self._law(law)
+        return np.asarray((np.abs(given).sum(axis=(1, 2)) + lost.sum(axis=1))[..., law.d :])
 
     def _law(self, law: Spread) -> tuple[Array, Array]:
         """The coefficients of the law in time and parameters, ``(s, p + 1, M, d, d + m + mw)``, and what those of every

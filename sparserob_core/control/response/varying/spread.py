@@ -37,12 +37,10 @@ _KNOWN: WeakKeyDictionary[Phase, dict[tuple[object, ...], Parts]] = WeakKeyDicti
 class Parts:
     """A box of parameters in parts, and how the law depends on the parameters of each: ``every`` of them, how, and
     the known system of all coefficients. ``edges``: where the parts of every parameter begin and end; the parts are
-    all their products, those of the last parameter one after another. All have the same polynomials. ``missed``: what
-    these leave of states is about, as a share."""
+    all their products, those of the last parameter one after another. All have the same polynomials."""
 
     edges: tuple[Array, ...]
     every: tuple[tuple[Spread, System], ...]
-    missed: float
 
     def of(self, parameters: Array) -> np.ndarray:
         """The part that each of ``parameters (k, nu)`` is in, ``(k,)``; at an edge any one that has it."""
@@ -97,14 +95,14 @@ def law_of(system: System) -> Parts:
 def _made(system: System) -> Parts:
     """`law_of` a system in the units that it is stated in."""
     edges, looks, degree = _parted(system)
-    every, scale = [], _scale(system)
+    every = []
     for part, look in zip(_boxes(system, edges), looks, strict=True):
         centre, units = part.deviations
         assert part.powers is not None
         left = None if look is None else look.left(degree)
         how = Spread(system.states, taylor_space(centre.size, degree), centre, units, part.powers, left)
         every.append((how, part.superposed(how)))
-    return Parts(edges, tuple(every), max(_share(look, degree, scale) for look in looks))
+    return Parts(edges, tuple(every))
 
 
 def _in_units(system: System) -> Parts:
@@ -123,7 +121,7 @@ def _in_units(system: System) -> Parts:
         scaled = part.in_units(whole[0], whole[1], whole[2], np.zeros(0), drift, time)
         every.append((replace(how, centre=how.centre / units, units=how.units / units, left=left), scaled))
     edges = tuple(ends / one for ends, one in zip(known.edges, units, strict=True))
-    return Parts(edges, tuple(every), known.missed)
+    return Parts(edges, tuple(every))
 
 
 def _boxes(system: System, edges: tuple[Array, ...]) -> list[System]:
