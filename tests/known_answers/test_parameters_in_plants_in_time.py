@@ -17,6 +17,7 @@ from scipy.optimize import linprog
 import sparserob_core as sr
 from sparserob_core.checker.flow import flows
 from sparserob_core.control.problem.expression import kepler
+from sparserob_core.control.studies.initial_states import InitialPlane
 from sparserob_core.experiment.assemble import assemble
 from sparserob_core.experiment.check.check import check
 from sparserob_core.experiment.config.load import load_config
@@ -442,3 +443,25 @@ def test_the_states_that_are_feasible_at_every_rate_are_as_many_as_a_closed_form
     ends = [farthest(), 0.3 * np.exp(2.0)]
     np.testing.assert_allclose(np.abs(found.outer).max(axis=0), ends, rtol=3e-7)
     np.testing.assert_allclose(np.abs(found.inner).max(axis=0), ends, rtol=3e-6)
+
+
+@pytest.mark.slow
+def test_what_a_law_leaves_out_widens_the_rows_from_which_states_are_feasible() -> None:
+    config = of_two()
+    config["problem"]["system"]["A"][0][0] = "-0.5/(1 + p) + 0*t"  # no polynomial of p
+    model = assemble(load_config(config)).transcription
+    plane = InitialPlane(model, (0, 1), np.array([0.5, -0.2]), np.array([1.0, 2.0]))
+    for z in ([1.0, 1.0], [1.0, -1.0], [-1.0, -1.0], [0.3, 0.2]):
+        begun = model.functionals.from_state(plane.point(np.array(z)))
+        assert (plane.beyond * (1 + 1e-12) >= begun.beyond(np.array([1.0]))).all()
+    assert (plane.beyond > 0.0).all()
+    (family,) = plane._families
+    index = np.array([[2.0, 0.4]])
+    with_it = family.rows(index)[1]
+    vars(plane)["beyond"] = 0.0 * plane.beyond
+    constraint = model.constraint(model.program.families[0])
+    directions = constraint.functionals_at(index)[1]
+    wider = with_it.ravel() - family.rows(index)[1].ravel()
+    vars(plane)["beyond"] = np.ones(2)
+    assert (wider <= 1e-9).all()  # the degree is high
+    np.testing.assert_allclose((family.rows(index)[1] - with_it).ravel(), np.abs(directions).sum(axis=1), rtol=1e-6)
