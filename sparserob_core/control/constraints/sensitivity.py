@@ -237,7 +237,7 @@ class Sensitivity:
 
     def _changing(self, times: Array, parameters: Array, at: Functional, x: Array, signals: Array | None) -> Array:
         """`Functional.in_time` of a system that changes with time, ``c'(A(t) x(t) + B(t) u + E(t) w)``."""
-        A, inputs = self._response.propagator.law_at(times, parameters)
+        A, inputs = self._response.propagator.law.entries(times, parameters)
         along, pushes = (at.direction[:, None] @ A)[:, 0], (at.direction[:, None] @ inputs)[:, 0]
         known = self._response.weights(times, along, parameters)
         control = self.constraint.functionals.on_grid(x)

@@ -44,10 +44,6 @@ class Execution:
     shares: Array
     felt: Array
 
-    def followed(self) -> Execution:
-        """The same along what the state is expanded in, where it is: of errors that are stated for the states."""
-        return self
-
     def seen(self, directions: Array, parameters: Array) -> Array:
         """Directions ``(k, d)`` at parameters ``(k, nu)`` as those on the states that errors are followed in."""
         return directions

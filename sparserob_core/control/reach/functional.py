@@ -542,7 +542,7 @@ class WorstCase:
         for part, (how, _) in enumerate(laws.every):
             if how.left is not None:
                 growth = self._growth(*laws.ends(part), HALVINGS)
-                off = self.response.propagator.left_out(part, begun, inputs, growth)
+                off = laws.left_out(part, begun, inputs, growth)
                 found = np.maximum(found, off)
         return found
 

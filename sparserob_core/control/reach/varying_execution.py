@@ -64,12 +64,6 @@ class VaryingExecution(Execution):
         """`Execution.none`; what is remembered is of these shares."""
         return replace(self, shares=np.zeros(self.shares.size), _lengths={}, _reaching={})
 
-    def followed(self) -> VaryingExecution | UncertainExecution:
-        """`Execution.followed`: where there are parameters, at each of them and on cells of them."""
-        if self.response.propagator.laws is None:
-            return self
-        return UncertainExecution(self.response, self.breakpoints, self.shares, self.felt, self)
-
     def following(self, propagator: Propagator, initial_state: Array) -> VaryingExecution:
         """Return the errors along states ``(d,)`` or their coefficients ``(M d,)``, that a propagator moves."""
         response = Response(propagator.system, propagator.grid, initial_state, shared=propagator)
@@ -387,6 +381,13 @@ class UncertainExecution(Execution):
         """`Execution.enclosed`."""
         found = np.empty((times.size, 2))
         return self._each(directions, found, lambda one, here, c: one.enclosed(control, times[here], c))
+
+
+def followed(errors: VaryingExecution) -> VaryingExecution | UncertainExecution:
+    """Return the errors of a system that changes with time: where it has parameters, at each of them and on cells."""
+    if errors.response.propagator.laws is None:
+        return errors
+    return UncertainExecution(errors.response, errors.breakpoints, errors.shares, errors.felt, errors)
 
 
 @final

@@ -11,7 +11,7 @@ import numpy as np
 from sparserob_core.control.enclosures.taylor import Combination
 from sparserob_core.control.reach.measurable import AT_ONCE, MeasurableSupport
 from sparserob_core.control.reach.support import Support
-from sparserob_core.control.reach.varying_execution import UncertainExecution, VaryingExecution
+from sparserob_core.control.reach.varying_execution import UncertainExecution, VaryingExecution, followed
 from sparserob_core.control.reach.varying_motion import (
     SpreadMotion,
     SpreadSupport,
@@ -78,7 +78,7 @@ class VaryingMeasurable:
             bound, through = _moving(self.bound)
         ends, felt = self.response.grid.breakpoints[[0, -1]], np.ones(self.response.system.states)
         one = VaryingExecution(self.response, ends, shares, felt, disturbing=True, bound=bound, through=through)
-        return one.followed()
+        return followed(one)
 
     @property
     def command(self) -> Array:

@@ -8,7 +8,7 @@ On every piece of the merged time grid the inputs are constant, so the state fol
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import pairwise
@@ -22,7 +22,6 @@ from sparserob_core.control.enclosures.matrix_exponential import EPSILON, transi
 from sparserob_core.control.problem.system import System
 from sparserob_core.control.response.varying.expansion import Expansion
 from sparserob_core.control.response.varying.spread import Parts, law_of
-from sparserob_core.errors import NotEnclosable
 from sparserob_core.shapes import Float, Int, shaped
 from sparserob_core.sip.convex_set import Array
 
@@ -197,12 +196,6 @@ def merge_grids(
     acting, pushing = np.searchsorted(begin, middles) - 1, np.searchsorted(disturbance, middles) - 1
     mode = np.searchsorted(switches, middles) if switches else np.arange(middles.size) if varying else None
     return TimeGrid(points, acting, pushing, before if delay > 0.0 else None, constants, mode, varying=varying)
-
-
-def _joined_parts(found: Sequence[tuple[np.ndarray, Sequence[Array]]]) -> list[Array]:
-    """Tables that were made of some of all indices each, ``(numbers (k,), tables)``, as those of all of them."""
-    order = np.argsort(np.concatenate([numbers for numbers, _ in found]))
-    return [np.concatenate(one)[order] for one in zip(*(tables for _, tables in found), strict=True)]
 
 
 def _joined(points: Array, others: Array) -> Array:
@@ -407,86 +400,22 @@ class Propagator:
         where the state is an affine function of them, or there are none."""
         return None if self.system.powers is None else law_of(self.system)
 
-    @cached_property
-    def _of_laws(self) -> tuple[Expansion, ...]:
-        """The law on each of the `laws`, as polynomials in time and parameters."""
-        return () if self.laws is None else tuple(Expansion.of(system) for _, system in self.laws.every)
+    @property
+    def law(self) -> Expansion | Parts:
+        """The law of a system that changes with time, known or with parameters."""
+        found = self.expansion if self.laws is None else self.laws
+        assert found is not None
+        return found
 
     def on_cell(self, low: Array, high: Array) -> Propagator:
-        """Return what all coefficients of the state do on a cell ``[low, high]`` of parameters, within one part.
-
-        Raises `NotEnclosable` where the cell lies in several of the parts on which the law is expanded.
-        """
+        """Return what all coefficients of the state do on a cell ``[low, high]`` of parameters (`Parts.on_cell`)."""
         assert self.laws is not None
-        part = self.laws.holding(low, high)
-        if part is None:
-            raise NotEnclosable("a cell of parameters lies in two parts of their box")
-        found = self._of_laws[part].on_cell(self.laws.every[part][0], low, high)
-        return Propagator(self.system, self.grid, given=found)
+        return Propagator(self.system, self.grid, given=self.laws.on_cell(low, high))
 
     def at_point(self, parameter: Array) -> Propagator:
         """Return what the known system at a parameter ``(nu,)`` does."""
         assert self.laws is not None
-        part = int(self.laws.of(parameter[None])[0])
-        found = self._of_laws[part].at_point(self.laws.every[part][0], parameter)
-        return Propagator(self.system, self.grid, given=found)
-
-    def left_out(self, part: int, begun: Array, inputs: Array, growth: float) -> Array:
-        """Return what the law leaves out of any state at any parameter of a part, ``(d,)``, at most.
-
-        Parameters
-        ----------
-        part : int
-            The part of the parameters.
-        begun, inputs : Array
-            How large the initial state ``(d,)`` and the inputs ``(m + mw,)`` are at most.
-        growth : float
-            How far states grow between two times at most, in the units of the part.
-        """
-        assert self.laws is not None
-        how, law = self.laws.every[part][0], self._of_laws[part]
-        left, d = how.left, how.d
-        assert left is not None
-        units, pushes = law.units[:d], law.largest_inputs(how) @ inputs / law.units[:d]
-        state = growth * (float((begun / units).max()) + float(np.diff(law.ends) @ pushes.max(axis=1)))
-        A = (left.sizes[:, :, :d] * units).sum(axis=2) / units
-        entered = left.sizes[:, :, d:] @ inputs / units
-        rate = state * A.max(axis=1) + entered.max(axis=1)
-        return np.asarray(growth * float(np.diff(left.ends) @ rate) * units * (1.0 + 1e-9))
-
-    def over(self, starts: Array, stops: Array, points: Array) -> tuple[Array, Array]:
-        """Return what intervals ``(k,)`` make of the state and of inputs at each of the parameters ``points (v, nu)``.
-
-        Returns
-        -------
-        Array, Array
-            The transitions ``(v, k, d, d)``; and what inputs that stay the same bring, those of the disturbance after
-            the others, ``(v, k, d, m + mw)``. Nothing is proven by them.
-        """
-        if self.laws is None:
-            assert self.expansion is not None
-            flow = self.expansion.flow(starts, stops)
-            return flow.state[None], np.concatenate([flow.control, flow.disturbance], axis=2)[None]
-        found = [(here, of.at_parameters(starts, stops, powers[:, None])) for here, of, powers in self._by_part(points)]
-        state, inputs = _joined_parts(found)
-        return state, inputs
-
-    def _along(self, starts: Array, stops: Array, parameters: Array) -> tuple[Array, Array]:
-        """`over` of intervals each at its own of the ``parameters (k, nu)``, ``(k, d, d)`` and ``(k, d, m + mw)``."""
-        found = []
-        for here, of, powers in self._by_part(parameters):
-            both = of.at_parameters(starts[here], stops[here], powers[None])
-            found.append((here, (both[0][0], both[1][0])))
-        state, inputs = _joined_parts(found)
-        return state, inputs
-
-    def _by_part(self, points: Array) -> Iterator[tuple[np.ndarray, Expansion, Array]]:
-        """Of parameters ``(v, nu)`` the numbers of those in every part, the law there, and their monomials."""
-        assert self.laws is not None
-        which = self.laws.of(points)
-        for part in np.unique(which).tolist():
-            here, how = np.flatnonzero(which == part), self.laws.every[part][0]
-            yield here, self._of_laws[part], how.space.monomials(how.shares(points[here]))
+        return Propagator(self.system, self.grid, given=self.laws.at_point(parameter))
 
     @shaped
     def steps(self, parameters: Float[Array, "v nu"]) -> Steps:
@@ -538,12 +467,12 @@ class Propagator:
         rows, at = np.array(directions, dtype=float)[order], pieces[order]
         begun = self.grid.breakpoints[at]
         if expansion is None:
-            state, both = self._along(begun, np.maximum(times[order], begun), parameters[order])
+            state, both = self.law.along(begun, np.maximum(times[order], begun), parameters[order])
         else:
             distinct, each = np.unique(np.stack([begun, np.maximum(times[order], begun)]), axis=1, return_inverse=True)
             key, each = distinct.tobytes(), each.reshape(-1)
             if key not in self._flows:
-                remember(self._flows, key, self.over(distinct[0], distinct[1], parameters[:0]), FLOWS_KEPT)
+                remember(self._flows, key, self.law.over(distinct[0], distinct[1], parameters[:0]), FLOWS_KEPT)
             state, both = (part[0, each] for part in self._flows[key])
         found = np.zeros((times.size, self.grid.pieces, both.shape[2]))
         found[np.arange(times.size), at] = (rows[:, None] @ both)[:, 0]
@@ -560,8 +489,7 @@ class Propagator:
         these that is a breakpoint but for rounding counts as that, unless another law takes over there: then what
         moves the state jumps, however near a breakpoint is."""
         breaks = self.grid.breakpoints
-        every = self._of_laws if self.expansion is None else (self.expansion,)
-        for one in every:
+        for one in self.law.expansions if self.system.varies else ():
             breaks = np.union1d(_joined(breaks, one.ends[1:-1]), one.ends[list(one.turns)])
         return breaks
 
@@ -575,54 +503,20 @@ class Propagator:
     @property
     def slack(self) -> float:
         """`Expansion.slack` of a system that changes with time, the largest one of all parts."""
-        every = (self.expansion, *self._of_laws)
-        return max(0.0 if one is None else one.slack for one in every)
+        return max((one.slack for one in self.law.expansions), default=0.0) if self.system.varies else 0.0
 
     def _varying_steps(self, parameters: Array) -> Steps:
         """Steps of a system that changes with time, whose pieces are modes: ``Gamma`` is the length of a piece, and
         ``B`` and ``E`` of a mode are what a piece makes of an input, per time."""
         points = parameters if self.laws is not None else parameters[:1]
         count, pieces, breaks, lengths = len(points), self.grid.pieces, self.grid.breakpoints, self.grid.lengths
-        state, pushes = self.over(breaks[:-1], breaks[1:], points)
+        state, pushes = self.law.over(breaks[:-1], breaks[1:], points)
         d, m = state.shape[2], self.system.controls
-        A = self._averages(points)
+        A = self.law.averages(breaks, points)
         Gamma = np.broadcast_to(np.eye(d) * lengths[:, None, None], (count, pieces, d, d))
         rates = (pushes / lengths[:, None, None]).swapaxes(1, 2)
         B, E = (np.ascontiguousarray(part).reshape(count, d, -1) for part in (rates[..., :m], rates[..., m:]))
         return Steps(A, B, E, state, Gamma, self._modes)
-
-    def _averages(self, points: Array) -> Array:
-        """About what ``A`` is on the pieces at parameters ``(v, nu)``, ``(v, L, d, d)``."""
-        breaks = self.grid.breakpoints
-        if self.laws is None:
-            assert self.expansion is not None
-            return self.expansion.average(breaks)[None]
-        d = self.system.states
-        found = np.empty((len(points), self.grid.pieces, d, d))
-        for here, of, powers in self._by_part(points):
-            key = id(of).to_bytes(8)  # of one of the laws, which stay
-            if key not in self._middles:
-                self._middles[key] = of.average(breaks).reshape(self.grid.pieces, -1, d, d)
-            found[here] = np.einsum("va,kaij->vkij", powers, self._middles[key])
-        return found
-
-    @cached_property
-    def _middles(self) -> dict[bytes, Array]:
-        return {}
-
-    def law_at(self, times: Array, parameters: Array) -> tuple[Array, Array]:
-        """Return ``A (k, d, d)`` and ``[B E] (k, d, m + mw)`` of a system that changes with time, at times ``(k,)`` and
-        ``parameters (k, nu)``; nothing is proven by them."""
-        if self.laws is None:
-            assert self.expansion is not None
-            return self.expansion.at(times)
-        found, d = [], self.system.states
-        for here, of, powers in self._by_part(parameters):
-            both = (one.reshape(here.size, -1, d, one.shape[2]) for one in of.at(times[here]))
-            A, inputs = (np.einsum("ka,kaij->kij", powers, one) for one in both)
-            found.append((here, (A, inputs)))
-        A, inputs = _joined_parts(found)
-        return A, inputs
 
     def _varying_adjoint(self, times: Array, directions: Array, parameters: Array) -> tuple[Array, Array, Array, Array]:
         """`adjoint` of a system that changes with time; the part of a piece before a time has a ``B`` and an ``E`` of
@@ -630,11 +524,7 @@ class Propagator:
         unique, which = unique_rows(parameters)
         steps, pieces, m = self.steps(unique), self.grid.locate(times), self.system.controls
         begun, every = self.grid.breakpoints[pieces], np.arange(times.size)
-        ends = np.maximum(times, begun)
-        if self.laws is None:
-            state, pushes = (one[0] for one in self.over(begun, ends, unique))
-        else:
-            state, pushes = self._along(begun, ends, parameters)
+        state, pushes = self.law.along(begun, np.maximum(times, begun), parameters)
         d, L = directions.shape[1], self.grid.pieces
         gains, rows = np.zeros((times.size, L, d)), directions.astype(float)
         length = self.grid.lengths[pieces]
@@ -947,7 +837,9 @@ class Outputs:
         if not self.propagator.system.varies:
             return None
         begun = self.propagator.grid.breakpoints[self.within[0]]
-        flow, driven = (self.H @ one for one in self.propagator.over(begun, np.maximum(self.times, begun), self.points))
+        flow, driven = (
+            self.H @ one for one in self.propagator.law.over(begun, np.maximum(self.times, begun), self.points)
+        )
         return flow, driven[..., : self.propagator.system.controls]
 
     def at(self, response: Response, control: Array) -> Array:

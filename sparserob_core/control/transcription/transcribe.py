@@ -145,12 +145,12 @@ def _functionals(
     execution: Execution | None = None
     if problem.execution is not None:
         from sparserob_core.control.reach.execution import Execution
-        from sparserob_core.control.reach.varying_execution import VaryingExecution
+        from sparserob_core.control.reach.varying_execution import VaryingExecution, followed
 
         shares, felt = np.asarray(problem.execution), np.ones(problem.system.states)
         felt[list(problem.commanded)] = 0.0
-        kind = VaryingExecution if system.varies else Execution
-        execution = kind(response, control.breakpoints, shares, felt).followed()
+        given = response, control.breakpoints, shares, felt
+        execution = followed(VaryingExecution(*given)) if system.varies else Execution(*given)
     functionals = WorstCase(response, control, model, names=problem.names, initial=begun, execution=execution)
     return functionals, ParameterIndex(problem.system.parameters)
 

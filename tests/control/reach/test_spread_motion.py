@@ -302,7 +302,7 @@ def test_a_known_plant_at_a_parameter_is_what_the_law_is_there(pushed: Propagato
         off = np.abs(law - entries(t, 0.27, 0.02))
         assert (off <= left + 1e-13).all()
         assert left.max() < 1e-12
-        A, inputs = pushed.law_at(np.array([t]), np.array([[0.27, 0.02]]))
+        A, inputs = pushed.law.entries(np.array([t]), np.array([[0.27, 0.02]]))
         assert np.hstack([A[0], inputs[0]]) == pytest.approx(entries(t, 0.27, 0.02), abs=1e-12)
 
 

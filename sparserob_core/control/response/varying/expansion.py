@@ -443,6 +443,30 @@ class Expansion:
         total = every.sum(axis=1)  # smallest terms first
         return np.asarray(total.swapaxes(1, 2).reshape(count, size * own, wide))
 
+    @property
+    def expansions(self) -> tuple[Expansion, ...]:
+        """This one: there are no parts of parameters."""
+        return (self,)
+
+    def over(self, starts: Array, stops: Array, points: Array) -> tuple[Array, Array]:
+        """Return what intervals make of states and inputs, in the form of `Parts.over`; it is known, and ``points`` say
+        nothing."""
+        flow = self.flow(starts, stops)
+        return flow.state[None], np.concatenate([flow.control, flow.disturbance], axis=2)[None]
+
+    def along(self, starts: Array, stops: Array, parameters: Array) -> tuple[Array, Array]:
+        """Return the same in the form of `Parts.along`."""
+        state, inputs = self.over(starts, stops, parameters)
+        return state[0], inputs[0]
+
+    def entries(self, times: Array, parameters: Array) -> tuple[Array, Array]:
+        """Return ``A`` and ``[B E]`` at times, in the form of `Parts.entries`."""
+        return self.at(times)
+
+    def averages(self, breaks: Array, points: Array) -> Array:
+        """Return about what ``A`` is, in the form of `Parts.averages`."""
+        return np.asarray(self.average(breaks))[None]
+
     def on_cell(self, law: Spread, low: Array, high: Array) -> Expansion:
         """Return the expansion of the state on a cell of parameters, on the same segments, from that of the law.
 

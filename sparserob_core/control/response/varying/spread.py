@@ -3,7 +3,9 @@ parts of their box. States are expanded on cells of these, each by itself (`Expa
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import pairwise, product
 from math import comb
 from typing import final
@@ -16,9 +18,9 @@ from sparserob_core.control.enclosures.taylor import taylor_space
 from sparserob_core.control.problem.phase import Phase, PhaseInUnits
 from sparserob_core.control.problem.system import System
 from sparserob_core.control.response.varying.discs import NAMES, Cauchy, beyond, cauchy
-from sparserob_core.control.response.varying.expansion import balanced
+from sparserob_core.control.response.varying.expansion import Expansion, balanced
 from sparserob_core.control.sets.sets import Box
-from sparserob_core.errors import InputError
+from sparserob_core.errors import InputError, NotEnclosable
 from sparserob_core.sip.convex_set import Array
 
 LEFT = (1e-14, 1e-12, 1e-10)
@@ -76,6 +78,109 @@ class Parts:
             found[0].append(a[thick])
             found[1].append(b[thick])
         return np.concatenate(found[0]), np.concatenate(found[1])
+
+    @cached_property
+    def expansions(self) -> tuple[Expansion, ...]:
+        """The law on each part, as polynomials in time and parameters."""
+        return tuple(Expansion.of(system) for _, system in self.every)
+
+    def on_cell(self, low: Array, high: Array) -> Expansion:
+        """Return the law of all coefficients of the state on a cell ``[low, high]`` of parameters, ``(nu,)`` each.
+
+        Raises `NotEnclosable` where the cell lies in several parts.
+        """
+        part = self.holding(low, high)
+        if part is None:
+            raise NotEnclosable("a cell of parameters lies in two parts of their box")
+        return self.expansions[part].on_cell(self.every[part][0], low, high)
+
+    def at_point(self, parameter: Array) -> Expansion:
+        """Return the known law at a parameter ``(nu,)``."""
+        part = int(self.of(parameter[None])[0])
+        return self.expansions[part].at_point(self.every[part][0], parameter)
+
+    def over(self, starts: Array, stops: Array, points: Array) -> tuple[Array, Array]:
+        """Return what intervals make of the state and of inputs at every one of several parameters.
+
+        Parameters
+        ----------
+        starts, stops : Array
+            Times ``(k,)``.
+        points : Array
+            Parameters ``(v, nu)``.
+
+        Returns
+        -------
+        Array, Array
+            The transitions ``(v, k, d, d)``; and what inputs that stay the same bring, those of the disturbance after
+            the others, ``(v, k, d, m + mw)``. Nothing is proven by them.
+        """
+        found = [(here, of.at_parameters(starts, stops, powers[:, None])) for here, of, powers in self._apart(points)]
+        state, inputs = _joined_parts(found)
+        return state, inputs
+
+    def along(self, starts: Array, stops: Array, parameters: Array) -> tuple[Array, Array]:
+        """`over` of intervals each at its own of the ``parameters (k, nu)``, ``(k, d, d)`` and ``(k, d, m + mw)``."""
+        found = []
+        for here, of, powers in self._apart(parameters):
+            both = of.at_parameters(starts[here], stops[here], powers[None])
+            found.append((here, (both[0][0], both[1][0])))
+        state, inputs = _joined_parts(found)
+        return state, inputs
+
+    def entries(self, times: Array, parameters: Array) -> tuple[Array, Array]:
+        """Return ``A (k, d, d)`` and ``[B E] (k, d, m + mw)`` at times ``(k,)`` and ``parameters (k, nu)``; nothing is
+        proven by them."""
+        found, d = [], self.every[0][0].d
+        for here, of, powers in self._apart(parameters):
+            both = (one.reshape(here.size, -1, d, one.shape[2]) for one in of.at(times[here]))
+            A, inputs = (np.einsum("ka,kaij->kij", powers, one) for one in both)
+            found.append((here, (A, inputs)))
+        A, inputs = _joined_parts(found)
+        return A, inputs
+
+    def averages(self, breaks: Array, points: Array) -> Array:
+        """About what ``A`` is between ``breaks (L + 1,)`` at parameters ``(v, nu)``, ``(v, L, d, d)``."""
+        d, found = self.every[0][0].d, []
+        for here, of, powers in self._apart(points):
+            first = of.average(breaks).reshape(breaks.size - 1, -1, d, d)
+            found.append((here, (np.einsum("va,kaij->vkij", powers, first),)))
+        return _joined_parts(found)[0]
+
+    def left_out(self, part: int, begun: Array, inputs: Array, growth: float) -> Array:
+        """Return what the law leaves out of any state at any parameter of a part, ``(d,)``, at most.
+
+        Parameters
+        ----------
+        part : int
+            The part of the parameters.
+        begun, inputs : Array
+            How large the initial state ``(d,)`` and the inputs ``(m + mw,)`` are at most.
+        growth : float
+            How far states grow between two times at most, in the units of the part.
+        """
+        how, law = self.every[part][0], self.expansions[part]
+        left, d = how.left, how.d
+        assert left is not None
+        units, pushes = law.units[:d], law.largest_inputs(how) @ inputs / law.units[:d]
+        state = growth * (float((begun / units).max()) + float(np.diff(law.ends) @ pushes.max(axis=1)))
+        A = (left.sizes[:, :, :d] * units).sum(axis=2) / units
+        entered = left.sizes[:, :, d:] @ inputs / units
+        rate = state * A.max(axis=1) + entered.max(axis=1)
+        return np.asarray(growth * float(np.diff(left.ends) @ rate) * units * (1.0 + 1e-9))
+
+    def _apart(self, points: Array) -> Iterator[tuple[np.ndarray, Expansion, Array]]:
+        """Of parameters ``(v, nu)`` the numbers of those in every part, the law there, and their monomials."""
+        which = self.of(points)
+        for part in np.unique(which).tolist():
+            here, how = np.flatnonzero(which == part), self.every[part][0]
+            yield here, self.expansions[part], how.space.monomials(how.shares(points[here]))
+
+
+def _joined_parts(found: Sequence[tuple[np.ndarray, Sequence[Array]]]) -> list[Array]:
+    """Tables that were made of some of all indices each, ``(numbers (k,), tables)``, as those of all of them."""
+    order = np.argsort(np.concatenate([numbers for numbers, _ in found]))
+    return [np.concatenate(one)[order] for one in zip(*(tables for _, tables in found), strict=True)]
 
 
 def law_of(system: System) -> Parts:
