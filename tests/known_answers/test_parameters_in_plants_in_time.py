@@ -17,7 +17,9 @@ from scipy.optimize import linprog
 import sparserob_core as sr
 from sparserob_core.checker.flow import flows
 from sparserob_core.control.problem.expression import kepler
+from sparserob_core.control.reach.functional import WorstCase
 from sparserob_core.control.studies.initial_states import InitialPlane
+from sparserob_core.control.transcription.rounding import rounded_down
 from sparserob_core.experiment.assemble import assemble
 from sparserob_core.experiment.check.check import check
 from sparserob_core.experiment.config.load import load_config
@@ -465,3 +467,19 @@ def test_what_a_law_leaves_out_widens_the_rows_from_which_states_are_feasible() 
     vars(plane)["beyond"] = np.ones(2)
     assert (wider <= 1e-9).all()  # the degree is high
     np.testing.assert_allclose((family.rows(index)[1] - with_it).ravel(), np.abs(directions).sum(axis=1), rtol=1e-6)
+
+
+@pytest.mark.slow
+def test_what_a_law_leaves_out_lowers_the_bound_by_as_much_as_its_rows_weigh(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    outcome = sr.run(INSIDE, out=tmp_path / "run", quiet=True, figures=False)
+    model = assemble(load_config(INSIDE)).transcription
+    plain = rounded_down(model, outcome.result, None).lower_bound
+    monkeypatch.setattr(WorstCase, "beyond", lambda *_: np.full(1, 1e-3))
+    weighed = sum(
+        abs(cut.multiplier) * float(np.abs(said.direction).sum())
+        for cut, said in zip(outcome.result.dual.cuts, model.explained(outcome.result.dual.cuts), strict=True)
+    )
+    assert weighed > 0.0
+    assert plain - rounded_down(model, outcome.result, None).lower_bound == pytest.approx(1e-3 * weighed)

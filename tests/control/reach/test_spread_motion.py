@@ -3,6 +3,7 @@ by what is said, and bounds over cells of times and parameters hold what closed 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from math import factorial
 
@@ -353,22 +354,50 @@ def test_derivatives_in_time_and_parameters_are_those_of_differences() -> None:
         assert found[:, axis] == pytest.approx(exact, abs=1e-6)
 
 
-def test_what_a_law_leaves_out_of_its_series_is_in_no_state_more_than_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
+DRIVEN = sr.VaryingSystem.of([["-1/(1 + p) + 0*t"]], [["1"]], 2.0, [[1]], parameters=sr.Box([-0.2], [0.3]), names=["p"])
+
+
+@pytest.mark.parametrize(
+    ("law", "begun", "closed"),
+    [
+        (RELAXING, 1.0, relaxed),
+        (FILLING, 1.0, lambda t, p: 1.0 - 2.0 * t / (1.0 + p)),
+        (DRIVEN, 0.0, lambda t, p: -2.0 * (1.0 + p) * (1.0 - np.exp(-t / (1.0 + p)))),
+    ],
+    ids=["relaxing", "filling", "driven"],
+)
+def test_what_a_law_leaves_out_of_its_series_is_in_no_state_more_than_is_said(
+    law: sr.System, begun: float, closed: Callable[..., np.ndarray], monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(expansions, "LEFT", (1e-2,))  # so much that the degree is low
-    system = RELAXING.in_phases([replace(phase) for phase in RELAXING.phases])
+    system = law.in_phases([replace(phase) for phase in law.phases])
     problem = sr.OptimalControlProblem(
-        system=system, horizon=2.0, initial_state=[1.0], control=sr.Box([-2.0], [2.0]), path=[sr.Box([-9.0], [9.0])]
+        system=system, horizon=2.0, initial_state=[begun], control=sr.Box([-2.0], [2.0]), path=[sr.Box([-9.0], [9.0])]
     )
     pieces = sr.Dictionary.indicators(np.linspace(0.0, 2.0, 5))
     (constraint,) = prepare(problem, pieces, pieces).constraints
     functionals, points = constraint.functionals, np.linspace(-0.2, 0.3, 31)
     states = functionals.response.states(np.full((1, 4), -2.0), points[:, None])[:, :, 0]
-    exact = relaxed(functionals.response.grid.breakpoints, points[:, None])
+    exact = closed(functionals.response.grid.breakpoints, points[:, None])
     off, said = np.abs(states - exact).max(), functionals.beyond(np.array([2.0]))[0]
     assert 1e-6 < off <= said <= 1e3 * off
     least = functionals.beyond(np.array([0.0]))[0]
-    assert 0.0 < least < said
-    assert replace(functionals, initial=sr.Box([-1.0], [1.0])).beyond(np.array([2.0]))[0] > said
+    assert (least > 0.0) == (law is RELAXING)
+    assert least < said
+    wider = replace(functionals, initial=sr.Box([-1.0], [1.0])).beyond(np.array([2.0]))[0]
+    assert (wider > said) == (law is not FILLING)
+    cell = functionals.response.propagator.on_cell(np.array([-0.1]), np.array([0.2])).expansion
+    assert cell is not None
+    assert cell.spread is not None
+    assert cell.spread.left is not None
+    for p in (-0.1, 0.05, 0.2):  # what the law leaves out is in what is beyond a cell
+        powers = cell.spread.space.monomials(np.array([[(p - 0.05) / 0.15]]))[0]
+        found = (
+            powers @ cell.coefficients[0, 0, :, 0] if law is not FILLING else powers @ cell.coefficients[0, 0, :, -2]
+        )
+        true = -1.0 / (1.0 + p) if law is not FILLING else 1.0 / (1.0 + p)
+        entry = cell.spread.left.sizes[0, 0, 0 if law is not FILLING else 1]
+        assert abs(found - true) <= entry + 1e-14
     (polynomial,) = prepare(replace(problem, system=SYSTEM, horizon=3.0), pieces_of(3.0), pieces_of(3.0)).constraints
     assert not polynomial.functionals.beyond(np.array([2.0])).any()
 
@@ -404,7 +433,52 @@ def test_growth_is_asked_of_the_part_that_a_cell_is_in(monkeypatch: pytest.Monke
     narrow = laws.ends(edge)[0], laws.ends(edge)[0] * 0.75 + point * 0.25
     inside = functionals.legs(*narrow)[0]
     assert isinstance(inside, SpreadMotion)
-    assert inside.truncation.known == before.truncation.growth
+    assert inside.truncation.growth == before.truncation.growth
+    (other,) = prepare(problem, pieces_of(1.0), pieces_of(1.0)).constraints
+    other.functionals.legs(*narrow)
+    around = other.functionals.legs(*laws.ends(edge))[0]  # which is not inside of what is known
+    assert isinstance(around, SpreadMotion)
+    assert around.truncation.known is None
+
+
+def test_growth_is_the_largest_on_any_half_of_a_part() -> None:
+    law = [["2*exp(p) + 0*t"]]
+    system = sr.VaryingSystem.of(law, [[1]], 2.0, parameters=sr.Box([-1.0], [1.0]), names=["p"])
+    problem = sr.OptimalControlProblem(
+        system=system, horizon=2.0, initial_state=[0.0], control=sr.Box([-1.0], [1.0]), path=[sr.Box([-9.0], [9.0])]
+    )
+    (constraint,) = prepare(problem, pieces_of(2.0), pieces_of(2.0)).constraints
+    low, high = np.array([-1.0]), np.array([1.0])
+    with pytest.raises(NotEnclosable):
+        constraint.functionals.legs(low, high)
+    found = constraint.functionals._growth(low, high, 8)
+    assert np.exp(4.0 * np.e) * (1.0 - 1e-9) <= found <= 100.0 * np.exp(4.0 * np.e)
+    assert constraint.functionals._growth(low, high, 0) == np.inf
+
+
+def test_what_steps_are_off_by_is_carried_to_all_coefficients(pushed: Propagator) -> None:
+    motion = SpreadMotion.of(pushed.on_cell(LOW, HIGH), np.zeros(2), None).motion
+    steps, units = motion.flow.state, motion.expansion.units
+    for mark in (1, len(steps) // 2, len(steps)):
+        transition = np.eye(motion.states)
+        for piece in range(mark - 1, -1, -1):  # from the end of the piece
+            stretch = motion._stretches[0][piece]
+            assert (motion.carries[mark, stretch] >= np.abs(transition) @ units * (1.0 - 1e-12)).all()
+            transition = transition @ steps[piece]
+
+
+def test_what_a_law_leaves_out_in_time_is_no_less_on_a_cell_than_at_its_corners(pushed: Propagator) -> None:
+    assert pushed.laws is not None
+    how, law = pushed.laws.every[0][0], pushed.laws.expansions[0]
+    low, high = np.array([0.25, 0.0]), np.array([0.3, 0.05])  # at a corner all monomials have one sign
+    rough = replace(law, remainder=np.full(law.remainder.shape, 1e-3))
+    cell, corner = rough.on_cell(how, low, high), rough.at_point(how, high)
+    assert cell.spread is not None
+    first = np.concatenate([cell.remainder[..., :2], cell.remainder[..., cell.units.size :]], axis=2)
+    on_cell = first.reshape(len(first), cell.spread.space.size, 2, -1).sum(axis=1)
+    left = 0.0 if cell.spread.left is None else cell.spread.left.over(cell.ends)
+    assert (on_cell + left >= corner.remainder * (1.0 - 1e-9)).all()
+    assert (on_cell <= 1.01 * corner.remainder).all()
 
 
 def test_cells_on_which_inputs_vanish_are_halved_where_states_grow() -> None:
