@@ -15,7 +15,7 @@ import numpy as np
 
 from sparserob_core.control.constraints.state import StateConstraint
 from sparserob_core.control.reach.functional import CHUNK
-from sparserob_core.control.response.response import Response, TimeGrid
+from sparserob_core.control.response.response import Response, TimeGrid, Weights
 from sparserob_core.control.response.sensitivity_system import tangent
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.relaxed.index_gradient import differences
@@ -226,10 +226,7 @@ class Sensitivity:
 
         def value(p: Array, of: np.ndarray) -> Array:
             known = self._response.weights(times[of], at.direction[of], p)
-            found = (known.free * at.start[of]).sum(axis=1) + np.einsum("klm,ml->k", known.control, control)
-            if signals is not None:
-                found = found + np.einsum("klw,kwl->k", known.disturbance, signals[of])
-            return np.asarray(found)
+            return _seen(known, at.start[of], control, None if signals is None else signals[of])
 
         if not self._nu:
             return np.zeros((times.size, 0))
@@ -242,9 +239,8 @@ class Sensitivity:
         known = self._response.weights(times, along, parameters)
         control = self.constraint.functionals.on_grid(x)
         acting = control[:, at.now].T
-        found = (known.free * at.start).sum(axis=1) + np.einsum("klm,ml->k", known.control, control)
+        found = _seen(known, at.start, control, signals)
         if signals is not None:
-            found = found + np.einsum("klw,kwl->k", known.disturbance, signals)
             acting = np.hstack([acting, signals[np.arange(times.size), :, at.now]])
         return np.asarray(found + (pushes[:, : acting.shape[1]] * acting).sum(axis=1))[:, None]
 
@@ -315,3 +311,10 @@ class Sensitivity:
         """1 for the coordinates ``(d,)`` of the index that can move, 0 for the others."""
         box = self.constraint.index_set
         return np.asarray(box.upper > box.lower, dtype=float)
+
+
+def _seen(known: Weights, start: Array, control: Array, signals: Array | None) -> Array:
+    """The functionals ``(k,)`` with these weights, from states ``start (k, d)``, under inputs on the pieces, ``(m, L)``
+    and ``(k, mw, L)``."""
+    found = (known.free * start).sum(axis=1) + np.einsum("klm,ml->k", known.control, control)
+    return np.asarray(found if signals is None else found + np.einsum("klw,kwl->k", known.disturbance, signals))

@@ -446,14 +446,13 @@ class Spread:
     """The state of a system of ``d`` states as a polynomial in its parameters: ``x = sum_a delta^a x_a`` and what is
     left of higher degrees. The ``x_a`` are the blocks of a larger state, in the
     order of the monomials of the ``space``, and obey ``x_a' = sum_b A_b x_(a-b) + B_a u + E_a w + c_a``; about the
-    ``centre (nu,)`` of the parameters and in ``units (nu,)`` of theirs. ``powers``: the largest degree of an
-    entry that is a polynomial; of others ``left`` tells what is beyond the degree of the space."""
+    ``centre (nu,)`` of the parameters and in ``units (nu,)`` of theirs.
+    Of entries that are no polynomials of that degree ``left`` tells what is beyond the degree of the space."""
 
     d: int
     space: TaylorSpace
     centre: Array
     units: Array
-    powers: int
     left: Left | None = None
 
     @property
@@ -487,7 +486,7 @@ class Spread:
         if self.left is not None:
             beyond = beyond + self.left.over(ends)
         left = Left(ends, beyond * OUTWARD) if beyond.any() else None
-        return Spread(self.d, space, (low + high) / 2, (high - low) / 2, self.powers, left), kept
+        return Spread(self.d, space, (low + high) / 2, (high - low) / 2, left), kept
 
     def shares(self, parameters: Array) -> Array:
         """``delta (k, nu)`` of parameters ``(k, nu)``."""

@@ -84,8 +84,7 @@ class Plan:
         grid, system = response.grid, response.system
         for number in np.flatnonzero(grid.control_piece == piece).tolist():
             if grid.varying:  # whose pieces are its modes
-                middle = system.box.interior_point()[None] if system.parameter_count else KNOWN
-                B = grid.of_modes(response.steps(middle).B[0])[number]
+                B = grid.of_modes(response.steps(self.known.parameters.middle[None]).B[0])[number]
             else:
                 mode = system.modes[int(grid.modes[number])]
                 B = mode.matrices(mode.probes[:1])[1][0]

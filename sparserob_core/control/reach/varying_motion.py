@@ -672,10 +672,9 @@ class Truncation:
 @dataclass(frozen=True, eq=False)
 class SpreadMotion:
     """The `Motion` over a cell of parameters, by that of all coefficients on it, and what is beyond their degree, in a
-    ``truncation``. ``influence (nu,)`` as in `Motion`."""
+    ``truncation``."""
 
     truncation: Truncation
-    influence: Array
 
     @staticmethod
     def of(propagator: Propagator, initial_state: Array, growth: float | None) -> SpreadMotion:
@@ -694,7 +693,7 @@ class SpreadMotion:
         if not bounded:
             wide = "the state moves too far on a cell of parameters"
             raise NotEnclosable(wide, along=truncation.growing)
-        return SpreadMotion(truncation, truncation.influence)
+        return SpreadMotion(truncation)
 
     @property
     def motion(self) -> VaryingMotion:
@@ -730,6 +729,11 @@ class SpreadMotion:
     def starts(self) -> np.ndarray:
         """Every state is a block."""
         return np.arange(self.states)
+
+    @property
+    def influence(self) -> Array:
+        """`Motion.influence`."""
+        return self.truncation.influence
 
     @property
     def norm(self) -> float:

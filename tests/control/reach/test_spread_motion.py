@@ -35,7 +35,7 @@ def decay(t: np.ndarray, p: np.ndarray) -> np.ndarray:
 @pytest.mark.slow
 @pytest.mark.parametrize("degree", [2, 3, 5])
 def test_what_is_beyond_a_degree_is_bounded_and_not_by_far_more_than_it_is(degree: int) -> None:
-    spread = Spread(1, TaylorSpace(1, degree), *SYSTEM.deviations, powers=2)
+    spread = Spread(1, TaylorSpace(1, degree), *SYSTEM.deviations)
     breaks = np.linspace(0.0, 3.0, 7)
     every = Propagator(SYSTEM.superposed(spread), merge_grids(breaks, breaks, varying=True))
     motion = VaryingMotion(every, np.eye(spread.states)[0])
@@ -134,7 +134,7 @@ def relaxed(t: np.ndarray, p: np.ndarray) -> np.ndarray:
 def test_what_power_series_leave_of_entries_is_in_what_is_beyond(name: str, degree: int) -> None:
     system = RELAXING if name == "relaxing" else FILLING
     left = cauchy(system).left(degree)
-    spread = Spread(1, TaylorSpace(1, degree), *system.deviations, powers=1, left=left)
+    spread = Spread(1, TaylorSpace(1, degree), *system.deviations, left=left)
     breaks = np.linspace(0.0, 2.0, 5)
     every = Propagator(system.superposed(spread), merge_grids(breaks, breaks, varying=True))
     motion = VaryingMotion(every, np.eye(spread.states)[0])
@@ -213,7 +213,7 @@ def test_rows_and_outputs_at_any_time_and_parameter_are_those_of_an_integrator(
 
 @pytest.mark.parametrize("off", [0.0, 3e-7])
 def test_norms_of_coefficients_hold_what_transitions_are_off_by(off: float, monkeypatch: pytest.MonkeyPatch) -> None:
-    spread = Spread(1, TaylorSpace(1, 6), *SYSTEM.deviations, powers=2)
+    spread = Spread(1, TaylorSpace(1, 6), *SYSTEM.deviations)
     breaks = np.linspace(0.0, 3.0, 7)
     every = Propagator(SYSTEM.superposed(spread), merge_grids(breaks, breaks, varying=True))
     truncation = Truncation(VaryingMotion(every, np.eye(spread.states)[0]), spread)

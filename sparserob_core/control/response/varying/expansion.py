@@ -494,10 +494,16 @@ class Expansion:
         table[:, :, place] = every[:, :, kept]
         beside = np.zeros((len(rest), space.size, *rest.shape[2:]))
         beside[:, place] = rest[:, kept] * (1.0 + 1e-9)
+
+        def filled(law: Array) -> Array:  # (..., M, d, d + n)
+            first = law.reshape(*law.shape[:-3], how.states, -1)
+            A = how.filled(first[..., :d].reshape(-1, how.states, d)).reshape(*first.shape[:-1], how.states)
+            return np.concatenate([A, first[..., d:]], axis=-1)
+
         return Expansion(
             self.ends,
-            _filled(space, table),
-            _filled(space, beside[:, None])[:, 0],
+            filled(table),
+            filled(beside),
             np.tile(self.units[:d], space.size),
             np.ones((len(rest), how.states)),
             self.channels,
@@ -710,17 +716,6 @@ def _tail(sizes: Array, shares: Array, summed: int | None = None) -> tuple[int, 
             if (tail <= IDLE).all():
                 break
     return terms, tail
-
-
-def _filled(space: TaylorSpace, law: Array) -> Array:
-    """``[A F]`` of all coefficients of the state, ``(s, p, M d, M d + n)``, from the coefficients ``(s, p, M, d, d +
-    n)`` of that of the state."""
-    left, right, target = space.products
-    count, orders, size, d, wide = law.shape
-    A = np.zeros((count, orders, size, size, d, d))
-    A[:, :, target, right] = law[:, :, left, :, :d]
-    whole = A.swapaxes(3, 4).reshape(count, orders, size * d, size * d)
-    return np.concatenate([whole, law[..., d:].reshape(count, orders, size * d, wide - d)], axis=3)
 
 
 def _spread_of(system: System) -> Spread | None:

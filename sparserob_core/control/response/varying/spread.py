@@ -203,9 +203,8 @@ def _made(system: System) -> Parts:
     every = []
     for part, look in zip(_boxes(system, edges), looks, strict=True):
         centre, units = part.deviations
-        assert part.powers is not None
         left = None if look is None else look.left(degree)
-        how = Spread(system.states, taylor_space(centre.size, degree), centre, units, part.powers, left)
+        how = Spread(system.states, taylor_space(centre.size, degree), centre, units, left)
         every.append((how, part.superposed(how)))
     return Parts(edges, tuple(every))
 
