@@ -31,12 +31,12 @@ def balls(vector: Sequence[float] | Array) -> list[arb]:
 
 def largest(values: Iterable[arb]) -> arb:
     """Return the largest of some balls, at least one."""
-    return reduce(lambda one, other: one.max(other), values)
+    return reduce(lambda a, b: a.max(b), values)
 
 
 def smallest(values: Iterable[arb]) -> arb:
     """Return the smallest of some balls, at least one."""
-    return reduce(lambda one, other: one.min(other), values)
+    return reduce(lambda a, b: a.min(b), values)
 
 
 def rational(value: Fraction) -> arb:
@@ -62,8 +62,8 @@ def difference(a: float, b: float) -> tuple[float, float]:
     Two differences are equal where the pairs are equal.
     """
     nearest = a - b
-    part = nearest - a
-    return nearest, (a - (nearest - part)) - (b + part)
+    negative_b = nearest - a
+    return nearest, (a - (nearest - negative_b)) - (b + negative_b)
 
 
 def spanning(rows: Sequence[Sequence[fmpq]]) -> list[list[fmpq]]:

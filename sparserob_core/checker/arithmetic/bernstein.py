@@ -39,8 +39,8 @@ def _conversion(degree: int, symmetric: bool) -> Array:
             for i in range(degree + 1)
         ]
     )
-    answer: Array = rows @ shift
-    return answer
+    conversion: Array = rows @ shift
+    return conversion
 
 
 def bernstein(coefficients: Array, symmetric: Sequence[bool], absolute: bool = False) -> Array:
@@ -74,23 +74,23 @@ def highest(coefficients: Array, symmetric: Sequence[bool], errors: Array, limit
             coefficients.shape[0], -1
         ).max(axis=1)
         b = bernstein(coefficients, symmetric)
-    tame = np.isfinite(b).reshape(b.shape[0], -1).all(axis=1) & np.isfinite(slack)  # the other bounds are infinite
-    owner, b = np.flatnonzero(tame), b[tame]
-    bounds = np.where(tame, -np.inf, np.inf)
+    is_finite = np.isfinite(b).reshape(b.shape[0], -1).all(axis=1) & np.isfinite(slack)  # the other bounds are infinite
+    owner, b = np.flatnonzero(is_finite), b[is_finite]
+    bounds = np.where(is_finite, -np.inf, np.inf)
     for step in range(HALVINGS if owner.size else 0):
-        top = b.reshape(b.shape[0], -1).max(axis=1)
-        done = top + slack[owner] <= limit
-        reached = _corners(b).max(axis=1)
-        hopeless = reached + slack[owner] > limit  # the polynomial attains this value
-        stop = (
+        upper = b.reshape(b.shape[0], -1).max(axis=1)
+        is_shown = upper + slack[owner] <= limit
+        attained = _corners(b).max(axis=1)
+        is_refuted = attained + slack[owner] > limit  # the polynomial attains this value
+        is_stopped = (
             np.zeros(owner.size, dtype=bool)
             if step < HALVINGS - 1 and owner.size <= MOST_BOXES
             else np.ones(owner.size, dtype=bool)
         )
-        lost = np.isin(owner, owner[hopeless | stop & ~done])
-        closed = done | lost
-        np.maximum.at(bounds, owner[closed], (top + slack[owner])[closed])
-        b, owner = b[~closed], owner[~closed]
+        is_given_up = np.isin(owner, owner[is_refuted | is_stopped & ~is_shown])
+        is_closed = is_shown | is_given_up
+        np.maximum.at(bounds, owner[is_closed], (upper + slack[owner])[is_closed])
+        b, owner = b[~is_closed], owner[~is_closed]
         if not owner.size:
             break
         b, owner = _halved(b), np.tile(owner, 2)
@@ -98,32 +98,32 @@ def highest(coefficients: Array, symmetric: Sequence[bool], errors: Array, limit
 
 
 def _corners(b: Array) -> Array:
-    picked = b
+    corners = b
     for axis in range(1, b.ndim):
-        picked = np.take(picked, [0, -1], axis=axis)
-    return picked.reshape(b.shape[0], -1)
+        corners = np.take(corners, [0, -1], axis=axis)
+    return corners.reshape(b.shape[0], -1)
 
 
 def _halved(b: Array) -> Array:
     """Return both halves of every box, the lower halves first. Each box is halved along the axis on which its
     coefficients vary most (de Casteljau)."""
-    spread = np.stack(
+    variation = np.stack(
         [np.abs(np.diff(b, axis=axis)).reshape(b.shape[0], -1).max(axis=1, initial=0.0) for axis in range(1, b.ndim)],
         axis=1,
     )
-    axes = spread.argmax(axis=1) + 1
+    axes = variation.argmax(axis=1) + 1
     low, high = np.empty_like(b), np.empty_like(b)
     for axis in range(1, b.ndim):
-        mine = axes == axis
-        if mine.any():
-            first, second = _casteljau(np.moveaxis(b[mine], axis, -1))
-            low[mine], high[mine] = np.moveaxis(first, -1, axis), np.moveaxis(second, -1, axis)
+        is_chosen = axes == axis
+        if is_chosen.any():
+            lower_half, upper_half = _casteljau(np.moveaxis(b[is_chosen], axis, -1))
+            low[is_chosen], high[is_chosen] = np.moveaxis(lower_half, -1, axis), np.moveaxis(upper_half, -1, axis)
     return np.concatenate([low, high])
 
 
 def _casteljau(b: Array) -> tuple[Array, Array]:
-    left, right, row = np.empty_like(b), np.empty_like(b), b
+    lower_half, upper_half, row = np.empty_like(b), np.empty_like(b), b
     for i in range(b.shape[-1]):
-        left[..., i], right[..., b.shape[-1] - 1 - i] = row[..., 0], row[..., -1]
+        lower_half[..., i], upper_half[..., b.shape[-1] - 1 - i] = row[..., 0], row[..., -1]
         row = (row[..., :-1] + row[..., 1:]) / 2
-    return left, right
+    return lower_half, upper_half

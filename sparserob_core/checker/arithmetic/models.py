@@ -47,10 +47,10 @@ class Frame:
         """Return the model of ``middle + half s_place``, with the parameter ``s_place`` in ``[-1, 1]``."""
         from flint import arb_poly
 
-        found = self.number(middle)
+        model = self.number(middle)
         if not half.is_zero():
-            found.parts[self.monomials.linear(place)] = arb_poly([half])
-        return found
+            model.parts[self.monomials.linear(place)] = arb_poly([half])
+        return model
 
     def _of(self, coefficients: list[arb]) -> Model:
         from flint import arb_poly
@@ -74,13 +74,13 @@ class Model:
     @property
     def constant(self) -> arb:
         """The term that depends on neither the time nor a parameter."""
-        first = self.parts[0]
-        return ball(0) if first is None else first[0]
+        coefficient = self.parts[0]
+        return ball(0) if coefficient is None else coefficient[0]
 
     @property
     def size(self) -> arb:
         """The upper bound of the absolute value."""
-        return sum((_size(part) for part in self.parts if part is not None), ball(0))
+        return sum((_size(coefficient) for coefficient in self.parts if coefficient is not None), ball(0))
 
     def _other(self, value: object) -> Model:
         if isinstance(value, Model):
@@ -94,7 +94,7 @@ class Model:
         return Model(self.frame, [a if b is None else b if a is None else a + b for a, b in pairs])
 
     def __neg__(self) -> Model:
-        return Model(self.frame, [None if part is None else -part for part in self.parts])
+        return Model(self.frame, [None if coefficient is None else -coefficient for coefficient in self.parts])
 
     def __pos__(self) -> Model:
         return self
@@ -107,29 +107,29 @@ class Model:
 
     def __mul__(self, other: object) -> Model:
         right, monomials = self._other(other).parts, self.frame.monomials
-        found: list[Part] = [None] * monomials.size
+        coefficients: list[Part] = [None] * monomials.size
         for a, pairs in zip(self.parts, monomials.products_with, strict=True):
             if a is None:
                 continue
             for j, k in pairs:
-                b, total = right[j], found[k]
+                b, total = right[j], coefficients[k]
                 if b is not None:
-                    found[k] = a * b if total is None else total + a * b
-        return Model(self.frame, found)._within(_beyond(monomials, self.parts, right))
+                    coefficients[k] = a * b if total is None else total + a * b
+        return Model(self.frame, coefficients)._within(_beyond(monomials, self.parts, right))
 
     def _within(self, beyond: arb) -> Model:
         """Return the model up to its order in the time, with a remainder of at most ``beyond`` added."""
         from flint import arb, arb_poly
 
-        parts = list(self.parts)
-        for k, part in enumerate(parts):
-            if part is not None and part.length() > self.frame.order + 1:
-                rest = sum(map(abs, part.coeffs()[self.frame.order + 1 :]), arb(0))
-                parts[k] = part.truncate(self.frame.order + 1) + arb_poly([arb(0, rest.upper())])
+        coefficients = list(self.parts)
+        for k, coefficient in enumerate(coefficients):
+            if coefficient is not None and coefficient.length() > self.frame.order + 1:
+                remainder = sum(map(abs, coefficient.coeffs()[self.frame.order + 1 :]), arb(0))
+                coefficients[k] = coefficient.truncate(self.frame.order + 1) + arb_poly([arb(0, remainder.upper())])
         if not beyond.is_zero():
-            ball, first = arb_poly([arb(0, beyond.upper())]), parts[0]
-            parts[0] = ball if first is None else first + ball
-        return Model(self.frame, parts)
+            remainder_ball, constant = arb_poly([arb(0, beyond.upper())]), coefficients[0]
+            coefficients[0] = remainder_ball if constant is None else constant + remainder_ball
+        return Model(self.frame, coefficients)
 
     def __truediv__(self, other: object) -> Model:
         return self * self._other(other)._through(lambda series: 1 / series)
@@ -141,10 +141,10 @@ class Model:
         if isinstance(other, int | float | np.integer | np.floating) and float(other).is_integer():
             count = int(other)
             if abs(count) <= LARGEST_POWER:
-                found, base = self._other(1.0), self
+                power, base = self._other(1.0), self
                 for _ in range(abs(count)):
-                    found = found * base
-                return found if count >= 0 else 1.0 / found
+                    power = power * base
+                return power if count >= 0 else 1.0 / power
         return (self._other(other) * self.log()).exp()
 
     def __rpow__(self, other: object) -> Model:
@@ -158,28 +158,28 @@ class Model:
         from flint import arb, arb_series, ctx
 
         c = arb(self.constant.mid())
-        away = self - self.frame.number(c)
-        far, count = away.size.upper(), self.frame.order + self.frame.monomials.degree + 1
-        before, ctx.cap = ctx.cap, count + 1
+        deviation = self - self.frame.number(c)
+        radius, count = deviation.size.upper(), self.frame.order + self.frame.monomials.degree + 1
+        old_cap, ctx.cap = ctx.cap, count + 1
         try:
-            near, wide = (function(arb_series([at, 1], count + 1)) for at in (c, arb(c, far)))
-            coefficients, bounds = ([one[k] for k in range(count + 1)] for one in (near, wide))
+            expansion, enclosure = (function(arb_series([at, 1], count + 1)) for at in (c, arb(c, radius)))
+            coefficients, bounds = ([series[k] for k in range(count + 1)] for series in (expansion, enclosure))
         except (ValueError, ZeroDivisionError) as error:
             raise Unchecked(f"an entry of the system is not finite ({error})") from error
         finally:
-            ctx.cap = before
-        if not all(one.is_finite() for one in (*coefficients, *bounds)):
+            ctx.cap = old_cap
+        if not all(coefficient.is_finite() for coefficient in (*coefficients, *bounds)):
             raise Unchecked("an entry of the system is not finite")
-        power, rests, wanted = arb(1), [], arb(ENOUGH) * abs(coefficients[0])
+        power, remainders, tolerance = arb(1), [], arb(ENOUGH) * abs(coefficients[0])
         for bound in bounds[1:]:
-            power = power * far
-            rests.append((abs(bound) * power).upper())
-        least = min(range(count), key=lambda k: float(rests[k]))
-        order = next((k for k, rest in enumerate(rests) if rest <= wanted), least)
-        found = self.frame.number(coefficients[order])
+            power = power * radius
+            remainders.append((abs(bound) * power).upper())
+        smallest = min(range(count), key=lambda k: float(remainders[k]))
+        order = next((k for k, remainder in enumerate(remainders) if remainder <= tolerance), smallest)
+        model = self.frame.number(coefficients[order])
         for coefficient in reversed(coefficients[:order]):
-            found = found * away + self.frame.number(coefficient)
-        return found._within(rests[order])
+            model = model * deviation + self.frame.number(coefficient)
+        return model._within(remainders[order])
 
     def exp(self) -> Model:
         return self._through(lambda s: s.exp())
@@ -216,10 +216,10 @@ def _beyond(monomials: Monomials, left: Sequence[Part], right: Sequence[Part]) -
     if not monomials.degree:
         return ball(0)
     sizes = [[ball(0)] * (monomials.degree + 1) for _ in range(2)]
-    for side, parts in zip(sizes, (left, right), strict=True):
-        for degree, part in zip(monomials.degrees, parts, strict=True):
-            if part is not None:
-                side[degree] = side[degree] + _size(part)
+    for side, coefficients in zip(sizes, (left, right), strict=True):
+        for degree, coefficient in zip(monomials.degrees, coefficients, strict=True):
+            if coefficient is not None:
+                side[degree] = side[degree] + _size(coefficient)
     total = ball(0)
     for i, size in enumerate(sizes[0]):
         if i and not size.is_zero():
@@ -255,12 +255,12 @@ def kepler_series(anomaly: arb_series, eccentricity: float, length: int) -> arb_
     s, c = [E[0].sin()], [E[0].cos()]
     slope = 1 - e * c[0]
     for n in range(length - 1):
-        moved = [(k + 1) * one for k, one in enumerate(E[1:])]
-        pushed = sum((moved[k] * c[n - k] for k in range(n)), arb(0))
-        E.append(((n + 1) * anomaly[n + 1] + e * pushed) / (slope * (n + 1)))
-        moved.append((n + 1) * E[-1])
-        s.append(sum((moved[k] * c[n - k] for k in range(n + 1)), arb(0)) / (n + 1))
-        c.append(-sum((moved[k] * s[n - k] for k in range(n + 1)), arb(0)) / (n + 1))
+        derivative = [(k + 1) * coefficient for k, coefficient in enumerate(E[1:])]
+        convolution = sum((derivative[k] * c[n - k] for k in range(n)), arb(0))
+        E.append(((n + 1) * anomaly[n + 1] + e * convolution) / (slope * (n + 1)))
+        derivative.append((n + 1) * E[-1])
+        s.append(sum((derivative[k] * c[n - k] for k in range(n + 1)), arb(0)) / (n + 1))
+        c.append(-sum((derivative[k] * s[n - k] for k in range(n + 1)), arb(0)) / (n + 1))
     return arb_series(E, length)
 
 
@@ -286,12 +286,12 @@ def kepler_root(anomaly: arb, e: arb) -> arb:
     E = anomaly
     low, high = anomaly - e, anomaly + e
     for _ in range(NEWTON):
-        missed = arb((E - e * E.sin() - anomaly).mid())
-        if missed > 0:
+        residual = arb((E - e * E.sin() - anomaly).mid())
+        if residual > 0:
             high = E
         else:
             low = E
-        E = arb((E - missed / (1 - e * E.cos())).mid())
+        E = arb((E - residual / (1 - e * E.cos())).mid())
         if not (low <= E <= high):
             E = arb(((low + high) / 2).mid())
     width = arb(2) ** (8 - ctx.prec) * (1 + abs(anomaly))

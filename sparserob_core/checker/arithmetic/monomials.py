@@ -69,8 +69,8 @@ NONE = Monomials(0, 0)
 
 @lru_cache(maxsize=64)
 def _exponents(count: int, degree: int) -> list[tuple[int, ...]]:
-    every = [e for e in product(range(degree + 1), repeat=count) if sum(e) <= degree]
-    return sorted(every, key=lambda e: (sum(e), e))
+    exponents = [e for e in product(range(degree + 1), repeat=count) if sum(e) <= degree]
+    return sorted(exponents, key=lambda e: (sum(e), e))
 
 
 @lru_cache(maxsize=64)
@@ -90,19 +90,19 @@ def _places(count: int, degree: int) -> dict[tuple[int, ...], int]:
 
 @lru_cache(maxsize=64)
 def _products_with(count: int, degree: int) -> list[list[tuple[int, int]]]:
-    found: list[list[tuple[int, int]]] = [[] for _ in _exponents(count, degree)]
+    pairs: list[list[tuple[int, int]]] = [[] for _ in _exponents(count, degree)]
     for i, j, k in _products(count, degree):
-        found[i].append((j, k))
-    return found
+        pairs[i].append((j, k))
+    return pairs
 
 
 @lru_cache(maxsize=64)
 def _products(count: int, degree: int) -> list[tuple[int, int, int]]:
-    places, every = _places(count, degree), _exponents(count, degree)
+    places, exponents = _places(count, degree), _exponents(count, degree)
     return [
         (i, j, places[g])
-        for i, e in enumerate(every)
-        for j, f in enumerate(every)
+        for i, e in enumerate(exponents)
+        for j, f in enumerate(exponents)
         if sum(e) + sum(f) <= degree
         for g in [tuple(a + b for a, b in zip(e, f, strict=True))]
     ]
@@ -111,8 +111,8 @@ def _products(count: int, degree: int) -> list[tuple[int, int, int]]:
 @lru_cache(maxsize=64)
 def _quotients(count: int, degree: int) -> np.ndarray:
     size = len(_exponents(count, degree))
-    found = np.full((size, size), -1)
+    quotients = np.full((size, size), -1)
     for i, j, k in _products(count, degree):
-        found[i, k] = j
-    found.flags.writeable = False
-    return found
+        quotients[i, k] = j
+    quotients.flags.writeable = False
+    return quotients

@@ -25,18 +25,18 @@ def remembered(
     """
 
     def of(method: Callable[Concatenate[S, P], T]) -> Callable[Concatenate[S, P], T]:
-        place = f"_{method.__name__}_remembered"
+        attribute = f"_{method.__name__}_remembered"
 
         @wraps(method)
         def remembering(self: S, *given: P.args, **named: P.kwargs) -> T:
-            made: dict[Any, T] = self.__dict__.setdefault(place, {})
-            mark = (given, *named.items()) if key is None else key(self, *given, **named)
-            if mark not in made:
+            cache: dict[Any, T] = self.__dict__.setdefault(attribute, {})
+            cache_key = (given, *named.items()) if key is None else key(self, *given, **named)
+            if cache_key not in cache:
                 value = method(self, *given, **named)
-                while most is not None and len(made) >= most():
-                    made.pop(next(iter(made)))
-                made[mark] = value
-            return made[mark]
+                while most is not None and len(cache) >= most():
+                    cache.pop(next(iter(cache)))
+                cache[cache_key] = value
+            return cache[cache_key]
 
         return remembering  # type: ignore[return-value]  # its first argument has a name
 

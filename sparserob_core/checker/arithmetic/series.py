@@ -44,8 +44,8 @@ class Series:
     @property
     def matrix(self) -> arb_mat:
         """The matrix where there are no parameters."""
-        (found,) = self.parts
-        return found
+        (matrix,) = self.parts
+        return matrix
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -56,30 +56,30 @@ class Series:
     def there(self) -> list[bool]:
         """The coefficients that are not exactly 0, as Booleans: those of a system are few."""
         zero = self.parts[0] * 0
-        absent = [part == zero for part in self.parts]  # certainly equal; != is certainly different
-        return [not gone for gone in absent]
+        is_zero = [coefficient == zero for coefficient in self.parts]  # certainly equal; != is certainly different
+        return [not vanishes for vanishes in is_zero]
 
     @cached_property
     def sizes(self) -> Array:
         """For every degree, upper bounds ``(D + 1, rows, columns)`` of the sums of the absolute values of its
         coefficients."""
-        there = [part for part, here in zip(self.parts, self.there, strict=True) if here]
-        entries = np.array([float(x.abs_upper()) for part in there for x in part.entries()])
-        found = np.zeros((self.monomials.size, *self.shape))
-        found[self.there] = entries.reshape(len(there), *self.shape) + TINY
-        return np.add.reduceat(found, self.monomials.firsts, axis=0) * OUTWARD
+        nonzero = [coefficient for coefficient, is_nonzero in zip(self.parts, self.there, strict=True) if is_nonzero]
+        entries = np.array([float(x.abs_upper()) for coefficient in nonzero for x in coefficient.entries()])
+        bounds = np.zeros((self.monomials.size, *self.shape))
+        bounds[self.there] = entries.reshape(len(nonzero), *self.shape) + TINY
+        return np.add.reduceat(bounds, self.monomials.firsts, axis=0) * OUTWARD
 
     @cached_property
     def size(self) -> Array:
         """The upper bounds ``(rows, columns)`` of the absolute values of the entries."""
-        entries = np.array([float(x.abs_upper()) for part in self.parts for x in part.entries()])
-        found = np.where(entries > 0.0, entries + TINY, 0.0)
-        return np.asarray(found.reshape(len(self.parts), *self.shape).sum(axis=0) * OUTWARD)
+        entries = np.array([float(x.abs_upper()) for coefficient in self.parts for x in coefficient.entries()])
+        bounds = np.where(entries > 0.0, entries + TINY, 0.0)
+        return np.asarray(bounds.reshape(len(self.parts), *self.shape).sum(axis=0) * OUTWARD)
 
     @property
     def middle(self) -> Series:
         """The series of the middles of the balls."""
-        return Series(self.monomials, [part.mid() for part in self.parts])
+        return Series(self.monomials, [coefficient.mid() for coefficient in self.parts])
 
     def __add__(self, other: Series) -> Series:
         return Series(self.monomials, [a + b for a, b in zip(self.parts, other.parts, strict=True)])
@@ -90,18 +90,18 @@ class Series:
     def __mul__(self, other: Series) -> Series:
         if self.monomials.size == 1:
             return Series(self.monomials, [self.parts[0] * other.parts[0]])
-        total: list[arb_mat | None] = [None] * self.monomials.size
-        right, there, products = other.parts, other.there, self.monomials.products_with
-        for factor, pairs, here in zip(self.parts, products, self.there, strict=True):
-            for j, k in pairs if here else ():
-                if there[j]:
-                    term, so_far = factor * right[j], total[k]
-                    total[k] = term if so_far is None else so_far + term
+        sums: list[arb_mat | None] = [None] * self.monomials.size
+        right, right_mask, products = other.parts, other.there, self.monomials.products_with
+        for factor, pairs, is_nonzero in zip(self.parts, products, self.there, strict=True):
+            for j, k in pairs if is_nonzero else ():
+                if right_mask[j]:
+                    term, total = factor * right[j], sums[k]
+                    sums[k] = term if total is None else total + term
         zero = zeros(self.shape[0], other.shape[1])
-        found = Series(self.monomials, [zero if part is None else part for part in total])
-        later = np.cumsum(other.sizes[:0:-1], axis=0)  # sums over the last degree, the last two, ...
-        beyond = sum((self.sizes[i] @ later[i - 1] for i in range(1, len(self.sizes))), np.zeros(found.shape))
-        return found.within(beyond * OUTWARD) if beyond.any() else found
+        product = Series(self.monomials, [zero if coefficient is None else coefficient for coefficient in sums])
+        tail_sums = np.cumsum(other.sizes[:0:-1], axis=0)  # sums over the last degree, the last two, ...
+        remainder = sum((self.sizes[i] @ tail_sums[i - 1] for i in range(1, len(self.sizes))), np.zeros(product.shape))
+        return product.within(remainder * OUTWARD) if remainder.any() else product
 
     def within(self, off: Array) -> Series:
         """Return the series with radii that contain every matrix within ``off (rows, columns)`` of it at every
@@ -111,17 +111,17 @@ class Series:
     def scaled(self, factor: arb | arb_mat) -> Series:
         """Return the series times a number, or times a matrix from the right, that does not depend on the
         parameters."""
-        return Series(self.monomials, [part * factor for part in self.parts])
+        return Series(self.monomials, [coefficient * factor for coefficient in self.parts])
 
     def along(self, rows: arb_mat) -> Series:
         """Return the product of a matrix that does not depend on the parameters with the series."""
-        return Series(self.monomials, [rows * part for part in self.parts])
+        return Series(self.monomials, [rows * coefficient for coefficient in self.parts])
 
     def columns(self, first: int, last: int | None) -> Series:
         """Return the columns from ``first`` up to, but without, ``last``."""
         from flint import arb_mat
 
-        n, tables = self.shape[0], [[row[first:last] for row in part.tolist()] for part in self.parts]
+        n, tables = self.shape[0], [[row[first:last] for row in coefficient.tolist()] for coefficient in self.parts]
         return Series(self.monomials, [arb_mat(n, len(rows[0]), [x for row in rows for x in row]) for rows in tables])
 
     def beside(self, other: Series) -> Series:
@@ -130,23 +130,28 @@ class Series:
 
         (n, p), q = self.shape, other.shape[1]
         pairs = [(a.tolist(), b.tolist()) for a, b in zip(self.parts, other.parts, strict=True)]
-        every = [[x for one, two in zip(a, b, strict=True) for x in (*one, *two)] for a, b in pairs]
-        return Series(self.monomials, [arb_mat(n, p + q, entries) for entries in every])
+        tables = [
+            [x for left_row, right_row in zip(a, b, strict=True) for x in (*left_row, *right_row)] for a, b in pairs
+        ]
+        return Series(self.monomials, [arb_mat(n, p + q, entries) for entries in tables])
 
     def above(self, below: arb_mat) -> Series:
         """Return the series with the rows of a matrix below it that does not depend on the parameters."""
-        none = (below * 0).tolist()
-        first, *others = (part.tolist() for part in self.parts)
-        return Series(self.monomials, [stacked(first + below.tolist()), *(stacked(part + none) for part in others)])
+        zero_rows = (below * 0).tolist()
+        constant, *higher = (coefficient.tolist() for coefficient in self.parts)
+        return Series(
+            self.monomials,
+            [stacked(constant + below.tolist()), *(stacked(coefficient + zero_rows) for coefficient in higher)],
+        )
 
     def transpose(self) -> Series:
         """Return the transpose."""
-        return Series(self.monomials, [part.transpose() for part in self.parts])
+        return Series(self.monomials, [coefficient.transpose() for coefficient in self.parts])
 
 
 def sizes_of(series: Sequence[Series]) -> Array:
     """Return upper bounds ``(n, rows, columns)`` of the absolute values of the entries of series of one shape."""
-    return np.array([one.size for one in series])
+    return np.array([matrix.size for matrix in series])
 
 
 def dot(left: Sequence[Series], right: Sequence[Series]) -> Series:
@@ -157,10 +162,10 @@ def dot(left: Sequence[Series], right: Sequence[Series]) -> Series:
         for a, b in pairs[1:]:
             total = total + a.parts[0] * b.parts[0]
         return Series(left[0].monomials, [total])
-    found = pairs[0][0] * pairs[0][1]
+    series = pairs[0][0] * pairs[0][1]
     for a, b in pairs[1:]:
-        found = found + a * b
-    return found
+        series = series + a * b
+    return series
 
 
 def identity(count: int) -> arb_mat:
@@ -218,21 +223,21 @@ def products(steps: Sequence[Series]) -> list[Series]:
     if len(steps) == 1:
         return [steps[0], unit]
     odd = len(steps) % 2
-    made = dict[tuple[int, int], Series]()  # equal pairs of objects share one product
+    cache = dict[tuple[int, int], Series]()  # equal pairs of objects share one product
     pairs = []
     for first, second in zip(steps[:-1:2], steps[1::2], strict=False):
         key = id(first), id(second)
-        if key not in made:
-            made[key] = second * first
-        pairs.append(made[key])
+        if key not in cache:
+            cache[key] = second * first
+        pairs.append(cache[key])
     coarse = products([*pairs, *([steps[-1]] if odd else [])])
-    found: list[Series] = []
+    suffixes: list[Series] = []
     for k in range(len(steps) + 1):
-        place, inside = divmod(k, 2)
-        if not inside:
-            found.append(coarse[place])
+        pair, parity = divmod(k, 2)
+        if not parity:
+            suffixes.append(coarse[pair])
         elif k == len(steps):
-            found.append(unit)
+            suffixes.append(unit)
         else:
-            found.append(coarse[place + 1] * steps[k])
-    return found
+            suffixes.append(coarse[pair + 1] * steps[k])
+    return suffixes

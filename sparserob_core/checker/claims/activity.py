@@ -32,11 +32,11 @@ Rows = list[tuple[float, ConstraintRow]]
 
 def acted(case: Case) -> float:
     """Return the share of time, weighted over the channels, that the certificate's control acts."""
-    acts = np.abs(case.control.control(case.theta)) > ROUNDED * case.control.summands(case.theta)
+    is_active = np.abs(case.control.control(case.theta)) > ROUNDED * case.control.summands(case.theta)
     for block in case.price.blocks:  # the channels of one vector act together
-        acts[block] = acts[block].any(axis=0)
+        is_active[block] = is_active[block].any(axis=0)
     counts = _counts(case)
-    return float(counts[acts].sum() / counts.sum())
+    return float(counts[is_active].sum() / counts.sum())
 
 
 def shared(case: Case, rows: Rows, pieces: Any) -> tuple[Rows, Any]:
@@ -44,10 +44,10 @@ def shared(case: Case, rows: Rows, pieces: Any) -> tuple[Rows, Any]:
 
     The multipliers are divided by the largest absolute value of a channel times the factor ``l1`` of the cost. This
     divisor is best where all channels have the same largest value; any positive divisor gives a valid bound."""
-    most = max((max(float(abs(low).mid()), float(abs(high).mid())) for low, high in _ranges(case)), default=1.0)
-    most = most * case.problem.cost.l1 or 1.0
-    rest = pieces if pieces is None else (np.asarray(pieces, dtype=float) / most).tolist()
-    return [(y / most, row) for y, row in rows], rest
+    divisor = max((max(float(abs(low).mid()), float(abs(high).mid())) for low, high in _ranges(case)), default=1.0)
+    divisor = divisor * case.problem.cost.l1 or 1.0
+    piece_multipliers = pieces if pieces is None else (np.asarray(pieces, dtype=float) / divisor).tolist()
+    return [(y / divisor, row) for y, row in rows], piece_multipliers
 
 
 def least(case: Case, rows: Rows, pieces: Sequence[Sequence[float]] | None) -> float:
@@ -84,8 +84,8 @@ def least_of_cost(case: Case, cost: arb) -> float:
 def _longest(case: Case, block: Sequence[int]) -> arb:
     """Return an upper bound of the Euclidean length of the vector of some channels."""
     bound, ranges = case.problem.control, _ranges(case)
-    reach = [abs(ranges[i][0]).max(abs(ranges[i][1])) for i in block]
-    size = sum((r * r for r in reach), ball(0)).sqrt()
+    largest_values = [abs(ranges[i][0]).max(abs(ranges[i][1])) for i in block]
+    size = sum((r * r for r in largest_values), ball(0)).sqrt()
     if isinstance(bound, NormBall) and bound.p == 2.0:
         middle = sum((ball(bound.centre[i]) ** 2 for i in block), ball(0)).sqrt()
         size = size.min(ball(bound.radius) + middle)
@@ -99,11 +99,11 @@ def _whole(case: Case, total: arb) -> float:
 
 def _rounded(case: Case, total: arb) -> float:
     """Return a lower bound of the time of action, rounded up to whole pieces where all of them count the same."""
-    table = _vectors(case)
+    counts = _vectors(case)
     bound = float(np.nextafter(float(total.lower()), -np.inf))
-    if np.ptp(table) <= EQUAL * table.max():
-        one = float(table.mean())
-        bound = float(np.ceil(bound / one - NEARLY)) * one
+    if np.ptp(counts) <= EQUAL * counts.max():
+        count = float(counts.mean())
+        bound = float(np.ceil(bound / count - NEARLY)) * count
     return max(0.0, bound)
 
 
@@ -120,34 +120,34 @@ def _least(
     The sum is the count of the channels that act, the products of the ``slope (m,)`` and the control, and
     ``sizes (m,)`` times its absolute values. The channels marked in ``off`` are 0."""
     ups, downs, certain = [], [], ball(0)
-    for (low, high), one in zip(ranges, count, strict=True):
-        always = low > 0 or high < 0
-        certain = certain + (one if always else ball(0))
-        up = ball(0) if always or not high > 0 else one / high
-        down = ball(0) if always or not low < 0 else one / -low
+    for (low, high), count_i in zip(ranges, count, strict=True):
+        excludes_zero = low > 0 or high < 0
+        certain = certain + (count_i if excludes_zero else ball(0))
+        up = ball(0) if excludes_zero or not high > 0 else count_i / high
+        down = ball(0) if excludes_zero or not low < 0 else count_i / -low
         ups.append(up if high > 0 else down)
         downs.append(down if low < 0 else up)
     for i, size in enumerate(sizes):
         ups[i], downs[i] = ups[i] + size, downs[i] + size
-    for i, zero in enumerate(off):
-        if zero:  # then no value other than 0 lowers the sum
+    for i, is_zero in enumerate(off):
+        if is_zero:  # then no value other than 0 lowers the sum
             ups[i] = downs[i] = abs(slope[i])
     return certain + known(case.problem.control).least(ups, downs, slope)
 
 
 def _ranges(case: Case) -> list[tuple[arb, arb]]:
     """Return the least and the largest value of every channel."""
-    found, m, shape = [], case.problem.system.controls, known(case.problem.control)
+    ranges, m, shape = [], case.problem.system.controls, known(case.problem.control)
     for i in range(m):
         axis = [ball(i == j) for j in range(m)]
-        found.append((-shape.support([-a for a in axis]), shape.support(axis)))
-    return found
+        ranges.append((-shape.support([-a for a in axis]), shape.support(axis)))
+    return ranges
 
 
 def _lengths(case: Case) -> list[arb]:
     """Return the length of every piece of the control, in time."""
-    breaks = case.control.breakpoints
-    return [ball(b) - ball(a) for a, b in pairwise(breaks)]
+    breakpoints = case.control.breakpoints
+    return [ball(b) - ball(a) for a, b in pairwise(breakpoints)]
 
 
 def _counts(case: Case) -> np.ndarray:
@@ -190,24 +190,24 @@ def proven(case: Case, nodes: Sequence[Any], weighted: Callable[[Mapping[str, An
     Broken
         Where the nodes are no tree whose leaves cover all controls, or a leaf does not prove what it says.
     """
-    answer, waiting, seen = float("inf"), [(0, dict[tuple[int, int], Part]())], set[int]()
-    while waiting:
+    bound, open_nodes, visited = float("inf"), [(0, dict[tuple[int, int], Part]())], set[int]()
+    while open_nodes:
         case.clock.check()
-        number, parts = waiting.pop()
+        number, restrictions = open_nodes.pop()
         node = nodes[number] if 0 <= number < len(nodes) else None
-        if number in seen or not isinstance(node, Mapping):
+        if number in visited or not isinstance(node, Mapping):
             raise Broken("tree: its nodes are no tree")
-        seen.add(number)
+        visited.add(number)
         if "multipliers" in node:
-            answer = min(answer, _leaf(case, node.get("feasible") is not False, parts, weighted(node)))
+            bound = min(bound, _leaf(case, node.get("feasible") is not False, restrictions, weighted(node)))
             continue
-        halves = _divided(case, node, parts)
+        halves = _divided(case, node, restrictions)
         for key, half in zip(("first", "second"), halves, strict=True):
             child = node.get(key)
             if type(child) is not int:
                 raise Broken("tree: expected the numbers of two nodes")
-            waiting.append((child, {**parts, **half}))
-    return answer
+            open_nodes.append((child, {**restrictions, **half}))
+    return bound
 
 
 def _divided(
@@ -223,16 +223,25 @@ def _divided(
         raise Broken(f"tree: there is no piece {piece!r} of channel {channel!r}")
     if case.letters is None:
         (block,) = (block for block in case.price.blocks if channel in block)
-        known = {(c, piece): parts.get((c, piece), ANY) for c in block}
-        return dict.fromkeys(known, (0.0, 0.0, False)), {at: (low, high, True) for at, (low, high, _) in known.items()}
-    low, high, on = parts.get((channel, piece), ANY)
-    at = node.get("at")
-    if not (isinstance(at, list) and len(at) == 2 and all(value in case.letters for value in at) and at[0] < at[1]):
-        raise Broken(f"tree: expected two letters, got {at!r}")
-    if any(at[0] < letter < at[1] for letter in case.letters):
-        raise Broken(f"tree: {at} are no neighbours")
-    place = channel, piece
-    return {place: (low, min(high, float(at[0])), on)}, {place: (max(low, float(at[1])), high, on)}
+        block_ranges = {(c, piece): parts.get((c, piece), ANY) for c in block}
+        return dict.fromkeys(block_ranges, (0.0, 0.0, False)), {
+            key: (low, high, True) for key, (low, high, _) in block_ranges.items()
+        }
+    low, high, is_counted = parts.get((channel, piece), ANY)
+    letters = node.get("at")
+    if not (
+        isinstance(letters, list)
+        and len(letters) == 2
+        and all(value in case.letters for value in letters)
+        and letters[0] < letters[1]
+    ):
+        raise Broken(f"tree: expected two letters, got {letters!r}")
+    if any(letters[0] < letter < letters[1] for letter in case.letters):
+        raise Broken(f"tree: {letters} are no neighbours")
+    key = channel, piece
+    return {key: (low, min(high, float(letters[0])), is_counted)}, {
+        key: (max(low, float(letters[1])), high, is_counted)
+    }
 
 
 def _leaf(case: Case, feasible: bool, parts: Mapping[tuple[int, int], Part], rows: Rows) -> float:
@@ -240,9 +249,9 @@ def _leaf(case: Case, feasible: bool, parts: Mapping[tuple[int, int], Part], row
     total, slopes = case.duality.summed(rows, None)
     sizes = case.duality.charged(rows, [[ball(0)] * case.problem.system.controls] * len(slopes))
     for k, (length, slope, charged) in enumerate(zip(_lengths(case), slopes, sizes, strict=True)):
-        here = [parts.get((c, k), ANY) for c in range(len(slope))]
+        piece_restrictions = [parts.get((c, k), ANY) for c in range(len(slope))]
         counts = [ball(c) * length if feasible else ball(0) for c in case.price.counts]
-        total = total + _least_of_part(case, here, counts, slope, charged)
+        total = total + _least_of_part(case, piece_restrictions, counts, slope, charged)
     if not feasible:
         if not total > 0:
             raise Broken(f"tree: multipliers of a part prove {float(total.lower()):.3g}, expected a positive number")
@@ -257,11 +266,11 @@ def _least_of_part(case: Case, parts: Sequence[Part], counts: list[arb], slope: 
     if case.problem.control.is_box or case.letters is not None:
         box, total = case.problem.control.bounding_box(), arb(0)
         for part, count, s, size, low, high in zip(parts, counts, slope, sizes, box.lower, box.upper, strict=True):
-            ends = _values(case, part, float(low), float(high))
-            if not ends:
+            values = _values(case, part, float(low), float(high))
+            if not values:
                 return arb("inf")  # nothing is in this part
-            heights = [(count if part[2] or v != 0.0 else arb(0)) + s * arb(v) + size * arb(abs(v)) for v in ends]
-            total = total + smallest(heights)
+            sums = [(count if part[2] or v != 0.0 else arb(0)) + s * arb(v) + size * arb(abs(v)) for v in values]
+            total = total + smallest(sums)
         return total
     certain = sum((count for part, count in zip(parts, counts, strict=True) if part[2]), arb(0))
     priced = [arb(0) if part[2] else count for part, count in zip(parts, counts, strict=True)]
@@ -274,5 +283,5 @@ def _values(case: Case, part: Part, low: float, high: float) -> list[float]:
     The values are the ends of the range of the entry, and 0 in between; with an alphabet, the letters in the range."""
     if case.letters is not None:
         return [letter for letter in case.letters if part[0] <= letter <= part[1]]
-    least, most = max(low, part[0]), min(high, part[1])
-    return [] if least > most else [least, most, float(np.clip(0.0, least, most))]
+    lower, upper = max(low, part[0]), min(high, part[1])
+    return [] if lower > upper else [lower, upper, float(np.clip(0.0, lower, upper))]

@@ -48,10 +48,12 @@ class VerifiedFeedback:
         if not case.answering:
             return self._none
         gains = shaped(case.certificate, "gains", self._none.shape)
-        times, measured = case.control.breakpoints, case.problem.measurements
-        told = case.problem.initial_set is not None or (measured is not None and measured.noise is not None)
+        times, measurements = case.control.breakpoints, case.problem.measurements
+        has_first_deviation = case.problem.initial_set is not None or (
+            measurements is not None and measurements.noise is not None
+        )
         for k, j in np.argwhere(gains.any(axis=(2, 3))).tolist():
-            if j > k or (j == 0 and not told):
+            if j > k or (j == 0 and not has_first_deviation):
                 raise Broken(f"the control from t = {float(times[k]):.6g} on answers what is not measured yet")
             if not case.answers[k, j]:
                 raise Broken(
@@ -63,8 +65,8 @@ class VerifiedFeedback:
     @property
     def _none(self) -> Array:
         """Gains that answer nothing, ``(K, K, m, p)``."""
-        system, measured, K = self.case.problem.system, self.case.problem.measurements, self.case.control.pieces
-        return np.zeros((K, K, system.controls, system.states if measured is None else measured.outputs))
+        system, measurements, K = self.case.problem.system, self.case.problem.measurements, self.case.control.pieces
+        return np.zeros((K, K, system.controls, system.states if measurements is None else measurements.outputs))
 
     @cached_property
     def observer(self) -> Array | None:
@@ -94,21 +96,24 @@ class VerifiedFeedback:
             raise Unchecked("the checker knows feedback under measurable disturbances of one system, undelayed")
         if not case.disturbances.alike:
             raise Unchecked("the checker knows feedback under disturbances of one class, on one dictionary")
-        held, measured = (changes if case.measurable else case.disturbances.changes) or [], case.problem.measurements
-        if measured is not None and case.measurable:
+        jump_times, measurements = (
+            (changes if case.measurable else case.disturbances.changes) or [],
+            case.problem.measurements,
+        )
+        if measurements is not None and case.measurable:
             raise Unchecked("the checker knows outputs beside disturbances that are constant on pieces only")
         return (MeasurableLoop if case.measurable and changes is None else VerifiedLoop)(
             system,
             [float(v) for v in np.asarray(case.problem.initial_state)],
             nominal,
             gains,
-            sorted({*case.timing.grid, *held}),
+            sorted({*case.timing.grid, *jump_times}),
             [float(t) for t in case.control.breakpoints],
-            held,
+            jump_times,
             case.problem.disturbance,
             case.problem.initial_set,
             tuple(float(v) for v in before(case.problem)),
-            measured,
+            measurements,
             self.observer,
             law=case.flows.at(()),
         )
@@ -141,10 +146,10 @@ class VerifiedFeedback:
         case = self.case
         if name != STEP:
             return [self.commands[case.duality.control_piece(time)]]
-        places = [k for k in steps(case.problem, case.control) if float(case.control.breakpoints[k]) == time]
-        if not places:
+        indices = [k for k in steps(case.problem, case.control) if float(case.control.breakpoints[k]) == time]
+        if not indices:
             raise Broken(f"{name}: there is no step at t = {time!r}")
-        return self.changes(places[0])
+        return self.changes(indices[0])
 
     def support(self, responses: list[arb]) -> arb:
         """Return the support value of all deviations in the direction ``responses (Q,)``; 0 without any."""
@@ -154,17 +159,17 @@ class VerifiedFeedback:
         """Return the largest ``c'u`` over all deviations, ``(r,)``, for every row ``c`` of ``rows (r, m)``.
 
         ``u`` is a sum of ``parts (m, 1 + Q)`` with independent deviations."""
-        every = [[row[0] + self.support(row[1:]) for row in (rows * part).tolist()] for part in parts]
-        return [sum(heights[1:], heights[0]) for heights in zip(*every, strict=True)]
+        support_values = [[row[0] + self.support(row[1:]) for row in (rows * part).tolist()] for part in parts]
+        return [sum(values[1:], values[0]) for values in zip(*support_values, strict=True)]
 
     def sizes(self, rows: Array) -> Array:
         """Return the largest ``|c'x|`` on the grid under any deviation, for ``rows (k, d)``, never too large."""
-        found = np.zeros(len(rows))
+        largest = np.zeros(len(rows))
         for node in self.loop.nodes:
             for sign in (1.0, -1.0):
                 heights = self.heights([node], exactly(sign * rows))
-                found = np.maximum(found, [below(height) for height in heights])
-        return np.asarray(np.where(np.isfinite(found), found, 0.0))
+                largest = np.maximum(largest, [below(height) for height in heights])
+        return np.asarray(np.where(np.isfinite(largest), largest, 0.0))
 
     def added(self, state: int) -> float:
         """Return the size of the numbers that are added up to a state at the end.
@@ -208,8 +213,8 @@ class VerifiedFeedback:
                 A.append([price * x for x in loop.effects[k][i]])
         deviations = loop.deviations
         axes = [[ball(int(b == axis)) for b in range(deviations.starts[-1])] for axis in range(deviations.starts[-1])]
-        reach = np.array([float(x.mid()) for x in deviations.supports(axes)])
-        at_most(a, A, deviations.support, reach, limit, case.clock)
+        support_values = np.array([float(x.mid()) for x in deviations.supports(axes)])
+        at_most(a, A, deviations.support, support_values, limit, case.clock)
 
     def least(self, rows: Sequence[tuple[float, ConstraintRow]], priced: bool) -> arb:
         """Return a lower bound of what gains, and charged peaks or an effort, add to the sum of weighted ``rows``.
@@ -217,17 +222,19 @@ class VerifiedFeedback:
         The bound is 0 where nothing is answered. ``priced`` says whether the cost is part of the sum. Peaks and the
         effort are bounded by the set of the control alone. For the gains, the control that they cause is no wider than
         its set: ``h(F_kl) + h(-F_kl) <= width``, summed over the blocks ``l``."""
-        case, total, most = self.case, ball(0), ball(0)
+        case, total, largest_effort = self.case, ball(0), ball(0)
         for k, costs in enumerate(case.price.costs if case.charge in (PEAK, WORST) else ()):
             for i, price in enumerate(costs):
-                far = reach(case.problem.control, i)
-                most = most + price * far
+                largest_value = reach(case.problem.control, i)
+                largest_effort = largest_effort + price * largest_value
                 if case.charge == PEAK:
-                    left = price * int(priced) - sum((ball(y) for y, row in rows if row.charged == (k, i)), ball(0))
-                    total = total + (left * far).min(ball(0))
+                    remaining_price = price * int(priced) - sum(
+                        (ball(y) for y, row in rows if row.charged == (k, i)), ball(0)
+                    )
+                    total = total + (remaining_price * largest_value).min(ball(0))
         if case.charge == WORST:
-            left = ball(int(priced)) - sum((ball(y) for y, row in rows if row.charged == EFFORT), ball(0))
-            total = total + (left * most).min(ball(0))
+            remaining_price = ball(int(priced)) - sum((ball(y) for y, row in rows if row.charged == EFFORT), ball(0))
+            total = total + (remaining_price * largest_effort).min(ball(0))
         return total - self._gains_bound.of(rows) if case.answering else total
 
     @cached_property
@@ -244,9 +251,9 @@ class VerifiedFeedback:
         case = self.case
         if not case.measurable:
             return self._resting(None)
-        parts = np.arange(case.problem.system.states) / case.problem.system.states
-        ends = zip(case.timing.grid[:-1], case.timing.grid[1:], strict=True)
-        return self._resting([float(t) for a, b in ends for t in a + parts * (b - a)])
+        fractions = np.arange(case.problem.system.states) / case.problem.system.states
+        intervals = zip(case.timing.grid[:-1], case.timing.grid[1:], strict=True)
+        return self._resting([float(t) for a, b in intervals for t in a + fractions * (b - a)])
 
     def _resting(self, changes: list[float] | None) -> VerifiedLoop:
         """Return the system without any control, under disturbances that jump at ``changes``."""
@@ -278,17 +285,17 @@ class VerifiedFeedback:
 
         No disturbance has acted yet. The entry names the ``following`` deviation ``(d,)`` of the next initial state;
         there is none where only one initial state exists. Raise `Broken` where it is not shown to be in its set."""
-        calm = named.loop.deviations.rests[: named.loop.deviations.begun]
+        inner_deviations = named.loop.deviations.rests[: named.loop.deviations.begun]
         if self.case.problem.initial_set is None:
-            return NamedDeviations(self.case, named.loop, calm)
+            return NamedDeviations(self.case, named.loop, inner_deviations)
         point = numbers(entry.get("following"), f"{name}: following")
-        held = known(self.case.problem.initial_set)
-        found = held.member(point) if point.shape == (self.case.problem.system.states,) else None
-        if found is None:
+        initial_set = known(self.case.problem.initial_set)
+        member = initial_set.member(point) if point.shape == (self.case.problem.system.states,) else None
+        if member is None:
             raise Broken(f"{name}: the next deviation {point.tolist()} is not shown to be in its set")
-        about = self.loop_at_rest.deviations.sets[-1][1]
-        begun = [v - ball(c) for v, c in zip(found, about, strict=True)]
-        return NamedDeviations(self.case, named.loop, [*calm, begun])
+        middle = self.loop_at_rest.deviations.sets[-1][1]
+        deviation = [v - ball(c) for v, c in zip(member, middle, strict=True)]
+        return NamedDeviations(self.case, named.loop, [*inner_deviations, deviation])
 
 
 def commanded(case: Case, name: str) -> ConvexSet | None:
@@ -315,8 +322,8 @@ class NamedDeviations:
 
     def of(self, rows: Sequence[list[arb]]) -> list[arb]:
         """Return the values of ``rows`` under these deviations, each a nominal value and responses, ``(1 + Q,)``."""
-        every = [x for block in self.z for x in block]
-        return [sum((a * b for a, b in zip(row[1:], every, strict=True)), row[0]) for row in rows]
+        deviations = [x for block in self.z for x in block]
+        return [sum((a * b for a, b in zip(row[1:], deviations, strict=True)), row[0]) for row in rows]
 
     @property
     def innovations(self) -> list[list[arb]]:
@@ -327,29 +334,35 @@ class NamedDeviations:
         points."""
         pairs = zip(self.z, self.loop.deviations.rests, strict=True)
         z = [
-            [ball(0)] * len(mine) if mine is rest else [x - r for x, r in zip(mine, rest, strict=True)]
-            for mine, rest in pairs
+            [ball(0)] * len(deviation)
+            if deviation is inner_deviation
+            else [x - r for x, r in zip(deviation, inner_deviation, strict=True)]
+            for deviation, inner_deviation in pairs
         ]
         return [
             [
-                sum((push[s, b] * x for block, push in seen.items() for b, x in enumerate(z[block])), ball(0))
+                sum(
+                    (response[s, b] * x for block, response in responses.items() for b, x in enumerate(z[block])),
+                    ball(0),
+                )
                 for s in range(self.loop.outputs)
             ]
-            for seen in self.loop.seen
+            for responses in self.loop.seen
         ]
 
     def given(self, direction: Array, time: float) -> arb:
         """Return the contribution of disturbance and initial state to ``c'x(t)``, ``c (d,)``, without control."""
         case, loop = self.case, self.loop
         weights = case.duality.pushed(direction, time, loop.changes)
-        parts, of = [*zip(loop.deviations.sets, self.z, strict=True)], loop.deviations
-        parts = parts[: of.blocks] + parts[of.begun :]  # noise reaches the state through answers alone
+        blocks, loop_deviations = [*zip(loop.deviations.sets, self.z, strict=True)], loop.deviations
+        # noise reaches the state through answers alone
+        blocks = blocks[: loop_deviations.blocks] + blocks[loop_deviations.begun :]
         weights += [] if case.problem.initial_set is None else [case.duality.carried(direction, time)]
         return sum(
             (
-                weight * (ball(m) + off)
-                for row, ((_, about), block) in zip(weights, parts, strict=True)
-                for weight, m, off in zip(row, about, block, strict=True)
+                weight * (ball(centre) + deviation)
+                for row, ((_, middle), block) in zip(weights, blocks, strict=True)
+                for weight, centre, deviation in zip(row, middle, block, strict=True)
             ),
             ball(0),
         )
@@ -363,20 +376,20 @@ def _deviations(case: Case, loop: VerifiedLoop, entry: Mapping[str, Any], name: 
     ``deviation (d,)`` of the initial state from its centre."""
     from flint import arb
 
-    points, of = list[Array](), loop.deviations
-    noises = of.begun - of.blocks
+    points, loop_deviations = list[Array](), loop.deviations
+    noises = loop_deviations.begun - loop_deviations.blocks
     if case.problem.disturbance is not None:
-        points = list(shaped(entry, "disturbance", (of.width, of.blocks), f"{name}: ").T)
+        points = list(shaped(entry, "disturbance", (loop_deviations.width, loop_deviations.blocks), f"{name}: ").T)
     if noises and loop.measured is not None:
         points += list(shaped(entry, "noise", (noises, loop.outputs), f"{name}: "))
     if case.problem.initial_set is not None:
         points.append(shaped(entry, "deviation", (case.problem.system.states,), f"{name}: "))
-    found = list[list[arb]]()
-    for number_of, (point, (shape, about)) in enumerate(zip(points, of.sets, strict=True)):
+    deviations = list[list[arb]]()
+    for index, (point, (shape, middle)) in enumerate(zip(points, loop_deviations.sets, strict=True)):
         member = known(shape).member(point)
         if member is None:
             kinds = ("disturbance", "noise", "deviation of the initial state")
-            what = kinds[(number_of >= of.blocks) + (number_of >= of.begun)]
-            raise Broken(f"{name}: the {what} {point.tolist()} is not shown to be in its set")
-        found.append([v - arb(float(c)) for v, c in zip(member, about, strict=True)])
-    return found
+            kind = kinds[(index >= loop_deviations.blocks) + (index >= loop_deviations.begun)]
+            raise Broken(f"{name}: the {kind} {point.tolist()} is not shown to be in its set")
+        deviations.append([v - arb(float(c)) for v, c in zip(member, middle, strict=True)])
+    return deviations

@@ -69,15 +69,15 @@ class Case:
             object.__setattr__(self, "given", self.problem)
             object.__setattr__(self, "problem", returning(self.problem))
         plain = in_turns(spelt(self.problem))
-        known = parted(plain)
-        uncertain = known.system.varies and known.system.parameters is not None
-        if (known is not plain or uncertain) and self.policy is not None:
+        expanded = parted(plain)
+        is_uncertain = expanded.system.varies and expanded.system.parameters is not None
+        if (expanded is not plain or is_uncertain) and self.policy is not None:
             raise Unchecked("the checker knows no feedback beside parameters and the time")
-        object.__setattr__(self, "problem", in_turns(integrating(known)))
+        object.__setattr__(self, "problem", in_turns(integrating(expanded)))
         if self.problem.disturbance_breakpoints is not None:
-            known_by, joint = on_one_grid(self.problem, self.disturbance)
-            object.__setattr__(self, "problem", known_by)
-            object.__setattr__(self, "disturbance", joint)
+            problem, dictionary = on_one_grid(self.problem, self.disturbance)
+            object.__setattr__(self, "problem", problem)
+            object.__setattr__(self, "disturbance", dictionary)
         if self.policy is not None and self.control.functions == self.control.pieces:
             # as many independent functions as pieces make every control on these; the certificate writes its values
             object.__setattr__(self, "control", Dictionary.indicators(self.control.breakpoints))
@@ -111,12 +111,16 @@ class Case:
     def windows(self) -> list[ConstraintWindow]:
         """The state constraints, under the names that the certificate uses."""
         path = [entry for entry in self.problem.windows if not isinstance(entry, Return)]
-        d, own = self.problem.system.states, sum(not isinstance(entry, Accumulated) for entry in path)
-        ends, until = self.problem.terminal_sets, self.problem.horizon
-        found = [_window(self.problem, entry, f"path[{i}]" if own > 1 else "path") for i, entry in enumerate(path)]
-        names = [f"terminal[{i}]" if len(ends) > 1 else "terminal" for i in range(len(ends))]
-        more = [ConstraintWindow(name, end, until, until, d) for name, end in zip(names, ends, strict=True)]
-        return [*found, *self.returned, *more]
+        d, path_count = self.problem.system.states, sum(not isinstance(entry, Accumulated) for entry in path)
+        terminal_sets, horizon = self.problem.terminal_sets, self.problem.horizon
+        path_windows = [
+            _window(self.problem, entry, f"path[{i}]" if path_count > 1 else "path") for i, entry in enumerate(path)
+        ]
+        names = [f"terminal[{i}]" if len(terminal_sets) > 1 else "terminal" for i in range(len(terminal_sets))]
+        terminal_windows = [
+            ConstraintWindow(name, end, horizon, horizon, d) for name, end in zip(names, terminal_sets, strict=True)
+        ]
+        return [*path_windows, *self.returned, *terminal_windows]
 
     @cached_property
     def returned(self) -> list[ConstraintWindow]:
@@ -133,10 +137,10 @@ class Case:
 
     def window(self, name: str) -> ConstraintWindow:
         """Return the constraint of that name; raise `Broken` where there is none."""
-        found = [window for window in self.windows if window.name == name]
-        if not found:
+        windows = [window for window in self.windows if window.name == name]
+        if not windows:
             raise Broken(f"the problem has no constraint {name!r}")
-        return found[0]
+        return windows[0]
 
     @property
     def measurable(self) -> bool:
@@ -146,8 +150,8 @@ class Case:
     @cached_property
     def timing(self) -> Timing:
         """The times at which an input may begin to act."""
-        ends = self.control.breakpoints, self.disturbance.breakpoints
-        return Timing(self.problem, *ends, self.answering, self.clock)
+        breakpoints = self.control.breakpoints, self.disturbance.breakpoints
+        return Timing(self.problem, *breakpoints, self.answering, self.clock)
 
     @cached_property
     def disturbances(self) -> Disturbances:
@@ -192,37 +196,39 @@ class Case:
         from flint import arb, arb_mat
 
         if self.control.is_indicators:
-            values, alike = coefficients.T.tolist(), dict[tuple[float, ...], arb_mat]()
+            values, pieces_by_value = coefficients.T.tolist(), dict[tuple[float, ...], arb_mat]()
             for value in self.clock.each(map(tuple, values)):
-                if value not in alike:
-                    alike[value] = stacked([[arb(v)] for v in value])
-            return [alike[tuple(value)] for value in values]
-        columns, none = self.control.sparse.tocsc(), arb(0)
-        found, made = [], dict[bytes, arb_mat]()
+                if value not in pieces_by_value:
+                    pieces_by_value[value] = stacked([[arb(v)] for v in value])
+            return [pieces_by_value[tuple(value)] for value in values]
+        columns, zero = self.control.sparse.tocsc(), arb(0)
+        pieces, pieces_by_key = [], dict[bytes, arb_mat]()
         for start, stop in self.clock.each(pairwise(columns.indptr.tolist())):
-            which, values = columns.indices[start:stop], columns.data[start:stop]
-            key = coefficients[:, which].tobytes() + values.tobytes()
-            if key not in made:
-                terms = list(zip(which.tolist(), values.tolist(), strict=True))
-                rows = [sum((arb(float(row[i])) * arb(v) for i, v in terms), none) for row in coefficients]
-                made[key] = stacked([[x] for x in rows])
-            found.append(made[key])
-        return found
+            functions, values = columns.indices[start:stop], columns.data[start:stop]
+            key = coefficients[:, functions].tobytes() + values.tobytes()
+            if key not in pieces_by_key:
+                terms = list(zip(functions.tolist(), values.tolist(), strict=True))
+                rows = [sum((arb(float(row[i])) * arb(v) for i, v in terms), zero) for row in coefficients]
+                pieces_by_key[key] = stacked([[x] for x in rows])
+            pieces.append(pieces_by_key[key])
+        return pieces
 
     @cached_property
     def scene(self) -> Scene:
         """The control and the disturbance on the common grid."""
         grid, acting = self.timing.grid, self.timing.acting
         middles = [(a + b) / 2 for a, b in pairwise(grid)]
-        which = np.clip(np.searchsorted(acting, middles, side="right") - 1, 0, len(acting) - 1)
+        piece_indices = np.clip(np.searchsorted(acting, middles, side="right") - 1, 0, len(acting) - 1)
         changes = self.disturbances.changes
-        known = [stacked([[v] for v in balls([*before(self.problem)])])] if self.problem.system.delay > 0.0 else []
-        inputs = [*known, *self.pieces]
+        early_inputs = (
+            [stacked([[v] for v in balls([*before(self.problem)])])] if self.problem.system.delay > 0.0 else []
+        )
+        inputs = [*early_inputs, *self.pieces]
         if self.problem.system.drifts:
             inputs = [stacked([[v] for v in (*u.entries(), *balls([1.0]))]) for u in self.clock.each(inputs)]
         return Scene(
             grid,
-            [inputs[k] for k in which],
+            [inputs[k] for k in piece_indices],
             [float(v) for v in np.asarray(self.problem.initial_state)],
             None if changes is None else self.disturbances.held,
             changes or [],
@@ -256,15 +262,17 @@ class Case:
     @cached_property
     def duality(self) -> Duality:
         """The data that lower bounds are derived from."""
-        given = self.disturbances
-        return Duality(self.problem, self.control, given.changes, self.flows, given.held, given.lasting)
+        disturbances = self.disturbances
+        return Duality(
+            self.problem, self.control, disturbances.changes, self.flows, disturbances.held, disturbances.lasting
+        )
 
 
 def _window(problem: OptimalControlProblem, entry: PathConstraint | MixedConstraint, name: str) -> ConstraintWindow:
     """Return the constraint of one entry of a problem, under the entry's own name where it has one."""
     stop = problem.horizon if entry.stop is None else entry.stop
-    moved = None if entry.relative_to is None else np.asarray(entry.relative_to)
-    return ConstraintWindow(entry.name or name, entry.set, entry.start, stop, problem.system.states, moved)
+    reference = None if entry.relative_to is None else np.asarray(entry.relative_to)
+    return ConstraintWindow(entry.name or name, entry.set, entry.start, stop, problem.system.states, reference)
 
 
 def numbers(data: object, name: str) -> Array:
@@ -284,10 +292,10 @@ def shaped(data: Mapping[str, Any], key: str, shape: tuple[int, ...], whose: str
     """Return finite numbers of one shape under a key of the certificate; raise `Broken` where they are something else.
 
     ``whose`` names their entry, before the key in messages."""
-    found = numbers(data.get(key), f"{whose}{key}")
-    if found.shape != shape:
-        raise Broken(f"{whose}{key}: shape {found.shape}, expected {shape}")
-    return found
+    array = numbers(data.get(key), f"{whose}{key}")
+    if array.shape != shape:
+        raise Broken(f"{whose}{key}: shape {array.shape}, expected {shape}")
+    return array
 
 
 def _numeric(data: object) -> bool:
@@ -308,21 +316,21 @@ def written_policy(certificate: Mapping[str, Any], pieces: int) -> WrittenPolicy
     data = certificate.get("policy")
     if not isinstance(data, Mapping):
         raise Broken("policy: expected a cost, and the breakpoints that every piece answers")
-    rows, said_of_cost = listed(data, "answers"), data.get("cost")
-    cost: Cost | None = next((one for one in get_args(Cost) if one == said_of_cost), None)
+    rows, written_cost = listed(data, "answers"), data.get("cost")
+    cost: Cost | None = next((kind for kind in get_args(Cost) if kind == written_cost), None)
     if cost is None:
-        raise Broken(f"policy: the cost is {said_of_cost!r}, expected one of {', '.join(get_args(Cost))}")
+        raise Broken(f"policy: the cost is {written_cost!r}, expected one of {', '.join(get_args(Cost))}")
     if len(rows) != pieces:
         raise Broken(f"policy: answers of {len(rows)} pieces, expected {pieces}")
     if pieces > MOST_ANSWERING:
         raise Broken(f"policy: {pieces} pieces that answer, expected at most {MOST_ANSWERING}")
     mask = np.zeros((pieces, pieces), dtype=bool)
     for k, ranges in enumerate(rows):
-        for said in ranges if isinstance(ranges, list) else [ranges]:
-            whole = isinstance(said, list) and len(said) == 2 and all(type(place) is int for place in said)
-            if not whole or not 0 <= said[0] <= said[1] <= k:
-                raise Broken(f"policy: piece {k + 1} answers the breakpoints {said!r}, expected a range up to {k}")
-            mask[k, said[0] : said[1] + 1] = True
+        for indices in ranges if isinstance(ranges, list) else [ranges]:
+            is_range = isinstance(indices, list) and len(indices) == 2 and all(type(index) is int for index in indices)
+            if not is_range or not 0 <= indices[0] <= indices[1] <= k:
+                raise Broken(f"policy: piece {k + 1} answers the breakpoints {indices!r}, expected a range up to {k}")
+            mask[k, indices[0] : indices[1] + 1] = True
     return WrittenPolicy(mask, Charge(cost))
 
 

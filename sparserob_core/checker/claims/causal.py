@@ -64,39 +64,47 @@ def causal_bound(case: Case, data: Mapping[str, Any], priced: bool) -> arb:
         For problems whose causal policies the checker does not bound.
     """
     _refuse(case)
-    signals, rest = _signals(case, data), middle_of(case)
+    signals, nominal_report = _signals(case, data), middle_of(case)
     K, m, total = case.control.pieces, case.problem.system.controls, ball(0)
     changes = case.disturbances.changes or []
-    points, measured = case.control.breakpoints, case.problem.measurements
-    known_last = points[:-1] if measured is None else measured.latest(points)
-    seen = [bisect_left(changes, float(t)) for t in known_last]  # blocks that begin before the last known measurement
-    reports, begun = signals, None
-    if measured is not None and "outputs" in data:
-        seen = measured.known(points).sum(axis=1).tolist()
-        begun = _begun(case, data, len(signals))
-        reports, rest = _outputs(case, data, signals, begun, max(seen)), np.zeros((measured.outputs, K))
-    groups: list[dict[bytes, list[arb]]] = [{_until(rest, n): [ball(0)] * m} for n in seen]
+    breakpoints, measurements = case.control.breakpoints, case.problem.measurements
+    latest_times = breakpoints[:-1] if measurements is None else measurements.latest(breakpoints)
+    # blocks that begin before the last known measurement
+    known_blocks = [bisect_left(changes, float(t)) for t in latest_times]
+    reports, initial_deviations = signals, None
+    if measurements is not None and "outputs" in data:
+        known_blocks = measurements.known(breakpoints).sum(axis=1).tolist()
+        initial_deviations = _begun(case, data, len(signals))
+        reports, nominal_report = (
+            _outputs(case, data, signals, initial_deviations, max(known_blocks)),
+            np.zeros((measurements.outputs, K)),
+        )
+    groups: list[dict[bytes, list[arb]]] = [{_until(nominal_report, n): [ball(0)] * m} for n in known_blocks]
     entries = listed(data, "multipliers")
     if len(entries) > MOST:
         raise Broken(f"{len(entries)} multipliers are too many to be checked")
-    known_rows: Rows = {}
+    rows_by_key: Rows = {}
     for entry in entries:
         case.clock.check()
-        y, which, (row, pushed, carried) = _row(case, entry, len(signals), known_rows)
-        weight, signal = ball(y), signals[which]
-        noise = [a * ball(w) for block, column in zip(pushed, signal.T, strict=True)
+        y, signal_index, (row, disturbance_weights, initial_weights) = _row(case, entry, len(signals), rows_by_key)
+        weight, signal = ball(y), signals[signal_index]
+        terms = [a * ball(w) for block, column in zip(disturbance_weights, signal.T, strict=True)
                  for a, w in zip(block, column, strict=True)]  # fmt: skip
-        noise += [] if begun is None else [c * x for c, x in zip(carried, begun[which], strict=True)]
-        total = total + weight * sum(noise, row.constant)
+        terms += (
+            []
+            if initial_deviations is None
+            else [c * x for c, x in zip(initial_weights, initial_deviations[signal_index], strict=True)]
+        )
+        total = total + weight * sum(terms, row.constant)
         for k in range(K):
             if any(not x.is_zero() for x in row.slope[k]):
-                group = groups[k].setdefault(_until(reports[which], seen[k]), [ball(0)] * m)
+                group = groups[k].setdefault(_until(reports[signal_index], known_blocks[k]), [ball(0)] * m)
                 group[:] = [a + weight * x for a, x in zip(group, row.slope[k], strict=True)]
-    shared = _shares(data, len(signals)) if priced and case.charge == WORST else None
+    shares = _shares(data, len(signals)) if priced and case.charge == WORST else None
     for k in range(K):
-        prices: dict[bytes, arb] = {_until(rest, seen[k]): ball(1)} if shared is None else {}
-        for report, share in zip(reports, shared or (), strict=False):
-            key = _until(report, seen[k])
+        prices: dict[bytes, arb] = {_until(nominal_report, known_blocks[k]): ball(1)} if shares is None else {}
+        for report, share in zip(reports, shares or (), strict=False):
+            key = _until(report, known_blocks[k])
             prices[key] = prices.get(key, ball(0)) + share
             groups[k].setdefault(key, [ball(0)] * m)
         total = total + _of_piece(case, k, groups[k], prices, priced)
@@ -107,13 +115,13 @@ def _shares(data: Mapping[str, Any], count: int) -> list[arb]:
     """Return the weights of the efforts under the signals; their weighted sum is at most the largest effort.
 
     Raise `Broken` unless no weight is negative and their sum is at most 1."""
-    found = numbers(data.get("shares", []), "causal: shares")
-    if found.shape != (count,) or not (found >= 0.0).all():
+    shares = numbers(data.get("shares", []), "causal: shares")
+    if shares.shape != (count,) or not (shares >= 0.0).all():
         raise Broken(f"causal: expected shares of {count} signals, not below 0")
-    held = balls(found)
-    if not sum(held, ball(0)) <= 1:
-        raise Broken(f"causal: the shares of the signals add up to {found.sum()!r}, expected at most 1")
-    return held
+    share_balls = balls(shares)
+    if not sum(share_balls, ball(0)) <= 1:
+        raise Broken(f"causal: the shares of the signals add up to {shares.sum()!r}, expected at most 1")
+    return share_balls
 
 
 def _refuse(case: Case) -> None:
@@ -131,11 +139,11 @@ def _row(case: Case, entry: object, signals: int, rows: Rows) -> tuple[float, in
     if not isinstance(entry, Mapping):
         raise Broken("causal: expected a signal, a constraint, a time, a direction and a number each")
     name, time, y = str(entry.get("constraint")), number(entry, "time"), number(entry, "multiplier")
-    direction, which = numbers(entry.get("direction"), f"{name}: direction"), entry.get("signal")
+    direction, signal_index = numbers(entry.get("direction"), f"{name}: direction"), entry.get("signal")
     if not y > 0:
         raise Broken(f"causal: a multiplier of {name} is {y!r}, expected a positive number")
-    if not isinstance(which, int) or isinstance(which, bool) or not 0 <= which < signals:
-        raise Broken(f"causal: there is no signal {which!r}")
+    if not isinstance(signal_index, int) or isinstance(signal_index, bool) or not 0 <= signal_index < signals:
+        raise Broken(f"causal: there is no signal {signal_index!r}")
     window = case.window(name)
     if window.is_mixed or direction.shape != (case.problem.system.states,):
         raise Broken(f"causal: {name}: {direction.size} numbers where {case.problem.system.states} are expected")
@@ -143,18 +151,23 @@ def _row(case: Case, entry: object, signals: int, rows: Rows) -> tuple[float, in
         raise Broken(f"causal: {name}: t = {time!r} is not within {window.start:g} to {window.stop:g}")
     key = (name, time, direction.tobytes())
     if key not in rows:
-        row, carried = (
+        row, initial_weights = (
             case.duality.row(direction, time, [], window.limit(direction, time), disturbed=False),
             list[Any](),
         )
         if case.problem.initial_set is not None:  # its middle is one of the initial states
-            about = middle(case.problem.initial_set)
-            if not known(case.problem.initial_set).contains(about):
+            initial_middle = middle(case.problem.initial_set)
+            if not known(case.problem.initial_set).contains(initial_middle):
                 raise Unchecked("the middle of the initial states is not shown to be one of them")
-            carried = case.duality.carried(direction, time)
-            row = replace(row, constant=sum((c * x for c, x in zip(carried, balls(about), strict=True)), row.constant))
-        rows[key] = row, case.duality.pushed(direction, time), carried
-    return y, which, rows[key]
+            initial_weights = case.duality.carried(direction, time)
+            row = replace(
+                row,
+                constant=sum(
+                    (c * x for c, x in zip(initial_weights, balls(initial_middle), strict=True)), row.constant
+                ),
+            )
+        rows[key] = row, case.duality.pushed(direction, time), initial_weights
+    return y, signal_index, rows[key]
 
 
 def middle_of(case: Case) -> Array:
@@ -172,21 +185,21 @@ def _until(signal: Array, blocks: int) -> bytes:
 
 def _signals(case: Case, data: Mapping[str, Any]) -> list[Array]:
     """Return the signals ``(mw, blocks)``; raise `Broken` unless all are shown to be in the set of disturbances."""
-    found, shape = [], case.problem.disturbance
-    for said in listed(data, "signals"):
+    signals, shape = [], case.problem.disturbance
+    for entry in listed(data, "signals"):
         case.clock.check()
         if shape is None:
-            found.append(np.zeros((0, 0)))
+            signals.append(np.zeros((0, 0)))
             continue
-        w = numbers(said, "causal: signal")
+        w = numbers(entry, "causal: signal")
         expected = shape.dimension, len(case.disturbances.changes or [])
         if w.shape != expected:
             raise Broken(f"causal: a signal of shape {w.shape}, expected {expected}")
         for column in np.unique(w.T, axis=0):
             if not known(shape).contains(column):
                 raise Broken(f"causal: the disturbance {column.tolist()} is not shown to be in its set")
-        found.append(w)
-    return found
+        signals.append(w)
+    return signals
 
 
 def _begun(case: Case, data: Mapping[str, Any], count: int) -> list[list[arb]]:
@@ -194,18 +207,18 @@ def _begun(case: Case, data: Mapping[str, Any], count: int) -> list[list[arb]]:
 
     The deviations are empty where there is no set. Raise `Broken` unless every initial state is shown to be in the
     set."""
-    shape, told = case.problem.initial_set, listed(data, "initial_states")
-    if len(told) != count:
-        raise Broken(f"causal: {len(told)} initial states of {count} signals")
+    shape, entries = case.problem.initial_set, listed(data, "initial_states")
+    if len(entries) != count:
+        raise Broken(f"causal: {len(entries)} initial states of {count} signals")
     if shape is None:
-        return [[] for _ in told]
-    about, found = balls(middle(shape)), []
-    for said in told:
-        start = numbers(said, "causal: initial state")
+        return [[] for _ in entries]
+    initial_middle, deviations = balls(middle(shape)), []
+    for entry in entries:
+        start = numbers(entry, "causal: initial state")
         if start.shape != (shape.dimension,) or not known(shape).contains(start):
             raise Broken(f"causal: the initial state {start.tolist()} is not shown to be in its set")
-        found.append([a - b for a, b in zip(balls(start), about, strict=True)])
-    return found
+        deviations.append([a - b for a, b in zip(balls(start), initial_middle, strict=True)])
+    return deviations
 
 
 def _outputs(
@@ -215,31 +228,35 @@ def _outputs(
 
     The remaining difference of each output must be a noise of the set, at the first ``known_at_all`` breakpoints; later
     outputs are known to no control."""
-    measured, told, times = case.problem.measurements, listed(data, "outputs"), case.control.breakpoints
-    assert measured is not None
-    C, K = np.asarray(measured.C, dtype=float), case.control.pieces
-    if measured.noise is None or len(told) != len(signals):
-        raise Broken(f"causal: outputs of {len(told)} signals, expected those of {len(signals)}, under a noise")
-    about, centre = balls(middle(measured.noise)), [balls(x) for x in middle_of(case).T]
-    found = [numbers(said, "causal: outputs") for said in told]
-    for outputs in found:
-        if outputs.shape != (K, measured.outputs):
-            raise Broken(f"causal: outputs of shape {outputs.shape}, expected {(K, measured.outputs)}")
+    measurements, entries, times = case.problem.measurements, listed(data, "outputs"), case.control.breakpoints
+    assert measurements is not None
+    C, K = np.asarray(measurements.C, dtype=float), case.control.pieces
+    if measurements.noise is None or len(entries) != len(signals):
+        raise Broken(f"causal: outputs of {len(entries)} signals, expected those of {len(signals)}, under a noise")
+    noise_middle, nominal_columns = balls(middle(measurements.noise)), [balls(x) for x in middle_of(case).T]
+    outputs_by_signal = [numbers(entry, "causal: outputs") for entry in entries]
+    for outputs in outputs_by_signal:
+        if outputs.shape != (K, measurements.outputs):
+            raise Broken(f"causal: outputs of shape {outputs.shape}, expected {(K, measurements.outputs)}")
     for j in range(known_at_all):
         time = float(times[j])
-        pushed = [case.duality.pushed(row, time) for row in C] if j else [[] for _ in C]
-        carried = [case.duality.carried(row, time) if j else balls(row) for row in C]
-        for w, start, outputs in zip(signals, begun, found, strict=True):
+        disturbance_weights = [case.duality.pushed(row, time) for row in C] if j else [[] for _ in C]
+        initial_weights = [case.duality.carried(row, time) if j else balls(row) for row in C]
+        for w, deviation, outputs in zip(signals, begun, outputs_by_signal, strict=True):
             case.clock.check()
             noise = []
-            for a in range(measured.outputs):
-                given = [c * x for c, x in zip(carried[a], start, strict=True)] if start else []
-                for block, column, rest in zip(pushed[a], [balls(x) for x in w.T], centre, strict=True) if j else ():
-                    given += [c * (x - m) for c, x, m in zip(block, column, rest, strict=True) if not c.is_zero()]
-                noise.append(sum((-x for x in given), about[a] + ball(outputs[j, a])))
-            if not known(measured.noise).holds(noise):
+            for a in range(measurements.outputs):
+                contributions = [c * x for c, x in zip(initial_weights[a], deviation, strict=True)] if deviation else []
+                for block, column, nominal_column in (
+                    zip(disturbance_weights[a], [balls(x) for x in w.T], nominal_columns, strict=True) if j else ()
+                ):
+                    contributions += [
+                        c * (x - m) for c, x, m in zip(block, column, nominal_column, strict=True) if not c.is_zero()
+                    ]
+                noise.append(sum((-x for x in contributions), noise_middle[a] + ball(outputs[j, a])))
+            if not known(measurements.noise).holds(noise):
                 raise Broken(f"causal: no noise is shown to make what is said to be measured at t = {time:.6g}")
-    return [np.ascontiguousarray(outputs.T) for outputs in found]
+    return [np.ascontiguousarray(outputs.T) for outputs in outputs_by_signal]
 
 
 def _of_piece(case: Case, k: int, groups: dict[bytes, list[arb]], counts: dict[bytes, arb], priced: bool) -> arb:
@@ -250,7 +267,7 @@ def _of_piece(case: Case, k: int, groups: dict[bytes, list[arb]], counts: dict[b
     m, control = case.problem.system.controls, case.problem.control
     prices = case.price.costs[k] if priced else [ball(0)] * m
     total, zero = ball(0), [ball(0)] * m
-    shares = dict.fromkeys(groups, zero) | {key: [part * price for price in prices] for key, part in counts.items()}
+    shares = dict.fromkeys(groups, zero) | {key: [share * price for price in prices] for key, share in counts.items()}
     if priced and case.charge == PEAK:
         shares = _shared(case, prices, groups)
     for key, slope in groups.items():
@@ -266,12 +283,12 @@ def _shared(case: Case, prices: list[arb], groups: dict[bytes, list[arb]]) -> di
     for i, price in enumerate(prices):
         axis = [ball(j == i) for j in range(len(prices))]
         high, low = known(case.problem.control).support(axis), known(case.problem.control).support([-x for x in axis])
-        reach = {key: float((high if slope[i] < 0 else low).mid()) for key, slope in groups.items()}
-        left = float(price.lower()) * SHARE
-        for key in sorted(groups, key=lambda key: -reach[key]):
-            part = min(left, abs(float(groups[key][i].mid()))) if reach[key] > 0.0 else 0.0
-            part = max(part * SHARE, 0.0)
-            shares[key][i] = ball(part)
-            left -= part
-        shares[next(iter(groups))][i] += ball(max(left * SHARE, 0.0))
+        largest_values = {key: float((high if slope[i] < 0 else low).mid()) for key, slope in groups.items()}
+        remaining_price = float(price.lower()) * SHARE
+        for key in sorted(groups, key=lambda key: -largest_values[key]):
+            share = min(remaining_price, abs(float(groups[key][i].mid()))) if largest_values[key] > 0.0 else 0.0
+            share = max(share * SHARE, 0.0)
+            shares[key][i] = ball(share)
+            remaining_price -= share
+        shares[next(iter(groups))][i] += ball(max(remaining_price * SHARE, 0.0))
     return shares

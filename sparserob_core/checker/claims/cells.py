@@ -83,37 +83,37 @@ def prove(
     Unchecked
         Where neither could be shown with the cells and the time allowed.
     """
-    waiting = dict[Corners, list[tuple[Sides, list[Interval]]]]()
-    for box, sides, todo in reversed(work):
-        waiting.setdefault(box, []).append((sides, todo))
-    found, cells, items = _Found(), 0, 0
-    most = max(MOST_CELLS, TIMES * sum(len(todo) for _, _, todo in work))
-    while waiting:
+    work_by_box = dict[Corners, list[tuple[Sides, list[Interval]]]]()
+    for box, sides, intervals in reversed(work):
+        work_by_box.setdefault(box, []).append((sides, intervals))
+    excess, cells, boxes = _Found(), 0, 0
+    cell_limit = max(MOST_CELLS, TIMES * sum(len(intervals) for _, _, intervals in work))
+    while work_by_box:
         # all directions of one box come before any of its halves, because the tube of a box is expensive
-        box, stack = waiting.popitem()
+        box, stack = work_by_box.popitem()
         if not parameters.meets(box):
             continue
         halved = list[Work]()
         while stack:
-            sides, todo = stack.pop()
-            items += 1
-            left = _Left(np.zeros(len(box[0])))
-            while todo:
-                cells += len(todo)
-                if cells > most or items > MOST_BOXES:
+            sides, intervals = stack.pop()
+            boxes += 1
+            open_cells = _Left(np.zeros(len(box[0])))
+            while intervals:
+                cells += len(intervals)
+                if cells > cell_limit or boxes > MOST_BOXES:
                     raise Unchecked(
                         f"neither shown nor refuted: after {cells} cells a violation of more than {TOLERANCE:.0e} of"
                         " its unit is not excluded"
                     )
-                _examine(Place(tubes(box), parameters, box, clock, beside), sides, todo, left, found)
-                todo, left.halves = left.halves, []
-            if left.turned:
-                stack += [(half, left.turned) for half in reversed(sides.halves(left.slopes))]
-            if left.wide:
-                halved += [(half, sides, left.wide) for half in _split(box, left.influence)]
-        for half, sides, todo in reversed(halved):
-            waiting.setdefault(half, []).append((sides, todo))
-    return Proven(found.bound, found.share, cells, items)
+                _examine(Place(tubes(box), parameters, box, clock, beside), sides, intervals, open_cells, excess)
+                intervals, open_cells.halves = open_cells.halves, []
+            if open_cells.turned:
+                stack += [(half, open_cells.turned) for half in reversed(sides.halves(open_cells.slopes))]
+            if open_cells.wide:
+                halved += [(half, sides, open_cells.wide) for half in _split(box, open_cells.influence)]
+        for half, sides, intervals in reversed(halved):
+            work_by_box.setdefault(half, []).append((sides, intervals))
+    return Proven(excess.bound, excess.share, cells, boxes)
 
 
 @final
@@ -129,10 +129,10 @@ class Place:
 
     def cells(self, interval: Interval, z: Array, sharp: bool) -> list[Polynomial]:
         """Return the polynomials of the rows ``z (k, b)`` on an interval, with the added terms of `beside`."""
-        found = self.tube.cells(*interval, z, sharp)
+        polynomials = self.tube.cells(*interval, z, sharp)
         if self.beside is None:
-            return found
-        return self.beside.added(found, *interval[1:], z, within=(self.box, self.tube.flow))
+            return polynomials
+        return self.beside.added(polynomials, *interval[1:], z, within=(self.box, self.tube.flow))
 
 
 @final
@@ -170,14 +170,16 @@ def _examine(place: Place, sides: Sides, todo: Sequence[Interval], left: _Left, 
     """Bound the rows on every cell of time, and sort the cells whose bounds are too large into ``left``.
 
     The bounds that suffice are recorded in ``shown``."""
-    for interval, found, tops in _batch(place, sides.rows, todo):
+    for interval, polynomials, tops in _batch(place, sides.rows, todo):
         for i, row in enumerate(sides.rows):
             if not tops[i] <= 0.0:
-                tops[i], found[i] = _closer(place, row, interval, found[i], tops[i])
+                tops[i], polynomials[i] = _closer(place, row, interval, polynomials[i], tops[i])
         for top, row in zip(tops, sides.rows, strict=True):
             if top <= 0.0:
                 shown.add(top, row)
-        over = [(row, poly, top) for row, poly, top in zip(sides.rows, found, tops, strict=True) if not top <= 0.0]
+        over = [
+            (row, poly, top) for row, poly, top in zip(sides.rows, polynomials, tops, strict=True) if not top <= 0.0
+        ]
         failed = [(row, poly) for row, poly, _ in over]
         if not failed:
             continue
@@ -197,9 +199,9 @@ def _closer(place: Place, row: Bounded, interval: Interval, poly: Polynomial, to
     The polynomial is sharper where switching disturbances cause the error, and the half-spaces of the set of parameters
     are used."""
     if poly.kinks > BLAME * row.slack:
-        ((_, (sharper,), (other,)),) = _batch(place, [row], [interval], sharp=True)
-        if other < top:
-            top, poly = other, sharper
+        ((_, (sharper,), (sharper_top,)),) = _batch(place, [row], [interval], sharp=True)
+        if sharper_top < top:
+            top, poly = sharper_top, sharper
     return (top if top <= 0.0 else min(top, _cut(place, row, poly))), poly
 
 
@@ -240,13 +242,20 @@ def _batch(
     """Yield every interval with its polynomials, one per row, and with proven upper bounds of their excess.
 
     Each bound holds for the polynomial with its error, less the limit and the slack of its row."""
-    z, every = np.array([row.z for row in rows]), []
+    z, polynomials_by_interval = np.array([row.z for row in rows]), []
     for interval in todo:
         place.clock.check()
-        every.append(place.cells(interval, z, sharp))
-    tops = _tops(place.tube, [(poly, row.allowed) for found in every for poly, row in zip(found, rows, strict=True)])
-    for number, (interval, found) in enumerate(zip(todo, every, strict=True)):
-        yield interval, found, tops[number * len(rows) : (number + 1) * len(rows)].tolist()
+        polynomials_by_interval.append(place.cells(interval, z, sharp))
+    tops = _tops(
+        place.tube,
+        [
+            (poly, row.allowed)
+            for polynomials in polynomials_by_interval
+            for poly, row in zip(polynomials, rows, strict=True)
+        ],
+    )
+    for number, (interval, polynomials) in enumerate(zip(todo, polynomials_by_interval, strict=True)):
+        yield interval, polynomials, tops[number * len(rows) : (number + 1) * len(rows)].tolist()
 
 
 def _tops(tube: Reached, flat: Sequence[tuple[Polynomial, float]]) -> Array:
@@ -255,17 +264,17 @@ def _tops(tube: Reached, flat: Sequence[tuple[Polynomial, float]]) -> Array:
     A bound is at most 0 where halving boxes shows that; where it is positive it may be far from sharp."""
     tops, monomials = np.empty(len(flat)), tube.flow.monomials
     for orders in {poly.coefficients.shape[0] for poly, _ in flat}:
-        which = [i for i, (poly, _) in enumerate(flat) if poly.coefficients.shape[0] == orders]
-        dense = np.zeros((len(which), orders, *(monomials.degree + 1,) * monomials.count))
-        together = dense.reshape(len(which), orders, -1)
+        indices = [i for i, (poly, _) in enumerate(flat) if poly.coefficients.shape[0] == orders]
+        dense = np.zeros((len(indices), orders, *(monomials.degree + 1,) * monomials.count))
+        flattened = dense.reshape(len(indices), orders, -1)
         powers = np.array(monomials.exponents, dtype=int).reshape(monomials.size, -1).T
-        places = np.ravel_multi_index(tuple(powers), dense.shape[2:]) if monomials.count else [0]
-        together[:, :, places] = np.array([flat[i][0].coefficients for i in which])
-        together[:, 0, 0] -= np.array([flat[i][1] for i in which])
-        errors = np.array([flat[i][0].error + HALF_ULP * abs(flat[i][1]) for i in which]) * OUTWARD
+        positions = np.ravel_multi_index(tuple(powers), dense.shape[2:]) if monomials.count else [0]
+        flattened[:, :, positions] = np.array([flat[i][0].coefficients for i in indices])
+        flattened[:, 0, 0] -= np.array([flat[i][1] for i in indices])
+        errors = np.array([flat[i][0].error + HALF_ULP * abs(flat[i][1]) for i in indices]) * OUTWARD
         if not (np.isfinite(dense).all() and np.isfinite(errors).all()):
             raise Unchecked("the response grows beyond what numbers can hold")
-        tops[which] = highest(dense, [False] + [True] * monomials.count, errors, 0.0)
+        tops[indices] = highest(dense, [False] + [True] * monomials.count, errors, 0.0)
     return tops
 
 
@@ -310,10 +319,10 @@ def _influence(tube: Reached, poly: Polynomial) -> Array:
     returned."""
     expansion = poly.expansion > BLAME * poly.error
     sizes = tube.flow.sizes if expansion else np.abs(poly.coefficients).sum(axis=0)
-    answer: Array = np.array(tube.flow.monomials.exponents, dtype=float).T @ sizes
+    influence: Array = np.array(tube.flow.monomials.exponents, dtype=float).T @ sizes
     if poly.bent is not None and poly.turning > BLAME * poly.error:
         return poly.bent
-    return answer
+    return influence
 
 
 def _halves(interval: Interval) -> list[Interval]:
@@ -334,6 +343,6 @@ def _split(box: Corners, influence: Array) -> list[Corners]:
         raise Unchecked("a box of parameters cannot be halved any more")
     axis = int(np.where(thick, influence, -np.inf).argmax())
     middle = float(middles[axis])
-    left, right = upper.copy(), lower.copy()
-    left[axis] = right[axis] = middle
-    return [(tuple(lower), tuple(left)), (tuple(right), tuple(upper))]
+    first_upper, second_lower = upper.copy(), lower.copy()
+    first_upper[axis] = second_lower[axis] = middle
+    return [(tuple(lower), tuple(first_upper)), (tuple(second_lower), tuple(upper))]

@@ -78,7 +78,7 @@ def check(case: Case, gap_tolerance: float | None) -> list[Finding]:
             claims.append(_of_status(str(status), judged("equalities", lambda: equalities(case))))
         claims += [judged(window.name, lambda window=window: bounded(case, window)) for window in case.windows]  # type: ignore[misc]
         if case.problem.repeat or "repeat" in case.certificate:
-            claims.append(judged("repeat", lambda: _repeats(case, {one.name: one.verdict for one in claims})))
+            claims.append(judged("repeat", lambda: _repeats(case, {claim.name: claim.verdict for claim in claims})))
         return [*claims, judged("status", lambda: _status(case, str(status), gap_tolerance, claims))]
 
 
@@ -114,15 +114,15 @@ def precision_of(case: Case) -> int:
     parameters = problem.system.parameters
     middle = np.zeros((1, 0)) if parameters is None else parameters.interior_point()[None]
     try:
-        parts = [part for mode in problem.system.modes for part in mode.matrices(middle)]
+        matrices = [matrix for mode in problem.system.modes for matrix in mode.matrices(middle)]
     except InputError:  # not finite there
         return PRECISION
     with np.errstate(over="ignore"):  # numbers that are not finite do not count
-        entries = np.concatenate([np.ravel(part) for part in parts]) * problem.horizon
+        entries = np.concatenate([np.ravel(matrix) for matrix in matrices]) * problem.horizon
     sizes = np.abs(entries[np.isfinite(entries) & (entries != 0.0)])
-    apart = np.log2(max(1.0, sizes.max(initial=1.0))) - np.log2(min(1.0, sizes.min(initial=1.0)))
-    spare = VARYING if problem.system.varies else 0
-    return int(min(PRECISION + spare + np.ceil(apart), MOST_PRECISION))
+    range_bits = np.log2(max(1.0, sizes.max(initial=1.0))) - np.log2(min(1.0, sizes.min(initial=1.0)))
+    extra_bits = VARYING if problem.system.varies else 0
+    return int(min(PRECISION + extra_bits + np.ceil(range_bits), MOST_PRECISION))
 
 
 def judged(name: str, derive: Callable[[], str]) -> Finding:
@@ -159,12 +159,14 @@ def _policy(case: Case) -> str:
     different = np.argwhere(written.mask != case.answers)
     if different.size:
         k, j = different[0].tolist()
-        does = "is" if written.mask[k, j] else "is not"
-        raise Broken(f"that piece {k + 1} answers breakpoint {j + 1} {does} written, which the config's policy denies")
-    told = f"answers {int(case.answers.sum())} of {case.control.pieces * (case.control.pieces + 1) // 2} pairs of a"
-    told += f" piece and a measurement before it, and is charged {case.charge}"
+        verb = "is" if written.mask[k, j] else "is not"
+        raise Broken(f"that piece {k + 1} answers breakpoint {j + 1} {verb} written, which the config's policy denies")
+    description = (
+        f"answers {int(case.answers.sum())} of {case.control.pieces * (case.control.pieces + 1) // 2} pairs of a"
+    )
+    description += f" piece and a measurement before it, and is charged {case.charge}"
     # a component that is not loaded cannot be asked for its policy: then bounds are about the written policy
-    return f"it {told}" + (
+    return f"it {description}" + (
         ", as is written; its own component is not loaded" if isinstance(case.policy, WrittenPolicy) else ""
     )
 
@@ -185,25 +187,28 @@ def _in_set(
 
     ``parts`` returns matrices ``(m, 1 + Q)`` with independent deviations, whose sum is the control or the change.
     Return the largest excess in words."""
-    shape, feedback, worst, wide = known(bound), feedback_of(case), 0.0, list[int]()
+    shape, feedback, worst, answering_pieces = known(bound), feedback_of(case), 0.0, list[int]()
     for k in places:
         case.clock.check()
-        every = parts(k)
-        beyond, point = None, [sum(entries[1:], entries[0]) for entries in zip(*map(_nominal, every), strict=True)]
-        if any(not x.is_zero() for part in every for row in part.tolist() for x in row[1:]):
+        summands = parts(k)
+        deviation_support, point = (
+            None,
+            [sum(entries[1:], entries[0]) for entries in zip(*map(_nominal, summands), strict=True)],
+        )
+        if any(not x.is_zero() for summand in summands for row in summand.tolist() for x in row[1:]):
             if shape.facets is None:
-                wide.append(k)
+                answering_pieces.append(k)
                 continue
-            responses = [_without_nominal(part) for part in every]
-            beyond = lambda c, responses=responses: feedback.heights(responses, exactly(c[None]))[0]  # noqa: E731
-        over, where = shape.excess(point, beyond)
+            responses = [_without_nominal(summand) for summand in summands]
+            deviation_support = lambda c, responses=responses: feedback.heights(responses, exactly(c[None]))[0]  # noqa: E731
+        over, where = shape.excess(point, deviation_support)
         if over > TOLERANCE:
             where = name.format("the control" if where == "it" else where)
             at = _at(case, float(case.control.breakpoints[k]))
             raise Broken(f"{where} leaves its set by {over:.3g} of its own unit, from {at} on")
         worst = max(worst, over)
-    if wide:
-        worst = max(worst, _turned(case, shape, wide, lambda k, rows: feedback.heights(parts(k), rows)))
+    if answering_pieces:
+        worst = max(worst, _turned(case, shape, answering_pieces, lambda k, rows: feedback.heights(parts(k), rows)))
     return f", to {worst:.1e} of its own units" if worst > 0 else ""
 
 
@@ -243,8 +248,8 @@ def _repeats(case: Case, verdicts: Mapping[str, str]) -> str:
     if case.problem.system.delay > 0.0:
         raise Broken("with a delay the last controls of a period act in the next one")
     fixed, centre = dict(case.equalities), np.asarray(case.stated.initial_state, dtype=float)
-    alone = single(case.stated)
-    for state in alone:
+    single_states = single(case.stated)
+    for state in single_states:
         if fixed.get(state) != float(centre[state]):
             name = case.problem.names.state(state)
             raise Broken(f"{name} begins at {float(centre[state])!r}, and does not end there")
@@ -255,10 +260,10 @@ def _repeats(case: Case, verdicts: Mapping[str, str]) -> str:
         if verdicts[name] != "holds":
             raise (Broken if verdicts[name] == "fails" else Unchecked)(f"it rests on {name}, which is {verdicts[name]}")
     back = "every final state is one of the initial states"
-    if len(alone) == centre.size:
+    if len(single_states) == centre.size:
         back = "the final state is the initial one, to rounding"
-    elif alone:
-        back += ", in " + ", ".join(case.problem.names.state(state) for state in alone) + " to rounding"
+    elif single_states:
+        back += ", in " + ", ".join(case.problem.names.state(state) for state in single_states) + " to rounding"
     return f"{back}, so that all constraints hold in every period"
 
 
@@ -268,18 +273,19 @@ def _strictly(case: Case, window: ConstraintWindow) -> None:
 
     bound = case.stated.initial_set
     assert bound is not None
-    mine, flat = window.seen.facets, known(bound).facets
-    if mine is None or flat is None:
+    window_facets, initial_facets = window.seen.facets, known(bound).facets
+    if window_facets is None or initial_facets is None:
         return  # along the gauge a share of the whole set is excused, and the return is proven for a smaller set
-    kept, alone = dict[tuple[float, ...], list[arb]](), {*single(case.stated)}
-    for c, b in flat:
-        if not set(np.flatnonzero(c).tolist()) <= alone:
-            kept.setdefault(tuple(c.tolist()), []).append(b)
-    own = [tuple(c[: bound.dimension].tolist()) for c, _ in mine]  # once for each corner of parameters made states
-    if {*own} != kept.keys():
+    limits, single_states = dict[tuple[float, ...], list[arb]](), {*single(case.stated)}
+    for c, b in initial_facets:
+        if not set(np.flatnonzero(c).tolist()) <= single_states:
+            limits.setdefault(tuple(c.tolist()), []).append(b)
+    # once for each corner of parameters made states
+    normals = [tuple(c[: bound.dimension].tolist()) for c, _ in window_facets]
+    if {*normals} != limits.keys():
         raise Unchecked("the sides of the set of initial states are not told apart")
-    for normal, (_, within), unit in zip(own, mine, units_of(case, window).rows.tolist(), strict=True):
-        if not all(within + arb(TOLERANCE) * arb(unit) <= b for b in kept[normal]):
+    for normal, (_, limit), unit in zip(normals, window_facets, units_of(case, window).rows.tolist(), strict=True):
+        if not all(limit + arb(TOLERANCE) * arb(unit) <= b for b in limits[normal]):
             raise Unchecked(
                 f"a violation that counts as none leaves the set of initial states along {[*normal]}: it is too thin"
                 " beside the numbers that are added up"
@@ -288,10 +294,10 @@ def _strictly(case: Case, window: ConstraintWindow) -> None:
 
 def _steps(case: Case) -> str:
     """Show that every step of the control from piece to piece is in its set."""
-    bound, found = case.problem.control_step, steps(case.problem, case.control)
+    bound, breaks = case.problem.control_step, steps(case.problem, case.control)
     assert bound is not None
     return (
-        f"{len(found)} steps in their set{_in_set(case, bound, found, feedback_of(case).changes, 'the change of {}')}"
+        f"{len(breaks)} steps in their set{_in_set(case, bound, breaks, feedback_of(case).changes, 'the change of {}')}"
     )
 
 
@@ -313,8 +319,8 @@ def _counted(case: Case) -> str:
     """Show that the written time of action and the written cost ``J`` are those of the control.
 
     Where there is an alphabet, its letters must be the only values of the control."""
-    acted, total = activity.acted(case), activity.largest(case)
-    _agrees("cost", number(case.certificate, "cost"), ball(acted * total), 0.0)
+    active_share, total = activity.acted(case), activity.largest(case)
+    _agrees("cost", number(case.certificate, "cost"), ball(active_share * total), 0.0)
     derived = case.price.of(case.pieces)
     _agrees(
         "J",
@@ -325,13 +331,15 @@ def _counted(case: Case) -> str:
     if case.letters is not None and not np.isin(case.control.control(case.theta), case.letters).all():
         raise Broken(f"the control takes other values than {list(case.letters)}")
     unit = f" {case.problem.names.time}" if case.problem.names.time else ""
-    return f"it acts for {acted * total:.9g}{unit} of {total:.9g}{unit}, J = {float(derived):.12g}{_effort(case)}"
+    return (
+        f"it acts for {active_share * total:.9g}{unit} of {total:.9g}{unit}, J = {float(derived):.12g}{_effort(case)}"
+    )
 
 
 def _agrees(name: str, written: float, derived: arb, scale: float) -> None:
     """Raise `Broken` unless a written figure is the derived one, to `FIGURES` of the larger of it and ``scale``."""
-    off = abs(ball(written) - derived)
-    if not off <= ball(FIGURES) * ball(scale).max(abs(derived)):
+    difference = abs(ball(written) - derived)
+    if not difference <= ball(FIGURES) * ball(scale).max(abs(derived)):
         raise Broken(f"{name}: {written!r} is written, {float(derived)!r} is derived")
 
 
@@ -344,26 +352,28 @@ def _fewest(case: Case, status: str) -> str:
     proven = status in ("certified", "verified")
     if (upper is not None) is not proven:
         raise Broken(f"upper is {upper!r} where the status is {status}")
-    other = _other(case, data)
-    acted = activity.acted(other)
-    if proven and abs(number(data, "upper") - acted) > FIGURES:
-        raise Broken(f"upper is {upper!r}, the control acts for a share of {acted!r}")
-    own = data.get("multipliers")
+    other_case = _other(case, data)
+    active_share = activity.acted(other_case)
+    if proven and abs(number(data, "upper") - active_share) > FIGURES:
+        raise Broken(f"upper is {upper!r}, the control acts for a share of {active_share!r}")
+    own_multipliers = data.get("multipliers")
     if case.counts and case.letters is None:
         derived = _tree(case) / activity.largest(case)
-        if not 0.0 <= written <= min(derived, acted if proven else np.inf) + FIGURES:
+        if not 0.0 <= written <= min(derived, active_share if proven else np.inf) + FIGURES:
             raise Broken(f"lower is {written!r}, the leaves prove {derived!r}")
         return _at_least(case, written)
-    if own is None and case.problem.cost.blocks and not case.problem.cost.is_quadratic:
+    if own_multipliers is None and case.problem.cost.blocks and not case.problem.cost.is_quadratic:
         derived = activity.least_of_cost(case, multiplied(case, priced=True))
     else:
-        rows, pieces = weighted(case, case.certificate.get("multipliers") if own is None else own)
-        rows, pieces = activity.shared(case, rows, pieces) if own is None else (rows, pieces)
+        rows, pieces = weighted(
+            case, case.certificate.get("multipliers") if own_multipliers is None else own_multipliers
+        )
+        rows, pieces = activity.shared(case, rows, pieces) if own_multipliers is None else (rows, pieces)
         derived = activity.least(case, rows, pieces)
-    if not 0.0 <= written <= derived + FIGURES or (proven and written > acted + FIGURES):
+    if not 0.0 <= written <= derived + FIGURES or (proven and written > active_share + FIGURES):
         raise Broken(f"lower is {written!r}, the multipliers prove {derived!r}")
     least = _at_least(case, written)
-    return f"{least}, {'this' if other is case else 'another'} one {acted:.1%}" if proven else least
+    return f"{least}, {'this' if other_case is case else 'another'} one {active_share:.1%}" if proven else least
 
 
 def _at_least(case: Case, share: float) -> str:
@@ -376,14 +386,14 @@ def _other(case: Case, data: Mapping[str, Any]) -> Case:
     """Return the case with another control that the certificate offers, shown to be admissible, or the case itself."""
     if data.get("decision") is None:
         return case
-    said = {name: data.get(name) for name in ("decision", "proof")}
-    other = replace(case, certificate={**case.certificate, **said})
-    _control(other)
+    entries = {name: data.get(name) for name in ("decision", "proof")}
+    other_case = replace(case, certificate={**case.certificate, **entries})
+    _control(other_case)
     if case.equalities:
-        equalities(other)
-    for window in other.windows:
-        bounded(other, window)
-    return other
+        equalities(other_case)
+    for window in other_case.windows:
+        bounded(other_case, window)
+    return other_case
 
 
 def _lower(case: Case) -> str:
@@ -435,15 +445,15 @@ def _tree(case: Case) -> float:
         raise Unchecked("the certificate holds no tree of parts")
     if case.control.functions < case.control.pieces:
         raise Unchecked("the control has fewer functions than pieces, which is not followed")
-    known = listed(data, "constraints")
+    entries = listed(data, "constraints")
 
     def of_leaf(leaf: Mapping[str, Any]) -> list[tuple[float, ConstraintRow]]:
         constraints = []
         for pair in listed(leaf, "multipliers"):
-            if not (isinstance(pair, list) and len(pair) == 2 and type(pair[0]) is int and 0 <= pair[0] < len(known)):
+            if not (isinstance(pair, list) and len(pair) == 2 and type(pair[0]) is int and 0 <= pair[0] < len(entries)):
                 raise Broken("tree: expected the number of a constraint and its multiplier")
-            said = known[pair[0]]
-            constraints.append({**said, "multiplier": pair[1]} if isinstance(said, Mapping) else said)
+            entry = entries[pair[0]]
+            constraints.append({**entry, "multiplier": pair[1]} if isinstance(entry, Mapping) else entry)
         return weighted(case, {"constraints": constraints, "equalities": leaf.get("equalities")})[0]
 
     return activity.proven(case, listed(data, "nodes"), of_leaf)
@@ -459,9 +469,9 @@ def _infeasible(case: Case) -> str:
     if not amount > 0:
         raise Broken(f"the multipliers prove {float(amount.lower()):.3g}, expected a positive number")
     entries = case.certificate["multipliers"]["constraints"]
-    which = "this constraint" if len(entries) == 1 else f"these {len(entries)} constraints together"
+    constraints_text = "this constraint" if len(entries) == 1 else f"these {len(entries)} constraints together"
     return (
-        f"no control meets {which}: the weighted sum is at least"
+        f"no control meets {constraints_text}: the weighted sum is at least"
         f" {float(amount.lower()):.4g} for every control, it must not be positive"
     )
 
@@ -511,8 +521,8 @@ def added_up(case: Case) -> float:
     cost = number(case.certificate, "cost")
     if case.counts or not case.price.is_quadratic:
         return abs(cost)
-    other = None if case.charge == "nominal" else cost - case.price.squares(case.pieces)
-    return case.price.added(case.pieces, other)
+    lengths = None if case.charge == "nominal" else cost - case.price.squares(case.pieces)
+    return case.price.added(case.pieces, lengths)
 
 
 def compared(case: Case) -> float:
@@ -559,8 +569,8 @@ def _at(case: Case, time: float) -> str:
 
 def _measured(case: Case, name: str, direction: Array) -> str:
     """Return the unit of the row of a constraint with this normal, after a space; an empty string for a curved set."""
-    held = {case.of_control: case.problem.control, STEP: case.problem.control_step}
-    shape = held[name] if name in held else None if name == EQUALS else case.window(name).shape
+    control_sets = {case.of_control: case.problem.control, STEP: case.problem.control_step}
+    shape = control_sets[name] if name in control_sets else None if name == EQUALS else case.window(name).shape
     if shape is not None and shape.halfspaces() is None:
         return ""
-    return unit_of_row(direction, case.problem.names, 0 if name in held else case.problem.system.states)
+    return unit_of_row(direction, case.problem.names, 0 if name in control_sets else case.problem.system.states)

@@ -64,14 +64,14 @@ def bounded(case: Case, window: ConstraintWindow) -> str:
     normals = normals_of(window, entry.get("normals"))
     covered(case, window, lower, upper)
     if case.followed.are_best and window.seen.facets is not None:
-        found = _along_rows(case, window)
+        proven = _along_rows(case, window)
     else:
         basis, gains, work = _work(case, window, normals, lower, upper)
-        found = prove_on_cells(case, window, (basis, gains), work, (lower, upper))
-    size = f"{found.cells} cells" + (f" in {found.boxes} boxes" if found.boxes > 1 else "")
-    if found.bound < 0:
-        return f"kept, with a margin of at least {-found.bound:.1e}{_unit(case, window)} ({size})"
-    return f"kept to {found.bound:.1e}{_unit(case, window)}{_excused(case, window, normals)} ({size})"
+        proven = prove_on_cells(case, window, (basis, gains), work, (lower, upper))
+    size = f"{proven.cells} cells" + (f" in {proven.boxes} boxes" if proven.boxes > 1 else "")
+    if proven.bound < 0:
+        return f"kept, with a margin of at least {-proven.bound:.1e}{_unit(case, window)} ({size})"
+    return f"kept to {proven.bound:.1e}{_unit(case, window)}{_excused(case, window, normals)} ({size})"
 
 
 def _excused(case: Case, window: ConstraintWindow, normals: Array) -> str:
@@ -87,10 +87,10 @@ def _excused(case: Case, window: ConstraintWindow, normals: Array) -> str:
 
 def _along_rows(case: Case, window: ConstraintWindow) -> Proven:
     """Show by the adjoints of the rows that no row of a flat set is exceeded by more than what counts as none."""
-    flat, units = window.seen.facets, units_of(case, window).rows.tolist()
-    assert flat is not None
+    facets, units = window.seen.facets, units_of(case, window).rows.tolist()
+    assert facets is not None
     count, bound, share = 0, -np.inf, -np.inf
-    for (direction, b), unit in zip(flat, units, strict=True):
+    for (direction, b), unit in zip(facets, units, strict=True):
         row = Bounded(direction, below(b), unit)
         cells, top = FollowedRow(case, window, np.asarray(direction, dtype=float)).prove(row.allowed)
         over = float(np.nextafter(top - row.limit, np.inf))
@@ -145,10 +145,10 @@ def covered(case: Case, window: ConstraintWindow, lower: Array, upper: Array) ->
     for axis in range(b):
         for sign in (-1.0, 1.0):
             face = 1 + nu + axis
-            mine = (lower[:, face] == sign) & (upper[:, face] == sign)
+            is_on_face = (lower[:, face] == sign) & (upper[:, face] == sign)
             ends = (np.append(low, -np.ones(b)), np.append(high, np.ones(b)))
             ends[0][face] = ends[1][face] = sign
-            fill(lower[mine], upper[mine], *ends, case.clock)
+            fill(lower[is_on_face], upper[is_on_face], *ends, case.clock)
 
 
 def _extent(case: Case, window: ConstraintWindow, lower: Array, upper: Array) -> tuple[Array, Array]:
@@ -198,8 +198,8 @@ def _work(
 
 def cut_times(case: Case, window: ConstraintWindow, times: Sequence[tuple[float, float]]) -> list[Interval]:
     """Return the ``times``, each a start and an end, cut at every kink and jump of the state and of the rows."""
-    every = np.union1d(_cuts(case), window.cuts(case.control.breakpoints.tolist()))
-    return [one for start, stop in times for one in cut(np.array(case.timing.grid), every, start, stop)]
+    cuts = np.union1d(_cuts(case), window.cuts(case.control.breakpoints.tolist()))
+    return [interval for start, stop in times for interval in cut(np.array(case.timing.grid), cuts, start, stop)]
 
 
 @lru_cache(maxsize=2)
@@ -212,12 +212,13 @@ def _facets(window: ConstraintWindow, units: WindowUnits) -> tuple[Array, Array,
     """Return the normals of a flat set's facets, on the state ``(b, d)`` and on the control ``(b, m)``, and its rows.
 
     Opposite facets share a normal. The rows are ``None`` for a curved set."""
-    found, flat = window.seen.basis, window.seen.facets
-    if found is None or flat is None:
+    facet_basis, facets = window.seen.basis, window.seen.facets
+    if facet_basis is None or facets is None:
         return np.zeros((0, 0)), np.zeros((0, 0)), None
-    basis, z = found
+    basis, z = facet_basis
     rows = [
-        Bounded(direction, below(b), unit) for direction, (_, b), unit in zip(z, flat, units.rows.tolist(), strict=True)
+        Bounded(direction, below(b), unit)
+        for direction, (_, b), unit in zip(z, facets, units.rows.tolist(), strict=True)
     ]
     return basis[:, : window.states], basis[:, window.states :], Sides(rows)
 
@@ -225,9 +226,9 @@ def _facets(window: ConstraintWindow, units: WindowUnits) -> tuple[Array, Array,
 def cut(grid: Array, cuts: Array, start: float, stop: float) -> list[Interval]:
     """Return the parts between the increasing ``cuts``, each with the piece of the ``grid`` that it lies in."""
     inside = cuts[np.searchsorted(cuts, start, side="right") : np.searchsorted(cuts, stop)].tolist()
-    parts = list(pairwise([start, *inside, stop]))
-    pieces = np.searchsorted(grid, [a for a, _ in parts], side="right") - 1
-    return [(int(k), a, b) for k, (a, b) in zip(np.clip(pieces, 0, grid.size - 2), parts, strict=True)]
+    intervals = list(pairwise([start, *inside, stop]))
+    pieces = np.searchsorted(grid, [a for a, _ in intervals], side="right") - 1
+    return [(int(k), a, b) for k, (a, b) in zip(np.clip(pieces, 0, grid.size - 2), intervals, strict=True)]
 
 
 def prove_on_cells(
@@ -236,8 +237,8 @@ def prove_on_cells(
     """Show with `prove` that a constraint is kept on the parts ``work`` of ``cells`` between lower and upper corners.
 
     The rows to bound are combinations of ``rows``, ``(b, d)`` on the state and ``(b, m)`` on the control."""
-    beside = case.beside(window, *rows)
-    return prove(tubes(case, *rows, *cells), parameters_of(case), work, case.clock, beside)
+    added_terms = case.beside(window, *rows)
+    return prove(tubes(case, *rows, *cells), parameters_of(case), work, case.clock, added_terms)
 
 
 def tubes(case: Case, basis: Array, gains: Array, lower: Array, upper: Array) -> Callable[[Corners], Reached]:
@@ -252,15 +253,15 @@ def tubes(case: Case, basis: Array, gains: Array, lower: Array, upper: Array) ->
     nu = case.problem.system.parameter_count
     widened = nu and not parameters_of(case).is_box
     extra = WIDER * (upper[:, 1 : 1 + nu].max(axis=0) - lower[:, 1 : 1 + nu].min(axis=0)) if widened else np.zeros(nu)
-    seen = dict[int, ProjectedStates]()
+    projected_states = dict[int, ProjectedStates]()
 
     @lru_cache(maxsize=TUBES_KEPT)
     def tube(corners: Corners) -> VerifiedTube:
         box = ParameterBox.between(corners[0], corners[1]).wider(extra)
         states = case.states.over(box)
-        if len(seen) >= TUBES_KEPT and id(states) not in seen:
-            seen.clear()
-        return VerifiedTube(seen.setdefault(id(states), ProjectedStates(states, basis)), box)
+        if len(projected_states) >= TUBES_KEPT and id(states) not in projected_states:
+            projected_states.clear()
+        return VerifiedTube(projected_states.setdefault(id(states), ProjectedStates(states, basis)), box)
 
     return tube
 
@@ -272,14 +273,16 @@ def equalities(case: Case) -> str:
     excused, `Unchecked` where an uncertainty may reach a fixed state."""
     worst, states = 0.0, np.eye(case.problem.system.states)[[state for state, _ in case.equalities]]
     sizes = nominal_sizes(case, states, np.zeros((len(states), 0))).tolist()
-    for (state, value), (off, added), size, row in zip(case.equalities, missed(case), sizes, states, strict=True):
-        most = min(EQUALITY * max(added, abs(value)), TOLERANCE * max(size, abs(value)))
-        if not off <= most:
+    for (state, value), (residual, term_size), size, row in zip(
+        case.equalities, missed(case), sizes, states, strict=True
+    ):
+        allowed = min(EQUALITY * max(term_size, abs(value)), TOLERANCE * max(size, abs(value)))
+        if not residual <= allowed:
             name, unit = case.problem.names.state(state), measured_in(row, case.problem.names)
             raise Broken(
-                f"{name} is missed by up to {float(off.upper()):.3g}{unit}, at most {most:.1e}{unit} is excused"
+                f"{name} is missed by up to {float(residual.upper()):.3g}{unit}, at most {allowed:.1e}{unit} is excused"
             )
-        worst = max(worst, float(off.upper()))
+        worst = max(worst, float(residual.upper()))
     return f"kept to {worst:.1e}{of_fixed(case)}"
 
 
@@ -289,18 +292,18 @@ def missed(case: Case) -> list[tuple[arb, float]]:
     The size counts what the initial state and the control contribute. Where the control answers deviations, it also
     counts what these contribute, without the control and with it."""
     scene, d = replace(case.scene, disturbance=None, initial_set=None), case.problem.system.states
-    horizon, everything = case.problem.horizon, Box(np.full(d, -np.inf), np.full(d, np.inf))
-    sums = WindowUnits(case.problem, case.flows, scene, everything, horizon, horizon).sums
-    feedback, found = feedback_of(case), []
+    horizon, whole_space = case.problem.horizon, Box(np.full(d, -np.inf), np.full(d, np.inf))
+    sums = WindowUnits(case.problem, case.flows, scene, whole_space, horizon, horizon).sums
+    feedback, residuals = feedback_of(case), []
     last = feedback.loop.nodes[-1].tolist() if case.answering else _unreached(case, scene)
     for state, value in case.equalities:
-        (reached, *responses), (goal,) = last[state], balls([value])
+        (final_value, *responses), (goal,) = last[state], balls([value])
         if not case.answering:
-            reached = reached * 0 if _rests(case, state) else reached + pushed_by_middle(case, state)
-        off = reached - goal
-        high, low = off + feedback.support(responses), feedback.support([-x for x in responses]) - off
-        found.append((high.max(low), float(sums[state]) + (feedback.added(state) if case.answering else 0.0)))
-    return found
+            final_value = final_value * 0 if _rests(case, state) else final_value + pushed_by_middle(case, state)
+        residual = final_value - goal
+        high, low = residual + feedback.support(responses), feedback.support([-x for x in responses]) - residual
+        residuals.append((high.max(low), float(sums[state]) + (feedback.added(state) if case.answering else 0.0)))
+    return residuals
 
 
 def _unreached(case: Case, scene: Scene) -> list[list[arb]]:
@@ -313,12 +316,12 @@ def _unreached(case: Case, scene: Scene) -> list[list[arb]]:
 
 def pushed_by_middle(case: Case, state: int) -> arb:
     """Return what the disturbance in the middle of its set adds to a state at the end."""
-    (total,), about = balls([0.0]), case.disturbances.middle
-    if about.any():
-        end, column = case.problem.horizon, stacked([[w] for w in balls(about)])
+    (total,), middle = balls([0.0]), case.disturbances.middle
+    if middle.any():
+        end, column = case.problem.horizon, stacked([[w] for w in balls(middle)])
         ends = [t for t in case.timing.grid if t < end]
-        for part in case.price.flow.weights([*ends, end]).disturbance:
-            total = total + (part * column)[state, 0]
+        for weights in case.price.flow.weights([*ends, end]).disturbance:
+            total = total + (weights * column)[state, 0]
     return total
 
 
@@ -335,16 +338,20 @@ def _reached(case: Case, state: int) -> bool:
     as entries where the middle of the disturbance is other than 0."""
     reaching = _linked(case, state)
     rows = sorted(reaching)
-    there, changed = case.flows.links
+    is_nonzero, is_parametric = case.flows.links
     d, m = case.problem.system.states, case.flows.plant.driven
-    acting = [*range(d + m), *(d + m + int(w) for w in np.flatnonzero(case.disturbances.middle))]
-    uncertain = bool(changed[np.ix_(rows, acting)].any())
+    acting_columns = [*range(d + m), *(d + m + int(w) for w in np.flatnonzero(case.disturbances.middle))]
+    is_uncertain = bool(is_parametric[np.ix_(rows, acting_columns)].any())
     bound = case.problem.disturbance
-    free = [] if bound is None else [w for w, axis in enumerate(np.eye(bound.dimension)) if _is_wide(bound, axis)]
-    pushed = bool(there[np.ix_(rows, [d + m + w for w in free])].any())
-    begun = case.problem.initial_set
-    moved = begun is not None and any(known(begun).radius[j] > math.ulp(0.0) for j in reaching)
-    return uncertain or pushed or moved
+    free_disturbances = (
+        [] if bound is None else [w for w, axis in enumerate(np.eye(bound.dimension)) if _is_wide(bound, axis)]
+    )
+    is_disturbed = bool(is_nonzero[np.ix_(rows, [d + m + w for w in free_disturbances])].any())
+    initial_set = case.problem.initial_set
+    has_uncertain_start = initial_set is not None and any(
+        known(initial_set).radius[j] > math.ulp(0.0) for j in reaching
+    )
+    return is_uncertain or is_disturbed or has_uncertain_start
 
 
 def _is_wide(bound: ConvexSet, axis: Array) -> bool:
@@ -357,15 +364,18 @@ def _rests(case: Case, state: int) -> bool:
     """Return whether a state starts at 0 and nothing ever moves it.
 
     Neither a linked state, nor a control of the decision, nor a drift, nor the middle of a disturbance may move it."""
-    reaching, (there, _) = _linked(case, state), case.flows.links
-    m, early = case.problem.system.controls, case.problem.initial_control
-    commands = [*case.pieces, *([] if early is None else [stacked([[u] for u in balls(np.asarray(early))])])]
+    reaching, (is_nonzero, _) = _linked(case, state), case.flows.links
+    m, initial_control = case.problem.system.controls, case.problem.initial_control
+    commands = [
+        *case.pieces,
+        *([] if initial_control is None else [stacked([[u] for u in balls(np.asarray(initial_control))])]),
+    ]
     idle = [all(command[channel, 0].is_zero() for command in commands) for channel in range(m)]
-    d, columns = case.problem.system.states, case.flows.plant.driven
-    acting = [d + channel for channel in range(columns) if channel >= m or not idle[channel]]
-    acting += [d + columns + int(w) for w in np.flatnonzero(case.disturbances.middle)]
-    driven = bool(there[np.ix_(sorted(reaching), acting)].any())
-    return not driven and not any(np.asarray(case.problem.initial_state)[[*reaching]])
+    d, input_count = case.problem.system.states, case.flows.plant.driven
+    acting_columns = [d + channel for channel in range(input_count) if channel >= m or not idle[channel]]
+    acting_columns += [d + input_count + int(w) for w in np.flatnonzero(case.disturbances.middle)]
+    is_driven = bool(is_nonzero[np.ix_(sorted(reaching), acting_columns)].any())
+    return not is_driven and not any(np.asarray(case.problem.initial_state)[[*reaching]])
 
 
 def _linked(case: Case, state: int) -> set[int]:

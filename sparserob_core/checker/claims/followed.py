@@ -53,12 +53,12 @@ class FollowedRow:
             if count > MOST_CELLS:
                 break
             tops = self.worst.over(start, stop, self._added(start, stop))
-            open_ = ~(tops <= limit)
-            top = max(top, float(tops[~open_].max(initial=-np.inf)))
-            if not open_.any():
+            is_open = ~(tops <= limit)
+            top = max(top, float(tops[~is_open].max(initial=-np.inf)))
+            if not is_open.any():
                 return count, top
-            self._refute(start[open_], stop[open_], limit)
-            start, stop = _parts(start[open_], stop[open_])
+            self._refute(start[is_open], stop[is_open], limit)
+            start, stop = _parts(start[is_open], stop[is_open])
             if not start.size:
                 break
         raise Unchecked(f"neither shown nor refuted: after {count} cells more than {limit!r} is not excluded")
@@ -82,29 +82,29 @@ class FollowedRow:
     @property
     def _delivered(self) -> FollowedExecution | None:
         """The errors of execution of the control; ``None`` where there are none."""
-        found = self.case.sources.execution
-        assert found is None or isinstance(found, FollowedExecution)  # one system acts all along
-        return found
+        execution = self.case.sources.execution
+        assert execution is None or isinstance(execution, FollowedExecution)  # one system acts all along
+        return execution
 
     def erring(self, times: Array) -> tuple[Array, Array]:
         """Return bounds, ``(k,)`` below and above, of what the worst errors of execution add at ``times (k,)``."""
-        delivered, none = self._delivered, np.zeros(times.size)
-        return (none, none) if delivered is None else delivered.added_at(self.window.split(self.direction)[0], times)
+        execution, zeros = self._delivered, np.zeros(times.size)
+        return (zeros, zeros) if execution is None else execution.added_at(self.window.split(self.direction)[0], times)
 
     def _added(self, start: Array, stop: Array) -> Array:
         """Return upper bounds ``(2, k)``, at both ends of cells, of the terms that are added to the state.
 
         The worst errors of execution are among these terms, with the largest distance by which they may lie above their
         chord."""
-        found, delivered = np.zeros((2, start.size)), self._delivered
+        bounds, execution = np.zeros((2, start.size)), self._delivered
         if self.window.reference is not None or self.window.is_mixed:
             cells = self.case.clock.each(zip(start.tolist(), stop.tolist(), strict=True))
-            found = np.array([[self.beside(t, (a + b) / 2)[1] for t in (a, b)] for a, b in cells]).T
-        if delivered is not None:
-            bent = delivered.bent_over(self.window.split(self.direction)[0], start, stop)
-            more = np.stack([self.erring(times)[1] for times in (start, stop)]) + bent
-            found = found + more + HALF_ULP * 4.0 * (np.abs(found) + more)
-        return found
+            bounds = np.array([[self.beside(t, (a + b) / 2)[1] for t in (a, b)] for a, b in cells]).T
+        if execution is not None:
+            chord_distances = execution.bent_over(self.window.split(self.direction)[0], start, stop)
+            execution_bounds = np.stack([self.erring(times)[1] for times in (start, stop)]) + chord_distances
+            bounds = bounds + execution_bounds + HALF_ULP * 4.0 * (np.abs(bounds) + execution_bounds)
+        return bounds
 
     def _refute(self, start: Array, stop: Array, limit: float) -> None:
         """Raise `Broken` where the row is certainly above ``limit`` in the middle of a cell.
@@ -112,19 +112,19 @@ class FollowedRow:
         Nothing is refuted where a set of deviations is curved, because its computed support function need not be
         sharp."""
         sets = (self.case.problem.initial_set, self.case.problem.disturbance)
-        if any(one is not None and known(one).facets is None for one in sets):
+        if any(deviation_set is not None and known(deviation_set).facets is None for deviation_set in sets):
             return
         middles = (start + stop) / 2
-        top, wide = self.worst.most(middles)
-        least = (top - wide) - HALF_ULP * 8.0 * np.abs(top)
+        top, overestimates = self.worst.most(middles)
+        least = (top - overestimates) - HALF_ULP * 8.0 * np.abs(top)
         if self.window.reference is not None or self.window.is_mixed:
-            more = [self.beside(t, t)[0] for t in middles.tolist()]
-            least = least + np.array(more) - HALF_ULP * 8.0 * np.abs(more)
+            lower_bounds = [self.beside(t, t)[0] for t in middles.tolist()]
+            least = least + np.array(lower_bounds) - HALF_ULP * 8.0 * np.abs(lower_bounds)
         errors, _ = self.erring(middles)
         least = least + errors - HALF_ULP * 8.0 * np.abs(errors)
-        place = int(least.argmax())
-        if least[place] > limit:
-            raise Broken(f"{limit!r} is exceeded, by {least[place] - limit:.3g} at t = {middles[place]:.6g}")
+        index = int(least.argmax())
+        if least[index] > limit:
+            raise Broken(f"{limit!r} is exceeded, by {least[index] - limit:.3g} at t = {middles[index]:.6g}")
 
 
 def _parts(start: Array, stop: Array) -> tuple[Array, Array]:

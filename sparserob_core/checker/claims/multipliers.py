@@ -91,10 +91,10 @@ def touched_by(case: Case, data: object) -> Sequence[arb_mat] | None:
     quadratic term is not convex."""
     if not (case.price.is_quadratic or any(len(block) > 1 for block in case.price.blocks)):
         return None
-    said = data if isinstance(data, Mapping) else {}
-    at = shaped(said, "tangent", (case.problem.system.controls, case.control.functions))
+    entries = data if isinstance(data, Mapping) else {}
+    tangent = shaped(entries, "tangent", (case.problem.system.controls, case.control.functions))
     case.price.convex()
-    return case.on_pieces(at)
+    return case.on_pieces(tangent)
 
 
 def norms_of(case: Case, data: object) -> Array | None:
@@ -133,14 +133,14 @@ def rows_of(case: Case, entry: object) -> list[tuple[float, ConstraintRow]]:
     row = case.duality.step_row(direction, time)
     if named is None:
         return [(y, row)]
-    seen = replace(row, innovations=named.innovations)
+    answered_row = replace(row, innovations=named.innovations)
     if time != float(case.control.breakpoints[-1]):
-        return [(y, seen)]
-    begun, none = feedback_of(case).following(named, entry, name), ball(0)
-    zero = [[none] * direction.size] * (case.control.pieces - 1)
+        return [(y, answered_row)]
+    next_deviations, zero = feedback_of(case).following(named, entry, name), ball(0)
+    zero_slopes = [[zero] * direction.size] * (case.control.pieces - 1)
     return [
-        (y, replace(seen, slope=[*zero, balls(-direction)])),
-        (y, ConstraintRow(none, [balls(direction), *zero], None, begun.innovations)),
+        (y, replace(answered_row, slope=[*zero_slopes, balls(-direction)])),
+        (y, ConstraintRow(zero, [balls(direction), *zero_slopes], None, next_deviations.innovations)),
     ]
 
 
@@ -154,14 +154,14 @@ def _of_state(
     if window is not None:
         admissible(case, window, time, parameter)
     key = name, time, tuple(direction.tolist()), tuple(parameter.tolist()), repr(entry.get("piece"))
-    made = _rows_of(case)
-    if key not in made:
-        made[key] = _undisturbed(case, window, entry, said)
-    row = made[key]
+    rows_by_key = _rows_of(case)
+    if key not in rows_by_key:
+        rows_by_key[key] = _undisturbed(case, window, entry, said)
+    row = rows_by_key[key]
     if named is None:
         return row
-    given = named.given(direction[: case.problem.system.states], time)
-    return replace(row, constant=row.constant + given, innovations=named.innovations)
+    contribution = named.given(direction[: case.problem.system.states], time)
+    return replace(row, constant=row.constant + contribution, innovations=named.innovations)
 
 
 @lru_cache(maxsize=2)
@@ -181,11 +181,11 @@ def _undisturbed(
         row = _along_adjoint(case, c, time, limit)
     else:
         row = case.duality.row(c, time, parameter.tolist(), limit, disturbed=not case.answering)
-        strayed = case.sources.strayed_at(parameter.tolist())
-        if strayed is not None:
-            row = replace(row, constant=row.constant + balls([strayed.added(c, time)[0]])[0])
-    sizes, given = case.sources.erring(c, time, parameter.tolist())
-    row = replace(row, constant=row.constant + given, sizes=sizes)
+        measurable_input = case.sources.strayed_at(parameter.tolist())
+        if measurable_input is not None:
+            row = replace(row, constant=row.constant + balls([measurable_input.added(c, time)[0]])[0])
+    sizes, early_bound = case.sources.erring(c, time, parameter.tolist())
+    row = replace(row, constant=row.constant + early_bound, sizes=sizes)
     if window is not None and window.is_mixed:
         piece = piece_of(case, window, entry, time)
         row.slope[piece] = [a + b for a, b in zip(row.slope[piece], balls(gain), strict=True)]
@@ -197,28 +197,34 @@ def _along_adjoint(case: Case, c: Array, time: float, limit: arb, disturbed: boo
 
     No transition matrix is computed, because each would take a minute for hundreds of states."""
     worst, problem, delay = case.followed.worst(c, None), case.problem, case.problem.system.delay
-    m, begins = problem.system.controls, np.append(case.control.breakpoints[:-1] + delay, np.inf)
-    state, slope = worst.carried(time), worst.weights(time, begins[:-1], begins[1:])
-    begun = balls(np.asarray(problem.initial_state, dtype=float))
-    constant = sum((w * x for w, x in zip(state, begun, strict=True)), ball(0)) - limit
+    m, starts = problem.system.controls, np.append(case.control.breakpoints[:-1] + delay, np.inf)
+    initial_weights, input_weights = worst.carried(time), worst.weights(time, starts[:-1], starts[1:])
+    initial_state = balls(np.asarray(problem.initial_state, dtype=float))
+    constant = sum((w * x for w, x in zip(initial_weights, initial_state, strict=True)), ball(0)) - limit
     if problem.system.drifts:  # a drift is an input that is 1
         constant = constant + worst.weights(time, np.zeros(1), np.full(1, np.inf))[0][m]
     if delay > 0.0:
-        (early,) = worst.weights(time, np.zeros(1), begins[:1])
-        constant = sum((w * u for w, u in zip(early[:m], balls(before(problem)), strict=True)), constant)
+        (early_weights,) = worst.weights(time, np.zeros(1), starts[:1])
+        constant = sum((w * u for w, u in zip(early_weights[:m], balls(before(problem)), strict=True)), constant)
     if disturbed and problem.initial_set is not None:
-        constant = constant + known(problem.initial_set).support(state)
+        constant = constant + known(problem.initial_set).support(initial_weights)
     if disturbed and problem.disturbance is not None:
         constant = constant + worst.pushed_by(time)
-    return ConstraintRow(constant, [every[:m] for every in slope])
+    return ConstraintRow(constant, [weights[:m] for weights in input_weights])
 
 
 def _of_control(case: Case, name: str, direction: Array, time: float, named: NamedDeviations | None) -> ConstraintRow:
     """Return the constraint on the control of one piece: it is in its set, or a channel is at most its peak."""
     row, piece = case.duality.control_row(direction, time), case.duality.control_piece(time)
     if named is not None:
-        seen = named.innovations
-        row = replace(row, innovations=[*seen[: piece + 1], *([x * 0 for x in part] for part in seen[piece + 1 :])])
+        innovations = named.innovations
+        row = replace(
+            row,
+            innovations=[
+                *innovations[: piece + 1],
+                *([x * 0 for x in innovation] for innovation in innovations[piece + 1 :]),
+            ],
+        )
     if name != PEAK:
         return row
     if sorted(np.abs(direction).tolist()) != [0.0] * (direction.size - 1) + [1.0]:

@@ -70,10 +70,10 @@ def reached(case: Case, time: float, parameter: Array, signal: object, deviation
 
 def _start(case: Case, deviation: object) -> arb_mat:
     """Return the initial state ``(d, 1)`` that a deviation leads to."""
-    begin = balls(np.asarray(case.problem.initial_state))
+    state = balls(np.asarray(case.problem.initial_state))
     if case.problem.initial_set is not None:
-        begin = [v + off for v, off in zip(begin, balls(_begun(case, deviation)), strict=True)]
-    return stacked([[v] for v in begin])
+        state = [v + z for v, z in zip(state, balls(_begun(case, deviation)), strict=True)]
+    return stacked([[v] for v in state])
 
 
 def witnessed(case: Case, data: Mapping[str, Any]) -> tuple[arb, float]:
@@ -87,22 +87,25 @@ def witnessed(case: Case, data: Mapping[str, Any]) -> tuple[arb, float]:
         number(data, "time"),
         numbers(data.get("direction"), "direction"),
     )
-    feedback, named, held = feedback_of(case), None, commanded(case, name)
+    feedback, named, control_set = feedback_of(case), None, commanded(case, name)
     if case.answering:
         if case.measurable or (case.problem.disturbance is not None and data.get("disturbance") is None):
             raise Unchecked("the certificate holds no disturbance of the witness")
         named = feedback.named(data, name)
-    if held is not None:
+    if control_set is not None:
         sized(direction, case.problem.system.controls, name)
-        parts = feedback.parts_at(name, time)
-        if len(parts) > 1 and case.answering:
+        summands = feedback.parts_at(name, time)
+        if len(summands) > 1 and case.answering:
             raise Unchecked("a witness across the seam is not followed")
-        value, limit = sum(_along(direction, named, part.tolist()) for part in parts), known(held).limit(direction)
-        slack = TOLERANCE * (1.0 if known(held).facets is None else max(known(held).units, default=1.0))
+        value, limit = (
+            sum(_along(direction, named, summand.tolist()) for summand in summands),
+            known(control_set).limit(direction),
+        )
+        slack = TOLERANCE * (1.0 if known(control_set).facets is None else max(known(control_set).units, default=1.0))
     elif name == EQUALS and named is not None:
         sized(direction, case.problem.system.states, name)
         value, limit = _along(direction, named, feedback.loop.nodes[-1].tolist()), fixed_limit(case, direction, time)
-        slack = EQUALITY * max(added for _, added in missed(case))
+        slack = EQUALITY * max(term_size for _, term_size in missed(case))
     else:
         window, parameter = case.window(name), numbers(data.get("parameter", []), "parameter")
         sized(direction, window.shape.dimension, name)
@@ -119,9 +122,9 @@ def witnessed(case: Case, data: Mapping[str, Any]) -> tuple[arb, float]:
             state = reached(case, time, parameter, data.get("disturbance"), data.get("deviation"))
             state += [] if piece is None else case.pieces[piece].entries()
             value = _along(direction, None, [[x] for x in state])
-        delivered = case.sources.delivered_at(parameter.tolist())
-        if delivered is not None:
-            low, high = delivered.added(window.split(direction)[0], time)
+        execution = case.sources.delivered_at(parameter.tolist())
+        if execution is not None:
+            low, high = execution.added(window.split(direction)[0], time)
             value = value + ball(low).union(ball(high))
     return value - limit, slack
 
@@ -145,16 +148,16 @@ def _farthest(
 
     ``direction`` is ``(c, gain)``, and ``u`` is the control on a ``piece``; where it is ``None``, ``gain'u`` is left
     out."""
-    (c, gain), none, strayed = direction, ball(0.0), case.sources.strayed_at(parameter)
-    assert strayed is not None
-    row = case.duality.row(c, time, parameter, none)
-    low, high = strayed.added(c, time)
+    (c, gain), zero, measurable_input = direction, ball(0.0), case.sources.strayed_at(parameter)
+    assert measurable_input is not None
+    row = case.duality.row(c, time, parameter, zero)
+    low, high = measurable_input.added(c, time)
     total = row.constant + ball(low).union(ball(high))
     for slope, control in zip(row.slope, case.pieces, strict=True):
-        total = total + sum((a * u for a, u in zip(slope, control.entries(), strict=True)), none)
+        total = total + sum((a * u for a, u in zip(slope, control.entries(), strict=True)), zero)
     if piece is None:
         return total
-    return total + sum((a * u for a, u in zip(balls(gain), case.pieces[piece].entries(), strict=True)), none)
+    return total + sum((a * u for a, u in zip(balls(gain), case.pieces[piece].entries(), strict=True)), zero)
 
 
 def _along(direction: Array, named: NamedDeviations | None, rows: Sequence[list[arb]]) -> arb:
@@ -180,22 +183,26 @@ def exceeded(case: Case, said: Mapping[str, object], begun: Array | None = None)
     begun
         The initial state ``(d,)``; by default the worst one; not used under feedback.
     """
-    name, time, held = str(said.get("constraint")), number(said, "time"), commanded(case, str(said.get("constraint")))
+    name, time, control_set = (
+        str(said.get("constraint")),
+        number(said, "time"),
+        commanded(case, str(said.get("constraint"))),
+    )
     number(said, "violation")
-    if held is not None:
-        flat, feedback = known(held).facets, feedback_of(case)
-        if flat is None:
+    if control_set is not None:
+        facets, feedback = known(control_set).facets, feedback_of(case)
+        if facets is None:
             raise Unchecked("the worst direction of a curved set is not told")
-        heights = feedback.heights(feedback.parts_at(name, time), exactly(np.array([c for c, _ in flat])))
-        slack = TOLERANCE * max(known(held).units, default=1.0)
-        return [float((height - b).mid()) for height, (_, b) in zip(heights, flat, strict=True)], slack
+        heights = feedback.heights(feedback.parts_at(name, time), exactly(np.array([c for c, _ in facets])))
+        slack = TOLERANCE * max(known(control_set).units, default=1.0)
+        return [float((height - b).mid()) for height, (_, b) in zip(heights, facets, strict=True)], slack
     if name == EQUALS and case.equalities:
-        every = missed(case)
-        return [float(off) for off, _ in every], TOLERANCE * max(added for _, added in every)
+        residuals = missed(case)
+        return [float(residual) for residual, _ in residuals], TOLERANCE * max(term_size for _, term_size in residuals)
     window, parameter = case.window(name), numbers(said.get("parameter", []), "parameter")
     asked(case, window, time, parameter)  # not `admissible`: rounding may take a parameter at the edge out of its set
-    flat, found = window.seen.facets, window.seen.basis
-    if flat is None or found is None:
+    facets, facet_basis = window.seen.facets, window.seen.basis
+    if facets is None or facet_basis is None:
         raise Unchecked("the worst direction of a curved set is not told")
     pieces = _pieces(case, time, jumps=window.is_mixed)
     if case.followed.are_best:
@@ -203,14 +210,14 @@ def exceeded(case: Case, said: Mapping[str, object], begun: Array | None = None)
         return over, slack + ROUNDED * case.problem.system.states * float(
             units_of(case, window).resolved.max(initial=0.0)
         )
-    (basis, gains), z = np.split(found[0], [window.states], axis=1), found[1]
+    (basis, gains), z = np.split(facet_basis[0], [window.states], axis=1), facet_basis[1]
     tube = _tube(case, parameter, begun, basis, gains)
-    beside = case.beside(window, basis, gains, parameter.tolist())
+    added_terms = case.beside(window, basis, gains, parameter.tolist())
     polynomials = list[Polynomial]()
     for piece, k in pieces:
         cells = tube.cells(piece, time, time, z)
-        polynomials += cells if beside is None else beside.added(cells, time, time, z, k)
-    limits = [float(b) for _, b in flat] * (len(polynomials) // max(1, len(flat)))
+        polynomials += cells if added_terms is None else added_terms.added(cells, time, time, z, k)
+    limits = [float(b) for _, b in facets] * (len(polynomials) // max(1, len(facets)))
     over = [float(poly.coefficients[0, 0]) - b for poly, b in zip(polynomials, limits, strict=True)]
     slack = max(float(poly.error) for poly in polynomials) + TOLERANCE * float(
         units_of(case, window).resolved.max(initial=0.0)
@@ -222,19 +229,19 @@ def _along_rows(
     case: Case, window: ConstraintWindow, time: float, begun: Array | None, pieces: Sequence[tuple[int, int]]
 ) -> tuple[list[float], float]:
     """Return the excess of the worst disturbance over each row of a flat set, by adjoints, with its accuracy."""
-    flat, over, slack = window.seen.facets, list[float](), 0.0
-    assert flat is not None
+    facets, over, slack = window.seen.facets, list[float](), 0.0
+    assert facets is not None
     breaks = case.control.breakpoints.tolist()
     for _, k in pieces:
-        for direction, b in flat:
+        for direction, b in facets:
             row = FollowedRow(case, window, np.asarray(direction, dtype=float))
             worst = row.worst if begun is None else replace(row.worst, centre=begun, begun=None)
-            (top,), (wide,) = worst.most(np.array([time]))
+            (top,), (overestimate,) = worst.most(np.array([time]))
             low, high = row.beside(time, (breaks[k] + breaks[k + 1]) / 2)
-            (least,), (most,) = row.erring(np.array([time]))
-            low, high = low + least, high + most
-            over.append(float(top - wide / 3.0 + (low + high) / 2.0) - float(b))
-            slack = max(slack, float(wide + high - low))
+            (error_low,), (error_high,) = row.erring(np.array([time]))
+            low, high = low + error_low, high + error_high
+            over.append(float(top - overestimate / 3.0 + (low + high) / 2.0) - float(b))
+            slack = max(slack, float(overestimate + high - low))
     return over, slack
 
 

@@ -72,11 +72,11 @@ class WindowUnits:
     @cached_property
     def rows(self) -> Array:
         """The unit ``(k,)`` of every facet of a flat set, by which a claim excuses violations."""
-        resolved, flat = self.resolved, known(self.shape).facets
-        assert flat is not None
-        across = np.array(widths(flat))
-        sizes = np.array([abs(float(b)) for _, b in flat])
-        sizes = np.maximum(sizes, np.where(np.isfinite(across), across, 0.0))
+        resolved, facets = self.resolved, known(self.shape).facets
+        assert facets is not None
+        slab_widths = np.array(widths(facets))
+        sizes = np.array([abs(float(b)) for _, b in facets])
+        sizes = np.maximum(sizes, np.where(np.isfinite(slab_widths), slab_widths, 0.0))
         if (resolved > sizes).any() and self.nominal is not None:
             sizes = np.maximum(sizes, self.nominal(*self._rows_of(states=False)))
         return np.asarray(np.minimum(resolved, np.where(sizes > 0.0, sizes, NOTHING * np.minimum(resolved, 1.0))))
@@ -106,20 +106,21 @@ class WindowUnits:
         """The unit ``(k,)`` of every facet of a flat set as far as double precision resolves it, large or small.
 
         This unit says how closely figures must agree; no violation is excused by it."""
-        flat = known(self.shape).facets
-        assert flat is not None
-        heights = np.array([abs(float(b)) for _, b in flat])
+        facets = known(self.shape).facets
+        assert facets is not None
+        heights = np.array([abs(float(b)) for _, b in facets])
         reach, sums = self._measured(self._middle, states=False)
-        across, thin = np.array(widths(flat)), THIN * sums[: heights.size]
-        both = np.where(across > thin, np.stack([heights, across]), 0.0)
-        near = np.array([smallest(pair) for pair in np.where(both > thin, both, 0.0).T.tolist()])
-        if (reach[: near.size] < np.where(near > 0.0, near, np.inf)).any():  # another parameter may take a row further
-            others = [self._measured(point, states=False)[0] for point in self._elsewhere]
-            reach = np.max([reach, *others], axis=0)
-        unit = [smallest(pair) for pair in zip(near.tolist(), reach.tolist(), strict=False)]
-        least = RESOLVED * sums[: near.size]
-        answer: Array = np.where((unit > least) | (least > 0.0), np.maximum(unit, least), 1.0)
-        return answer
+        slab_widths, thin = np.array(widths(facets)), THIN * sums[: heights.size]
+        candidates = np.where(slab_widths > thin, np.stack([heights, slab_widths]), 0.0)
+        sizes = np.array([smallest(pair) for pair in np.where(candidates > thin, candidates, 0.0).T.tolist()])
+        # another parameter may take a row further
+        if (reach[: sizes.size] < np.where(sizes > 0.0, sizes, np.inf)).any():
+            other_reaches = [self._measured(point, states=False)[0] for point in self._elsewhere]
+            reach = np.max([reach, *other_reaches], axis=0)
+        unit = [smallest(pair) for pair in zip(sizes.tolist(), reach.tolist(), strict=False)]
+        least = RESOLVED * sums[: sizes.size]
+        units: Array = np.where((unit > least) | (least > 0.0), np.maximum(unit, least), 1.0)
+        return units
 
     @cached_property
     def sums(self) -> Array:
@@ -179,14 +180,17 @@ class WindowUnits:
         allows."""
         with np.errstate(over="ignore", invalid="ignore"):
             nodes, places = self._nodes()
-            each = len(nodes) * len(self._rows_of(states)[0])
-            each *= self.problem.system.controls + 1 + self.problem.system.disturbances
-            parts = np.array_split(places, min(places.size, -(-places.size * each // MOST_HELD)))
-            every = [self._walked(parameter, states, nodes[: part[-1] + 1], part) for part in parts]
-            found = np.max([one for one, _ in every], axis=0), np.max([sums for _, sums in every], axis=0)
-        if not all(np.isfinite(numbers).all() for numbers in found):
+            weights_per_time = len(nodes) * len(self._rows_of(states)[0])
+            weights_per_time *= self.problem.system.controls + 1 + self.problem.system.disturbances
+            batches = np.array_split(places, min(places.size, -(-places.size * weights_per_time // MOST_HELD)))
+            results = [self._walked(parameter, states, nodes[: batch[-1] + 1], batch) for batch in batches]
+            reach_and_sums = (
+                np.max([reach for reach, _ in results], axis=0),
+                np.max([sums for _, sums in results], axis=0),
+            )
+        if not all(np.isfinite(numbers).all() for numbers in reach_and_sums):
             raise Unchecked("the response grows beyond what numbers can hold")
-        return found
+        return reach_and_sums
 
     def _rows_of(self, states: bool) -> tuple[Array, Array]:
         """Return the facets' normals on state ``(k, d)`` and control ``(k, m)``, or the axes of the ``states``."""
@@ -203,18 +207,18 @@ class WindowUnits:
     ) -> tuple[Array, Array]:
         """Return reach and sums as in `_measured`, ``(k,)`` each, over the times ``places`` among the ``nodes``."""
         system, bound = self.problem.system, self.problem.disturbance
-        d, m, columns = system.states, system.controls, system.controls + system.drifts
+        d, m, input_count = system.states, system.controls, system.controls + system.drifts
         rows, gains = self._rows_of(states)
         flow = self.flows.at(parameter)
         v = np.tile(rows, (len(places), 1, 1))
         count = len(nodes) - 1
-        driven = np.zeros((count, *v.shape[:2], columns))
-        pushed = np.zeros((count, *v.shape[:2], system.disturbances))
+        control_weights = np.zeros((count, *v.shape[:2], input_count))
+        disturbance_weights = np.zeros((count, *v.shape[:2], system.disturbances))
         for k in range(count - 1, -1, -1):
             first = int(np.searchsorted(places, k, side="right"))
             if first < len(places):
                 Phi, Gamma, Delta = flow.about(nodes[k], nodes[k + 1])
-                driven[k, first:], pushed[k, first:] = v[first:] @ Gamma, v[first:] @ Delta
+                control_weights[k, first:], disturbance_weights[k, first:] = v[first:] @ Gamma, v[first:] @ Delta
                 v[first:] = v[first:] @ Phi
         start = np.asarray(self.problem.initial_state, dtype=float)
         high, low, sums = v @ start, -(v @ start), np.abs(v) @ np.abs(start)
@@ -223,28 +227,33 @@ class WindowUnits:
             axes = np.eye(d)
             high, low = high + deviations.support(v), low + deviations.support(-v)
             sums = sums + np.abs(v) @ np.maximum(np.abs(deviations.support(axes)), np.abs(deviations.support(-axes)))
-        waiting, given = int(np.searchsorted(nodes[:-1], system.delay)), np.ones(columns)
-        given[:m] = before(self.problem)
-        applied = np.concatenate([driven[:waiting] * given, driven[waiting:] * np.append(np.zeros(m), given[m:])])
+        first_acting, early_inputs = int(np.searchsorted(nodes[:-1], system.delay)), np.ones(input_count)
+        early_inputs[:m] = before(self.problem)
+        applied = np.concatenate(
+            [
+                control_weights[:first_acting] * early_inputs,
+                control_weights[first_acting:] * np.append(np.zeros(m), early_inputs[m:]),
+            ]
+        )
         high, low = high + applied.sum(axis=(0, 3)), low - applied.sum(axis=(0, 3))
         sums = sums + np.abs(applied).sum(axis=(0, 3))
         for convex, weights in (
-            (self.problem.control, driven[waiting:, ..., :m]),
-            (bound, self._joined(nodes, pushed)),
+            (self.problem.control, control_weights[first_acting:, ..., :m]),
+            (bound, self._joined(nodes, disturbance_weights)),
         ):
             if convex is not None and len(weights):
                 high, low = high + convex.support(weights).sum(axis=0), low + convex.support(-weights).sum(axis=0)
                 axes = np.eye(convex.dimension)
-                far = np.maximum(np.abs(convex.support(axes)), np.abs(convex.support(-axes)))
+                largest_values = np.maximum(np.abs(convex.support(axes)), np.abs(convex.support(-axes)))
                 if convex is self.problem.control and self.acting is not None:
-                    share = (self.acting / np.where(far > 0.0, far, np.inf)).max(initial=0.0)
-                    far = far * min(1.0, BEYOND * float(share))
-                sums = sums + (np.abs(weights) @ far).sum(axis=0)
+                    share = (self.acting / np.where(largest_values > 0.0, largest_values, np.inf)).max(initial=0.0)
+                    largest_values = largest_values * min(1.0, BEYOND * float(share))
+                sums = sums + (np.abs(weights) @ largest_values).sum(axis=0)
         if self.reference is not None:
-            at, (times, *points) = np.array(nodes)[places], self.reference.T
-            moved = np.stack([np.interp(at, times, column) for column in points], axis=1)
-            off = moved @ rows.T
-            high, low, sums = high - off, low + off, sums + np.abs(off)
+            examined_times, (times, *points) = np.array(nodes)[places], self.reference.T
+            references = np.stack([np.interp(examined_times, times, column) for column in points], axis=1)
+            offsets = references @ rows.T
+            high, low, sums = high - offsets, low + offsets, sums + np.abs(offsets)
         if gains.shape[1]:
             up, down = self.problem.control.support(gains), self.problem.control.support(-gains)
             high, low, sums = high + up, low + down, sums + np.maximum(np.abs(up), np.abs(down))
@@ -255,11 +264,11 @@ class WindowUnits:
         if self.problem.disturbance is None or len(nodes) < 2:
             return pushed
         middles = (np.array(nodes[:-1]) + np.array(nodes[1:])) / 2
-        which = np.searchsorted(self.scene.changes, middles, side="right")
-        answer: Array = np.add.reduceat(pushed, np.flatnonzero(np.diff(which, prepend=-1)), axis=0)
+        blocks = np.searchsorted(self.scene.changes, middles, side="right")
+        weights: Array = np.add.reduceat(pushed, np.flatnonzero(np.diff(blocks, prepend=-1)), axis=0)
         if self.scene.lasting is None:
-            return answer
-        return self.scene.lasting.gathered(answer[..., None], np.zeros((*answer.shape, 1)))[0][..., 0]
+            return weights
+        return self.scene.lasting.gathered(weights[..., None], np.zeros((*weights.shape, 1)))[0][..., 0]
 
     def _nodes(self) -> tuple[list[float], npt.NDArray[np.intp]]:
         """Return the grid up to the window's end, with both its ends, and the places of the times to examine."""
@@ -279,9 +288,9 @@ def _units_of(case: Case) -> dict[ConstraintWindow, WindowUnits]:
 
 def units_of(case: Case, window: ConstraintWindow) -> WindowUnits:
     """Return the units by which violations of a constraint are judged."""
-    made = _units_of(case)
-    if window not in made:
-        made[window] = WindowUnits(
+    units_by_window = _units_of(case)
+    if window not in units_by_window:
+        units_by_window[window] = WindowUnits(
             case.problem,
             case.flows,
             case.scene,
@@ -292,16 +301,16 @@ def units_of(case: Case, window: ConstraintWindow) -> WindowUnits:
             None if case.answering else np.abs(case.control.control(case.theta)).max(axis=1),
             partial(nominal_sizes, case),
         )
-    return made[window]
+    return units_by_window[window]
 
 
 @lru_cache(maxsize=2)
 def _nominal_values(case: Case) -> tuple[Array, Array]:
     """Return the nominal ``(x, u)`` where pieces begin to act and at the end, ``(K', d + m)``, and the radii."""
     states = case.price.nominal_states(case.pieces)
-    every = np.array([[(float(x), float(x.rad())) for x in one.entries()] for one in states])
-    seen = np.delete(every, case.problem.system.states, axis=1)  # without the 1
-    return seen[:, :, 0], seen[:, :, 1]
+    entries = np.array([[(float(x), float(x.rad())) for x in state.entries()] for state in states])
+    values = np.delete(entries, case.problem.system.states, axis=1)  # without the 1
+    return values[:, :, 0], values[:, :, 1]
 
 
 def nominal_sizes(case: Case, rows: Array, gains: Array) -> Array:

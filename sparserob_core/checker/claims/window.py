@@ -65,8 +65,8 @@ class ConstraintWindow:
         """Return the upper bound of ``c'x + g'u`` that the constraint sets at a time, ``(c, g)`` the direction."""
         c, _ = self.split(direction)
         offset, _ = self.moved(time, time)
-        moved = [ball(a) * r for a, r in zip(c, offset, strict=True) if a]
-        return sum(moved, self.seen.limit(direction))
+        terms = [ball(a) * r for a, r in zip(c, offset, strict=True) if a]
+        return sum(terms, self.seen.limit(direction))
 
     def moved(self, start: float, stop: float) -> tuple[list[arb], list[arb]]:
         """Return ``r(start)`` and the derivative ``r'`` on ``[start, stop]``, ``(d,)`` each.
@@ -77,10 +77,10 @@ class ConstraintWindow:
         if self.reference is None:
             return zero, zero
         times = self.reference[:, 0].tolist()
-        place = bisect_right(times, start) - 1
-        if place < 0 or place >= len(times) - 1:
-            return [ball(v) for v in self.reference[max(place, 0), 1:]], zero
-        (t, *p), (s, *q) = self.reference[place].tolist(), self.reference[place + 1].tolist()
+        segment = bisect_right(times, start) - 1
+        if segment < 0 or segment >= len(times) - 1:
+            return [ball(v) for v in self.reference[max(segment, 0), 1:]], zero
+        (t, *p), (s, *q) = self.reference[segment].tolist(), self.reference[segment + 1].tolist()
         slope = [(ball(b) - ball(a)) / (ball(s) - ball(t)) for a, b in zip(p, q, strict=True)]
         return [ball(a) + v * (ball(start) - ball(t)) for a, v in zip(p, slope, strict=True)], slope
 
@@ -146,8 +146,8 @@ class Beside:
         basis = exactly(self.basis)
         level = -basis * stacked([[r] for r in offset])
         if self.window.is_mixed:
-            place = bisect_right(self.breakpoints, start) - 1 if piece is None else piece
-            control = self.pieces[min(place, len(self.pieces) - 1)]
+            piece_index = bisect_right(self.breakpoints, start) - 1 if piece is None else piece
+            control = self.pieces[min(piece_index, len(self.pieces) - 1)]
             level = level + exactly(self.gains) * control
         terms = [level]
         if stop > start and self.window.reference is not None:
@@ -155,15 +155,18 @@ class Beside:
             terms.append(-basis * stacked([[v * length] for v in slope]))
         enclosed = Enclosed.all(terms, (len(terms), self.basis.shape[0]))
         mid = enclosed.mid @ z.T
-        lost = (enclosed.rad + rounding(z.shape[1]) * np.abs(enclosed.mid)) @ np.abs(z).T
-        found = [_plus(poly, mid[:, i, None], float(lost[:, i].sum())) for i, poly in enumerate(found)]
+        error_bounds = (enclosed.rad + rounding(z.shape[1]) * np.abs(enclosed.mid)) @ np.abs(z).T
+        found = [_plus(poly, mid[:, i, None], float(error_bounds[:, i].sum())) for i, poly in enumerate(found)]
         if not self.delivered:
             return list(found)
-        directions, off = self.directions(z)
+        directions, direction_errors = self.directions(z)
         times = [start] if start == stop else [start, stop]
-        for one in self.delivered:
-            rows = zip(found, directions, off, strict=True)
-            found = [self._erring(poly, one, c, missed, times, within) for poly, c, missed in rows]
+        for bounded_input in self.delivered:
+            rows = zip(found, directions, direction_errors, strict=True)
+            found = [
+                self._erring(poly, bounded_input, c, direction_error, times, within)
+                for poly, c, direction_error in rows
+            ]
         return list(found)
 
     @remembered(lambda: DIRECTIONS_KEPT, lambda self, z: z.tobytes())
@@ -173,10 +176,10 @@ class Beside:
         The floats are exact where nothing is added up, and mostly elsewhere."""
         exact = (exactly(z) * exactly(self.basis)).entries()
         floats = [float(x) for x in exact]
-        left = [x - ball(c) for x, c in zip(exact, floats, strict=True)]
-        off = [0.0 if x.is_zero() else above(abs(x)) for x in left]
+        errors = [x - ball(c) for x, c in zip(exact, floats, strict=True)]
+        error_bounds = [0.0 if x.is_zero() else above(abs(x)) for x in errors]
         shape = len(z), self.basis.shape[1]
-        return np.reshape(floats, shape), np.reshape(off, shape)
+        return np.reshape(floats, shape), np.reshape(error_bounds, shape)
 
     @staticmethod
     def _erring(
@@ -191,20 +194,20 @@ class Beside:
 
         The direction ``c`` has an error of at most ``off (d,)``. The addition is sublinear in the direction, so this
         error adds at most ``off`` times the additions along the axes."""
-        found = one.over(c, times, within)
-        terms, lost = found.ends[:1], found.off
-        if len(found.ends) > 1:
-            rise = found.ends[1] - found.ends[0]
-            terms = np.stack([found.ends[0], rise])
-            lost += rounding(8) * float(np.abs(found.ends).sum() + np.abs(rise).sum())
+        bounds = one.over(c, times, within)
+        terms, error = bounds.ends[:1], bounds.off
+        if len(bounds.ends) > 1:
+            rise = bounds.ends[1] - bounds.ends[0]
+            terms = np.stack([bounds.ends[0], rise])
+            error += rounding(8) * float(np.abs(bounds.ends).sum() + np.abs(rise).sum())
         for state in np.flatnonzero(off):
             axis = np.eye(off.size)[state]
-            ends = [one.over(side, times, within) for side in (axis, -axis)]
-            lost += off[state] * max(float(np.abs(part.ends).sum(axis=1).max()) + part.off for part in ends) * OUTWARD
-        added = _plus(poly, terms, lost)
-        bent = found.wide if added.bent is None else added.bent + found.wide
-        turning = added.turning + float(found.wide.sum())
-        return replace(added, kinks=added.kinks + found.over, turning=turning, bent=bent)
+            axis_bounds = [one.over(side, times, within) for side in (axis, -axis)]
+            error += off[state] * max(float(np.abs(b.ends).sum(axis=1).max()) + b.off for b in axis_bounds) * OUTWARD
+        total = _plus(poly, terms, error)
+        width_errors = bounds.wide if total.bent is None else total.bent + bounds.wide
+        turning = total.turning + float(bounds.wide.sum())
+        return replace(total, kinks=total.kinks + bounds.over, turning=turning, bent=width_errors)
 
 
 def _plus(poly: Polynomial, terms: Array, lost: float) -> Polynomial:

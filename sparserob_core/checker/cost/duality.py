@@ -74,8 +74,8 @@ class Duality:
 
     def control_piece(self, time: float) -> int:
         """Return the piece of the control that is commanded at a time."""
-        place = int(np.searchsorted(self.control.breakpoints, time, side="right")) - 1
-        return min(max(place, 0), self.control.pieces - 1)
+        piece = int(np.searchsorted(self.control.breakpoints, time, side="right")) - 1
+        return min(max(piece, 0), self.control.pieces - 1)
 
     def control_row(self, direction: Array, time: float) -> ConstraintRow:
         """Return the row of ``c'u(t) <= h(c)`` for the set of controls."""
@@ -95,10 +95,10 @@ class Duality:
         """
         if self.problem.control_step is None:
             raise Broken("the problem has no constraint 'control_step'")
-        found = [k for k in steps(self.problem, self.control) if float(self.control.breakpoints[k]) == time]
-        if not found:
+        matches = [k for k in steps(self.problem, self.control) if float(self.control.breakpoints[k]) == time]
+        if not matches:
             raise Broken(f"control_step: there is no step at t = {time!r}")
-        (k,) = found
+        (k,) = matches
         slope = [[ball(0.0)] * direction.size for _ in range(self.control.pieces)]
         after = k % self.control.pieces  # the first piece follows the last one
         slope[after] = [ball(c) for c in direction]
@@ -106,8 +106,8 @@ class Duality:
         if k > 0:
             slope[k - 1] = [a - ball(c) for a, c in zip(slope[k - 1], direction, strict=True)]
         else:
-            early = zip(direction, before(self.problem), strict=True)
-            constant -= sum((ball(c) * ball(u) for c, u in early), ball(0.0))
+            pairs = zip(direction, before(self.problem), strict=True)
+            constant -= sum((ball(c) * ball(u) for c, u in pairs), ball(0.0))
         return ConstraintRow(constant, slope)
 
     def row(
@@ -119,29 +119,31 @@ class Duality:
         """
         m, problem = self.problem.system.controls, self.problem
         delay, jumps = problem.system.delay, self.changes or []
-        breaks = [float(s) + delay for s in self.control.breakpoints[:-1]]  # times at which a piece begins to act
-        begins = sorted({0.0, *(s for s in (*breaks, *jumps) if s < time)})
-        weights = self.flows.at(parameter).weights([*begins, time])
-        row, start = exactly(direction[None]), np.asarray(problem.initial_state)
-        free = (row * weights.free).entries()
-        constant = sum((w * ball(x) for w, x in zip(free, start, strict=True)), ball(0.0)) - limit
+        piece_starts = [float(s) + delay for s in self.control.breakpoints[:-1]]  # times at which a piece begins to act
+        starts = sorted({0.0, *(s for s in (*piece_starts, *jumps) if s < time)})
+        weights = self.flows.at(parameter).weights([*starts, time])
+        row, initial_state = exactly(direction[None]), np.asarray(problem.initial_state)
+        initial_slope = (row * weights.free).entries()
+        constant = sum((w * ball(x) for w, x in zip(initial_slope, initial_state, strict=True)), ball(0.0)) - limit
         slope = [[ball(0.0)] * m for _ in range(self.control.pieces)]
-        pushes = [[ball(0.0)] * problem.system.disturbances for _ in jumps]
-        for begin, part, pushed in zip(begins, weights.control, weights.disturbance, strict=True):
-            every, k = (row * part).entries(), bisect_right(breaks, begin) - 1
+        block_slopes = [[ball(0.0)] * problem.system.disturbances for _ in jumps]
+        for start, control_weight, disturbance_weight in zip(starts, weights.control, weights.disturbance, strict=True):
+            coefficients, k = (row * control_weight).entries(), bisect_right(piece_starts, start) - 1
             if k < 0:
-                constant = sum((w * ball(u) for w, u in zip(every[:m], before(problem), strict=True)), constant)
+                constant = sum((w * ball(u) for w, u in zip(coefficients[:m], before(problem), strict=True)), constant)
             else:
-                slope[k] = [a + b for a, b in zip(slope[k], every[:m], strict=True)]
-            constant = sum(every[m:], constant)  # a drift, whose input is 1
+                slope[k] = [a + b for a, b in zip(slope[k], coefficients[:m], strict=True)]
+            constant = sum(coefficients[m:], constant)  # a drift, whose input is 1
             if jumps:
-                block = bisect_right(jumps, begin) - 1
-                pushes[block] = [a + b for a, b in zip(pushes[block], (row * pushed).entries(), strict=True)]
+                block = bisect_right(jumps, start) - 1
+                block_slopes[block] = [
+                    a + b for a, b in zip(block_slopes[block], (row * disturbance_weight).entries(), strict=True)
+                ]
         if disturbed and problem.initial_set is not None:
-            constant = constant + known(problem.initial_set).support(free)
+            constant = constant + known(problem.initial_set).support(initial_slope)
         if disturbed and self.held is not None:
-            for one in summed(self.lasting, pushes):
-                constant = constant + known(self.held).support(one)
+            for block_slope in summed(self.lasting, block_slopes):
+                constant = constant + known(self.held).support(block_slope)
         return ConstraintRow(constant, slope)
 
     def pushed(self, direction: Array, time: float, jumps: list[float] | None = None) -> list[list[arb]]:
@@ -152,11 +154,11 @@ class Duality:
         jumps = self.changes if jumps is None else jumps
         if not jumps:
             return []
-        begins = sorted({0.0, *(s for s in jumps if s < time)})
-        weights, row = self.flows.at(()).weights([*begins, time]), exactly(direction[None])
-        given = {s: (row * one).entries() for s, one in zip(begins, weights.disturbance, strict=True)}
-        late = [ball(0.0)] * self.problem.system.disturbances
-        return [given[s] if s < time else late for s in jumps]
+        starts = sorted({0.0, *(s for s in jumps if s < time)})
+        weights, row = self.flows.at(()).weights([*starts, time]), exactly(direction[None])
+        slopes = {s: (row * weight).entries() for s, weight in zip(starts, weights.disturbance, strict=True)}
+        zero_slope = [ball(0.0)] * self.problem.system.disturbances
+        return [slopes[s] if s < time else zero_slope for s in jumps]
 
     def carried(self, direction: Array, time: float) -> list[arb]:
         """Return the coefficients ``(d,)`` of the initial state in ``c'x(t)``, for a known system."""
@@ -193,16 +195,16 @@ class Duality:
         constant, slopes = self.summed(rows, pieces, tangent)
         charges = price if lengths else None
         groups = [] if charges is None else [block for block in charges.blocks if len(block) > 1]
-        free = [[ball(0.0)] * self.problem.system.controls] * len(slopes)
-        costs = free if charges is None else charges.costs
-        sizes = self.charged(rows, free)
+        zero_costs = [[ball(0.0)] * self.problem.system.controls] * len(slopes)
+        costs = zero_costs if charges is None else charges.costs
+        sizes = self.charged(rows, zero_costs)
         for k, (cost, size, slope) in enumerate(zip(costs, sizes, slopes, strict=True)):
             if groups and touched is not None:
                 offered = None if norms is None else [ball(v) for v in norms[:, k]]
                 constant = constant + self._least_of_groups(cost, size, slope, groups, touched[k].entries(), offered)
             else:
-                every = [a + b for a, b in zip(cost, size, strict=True)]
-                constant = constant + known(self.problem.control).least(every, every, slope)
+                weights = [a + b for a, b in zip(cost, size, strict=True)]
+                constant = constant + known(self.problem.control).least(weights, weights, slope)
         return constant
 
     def _least_of_groups(
@@ -223,26 +225,26 @@ class Duality:
         In a corner of oblique facets the best vector is between the first two. The multipliers of the facets compensate
         a part of the slope, and a tangent at a slightly wrong control tilts the corner.
         """
-        asked = _shrunk([ball(-float(s)) for s in slope], sizes)
-        given = [] if offered is None else [(_within, _shrunk(offered, sizes))]
-        offers = []
-        for chosen, wanted in ((_within, asked), (_lengthened, at), *given):
-            tilted, left = list(slope), [a + b for a, b in zip(weights, sizes, strict=True)]
+        balancing = _shrunk([ball(-float(s)) for s in slope], sizes)
+        optional = [] if offered is None else [(_within, _shrunk(offered, sizes))]
+        candidates = []
+        for adjust, target in ((_within, balancing), (_lengthened, at), *optional):
+            tilted_slope, remaining = list(slope), [a + b for a, b in zip(weights, sizes, strict=True)]
             for block in groups:
-                d = chosen([wanted[c] for c in block], weights[block[0]])
-                for c, push in zip(block, d, strict=True):
-                    tilted[c], left[c] = slope[c] + push, sizes[c]
-            offers.append((left, tilted))
+                d = adjust([target[c] for c in block], weights[block[0]])
+                for c, component in zip(block, d, strict=True):
+                    tilted_slope[c], remaining[c] = slope[c] + component, sizes[c]
+            candidates.append((remaining, tilted_slope))
         shape = known(self.problem.control)
         if not isinstance(shape, Boxed):
-            return largest([shape.least(left, left, tilted) for left, tilted in offers])
-        alone = [[c] for c in range(len(slope)) if not any(c in block for block in groups)]
-        parts = [shape.shares_of_least(left, left, tilted) for left, tilted in offers]
-        found = ball(0.0)
-        for block in (*groups, *alone):
-            values = [sum((part[c] for c in block), ball(0.0)) for part in parts]
-            found = found + largest(values)
-        return found
+            return largest([shape.least(remaining, remaining, tilted_slope) for remaining, tilted_slope in candidates])
+        singles = [[c] for c in range(len(slope)) if not any(c in block for block in groups)]
+        shares = [shape.shares_of_least(remaining, remaining, tilted_slope) for remaining, tilted_slope in candidates]
+        total = ball(0.0)
+        for block in (*groups, *singles):
+            values = [sum((share[c] for c in block), ball(0.0)) for share in shares]
+            total = total + largest(values)
+        return total
 
     def summed(
         self,
@@ -265,22 +267,25 @@ class Duality:
         if tangent is not None:
             constant = constant + tangent.constant
             slopes = [
-                [a + b for a, b in zip(one, two, strict=True)] for one, two in zip(slopes, tangent.slope, strict=True)
+                [a + b for a, b in zip(slope, tangent_slope, strict=True)]
+                for slope, tangent_slope in zip(slopes, tangent.slope, strict=True)
             ]
         if pieces is not None and self.control.functions < K:
-            slopes, slip = self._moved(slopes, pieces)
-            constant = constant - slip
+            slopes, error_bound = self._moved(slopes, pieces)
+            constant = constant - error_bound
         return constant, slopes
 
     def charged(self, rows: Sequence[tuple[float, ConstraintRow]], costs: list[list[arb]]) -> list[list[arb]]:
         """Return the cost of absolute values on every piece, ``m`` balls each: ``costs`` plus ``sizes`` of ``rows``
         times their multipliers."""
-        found = costs
+        totals = costs
         for y, row in rows:
             if row.sizes is not None:
-                pairs = zip(found, row.sizes.tolist(), strict=True)
-                found = [[c + ball(y) * ball(v) for c, v in zip(one, two, strict=True)] for one, two in pairs]
-        return found
+                pairs = zip(totals, row.sizes.tolist(), strict=True)
+                totals = [
+                    [c + ball(y) * ball(v) for c, v in zip(total, size_row, strict=True)] for total, size_row in pairs
+                ]
+        return totals
 
     def _moved(self, slopes: list[list[arb]], pieces: Sequence[Sequence[float]]) -> tuple[list[list[arb]], arb]:
         """Return the slopes of the certificate in place of the derived ones, and a bound of the difference.
@@ -289,17 +294,17 @@ class Duality:
         difference of their effects is bounded by the largest coefficients.
         """
         m, K, N = self.problem.system.controls, self.control.pieces, self.control.functions
-        mine = [[-ball(pieces[c][k]) for c in range(m)] for k in range(K)]
-        slip = ball(0.0)
+        certified = [[-ball(pieces[c][k]) for c in range(m)] for k in range(K)]
+        error_bound = ball(0.0)
         for c in range(m):
-            largest = self._largest_coefficients(c)
+            coefficient_bounds = self._largest_coefficients(c)
             for n in range(N):
-                off = sum(
-                    ((mine[k][c] - slopes[k][c]) * ball(v) for k, v in enumerate(self.control.values[n]) if v),
+                difference = sum(
+                    ((certified[k][c] - slopes[k][c]) * ball(v) for k, v in enumerate(self.control.values[n]) if v),
                     ball(0.0),
                 )
-                slip = slip + abs(off) * largest[n]
-        return mine, slip
+                error_bound = error_bound + abs(difference) * coefficient_bounds[n]
+        return certified, error_bound
 
     def _largest_coefficients(self, channel: int) -> list[arb]:
         axis = [ball(float(i == channel)) for i in range(self.problem.system.controls)]
@@ -323,8 +328,8 @@ def steps(problem: OptimalControlProblem, control: Dictionary) -> range:
 
 def _shrunk(vector: Sequence[arb], sizes: Sequence[arb]) -> list[arb]:
     """Return exact numbers, each moved towards 0 by a size, but not across 0."""
-    about = [(float(v), float(size)) for v, size in zip(vector, sizes, strict=True)]
-    return [ball(np.sign(v) * max(abs(v) - size, 0.0)) for v, size in about]
+    pairs = [(float(v), float(size)) for v, size in zip(vector, sizes, strict=True)]
+    return [ball(np.sign(v) * max(abs(v) - size, 0.0)) for v, size in pairs]
 
 
 def _within(vector: Sequence[arb], length: arb) -> Sequence[arb]:

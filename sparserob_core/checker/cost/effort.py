@@ -61,35 +61,35 @@ def at_most(
     slopes = np.array([_slope(float(u), float(v)) for u, v in zip(high, low, strict=True)])
     ends = zip(high, low, balls(slopes), strict=True)
     heights = [(u * (1 - s)).max(-v * (1 + s)).max(ball(0)) for u, v, s in ends]
-    about, table = np.array([float(x) for x in a]), stacked([[x, *row] for x, row in zip(a, A, strict=True)])
-    rough = np.array([[float(x) for x in row] for row in A]).reshape(len(a), -1)
-    tall = np.array([float(h) for h in heights])
-    todo: list[tuple[Array, np.ndarray]] = [(slopes, np.array([bool(h > 0) or not h.is_zero() for h in heights]))]
+    middles, table = np.array([float(x) for x in a]), stacked([[x, *row] for x, row in zip(a, A, strict=True)])
+    matrix = np.array([[float(x) for x in row] for row in A]).reshape(len(a), -1)
+    float_heights = np.array([float(h) for h in heights])
+    pending: list[tuple[Array, np.ndarray]] = [(slopes, np.array([bool(h > 0) or not h.is_zero() for h in heights]))]
     count = 0
-    while todo:
+    while pending:
         clock.check()
-        taken, todo = todo[-TOGETHER:], todo[:-TOGETHER]
-        count += len(taken)
+        batch, pending = pending[-TOGETHER:], pending[:-TOGETHER]
+        count += len(batch)
         if count > MOST:
             raise Unchecked(f"the largest effort was not bounded by {count} parts of the signs of the control")
-        sums = (stacked([[ball(s) for s in one] for one, _ in taken]) * table).tolist()
-        for (signs, open_), (start, *along) in zip(taken, sums, strict=True):
-            bound = start + support(along) + sum((heights[k] for k in np.flatnonzero(open_)), ball(0))
+        sums = (stacked([[ball(s) for s in signs] for signs, _ in batch]) * table).tolist()
+        for (signs, is_open), (constant, *coefficients) in zip(batch, sums, strict=True):
+            bound = constant + support(coefficients) + sum((heights[k] for k in np.flatnonzero(is_open)), ball(0))
             if bound <= limit:
                 continue
-            if not open_.any():
+            if not is_open.any():
                 if bound > limit:
                     raise Broken(f"a disturbance causes the effort {float(bound)!r}")
                 raise Unchecked("the largest effort is known too roughly")
-            worst = np.sign(np.array([float(x) for x in along])) * reach
-            values = about + rough @ worst
-            k = int(np.where(open_, tall + signs * values - np.abs(values), -np.inf).argmax())
-            rest = open_.copy()
-            rest[k] = False
+            worst = np.sign(np.array([float(x) for x in coefficients])) * reach
+            values = middles + matrix @ worst
+            k = int(np.where(is_open, float_heights + signs * values - np.abs(values), -np.inf).argmax())
+            still_open = is_open.copy()
+            still_open[k] = False
             for sign in (1.0, -1.0):
-                other = signs.copy()
-                other[k] = sign
-                todo.append((other, rest))
+                branch_signs = signs.copy()
+                branch_signs[k] = sign
+                pending.append((branch_signs, still_open))
     return count
 
 

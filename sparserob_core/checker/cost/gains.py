@@ -42,13 +42,15 @@ class GainsBound:
     def of(self, rows: Sequence[tuple[float, ConstraintRow]]) -> arb:
         """Return an upper bound of how much the gains can lower the sum of ``rows`` times their multipliers."""
         total = ball(0)
-        rows = [(y, row) for y, row in rows if any(not x.is_zero() for part in row.innovations for x in part)]
+        rows = [
+            (y, row) for y, row in rows if any(not x.is_zero() for innovation in row.innovations for x in innovation)
+        ]
         if not rows:
             return total
         K, m, d = len(self.answers), self.control.dimension, self.loop.outputs
-        left = stacked([[ball(y) * row.slope[k][i] for y, row in rows] for k in range(K) for i in range(m)])
-        right = stacked([[x for part in row.innovations for x in part] for _, row in rows])
-        product = (left * right).tolist()
+        slopes = stacked([[ball(y) * row.slope[k][i] for y, row in rows] for k in range(K) for i in range(m)])
+        innovations = stacked([[x for innovation in row.innovations for x in innovation] for _, row in rows])
+        product = (slopes * innovations).tolist()
         width = [_width(self.control, i) for i in range(m)]
         for k in range(K):
             clusters = self._clusters(k)
@@ -77,16 +79,16 @@ class GainsBound:
         """
         groups: list[tuple[list[int], set[int]]] = []
         for j in np.flatnonzero(self.answers[k, : k + 1]).tolist():
-            seen = {block for block in self.loop.seen[j] if self._segments[block]}
-            if not seen:
+            measured_blocks = {block for block in self.loop.seen[j] if self._segments[block]}
+            if not measured_blocks:
                 continue
-            mine, rest = ([j], seen), []
+            cluster, separate = ([j], measured_blocks), []
             for members, blocks in groups:
-                if blocks & mine[1]:
-                    mine = (members + mine[0], mine[1] | blocks)
+                if blocks & cluster[1]:
+                    cluster = (members + cluster[0], cluster[1] | blocks)
                 else:
-                    rest.append((members, blocks))
-            groups = [*rest, mine]
+                    separate.append((members, blocks))
+            groups = [*separate, cluster]
         return [(sorted(members), *self._inverse(tuple(sorted(members)))) for members, _ in groups]
 
     @remembered()
@@ -101,10 +103,18 @@ class GainsBound:
         d = self.loop.outputs
         table: list[list[arb]] = []
         for j in members:
-            seen = self.loop.seen[j]
-            lists = {block: _onto(push, self._segments[block]) for block, push in seen.items() if block in blocks}
+            responses = self.loop.seen[j]
+            response_rows = {
+                block: _onto(response, self._segments[block])
+                for block, response in responses.items()
+                if block in blocks
+            }
             table += [
-                [x for block in blocks for x in (lists[block][s] if block in lists else self._none_of(block))]
+                [
+                    x
+                    for block in blocks
+                    for x in (response_rows[block][s] if block in response_rows else self._none_of(block))
+                ]
                 for s in range(d)
             ]
         groups = [self._pushed(block) for block in blocks]
@@ -112,8 +122,8 @@ class GainsBound:
             [np.hstack([g.pattern & (b in self.loop.seen[j]) for g, b in zip(groups, blocks, strict=True)])
              for j in members]
         )  # fmt: skip
-        most = max(group.states for group in groups)
-        rows = [(d * (k + 1), most) for k in range(len(members))]
+        state_count = max(group.states for group in groups)
+        rows = [(d * (k + 1), state_count) for k in range(len(members))]
         ends = np.cumsum([group.pattern.shape[1] for group in groups]).tolist()
         columns = [(end, group.entries) for end, group in zip(ends, groups, strict=True)]
         reach = np.array([float(length) for block in blocks for _, length in self._segments[block]])
@@ -142,8 +152,8 @@ class GainsBound:
         """For every block the directions along which its set is long, with the lengths; empty for a block that cannot
         deviate, which is never measured."""
         loop = self.loop
-        found = {id(shape): _segments(shape, about) for shape, about in loop.deviations.sets}
-        return [found[id(shape)] for shape, _ in loop.deviations.sets]
+        segments = {id(shape): _segments(shape, middle) for shape, middle in loop.deviations.sets}
+        return [segments[id(shape)] for shape, _ in loop.deviations.sets]
 
 
 def _axis(shape: ConvexSet, channel: int, sign: float) -> arb:
@@ -168,54 +178,55 @@ def _segments(shape: ConvexSet, middle: Array) -> list[tuple[list[Fraction], arb
     """
     if isinstance(shape, Product):
         return [
-            ([*[Fraction(0)] * place.start, *vector, *[Fraction(0)] * (shape.dimension - place.stop)], length)
-            for part, own, place in _parts(shape, middle)
-            for vector, length in _segments(part, own)
+            ([*[Fraction(0)] * indices.start, *vector, *[Fraction(0)] * (shape.dimension - indices.stop)], length)
+            for factor, point, indices in _parts(shape, middle)
+            for vector, length in _segments(factor, point)
         ]
     chords, axes = _chords(shape, middle), np.eye(shape.dimension)
-    wide = [_width(shape, channel) for channel in range(shape.dimension)]
-    if all(wide[b].is_zero() or chord > NEAR * wide[b] for b, chord in enumerate(chords)):
-        kept = [b for b, width in enumerate(wide) if not width.is_zero()]
-        return [([Fraction(float(v)) for v in axes[b]], chords[b]) for b in kept]
-    along = known(shape).segments
-    if along is None:
+    widths = [_width(shape, channel) for channel in range(shape.dimension)]
+    if all(widths[b].is_zero() or chord > NEAR * widths[b] for b, chord in enumerate(chords)):
+        channels = [b for b, width in enumerate(widths) if not width.is_zero()]
+        return [([Fraction(float(v)) for v in axes[b]], chords[b]) for b in channels]
+    segments = known(shape).segments
+    if segments is None:
         raise Unchecked(f"the checker does not know how long the {shape.kind} is along the axes")
-    return [(vector, rational(length)) for vector, length in along]
+    return [(vector, rational(length)) for vector, length in segments]
 
 
 def _parts(shape: Product, middle: Array) -> list[tuple[ConvexSet, Array, slice]]:
     """Return every part of a product, each with its part of a point and its place."""
-    ends = np.cumsum([0, *(part.dimension for part in shape.parts)]).tolist()
-    places = [slice(begin, end) for begin, end in pairwise(ends)]
-    return [(part, middle[place], place) for part, place in zip(shape.parts, places, strict=True)]
+    ends = np.cumsum([0, *(factor.dimension for factor in shape.parts)]).tolist()
+    slices = [slice(begin, end) for begin, end in pairwise(ends)]
+    return [(factor, middle[indices], indices) for factor, indices in zip(shape.parts, slices, strict=True)]
 
 
 def _chords(shape: ConvexSet, middle: Array) -> list[arb]:
     """Return numbers ``c_b`` such that the width of a set along any ``a`` is at least ``c_b |a_b|``: the lengths of its
     chords along the axes through its middle."""
     if isinstance(shape, Product):
-        return [chord for part, own in shape.split(middle) for chord in _chords(part, own)]
+        return [chord for factor, point in shape.split(middle) for chord in _chords(factor, point)]
     if isinstance(shape, NormBall):
         return [2 * ball(shape.radius)] * shape.dimension
     if isinstance(shape, Ellipsoid):
         inverse = exactly(shape.shape).inv()
         return [2 / inverse[b, b].sqrt() for b in range(shape.dimension)]
-    flat = known(shape).facets
-    if flat is None:
+    facets = known(shape).facets
+    if facets is None:
         raise Unchecked("the checker does not know how long the disturbance's set is along the axes")
-    found = []
+    chords = []
     for axis in range(shape.dimension):
-        reach = []
+        distances = []
         for sign in (1.0, -1.0):
-            ends = [(b - along(c, balls(middle))) / ball(abs(c[axis])) for c, b in flat if sign * c[axis] > 0]
-            reach.append(smallest(ends))
-        found.append(reach[0] + reach[1])
-    return found
+            ends = [(b - along(c, balls(middle))) / ball(abs(c[axis])) for c, b in facets if sign * c[axis] > 0]
+            distances.append(smallest(ends))
+        chords.append(distances[0] + distances[1])
+    return chords
 
 
 def _onto(push: arb_mat, segments: Sequence[tuple[list[Fraction], arb]]) -> list[list[arb]]:
     """Return the matrix of a block times its segments: the coefficients of the segments in every entry."""
     rows, columns = push.tolist(), [[(b, v) for b, v in enumerate(vector) if v] for vector, _ in segments]
     return [
-        [sum((row[b] if v == 1 else row[b] * rational(v) for b, v in one), ball(0)) for one in columns] for row in rows
+        [sum((row[b] if v == 1 else row[b] * rational(v) for b, v in column), ball(0)) for column in columns]
+        for row in rows
     ]

@@ -52,35 +52,35 @@ def walked(nominal: NominalMotion, control: Dictionary, pieces: Sequence[arb_mat
     """
     from flint import arb, arb_mat
 
-    problem, x, walked = nominal.problem, nominal.begin, []
+    problem, x, steps = nominal.problem, nominal.begin, []
     d, m = problem.system.states, problem.system.controls
     for start, stop, k in _acting(problem, control):
         flow, weight = nominal.step(start, stop), nominal.weight(start, stop)
         z = arb_mat(x.tolist() + (nominal.before if k < 0 else pieces[k]).tolist())
-        walked.append((k, flow, weight, z))
+        steps.append((k, flow, weight, z))
         x = arb_mat((flow * z).tolist()[: d + 1])
     costate = nominal.final * x
     value, terms = (x.transpose() * costate)[0, 0], _terms(x, nominal.final)
     slope: list[list[arb]] = [[arb(0)] * m for _ in pieces]
-    for k, flow, weight, z in reversed(walked):
-        own = weight * z
-        value, terms = value + (z.transpose() * own)[0, 0], terms + _terms(z, weight)
-        both = (own + flow.transpose() * arb_mat([*costate.tolist(), *([arb(0)] for _ in range(m))])).tolist()
-        costate = arb_mat(both[: d + 1])
+    for k, flow, weight, z in reversed(steps):
+        weighted = weight * z
+        value, terms = value + (z.transpose() * weighted)[0, 0], terms + _terms(z, weight)
+        adjoint = (weighted + flow.transpose() * arb_mat([*costate.tolist(), *([arb(0)] for _ in range(m))])).tolist()
+        costate = arb_mat(adjoint[: d + 1])
         if k >= 0:
-            slope[k] = [g + 2 * entry[0] for g, entry in zip(slope[k], both[d + 1 :], strict=True)]
+            slope[k] = [g + 2 * entry[0] for g, entry in zip(slope[k], adjoint[d + 1 :], strict=True)]
     R = problem.cost.terms[1]
     if R is not None:
         matrix, ends = exactly(R.Q), [Fraction(float(t)) for t in control.breakpoints]
         for k, (begin, end) in enumerate(pairwise(ends)):
-            push = matrix * pieces[k] * rational(end - begin)
-            value = value + (pieces[k].transpose() * push)[0, 0]
+            weighted_control = matrix * pieces[k] * rational(end - begin)
+            value = value + (pieces[k].transpose() * weighted_control)[0, 0]
             terms += _terms(pieces[k], matrix) * float(end - begin)
-            slope[k] = [g + 2 * entry for g, entry in zip(slope[k], push.entries(), strict=True)]
+            slope[k] = [g + 2 * entry for g, entry in zip(slope[k], weighted_control.entries(), strict=True)]
     sizes = [abs(float(value)), *(abs(float(g)) for entry in slope for g in entry)]
     radii = [float(value.rad()), *(float(g.rad()) for entry in slope for g in entry)]
-    exact = max(radii) == 0.0
-    blurred = 0.0 if exact else float("inf") if not np.isfinite(sum(radii)) else max(radii) / (max(sizes) or 1.0)
+    is_exact = max(radii) == 0.0
+    blurred = 0.0 if is_exact else float("inf") if not np.isfinite(sum(radii)) else max(radii) / (max(sizes) or 1.0)
     return Walk(value, slope, blurred, terms)
 
 
@@ -91,12 +91,12 @@ def nominal_states(nominal: NominalMotion, control: Dictionary, pieces: Sequence
     """
     from flint import arb_mat
 
-    x, still, seen = nominal.begin.tolist(), (nominal.before * 0).tolist(), []
+    x, zero_control, states = nominal.begin.tolist(), (nominal.before * 0).tolist(), []
     for start, stop, k in _acting(nominal.problem, control):
         u = nominal.before if k < 0 else pieces[k]
-        seen.append(arb_mat(x + (still if k < 0 else u.tolist())))
+        states.append(arb_mat(x + (zero_control if k < 0 else u.tolist())))
         x = (nominal.step(start, stop) * arb_mat(x + u.tolist())).tolist()[: len(x)]
-    return [*seen, arb_mat(x + still)]
+    return [*states, arb_mat(x + zero_control)]
 
 
 def _terms(z: arb_mat, M: arb_mat) -> float:
@@ -142,8 +142,8 @@ class NominalMotion:
     @cached_property
     def before(self) -> arb_mat:
         """The control ``(m, 1)`` that acts before the first piece acts."""
-        known = self.problem.initial_control
-        u = np.zeros(self.problem.system.controls) if known is None else np.asarray(known)
+        initial_control = self.problem.initial_control
+        u = np.zeros(self.problem.system.controls) if initial_control is None else np.asarray(initial_control)
         return stacked([[x] for x in balls(u)])
 
     @cached_property
@@ -176,13 +176,13 @@ class NominalMotion:
     def weight(self, start: float, stop: float) -> arb_mat:
         """Return the cost of an interval as a quadratic form of the ``z`` at its beginning."""
         size = self.running.nrows()
-        whole, passed = zeros(size, size), identity(size)
-        for part in self.flow.parts(start, stop) if self.problem.cost.terms[0] is not None else ():
-            step, cost = self._integrate(part)
-            for _ in range(part.doublings):
+        total, propagated = zeros(size, size), identity(size)
+        for flow_part in self.flow.parts(start, stop) if self.problem.cost.terms[0] is not None else ():
+            step, cost = self._integrate(flow_part)
+            for _ in range(flow_part.doublings):
                 step, cost = step * step, cost + step.transpose() * cost * step
-            whole, passed = whole + passed.transpose() * cost * passed, step * passed
-        return whole
+            total, propagated = total + propagated.transpose() * cost * propagated, step * propagated
+        return total
 
     def _integrate(self, part: FlowPart) -> tuple[arb_mat, arb_mat]:
         """Return the square matrix of ``z`` over a share of a segment, and the cost of that time as a quadratic form.
@@ -192,15 +192,15 @@ class NominalMotion:
         """
         from flint import arb, arb_mat
 
-        (terms, priced, off), share, M = self._tabulate(part.segment), part.share, self.running
+        (terms, weighted_terms, error), share, M = self._tabulate(part.segment), part.share, self.running
         size, count = M.nrows(), terms.nrows()
         powers = arb_mat([[x**n for n in range(count)] for x in (share, arb(0).union(share))]) * terms
-        step, seen = (arb_mat(size, size, row) for row in powers.tolist())
-        missed = off.transpose() * M * (seen + off) + seen.transpose() * M * off
+        step, flow_range = (arb_mat(size, size, row) for row in powers.tolist())
+        cost_error = error.transpose() * M * (flow_range + error) + flow_range.transpose() * M * error
         integrals = [share**k * part.length / (k + 1) for k in range(2 * count - 1)]
-        pushed = arb_mat([integrals[i : i + count] for i in range(count)]) * priced
-        every, pushed = (arb_mat(count * size, size, table.entries()) for table in (terms, pushed))
-        return step + off, every.transpose() * pushed + missed * part.length
+        integrated = arb_mat([integrals[i : i + count] for i in range(count)]) * weighted_terms
+        term_column, integrated = (arb_mat(count * size, size, table.entries()) for table in (terms, integrated))
+        return step + error, term_column.transpose() * integrated + cost_error * part.length
 
     @remembered(lambda: KEPT)
     def _tabulate(self, segment: VerifiedSegment) -> tuple[arb_mat, arb_mat, arb_mat]:
@@ -209,8 +209,10 @@ class NominalMotion:
         from flint import arb_mat
 
         terms = [self._lift(X.matrix, int(not n)) for n, X in enumerate(segment.terms)]
-        table, priced = ([X.entries() for X in some] for some in (terms, [self.running * X for X in terms]))
-        return arb_mat(table), arb_mat(priced), self._lift(around(segment.off), 0)
+        table, weighted_terms = (
+            [X.entries() for X in matrices] for matrices in (terms, [self.running * X for X in terms])
+        )
+        return arb_mat(table), arb_mat(weighted_terms), self._lift(around(segment.off), 0)
 
     def _lift(self, term: arb_mat, one: int) -> arb_mat:
         """Return a matrix ``(d, d + w)`` on states, controls, a drift and disturbances as a square matrix on ``z``.
@@ -220,7 +222,7 @@ class NominalMotion:
         system, bound = self.problem.system, self.problem.disturbance
         d, m, mw = system.states, system.controls, system.disturbances
         w = np.zeros(mw) if bound is None else nominal_point(bound)
-        given = balls([*np.ones(term.ncols() - d - m - mw), *w])  # the input of a drift is 1
-        rows = [[*row[:d], sum((e * v for e, v in zip(row[d + m :], given, strict=True)), ball(0)), *row[d : d + m]]
+        inputs = balls([*np.ones(term.ncols() - d - m - mw), *w])  # the input of a drift is 1
+        rows = [[*row[:d], sum((e * v for e, v in zip(row[d + m :], inputs, strict=True)), ball(0)), *row[d : d + m]]
                 for row in term.tolist()]  # fmt: skip
         return stacked(rows + (identity(d + 1 + m) * one).tolist()[d:])

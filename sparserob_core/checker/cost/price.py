@@ -68,17 +68,19 @@ class Price:
         l1, ends = ball(self.problem.cost.l1), [Fraction(t) for t in self.control.breakpoints.tolist()]
         times = [Fraction(t) for t in self._changes[0]]
         rows = [balls(row) for row in self._changes[1]]
-        found, first = [], 0
+        costs, first = [], 0
         for begin, end in self.clock.each(pairwise(ends)):
             while first + 1 < len(times) and times[first + 1] <= begin:
                 first += 1
-            total, now, row = [ball(0)] * len(rows[0]), begin, first
+            integrals, now, row = [ball(0)] * len(rows[0]), begin, first
             while now < end:
                 until = min(end, times[row + 1]) if row + 1 < len(times) else end
-                total = [one + w * rational(until - now) for one, w in zip(total, rows[row], strict=True)]
+                integrals = [
+                    integral + w * rational(until - now) for integral, w in zip(integrals, rows[row], strict=True)
+                ]
                 now, row = until, row + 1
-            found.append([l1 * one for one in total])
-        return found
+            costs.append([l1 * integral for integral in integrals])
+        return costs
 
     @cached_property
     def counts(self) -> np.ndarray:
@@ -102,8 +104,8 @@ class Price:
         groups: list[list[int]] = []
         if isinstance(self.problem.cost.group, tuple):
             groups = [[int(channel) - 1 for channel in group] for group in self.problem.cost.group]
-        taken = {channel for group in groups for channel in group}
-        return groups + [[c] for c in range(self.problem.system.controls) if c not in taken]
+        grouped = {channel for group in groups for channel in group}
+        return groups + [[c] for c in range(self.problem.system.controls) if c not in grouped]
 
     def of(self, pieces: Sequence[arb_mat]) -> arb:
         """Return the cost ``J`` of a control ``(m, 1)`` on every piece."""
@@ -117,19 +119,19 @@ class Price:
         return self._quadratic(pieces).value if self.is_quadratic else ball(0)
 
     def _norms(self, costs: Sequence[arb], u: Sequence[arb]) -> arb:
-        found = ball(0)
+        total = ball(0)
         for block in self.blocks:
             size = abs(u[block[0]]) if len(block) == 1 else norm(stacked([[u[c]] for c in block]))
-            found = found + costs[block[0]] * size
-        return found
+            total = total + costs[block[0]] * size
+        return total
 
     def tangent(self, pieces: Sequence[arb_mat]) -> Tangent:
         """Return the tangent of the quadratic terms at a control ``(m, 1)`` on every piece."""
-        found = self._quadratic(pieces)
-        constant = found.value
-        for piece, slope in self.clock.each(zip(pieces, found.slope, strict=True)):
+        quadratic = self._quadratic(pieces)
+        constant = quadratic.value
+        for piece, slope in self.clock.each(zip(pieces, quadratic.slope, strict=True)):
             constant = constant - sum((g * u for g, u in zip(slope, piece.entries(), strict=True)), constant * 0)
-        return Tangent(constant, found.slope)
+        return Tangent(constant, quadratic.slope)
 
     def added(self, pieces: Sequence[arb_mat], lengths: arb | None = None) -> float:
         """Return the sum of the absolute values of what the program adds up to the cost of a control.
@@ -137,19 +139,19 @@ class Price:
         It adds up the norms, or ``lengths`` where those are charged instead, and the linear, the quadratic and the
         constant part of the quadratic terms.
         """
-        parts = zip(self.costs, pieces, strict=True)
+        pairs = zip(self.costs, pieces, strict=True)
         norms = lengths
         if norms is None:
-            norms = sum((self._norms(costs, piece.entries()) for costs, piece in parts), rational(Fraction(0)))
+            norms = sum((self._norms(costs, piece.entries()) for costs, piece in pairs), rational(Fraction(0)))
         if not self.is_quadratic:
             return float(norms)
-        found = self._quadratic(pieces)
-        constant, linear = self._quadratic(self._still).value, -found.value
-        for piece, slope in zip(pieces, found.slope, strict=True):
+        quadratic = self._quadratic(pieces)
+        constant, linear = self._quadratic(self._still).value, -quadratic.value
+        for piece, slope in zip(pieces, quadratic.slope, strict=True):
             linear = linear + sum((g * u for g, u in zip(slope, piece.entries(), strict=True)), linear * 0)
-        bent = linear + constant  # slope'u - value + constant = u'P u / 2
-        linear = found.value - constant - bent
-        return float((norms + abs(linear) + abs(bent) + abs(constant)).mid())
+        curvature = linear + constant  # slope'u - value + constant = u'P u / 2
+        linear = quadratic.value - constant - curvature
+        return float((norms + abs(linear) + abs(curvature) + abs(constant)).mid())
 
     def terms(self, pieces: Sequence[arb_mat]) -> float:
         """Return the sum of the absolute values of all products in the quadratic terms of a control.
@@ -171,13 +173,13 @@ class Price:
             [float(known(self.problem.control).support(balls(s * axis)).mid()) for s in (1.0, -1.0)] for axis in axes
         ]
         reach = [max(abs(high), abs(low)) for high, low in ends]
-        lasting = np.diff([*self._changes[0], self.problem.horizon])
-        total = float(self.problem.cost.l1) * float(lasting @ self._changes[1] @ np.asarray(reach))
+        durations = np.diff([*self._changes[0], self.problem.horizon])
+        total = float(self.problem.cost.l1) * float(durations @ self._changes[1] @ np.asarray(reach))
         if not self.is_quadratic:
             return total
-        still = [np.zeros(m)] + [s * r * axis for axis, r in zip(axes, reach, strict=True) for s in (1.0, -1.0)]
-        held = [[stacked([[u] for u in balls(control)])] * len(self._lengths) for control in still]
-        return total + max(float(self._quadratic(pieces).value.mid()) for pieces in held)
+        vectors = [np.zeros(m)] + [s * r * axis for axis, r in zip(axes, reach, strict=True) for s in (1.0, -1.0)]
+        controls = [[stacked([[u] for u in balls(control)])] * len(self._lengths) for control in vectors]
+        return total + max(float(self._quadratic(pieces).value.mid()) for pieces in controls)
 
     @property
     def _terms(self) -> tuple[Quadratic | None, ...]:
@@ -215,9 +217,9 @@ class Price:
         """
         from flint import ctx
 
-        for control, bits, found in self._latest:
+        for control, bits, quadratic in self._latest:
             if control is pieces and bits >= ctx.prec:
-                return found
+                return quadratic
         self._latest.append((pieces, int(ctx.prec), self._resolved(pieces, int(ctx.prec))))
         return self._latest[-1][2]
 
@@ -226,9 +228,9 @@ class Price:
 
         while True:
             with ctx.workprec(bits):
-                found = walked(self._nominal, self.control, pieces)
-            if found.blurred <= ENOUGH:
-                return found
+                quadratic = walked(self._nominal, self.control, pieces)
+            if quadratic.blurred <= ENOUGH:
+                return quadratic
             bits *= 2
             if bits > MOST_BITS:
                 raise Unchecked("the quadratic cost cannot be resolved: the state grows too far over the horizon")
@@ -249,5 +251,5 @@ def _semidefinite(term: Quadratic) -> bool:
         for i in range(k + 1, len(rows)):
             if row[k] != 0 and rows[i][k] != 0:
                 factor = rows[i][k] / row[k]
-                rows[i] = [entry - factor * other for entry, other in zip(rows[i], row, strict=True)]
+                rows[i] = [entry - factor * pivot_entry for entry, pivot_entry in zip(rows[i], row, strict=True)]
     return True

@@ -117,30 +117,30 @@ class VerifiedFlow:
 
     @cached_property
     def _begins(self) -> list[float]:
-        return [one.start for one in self.law.stretches]
+        return [stretch.start for stretch in self.law.stretches]
 
     def _place(self, start: float, stop: float) -> int:
         """Return the number of the stretch that holds an interval; raise `Unchecked` where none does."""
         if not 0.0 <= start <= stop <= self.until:
             raise Unchecked(f"the system is not known from {start:g} to {stop:g}")
-        place = max(0, bisect_right(self._begins, start) - 1)
-        if stop > self.law.stretches[place].stop:
+        index = max(0, bisect_right(self._begins, start) - 1)
+        if stop > self.law.stretches[index].stop:
             raise Unchecked(f"the system is no polynomial from {start!r} to {stop!r}")
-        return place
+        return index
 
     def marks(self, times: Sequence[float]) -> list[float]:
         """Return the increasing times with marks between them, such that the flow is a polynomial from each to the
         next."""
-        found = [times[0]]
+        marks = [times[0]]
         for start, stop in pairwise(times):
-            ends = [one for one in self._begins if start < one < stop]
-            for a, b in pairwise([start, *ends, stop]):
+            cuts = [begin for begin in self._begins if start < begin < stop]
+            for a, b in pairwise([start, *cuts, stop]):
                 stretch = self.law.stretches[self._place(a, b)]
                 count = (b - a) / stretch.stride * (1.0 - 1e-14) if stretch.is_still else 1.0
-                if not len(found) + count <= MOST_MARKS:
+                if not len(marks) + count <= MOST_MARKS:
                     raise Unchecked("the system is too fast for its horizon to be followed")
-                found += [float(t) for t in np.linspace(a, b, max(1, ceil(count)) + 1)[1:-1]] + [b]
-        return found
+                marks += [float(t) for t in np.linspace(a, b, max(1, ceil(count)) + 1)[1:-1]] + [b]
+        return marks
 
     def segment(self, start: float, stop: float) -> tuple[VerifiedSegment, arb]:
         """Return the verified segment of the flow from ``start`` on, and the share of its time that has passed at
@@ -164,9 +164,9 @@ class VerifiedFlow:
 
     def kind(self, start: float, stop: float) -> tuple[int, tuple[float, float]]:
         """Return the kind of an interval: intervals of one kind have one flow."""
-        place = self._place(start, stop)
-        still = self.law.stretches[place].is_still
-        return (place, difference(stop, start)) if still else (-1 - place, (start, stop))
+        index = self._place(start, stop)
+        is_still = self.law.stretches[index].is_still
+        return (index, difference(stop, start)) if is_still else (-1 - index, (start, stop))
 
     @remembered(lambda: KEPT, lambda self, start, stop: self.kind(start, stop))
     def step(self, start: float, stop: float) -> Series:
@@ -179,24 +179,24 @@ class VerifiedFlow:
     def over(self, start: float, stop: float) -> tuple[Series, Series, Series]:
         """Return the factors of the state at its end on an interval: of the state at the beginning ``(d, d)``, of
         constant controls with a drift ``(d, driven)``, and of constant disturbances ``(d, w - driven)``."""
-        whole: tuple[Series, Series] | None = None
-        for part in self.parts(start, stop):
-            both = part.segment.at(part.share)
-            Phi, pushed = both.columns(0, self.states), both.columns(self.states, None)
-            for _ in range(part.doublings):
-                Phi, pushed = Phi * Phi, Phi * pushed + pushed
-            whole = (Phi, pushed) if whole is None else (Phi * whole[0], Phi * whole[1] + pushed)
-        assert whole is not None
-        return whole[0], whole[1].columns(0, self.driven), whole[1].columns(self.driven, None)
+        total: tuple[Series, Series] | None = None
+        for flow_part in self.parts(start, stop):
+            flow = flow_part.segment.at(flow_part.share)
+            Phi, Gamma = flow.columns(0, self.states), flow.columns(self.states, None)
+            for _ in range(flow_part.doublings):
+                Phi, Gamma = Phi * Phi, Phi * Gamma + Gamma
+            total = (Phi, Gamma) if total is None else (Phi * total[0], Phi * total[1] + Gamma)
+        assert total is not None
+        return total[0], total[1].columns(0, self.driven), total[1].columns(self.driven, None)
 
     def about(self, start: float, stop: float) -> tuple[Array, Array, Array]:
         """Return the three factors of `over` as floats with rounding errors. Units of rows are made of them; no claim
         rests on them."""
         phases, d = self.plant.phases, self.states
         if d < COARSE or self.plant.is_timed:
-            of_states, of_controls, of_disturbances = (middles(one.matrix) for one in self.over(start, stop))
+            of_states, of_controls, of_disturbances = (middles(factor.matrix) for factor in self.over(start, stop))
             return of_states, of_controls, of_disturbances
-        found = np.hstack([np.eye(d), np.zeros((d, self.plant.inputs))])
+        flow = np.hstack([np.eye(d), np.zeros((d, self.plant.inputs))])
         for number, phase in enumerate(phases):
             length = min(stop, phase.until) - max(start, phase.begin)
             if length > 0.0:
@@ -204,14 +204,14 @@ class VerifiedFlow:
                 if key not in self._about:
                     table = called(phase, np.array([phase.begin, *self.box.middle])).astype(float)
                     self._about[key] = held_about(table[:, :d], table[:, d:], length)
-                onward, pushed = self._about[key]
-                found = onward @ found
-                found[:, d:] += pushed
-        return found[:, :d], found[:, d : d + self.driven], found[:, d + self.driven :]
+                Phi, Gamma = self._about[key]
+                flow = Phi @ flow
+                flow[:, d:] += Gamma
+        return flow[:, :d], flow[:, d : d + self.driven], flow[:, d + self.driven :]
 
     def parts(self, start: float, stop: float) -> Iterator[FlowPart]:
         """Yield the parts of an interval, one after another."""
-        for a, b in pairwise([start, *(one for one in self._begins if start < one < stop), stop]):
+        for a, b in pairwise([start, *(begin for begin in self._begins if start < begin < stop), stop]):
             stretch, doublings, length = self.law.stretches[self._place(a, b)], 0, ball(b) - ball(a)
             if not stretch.is_still:
                 yield FlowPart(*self.segment(a, b), length)
@@ -260,40 +260,40 @@ class VerifiedFlow:
         """
         stretch = self.law.stretches[self._place(start, stop)]
         A, F = stretch.between(start, stop, backwards=True)
-        back, lost = self._back(stretch, A, start, stop)
+        Phi, Phi_error = self._back(stretch, A, start, stop)
         w = F[0].shape[1]
-        wanted = max(float((one.size / stretch.units[:, None]).max(initial=0.0)) for one in F) * ENOUGH
-        inputs, found, off = [one.size for one in F], list[Series](), np.zeros((self.states, w))
-        off += lost @ np.sum(inputs, axis=0)
-        sizes = [one.size for one in back]
-        for n in range(len(back) + len(F) - 1):
-            pairs = [(n - k, k) for k in range(len(F)) if 0 <= n - k < len(back)]
-            bound = sum((sizes[i] @ inputs[k] for i, k in pairs), np.zeros((self.states, w)))
-            if n and float((bound / stretch.units[:, None]).max(initial=0.0)) * 2.0 <= wanted:
-                off += bound
+        negligible = max(float((series.size / stretch.units[:, None]).max(initial=0.0)) for series in F) * ENOUGH
+        input_sizes, terms, remainder = [series.size for series in F], list[Series](), np.zeros((self.states, w))
+        remainder += Phi_error @ np.sum(input_sizes, axis=0)
+        Phi_sizes = [series.size for series in Phi]
+        for n in range(len(Phi) + len(F) - 1):
+            pairs = [(n - k, k) for k in range(len(F)) if 0 <= n - k < len(Phi)]
+            bound = sum((Phi_sizes[i] @ input_sizes[k] for i, k in pairs), np.zeros((self.states, w)))
+            if n and float((bound / stretch.units[:, None]).max(initial=0.0)) * 2.0 <= negligible:
+                remainder += bound
                 continue
-            term = back[pairs[0][0]] * F[pairs[0][1]]
+            term = Phi[pairs[0][0]] * F[pairs[0][1]]
             for i, k in pairs[1:]:
-                term = term + back[i] * F[k]
-            while len(found) < n:
-                found.append(Series.constant(self.monomials, zeros(self.states, w)))
-            found.append(term)
-        return found, off * OUTWARD
+                term = term + Phi[i] * F[k]
+            while len(terms) < n:
+                terms.append(Series.constant(self.monomials, zeros(self.states, w)))
+            terms.append(term)
+        return terms, remainder * OUTWARD
 
     def _back(self, stretch: Stretch, A: Sequence[Series], start: float, stop: float) -> tuple[list[Series], Array]:
         """Return ``Phi(stop, s)`` as coefficients in powers of the share of an interval that is left at ``s``, with an
         error bound ``(d, d)``. Where nothing changes with time, it is the flow over the time that is left."""
         if stretch.is_still:
             segment, share = self.segment(start, stop)
-            terms = [one.columns(0, self.states).scaled(share**n) for n, one in enumerate(segment.terms)]
+            terms = [term.columns(0, self.states).scaled(share**n) for n, term in enumerate(segment.terms)]
             return terms, segment.off[:, : self.states]
-        none = Series.constant(self.monomials, zeros(self.states, 0))
-        rows = solve([one.transpose() for one in A], [none], 1.0 / stretch.units, ROUGH)
-        return [one.transpose() for one in rows.terms], rows.off.T
+        no_inputs = Series.constant(self.monomials, zeros(self.states, 0))
+        rows = solve([series.transpose() for series in A], [no_inputs], 1.0 / stretch.units, ROUGH)
+        return [term.transpose() for term in rows.terms], rows.off.T
 
     def alike(self, start: float, stop: float) -> tuple[object, ...]:
         """Return a key that is equal for intervals with the same flow."""
-        inside = not any(start < one < stop for one in self._begins)
+        inside = not any(start < begin < stop for begin in self._begins)
         return self.kind(start, stop) if inside else (start, stop)
 
     def sizes(self, start: float, stop: float) -> tuple[Array, Array, Array]:
@@ -311,9 +311,9 @@ class VerifiedFlow:
     @remembered(lambda: WEIGHTS_KEPT, lambda self, grid: tuple(grid))
     def weights(self, grid: Sequence[float]) -> StateWeights:
         """Return the matrices that make up the state at the end of a grid, which begins at 0, at known parameters."""
-        parts = [self.over(*ends) for ends in pairwise(grid)]
-        after = products([part[0] for part in parts])
+        steps = [self.over(*ends) for ends in pairwise(grid)]
+        after = products([step[0] for step in steps])
         control, disturbance = (
-            [(Z * part[i]).matrix for Z, part in zip(after[1:], parts, strict=True)] for i in (1, 2)
+            [(Z * step[i]).matrix for Z, step in zip(after[1:], steps, strict=True)] for i in (1, 2)
         )
         return StateWeights(after[0].matrix, control, disturbance)

@@ -79,17 +79,17 @@ class VerifiedFlows:
         small."""
         if self._is_still:
             return self.over(box, self.degree)
-        part, degree = self.box, WIDE.get(len(box.middle), 2)
+        candidate, degree = self.box, WIDE.get(len(box.middle), 2)
         for _ in range(HALVINGS):
-            if not part.holds(box) or part == box or self._is_close(part, degree):
+            if not candidate.holds(box) or candidate == box or self._is_close(candidate, degree):
                 break
-            part = next((half for half in part.halved(self._axis(part)) if half.holds(box)), box)
-        return self.over(part if part.holds(box) else box, degree)
+            candidate = next((half for half in candidate.halved(self._axis(candidate)) if half.holds(box)), box)
+        return self.over(candidate if candidate.holds(box) else box, degree)
 
     @cached_property
     def _is_still(self) -> bool:
         """True where nothing changes with time or nothing is uncertain: then flows are cheap."""
-        return not self.box.middle or all(one.is_still for one in self.timing.stretches)
+        return not self.box.middle or all(stretch.is_still for stretch in self.timing.stretches)
 
     @remembered()
     def _is_close(self, box: ParameterBox, degree: int) -> bool:
@@ -99,20 +99,20 @@ class VerifiedFlows:
             Phi, units = flow.over(0.0, self.until)[0], flow.law.units
         except Unchecked:
             return False
-        off = np.array([[float(x.rad()) for x in row] for row in Phi.parts[0].tolist()])
-        size, lost = ((one * units / units[:, None]).max() for one in (Phi.size, off))
-        return bool(lost <= CLOSE * max(1.0, size))
+        radii = np.array([[float(x.rad()) for x in row] for row in Phi.parts[0].tolist()])
+        size, error = ((values * units / units[:, None]).max() for values in (Phi.size, radii))
+        return bool(error <= CLOSE * max(1.0, size))
 
     def _axis(self, box: ParameterBox) -> int:
         """Return the number of the parameter that changes the system most across a box."""
         try:
             law = Law(self.plant, self.until, box, 1, self.timing)
             sizes = np.zeros(len(box.middle))
-            for one in law.stretches:
+            for stretch in law.stretches:
                 u = law.units
                 for j in range(sizes.size):
-                    size = most(one.table[law.monomials.linear(j)])
-                    sizes[j] += (one.stop - one.start) * pace(size[:, : len(u)], u)
+                    size = most(stretch.table[law.monomials.linear(j)])
+                    sizes[j] += (stretch.stop - stretch.start) * pace(size[:, : len(u)], u)
             return int(sizes.argmax()) if sizes.any() else int(np.argmax(box.halves))
         except Unchecked:
             return int(np.argmax(box.halves))
@@ -122,14 +122,14 @@ class VerifiedFlows:
         """The entries of ``[A B E]`` that are not always 0, and the entries that depend on the parameters: two Boolean
         arrays ``(d, d + w)``."""
         law = Law(self.plant, self.until, self.box, min(1, self.degree), self.timing)
-        moved = []
-        for one in law.stretches:
-            first, *others = one.table
-            moved.append([[any(part[i][j].length() for part in others) or _is_wide(first[i][j])
-                           for j in range(len(first[0]))] for i in range(len(first))])  # fmt: skip
-        return law.there, np.any(moved, axis=0) & bool(self.box.middle)
+        is_dependent = []
+        for stretch in law.stretches:
+            constant, *higher = stretch.table
+            is_dependent.append([[any(table[i][j].length() for table in higher) or _is_wide(constant[i][j])
+                                  for j in range(len(constant[0]))] for i in range(len(constant))])  # fmt: skip
+        return law.there, np.any(is_dependent, axis=0) & bool(self.box.middle)
 
 
 def _is_wide(entry: object) -> bool:
     """Return True where a number is known less closely than rounding makes it."""
-    return any(float(one.rad()) > 2.0**-60 * float(abs(one).upper()) for one in entry.coeffs())  # type: ignore[attr-defined]
+    return any(float(c.rad()) > 2.0**-60 * float(abs(c).upper()) for c in entry.coeffs())  # type: ignore[attr-defined]

@@ -50,9 +50,9 @@ class ParameterBox:
 
     def wider(self, extra: Sequence[float] | Array) -> ParameterBox:
         """Return the box with ``extra (nu,)`` added at either side of every parameter."""
-        more = [h + float(x) for h, x in zip(self.halves, extra, strict=True)]
+        halves = [h + float(x) for h, x in zip(self.halves, extra, strict=True)]
         return (
-            ParameterBox(self.middle, tuple(float(np.nextafter(h, np.inf)) if h else 0.0 for h in more))
+            ParameterBox(self.middle, tuple(float(np.nextafter(h, np.inf)) if h else 0.0 for h in halves))
             if any(extra)
             else self
         )
@@ -67,13 +67,13 @@ class ParameterBox:
 
     def halved(self, axis: int) -> list[ParameterBox]:
         """Return the two halves of the box across one parameter, each a little larger than half."""
-        found = []
+        boxes = []
         for sign in (-0.5, 0.5):
             middle, halves = list(self.middle), list(self.halves)
             middle[axis] += sign * halves[axis]
             halves[axis] *= 0.5 * (1.0 + 1e-9)
-            found.append(ParameterBox(tuple(middle), tuple(halves)))
-        return found
+            boxes.append(ParameterBox(tuple(middle), tuple(halves)))
+        return boxes
 
 
 @final
@@ -96,7 +96,7 @@ class Stretch:
     @cached_property
     def is_still(self) -> bool:
         """True where nothing changes with time."""
-        return all(entry.length() <= 1 for part in self.table for row in part for entry in row)
+        return all(entry.length() <= 1 for table in self.table for row in table for entry in row)
 
     def between(self, start: float, stop: float, backwards: bool = False) -> tuple[list[Series], list[Series]]:
         """Return ``A`` and ``[B c E]`` times the length of a part of the stretch, as one series for each power of a
@@ -109,26 +109,28 @@ class Stretch:
         half, length = (arb(self.stop) - arb(self.start)) / 2, arb(stop) - arb(start)
         begin = (arb(stop if backwards else start) - (arb(self.start) + arb(self.stop)) / 2) / half
         shifted, d = arb_poly([begin, (-length if backwards else length) / half]), len(self.table[0])
-        parts = [[[(entry(shifted) * length).coeffs() for entry in row] for row in part] for part in self.table]
-        order, none = max(1, *(len(entry) for part in parts for row in part for entry in row)), arb(0)
-        every = []
+        coefficients = [
+            [[(entry(shifted) * length).coeffs() for entry in row] for row in table] for table in self.table
+        ]
+        order, zero = max(1, *(len(entry) for table in coefficients for row in table for entry in row)), arb(0)
+        terms = []
         for k in range(order):
-            tables = [[[e[k] if k < len(e) else none for e in row] for row in part] for part in parts]
-            every.append(Series(self.frame.monomials, list(map(stacked, tables))))
-        return _kept([one.columns(0, d) for one in every], self.units), [one.columns(d, None) for one in every]
+            tables = [[[e[k] if k < len(e) else zero for e in row] for row in table] for table in coefficients]
+            terms.append(Series(self.frame.monomials, list(map(stacked, tables))))
+        return _kept([term.columns(0, d) for term in terms], self.units), [term.columns(d, None) for term in terms]
 
     @cached_property
     def sizes(self) -> tuple[Array, Array]:
         """The largest absolute values of the law and of its derivative in time, ``(d, d + w)`` each."""
         half = (self.stop - self.start) / 2.0
-        found = np.zeros((2, len(self.table[0]), len(self.table[0][0])))
-        for part in self.table:
-            for i, row in enumerate(part):
+        sizes = np.zeros((2, len(self.table[0]), len(self.table[0][0])))
+        for table in self.table:
+            for i, row in enumerate(table):
                 for j, entry in enumerate(row):
-                    for n, one in enumerate(entry.coeffs()):
-                        size = float(one.abs_upper()) * OUTWARD
-                        found[:, i, j] += size, size * n / half
-        return found[0] * OUTWARD, found[1] * OUTWARD
+                    for n, c in enumerate(entry.coeffs()):
+                        size = float(c.abs_upper()) * OUTWARD
+                        sizes[:, i, j] += size, size * n / half
+        return sizes[0] * OUTWARD, sizes[1] * OUTWARD
 
 
 def most(table: Sequence[Sequence[arb_poly]]) -> Array:
@@ -143,12 +145,12 @@ def _power(length: float) -> float:
 
 def _kept(A: list[Series], units: Array) -> list[Series]:
     """Return the leading powers of ``A``. The first one encloses the later powers, whose sum is at most `SHARP`."""
-    sizes = [one.size for one in A]
+    sizes = [term.size for term in A]
     paces = [pace(size, units) for size in sizes]
-    kept = len(A)
-    while kept > 1 and sum(paces[kept - 1 :]) <= SHARP:
-        kept -= 1
-    return A if kept == len(A) else [A[0].within(np.sum(sizes[kept:], axis=0) * OUTWARD), *A[1:kept]]
+    count = len(A)
+    while count > 1 and sum(paces[count - 1 :]) <= SHARP:
+        count -= 1
+    return A if count == len(A) else [A[0].within(np.sum(sizes[count:], axis=0) * OUTWARD), *A[1:count]]
 
 
 @final
@@ -178,9 +180,12 @@ class Law:
     def _looks(self) -> tuple[Array, Array]:
         """The largest absolute values of the entries of ``A``, and of every column of ``[B c E]``, at sample times in
         the middle of the box. Units are made of them; any values would be right."""
-        every = np.array([np.abs(table) for table in self.plant.looked_at(self.box.middle)])
+        samples = np.array([np.abs(table) for table in self.plant.looked_at(self.box.middle)])
         with np.errstate(invalid="ignore"):
-            A, inputs = every[..., : self.plant.states].max(axis=0), every[..., self.plant.states :].max(axis=(0, 1))
+            A, inputs = (
+                samples[..., : self.plant.states].max(axis=0),
+                samples[..., self.plant.states :].max(axis=(0, 1)),
+            )
         return np.where(np.isfinite(A), A, 0.0), np.where(np.isfinite(inputs) & (inputs > 0.0), inputs, 1.0)
 
     @cached_property
@@ -193,64 +198,64 @@ class Law:
             Where the law is not finite.
         """
         if self.timing is not None:
-            return [self._on_same(one) for one in self.timing.stretches]
-        cut = [(phase.begin, min(phase.until, self.until), phase) for phase in self.plant.phases]
-        return [one for begin, until, phase in cut if begin < until for one in self._on(begin, until, phase)]
+            return [self._on_same(stretch) for stretch in self.timing.stretches]
+        spans = [(phase.begin, min(phase.until, self.until), phase) for phase in self.plant.phases]
+        return [stretch for begin, until, phase in spans if begin < until for stretch in self._on(begin, until, phase)]
 
     @property
     def is_still(self) -> bool:
         """True where no stretch changes with time."""
-        return all(one.is_still for one in self.stretches)
+        return all(stretch.is_still for stretch in self.stretches)
 
     @cached_property
     def there(self) -> np.ndarray:
         """The entries of ``[A B c E]`` that differ from 0 at any time or parameter, Booleans ``(d, d + w)``."""
-        return np.asarray(np.any([one.sizes[0] > 0.0 for one in self.stretches], axis=0))
+        return np.asarray(np.any([stretch.sizes[0] > 0.0 for stretch in self.stretches], axis=0))
 
     @cached_property
     def weights(self) -> Array:
         """The approximate size of the part of the law that belongs to each monomial of the parameters, ``(M,)``."""
-        found = np.zeros(self.monomials.size)
-        for one in self.stretches:
-            found += [most(part).sum() for part in one.table]
-        return found
+        weights = np.zeros(self.monomials.size)
+        for stretch in self.stretches:
+            weights += [most(table).sum() for table in stretch.table]
+        return weights
 
     def _on_same(self, other: Stretch) -> Stretch:
         """Return the law on a stretch of the timing."""
-        phase = next(one for one in reversed(self.plant.phases) if one.begin <= other.start)
+        phase = next(phase for phase in reversed(self.plant.phases) if phase.begin <= other.start)
         frame, table = self._table(other.start, other.stop, phase, self.monomials)
         return replace(other, frame=frame, table=table, stride=min(other.stride, _power(other.stop - other.start)))
 
     def _on(self, begin: float, until: float, phase: Phase) -> list[Stretch]:
-        whole = self._still(begin, until, phase)
-        if whole is not None:
-            return [whole]
+        constant_stretch = self._still(begin, until, phase)
+        if constant_stretch is not None:
+            return [constant_stretch]
         count = ceil(FIRST * (until - begin) / self.until)
-        todo, found = list(pairwise(np.linspace(begin, until, count + 1).tolist()))[::-1], []
+        todo, stretches = list(pairwise(np.linspace(begin, until, count + 1).tolist()))[::-1], []
         while todo:
             start, stop = todo.pop()
-            part = self._stretch(start, stop, phase)
-            if part is not None:
-                found.append(part)
+            stretch = self._stretch(start, stop, phase)
+            if stretch is not None:
+                stretches.append(stretch)
                 continue
             if stop - start <= SHORTEST * self.until:
                 raise Unchecked(f"near t = {start:.9g} the system is not enclosed")
             middle = (start + stop) / 2
             todo += [(middle, stop), (start, middle)]
-        return found
+        return stretches
 
     def _still(self, begin: float, until: float, phase: Phase) -> Stretch | None:
         """Return a law that does not change with time as one stretch; ``None`` where it changes."""
         try:
-            found = Stretch(begin, until, *self._table(begin, until, phase, self.monomials), self.units)
+            stretch = Stretch(begin, until, *self._table(begin, until, phase, self.monomials), self.units)
         except Unchecked:
             return None
-        if not found.is_still or (phase.timed and self._hides(found, phase)):
+        if not stretch.is_still or (phase.timed and self._hides(stretch, phase)):
             return None
-        longest, rate = _power(until - begin), pace(found.sizes[0][:, : self.plant.states], self.units)
+        longest, rate = _power(until - begin), pace(stretch.sizes[0][:, : self.plant.states], self.units)
         if not rate < 2.0**1000:
             raise Unchecked("the system is too fast for its horizon to be followed")
-        return replace(found, stride=min(longest, 2.0 ** floor(log2(LONG / rate))) if rate > 0.0 else longest)
+        return replace(stretch, stride=min(longest, 2.0 ** floor(log2(LONG / rate))) if rate > 0.0 else longest)
 
     def _hides(self, found: Stretch, phase: Phase) -> bool:
         """Return True where wide balls hide a dependence on time: at a single time the balls are less than half as
@@ -259,9 +264,9 @@ class Law:
         _, table = self._table(time, time, phase, self.monomials)
         return any(
             a.length() and float(a[0].rad()) > 2.0 * float(b[0].rad())
-            for part, other in zip(found.table, table, strict=True)
-            for row, beside in zip(part, other, strict=True)
-            for a, b in zip(row, beside, strict=True)
+            for wide, sharp in zip(found.table, table, strict=True)
+            for wide_row, sharp_row in zip(wide, sharp, strict=True)
+            for a, b in zip(wide_row, sharp_row, strict=True)
         )
 
     def _stretch(self, start: float, stop: float, phase: Phase) -> Stretch | None:
@@ -271,13 +276,13 @@ class Law:
             _, middle = self._table(start, stop, phase, NONE)
             d, u = len(middle[0]), self.units
             size = most(middle[0])
-            lost = np.array([[sum(float(c.rad()) for c in e.coeffs()) for e in row] for row in middle[0]])
+            radii = np.array([[sum(float(c.rad()) for c in e.coeffs()) for e in row] for row in middle[0]])
             rate, long = pace(size[:, :d], u), float((stop - start) * OUTWARD)
             ratios = np.ones(d) if rate * long <= LONG else _slow(size[:, :d] * u / u[:, None] * long)
             least = SHARP * max(rate, pace(self._looks[0], u))
-            if ratios is None or not pace(lost[:, :d], u) * ratios.max() <= least:
+            if ratios is None or not pace(radii[:, :d], u) * ratios.max() <= least:
                 return None
-            if not (lost[:, d:] <= SHARP * self._looks[1]).all():
+            if not (radii[:, d:] <= SHARP * self._looks[1]).all():
                 return None
             table = middle if self.monomials.size == 1 else self._table(start, stop, phase, self.monomials)[1]
         except Unchecked:
@@ -297,15 +302,15 @@ class Law:
             wide = arb(half) if monomials.count else arb(0)
             p[1 + j] = frame.number(arb(middle)) if wide.is_zero() else frame.parameter(j, arb(middle), wide)
         values = called(phase, p)
-        found = [[[arb_poly([])] * values.shape[1] for _ in range(values.shape[0])] for _ in range(monomials.size)]
+        tables = [[[arb_poly([])] * values.shape[1] for _ in range(values.shape[0])] for _ in range(monomials.size)]
         for (i, j), value in np.ndenumerate(values):
-            parts = value.parts if isinstance(value, Model) else [arb_poly([float(value)])]
-            for k, part in enumerate(parts):
-                if part is not None:
-                    if not all(one.is_finite() for one in part.coeffs()):
+            polynomials = value.parts if isinstance(value, Model) else [arb_poly([float(value)])]
+            for k, polynomial in enumerate(polynomials):
+                if polynomial is not None:
+                    if not all(c.is_finite() for c in polynomial.coeffs()):
                         raise Unchecked("an entry of the system is not finite")
-                    found[k][i][j] = part
-        return frame, found
+                    tables[k][i][j] = polynomial
+        return frame, tables
 
 
 def _slow(most: Array) -> Array | None:

@@ -36,8 +36,8 @@ class Plant:
     @staticmethod
     def of(system: System, horizon: float) -> Plant:
         """Return the plant of a system up to the horizon."""
-        driven = int(system.controls + system.drifts)
-        return Plant(system.until(horizon), int(system.states), driven, driven + int(system.disturbances))
+        known_inputs = int(system.controls + system.drifts)
+        return Plant(system.until(horizon), int(system.states), known_inputs, known_inputs + int(system.disturbances))
 
     @property
     def is_timed(self) -> bool:
@@ -58,5 +58,5 @@ class Plant:
 def called(phase: Phase, p: np.ndarray) -> np.ndarray:
     """Return ``[A B c E]``, ``(d, d + w)``, of a phase at the time and the parameters ``p (1 + nu,)``, numbers of any
     kind."""
-    given, parts = p if phase.timed else p[1:], [phase.entry(name) for name in ("A", "B", "c", "E")]
-    return np.hstack([matrix_at(part, given) for part in parts if part is not None])
+    arguments, entries = p if phase.timed else p[1:], [phase.entry(name) for name in ("A", "B", "c", "E")]
+    return np.hstack([matrix_at(entry, arguments) for entry in entries if entry is not None])

@@ -56,22 +56,24 @@ class Powers:
         from flint import arb, arb_mat
 
         (d, columns), count, kept = self.off.shape, self.count, min(order, self.count)
-        a, b = ([one**n for n in range(count)] for one in (start, width))
+        a, b = ([x**n for n in range(count)] for x in (start, width))
         weights = [[a[n - j] * b[j] * comb(n, j) if n >= j else arb(0) for n in range(count)] for j in range(kept)]
-        size, moved = d * columns, []
+        size, coefficients = d * columns, []
         for row in (arb_mat(weights) * self._table).tolist():
-            parts = [arb_mat(d, columns, row[k : k + size]) for k in range(0, len(row), size)]
-            moved.append(Series(self.stack.monomials, parts))
-        beyond = shifted(float(start.abs_upper()), float(width.abs_upper()), count)[kept:].sum(axis=0)
-        return moved, np.einsum("n,nij->ij", beyond, self.sizes) * OUTWARD + self.off
+            matrices = [arb_mat(d, columns, row[k : k + size]) for k in range(0, len(row), size)]
+            coefficients.append(Series(self.stack.monomials, matrices))
+        dropped_weights = shifted(float(start.abs_upper()), float(width.abs_upper()), count)[kept:].sum(axis=0)
+        return coefficients, np.einsum("n,nij->ij", dropped_weights, self.sizes) * OUTWARD + self.off
 
     @cached_property
     def _table(self) -> arb_mat:
         """All entries of all coefficients, one row for each power."""
         from flint import arb_mat
 
-        entries, size = [part.entries() for part in self.stack.parts], self.off.size
-        return arb_mat([[x for part in entries for x in part[n * size : (n + 1) * size]] for n in range(self.count)])
+        entries, size = [matrix.entries() for matrix in self.stack.parts], self.off.size
+        return arb_mat(
+            [[x for values in entries for x in values[n * size : (n + 1) * size]] for n in range(self.count)]
+        )
 
     @cached_property
     def sizes(self) -> Array:
@@ -92,8 +94,8 @@ class VerifiedSegment:
 
     def at(self, share: arb) -> Series:
         """Return the flow at a share of the time, ``(d, d + w)``."""
-        (value,), off = self.within(share, share * 0, 1)
-        return value.within(off)
+        (value,), remainder = self.within(share, share * 0, 1)
+        return value.within(remainder)
 
     def within(self, start: arb, width: arb, order: int) -> tuple[list[Series], Array]:
         """Return the flow on the shares from ``start`` to ``start + width``: ``order`` coefficients, and an error
@@ -103,7 +105,7 @@ class VerifiedSegment:
     def first(self, count: int) -> tuple[list[Series], Array]:
         """Return the first ``count`` terms, and an upper bound ``(d, d + w)`` of the difference between their sum and
         the flow."""
-        return self.terms[:count], (sum((one.size for one in self.terms[count:]), self.off)) * OUTWARD
+        return self.terms[:count], (sum((term.size for term in self.terms[count:]), self.off)) * OUTWARD
 
     @property
     def end(self) -> Series:
@@ -116,19 +118,19 @@ class VerifiedSegment:
         from flint import arb_mat
 
         (rows, columns), first = self.terms[0].shape, self.terms[0]
-        parts = [
+        matrices = [
             arb_mat(rows * len(self.terms), columns, [x for term in self.terms for x in term.parts[k].entries()])
             for k in range(first.monomials.size)
         ]
-        return Powers(Series(first.monomials, parts), len(self.terms), self.off)
+        return Powers(Series(first.monomials, matrices), len(self.terms), self.off)
 
     def applied(self, columns: Series) -> Powers:
         """Return the flow times some columns of states and of the first inputs."""
         used = columns.shape[0]
         if used not in self._stacks:
             self._stacks[used] = self.powers.stack.columns(0, used)
-        off = self.off[:, :used] @ columns.size * OUTWARD
-        return Powers(self._stacks[used] * columns, self.powers.count, off)
+        remainder = self.off[:, :used] @ columns.size * OUTWARD
+        return Powers(self._stacks[used] * columns, self.powers.count, remainder)
 
 
 def shifted(start: float, width: float, count: int) -> Array:
@@ -203,17 +205,17 @@ def verify(equation: Equation, terms: Sequence[Series], units: Array) -> Array:
     longer = LONGER ** (last + max(len(A), len(F)) + 1) * OUTWARD
     defects = [terms[n + 1].scaled(ball(n + 1)) - equation.slope(terms, n) for n in range(last)]
     orders = np.array([1.0, *range(1, last + 1)])[:, None, None]
-    missed = (sizes_of([terms[0] - equation.begin, *defects]) / orders).sum(axis=0)
+    residual = (sizes_of([terms[0] - equation.begin, *defects]) / orders).sum(axis=0)
     sizes, paces, drives = map(sizes_of, (terms, A, F))
     for n in range(last, last + max(len(A), len(F))):
         for k in range(max(0, n - last), min(n + 1, len(A))):
-            missed = missed + paces[k] @ sizes[n - k] / (n + 1)
+            residual = residual + paces[k] @ sizes[n - k] / (n + 1)
         if n < len(F):
-            missed[:, d:] += drives[n] / (n + 1)
-    growth = sum(pace(one, units) / (k + 1) for k, one in enumerate(paces)) * longer
+            residual[:, d:] += drives[n] / (n + 1)
+    growth = sum(pace(rates, units) / (k + 1) for k, rates in enumerate(paces)) * longer
     if not growth <= FAR:
         raise Unchecked("the system is too fast for a part of its horizon")
-    worst = (missed / units[:, None]).max(axis=0, initial=0.0) * (np.exp(growth) * longer)
+    worst = (residual / units[:, None]).max(axis=0, initial=0.0) * (np.exp(growth) * longer)
     return np.asarray(units[:, None] * worst * OUTWARD)
 
 
@@ -235,18 +237,18 @@ class Equation:
     @cached_property
     def _inputs(self) -> list[Series]:
         d = self.A[0].shape[0]
-        none = Series.constant(self.A[0].monomials, zeros(d, d))
-        return [none.beside(one) for one in self.F]
+        zero = Series.constant(self.A[0].monomials, zeros(d, d))
+        return [zero.beside(term) for term in self.F]
 
     def slope(self, terms: Sequence[Series], n: int) -> Series:
         """Return the term of order ``n`` of ``A P + [0 F]``; for the same terms of ``P`` it is remembered."""
         count = min(n + 1, len(self.A))
         factors = [terms[n - k] for k in range(count)]
-        known = self._known.get(n)
-        if known is None or not all(a is b for a, b in zip(known[0], factors, strict=True)):
-            found = dot(self.A[:count], factors)
-            known = self._known[n] = factors, found + self._inputs[n] if n < len(self.F) else found
-        return known[1]
+        cached = self._known.get(n)
+        if cached is None or not all(a is b for a, b in zip(cached[0], factors, strict=True)):
+            product = dot(self.A[:count], factors)
+            cached = self._known[n] = factors, product + self._inputs[n] if n < len(self.F) else product
+        return cached[1]
 
 
 def _inverse(value: int) -> arb:

@@ -27,15 +27,15 @@ def modes_at(system: System, parameter: Sequence[float]) -> list[dict[str, arb_m
     system."""
     p = np.empty(1 + len(parameter), dtype=object)
     p[:] = [POINT.number(ball(value)) for value in (0.0, *parameter)]
-    found = []
+    matrices = []
     for mode in system.modes:
         table = [
             [value.constant if isinstance(value, Model) else ball(value) for value in row] for row in called(mode, p)
         ]
         d, m = mode.states, mode.controls + (mode.c is not None)
         cuts = {"A": slice(0, d), "B": slice(d, d + m), "E": slice(d + m, None)}
-        found.append({name: stacked([row[cut] for row in table]) for name, cut in cuts.items()})
-    return found
+        matrices.append({name: stacked([row[cut] for row in table]) for name, cut in cuts.items()})
+    return matrices
 
 
 def held_about(A: Array, inputs: Array, time: float) -> tuple[Array, Array]:
@@ -46,11 +46,11 @@ def held_about(A: Array, inputs: Array, time: float) -> tuple[Array, Array]:
     d, size = A.shape[0], float(np.abs(A).sum(axis=1).max(initial=0.0)) * time
     halvings = max(0, int(np.ceil(np.log2(2.0 * size)))) if 0.0 < size < np.inf else 0
     short = time / 2.0**halvings
-    flow, driven, term = np.eye(d), np.eye(d) * short, np.eye(d)
+    flow, integral, term = np.eye(d), np.eye(d) * short, np.eye(d)
     for order in range(1, TERMS + 1):
         term = term @ A * (short / order)
-        flow, driven = flow + term, driven + term * (short / (order + 1))
-    driven = driven @ inputs
+        flow, integral = flow + term, integral + term * (short / (order + 1))
+    integral = integral @ inputs
     for _ in range(halvings):
-        flow, driven = flow @ flow, driven + flow @ driven
-    return flow, driven
+        flow, integral = flow @ flow, integral + flow @ integral
+    return flow, integral

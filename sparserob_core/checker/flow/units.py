@@ -45,15 +45,15 @@ def balanced(A: Array, horizon: float, speed: Array) -> Array:
     rates = np.zeros((speed.size + 1, speed.size + 1))
     rates[:-1, :-1], rates[:-1, -1] = np.abs(A), speed
     np.fill_diagonal(rates, 0.0)
-    through = reached = speed
+    effects = term = speed
     with np.errstate(over="ignore", invalid="ignore"):
-        for turn in range(1, speed.size):
-            reached = horizon / turn * (rates[:-1, :-1] @ reached)
-            through = through + reached
-        rates[:-1, -1] = np.where(speed < FAINT * through, 0.0, speed)
+        for order in range(1, speed.size):
+            term = horizon / order * (rates[:-1, :-1] @ term)
+            effects = effects + term
+        rates[:-1, -1] = np.where(speed < FAINT * effects, 0.0, speed)
     rates[rates < LEAST] = 0.0  # outward rounding makes such rates of zeros; they have no reciprocal
-    driven = np.where(rates > 0.0, rates, np.inf)
-    rates = np.maximum(rates, (1.0 / horizon / horizon / driven).T)
+    divisors = np.where(rates > 0.0, rates, np.inf)
+    rates = np.maximum(rates, (1.0 / horizon / horizon / divisors).T)
     exponents = np.zeros(speed.size + 1)
     for _ in range(SWEEPS):
         for i in range(exponents.size):

@@ -91,12 +91,13 @@ class Disturbances:
         bound, classes = self.problem.disturbance, self.problem.disturbance_class
         if self.timing.answering or self.problem.measurable is None or bound is None:
             return bound
-        parts, kinds = ((bound,), (classes,)) if isinstance(classes, str) else (_parts(bound), classes)
-        middles = [
-            one if kind != "measurable" else Box(*2 * (middle(one),)) for one, kind in zip(parts, kinds, strict=True)
+        factors, kinds = ((bound,), (classes,)) if isinstance(classes, str) else (_parts(bound), classes)
+        sets = [
+            factor if kind != "measurable" else Box(*2 * (middle(factor),))
+            for factor, kind in zip(factors, kinds, strict=True)
         ]
-        found = product(middles)
-        return None if isinstance(classes, str) and not middle(found).any() else found
+        held_set = product(sets)
+        return None if isinstance(classes, str) and not middle(held_set).any() else held_set
 
 
 def _parts(bound: ConvexSet) -> Sequence[ConvexSet]:

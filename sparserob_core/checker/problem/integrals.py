@@ -55,9 +55,9 @@ class Above:
     def __call__(self, p: object) -> object:
         table = np.asarray(self.top(p) if callable(self.top) else self.top)
         (n, columns), (k, width) = table.shape, self.below.shape
-        whole = np.zeros((n + k, width), dtype=object)
-        whole[:n, :columns], whole[n:] = table, self.below
-        return whole
+        enlarged = np.zeros((n + k, width), dtype=object)
+        enlarged[:n, :columns], enlarged[n:] = table, self.below
+        return enlarged
 
 
 Rows: TypeAlias = list[PathConstraint | MixedConstraint | IntegralConstraint]
@@ -76,20 +76,20 @@ def spelt(problem: OptimalControlProblem) -> OptimalControlProblem:
     InputError
         For a constraint that is not among the `DERIVED` ones, so that no constraint is ignored.
     """
-    every = [(name, entry) for name, entries in problem.lists.items() for entry in entries]
-    for name, entry in every:
+    constraints = [(name, entry) for name, entries in problem.lists.items() for entry in entries]
+    for name, entry in constraints:
         if type(entry) not in DERIVED:
             expected = "a constraint that the checker derives too"
             raise InputError(path=name, expected=expected, got=type(entry).__name__)
-    if all(name in ("path", "integral") for name, _ in every):
+    if all(name in ("path", "integral") for name, _ in constraints):
         return problem
-    found: dict[str, Any] = {name: [] for name in problem.lists}
+    lists: dict[str, Any] = {name: [] for name in problem.lists}
     for name, entries in problem.lists.items():
         for i, entry in enumerate(entries):
-            called = entry.name or (name if len(entries) == 1 else f"{name}[{i}]")
-            for row in DERIVED[type(entry)](entry, called):
-                found["integral" if isinstance(row, IntegralConstraint) else "path"].append(row)
-    return replace(problem, **found)
+            label = entry.name or (name if len(entries) == 1 else f"{name}[{i}]")
+            for row in DERIVED[type(entry)](entry, label):
+                lists["integral" if isinstance(row, IntegralConstraint) else "path"].append(row)
+    return replace(problem, **lists)
 
 
 def integrating(problem: OptimalControlProblem) -> OptimalControlProblem:
@@ -114,7 +114,9 @@ def integrating(problem: OptimalControlProblem) -> OptimalControlProblem:
         ],
         integral=(),
         names=_named(problem, coordinates),
-        commanded=tuple(d + i for i, one in enumerate(coordinates) if one.g.any() and problem.execution is not None),
+        commanded=tuple(
+            d + i for i, coordinate in enumerate(coordinates) if coordinate.g.any() and problem.execution is not None
+        ),
     )
 
 
@@ -133,23 +135,24 @@ def _coordinates(
     coordinates, windows = list[Coordinate](), list[tuple[str, float, list[tuple[list[int], float, float]]]]()
     for number, entry in enumerate(problem.integral):
         H, G = np.reshape(np.asarray(entry.H), (-1, d)), np.reshape(np.asarray(entry.G), (-1, m))
-        late = problem.system.delay if G.any() else 0.0
+        delay = problem.system.delay if G.any() else 0.0
         assert entry.stop is not None
-        judged, sums = min(entry.stop + late, problem.horizon), []
-        called = entry.name or ("integral" if len(problem.integral) == 1 else f"integral[{number}]")
+        judged_at, sums = min(entry.stop + delay, problem.horizon), []
+        label = entry.name or ("integral" if len(problem.integral) == 1 else f"integral[{number}]")
         bounds = zip(np.asarray(entry.lower).tolist(), np.asarray(entry.upper).tolist(), strict=True)
         for row, (h, g, (lower, upper)) in enumerate(zip(H, G, bounds, strict=True)):
-            name, unit = called + (f" {row + 1}" if len(H) > 1 else ""), _unit(problem.names, h, g)
-            made = [Coordinate(h, g, entry.start, entry.stop, name, unit)]
-            if g.any() and (late or problem.execution is not None):  # commands count, their errors do not
-                both = [f"{name} of states", f"{name} of controls"] if h.any() else [name]
-                made = [Coordinate(0.0 * h, g, entry.start + late, judged, both[-1], unit)]
-                made = [Coordinate(h, 0.0 * g, entry.start, entry.stop, both[0], unit)] * (len(both) - 1) + made
-            sums.append(([d + len(coordinates) + i for i in range(len(made))], lower, upper))
-            coordinates += made
-        windows.append((called, judged, sums))
-    if not problem.system.switches and not any(one.begin > 0.0 for one in coordinates):
-        coordinates = [replace(one, end=problem.horizon) for one in coordinates]  # a system of one phase remains one
+            name, unit = label + (f" {row + 1}" if len(H) > 1 else ""), _unit(problem.names, h, g)
+            coords = [Coordinate(h, g, entry.start, entry.stop, name, unit)]
+            if g.any() and (delay or problem.execution is not None):  # commands count, their errors do not
+                names = [f"{name} of states", f"{name} of controls"] if h.any() else [name]
+                coords = [Coordinate(0.0 * h, g, entry.start + delay, judged_at, names[-1], unit)]
+                coords = [Coordinate(h, 0.0 * g, entry.start, entry.stop, names[0], unit)] * (len(names) - 1) + coords
+            sums.append(([d + len(coordinates) + i for i in range(len(coords))], lower, upper))
+            coordinates += coords
+        windows.append((label, judged_at, sums))
+    if not problem.system.switches and not any(coordinate.begin > 0.0 for coordinate in coordinates):
+        # a system of one phase remains one
+        coordinates = [replace(coordinate, end=problem.horizon) for coordinate in coordinates]
     return coordinates, windows
 
 
@@ -174,41 +177,46 @@ class RunningIntegrals:
         if not problem.integral or not system.is_constant or system.parameters is not None:
             return None
         coordinates, _ = _coordinates(problem)
-        whole = _with(system.phases[0], [(one.h, one.g) for one in coordinates])
-        ends = np.array([[one.begin, one.end] for one in coordinates])
-        return RunningIntegrals(System((whole,), None, system.delay), *ends.T)
+        phase = _with(system.phases[0], [(coordinate.h, coordinate.g) for coordinate in coordinates])
+        windows = np.array([[coordinate.begin, coordinate.end] for coordinate in coordinates])
+        return RunningIntegrals(System((phase,), None, system.delay), *windows.T)
 
     def is_beside(self, phase: Phase, d: int) -> bool:
         """Return True where a phase agrees with this system in the first ``d`` states, whatever is integrated with
         them."""
         pairs = [(phase.entry(name), self.system.phases[0].entry(name)) for name in PARTS]
-        if phase.domain is not None or any((one is None) != (other is None) for one, other in pairs):
+        if phase.domain is not None or any(
+            (entry is None) != (running_entry is None) for entry, running_entry in pairs
+        ):
             return False
-        return all(one is None or np.array_equal(np.asarray(one)[:d], np.asarray(other)[:d]) for one, other in pairs)
+        return all(
+            entry is None or np.array_equal(np.asarray(entry)[:d], np.asarray(running_entry)[:d])
+            for entry, running_entry in pairs
+        )
 
     def parts(self, c: Array) -> list[tuple[Array, float]]:
         """Return rows ``(d + k,)`` of that system, each with the time when it ends, which add up to a row ``c (d +
         k,)``."""
         d = c.size - self.begins.size
-        found, ends = [(np.append(c[:d], np.zeros(self.begins.size)), np.inf)], np.stack([self.begins, self.ends])
+        rows, ends = [(np.append(c[:d], np.zeros(self.begins.size)), np.inf)], np.stack([self.begins, self.ends])
         for begin, end in np.unique(ends[:, c[d:] != 0.0], axis=1).T.tolist():
-            mine = (self.begins == begin) & (self.ends == end)
-            row = np.append(np.zeros(d), np.where(mine, c[d:], 0.0))
-            found += [(row, end)] + ([(-row, begin)] if begin > 0.0 else [])
-        return [(row, until) for row, until in found if row.any()] or found[:1]
+            in_window = (self.begins == begin) & (self.ends == end)
+            row = np.append(np.zeros(d), np.where(in_window, c[d:], 0.0))
+            rows += [(row, end)] + ([(-row, begin)] if begin > 0.0 else [])
+        return [(row, until) for row, until in rows if row.any()] or rows[:1]
 
 
 def _larger(system: System, coordinates: list[Coordinate], horizon: float) -> System:
     """Return the system with its coordinates, divided where one of them begins or ends."""
     switches = [phase.begin for phase in system.phases[1:]]
-    turns = [*switches, horizon]
-    for time in sorted({t for one in coordinates for t in (one.begin, one.end)}):
-        if all(abs(time - turn) > APART * horizon for turn in (0.0, *turns)):
-            turns.append(time)
+    boundaries = [*switches, horizon]
+    for time in sorted({t for coordinate in coordinates for t in (coordinate.begin, coordinate.end)}):
+        if all(abs(time - boundary) > APART * horizon for boundary in (0.0, *boundaries)):
+            boundaries.append(time)
     phases = []
-    for begin, until in pairwise([0.0, *sorted(turns)]):
-        which = sum(switch <= begin for switch in switches)
-        phases.append(_with(system.phases[which], list(_acting(coordinates, begin, until))).between(begin, until))
+    for begin, until in pairwise([0.0, *sorted(boundaries)]):
+        number = sum(switch <= begin for switch in switches)
+        phases.append(_with(system.phases[number], list(_acting(coordinates, begin, until))).between(begin, until))
     return system.in_phases(phases)
 
 
@@ -216,9 +224,9 @@ def _acting(coordinates: list[Coordinate], begin: float, until: float) -> Iterat
     """Yield the rates of the coordinates on an interval of time, which lies inside the window of each or outside of
     it."""
     middle = (begin + until) / 2
-    for one in coordinates:
-        share = float(one.begin < middle < one.end)
-        yield share * one.h, share * one.g
+    for coordinate in coordinates:
+        share = float(coordinate.begin < middle < coordinate.end)
+        yield share * coordinate.h, share * coordinate.g
 
 
 def _with(phase: Phase, rates: list[tuple[Array, Array]]) -> Phase:
@@ -229,11 +237,11 @@ def _with(phase: Phase, rates: list[tuple[Array, Array]]) -> Phase:
         "E": np.zeros((k, phase.disturbances)),
         "c": np.zeros((k, 1)),
     }
-    given = {name: (phase.entry(name), part) for name, part in below.items() if phase.entry(name) is not None}
-    made: dict[str, Any] = {name: Above(entry, part) for name, (entry, part) in given.items()}
+    pairs = {name: (phase.entry(name), rows) for name, rows in below.items() if phase.entry(name) is not None}
+    matrices: dict[str, Any] = {name: Above(entry, rows) for name, (entry, rows) in pairs.items()}
     if phase.domain is None:
-        made = {name: np.asarray(entry(()), dtype=float) for name, entry in made.items()}
-    return replace(phase, A=made["A"], B=made["B"], E=made["E"], c=made.get("c"))
+        matrices = {name: np.asarray(entry(()), dtype=float) for name, entry in matrices.items()}
+    return replace(phase, A=matrices["A"], B=matrices["B"], E=matrices["E"], c=matrices.get("c"))
 
 
 def _freed(entry: PathConstraint | MixedConstraint, size: int) -> PathConstraint | MixedConstraint:
@@ -241,20 +249,20 @@ def _freed(entry: PathConstraint | MixedConstraint, size: int) -> PathConstraint
         H = np.asarray(entry.H)
         return replace(entry, H=np.pad(H, ((0, 0), (0, size - H.shape[1]))))
     rows = None if entry.relative_to is None else np.asarray(entry.relative_to)
-    moved = None if rows is None else np.pad(rows, ((0, 0), (0, size + 1 - rows.shape[1])))
-    return replace(entry, set=_free(entry.set, size), relative_to=moved)
+    padded = None if rows is None else np.pad(rows, ((0, 0), (0, size + 1 - rows.shape[1])))
+    return replace(entry, set=_free(entry.set, size), relative_to=padded)
 
 
 def _free(bound: ConvexSet, size: int) -> ConvexSet:
     """Return a set of more coordinates: the first ones are in the given set, the others are free."""
-    more = size - bound.dimension
+    extra = size - bound.dimension
     if isinstance(bound, Box):
         ends = ((bound.lower, -np.inf), (bound.upper, np.inf))
-        return Box(*(np.pad(side, (0, more), constant_values=far) for side, far in ends))
-    flat = bound.halfspaces()
-    if flat is None and isinstance(bound, Cylinder) and bound.slopes is not None:
-        return Cylinder(bound.base, size, np.pad(bound.slopes, ((0, 0), (0, more))))
-    return Cylinder(bound, size) if flat is None else Polytope(np.pad(flat[0], ((0, 0), (0, more))), flat[1])
+        return Box(*(np.pad(side, (0, extra), constant_values=infinity) for side, infinity in ends))
+    facets = bound.halfspaces()
+    if facets is None and isinstance(bound, Cylinder) and bound.slopes is not None:
+        return Cylinder(bound.base, size, np.pad(bound.slopes, ((0, 0), (0, extra))))
+    return Cylinder(bound, size) if facets is None else Polytope(np.pad(facets[0], ((0, 0), (0, extra))), facets[1])
 
 
 def with_zeros(problem: OptimalControlProblem, more: int) -> dict[str, Any]:
@@ -262,50 +270,50 @@ def with_zeros(problem: OptimalControlProblem, more: int) -> dict[str, Any]:
 
     The ``more`` states follow those of the problem, begin at 0 and cost nothing.
     """
-    begun, zero, d = problem.initial_set, np.zeros(more), problem.system.states
-    if isinstance(begun, Box):
-        begun = Box(np.append(begun.lower, zero), np.append(begun.upper, zero))
-    elif begun is not None and more:
-        begun = Product((begun, Box(zero, zero)))
+    initial_set, zeros, d = problem.initial_set, np.zeros(more), problem.system.states
+    if isinstance(initial_set, Box):
+        initial_set = Box(np.append(initial_set.lower, zeros), np.append(initial_set.upper, zeros))
+    elif initial_set is not None and more:
+        initial_set = Product((initial_set, Box(zeros, zeros)))
     state, _, final = (
         None if term is None else Quadratic(np.pad(term.Q, (0, more)), np.pad(term.reference, (0, more)))
         for term in problem.cost.terms
     )
-    measured = problem.measurements or Measurements(np.eye(d))
+    measurements = problem.measurements or Measurements(np.eye(d))
     return {
-        "initial_state": np.concatenate([np.asarray(problem.initial_state), zero]),
-        "initial_set": begun,
+        "initial_state": np.concatenate([np.asarray(problem.initial_state), zeros]),
+        "initial_set": initial_set,
         "cost": replace(problem.cost, state=state, final=final),
-        "measurements": replace(measured, C=np.pad(np.asarray(measured.C), ((0, 0), (0, more)))),
+        "measurements": replace(measurements, C=np.pad(np.asarray(measurements.C), ((0, 0), (0, more)))),
     }
 
 
 def _summed(sums: list[tuple[list[int], float, float]], size: int) -> ConvexSet:
     """Return the set in which sums of coordinates are between their bounds."""
-    if all(len(which) == 1 for which, _, _ in sums):
+    if all(len(indices) == 1 for indices, _, _ in sums):
         lower, upper = np.full(size, -np.inf), np.full(size, np.inf)
-        for (place,), low, high in sums:
-            lower[place], upper[place] = low, high
+        for (index,), low, high in sums:
+            lower[index], upper[index] = low, high
         return Box(lower, upper)
-    rows = np.array([[float(i in which) for i in range(size)] for which, _, _ in sums])
+    rows = np.array([[float(i in indices) for i in range(size)] for indices, _, _ in sums])
     above, below = ([row[side] for row in sums] for side in (2, 1))
     H, h = np.vstack([rows, -rows]), np.append(above, np.negative(below))
     return Polytope(H[np.isfinite(h)], h[np.isfinite(h)])
 
 
 def _named(problem: OptimalControlProblem, coordinates: list[Coordinate]) -> Names:
-    given, d = problem.names, problem.system.states
-    units = [*(given.state_units or ("",) * d), *(one.unit for one in coordinates)]
-    called = [*(given.states or [f"x{i + 1}" for i in range(d)]), *(one.name for one in coordinates)]
-    return replace(given, states=called, state_units=units if any(units) else ())
+    names, d = problem.names, problem.system.states
+    units = [*(names.state_units or ("",) * d), *(coordinate.unit for coordinate in coordinates)]
+    labels = [*(names.states or [f"x{i + 1}" for i in range(d)]), *(coordinate.name for coordinate in coordinates)]
+    return replace(names, states=labels, state_units=units if any(units) else ())
 
 
 def _unit(names: Names, h: Array, g: Array) -> str:
     """Return the unit of an integral, that of the integrand times that of time; empty where terms have different
     units."""
-    given = [(h, names.state_units), (g, names.control_units)]
-    every = {units[i] if units else "" for values, units in given for i in np.flatnonzero(values).tolist()}
-    (unit,) = every if len(every) == 1 else ("",)
+    pairs = [(h, names.state_units), (g, names.control_units)]
+    distinct_units = {units[i] if units else "" for values, units in pairs for i in np.flatnonzero(values).tolist()}
+    (unit,) = distinct_units if len(distinct_units) == 1 else ("",)
     if not (unit and names.time):
         return ""
     head, slash, per = unit.rpartition("/")

@@ -33,13 +33,13 @@ def on_one_grid(problem: OptimalControlProblem, dictionary: Dictionary) -> tuple
     if not dictionary.is_complete:
         raise Unchecked("beside breakpoints the checker knows dictionaries that take any value on each piece")
     assert problem.disturbance_breakpoints is not None
-    plain = dictionary.merged().breakpoints
-    own = tuple(plain if one is None else one for one in problem.disturbance_breakpoints)
+    default = dictionary.merged().breakpoints
+    grids = tuple(default if breakpoints is None else breakpoints for breakpoints in problem.disturbance_breakpoints)
     joint: list[float] = []
-    for time in sorted({time for times in own for time in times[:-1].tolist()}):
+    for time in sorted({time for times in grids for time in times[:-1].tolist()}):
         if not joint or time - joint[-1] > SAME * problem.horizon:
             joint.append(time)
-    return replace(problem, disturbance_breakpoints=own), Dictionary.indicators([*joint, dictionary.horizon])
+    return replace(problem, disturbance_breakpoints=grids), Dictionary.indicators([*joint, dictionary.horizon])
 
 
 @final
@@ -63,14 +63,14 @@ class Lasting:
             return None
         if not isinstance(problem.disturbance, Product):
             raise Unchecked("of disturbances with breakpoints of their own, the checker knows lists of sets only")
-        parts, column = [], 0
-        for part, times in zip(problem.disturbance.parts, problem.disturbance_breakpoints, strict=True):
+        pairs, column = [], 0
+        for factor, times in zip(problem.disturbance.parts, problem.disturbance_breakpoints, strict=True):
             assert times is not None
             slack = SAME * problem.horizon
             firsts = [bisect_right(changes, time + slack) - 1 for time in times[:-1].tolist()]
-            parts.append((slice(column, column + part.dimension), np.array(firsts)))
-            column += part.dimension
-        return Lasting(changes, tuple(parts))
+            pairs.append((slice(column, column + factor.dimension), np.array(firsts)))
+            column += factor.dimension
+        return Lasting(changes, tuple(pairs))
 
     def gathered(self, mid: Array, rad: Array) -> tuple[Array, Array]:
         """Return the coefficients of the pieces, added up over the intervals on which a component has one value.
@@ -89,29 +89,31 @@ class Lasting:
         """
         mid, rad = mid.copy(), rad.copy()
         for columns, firsts in self.parts:
-            begun = firsts[firsts < mid.shape[0]]
-            here, off = mid[..., columns, :], rad[..., columns, :]
-            off = off + rounding(mid.shape[0]) * np.abs(here)
-            here, off = (np.add.reduceat(one, begun, axis=0) for one in (here, off))
+            starts = firsts[firsts < mid.shape[0]]
+            values, errors = mid[..., columns, :], rad[..., columns, :]
+            errors = errors + rounding(mid.shape[0]) * np.abs(values)
+            values, errors = (np.add.reduceat(array, starts, axis=0) for array in (values, errors))
             mid[..., columns, :], rad[..., columns, :] = 0.0, 0.0
-            mid[begun, ..., columns, :], rad[begun, ..., columns, :] = here, off * OUTWARD
+            mid[starts, ..., columns, :], rad[starts, ..., columns, :] = values, errors * OUTWARD
         return mid, rad
 
     def may_jump(self, time: float) -> np.ndarray:
         """Return which components ``(mw,)`` may have another value from a time on."""
         piece = bisect_right(self.changes, time) - 1
-        begins = self.changes[piece] == time
-        return np.concatenate([np.full(one.stop - one.start, begins and piece in firsts) for one, firsts in self.parts])
+        is_breakpoint = self.changes[piece] == time
+        return np.concatenate(
+            [np.full(columns.stop - columns.start, is_breakpoint and piece in firsts) for columns, firsts in self.parts]
+        )
 
 
 def summed(lasting: Lasting | None, weights: Sequence[Sequence[arb]]) -> list[list[arb]]:
     """Return weights ``(mw,)`` on every piece, added up exactly to the first piece of the interval on which a component
     is held."""
-    found = [list(one) for one in weights]
+    sums = [list(row) for row in weights]
     for columns, firsts in () if lasting is None else lasting.parts:
         first = 0
-        for piece in range(len(found)):
+        for piece in range(len(sums)):
             first = piece if piece in firsts else first
             for j in range(columns.start, columns.stop) if piece != first else ():
-                found[first][j], found[piece][j] = found[first][j] + found[piece][j], ball(0)
-    return found
+                sums[first][j], sums[piece][j] = sums[first][j] + sums[piece][j], ball(0)
+    return sums

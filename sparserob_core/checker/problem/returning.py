@@ -27,19 +27,19 @@ def returning(problem: OptimalControlProblem) -> OptimalControlProblem:
     where there is only one initial state. It is derived from the initial states alone, whatever the problem's records
     say.
     """
-    bound, end, alone = problem.initial_set, problem.horizon, single(problem)
+    bound, end, fixed = problem.initial_set, problem.horizon, single(problem)
     path = [entry for entry in problem.windows if not isinstance(entry, Return)]
-    if not problem.repeat or bound is None or len(alone) == problem.system.states:
+    if not problem.repeat or bound is None or len(fixed) == problem.system.states:
         return replace(problem, path=path) if len(path) < len(problem.path) else problem
-    free = np.isin(np.arange(bound.dimension), alone)
+    free = np.isin(np.arange(bound.dimension), fixed)
     if free.any():
         if not isinstance(bound, Box):
             raise Unchecked("of a flat set of initial states, the checker knows boxes only")
         bound = Box(np.where(free, -np.inf, bound.lower), np.where(free, np.inf, bound.upper))
     centre = np.asarray(problem.initial_state, dtype=float)
-    moved = np.column_stack([[0.0, end], np.vstack([centre, centre])]) if centre.any() else None
-    back = Return(bound.scaled(1.0 - INSIDE), end, end, RETURN, moved)
-    return replace(problem, path=[*path, back])
+    reference = np.column_stack([[0.0, end], np.vstack([centre, centre])]) if centre.any() else None
+    return_constraint = Return(bound.scaled(1.0 - INSIDE), end, end, RETURN, reference)
+    return replace(problem, path=[*path, return_constraint])
 
 
 def single(problem: OptimalControlProblem) -> list[int]:
@@ -48,5 +48,5 @@ def single(problem: OptimalControlProblem) -> list[int]:
     if bound is None:
         return list(range(d))
     axes = np.eye(d).tolist()
-    both = ((known(bound).support(balls(c)), known(bound).support(balls([-v for v in c]))) for c in axes)
-    return [i for i, (up, down) in enumerate(both) if (up + down).is_zero()]
+    heights = ((known(bound).support(balls(c)), known(bound).support(balls([-v for v in c]))) for c in axes)
+    return [i for i, (up, down) in enumerate(heights) if (up + down).is_zero()]

@@ -52,8 +52,8 @@ class Affine:
     def _sum(self, other: object, product: bool = False) -> Affine:
         if not isinstance(other, Affine):
             return self
-        both = product and bool(self.parameters) and bool(other.parameters)
-        return Affine(self.parameters | other.parameters, self.bent or other.bent or both)
+        is_bilinear = product and bool(self.parameters) and bool(other.parameters)
+        return Affine(self.parameters | other.parameters, self.bent or other.bent or is_bilinear)
 
     def _product(self, other: object) -> Affine:
         return self._sum(other, product=True)
@@ -94,10 +94,10 @@ class ParameterExpansion:
         box = self.system.parameters
         if not isinstance(box, Box):
             raise Unchecked("the checker knows boxes of parameters beside the time")
-        every = zip(box.lower.tolist(), box.upper.tolist(), self.middle, strict=True)
+        ranges = zip(box.lower.tolist(), box.upper.tolist(), self.middle, strict=True)
         return [
             _above(max(Fraction(high) - Fraction(middle), Fraction(middle) - Fraction(low)))
-            for low, high, middle in every
+            for low, high, middle in ranges
         ]
 
     def depends(self, entry: object) -> tuple[np.ndarray, np.ndarray]:
@@ -114,32 +114,32 @@ class ParameterExpansion:
             Where an entry is no affine function of the parameters.
         """
         movable = [frozenset([j]) if scale else frozenset[int]() for j, scale in enumerate(self.scales)]
-        whole = _called(entry, [Affine(), *map(Affine, movable)])
-        there, moves = np.zeros(whole.shape, dtype=bool), np.zeros((len(movable), *whole.shape), dtype=bool)
-        for place, value in np.ndenumerate(whole):
-            there[place] = isinstance(value, Affine) or float(value) != 0.0
+        matrix = _called(entry, [Affine(), *map(Affine, movable)])
+        nonzero, dependent = np.zeros(matrix.shape, dtype=bool), np.zeros((len(movable), *matrix.shape), dtype=bool)
+        for index, value in np.ndenumerate(matrix):
+            nonzero[index] = isinstance(value, Affine) or float(value) != 0.0
             if isinstance(value, Affine):
                 if value.bent:
                     raise Unchecked(NO_PLANE)
-                moves[(list(value.parameters), *place)] = True
-        return there, moves
+                dependent[(list(value.parameters), *index)] = True
+        return nonzero, dependent
 
     def tables(self, entry: object, time: object) -> list[np.ndarray]:
         """Return ``f_0, f_1, ..., f_nu`` of a matrix at a time.
 
         ``f_0`` is the matrix in the middle, and ``f_j`` its change where parameter ``j`` deviates by its `scales`.
         """
-        nothing: Any = 0.0 * time  # type: ignore[operator]  # a number of the kind of the time
-        middle, moves = [nothing + value for value in self.middle], self.depends(entry)[1]
-        found = [_called(entry, [time, *middle])]
-        for j, (scale, mine) in enumerate(zip(self.scales, moves, strict=True)):
-            added = np.zeros(mine.shape, dtype=object)
-            if mine.any():
-                far = _called(entry, [time, *middle[:j], middle[j] + scale, *middle[j + 1 :]])
-                for place in zip(*np.nonzero(mine), strict=True):
-                    added[place] = far[place] - found[0][place]
-            found.append(added)
-        return found
+        zero: Any = 0.0 * time  # type: ignore[operator]  # a number of the kind of the time
+        middle, dependent = [zero + value for value in self.middle], self.depends(entry)[1]
+        tables = [_called(entry, [time, *middle])]
+        for j, (scale, mask) in enumerate(zip(self.scales, dependent, strict=True)):
+            change = np.zeros(mask.shape, dtype=object)
+            if mask.any():
+                shifted = _called(entry, [time, *middle[:j], middle[j] + scale, *middle[j + 1 :]])
+                for index in zip(*np.nonzero(mask), strict=True):
+                    change[index] = shifted[index] - tables[0][index]
+            tables.append(change)
+        return tables
 
     @cached_property
     def is_affine(self) -> bool:
@@ -154,24 +154,30 @@ class ParameterExpansion:
     def moved(self) -> list[list[int]]:
         """The coordinates of every ``y_j``; raises `Unchecked` where the state is not affine in the parameters."""
         d, nu = self.system.states, len(self.middle)
-        steady, own, driven = np.zeros((d, d), dtype=bool), np.zeros((nu, d, d), dtype=bool), np.zeros((nu, d), bool)
+        coupling, dependent_coupling, affected = (
+            np.zeros((d, d), dtype=bool),
+            np.zeros((nu, d, d), dtype=bool),
+            np.zeros((nu, d), bool),
+        )
         for phase in self.system.phases:
             for name in PARTS:
                 entry = phase.entry(name)
                 if entry is None:
                     continue
-                there, others = self.depends(entry)
+                nonzero, dependent = self.depends(entry)
                 if name == "A":
-                    steady |= there
-                    own |= others
-                driven |= others.any(axis=2)
-        onward = np.minimum(np.eye(d) + steady, 1.0)
+                    coupling |= nonzero
+                    dependent_coupling |= dependent
+                affected |= dependent.any(axis=2)
+        reachable = np.minimum(np.eye(d) + coupling, 1.0)
         for _ in range(d.bit_length()):  # the states that a state can influence in 1, 2, 4, ... steps
-            onward = np.minimum(onward @ onward, 1.0)
-        found = [np.flatnonzero(onward @ start > 0.0).tolist() for start in driven.astype(float)]
-        if any(own[:, :, places].any() for places in found):
+            reachable = np.minimum(reachable @ reachable, 1.0)
+        coordinates = [
+            np.flatnonzero(reachable @ affected_states > 0.0).tolist() for affected_states in affected.astype(float)
+        ]
+        if any(dependent_coupling[:, :, states].any() for states in coordinates):
             raise Unchecked(NO_PLANE)
-        return found
+        return coordinates
 
     @property
     def size(self) -> int:
@@ -182,18 +188,18 @@ class ParameterExpansion:
         """Return the matrix ``(d, size)`` that gives ``x`` from all coordinates, at the shares ``s_j`` of the
         parameters."""
         d = self.system.states
-        found, column = np.zeros((d, self.size)), d
-        found[:, :d] = np.eye(d)
-        for share, places in zip(shares, self.moved, strict=True):
-            for place in places:
-                found[place, column] = share
+        projection, column = np.zeros((d, self.size)), d
+        projection[:, :d] = np.eye(d)
+        for share, states in zip(shares, self.moved, strict=True):
+            for state in states:
+                projection[state, column] = share
                 column += 1
-        return found
+        return projection
 
     def corners(self) -> Iterator[tuple[float, ...]]:
         """Return the corners of a box that contains all shares; a parameter without any effect has the share 0 only."""
         pairs = zip(self.scales, self.moved, strict=True)
-        return product(*((-1.0, 1.0) if scale and places else (0.0,) for scale, places in pairs))
+        return product(*((-1.0, 1.0) if scale and states else (0.0,) for scale, states in pairs))
 
 
 @final
@@ -207,16 +213,18 @@ class Larger:
 
     def __call__(self, p: Any) -> np.ndarray:
         """Return the matrix at a time ``(1,)``."""
-        whole, moved, d = self.parts.tables(self.entry, p[0]), self.parts.moved, self.parts.system.states
+        tables, coordinates, d = self.parts.tables(self.entry, p[0]), self.parts.moved, self.parts.system.states
         if self.name != "A":
-            return np.concatenate([whole[0], *(one[places] for one, places in zip(whole[1:], moved, strict=True))])
-        found, row = np.zeros((self.parts.size, self.parts.size), dtype=object), d
-        found[:d, :d] = whole[0]
-        for one, places in zip(whole[1:], moved, strict=True):
-            rows = slice(row, row + len(places))
-            found[rows, :d], found[rows, rows] = one[places], whole[0][np.ix_(places, places)]
-            row += len(places)
-        return found
+            return np.concatenate(
+                [tables[0], *(table[states] for table, states in zip(tables[1:], coordinates, strict=True))]
+            )
+        matrix, row = np.zeros((self.parts.size, self.parts.size), dtype=object), d
+        matrix[:d, :d] = tables[0]
+        for table, states in zip(tables[1:], coordinates, strict=True):
+            rows = slice(row, row + len(states))
+            matrix[rows, :d], matrix[rows, rows] = table[states], tables[0][np.ix_(states, states)]
+            row += len(states)
+        return matrix
 
 
 def parted(problem: OptimalControlProblem) -> OptimalControlProblem:
@@ -227,37 +235,37 @@ def parted(problem: OptimalControlProblem) -> OptimalControlProblem:
     system = problem.system
     if not system.varies or system.parameters is None:
         return problem
-    parts = ParameterExpansion(system, tuple(system.parameters.interior_point().tolist()))
-    if not parts.is_affine:  # then the flow is expanded on boxes of parameters
+    expansion = ParameterExpansion(system, tuple(system.parameters.interior_point().tolist()))
+    if not expansion.is_affine:  # then the flow is expanded on boxes of parameters
         return problem
-    d, more = system.states, parts.size - system.states
-    corners = [parts.seen(shares) for shares in parts.corners()]
-    reached = {place for places in parts.moved for place in places}
-    if any(reached & set(end.fixed.tolist()) for end in problem.terminal_equalities):
+    d, extra = system.states, expansion.size - system.states
+    corners = [expansion.seen(shares) for shares in expansion.corners()]
+    moved_states = {state for states in expansion.moved for state in states}
+    if any(moved_states & set(end.fixed.tolist()) for end in problem.terminal_equalities):
         raise Unchecked("the checker knows fixed final values of states that no parameter beside the time moves")
-    several = sum(not isinstance(entry, Return) for entry in problem.windows) > 1
-    called_as = [entry.name or (f"path[{i}]" if several else "path") for i, entry in enumerate(problem.windows)]
-    called = list(problem.names.states or [f"x{i + 1}" for i in range(d)])
+    is_numbered = sum(not isinstance(entry, Return) for entry in problem.windows) > 1
+    labels = [entry.name or (f"path[{i}]" if is_numbered else "path") for i, entry in enumerate(problem.windows)]
+    state_names = list(problem.names.states or [f"x{i + 1}" for i in range(d)])
     units = list(problem.names.state_units)
-    for name, scale, places in zip(system.names, parts.scales, parts.moved, strict=True):
-        called += [f"{called[i]} per {scale:.3g} {name}" for i in places]
-        units += [units[i] for i in places] if problem.names.state_units else []
+    for name, scale, states in zip(system.names, expansion.scales, expansion.moved, strict=True):
+        state_names += [f"{state_names[i]} per {scale:.3g} {name}" for i in states]
+        units += [units[i] for i in states] if problem.names.state_units else []
     return replace(
         problem,
-        **with_zeros(problem, more),
-        system=System(tuple(_larger(parts, phase) for phase in system.phases), None, system.delay),
-        path=[one for entry, name in zip(problem.path, called_as, strict=True) for one in _seen(entry, name, corners)],
+        **with_zeros(problem, extra),
+        system=System(tuple(_larger(expansion, phase) for phase in system.phases), None, system.delay),
+        path=[row for entry, name in zip(problem.path, labels, strict=True) for row in _seen(entry, name, corners)],
         terminal=[
-            one
+            bound
             for end in problem.terminal
-            for one in (
-                [Equality(np.pad(end.values, (0, more), constant_values=np.nan))]
+            for bound in (
+                [Equality(np.pad(end.values, (0, extra), constant_values=np.nan))]
                 if isinstance(end, Equality)
                 else _bounds(end, corners)
             )
         ],
         integral=[_sums(entry, corners) for entry in problem.integral],
-        names=replace(problem.names, states=called, state_units=units),
+        names=replace(problem.names, states=state_names, state_units=units),
     )
 
 
@@ -270,14 +278,24 @@ def _called(entry: object, arguments: list[Any]) -> np.ndarray:
 
 def _above(exact: Fraction) -> float:
     """Return the number itself, or the next double above it."""
-    found = float(exact)
-    return nextafter(found, inf) if Fraction(found) < exact else found
+    rounded = float(exact)
+    return nextafter(rounded, inf) if Fraction(rounded) < exact else rounded
 
 
 def _larger(parts: ParameterExpansion, phase: Phase) -> Phase:
-    made = {name: Larger(parts, name, phase.entry(name)) for name in PARTS if phase.entry(name) is not None}
+    matrices = {name: Larger(parts, name, phase.entry(name)) for name in PARTS if phase.entry(name) is not None}
     times = Box([phase.begin], [phase.until])
-    return Phase(made["A"], made["B"], made["E"], times, ("t",), made.get("c"), phase.begin, phase.until, timed=True)
+    return Phase(
+        matrices["A"],
+        matrices["B"],
+        matrices["E"],
+        times,
+        ("t",),
+        matrices.get("c"),
+        phase.begin,
+        phase.until,
+        timed=True,
+    )
 
 
 def _rows(blocks: list[Array]) -> Array:
@@ -291,14 +309,14 @@ def _bounds(bound: ConvexSet, corners: list[Array]) -> list[ConvexSet]:
     A set with flat sides becomes one polytope with the rows of all corners, another set becomes one set for each
     corner.
     """
-    flat = bound.halfspaces()
-    if flat is not None:
-        every = _rows([np.column_stack([flat[0] @ seen, flat[1]]) for seen in corners])
-        return [Polytope(every[:, :-1], every[:, -1])]
+    facets = bound.halfspaces()
+    if facets is not None:
+        rows = _rows([np.column_stack([facets[0] @ projection, facets[1]]) for projection in corners])
+        return [Polytope(rows[:, :-1], rows[:, -1])]
     base = bound.base if isinstance(bound, Cylinder) else bound
     b = base.dimension
-    leaning = list(dict.fromkeys(tuple(map(tuple, seen[:b, b:].tolist())) for seen in corners))
-    return [Cylinder(base, corners[0].shape[1], np.array(one)) for one in leaning]
+    distinct_slopes = list(dict.fromkeys(tuple(map(tuple, projection[:b, b:].tolist())) for projection in corners))
+    return [Cylinder(base, corners[0].shape[1], np.array(slopes)) for slopes in distinct_slopes]
 
 
 def _seen(
@@ -308,20 +326,25 @@ def _seen(
     d, size = corners[0].shape
     if isinstance(entry, MixedConstraint):
         H, G = np.asarray(entry.H), np.asarray(entry.G)
-        every = _rows(
-            [np.column_stack([H @ seen, G, np.broadcast_to(np.asarray(entry.h), len(H))]) for seen in corners]
+        table = _rows(
+            [
+                np.column_stack([H @ projection, G, np.broadcast_to(np.asarray(entry.h), len(H))])
+                for projection in corners
+            ]
         )
-        return [replace(entry, name=name, H=every[:, :size], G=every[:, size:-1], h=every[:, -1])]
+        return [replace(entry, name=name, H=table[:, :size], G=table[:, size:-1], h=table[:, -1])]
     rows = None if entry.relative_to is None else np.asarray(entry.relative_to)
-    moved = None if rows is None else np.pad(rows, ((0, 0), (0, size - d)))
-    found = _bounds(entry.set, corners)
+    padded = None if rows is None else np.pad(rows, ((0, 0), (0, size - d)))
+    bounds = _bounds(entry.set, corners)
     return [
-        replace(entry, name=name if len(found) == 1 else f"{name} at corner {k + 1}", set=one, relative_to=moved)
-        for k, one in enumerate(found)
+        replace(entry, name=name if len(bounds) == 1 else f"{name} at corner {k + 1}", set=bound, relative_to=padded)
+        for k, bound in enumerate(bounds)
     ]
 
 
 def _sums(entry: IntegralConstraint, corners: list[Array]) -> IntegralConstraint:
-    size, sides = corners[0].shape[1], [np.asarray(one, dtype=float) for one in (entry.lower, entry.upper)]
-    every = _rows([np.column_stack([np.asarray(entry.H) @ seen, np.asarray(entry.G), *sides]) for seen in corners])
-    return replace(entry, H=every[:, :size], G=every[:, size:-2], lower=every[:, -2], upper=every[:, -1])
+    size, sides = corners[0].shape[1], [np.asarray(side, dtype=float) for side in (entry.lower, entry.upper)]
+    table = _rows(
+        [np.column_stack([np.asarray(entry.H) @ projection, np.asarray(entry.G), *sides]) for projection in corners]
+    )
+    return replace(entry, H=table[:, :size], G=table[:, size:-2], lower=table[:, -2], upper=table[:, -1])

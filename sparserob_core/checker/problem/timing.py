@@ -29,8 +29,8 @@ class Timing:
     @cached_property
     def acting(self) -> list[float]:
         """The times at which the pieces of the control begin to act, from 0 on."""
-        later: list[float] = np.unique([0.0, *(self.control[:-1] + self.problem.system.delay)]).tolist()
-        return later
+        starts: list[float] = np.unique([0.0, *(self.control[:-1] + self.problem.system.delay)]).tolist()
+        return starts
 
     @property
     def until(self) -> float:
@@ -44,8 +44,8 @@ class Timing:
         self.clock.check()
         ends, last = (self.control[-1], self.disturbance[-1]), self.until
         measured = self.control.tolist() if self.answering else []
-        every = np.unique([*self.acting, *measured, *self.disturbance.tolist(), *self.problem.system.switches])
-        return [*every[(every < last) & ~np.isin(every, ends)].tolist(), last]
+        times = np.unique([*self.acting, *measured, *self.disturbance.tolist(), *self.problem.system.switches])
+        return [*times[(times < last) & ~np.isin(times, ends)].tolist(), last]
 
     def piece_at(self, time: float) -> int:
         """Return the piece of the `grid` that contains a time from 0 on; the last piece contains the end too."""
@@ -54,5 +54,7 @@ class Timing:
 
 def before(problem: OptimalControlProblem) -> list[float]:
     """Return the control ``(m,)`` that acts until the first piece of a delayed system acts."""
-    given = problem.initial_control
-    return [0.0] * problem.system.controls if given is None else [float(u) for u in np.asarray(given)]
+    initial_control = problem.initial_control
+    return (
+        [0.0] * problem.system.controls if initial_control is None else [float(u) for u in np.asarray(initial_control)]
+    )

@@ -20,9 +20,11 @@ def in_turns(problem: OptimalControlProblem) -> OptimalControlProblem:
     box of parameters.
     """
     system = problem.system
-    missed = problem.execution is not None and bool(system.switches or system.delay or system.parameter_count)
-    pushed = problem.measurable is not None and isinstance(system.parameters, Box)
-    if system.varies or not (missed or pushed):
+    is_execution_case = problem.execution is not None and bool(
+        system.switches or system.delay or system.parameter_count
+    )
+    is_measurable_case = problem.measurable is not None and isinstance(system.parameters, Box)
+    if system.varies or not (is_execution_case or is_measurable_case):
         return problem
     if not isinstance(system.parameters, Box | None):
         raise Unchecked("beside errors of execution the checker knows boxes of parameters")

@@ -110,27 +110,27 @@ class AdjointFlow:
     @cached_property
     def between(self) -> list[Enclosed]:
         """The transitions over 1, 2, ... steps, fewer than `apart`, ``(1, d, d)`` each."""
-        found: list[arb_mat] = []
+        transitions: list[arb_mat] = []
         shape = (1, self.states, self.states)
         for j in range(1, self.apart):
             self.clock.check()
-            place = floor(log2(j))
-            power = self.over(place)
-            found.append(power if j == 2**place else found[j - 2**place - 1] * power)
-        return [Enclosed.all([one], shape) for one in found]
+            exponent = floor(log2(j))
+            power = self.over(exponent)
+            transitions.append(power if j == 2**exponent else transitions[j - 2**exponent - 1] * power)
+        return [Enclosed.all([transition], shape) for transition in transitions]
 
     def _expanded(self, order: int, columns: arb_mat | None = None) -> Enclosed:
         """Return matrices ``(order + 1, d, n)`` that turn an adjoint at the beginning of a step into the terms of ``l``
         on this step, or of ``l`` times ``columns (d, n)``. The remainder is in the radius of the first."""
         self.clock.check()
-        terms, off = self.segment.first(order + 1)
-        every = [one.matrix for one in terms]
+        terms, remainder = self.segment.first(order + 1)
+        matrices = [term.matrix for term in terms]
         if columns is not None:
-            every, off = [one * columns for one in every], off @ Series.known(columns).size
-        every += [every[0] * 0] * (order + 1 - len(every))  # the series of a system may end earlier
-        found = Enclosed.all(every, (order + 1, *off.shape))
-        found.rad[0] += off * OUTWARD
-        return found
+            matrices, remainder = [matrix * columns for matrix in matrices], remainder @ Series.known(columns).size
+        matrices += [matrices[0] * 0] * (order + 1 - len(matrices))  # the series of a system may end earlier
+        enclosure = Enclosed.all(matrices, (order + 1, *remainder.shape))
+        enclosure.rad[0] += remainder * OUTWARD
+        return enclosure
 
     @cached_property
     def rows(self) -> Enclosed:
@@ -146,7 +146,7 @@ class AdjointFlow:
     def bending(self) -> Enclosed:
         """The matrices that turn an adjoint into the first terms of ``l'[A^2, A F, A^2 F]`` on a step,
         ``(J, d, d + 2 q)``."""
-        once, twice = (Series.known(self.A * one) for one in (self.F, self.A))
+        once, twice = (Series.known(self.A * matrix) for matrix in (self.F, self.A))
         return self._expanded(BENDING, twice.beside(once).beside(Series.known(self.A * once.matrix)).matrix)
 
 
@@ -184,17 +184,19 @@ class AdjointRow:
     @staticmethod
     def of_balls(motion: AdjointFlow, c: list[arb]) -> AdjointRow:
         """Return the adjoint of a row ``c (d,)`` of balls."""
-        found, place, count = [c], floor(log2(motion.apart)), motion.count // motion.apart + 1
-        while len(found) < BLOCK:
-            found += (stacked(found) * motion.over(place)).tolist()
-            place += 1
-        blocks = [stacked(found)]
+        rows, exponent, count = [c], floor(log2(motion.apart)), motion.count // motion.apart + 1
+        while len(rows) < BLOCK:
+            rows += (stacked(rows) * motion.over(exponent)).tolist()
+            exponent += 1
+        blocks = [stacked(rows)]
         while len(blocks) * BLOCK < count:
             motion.clock.check()
-            power, place = motion.over(place), place + 1
+            power, exponent = motion.over(exponent), exponent + 1
             blocks += [block * power for block in blocks[: -(-count // BLOCK) - len(blocks)]]
-        parts = [Enclosed.of(block) for block in blocks]
-        mid, rad = (np.concatenate(one)[:count] for one in zip(*((p.mid, p.rad) for p in parts), strict=True))
+        enclosures = [Enclosed.of(block) for block in blocks]
+        mid, rad = (
+            np.concatenate(arrays)[:count] for arrays in zip(*((p.mid, p.rad) for p in enclosures), strict=True)
+        )
         nodes = [np.empty((count, motion.apart, len(c))) for _ in range(2)]
         nodes[0][:, 0], nodes[1][:, 0] = mid, rad
         for j in range(1, motion.apart):
@@ -231,12 +233,12 @@ class AdjointRow:
         """The integrals of ``l'F`` from 0 to the end of every step, ``(N + 1, q)``. The radius grows from step to step
         by the error bound of this step, so that the error of a difference of two is bounded by the difference of their
         radii."""
-        moved, size = (
-            self.step * np.einsum("kjq,j->kq", part, self._weights)
-            for part in (self.driven.mid, np.abs(self.driven.mid))
+        increments, size = (
+            self.step * np.einsum("kjq,j->kq", terms, self._weights)
+            for terms in (self.driven.mid, np.abs(self.driven.mid))
         )
         rad = self.step * np.einsum("kjq,j->kq", self.driven.rad, self._weights) + rounding(ORDER + 2) * size
-        return Enclosed(accumulate_exactly(moved), _accumulated(rad) * OUTWARD)
+        return Enclosed(accumulate_exactly(increments), _accumulated(rad) * OUTWARD)
 
     def placed(self, times: Array) -> tuple[np.ndarray, Array]:
         """Return the step that holds each time, and the share of the step that has passed, both exact."""
@@ -247,20 +249,20 @@ class AdjointRow:
         """Return ``l`` at exact ``times (k,)``, ``(k, d)``."""
         steps, shares = self.placed(times)
         mid, rad = np.empty((2, times.size, self.motion.states))
-        whole = shares == 0.0
-        mid[whole], rad[whole] = self.nodes.mid[steps[whole]], self.nodes.rad[steps[whole]]
-        others = np.flatnonzero(~whole)
-        others = others[np.argsort(steps[others], kind="stable")]
-        several = max(1, AT_ONCE // self.motion.rows.mid[:, 0].size)
-        for start in range(0, others.size, several):
-            here = others[start : start + several]
-            used, which = np.unique(steps[here], return_inverse=True)
-            terms, off = _product(Enclosed(self.nodes.mid[used], self.nodes.rad[used]), self.motion.rows)
-            powers = shares[here][:, None] ** np.arange(ORDER + 1)
-            chosen = terms[which]
-            mid[here] = np.einsum("kjd,kj->kd", chosen, powers)
-            lost = np.einsum("kjd,kj->kd", off[which] + rounding(3 * ORDER) * np.abs(chosen), powers)
-            rad[here] = lost * OUTWARD
+        is_node = shares == 0.0
+        mid[is_node], rad[is_node] = self.nodes.mid[steps[is_node]], self.nodes.rad[steps[is_node]]
+        indices = np.flatnonzero(~is_node)
+        indices = indices[np.argsort(steps[indices], kind="stable")]
+        batch_size = max(1, AT_ONCE // self.motion.rows.mid[:, 0].size)
+        for start in range(0, indices.size, batch_size):
+            batch = indices[start : start + batch_size]
+            distinct, positions = np.unique(steps[batch], return_inverse=True)
+            terms, errors = _product(Enclosed(self.nodes.mid[distinct], self.nodes.rad[distinct]), self.motion.rows)
+            powers = shares[batch][:, None] ** np.arange(ORDER + 1)
+            chosen = terms[positions]
+            mid[batch] = np.einsum("kjd,kj->kd", chosen, powers)
+            error = np.einsum("kjd,kj->kd", errors[positions] + rounding(3 * ORDER) * np.abs(chosen), powers)
+            rad[batch] = error * OUTWARD
         return Enclosed(mid, rad)
 
     def integrals(self, times: Array) -> tuple[Enclosed, Array]:
@@ -284,11 +286,11 @@ class AdjointRow:
     def between(self, times: Array, start: Array | float, stop: Array | float) -> Enclosed:
         """Return what an input of 1 from ``start`` to ``stop`` adds to the row at exact times, ``(..., q)``. The radius
         allows for the rounding of differences of times."""
-        (since, one), (until, other) = subtract_times(times, start), subtract_times(times, stop)
-        (late, first), (early, second) = self.integrals(since), self.integrals(until)
+        (since, since_rounding), (until, until_rounding) = subtract_times(times, start), subtract_times(times, stop)
+        (late, late_rounding), (early, early_rounding) = self.integrals(since), self.integrals(until)
         mid = late.mid - early.mid
-        rad = np.abs(late.rad - early.rad) + (OUTWARD - 1.0) * (late.rad + early.rad) + first + second
-        rad = rad + HALF_ULP * np.abs(mid) + (one + other)[..., None] * self.fastest
+        rad = np.abs(late.rad - early.rad) + (OUTWARD - 1.0) * (late.rad + early.rad) + late_rounding + early_rounding
+        rad = rad + HALF_ULP * np.abs(mid) + (since_rounding + until_rounding)[..., None] * self.fastest
         return Enclosed(mid, rad * OUTWARD)
 
     @cached_property
@@ -303,15 +305,15 @@ class AdjointRow:
         if self.opposite is not None:
             return self.opposite.bends
         d, q, terms = self.motion.states, self.motion.F.ncols(), self.motion.bending
-        found = np.zeros((self.count, d + 2 * q))
-        several = max(1, AT_ONCE // (d + 2 * q))
-        for start in range(0, self.count, several):
-            steps = slice(start, min(start + several, self.count))
-            for one in zip(terms.mid[:, None], terms.rad[:, None], strict=True):
-                mid, rad = _product(Enclosed(self.nodes.mid[steps], self.nodes.rad[steps]), Enclosed(*one))
-                found[steps] += np.abs(mid[:, 0]) + rad[:, 0]
-        found *= OUTWARD
-        return found[:, :d], found[:, d : d + q], found[:, d + q :]
+        bounds = np.zeros((self.count, d + 2 * q))
+        batch_size = max(1, AT_ONCE // (d + 2 * q))
+        for start in range(0, self.count, batch_size):
+            steps = slice(start, min(start + batch_size, self.count))
+            for term in zip(terms.mid[:, None], terms.rad[:, None], strict=True):
+                mid, rad = _product(Enclosed(self.nodes.mid[steps], self.nodes.rad[steps]), Enclosed(*term))
+                bounds[steps] += np.abs(mid[:, 0]) + rad[:, 0]
+        bounds *= OUTWARD
+        return bounds[:, :d], bounds[:, d : d + q], bounds[:, d + q :]
 
 
 @final
@@ -329,47 +331,49 @@ class SupportIntegrals:
         """The columns of ``l'F`` on every step in powers of ``u`` from -1 to 1, ``(N, p + 1, w)``; their error bounds,
         which allow for rounding errors in the sum of two of their values; and bounds of their absolute values,
         ``(N, w)`` each."""
-        mid, rad = (part[:, :, self.columns] for part in (self.row.driven.mid, self.row.driven.rad))
+        mid, rad = (values[:, :, self.columns] for values in (self.row.driven.mid, self.row.driven.rad))
         size = np.abs(mid).sum(axis=1) * OUTWARD  # no larger in powers of ``u``, since ``|v| <= (1 + |u|) / 2``
-        off = rad.sum(axis=1) + (rounding(2 * ORDER) + rounding(size.shape[1] + 2 * ORDER)) * size
-        return np.einsum("ij,kjw->kiw", CENTRED, mid), off * OUTWARD, size
+        errors = rad.sum(axis=1) + (rounding(2 * ORDER) + rounding(size.shape[1] + 2 * ORDER)) * size
+        return np.einsum("ij,kjw->kiw", CENTRED, mid), errors * OUTWARD, size
 
     @cached_property
     def _heights(self) -> Array:
         """The upper bounds of the support functions on every step and its neighbours, ``(N, S)``."""
-        _, off, size = self._polynomials
-        found = (size + off) @ np.array([side.far for side in self.sides]).T * OUTWARD
-        around = np.pad(found, ((1, 1), (0, 0)), mode="edge")
-        return np.asarray(np.maximum(found, np.maximum(around[:-2], around[2:])))
+        _, errors, size = self._polynomials
+        heights = (size + errors) @ np.array([side.far for side in self.sides]).T * OUTWARD
+        padded = np.pad(heights, ((1, 1), (0, 0)), mode="edge")
+        return np.asarray(np.maximum(heights, np.maximum(padded[:-2], padded[2:])))
 
     def _parts(self, steps: np.ndarray, shares: Array) -> tuple[Array, Array, Array]:
         """Return the integrals over the first ``shares (k,)`` of ``steps (k,)``, and how much more and how much less
         they may be, ``(k, S)`` each."""
-        P, off, size = (part[steps] for part in self._polynomials)
-        found = []
+        P, errors, size = (values[steps] for values in self._polynomials)
+        integrals = []
         for side in self.sides:
-            value, more, less, tops = side.swept(P, off, size, 2.0 * shares - 1.0)
+            value, excess, deficit, tops = side.swept(P, errors, size, 2.0 * shares - 1.0)
             rounded = rounding(4 * ORDER) * 2.0 * tops
-            found.append((value, (more + rounded) * OUTWARD, (less + rounded) * OUTWARD))
-        value, more, less = (np.stack(part, axis=1) * (self.row.step / 2.0) for part in zip(*found, strict=True))
-        return value, more, less
+            integrals.append((value, (excess + rounded) * OUTWARD, (deficit + rounded) * OUTWARD))
+        value, excess, deficit = (
+            np.stack(values, axis=1) * (self.row.step / 2.0) for values in zip(*integrals, strict=True)
+        )
+        return value, excess, deficit
 
     @cached_property
     def _ends(self) -> tuple[Array, Array, Array]:
         """The integrals from 0 to the end of every step, and how much more and how much less they may be,
         ``(N + 1, S)`` each."""
-        value, more, less = self._parts(np.arange(self.row.count), np.ones(self.row.count))
+        value, excess, deficit = self._parts(np.arange(self.row.count), np.ones(self.row.count))
         outward = OUTWARD * (1.0 + rounding(self.row.count))
-        return accumulate_exactly(value), _accumulated(more) * outward, _accumulated(less) * outward
+        return accumulate_exactly(value), _accumulated(excess) * outward, _accumulated(deficit) * outward
 
     def at(self, times: Array, rounded: Array | float = 0.0) -> tuple[Array, Array]:
         """Return lower and upper bounds ``(k, S)`` of the integrals from 0 to ``times (k,)``, whose rounding errors are
         at most ``rounded``."""
         steps, shares = self.row.placed(times)
-        (value, more, less), inside = (part[steps] for part in self._ends), self._parts(steps, shares)
-        found = value + inside[0]
-        lost = np.asarray(rounded)[..., None] * self._heights[steps] + 4.0 * HALF_ULP * (np.abs(value) + np.abs(found))
-        return found - (less + inside[2] + lost) * OUTWARD, found + (more + inside[1] + lost) * OUTWARD
+        (value, excess, deficit), partial = (values[steps] for values in self._ends), self._parts(steps, shares)
+        total = value + partial[0]
+        error = np.asarray(rounded)[..., None] * self._heights[steps] + 4.0 * HALF_ULP * (np.abs(value) + np.abs(total))
+        return total - (deficit + partial[2] + error) * OUTWARD, total + (excess + partial[1] + error) * OUTWARD
 
 
 @final
@@ -398,9 +402,11 @@ class Stopped:
 
         (first, _), motion = parts[0], parts[0][0].motion
         exact = arb_mat([[arb(float(v)) for v in row]])
-        turned = exact * (motion.A * (arb(end) - arb(begin))).exp() - exact
-        length, rounded = (part.item() for part in subtract_times(np.array([end]), begin))
-        return Stopped(parts, [(first, length, rounded), (AdjointRow.of_balls(motion, turned.tolist()[0]), begin, 0.0)])
+        difference = exact * (motion.A * (arb(end) - arb(begin))).exp() - exact
+        length, rounded = (value.item() for value in subtract_times(np.array([end]), begin))
+        return Stopped(
+            parts, [(first, length, rounded), (AdjointRow.of_balls(motion, difference.tolist()[0]), begin, 0.0)]
+        )
 
     @property
     def motion(self) -> AdjointFlow:
@@ -418,9 +424,9 @@ class Stopped:
 
 def _sum(parts: Sequence[Enclosed]) -> Enclosed:
     mid, rad = parts[0].mid, parts[0].rad
-    for part in parts[1:]:
-        mid = mid + part.mid
-        rad = rad + part.rad + HALF_ULP * np.abs(mid)
+    for summand in parts[1:]:
+        mid = mid + summand.mid
+        rad = rad + summand.rad + HALF_ULP * np.abs(mid)
     return Enclosed(mid, rad * OUTWARD)
 
 
@@ -438,8 +444,8 @@ def subtract_times(times: Array, others: Array | float) -> tuple[Array, Array]:
     """Return the differences of times as floats, and the absolute values of their rounding errors (Knuth 1997, section
     4.2.2, theorem B)."""
     nearest = times - np.asarray(others, dtype=float)
-    part = nearest - times
-    return nearest, np.abs((times - (nearest - part)) - (others + part))
+    opposite = nearest - times
+    return nearest, np.abs((times - (nearest - opposite)) - (others + opposite))
 
 
 def _product(left: Enclosed, right: Enclosed) -> tuple[Array, Array]:
@@ -447,13 +453,13 @@ def _product(left: Enclosed, right: Enclosed) -> tuple[Array, Array]:
     rounding error grows with the number of terms of one partial sum plus the number of these sums (Higham 2002, section
     4.2)."""
     j, d, n = right.mid.shape
-    flat, off = (part.transpose(1, 0, 2).reshape(d, j * n) for part in (right.mid, right.rad))
+    flat, flat_rad = (matrices.transpose(1, 0, 2).reshape(d, j * n) for matrices in (right.mid, right.rad))
     size = np.abs(left.mid)
     mid = left.mid[:, :SUMMED] @ flat[:SUMMED]
     for start in range(SUMMED, d, SUMMED):
         mid += left.mid[:, start : start + SUMMED] @ flat[start : start + SUMMED]
-    met = min(d, SUMMED) + (d - 1) // SUMMED
-    rad = size @ (off + rounding(met) * np.abs(flat)) + left.rad @ (np.abs(flat) + off)
+    operations = min(d, SUMMED) + (d - 1) // SUMMED
+    rad = size @ (flat_rad + rounding(operations) * np.abs(flat)) + left.rad @ (np.abs(flat) + flat_rad)
     return mid.reshape(-1, j, n), rad.reshape(-1, j, n) * OUTWARD
 
 
@@ -519,24 +525,24 @@ class Worst:
             rad = rad + 2.0 * HALF_ULP * np.abs(value)
         if signal is not None:
             late, early = np.append(changes[:-1], time)[:-1], np.minimum(changes[1:], time)
-            part = self.adjoint.between(np.full(late.size, time), late, early)
-            gains, off = part.mid[:, self._mine] * signal.T, part.rad[:, self._mine] * np.abs(signal.T)
+            effects = self.adjoint.between(np.full(late.size, time), late, early)
+            gains, gain_errors = effects.mid[:, self._mine] * signal.T, effects.rad[:, self._mine] * np.abs(signal.T)
             value = value + gains.sum()
-            rad = rad + off.sum() + rounding(gains.size) * np.abs(gains).sum()
-        lost = float(rad[0] + 4.0 * HALF_ULP * abs(value[0])) * OUTWARD
-        return float(value[0]) - lost, float(value[0]) + lost
+            rad = rad + gain_errors.sum() + rounding(gains.size) * np.abs(gains).sum()
+        error = float(rad[0] + 4.0 * HALF_ULP * abs(value[0])) * OUTWARD
+        return float(value[0]) - error, float(value[0]) + error
 
     def _driven(self, times: Array) -> tuple[Array, Array]:
         """Return what the known inputs add to the row at ``times (k,)``, and the error bounds, ``(k,)`` each."""
         mid, rad, size = np.zeros(times.size), np.zeros(times.size), np.zeros(times.size)
         used = self.drives.mid.shape[0]
         for k, (start, stop) in enumerate(zip(self.grid[:-1], self.grid[1:], strict=True)):
-            u, off = self.drives.mid[:, k], self.drives.rad[:, k]
+            u, u_rad = self.drives.mid[:, k], self.drives.rad[:, k]
             if u.any():
-                part = self.adjoint.between(times, float(start), float(stop))
-                mid += part.mid[:, :used] @ u
-                rad += part.rad[:, :used] @ (np.abs(u) + off) + np.abs(part.mid[:, :used]) @ off
-                size += np.abs(part.mid[:, :used]) @ np.abs(u)
+                effects = self.adjoint.between(times, float(start), float(stop))
+                mid += effects.mid[:, :used] @ u
+                rad += effects.rad[:, :used] @ (np.abs(u) + u_rad) + np.abs(effects.mid[:, :used]) @ u_rad
+                size += np.abs(effects.mid[:, :used]) @ np.abs(u)
         return mid, rad + rounding(used + self.grid.size) * size
 
     def most(self, times: Array) -> tuple[Array, Array]:
@@ -547,11 +553,11 @@ class Worst:
         size = np.abs(rows.mid) @ np.abs(self.centre)
         top = top + rows.mid @ self.centre
         rad = rad + rows.rad @ np.abs(self.centre) + rounding(self.centre.size) * size
-        parts = [] if self.begun is None else [_supported(self.begun, rows)]
+        supports = [] if self.begun is None else [_supported(self.begun, rows)]
         if self.pushed is not None:
-            parts.append(self._constant(times) if self.changes is not None else self._measurable(times))
-        for high, more in parts:
-            top, rad, size = top + high, rad + more, size + np.abs(high)
+            supports.append(self._constant(times) if self.changes is not None else self._measurable(times))
+        for high, error in supports:
+            top, rad, size = top + high, rad + error, size + np.abs(high)
         rad = (rad + 8.0 * HALF_ULP * (np.abs(top) + size)) * OUTWARD
         return top + rad, 3.0 * rad
 
@@ -567,12 +573,16 @@ class Worst:
         each."""
         from flint import arb
 
-        begun, columns = starts < time, self.adjoint.motion.F.ncols()
-        found = [[arb(0)] * columns for _ in range(starts.size)]
-        part = self.adjoint.between(np.full(begun.sum(), time), starts[begun], np.minimum(stops[begun], time))
-        for k, mid, rad in zip(np.flatnonzero(begun).tolist(), part.mid.tolist(), part.rad.tolist(), strict=True):
-            found[k] = [arb(m, r) for m, r in zip(mid, rad, strict=True)]
-        return found
+        has_begun, columns = starts < time, self.adjoint.motion.F.ncols()
+        weights = [[arb(0)] * columns for _ in range(starts.size)]
+        effects = self.adjoint.between(
+            np.full(has_begun.sum(), time), starts[has_begun], np.minimum(stops[has_begun], time)
+        )
+        for k, mid, rad in zip(
+            np.flatnonzero(has_begun).tolist(), effects.mid.tolist(), effects.rad.tolist(), strict=True
+        ):
+            weights[k] = [arb(m, r) for m, r in zip(mid, rad, strict=True)]
+        return weights
 
     def pushed_by(self, time: float) -> arb:
         """Return what the worst disturbance adds to the row at a time."""
@@ -582,8 +592,8 @@ class Worst:
         if self.changes is None:
             (value,), (rad,) = self._measurable(np.array([time]))
             return arb(float(value), float(2.0 * rad))
-        every = self.weights(time, self.changes[:-1], self.changes[1:])
-        return sum((known(self.pushed).support(one[self._mine]) for one in every), arb(0))
+        weights = self.weights(time, self.changes[:-1], self.changes[1:])
+        return sum((known(self.pushed).support(weight[self._mine]) for weight in weights), arb(0))
 
     def _constant(self, times: Array) -> tuple[Array, Array]:
         """Return what the worst disturbance that is constant between ``changes`` adds to the row at ``times (k,)``, and
@@ -591,9 +601,9 @@ class Worst:
         assert self.pushed is not None and self.changes is not None
         top, rad = np.zeros(times.size), np.zeros(times.size)
         for start, stop in zip(self.changes[:-1], self.changes[1:], strict=True):
-            part = self.adjoint.between(times, float(start), float(stop))
-            high, more = _supported(self.pushed, Enclosed(part.mid[:, self._mine], part.rad[:, self._mine]))
-            top, rad = top + high, rad + more + HALF_ULP * np.abs(top)
+            effects = self.adjoint.between(times, float(start), float(stop))
+            high, error = _supported(self.pushed, Enclosed(effects.mid[:, self._mine], effects.rad[:, self._mine]))
+            top, rad = top + high, rad + error + HALF_ULP * np.abs(top)
         return top, rad
 
     @cached_property
@@ -613,13 +623,13 @@ class Worst:
         each."""
         if isinstance(self.adjoint, Stopped):
             return self._over_ways(self.adjoint, times)
-        low, high = (part.sum(axis=1) for part in self._swept.at(times))
+        low, high = (bound.sum(axis=1) for bound in self._swept.at(times))
         linear, rounded = self._row.integrals(times)
-        mid, off = linear.mid[:, self._mine], (linear.rad + rounded)[:, self._mine]
+        mid, mid_errors = linear.mid[:, self._mine], (linear.rad + rounded)[:, self._mine]
         top = (low + high) / 2.0 + mid @ self._about
         size = np.abs(mid) @ np.abs(self._about) + np.abs(low) + np.abs(high)
-        lost = rounding(len(self._swept.sides) + self._about.size + 2) * size
-        return top, (high - low) / 2.0 + off @ np.abs(self._about) + lost
+        rounding_error = rounding(len(self._swept.sides) + self._about.size + 2) * size
+        return top, (high - low) / 2.0 + mid_errors @ np.abs(self._about) + rounding_error
 
     def _over_ways(self, stopped: Stopped, times: Array) -> tuple[Array, Array]:
         """Return what the worst measurable disturbance adds to an integral that has ended at all ``times (k,)``, and
@@ -628,11 +638,11 @@ class Worst:
         if not stopped.ways or (times < stopped.parts[0][1]).any():
             raise Unchecked("of measurable disturbances one integral at a time is followed")
         top, rad = np.zeros(times.size), np.zeros(times.size)
-        far: Array = np.abs(self._about) + np.array(known(self.pushed).radius)
+        radius: Array = np.abs(self._about) + np.array(known(self.pushed).radius)
         for row, length, rounded in stopped.ways:
-            value, more = replace(self, adjoint=row)._measurable(np.full(times.size, length))
+            value, error = replace(self, adjoint=row)._measurable(np.full(times.size, length))
             top = top + value
-            rad = rad + more + HALF_ULP * np.abs(top) + rounded * float(row.fastest[self._mine] @ far)
+            rad = rad + error + HALF_ULP * np.abs(top) + rounded * float(row.fastest[self._mine] @ radius)
         return top, rad * OUTWARD
 
     @cached_property
@@ -640,21 +650,21 @@ class Worst:
         """The bounds ``(N,)`` of the curvature of the largest value on every step. Times an eighth of the square of the
         width of a cell, they bound how far the largest value lies above its chord."""
         states, once, twice = self._row.bends
-        far = np.abs(self.centre) + (0.0 if self.begun is None else np.array(known(self.begun).radius))
-        found = states @ far
+        state_bound = np.abs(self.centre) + (0.0 if self.begun is None else np.array(known(self.begun).radius))
+        curvature = states @ state_bound
         inputs = np.zeros(once.shape[1])
         used = self.drives.mid.shape[0]
         inputs[:used] = (np.abs(self.drives.mid) + self.drives.rad).max(axis=1, initial=0.0)
         if self.pushed is not None:
             radius = np.array(known(self.pushed).radius)
             if self.changes is None:  # an integral of a support function, whose argument changes at the rate l'AE
-                found = found + once[:, self._mine] @ radius
+                curvature = curvature + once[:, self._mine] @ radius
             else:
                 inputs[self._mine] = radius
         # an input on a piece has a difference of l'AF as second derivative: all together the total variation of l'AF,
         # and one value for the piece that acts
         total = self._row.step * float((twice @ inputs).sum()) + float((once @ inputs).max(initial=0.0))
-        return np.asarray((found + total) * OUTWARD)
+        return np.asarray((curvature + total) * OUTWARD)
 
     def over(self, start: Array, stop: Array, beside: Array | float = 0.0) -> Array:
         """Return upper bounds ``(k,)`` of the largest value on cells from ``start (k,)`` to ``stop (k,)``, each between
@@ -662,34 +672,34 @@ class Worst:
 
         The values ``beside (2, k)`` are added at both ends of every cell, and linearly in between.
         """
-        ends, which = np.unique(np.concatenate([start, stop]), return_inverse=True)
-        several = max(1, AT_ONCE // self.adjoint.motion.states)  # the adjoints at all ends take much memory
-        parts = [self.most(ends[k : k + several])[0] for k in range(0, ends.size, several)]
-        tops = np.concatenate(parts)[which]
-        width, bent = (stop - start) * OUTWARD, np.zeros(start.size)
+        ends, positions = np.unique(np.concatenate([start, stop]), return_inverse=True)
+        batch_size = max(1, AT_ONCE // self.adjoint.motion.states)  # the adjoints at all ends take much memory
+        bounds = [self.most(ends[k : k + batch_size])[0] for k in range(0, ends.size, batch_size)]
+        tops = np.concatenate(bounds)[positions]
+        width, curvature = (stop - start) * OUTWARD, np.zeros(start.size)
         if width.any():
             step, last = self._row.step, self._row.count - 1
-            bent = np.maximum(*(self._bent[np.clip((t / step).astype(int), 0, last)] for t in (start, stop)))
-        both = tops.reshape(2, -1) + beside
-        lost = 4.0 * HALF_ULP * (np.abs(both) + np.abs(beside)).max(axis=0)
-        return np.asarray(both.max(axis=0) + (width**2 / 8.0 * bent + lost) * OUTWARD)
+            curvature = np.maximum(*(self._bent[np.clip((t / step).astype(int), 0, last)] for t in (start, stop)))
+        end_values = tops.reshape(2, -1) + beside
+        rounding_error = 4.0 * HALF_ULP * (np.abs(end_values) + np.abs(beside)).max(axis=0)
+        return np.asarray(end_values.max(axis=0) + (width**2 / 8.0 * curvature + rounding_error) * OUTWARD)
 
     def cuts(self, more: Sequence[float]) -> Array:
         """Return times, among them ``more``, between which no input jumps and which are at most a step apart."""
-        parts = [np.asarray(more, dtype=float)]
+        times = [np.asarray(more, dtype=float)]
         if isinstance(self.adjoint, AdjointRow):
-            parts.append(np.arange(self.adjoint.count + 1) * self.adjoint.step)
-        parts += [self.grid] if self.drives.mid.any() else []
-        parts += [self.changes] if self.pushed is not None and self.changes is not None else []
-        return np.unique(np.concatenate(parts))
+            times.append(np.arange(self.adjoint.count + 1) * self.adjoint.step)
+        times += [self.grid] if self.drives.mid.any() else []
+        times += [self.changes] if self.pushed is not None and self.changes is not None else []
+        return np.unique(np.concatenate(times))
 
 
 def _supported(bound: ConvexSet, rows: Enclosed) -> tuple[Array, Array]:
     """Return the support values of a set at rows ``(k, d)``, and how much more they may be, ``(k,)`` each."""
     w, excess = known(bound).bound(rows.mid, rows.rad)
     size = (np.abs(w) * np.abs(rows.mid)).sum(axis=1)
-    more = (np.abs(w) * rows.rad).sum(axis=1) + rounding(rows.mid.shape[1]) * size
-    return (w * rows.mid).sum(axis=1), (more + np.abs(excess)) * OUTWARD
+    error = (np.abs(w) * rows.rad).sum(axis=1) + rounding(rows.mid.shape[1]) * size
+    return (w * rows.mid).sum(axis=1), (error + np.abs(excess)) * OUTWARD
 
 
 # from powers of the share ``v`` of a step to powers of ``u = 2 v - 1``: ``v^j = (1 + u)^j / 2^j``

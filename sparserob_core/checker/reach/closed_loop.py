@@ -123,10 +123,10 @@ class VerifiedLoop:
         """Return which states a block of the disturbance along ``vectors (q, mw)`` reaches. For a system that may
         change with time, only the positions of entries that are not always 0 are used."""
         if not self.flow.plant.is_timed:
-            return Pushed.of([(one["A"], one["E"]) for one in modes_at(self.system, ())], vectors)
+            return Pushed.of([(mode["A"], mode["E"]) for mode in modes_at(self.system, ())], vectors)
         d, m = self.flow.states, self.flow.driven
-        there = self.flow.law.there
-        return Pushed.linked(there[:, :d], there[:, d + m :], vectors)
+        is_nonzero = self.flow.law.there
+        return Pushed.linked(is_nonzero[:, :d], is_nonzero[:, d + m :], vectors)
 
     @cached_property
     def seen(self) -> list[dict[int, arb_mat]]:
@@ -139,48 +139,48 @@ class VerifiedLoop:
         assert self.observer is not None
         C = exactly(np.asarray(measured.C))
         unit = identity(self.outputs)
-        found: list[dict[int, arb_mat]] = []
+        innovations: list[dict[int, arb_mat]] = []
         error: dict[int, arb_mat] = {}
         for j, entering in enumerate(self._entering):
-            for block, push in entering.items():
-                error[block] = error[block] + push if block in error else push
-            seen = {block: C * push for block, push in error.items()}
+            for block, effect in entering.items():
+                error[block] = error[block] + effect if block in error else effect
+            innovation = {block: C * effect for block, effect in error.items()}
             if self.deviations.begun > self.deviations.blocks:
-                seen[self.deviations.blocks + j] = unit
-            found.append(seen)
+                innovation[self.deviations.blocks + j] = unit
+            innovations.append(innovation)
             if j + 1 == len(self.breakpoints) - 1:
                 break
             L, flow = exactly(self.observer[j]), self._between[j]
-            error = {block: flow * error[block] - L * push if block in error else -L * push
-                     for block, push in seen.items()}  # fmt: skip
-        return found
+            error = {block: flow * error[block] - L * effect if block in error else -L * effect
+                     for block, effect in innovation.items()}  # fmt: skip
+        return innovations
 
     @cached_property
     def _between(self) -> list[arb_mat]:
         """The transitions from each breakpoint of the control to the next, ``(d, d)`` each."""
-        found = [identity(self.system.states) for _ in self.breakpoints[:-1]]
+        transitions = [identity(self.system.states) for _ in self.breakpoints[:-1]]
         for piece in range(len(self.grid) - 1):
-            found[self.on(piece)] = self._passed(piece)[0] * found[self.on(piece)]
-        return found
+            transitions[self.on(piece)] = self._passed(piece)[0] * transitions[self.on(piece)]
+        return transitions
 
     @cached_property
     def _entering(self) -> list[dict[int, arb_mat]]:
         """The effect ``(d, mw)`` of every block on the state at a breakpoint of the control, as far as it entered since
         the breakpoint before; at the first breakpoint, the initial deviation."""
         K = len(self.breakpoints) - 1
-        found: list[dict[int, arb_mat]] = [{} for _ in range(K)]
+        effects: list[dict[int, arb_mat]] = [{} for _ in range(K)]
         if self.initial is not None:
-            found[0][self.deviations.begun] = identity(self.system.states)
+            effects[0][self.deviations.begun] = identity(self.system.states)
         for piece in range(len(self.grid) - 1 if self.deviations.blocks else 0):
             k, (_, block) = self.on(piece), self._places(piece)
             if k + 1 >= K:
                 break
-            Phi, push = self._passed(piece)
-            seen = {earlier: Phi * before for earlier, before in found[k + 1].items()}
-            if any(not x.is_zero() for x in push.entries()):
-                seen[block] = seen[block] + push if block in seen else push
-            found[k + 1] = seen
-        return found
+            Phi, effect = self._passed(piece)
+            by_block = {earlier: Phi * before for earlier, before in effects[k + 1].items()}
+            if any(not x.is_zero() for x in effect.entries()):
+                by_block[block] = by_block[block] + effect if block in by_block else effect
+            effects[k + 1] = by_block
+        return effects
 
     @cached_property
     def effects(self) -> list[list[list[arb]]]:
@@ -193,8 +193,8 @@ class VerifiedLoop:
                 if not self.gains[k, j].any():
                     continue
                 M = exactly(self.gains[k, j])
-                for block, push in self.seen[j].items():
-                    for i, row in enumerate((M * push).tolist()):
+                for block, matrix in self.seen[j].items():
+                    for i, row in enumerate((M * matrix).tolist()):
                         for b, value in enumerate(row):
                             rows[i][starts[block] + b] = rows[i][starts[block] + b] + value
             table.append(rows)
@@ -204,21 +204,21 @@ class VerifiedLoop:
     def drives(self) -> list[arb_mat]:
         """The inputs on each piece of the grid, control, drift and disturbance, as nominal values and responses: with a
         drift ``(m + 1 + mw, 1 + Q)``, without one ``(m + mw, 1 + Q)``."""
-        found, none = [], [0.0] * self.deviations.starts[-1]
+        drives, zeros = [], [0.0] * self.deviations.starts[-1]
         for piece in range(len(self.grid) - 1):
             k, block = self._places(piece)
-            given = [balls([1.0, *none])] if self.flow.driven > self.system.controls else []
-            entering = [balls([middle, *none]) for middle in self.deviations.middle.tolist()]
+            drift = [balls([1.0, *zeros])] if self.flow.driven > self.system.controls else []
+            entering = [balls([middle, *zeros]) for middle in self.deviations.middle.tolist()]
             if self.deviations.blocks:
                 self._entered(entering, block)
-            found.append(stacked([*self.inputs(k).tolist(), *given, *entering]))
-        return found
+            drives.append(stacked([*self.inputs(k).tolist(), *drift, *entering]))
+        return drives
 
     def _entered(self, rows: list[list[arb]], block: int) -> None:
         """Add the response to a block of the disturbance to the rows of the disturbance, in place."""
         for i, row in enumerate(rows):
-            place = 1 + block * self.system.disturbances + i
-            row[place] = row[place] + 1
+            column = 1 + block * self.system.disturbances + i
+            row[column] = row[column] + 1
 
     def _ended(self, piece: int, state: arb_mat) -> arb_mat:
         """Return the nominal state and the responses after a piece of the grid, from those at its end: the same, unless
@@ -234,11 +234,11 @@ class VerifiedLoop:
         else:
             begin = [v + ball(m) for v, m in zip(begin, self.deviations.sets[-1][1], strict=True)]
         zero = [ball(0)] * self.deviations.starts[self.deviations.begun]
-        found = [stacked([[v, *zero, *row] for v, row in zip(begin, answers, strict=True)])]
+        nodes = [stacked([[v, *zero, *row] for v, row in zip(begin, answers, strict=True)])]
         for piece, ends in enumerate(pairwise(self.grid)):
-            Phi, added = self._moved(piece, *ends)
-            found.append(self._ended(piece, Phi * found[-1] + added))
-        return found
+            Phi, effect = self._moved(piece, *ends)
+            nodes.append(self._ended(piece, Phi * nodes[-1] + effect))
+        return nodes
 
     def state(self, piece: int, time: float) -> arb_mat:
         """Return the nominal state and the responses at a time in a piece of the grid, ``(d, 1 + Q)``."""
@@ -246,8 +246,8 @@ class VerifiedLoop:
             return self.nodes[piece]
         if time == self.grid[piece + 1]:
             return self.nodes[piece + 1]
-        Phi, added = self._moved(piece, self.grid[piece], time)
-        return Phi * self.nodes[piece] + added
+        Phi, effect = self._moved(piece, self.grid[piece], time)
+        return Phi * self.nodes[piece] + effect
 
     def inputs(self, k: int) -> arb_mat:
         """Return the nominal control and its answers on a piece of the control, ``(m, 1 + Q)``; on piece -1 the control
@@ -280,8 +280,8 @@ class VerifiedLoop:
         """
         product = exactly(rows) * state
         along = (product if beside is None else product + beside).tolist()
-        most = self.deviations.supports([row[1:] for row in along])
-        return [row[0] + more for row, more in zip(along, most, strict=True)]
+        supports = self.deviations.supports([row[1:] for row in along])
+        return [row[0] + support for row, support in zip(along, supports, strict=True)]
 
     def highest(self, piece: int, time: float, rows: Array | arb_mat, beside: arb_mat | None = None) -> list[arb]:
         """Return the `heights` of ``rows (r, d)`` at a time in a piece of the grid."""
@@ -291,14 +291,14 @@ class VerifiedLoop:
         """Return upper bounds ``(r,)`` of how far ``max c'x(t)`` lies above its chord on ``[start, stop]``, a part of a
         piece of the grid without marks. The states are a polynomial in the share ``s`` of the cell, and a term
         ``a s^n`` differs from its chord by at most ``(n - 1) n^(-n / (n - 1)) |a|``."""
-        terms, off = self.flow.within(start, stop, start, stop, ORDER + 1)
-        both = stacked([*self.state(piece, start).tolist(), *self.drives[piece].tolist()])
+        terms, remainder = self.flow.within(start, stop, start, stop, ORDER + 1)
+        augmented = stacked([*self.state(piece, start).tolist(), *self.drives[piece].tolist()])
         line, sizes = exactly(rows), np.concatenate([[1.0], self.deviations.radii])
         total = np.zeros((line.nrows(), sizes.size))
         for n, term in enumerate(terms[2:], 2):
-            found = Enclosed.of(line * (term.matrix * both))
-            total += (np.abs(found.mid) + found.rad) * ((n - 1) * n ** (-n / (n - 1)) * OUTWARD)
+            enclosure = Enclosed.of(line * (term.matrix * augmented))
+            total += (np.abs(enclosure.mid) + enclosure.rad) * ((n - 1) * n ** (-n / (n - 1)) * OUTWARD)
         # twice, since the remainder changes both the states within the cell and the ends of the chord
-        found = Enclosed.of(line * (around(off) * both))
-        total += 2.0 * (np.abs(found.mid) + found.rad)
+        enclosure = Enclosed.of(line * (around(remainder) * augmented))
+        total += 2.0 * (np.abs(enclosure.mid) + enclosure.rad)
         return np.asarray(total @ sizes * (1.0 + rounding(sizes.size)) * OUTWARD)

@@ -71,13 +71,13 @@ class Deviations(ABC):
     def rests(self) -> list[list[arb]]:
         """The difference between a point that is proven to be in the set and the middle, for every one of `sets`: 0 but
         for thin sets, of which rounding may have moved the middle out."""
-        found: dict[int, list[arb]] = {}
+        differences: dict[int, list[arb]] = {}
         for shape, about in self.sets:
-            if id(shape) not in found:
+            if id(shape) not in differences:
                 point = known(shape).member(about)
                 assert point is not None
-                found[id(shape)] = [x - m for x, m in zip(point, balls(about), strict=True)]
-        return [found[id(shape)] for shape, _ in self.sets]
+                differences[id(shape)] = [x - m for x, m in zip(point, balls(about), strict=True)]
+        return [differences[id(shape)] for shape, _ in self.sets]
 
 
 @final
@@ -100,9 +100,9 @@ class HeldDeviations(Deviations):
 
     @cached_property
     def sets(self) -> list[tuple[ConvexSet, Array]]:
-        held = [] if self.shape is None else [(self.shape, self.middle)] * self.blocks
-        held += [] if self.noise is None else [(self.noise, middle(self.noise))] * self.noises
-        return held if self.initial is None else [*held, (self.initial, middle(self.initial))]
+        sets = [] if self.shape is None else [(self.shape, self.middle)] * self.blocks
+        sets += [] if self.noise is None else [(self.noise, middle(self.noise))] * self.noises
+        return sets if self.initial is None else [*sets, (self.initial, middle(self.initial))]
 
     @cached_property
     def starts(self) -> list[int]:
@@ -117,7 +117,7 @@ class HeldDeviations(Deviations):
 
     def _support(self, a: list[arb]) -> arb:
         blocks = (a[first : first + shape.dimension] for first, (shape, _) in zip(self.starts, self.sets, strict=False))
-        return sum((of_block(*one, block) for one, block in zip(self.sets, blocks, strict=True)), ball(0))
+        return sum((of_block(*pair, block) for pair, block in zip(self.sets, blocks, strict=True)), ball(0))
 
 
 def of_block(shape: ConvexSet, about: Array, a: list[arb]) -> arb:
@@ -132,5 +132,5 @@ def of_block(shape: ConvexSet, about: Array, a: list[arb]) -> arb:
 
 def rounded_radii(first: list[Array], sets: Sequence[tuple[ConvexSet, Array]]) -> Array:
     """Return the radii ``first`` of some blocks and those of ``sets`` about their middles, ``(Q,)``, rounded up."""
-    far = [np.array(known(shape).radius) + np.abs(about) for shape, about in sets]
-    return np.asarray(np.nextafter(np.concatenate([np.zeros(0), *first, *far]) * OUTWARD, np.inf))
+    radii = [np.array(known(shape).radius) + np.abs(about) for shape, about in sets]
+    return np.asarray(np.nextafter(np.concatenate([np.zeros(0), *first, *radii]) * OUTWARD, np.inf))

@@ -54,16 +54,16 @@ class FollowedExecution(BoundedInputHere):
     def absolute(self, c: Array) -> SupportIntegrals:
         """Return the integrals of ``|c'e^{A s} B_j|`` for an exact direction ``c (d,)``; the direction ``-c`` has the
         same ones."""
-        ends = np.eye(self.shares.size)
-        sides = [Side(np.stack([one, -one]), 0.0 * ends[:2]) for one in ends]
+        axes = np.eye(self.shares.size)
+        sides = [Side(np.stack([axis, -axis]), 0.0 * axes[:2]) for axis in axes]
         return SupportIntegrals(AdjointRow.of(self.motion, c + 0.0), slice(None), sides)
 
     def integrals(self, c: Array, times: Array, points: Array) -> tuple[Array, Array]:
         """Return lower and upper bounds ``(k, q, m)`` each of ``F_j(a)`` at the ages ``a = times (k,) - points (q,)``,
         and 0 where the age is not positive. The bounds hold for the exact differences of these times."""
-        ages, rounded = (part.ravel() for part in subtract_times(times[:, None], points))
-        both = self.absolute(c).at(np.maximum(ages, 0.0), rounded)
-        low, high = (np.where(ages[:, None] > 0.0, one, 0.0) for one in both)
+        ages, rounded = (values.ravel() for values in subtract_times(times[:, None], points))
+        bounds = self.absolute(c).at(np.maximum(ages, 0.0), rounded)
+        low, high = (np.where(ages[:, None] > 0.0, bound, 0.0) for bound in bounds)
         shape = times.size, points.size, self.shares.size
         return low.reshape(shape), high.reshape(shape)
 
@@ -79,11 +79,11 @@ class FollowedExecution(BoundedInputHere):
         ``(q, m)``, and their error bounds ``(q, m)``."""
         control = Enclosed.all(self.pieces, (len(self.pieces), self.shares.size))
         size = self.shares * np.abs(control.mid)
-        off = self.shares * control.rad + rounding(2) * size
+        errors = self.shares * control.rad + rounding(2) * size
         change = np.diff(size, axis=0, prepend=0.0)
-        off = off + np.concatenate([np.zeros_like(off[:1]), off[:-1]]) + rounding(1) * np.abs(change)
-        which = np.flatnonzero(np.diff(control.mid, axis=0, prepend=0.0).any(axis=1) | change.any(axis=1))
-        return which, change[which], (off * OUTWARD)[which]
+        errors = errors + np.concatenate([np.zeros_like(errors[:1]), errors[:-1]]) + rounding(1) * np.abs(change)
+        indices = np.flatnonzero(np.diff(control.mid, axis=0, prepend=0.0).any(axis=1) | change.any(axis=1))
+        return indices, change[indices], (errors * OUTWARD)[indices]
 
     def added(self, c: Array, time: float) -> tuple[float, float]:
         """Return a lower and an upper bound of what the worst errors add to ``c'x(t)``."""
@@ -92,11 +92,11 @@ class FollowedExecution(BoundedInputHere):
 
     def added_at(self, c: Array, times: Array) -> tuple[Array, Array]:
         """Return lower and upper bounds of what the worst errors add to ``c'x`` at ``times (k,)``, ``(k,)`` each."""
-        which, change, off = self.jumps
-        low, high = self.integrals(c, times, self.breakpoints[which])
+        indices, change, errors = self.jumps
+        low, high = self.integrals(c, times, self.breakpoints[indices])
         up, down = np.maximum(change, 0.0), np.minimum(change, 0.0)
-        lost = (off * high + rounding(2 * change.size + 8) * np.abs(change) * high).sum(axis=(1, 2)) * OUTWARD
-        return (up * low + down * high).sum(axis=(1, 2)) - lost, (up * high + down * low).sum(axis=(1, 2)) + lost
+        error = (errors * high + rounding(2 * change.size + 8) * np.abs(change) * high).sum(axis=(1, 2)) * OUTWARD
+        return (up * low + down * high).sum(axis=(1, 2)) - error, (up * high + down * low).sum(axis=(1, 2)) + error
 
     def bent(self, c: Array, start: float, stop: float) -> float:
         """Return an upper bound of the distance between `added` and its chord on ``[start, stop]``, which lies within
@@ -106,12 +106,12 @@ class FollowedExecution(BoundedInputHere):
     def bent_over(self, c: Array, start: Array, stop: Array) -> Array:
         """Return upper bounds ``(k,)`` of the distance between `added` and its chord on every interval from
         ``start (k,)`` to ``stop (k,)``, each within one piece."""
-        which, change, off = self.jumps
+        indices, change, errors = self.jumps
         steepest, step = self.absolute(c).row.bends[1], self.motion.step
-        ages = np.stack([start, stop])[:, :, None] - self.breakpoints[which]
+        ages = np.stack([start, stop])[:, :, None] - self.breakpoints[indices]
         places = np.clip(np.floor(ages / step).astype(int) + np.array([-1, 1])[:, None, None], 0, len(steepest) - 1)
         tops = _tallest(steepest, places[0], places[1] + 1)
-        total = ((np.abs(change) + off) * tops * (ages[1] > 0.0)[..., None]).sum(axis=(1, 2))
+        total = ((np.abs(change) + errors) * tops * (ages[1] > 0.0)[..., None]).sum(axis=(1, 2))
         return np.asarray((stop - start) ** 2 / 8.0 * total * (1.0 + rounding(change.size + 16)))
 
 

@@ -47,8 +47,12 @@ class FollowedRows:
         system = self.problem.system
         if not system.switches:
             return None
-        found, d = RunningIntegrals.of(spelt(self.stated)), self.stated.system.states
-        return found if found is not None and all(found.is_beside(phase, d) for phase in system.phases) else None
+        integrals, d = RunningIntegrals.of(spelt(self.stated)), self.stated.system.states
+        return (
+            integrals
+            if integrals is not None and all(integrals.is_beside(phase, d) for phase in system.phases)
+            else None
+        )
 
     @property
     def still(self) -> System | None:
@@ -75,8 +79,8 @@ class FollowedRows:
     def flow(self) -> AdjointFlow:
         """The adjoint flow that all rows share, with the inputs of the control before those of the disturbance."""
         assert self.still is not None
-        (parts,) = modes_at(self.still, [])
-        A, B, E = (parts[name] for name in ("A", "B", "E"))
+        (matrices,) = modes_at(self.still, [])
+        A, B, E = (matrices[name] for name in ("A", "B", "E"))
         if self.problem.disturbance is not None:
             B = stacked([[*b, *e] for b, e in zip(B.tolist(), E.tolist(), strict=True)])
         return AdjointFlow.of(A, B, self.timing.grid[-1], self.timing.clock)
@@ -107,19 +111,19 @@ class FollowedRows:
         """Return the adjoint of a row ``c (d,)``. An integral over a window is a sum of two rows, one that stops at the
         end of the window and an opposite one that stops at its beginning."""
         if self.running is not None:
-            parts = self.running.parts(c)
-            rows = [(self._kept(row), until) for row, until in parts]
-            if self.problem.measurable is not None and len(parts) == 2 and not (parts[0][0] + parts[1][0]).any():
-                (row, end), (_, begin) = parts
+            terms = self.running.parts(c)
+            rows = [(self._kept(row), until) for row, until in terms]
+            if self.problem.measurable is not None and len(terms) == 2 and not (terms[0][0] + terms[1][0]).any():
+                (row, end), (_, begin) = terms
                 return Stopped.integral(rows, row, begin, end)
-            if len(parts) > 1 or parts[0][1] < np.inf:
-                return Stopped(rows, [(*rows[0], 0.0)] if len(parts) == 1 else ())
+            if len(terms) > 1 or terms[0][1] < np.inf:
+                return Stopped(rows, [(*rows[0], 0.0)] if len(terms) == 1 else ())
         return self._kept(c)
 
     def _kept(self, c: Array) -> AdjointRow:
         """Return the adjoint of a row ``c (d,)``, which is made once for the row and its opposite."""
-        made, c = self._made, c + 0.0  # turns -0 into 0, so that equal rows have equal bytes
-        if c.tobytes() not in made:
-            opposite = made.get((0.0 - c).tobytes())
-            made[c.tobytes()] = AdjointRow.of(self.flow, c) if opposite is None else opposite.reversed()
-        return made[c.tobytes()]
+        adjoints, c = self._made, c + 0.0  # turns -0 into 0, so that equal rows have equal bytes
+        if c.tobytes() not in adjoints:
+            opposite = adjoints.get((0.0 - c).tobytes())
+            adjoints[c.tobytes()] = AdjointRow.of(self.flow, c) if opposite is None else opposite.reversed()
+        return adjoints[c.tobytes()]

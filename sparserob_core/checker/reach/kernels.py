@@ -91,9 +91,9 @@ class BoundedInputHere(BoundedInput):
     def over(self, c: Array, times: Sequence[float], within: tuple[Corners, Around] | None) -> Added:
         """Return the mean of both bounds at every time, and an error bound that includes the curvature in time."""
         ends = np.array([self.added(c, time) for time in times])
-        off = float((ends[:, 1] - ends[:, 0]).max())
-        bent = self.bent(c, times[0], times[-1]) if times[-1] > times[0] else 0.0
-        return Added(ends.mean(axis=1)[:, None], off + bent, 0.0, np.zeros(0))
+        gap = float((ends[:, 1] - ends[:, 0]).max())
+        chord_error = self.bent(c, times[0], times[-1]) if times[-1] > times[0] else 0.0
+        return Added(ends.mean(axis=1)[:, None], gap + chord_error, 0.0, np.zeros(0))
 
 
 def pushes(law: VerifiedFlow, start: float, stop: float, columns: slice) -> Enclosed:
@@ -108,13 +108,13 @@ def pushes(law: VerifiedFlow, start: float, stop: float, columns: slice) -> Encl
     """
     from flint import arb, arb_mat
 
-    terms, off = law.kernel(start, stop)
+    terms, remainder = law.kernel(start, stop)
     d, (count, size) = law.states, (len(terms), terms[0].shape[1])
-    table = arb_mat([[x for part in term.parts for x in part.entries()] for term in terms])
+    table = arb_mat([[x for matrix in term.parts for x in matrix.entries()] for term in terms])
     weights = arb_mat([[arb(comb(n, j)) / 2**n for n in range(count)] for j in range(count)])
-    found = Enclosed.all([weights * table], (count, law.monomials.size, d, size))
-    found.rad[0, 0] += off
-    return Enclosed(found.mid[..., columns], found.rad[..., columns])
+    kernel = Enclosed.all([weights * table], (count, law.monomials.size, d, size))
+    kernel.rad[0, 0] += remainder
+    return Enclosed(kernel.mid[..., columns], kernel.rad[..., columns])
 
 
 def above_chord(
@@ -139,19 +139,19 @@ def above_chord(
         The upper bound of the inputs, ``(m,)``, which enter by the columns of ``[B E]`` from the ``first`` one on.
     """
     lines, width = exactly(rows), (stop - start) * (1.0 + rounding(2))
-    large, d = Enclosed.of(lines), lines.ncols()
-    far = np.abs(large.mid) + large.rad
-    terms, off = law.within(start, stop, start, stop, ORDER + 1)
-    total = 2.0 * (far @ off[:, :d]) @ begun
+    enclosure, d = Enclosed.of(lines), lines.ncols()
+    row_bounds = np.abs(enclosure.mid) + enclosure.rad
+    terms, remainder = law.within(start, stop, start, stop, ORDER + 1)
+    total = 2.0 * (row_bounds @ remainder[:, :d]) @ begun
     for n, term in enumerate(terms[2:], 2):
-        found = enclosed([term.columns(0, d).along(lines)])
-        total += (n - 1) * n ** (-n / (n - 1)) * ((np.abs(found.mid) + found.rad).sum(axis=(0, 1)) @ begun)
+        values = enclosed([term.columns(0, d).along(lines)])
+        total += (n - 1) * n ** (-n / (n - 1)) * ((np.abs(values.mid) + values.rad).sum(axis=(0, 1)) @ begun)
     if size.any():
-        most, slope, units = law.sizes(start, stop)
+        bounds, slope, units = law.sizes(start, stop)
         entering = slice(d + first, d + first + size.size)
-        A, B = most[:, :d], most[:, entering]
+        A, B = bounds[:, :d], bounds[:, entering]
         pace = float((A * units / units[:, None]).sum(axis=1).max())
-        grown = np.exp(pace * width) * units * ((B @ size) / units).max()
-        second = (slope[:, entering] + A @ B) @ size + width * (slope[:, :d] + A @ A) @ grown
-        total += width**2 / 8.0 * (far @ second)
+        state_bound = np.exp(pace * width) * units * ((B @ size) / units).max()
+        second = (slope[:, entering] + A @ B) @ size + width * (slope[:, :d] + A @ A) @ state_bound
+        total += width**2 / 8.0 * (row_bounds @ second)
     return np.asarray(total * OUTWARD * (1.0 + rounding(8 * d * d)))

@@ -56,26 +56,26 @@ class Side:
         for every segment and one for its centre, for another set with corners, and for a curved set, one."""
         from flint import arb, fmpq
 
-        about, seen = [arb(float(m)) for m in middle(shape)], known(shape)
-        if isinstance(seen, Boxed):
-            found = []
+        about, known_shape = [arb(float(m)) for m in middle(shape)], known(shape)
+        if isinstance(known_shape, Boxed):
+            sides = []
             for i, m in enumerate(about):
-                axis = balls(np.eye(seen.dimension)[i])
-                ends = [seen.support(axis) - m, -seen.support([-x for x in axis]) - m]
-                found.append([[end if j == i else arb(0) for j in range(seen.dimension)] for end in ends])
-        elif isinstance(seen, Segments):
-            found = [[[arb(float(c)) - m for c, m in zip(seen.source.centre, about, strict=True)]]]
-            for segment in seen.generators:
+                axis = balls(np.eye(known_shape.dimension)[i])
+                ends = [known_shape.support(axis) - m, -known_shape.support([-x for x in axis]) - m]
+                sides.append([[end if j == i else arb(0) for j in range(known_shape.dimension)] for end in ends])
+        elif isinstance(known_shape, Segments):
+            sides = [[[arb(float(c)) - m for c, m in zip(known_shape.source.centre, about, strict=True)]]]
+            for segment in known_shape.generators:
                 end = [arb(fmpq(x.numerator, x.denominator)) for x in segment]
-                found.append([end, [-x for x in end]])
-        elif isinstance(seen, Cornered):
-            exact = [[arb(fmpq(x.numerator, x.denominator)) for x in corner] for corner in seen.corners]
-            found = [[[x - m for x, m in zip(corner, about, strict=True)] for corner in exact]]
+                sides.append([end, [-x for x in end]])
+        elif isinstance(known_shape, Cornered):
+            exact = [[arb(fmpq(x.numerator, x.denominator)) for x in corner] for corner in known_shape.corners]
+            sides = [[[x - m for x, m in zip(corner, about, strict=True)] for corner in exact]]
         else:
-            curved = CurvedSide(seen, middle(shape))
+            curved = CurvedSide(known_shape, middle(shape))
             _ = curved.far  # raises `Unchecked` for a set that the checker does not know
             return [curved]
-        return [Side(one.mid, one.rad) for one in (Enclosed.of(stacked(rows)) for rows in found)]
+        return [Side(enclosure.mid, enclosure.rad) for enclosure in (Enclosed.of(stacked(rows)) for rows in sides)]
 
     @property
     def dimension(self) -> int:
@@ -129,10 +129,10 @@ class Together:
 
     def swept(self, plain: Array, off: Array, sizes: Array, ends: Array) -> tuple[Array, Array, Array, Array]:
         """Return the sums over all sides of what `Side.swept` returns, with the rounding errors of these sums."""
-        every = [side.swept(plain, off, sizes, ends) for side in self.sides]
-        value, more, less, tops = (np.sum(part, axis=0) for part in zip(*every, strict=True))
-        rounded = rounding(len(every)) * 2.0 * tops
-        return value, (more + rounded) * OUTWARD, (less + rounded) * OUTWARD, tops
+        integrals = [side.swept(plain, off, sizes, ends) for side in self.sides]
+        value, excess, deficit, tops = (np.sum(values, axis=0) for values in zip(*integrals, strict=True))
+        rounded = rounding(len(integrals)) * 2.0 * tops
+        return value, (excess + rounded) * OUTWARD, (deficit + rounded) * OUTWARD, tops
 
 
 @final
@@ -159,27 +159,27 @@ class VerifiedKernel:
         size = np.abs(a.mid)
         plain = np.einsum("nd,spdw->nspw", a.mid, self.coefficients)
         large = np.einsum("nd,spdw->nsw", size, np.abs(self.coefficients))
-        off = rounding(size.shape[1] + 1) * large + np.einsum("nd,sdw->nsw", size + a.rad, self.off)
-        off = (off + np.einsum("nd,spdw->nsw", a.rad, np.abs(self.coefficients))) * OUTWARD
-        return plain, off
+        errors = rounding(size.shape[1] + 1) * large + np.einsum("nd,sdw->nsw", size + a.rad, self.off)
+        errors = (errors + np.einsum("nd,spdw->nsw", a.rad, np.abs(self.coefficients))) * OUTWARD
+        return plain, errors
 
     def most(self, a: Enclosed, sides: Sequence[Side | CurvedSide]) -> Enclosed:
         """Return the integral of the support function of ``K(r)'a`` over all parts, for ``a (N, d)``, as middles and
         radii ``(N,)``. The set is the sum of ``sides``."""
         size, count = np.abs(a.mid), self.count
         large = np.einsum("nd,spdw->nsw", size, np.abs(self.coefficients))
-        plain, off = self.along(a)
-        low, high, lost = np.zeros(len(size)), np.zeros(len(size)), np.zeros(len(size))
-        begun = [part.reshape(-1, *part.shape[2:]) for part in (plain, off, large)]
-        off = begun[1] + rounding(off.shape[2] + 2 * self.coefficients.shape[1] + 6) * begun[2]
+        plain, errors = self.along(a)
+        low, high, rounding_error = np.zeros(len(size)), np.zeros(len(size)), np.zeros(len(size))
+        flat = [arrays.reshape(-1, *arrays.shape[2:]) for arrays in (plain, errors, large)]
+        errors = flat[1] + rounding(errors.shape[2] + 2 * self.coefficients.shape[1] + 6) * flat[2]
         for side in sides:
-            every = side.swept(begun[0], off, begun[2], np.ones(len(off)))
-            *bounds, tops = (one.reshape(len(size), -1) for one in every)
-            value, more, less = (one.sum(axis=1) for one in bounds)
-            low, high = low + value - less, high + value + more
-            lost += rounding(4 * count + 8) * 2.0 * tops.sum(axis=1)
+            integrals = side.swept(flat[0], errors, flat[2], np.ones(len(errors)))
+            *bounds, tops = (values.reshape(len(size), -1) for values in integrals)
+            value, excess, deficit = (values.sum(axis=1) for values in bounds)
+            low, high = low + value - deficit, high + value + excess
+            rounding_error += rounding(4 * count + 8) * 2.0 * tops.sum(axis=1)
         low, high = low / 2.0, high / 2.0  # u runs from -1 to 1, an interval of length 2
-        rad = (high - low) / 2.0 + (lost / 2.0 + rounding(4) * (np.abs(low) + np.abs(high)))
+        rad = (high - low) / 2.0 + (rounding_error / 2.0 + rounding(4) * (np.abs(low) + np.abs(high)))
         return Enclosed((low + high) / 2.0, rad * OUTWARD)
 
 
@@ -202,45 +202,47 @@ def swept(P: Array, e: Array, ends: Array) -> tuple[Array, Array, Array]:
         Values, and how much more and how much less the true integral may be, ``(M,)`` each.
     """
     orders = np.arange(P.shape[1])
-    here, start, stop = np.arange(len(P)), -np.ones(len(P)), ends.copy()
-    value, more, less = np.zeros(len(P)), np.zeros(len(P)), np.zeros(len(P))
+    owners, start, stop = np.arange(len(P)), -np.ones(len(P)), ends.copy()
+    value, excess, deficit = np.zeros(len(P)), np.zeros(len(P)), np.zeros(len(P))
     allowed = SETTLED * np.abs(P).sum(axis=1).max(axis=1)
     weights = 1.0 / (orders + 1.0)
-    for turn in range(ROUNDS + 1):
-        Q = P[here]
-        left, right = _valued(Q, start), _valued(Q, stop)
-        best, rows, width = (left + right).argmax(axis=1), np.arange(here.size), stop - start
+    for iteration in range(ROUNDS + 1):
+        Q = P[owners]
+        start_values, stop_values = _valued(Q, start), _valued(Q, stop)
+        best, rows, width = (start_values + stop_values).argmax(axis=1), np.arange(owners.size), stop - start
         G = Q[rows, :, best][:, :, None] - Q
-        g = [one[rows, best][:, None] - one for one in (left, right)]
+        g = [values[rows, best][:, None] - values for values in (start_values, stop_values)]
         below = np.maximum(0.0, -np.minimum(*g))
         bend = (np.abs(G) * (orders * (orders - 1))[:, None]).sum(axis=1)
         # a function with |f''| <= bend that is not negative at the ends is nowhere negative where this holds
         near = (np.sqrt(np.maximum(g[0], 0.0)) + np.sqrt(np.maximum(g[1], 0.0))) ** 2
         dips = np.where(near >= bend * (width**2 / 2.0)[:, None], 0.0, bend * (width**2 / 8.0)[:, None])
-        wrong = (below + dips) * (1.0 + 1e-13)
-        wrong[rows, best] = 0.0
-        wrong = wrong.max(axis=1)
+        shortfall = (below + dips) * (1.0 + 1e-13)
+        shortfall[rows, best] = 0.0
+        shortfall = shortfall.max(axis=1)
         # where the corners differ by less than their error bounds, no further cut helps
-        settled = (wrong * width <= allowed[here]) | (wrong <= e[here].max(axis=1)) | (turn == ROUNDS)
-        done, at = rows[settled], here[settled]
-        chosen = Q[done, :, best[done]] * weights
-        area = _valued(chosen, stop[done]) * stop[done] - _valued(chosen, start[done]) * start[done]
-        own, others = e[at, best[done]], e[at].max(axis=1)
-        np.add.at(value, at, area)
+        is_settled = (
+            (shortfall * width <= allowed[owners]) | (shortfall <= e[owners].max(axis=1)) | (iteration == ROUNDS)
+        )
+        settled, targets = rows[is_settled], owners[is_settled]
+        chosen = Q[settled, :, best[settled]] * weights
+        area = _valued(chosen, stop[settled]) * stop[settled] - _valued(chosen, start[settled]) * start[settled]
+        own_errors, largest_errors = e[targets, best[settled]], e[targets].max(axis=1)
+        np.add.at(value, targets, area)
         # ``e`` allows for the rounding errors of two parts; with more parts, those at both ends of each are added
-        rounded = 2.0 * rounding(orders.size + 4) * np.abs(chosen).sum(axis=1) * (turn > 1)
-        np.add.at(more, at, (wrong[done] + own + 2.0 * others) * width[done] + rounded)
-        np.add.at(less, at, own * width[done] + rounded)
-        if settled.all():
+        rounded = 2.0 * rounding(orders.size + 4) * np.abs(chosen).sum(axis=1) * (iteration > 1)
+        np.add.at(excess, targets, (shortfall[settled] + own_errors + 2.0 * largest_errors) * width[settled] + rounded)
+        np.add.at(deficit, targets, own_errors * width[settled] + rounded)
+        if is_settled.all():
             break
-        rest = rows[~settled]
-        a, b = left[rest].argmax(axis=1), right[rest].argmax(axis=1)
-        cut = (start[rest] + stop[rest]) / 2.0
-        if turn < CROSSING or turn % 2:
-            cut = _equal(Q[rest, :, a] - Q[rest, :, b], start[rest], stop[rest])
-        here = np.tile(here[rest], 2)
-        start, stop = np.concatenate([start[rest], cut]), np.concatenate([cut, stop[rest]])
-    return value, more * OUTWARD, less * OUTWARD
+        open_cells = rows[~is_settled]
+        a, b = start_values[open_cells].argmax(axis=1), stop_values[open_cells].argmax(axis=1)
+        cut = (start[open_cells] + stop[open_cells]) / 2.0
+        if iteration < CROSSING or iteration % 2:
+            cut = _equal(Q[open_cells, :, a] - Q[open_cells, :, b], start[open_cells], stop[open_cells])
+        owners = np.tile(owners[open_cells], 2)
+        start, stop = np.concatenate([start[open_cells], cut]), np.concatenate([cut, stop[open_cells]])
+    return value, excess * OUTWARD, deficit * OUTWARD
 
 
 def _valued(P: Array, u: Array) -> Array:
@@ -261,8 +263,8 @@ def _equal(P: Array, start: Array, stop: Array) -> Array:
             cut = np.where(crossing, b - fb * (b - a) / (fb - fa), middle_of)
         cut = np.where(np.isfinite(cut), cut, middle_of)
         f = _valued(P, cut)
-        turned = f * fb < 0.0
-        a, fa = np.where(turned, b, a), np.where(turned, fb, fa / 2.0)
+        has_changed = f * fb < 0.0
+        a, fa = np.where(has_changed, b, a), np.where(has_changed, fb, fa / 2.0)
         b, fb = cut, f
     least = 1e-9 * (stop - start)
     return np.asarray(np.where(crossing & (cut > start + least) & (cut < stop - least), cut, middle_of))
@@ -307,16 +309,16 @@ class MeasurableDeviations(Deviations):
     def way(self, start: float, stop: float) -> VerifiedKernel:
         """Return the kernel of an interval; its parts are the intervals between marks, each with its own ``u`` from -1
         to 1."""
-        every, onward = list[Enclosed](), identity(self.flow.states)
+        kernels, transition = list[Enclosed](), identity(self.flow.states)
         columns = slice(self.flow.driven, self.flow.driven + self.width)
         for first, last in reversed(list(pairwise(self.flow.marks([start, stop])))):
             terms = pushes(self.flow, first, last, columns)
-            every.append(product(Enclosed.of(onward), Enclosed(terms.mid[:, 0], terms.rad[:, 0])))
-            onward = onward * self.flow.over(first, last)[0].matrix
-        most = max(len(one.mid) for one in every)
+            kernels.append(product(Enclosed.of(transition), Enclosed(terms.mid[:, 0], terms.rad[:, 0])))
+            transition = transition * self.flow.over(first, last)[0].matrix
+        order = max(len(kernel.mid) for kernel in kernels)
         mid, rad = (
-            np.array([np.pad(part, ((0, most - len(part)), (0, 0), (0, 0))) for part in parts])
-            for parts in zip(*((one.mid, one.rad) for one in every), strict=True)
+            np.array([np.pad(array, ((0, order - len(array)), (0, 0), (0, 0))) for array in arrays])
+            for arrays in zip(*((kernel.mid, kernel.rad) for kernel in kernels), strict=True)
         )
         return VerifiedKernel(mid, rad.sum(axis=1) * OUTWARD)
 
@@ -325,15 +327,15 @@ class MeasurableDeviations(Deviations):
         d = self.flow.states
         axes = np.vstack([np.eye(d), -np.eye(d)])
         exact = Enclosed(axes, np.zeros_like(axes))
-        alike: dict[int, tuple[VerifiedKernel, Array]] = {}  # the kernels are kept, so that their ids stay unique
-        found = list[Array]()
+        cached: dict[int, tuple[VerifiedKernel, Array]] = {}  # the kernels are kept, so that their ids stay unique
+        radii = list[Array]()
         for piece in range(self.blocks):
             kernel = self.kernel(piece)
-            if id(kernel) not in alike:
+            if id(kernel) not in cached:
                 ends = kernel.most(exact, self.sides)
-                alike[id(kernel)] = kernel, (ends.mid + ends.rad).reshape(2, d).max(axis=0)
-            found.append(alike[id(kernel)][1])
-        return rounded_radii(found, self.sets)
+                cached[id(kernel)] = kernel, (ends.mid + ends.rad).reshape(2, d).max(axis=0)
+            radii.append(cached[id(kernel)][1])
+        return rounded_radii(radii, self.sets)
 
     def supports(self, every: Sequence[list[arb]]) -> list[arb]:
         """Return the support values at every ``a (Q,)``: sums of integrals of support functions."""
@@ -341,22 +343,24 @@ class MeasurableDeviations(Deviations):
 
         d, blocks = self.flow.states, self.blocks
         table = Enclosed.of(stacked(every)).with_exact_zeros
-        mid, rad = (part[:, : blocks * d].reshape(len(every), blocks, d) for part in (table.mid, table.rad))
-        alike: dict[int, tuple[VerifiedKernel, list[int]]] = {}
+        mid, rad = (values[:, : blocks * d].reshape(len(every), blocks, d) for values in (table.mid, table.rad))
+        groups: dict[int, tuple[VerifiedKernel, list[int]]] = {}
         for piece in range(blocks):
             kernel = self.kernel(piece)
-            alike.setdefault(id(kernel), (kernel, []))[1].append(piece)
+            groups.setdefault(id(kernel), (kernel, []))[1].append(piece)
         total = [arb(0)] * len(every)
-        for kernel, pieces in alike.values():
-            parts = Enclosed(mid[:, pieces].reshape(-1, d), rad[:, pieces].reshape(-1, d))
-            used = np.flatnonzero((np.abs(parts.mid) + parts.rad).any(axis=1))
+        for kernel, pieces in groups.values():
+            rows = Enclosed(mid[:, pieces].reshape(-1, d), rad[:, pieces].reshape(-1, d))
+            used = np.flatnonzero((np.abs(rows.mid) + rows.rad).any(axis=1))
             if not used.size:
                 continue
-            found = kernel.most(Enclosed(parts.mid[used], parts.rad[used]), self.sides)
-            for place, m, r in zip((used // len(pieces)).tolist(), found.mid.tolist(), found.rad.tolist(), strict=True):
-                total[place] = total[place] + arb(m, r)
+            integrals = kernel.most(Enclosed(rows.mid[used], rows.rad[used]), self.sides)
+            for index, m, r in zip(
+                (used // len(pieces)).tolist(), integrals.mid.tolist(), integrals.rad.tolist(), strict=True
+            ):
+                total[index] = total[index] + arb(m, r)
         for shape, about in self.sets:
-            total = [one + of_block(shape, about, a[blocks * d :]) for one, a in zip(total, every, strict=True)]
+            total = [value + of_block(shape, about, a[blocks * d :]) for value, a in zip(total, every, strict=True)]
         return total
 
 
@@ -374,20 +378,20 @@ class MeasurableLoop(VerifiedLoop):
         """The transitions ``D_jl`` from the end of every piece ``l`` to the next breakpoint ``j`` of the control,
         ``(d, d)``."""
         K = len(self.breakpoints) - 1
-        found: list[dict[int, arb_mat]] = [{} for _ in range(K)]
+        transitions: list[dict[int, arb_mat]] = [{} for _ in range(K)]
         if self.initial is not None:
-            found[0][self.deviations.blocks] = identity(self.system.states)
+            transitions[0][self.deviations.blocks] = identity(self.system.states)
         later: tuple[int, arb_mat] = (
             K,
             identity(self.system.states),
         )  # the piece of the control, and the transition to its end
         for piece in reversed(range(self.deviations.blocks)):
             k = self.on(piece)
-            left = later[1] if later[0] == k else identity(self.system.states)
+            transition = later[1] if later[0] == k else identity(self.system.states)
             if k + 1 < K:
-                found[k + 1][piece] = left
-            later = k, left * self._passed(piece)[0]
-        return found
+                transitions[k + 1][piece] = transition
+            later = k, transition * self._passed(piece)[0]
+        return transitions
 
     def _entered(self, rows: list[list[arb]], block: int) -> None:
         """Leave the rows as they are: a disturbance within a piece counts at the end of the piece."""
@@ -405,18 +409,20 @@ class MeasurableLoop(VerifiedLoop):
         disturbance on this piece, ``(d, 1 + Q)``."""
         if time == self.grid[piece]:
             return self.nodes[piece]
-        Phi, added = self._moved(piece, self.grid[piece], time)
-        return Phi * self.nodes[piece] + added
+        Phi, effect = self._moved(piece, self.grid[piece], time)
+        return Phi * self.nodes[piece] + effect
 
     def highest(self, piece: int, time: float, rows: Array | arb_mat, beside: arb_mat | None = None) -> list[arb]:
         """Return the `heights` of ``rows (r, d)`` at a time in a piece, with the disturbance up to this time."""
         from flint import arb
 
-        found = super().highest(piece, time, rows, beside)
+        heights = super().highest(piece, time, rows, beside)
         if time == self.grid[piece]:
-            return found
-        added = self.under_way(piece, time, rows)
-        return [one + arb(m, r) for one, m, r in zip(found, added.mid.tolist(), added.rad.tolist(), strict=True)]
+            return heights
+        effect = self.under_way(piece, time, rows)
+        return [
+            height + arb(m, r) for height, m, r in zip(heights, effect.mid.tolist(), effect.rad.tolist(), strict=True)
+        ]
 
     def under_way(self, piece: int, time: float, rows: Array | arb_mat) -> Enclosed:
         """Return the most that the disturbances on a piece add to ``rows (r, d)`` up to a time in this piece,
@@ -427,16 +433,16 @@ class MeasurableLoop(VerifiedLoop):
         """Return upper bounds ``(r,)`` of how far ``max c'x(t)`` lies above its chord on ``[start, stop]``. The
         disturbance on the piece itself adds a sum of integrals of absolute values, or less."""
         axes = np.vstack([np.eye(self.system.states), -np.eye(self.system.states)])
-        begun, size = (
+        start_bounds, size = (
             np.zeros(len(axes)),
             sum((side.far for side in self.deviations.sides), np.zeros(self.deviations.width)),
         )
         if start > self.grid[piece]:
             ends = self.under_way(piece, start, axes)
-            begun = np.maximum(ends.mid + ends.rad, 0.0) * OUTWARD
-        states = begun.reshape(2, -1).max(axis=0)
-        more = above_chord(self.flow, rows, start, stop, states, size * OUTWARD, self.flow.driven)
-        return np.asarray((super().bent(piece, start, stop, rows) + more) * OUTWARD)
+            start_bounds = np.maximum(ends.mid + ends.rad, 0.0) * OUTWARD
+        states = start_bounds.reshape(2, -1).max(axis=0)
+        chord_error = above_chord(self.flow, rows, start, stop, states, size * OUTWARD, self.flow.driven)
+        return np.asarray((super().bent(piece, start, stop, rows) + chord_error) * OUTWARD)
 
 
 def as_enclosed(rows: Array | arb_mat) -> Enclosed:
@@ -447,5 +453,5 @@ def as_enclosed(rows: Array | arb_mat) -> Enclosed:
 def signed(P: Array, off: Array) -> tuple[Array, Array]:
     """Return polynomials ``(n, p + 1, m)`` one after another with their opposites, ``(n m, p + 1, 2)``, and the error
     bounds of both, ``(n m, 2)``, from ``off (n, m)``."""
-    each = np.moveaxis(P, 2, 1).reshape(-1, P.shape[1])
-    return np.stack([each, -each], axis=2), np.repeat(off.reshape(-1, 1), 2, axis=1)
+    flat = np.moveaxis(P, 2, 1).reshape(-1, P.shape[1])
+    return np.stack([flat, -flat], axis=2), np.repeat(off.reshape(-1, 1), 2, axis=1)

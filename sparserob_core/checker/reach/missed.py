@@ -72,9 +72,12 @@ class SizedInput:
     def sizes(self) -> Enclosed:
         """The size of the input on every piece of the command, ``(K, m)``, with error bounds."""
         control = Enclosed.all(self.pieces, (len(self.pieces), self.shares.size))
-        size, off = self.shares * np.abs(control.mid), np.zeros(self.shares.size) if self.off is None else self.off
-        lost = off * (np.abs(control.mid) + control.rad)
-        return Enclosed(size, (self.shares * control.rad + lost + rounding(2) * size) * OUTWARD)
+        size, share_errors = (
+            self.shares * np.abs(control.mid),
+            np.zeros(self.shares.size) if self.off is None else self.off,
+        )
+        error = share_errors * (np.abs(control.mid) + control.rad)
+        return Enclosed(size, (self.shares * control.rad + error + rounding(2) * size) * OUTWARD)
 
     @property
     def columns(self) -> slice:
@@ -90,8 +93,8 @@ class SizedInput:
 
     def piece_at(self, time: float) -> int:
         """Return the index of the piece of the command from a time on."""
-        place = int(np.searchsorted(self.breakpoints, time, side="right")) - 1
-        return min(max(0, place), len(self.pieces) - 1)
+        index = int(np.searchsorted(self.breakpoints, time, side="right")) - 1
+        return min(max(0, index), len(self.pieces) - 1)
 
     def largest(self, piece: int) -> Array:
         """Return upper bounds ``(m,)`` of what enters by each column on a piece."""
@@ -123,10 +126,10 @@ class BoundedInputAt(BoundedInputHere):
     def least(self, c: Array, time: float) -> Array:
         """Return lower bounds ``(K, m)`` of what the worst input adds to ``c'x(t)`` for a command of size 1 on every
         piece."""
-        found = np.zeros((self.input.breakpoints.size - 1, self.input.shares.size))
-        low, _, which = self._integrals(c[None], time, np.arange(len(self.marks) - 1))
-        np.add.at(found, self.owner[which], np.maximum(low[:, 0], 0.0))
-        return found * self.input.shares * (1.0 - rounding(which.size))
+        bounds = np.zeros((self.input.breakpoints.size - 1, self.input.shares.size))
+        low, _, indices = self._integrals(c[None], time, np.arange(len(self.marks) - 1))
+        np.add.at(bounds, self.owner[indices], np.maximum(low[:, 0], 0.0))
+        return bounds * self.input.shares * (1.0 - rounding(indices.size))
 
     def added(self, c: Array, time: float) -> tuple[float, float]:
         """Return a lower and an upper bound of what the worst input adds to ``c'x(t)``."""
@@ -136,26 +139,26 @@ class BoundedInputAt(BoundedInputHere):
     def bent(self, c: Array, start: float, stop: float) -> float:
         """Return an upper bound of how far `added` lies above its chord on ``[start, stop]``."""
         d = c.size
-        begun = self._summed(np.eye(d), start)[1]
+        start_bounds = self._summed(np.eye(d), start)[1]
         if self.input.side is not None:
-            begun = np.maximum(begun, self._summed(-np.eye(d), start)[1])
+            start_bounds = np.maximum(start_bounds, self._summed(-np.eye(d), start)[1])
         size = self.input.largest(self.input.piece_at(start))
-        return float(above_chord(self.law, c[None], start, stop, begun, size, self.input.first)[0])
+        return float(above_chord(self.law, c[None], start, stop, start_bounds, size, self.input.first)[0])
 
     @remembered(lambda: TIMES_KEPT, lambda self, rows, time: (time, rows.tobytes()))
     def _summed(self, rows: Array, time: float) -> tuple[Array, Array]:
         """Return lower and upper bounds ``(n,)`` of what the worst input adds to ``rows (n, d)`` at a time."""
         used = np.flatnonzero((self.input.sizes.mid + self.input.sizes.rad).any(axis=1))
-        low, high, which = self._integrals(rows, time, np.flatnonzero(np.isin(self.owner, used)))
-        owner = self.owner[which]
+        low, high, indices = self._integrals(rows, time, np.flatnonzero(np.isin(self.owner, used)))
+        owner = self.owner[indices]
         mid, rad = self.input.sizes.mid[owner, None], self.input.sizes.rad[owner, None]
         # absolute values are not negative; a support function may be, where the middle of a thin set is not in it
         if self.input.side is None:
             low = np.maximum(low, 0.0)
         at_least = np.where(low > 0.0, low * np.maximum(mid - rad, 0.0), low * (mid + rad)).sum(axis=(0, 2))
         at_most = (high * (mid + rad)).sum(axis=(0, 2))
-        lost = rounding(2 * which.size * self.input.shares.size + 8) * at_most
-        return at_least - lost * OUTWARD, at_most + lost * OUTWARD
+        rounding_error = rounding(2 * indices.size * self.input.shares.size + 8) * at_most
+        return at_least - rounding_error * OUTWARD, at_most + rounding_error * OUTWARD
 
     def _integrals(self, rows: Array, time: float, pieces: np.ndarray) -> tuple[Array, Array, np.ndarray]:
         """Return bounds of ``int |c'Phi(t, s) B_j(s)| ds`` for ``rows (n, d)``, over the intervals between marks among
@@ -168,39 +171,39 @@ class BoundedInputAt(BoundedInputHere):
             `side` the integrals are those of its support function, and ``m`` is 1.
         """
         begins, rows = np.array(self.marks[:-1]), self.input.reaching(rows)
-        which = pieces[begins[pieces] < time]
-        if not which.size:
+        indices = pieces[begins[pieces] < time]
+        if not indices.size:
             none = np.zeros((0, len(rows), self.input.shares.size))
-            return none, none, which
+            return none, none, indices
         last = int(np.searchsorted(begins, time, side="left")) - 1
         kernels, lines = [], []
-        if (which < last).any():
-            onwards = self.law.over(self.marks[last], time)[0].matrix
-            begun = Enclosed.of(exactly(rows) * onwards)
-            past, onward = which[which < last], self._onward_to(last)
-            found = _carried(begun, Enclosed(onward.mid[past], onward.rad[past]))
+        if (indices < last).any():
+            transition = self.law.over(self.marks[last], time)[0].matrix
+            last_rows = Enclosed.of(exactly(rows) * transition)
+            past, transitions = indices[indices < last], self._onward_to(last)
+            propagated = _carried(last_rows, Enclosed(transitions.mid[past], transitions.rad[past]))
             kernels += [self._kernel(self.marks[k], self.marks[k + 1]) for k in past]
-            lines.append(found)
-        if which[-1] == last:
+            lines.append(propagated)
+        if indices[-1] == last:
             kernels.append(self._kernel(self.marks[last], time))
             lines.append(Enclosed(rows[None], np.zeros((1, *rows.shape))))
-        order = max(one.mid.shape[0] for one in kernels)
+        order = max(kernel.mid.shape[0] for kernel in kernels)
         K = Enclosed(*(
-            np.array([np.pad(part, ((0, order - len(part)), (0, 0), (0, 0))) for part in parts])
-            for parts in zip(*((one.mid, one.rad) for one in kernels), strict=True)
+            np.array([np.pad(array, ((0, order - len(array)), (0, 0), (0, 0))) for array in arrays])
+            for arrays in zip(*((kernel.mid, kernel.rad) for kernel in kernels), strict=True)
         ))  # fmt: skip
-        a, rad = (np.concatenate([getattr(one, name) for one in lines]) for name in ("mid", "rad"))
+        a, rad = (np.concatenate([getattr(line, name) for line in lines]) for name in ("mid", "rad"))
         plain = np.einsum("qnd,qpdm->qnpm", a, K.mid)
         sizes = np.abs(K.mid).sum(axis=1)
-        off = np.einsum("qnd,qdm->qnm", np.abs(a), rounding(a.shape[2] + 1) * sizes + K.rad.sum(axis=1))
-        off = (off + np.einsum("qnd,qdm->qnm", rad, sizes + K.rad.sum(axis=1))) * OUTWARD
-        off = off + rounding(4 * order + 32) * np.abs(plain).sum(axis=2)  # rounding of the sums that follow
+        errors = np.einsum("qnd,qdm->qnm", np.abs(a), rounding(a.shape[2] + 1) * sizes + K.rad.sum(axis=1))
+        errors = (errors + np.einsum("qnd,qdm->qnm", rad, sizes + K.rad.sum(axis=1))) * OUTWARD
+        errors = errors + rounding(4 * order + 32) * np.abs(plain).sum(axis=2)  # rounding of the sums that follow
         if self.input.side is not None:
-            return *self._together(self.input.side, plain, off), which
-        flat = signed(plain.reshape(-1, *plain.shape[2:]), off.reshape(-1, off.shape[2]))
-        value, more, less = (one.reshape(off.shape) / 2.0 for one in swept(*flat, np.ones(off.size)))
-        ends = rounding(4) * (np.abs(value) + more)
-        return value - less - ends, value + more + ends, which
+            return *self._together(self.input.side, plain, errors), indices
+        flat = signed(plain.reshape(-1, *plain.shape[2:]), errors.reshape(-1, errors.shape[2]))
+        value, excess, deficit = (values.reshape(errors.shape) / 2.0 for values in swept(*flat, np.ones(errors.size)))
+        rounding_error = rounding(4) * (np.abs(value) + excess)
+        return value - deficit - rounding_error, value + excess + rounding_error, indices
 
     @staticmethod
     def _together(side: Side | CurvedSide | Together, plain: Array, off: Array) -> tuple[Array, Array]:
@@ -208,23 +211,23 @@ class BoundedInputAt(BoundedInputHere):
         polynomials ``(q, n, p + 1, m)`` with error bounds ``off (q, n, m)``."""
         q, n, order, m = plain.shape
         sizes = np.abs(plain).sum(axis=2).reshape(q * n, m)
-        lost = off.reshape(q * n, m) + rounding(4 * order + 32 + m) * sizes
-        found = side.swept(plain.reshape(q * n, order, m), lost, sizes, np.ones(q * n))
-        value, more, less, _ = (one.reshape(q, n, 1) / 2.0 for one in found)
-        ends = rounding(4) * (np.abs(value) + more)
-        return value - less - ends, np.maximum(value + more, 0.0) + ends
+        errors = off.reshape(q * n, m) + rounding(4 * order + 32 + m) * sizes
+        integrals = side.swept(plain.reshape(q * n, order, m), errors, sizes, np.ones(q * n))
+        value, excess, deficit, _ = (values.reshape(q, n, 1) / 2.0 for values in integrals)
+        rounding_error = rounding(4) * (np.abs(value) + excess)
+        return value - deficit - rounding_error, np.maximum(value + excess, 0.0) + rounding_error
 
     @remembered(lambda: TIMES_KEPT)
     def _kernel(self, start: float, stop: float) -> Enclosed:
         """Return the kernel of an interval in powers of ``u`` from -1 to 1, ``(p + 1, d, m)``."""
-        found = pushes(self.law, start, stop, self.input.columns)
-        return Enclosed(found.mid[:, 0], found.rad[:, 0])
+        kernel = pushes(self.law, start, stop, self.input.columns)
+        return Enclosed(kernel.mid[:, 0], kernel.rad[:, 0])
 
     @remembered(lambda: KEPT)
     def _onward_to(self, node: int) -> Enclosed:
         """Return the transitions to a mark from the end of every interval before it, ``(node, d, d)``."""
-        whole = enclosed(products(self._steps[:node])[1:])
-        return Enclosed(whole.mid[:, 0], whole.rad[:, 0])
+        transitions = enclosed(products(self._steps[:node])[1:])
+        return Enclosed(transitions.mid[:, 0], transitions.rad[:, 0])
 
     @cached_property
     def _steps(self) -> list[Series]:
@@ -260,24 +263,24 @@ class BoundedInputOver(BoundedInput):
         low, high, centre, radius = map(np.array, (*box, flow.centre, flow.radius))
         signs = np.array(list(every_choice((-1.0, 1.0), repeat=low.size)))
         corners = np.where(signs > 0.0, high, low).tolist()
-        found = np.array([[self.at(point).added(c, time) for time in times] for point in corners])
-        middle, off = found.mean(axis=2), float((found[..., 1] - found[..., 0]).max())
-        ends, numbers, rest = np.zeros((len(times), flow.monomials.size)), flow.monomials.number, 0.0
+        sums = np.array([[self.at(point).added(c, time) for time in times] for point in corners])
+        middle, gap = sums.mean(axis=2), float((sums[..., 1] - sums[..., 0]).max())
+        ends, numbers, fit_error = np.zeros((len(times), flow.monomials.size)), flow.monomials.number, 0.0
         for chosen in every_choice((0, 1), repeat=low.size):
-            part = signs[:, np.flatnonzero(chosen)].prod(axis=1) @ middle / len(signs)
+            coefficient = signs[:, np.flatnonzero(chosen)].prod(axis=1) @ middle / len(signs)
             if chosen in numbers:
-                ends[:, numbers[chosen]] = part
+                ends[:, numbers[chosen]] = coefficient
             else:  # a monomial that the expansion does not have
-                rest += float(np.abs(part).max())
+                fit_error += float(np.abs(coefficient).max())
         # rounding of the middle and the radius moves the corners of the box away from shares of exactly 1 and -1
         inside = np.minimum(high - centre, centre - low) * (1.0 - rounding(2))
         skew = float(((radius - inside) / np.where(radius > 0.0, radius, 1.0)).sum())
-        rest += 2.0 * skew * float(np.ptp(middle, axis=0).max()) + rounding(4 * len(signs) + 8) * float(found.max())
-        wide, lost, bent = self._curved(c, times, ParameterBox(flow.centre, flow.radius))
+        fit_error += 2.0 * skew * float(np.ptp(middle, axis=0).max()) + rounding(4 * len(signs) + 8) * float(sums.max())
+        wide, remainder, chord_error = self._curved(c, times, ParameterBox(flow.centre, flow.radius))
         least = np.array([self.at(centre.tolist()).added(c, time)[0] for time in times])
         over = max(0.0, float((middle.mean(axis=0) - least).max()))
         total = float(wide.sum()) * OUTWARD
-        return Added(ends, (off + rest + total + 2.0 * lost + bent) * OUTWARD, over * OUTWARD, wide)
+        return Added(ends, (gap + fit_error + total + 2.0 * remainder + chord_error) * OUTWARD, over * OUTWARD, wide)
 
     def _curved(self, c: Array, times: Sequence[float], box: ParameterBox) -> tuple[Array, float, float]:
         """Return bounds of what the curvature adds on a box of parameters.
@@ -286,43 +289,45 @@ class BoundedInputOver(BoundedInput):
         -------
         wide
             How far the integrals may lie above the interpolation between corners, due to each parameter, ``(nu,)``.
-        lost
+        remainder
             The remainder of the expansion.
-        bent
+        chord_error
             How far the integrals may lie above their chord between the ``times``; 0 at a single time.
         """
         flow = self.flows.holding(box)
         halves = np.array(flow.box.halves)
         shares = np.array(box.halves) / np.where(halves > 0.0, halves, 1.0) * (1.0 + rounding(4))
         exponents = np.array(flow.monomials.exponents, dtype=float)
-        reached = self.input.reaching(np.ones((1, c.size)))[0]
-        wide, lost, bent = np.zeros(len(shares)), 0.0, 0.0
+        mask = self.input.reaching(np.ones((1, c.size)))[0]
+        wide, remainder, chord_error = np.zeros(len(shares)), 0.0, 0.0
         for time in times:
-            size, off = self._summed(flow, (c * reached)[None], time)
+            size, remainders = self._summed(flow, (c * mask)[None], time)
             wide = np.maximum(wide, (size[0] @ (exponents * (exponents - 1.0))) * shares**2 / 2.0)
-            lost = max(lost, float(off[0]))
+            remainder = max(remainder, float(remainders[0]))
         if times[-1] > times[0]:
-            size, off = self._summed(flow, np.diag(reached), times[0])
+            size, remainders = self._summed(flow, np.diag(mask), times[0])
             entering = self.input.largest(self.input.piece_at(times[0])) * OUTWARD
-            begun = (size.sum(axis=1) + off) * OUTWARD
+            start_bounds = (size.sum(axis=1) + remainders) * OUTWARD
             ends, first = (times[0], times[-1]), self.input.first
-            bent = float(above_chord(flow, (c * reached)[None], *ends, begun, entering, first)[0])
-        return wide * OUTWARD, lost * OUTWARD, bent * OUTWARD
+            chord_error = float(above_chord(flow, (c * mask)[None], *ends, start_bounds, entering, first)[0])
+        return wide * OUTWARD, remainder * OUTWARD, chord_error * OUTWARD
 
     def _summed(self, flow: VerifiedFlow, rows: Array, time: float) -> tuple[Array, Array]:
         """Return upper bounds of what the input adds to ``rows (n, d)`` by a time, in absolute values: for every
         coefficient in the parameters, ``(n, M)``, and for the remainder, ``(n,)``."""
-        onward, kernels, owner = self._reaching(flow, time)
-        size, off = np.zeros((len(rows), flow.monomials.size)), np.zeros(len(rows))
-        lost = onward.rad + rounding(rows.shape[1]) * np.abs(onward.mid)
+        transitions, kernels, owner = self._reaching(flow, time)
+        size, remainders = np.zeros((len(rows), flow.monomials.size)), np.zeros(len(rows))
+        transition_errors = transitions.rad + rounding(rows.shape[1]) * np.abs(transitions.mid)
         for q, piece in enumerate(owner):
-            along = Enclosed(np.swapaxes(rows @ onward.mid[q], 1, 2), np.swapaxes(np.abs(rows) @ lost[q], 1, 2))
+            along = Enclosed(
+                np.swapaxes(rows @ transitions.mid[q], 1, 2), np.swapaxes(np.abs(rows) @ transition_errors[q], 1, 2)
+            )
             kernel = Enclosed(np.swapaxes(kernels.mid[q], 2, 3), np.swapaxes(kernels.rad[q], 2, 3))
             entering = self.input.largest(piece) * OUTWARD
-            found = ring(flow.monomials, kernel, along)  # (p + 1, M, m, n)
-            size += np.einsum("pkjn,j,p->nk", np.abs(found.mid), entering, MEANS[: len(found.mid)])
-            off += np.einsum("pkjn,j->n", found.rad, entering)
-        return size * OUTWARD, off * OUTWARD
+            product = ring(flow.monomials, kernel, along)  # (p + 1, M, m, n)
+            size += np.einsum("pkjn,j,p->nk", np.abs(product.mid), entering, MEANS[: len(product.mid)])
+            remainders += np.einsum("pkjn,j->n", product.rad, entering)
+        return size * OUTWARD, remainders * OUTWARD
 
     @remembered(lambda: TIMES_KEPT)
     def _kernel(self, flow: VerifiedFlow, start: float, stop: float) -> Enclosed:
@@ -341,16 +346,19 @@ class BoundedInputOver(BoundedInput):
         if not steps:
             none = np.zeros((2, 0, flow.monomials.size, d, d)), np.zeros((2, 0, 1, flow.monomials.size, d, m))
             return Enclosed(*none[0]), Enclosed(*none[1]), np.zeros(0, dtype=int)
-        every = [self._kernel(flow, *pair) for pair in pairwise(marks)]
-        order = max(len(one.mid) for one in every)
-        pad = [[np.pad(part, ((0, order - len(part)), *[(0, 0)] * 3)) for part in (one.mid, one.rad)] for one in every]
+        kernels = [self._kernel(flow, *pair) for pair in pairwise(marks)]
+        order = max(len(kernel.mid) for kernel in kernels)
+        pad = [
+            [np.pad(array, ((0, order - len(array)), *[(0, 0)] * 3)) for array in (kernel.mid, kernel.rad)]
+            for kernel in kernels
+        ]
         owner = np.searchsorted(self.input.breakpoints, np.array(marks[:-1]), side="right") - 1
-        return enclosed(products(steps)[1:]), Enclosed(*(np.array(one) for one in zip(*pad, strict=True))), owner
+        return enclosed(products(steps)[1:]), Enclosed(*(np.array(arrays) for arrays in zip(*pad, strict=True))), owner
 
 
 def _carried(rows: Enclosed, steps: Enclosed) -> Enclosed:
     """Return ``rows (n, d)`` times every one of ``steps (q, d, d)``, ``(q, n, d)``."""
-    size, there = np.abs(rows.mid), np.abs(steps.mid)
-    rad = np.einsum("nd,qde->qne", size, steps.rad + rounding(size.shape[1]) * there)
-    rad = (rad + np.einsum("nd,qde->qne", rows.rad, there + steps.rad)) * OUTWARD
+    row_size, step_size = np.abs(rows.mid), np.abs(steps.mid)
+    rad = np.einsum("nd,qde->qne", row_size, steps.rad + rounding(row_size.shape[1]) * step_size)
+    rad = (rad + np.einsum("nd,qde->qne", rows.rad, step_size + steps.rad)) * OUTWARD
     return Enclosed(np.einsum("nd,qde->qne", rows.mid, steps.mid), rad)

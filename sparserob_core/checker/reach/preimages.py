@@ -80,19 +80,19 @@ class Pushed:
         """
         from flint import fmpq, fmpq_mat
 
-        if not all(x.is_exact() for mode in modes for part in mode for x in part.entries()):
+        if not all(x.is_exact() for mode in modes for matrix in mode for x in matrix.entries()):
             raise Unchecked("the numbers of the system are not exact")
         systems = [_rational(A.transpose().tolist()) for A, _ in modes]
         along = fmpq_mat([[fmpq(v.numerator, v.denominator) for v in vector] for vector in vectors]).transpose()
-        entered = [_rational(E.tolist()) * along for _, E in modes]
-        pattern: Pattern = np.any([[[x != 0 for x in row] for row in E.tolist()] for E in entered], axis=0)
+        columns = [_rational(E.tolist()) * along for _, E in modes]
+        pattern: Pattern = np.any([[[x != 0 for x in row] for row in E.tolist()] for E in columns], axis=0)
         linked = np.any([middles(A) != 0.0 for A, _ in modes], axis=0).astype(int)
-        spanned = spanning([row for one in entered for row in one.transpose().tolist()])
+        spanned = spanning([row for matrix in columns for row in matrix.transpose().tolist()])
         for _ in range(linked.shape[0] - 1):
-            moved = [row for a in systems for row in (fmpq_mat(spanned) * a).tolist()] if spanned else []
-            spanned = spanning([*spanned, *moved])
+            images = [row for a in systems for row in (fmpq_mat(spanned) * a).tolist()] if spanned else []
+            spanned = spanning([*spanned, *images])
             pattern = pattern | (linked @ pattern.astype(int) > 0)
-        return Pushed(pattern, len(spanned), fmpq_mat([row for one in entered for row in one.tolist()]).rank())
+        return Pushed(pattern, len(spanned), fmpq_mat([row for matrix in columns for row in matrix.tolist()]).rank())
 
     @staticmethod
     def linked(A: Pattern, E: Pattern, vectors: Sequence[Sequence[Fraction]]) -> Pushed:
@@ -146,16 +146,16 @@ class SeenDeviations:
         row, column, seeing, shown = (sum(sizes[:k]) for k in range(4))
         source, sink = sum(sizes), sum(sizes) + 1
         links = [(row + i, column + j, 1) for i, j in np.argwhere(self.pattern).tolist()]
-        links += [(source, seeing + g, most) for g, (_, most) in enumerate(self.rows)]
-        links += [(shown + g, sink, most) for g, (_, most) in enumerate(self.columns)]
+        links += [(source, seeing + g, capacity) for g, (_, capacity) in enumerate(self.rows)]
+        links += [(shown + g, sink, capacity) for g, (_, capacity) in enumerate(self.columns)]
         links += [(seeing + g, row + i, 1) for i, g in enumerate(_groups(self.rows, r))]
         links += [(column + j, shown + g, 1) for j, g in enumerate(_groups(self.columns, c))]
         starts, ends, room = (np.array(values, dtype=np.int32) for values in zip(*links, strict=True))
         network = csr_array((room, (starts, ends)), shape=(sink + 1, sink + 1))
-        left = csr_array(network - maximum_flow(network, source, sink).flow)
-        left.eliminate_zeros()
+        residual = csr_array(network - maximum_flow(network, source, sink).flow)
+        residual.eliminate_zeros()
         inside = np.zeros(sink + 1, dtype=bool)
-        inside[breadth_first_order(left, source, return_predecessors=False)] = True
+        inside[breadth_first_order(residual, source, return_predecessors=False)] = True
         return int(room[inside[starts] & ~inside[ends]].sum())
 
     def inverse(self) -> arb_mat:
@@ -177,18 +177,22 @@ class SeenDeviations:
         D, rows, columns = (
             _evened(self.matrix) if rank == c or self.reach is None else _reaching(self.matrix, self.reach)
         )
-        every = D.tolist()
+        entries = D.tolist()
         for bits in (ctx.prec - OBSERVED, FEWEST):
-            told = [i for i, row in enumerate(every) if _is_told(row, bits)]
-            if len(told) < rank:
+            usable = [i for i, row in enumerate(entries) if _is_told(row, bits)]
+            if len(usable) < rank:
                 continue
-            chosen = told
-            if rank < min(c, len(told)):
-                chosen = [told[i] for i in qr(middles(D)[told].T, mode="r", pivoting=True)[1][:rank]]
-            some = stacked([every[i] for i in chosen])
-            turned = some.transpose()
+            chosen = usable
+            if rank < min(c, len(usable)):
+                chosen = [usable[i] for i in qr(middles(D)[usable].T, mode="r", pivoting=True)[1][:rank]]
+            submatrix = stacked([entries[i] for i in chosen])
+            transposed = submatrix.transpose()
             try:
-                inverse = (turned * some).inv() * turned if rank == c else turned * (some * turned).inv()
+                inverse = (
+                    (transposed * submatrix).inv() * transposed
+                    if rank == c
+                    else transposed * (submatrix * transposed).inv()
+                )
             except ZeroDivisionError:
                 continue
             return scaled(_spread(inverse, chosen, r), columns, rows)
@@ -202,11 +206,11 @@ def _groups(groups: Sequence[tuple[int, int]], count: int) -> list[int]:
 
 def _spread(matrix: arb_mat, places: list[int], count: int) -> arb_mat:
     """Return a matrix with its columns at these ``places`` of ``count``, and columns of 0 at the others."""
-    zero, found = ball(0), []
+    zero, rows = ball(0), []
     for row in matrix.tolist():
-        given = dict(zip(places, row, strict=True))
-        found.append([given.get(i, zero) for i in range(count)])
-    return stacked(found)
+        entries = dict(zip(places, row, strict=True))
+        rows.append([entries.get(i, zero) for i in range(count)])
+    return stacked(rows)
 
 
 def _is_told(row: Sequence[arb], bits: int) -> bool:
@@ -220,8 +224,8 @@ def _reaching(D: arb_mat, reach: Array) -> tuple[arb_mat, Array, Array]:
     about their reach, so that short solutions are those that use little of it. Rows are multiplied so that their
     largest entry is about 1."""
     columns = np.exp2(np.round(np.log2(reach)))
-    most = (np.abs(middles(D)) * columns).max(axis=1)
-    rows = np.exp2(-np.round(np.log2(np.where(most > 0.0, most, 1.0))))
+    largest = (np.abs(middles(D)) * columns).max(axis=1)
+    rows = np.exp2(-np.round(np.log2(np.where(largest > 0.0, largest, 1.0))))
     return scaled(D, rows, columns), rows, columns
 
 
@@ -232,7 +236,7 @@ def _evened(D: arb_mat) -> tuple[arb_mat, Array, Array]:
     rows, columns = np.ones(sizes.shape[0]), np.ones(sizes.shape[1])
     for _ in range(EVENED):
         evened = sizes * rows[:, None] * columns
-        for factors, most in ((rows, evened.max(axis=1)), (columns, evened.max(axis=0))):
-            factors /= np.sqrt(np.where(most > 0.0, most, 1.0))
+        for factors, largest in ((rows, evened.max(axis=1)), (columns, evened.max(axis=0))):
+            factors /= np.sqrt(np.where(largest > 0.0, largest, 1.0))
     rows, columns = (np.exp2(np.round(np.log2(factors))) for factors in (rows, columns))
     return scaled(D, rows, columns), rows, columns

@@ -53,12 +53,12 @@ class Sources:
             side = Together(Side.of(bound))
             return self._missing(np.ones(1), ends, [stacked([balls([1.0])])], first, side=side)
         box, about = bound.bounding_box(), middle(bound)
-        sides, single = np.stack([box.upper - about, about - box.lower]), box.upper == box.lower
-        most = np.where(single, 0.0, np.nextafter(sides.max(axis=0), np.inf))
-        least = np.where(single, 0.0, np.maximum(np.nextafter(sides.min(axis=0), -np.inf), 0.0))
-        half = least + (most - least) / 2.0
-        off = np.nextafter(np.maximum(most - half, half - least), np.inf)
-        return self._missing(half, ends, [stacked([[v] for v in balls([1.0] * half.size)])], first, off)
+        sides, is_single = np.stack([box.upper - about, about - box.lower]), box.upper == box.lower
+        largest = np.where(is_single, 0.0, np.nextafter(sides.max(axis=0), np.inf))
+        smallest = np.where(is_single, 0.0, np.maximum(np.nextafter(sides.min(axis=0), -np.inf), 0.0))
+        half = smallest + (largest - smallest) / 2.0
+        errors = np.nextafter(np.maximum(largest - half, half - smallest), np.inf)
+        return self._missing(half, ends, [stacked([[v] for v in balls([1.0] * half.size)])], first, errors)
 
     def _missing(self, *errors: Any, **more: Any) -> BoundedInput:
         """Return a bounded input of this size at every parameter of the system."""
@@ -80,14 +80,16 @@ class Sources:
             return None
         if self.timing.answering:
             raise Unchecked("the checker knows errors of execution without feedback")
-        shares, acts, pieces = np.asarray(shares, dtype=float), self.timing.control, self.pieces()
+        shares, breakpoints, pieces = np.asarray(shares, dtype=float), self.timing.control, self.pieces()
         if self.is_still:
-            return FollowedExecution(self.problem, shares, acts, pieces, self.timing.clock)
+            return FollowedExecution(self.problem, shares, breakpoints, pieces, self.timing.clock)
         if system.delay > 0.0:  # the control before 0 is the first piece; the last pieces act after the horizon
-            begins = acts[:-1] + system.delay
-            acts = np.array([0.0, *begins[begins < self.problem.horizon], self.problem.horizon])
-            pieces = [stacked([[v] for v in balls(before(self.problem))]), *pieces][: acts.size - 1 if pieces else 0]
-        return self._missing(shares, acts, pieces, numb=self.problem.commanded)
+            begins = breakpoints[:-1] + system.delay
+            breakpoints = np.array([0.0, *begins[begins < self.problem.horizon], self.problem.horizon])
+            pieces = [stacked([[v] for v in balls(before(self.problem))]), *pieces][
+                : breakpoints.size - 1 if pieces else 0
+            ]
+        return self._missing(shares, breakpoints, pieces, numb=self.problem.commanded)
 
     def delivered_at(self, parameter: Sequence[float]) -> BoundedInputHere | None:
         """Return `execution` at one parameter."""
@@ -95,8 +97,8 @@ class Sources:
 
     def entering(self, parameter: Sequence[float] | None) -> list[BoundedInput]:
         """Return all bounded inputs, at one parameter where it is given."""
-        both = (self.execution, self.strayed)
-        return [one if parameter is None else one.at(parameter) for one in both if one is not None]
+        sources = (self.execution, self.strayed)
+        return [source if parameter is None else source.at(parameter) for source in sources if source is not None]
 
     def erring(self, c: Array, time: float, parameter: Sequence[float]) -> tuple[Array | None, arb]:
         """Return lower bounds of what errors of execution add to ``c'x(t)`` at a parameter.
@@ -109,10 +111,10 @@ class Sources:
             The bound for the control that acts until the delay is over; 0 without a delay.
         """
         delivered = self.delivered_at(parameter)
-        found, none = None if delivered is None else delivered.least(c, time), ball(0)
-        if found is None or not self.problem.system.delay > 0.0:
-            return found, none
-        sizes: Array = np.zeros((self.timing.control.size - 1, found.shape[1]))
-        sizes[: len(found) - 1] = found[1:]
-        known = zip(balls(found[0]), balls(before(self.problem)), strict=True)
-        return sizes, sum((size * abs(u) for size, u in known), none)
+        bounds, none = None if delivered is None else delivered.least(c, time), ball(0)
+        if bounds is None or not self.problem.system.delay > 0.0:
+            return bounds, none
+        sizes: Array = np.zeros((self.timing.control.size - 1, bounds.shape[1]))
+        sizes[: len(bounds) - 1] = bounds[1:]
+        pairs = zip(balls(bounds[0]), balls(before(self.problem)), strict=True)
+        return sizes, sum((size * abs(u) for size, u in pairs), none)

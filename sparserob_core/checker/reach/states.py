@@ -115,14 +115,14 @@ class States:
         if (level, number) not in self._driven:
             block, last = self._block(level, number), 2 * number + 1
             if level:
-                parts = [self._controlled(level - 1, number) for number in (last - 1, last)]
-                key: tuple[int, ...] = (block, *map(id, parts))
+                effects = [self._controlled(level - 1, number) for number in (last - 1, last)]
+                key: tuple[int, ...] = (block, *map(id, effects))
             else:
                 u = self.scene.control[self.pieces[number]]
                 key = block, id(u)
             if key not in self._made:  # most pieces of a sparse control are the same
                 self._made[key] = (
-                    self._tables[self._block(level - 1, last)][0] * parts[0] + parts[1]
+                    self._tables[self._block(level - 1, last)][0] * effects[0] + effects[1]
                     if level
                     else self._inputs[block].scaled(u)
                 )
@@ -134,13 +134,13 @@ class States:
         """Return how the state at a mark depends on the initial state, ``(M, d, d)``, and on the disturbance on every
         interval before the mark, ``(M, d, mark mw)``. Both are made of blocks of 1, 2, 4, ... intervals, each
         propagated by the blocks after it."""
-        d, blocks = self.flow.states, [self._block(*one) for one in _blocks(mark)]
+        d, blocks = self.flow.states, [self._block(*pair) for pair in _blocks(mark)]
         monomials = self.flow.monomials
-        after, found = Series.constant(monomials, identity(d)), [Enclosed(*np.zeros((2, monomials.size, d, 0)))]
+        after, effects = Series.constant(monomials, identity(d)), [Enclosed(*np.zeros((2, monomials.size, d, 0)))]
         for block in reversed(blocks):
-            found.insert(1, ring(monomials, single(after), self._floats[block]))
+            effects.insert(1, ring(monomials, single(after), self._floats[block]))
             after = after * self._tables[block][0]
-        mid, rad = (np.concatenate([getattr(one, name) for one in found], axis=2) for name in ("mid", "rad"))
+        mid, rad = (np.concatenate([getattr(effect, name) for effect in effects], axis=2) for name in ("mid", "rad"))
         return single(after), Enclosed(mid, rad)
 
     def _block(self, level: int, number: int) -> int:
@@ -154,16 +154,16 @@ class States:
         else:
             name = (level, *(self._block(level - 1, 2 * number + i) for i in range(2)))
         if name not in self._numbers:
-            mine = self._numbers[name] = len(self._numbers)
+            block = self._numbers[name] = len(self._numbers)
             if not level:
                 d, step = self.flow.states, self._steps[number]
-                pushed = step.columns(d + self.flow.driven, None) if self._is_pushed else step.columns(0, 0)
-                self._tables[mine] = step.columns(0, d), pushed
-                self._inputs[mine] = step.columns(d, d + self.flow.driven)
+                Delta = step.columns(d + self.flow.driven, None) if self._is_pushed else step.columns(0, 0)
+                self._tables[block] = step.columns(0, d), Delta
+                self._inputs[block] = step.columns(d, d + self.flow.driven)
             else:
                 (Phi, early), (onward, late) = (self._tables[self._block(level - 1, 2 * number + i)] for i in range(2))
-                self._tables[mine] = onward * Phi, (onward * early).beside(late)
-            self._floats[mine] = single(self._tables[mine][1])
+                self._tables[block] = onward * Phi, (onward * early).beside(late)
+            self._floats[block] = single(self._tables[block][1])
         self._places[level, number] = self._numbers[name]
         return self._places[level, number]
 
@@ -200,30 +200,34 @@ class States:
         segment, share = flow.segment(begin, end)
         first, width = ((ball(b) - ball(a)) / (ball(end) - ball(begin)) * share
                         for a, b in ((begin, start), (start, stop)))  # fmt: skip
-        terms, off = self._path(place).within(first, width, order)
+        terms, remainder = self._path(place).within(first, width, order)
         rows = exactly(basis)
-        state = enclosed([one.along(rows) for one in terms])
-        state.rad[0, 0] += np.abs(basis) @ off * OUTWARD
+        state = enclosed([term.along(rows) for term in terms])
+        state.rad[0, 0] += np.abs(basis) @ remainder * OUTWARD
         lines = self._lines(segment, basis).shifted(float(first), float(width), order)
-        carried, found = Enclosed(lines.mid[..., :d], lines.rad[..., :d]), list[tuple[ConvexSet, Enclosed]]()
+        propagated_rows, effects = Enclosed(lines.mid[..., :d], lines.rad[..., :d]), list[tuple[ConvexSet, Enclosed]]()
         if scene.disturbance is not None and stop > 0.0:
-            past = ring(flow.monomials, carried, self.effect(place)[1])
+            past = ring(flow.monomials, propagated_rows, self.effect(place)[1])
             shape = (*past.mid.shape[:3], place, -1) if place else (*past.mid.shape[:3], 0, lines.mid.shape[-1] - d - m)
             mid, rad = (
-                np.moveaxis(np.concatenate([one.reshape(shape), two[:, :, :, None, d + m :]], axis=3), (3, 4), (0, 3))
-                for one, two in ((past.mid, lines.mid), (past.rad, lines.rad))
+                np.moveaxis(
+                    np.concatenate([earlier.reshape(shape), current[:, :, :, None, d + m :]], axis=3), (3, 4), (0, 3)
+                )
+                for earlier, current in ((past.mid, lines.mid), (past.rad, lines.rad))
             )
             block = np.searchsorted(np.array(scene.changes), np.array(self.marks[: place + 1]), side="right")
             firsts = np.flatnonzero(np.diff(block, prepend=-1))
             rad = (rad + rounding(len(mid)) * np.abs(mid)) * OUTWARD
-            mid, rad = (np.add.reduceat(part, firsts, axis=0) for part in (mid, rad))
+            mid, rad = (np.add.reduceat(values, firsts, axis=0) for values in (mid, rad))
             if scene.lasting is not None:
                 mid, rad = scene.lasting.gathered(mid, rad)
-            found.append((scene.disturbance, Enclosed(mid, rad)))
+            effects.append((scene.disturbance, Enclosed(mid, rad)))
         if scene.initial_set is not None:
-            begun = ring(flow.monomials, carried, self.effect(place)[0])
-            found.append((scene.initial_set, Enclosed(*(np.swapaxes(p, 2, 3)[None] for p in (begun.mid, begun.rad)))))
-        return Enclosed(state.mid[..., 0], state.rad[..., 0]), found
+            initial = ring(flow.monomials, propagated_rows, self.effect(place)[0])
+            effects.append(
+                (scene.initial_set, Enclosed(*(np.swapaxes(p, 2, 3)[None] for p in (initial.mid, initial.rad))))
+            )
+        return Enclosed(state.mid[..., 0], state.rad[..., 0]), effects
 
     @remembered(lambda: PATHS_KEPT)
     def _path(self, place: int) -> Powers:
@@ -244,12 +248,12 @@ class States:
         if not self.flow.monomials.degree:
             return np.zeros(self.flow.states)
         mark = max(place, 1)  # at the first mark nothing is uncertain yet
-        found = np.array([float(x.rad()) for x in self.node(mark).parts[0].entries()])
+        radii = np.array([float(x.rad()) for x in self.node(mark).parts[0].entries()])
         for convex, number in ((self.scene.initial_set, 0), (self.scene.disturbance, 1)):
             if convex is not None:
                 rad = self.effect(mark)[number].rad[0]
-                found += rad.reshape(*rad.shape[:1], -1, convex.dimension).sum(axis=1) @ np.array(known(convex).radius)
-        return found
+                radii += rad.reshape(*rad.shape[:1], -1, convex.dimension).sum(axis=1) @ np.array(known(convex).radius)
+        return radii
 
 
 @final
@@ -283,7 +287,7 @@ class Lines:
     def of(segment: VerifiedSegment, basis: Array) -> Lines:
         """Return the rows ``basis (b, d)`` of the flow on a segment."""
         rows = exactly(basis)
-        terms = enclosed([one.along(rows) for one in segment.terms])
+        terms = enclosed([term.along(rows) for term in segment.terms])
         return Lines(terms, np.abs(basis) @ segment.off * OUTWARD, np.abs(basis) @ segment.powers.sizes * OUTWARD)
 
     def shifted(self, first: float, width: float, order: int) -> Enclosed:
@@ -301,41 +305,41 @@ class Lines:
 def _blocks(mark: int) -> list[tuple[int, int]]:
     """Return the level and the number of the blocks of ``2^level`` intervals that fill those before a mark, longest
     first."""
-    found, begin = [], 0
+    blocks, begin = [], 0
     for level in range(mark.bit_length() - 1, -1, -1):
         if mark >> level & 1:
-            found.append((level, begin >> level))
+            blocks.append((level, begin >> level))
             begin += 1 << level
-    return found
+    return blocks
 
 
 def enclosed(series: Sequence[Series]) -> Enclosed:
     """Return the coefficients of series of one shape as floats with radii, ``(J, M, rows, columns)``."""
     first = series[0]
     shape = len(series), len(first.parts), *first.shape
-    return Enclosed.all([part for one in series for part in one.parts], shape)
+    return Enclosed.all([matrix for term in series for matrix in term.parts], shape)
 
 
 def single(series: Series) -> Enclosed:
     """Return the coefficients of one series as floats with radii, ``(M, rows, columns)``."""
-    found = enclosed([series])
-    return Enclosed(found.mid[0], found.rad[0])
+    enclosure = enclosed([series])
+    return Enclosed(enclosure.mid[0], enclosure.rad[0])
 
 
 def ring(monomials: Monomials, left: Enclosed, right: Enclosed) -> Enclosed:
     """Return the products of polynomials in the parameters, ``left (..., M, a, d)`` times ``right (M, d, n)``,
     truncated at the degree. The radii of the constants hold the truncation error."""
-    size, there = np.abs(left.mid), np.abs(right.mid)
-    wide = right.rad + rounding(left.mid.shape[-1] * monomials.size) * there
+    left_size, right_size = np.abs(left.mid), np.abs(right.mid)
+    right_error = right.rad + rounding(left.mid.shape[-1] * monomials.size) * right_size
     mid = _multiplied(monomials, left.mid, right.mid)
     with np.errstate(invalid="ignore"):
-        rad = _multiplied(monomials, size, wide) + _multiplied(monomials, left.rad, there + right.rad)
+        rad = _multiplied(monomials, left_size, right_error) + _multiplied(monomials, left.rad, right_size + right.rad)
     rad = np.where(np.isnan(rad), np.inf, rad)  # 0 times infinity: no bound
     if monomials.degree:
         degrees = np.array(monomials.degrees)
         sums = [
-            np.stack([part[..., degrees == n, :, :].sum(axis=-3) for n in range(monomials.degree + 1)])
-            for part in (size + left.rad, there + right.rad)
+            np.stack([values[..., degrees == n, :, :].sum(axis=-3) for n in range(monomials.degree + 1)])
+            for values in (left_size + left.rad, right_size + right.rad)
         ]
         later = np.cumsum(sums[1][:0:-1], axis=0)
         rad[..., 0, :, :] += sum(sums[0][n] @ later[n - 1] for n in range(1, monomials.degree + 1))
@@ -345,8 +349,8 @@ def ring(monomials: Monomials, left: Enclosed, right: Enclosed) -> Enclosed:
 def _multiplied(monomials: Monomials, left: Array, right: Array) -> Array:
     """Return the coefficients of the products up to the degree by one matrix product: ``right (M, d, n)`` becomes a
     matrix ``(M d, M n)``, whose blocks belong to a monomial of the left factor and a monomial of the product."""
-    (M, d, n), place = right.shape, monomials.quotients
-    table = np.concatenate([right, np.zeros((1, d, n))])[place]  # (M, M, d, n)
+    (M, d, n), indices = right.shape, monomials.quotients
+    table = np.concatenate([right, np.zeros((1, d, n))])[indices]  # (M, M, d, n)
     rows = np.swapaxes(left, -3, -2)
-    found = rows.reshape(*rows.shape[:-2], M * d) @ table.transpose(0, 2, 1, 3).reshape(M * d, M * n)
-    return np.swapaxes(found.reshape(*rows.shape[:-2], M, n), -3, -2)
+    product = rows.reshape(*rows.shape[:-2], M * d) @ table.transpose(0, 2, 1, 3).reshape(M * d, M * n)
+    return np.swapaxes(product.reshape(*rows.shape[:-2], M, n), -3, -2)

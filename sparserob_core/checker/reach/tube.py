@@ -115,12 +115,12 @@ class VerifiedTube:
     def _recentred(self) -> Enclosed | None:
         """The matrix ``(M, M)`` from coefficients on the larger box to those on this one; ``None`` where both boxes are
         the same."""
-        whole = self.rows.states.flow.box
-        if whole == self.box:
+        outer_box = self.rows.states.flow.box
+        if outer_box == self.box:
             return None
         moves, table = [], []
         for middle, half, centre, width in zip(
-            self.box.middle, self.box.halves, whole.middle, whole.halves, strict=True
+            self.box.middle, self.box.halves, outer_box.middle, outer_box.halves, strict=True
         ):
             unit = ball(width) if width else ball(1)
             moves.append(((ball(middle) - ball(centre)) / unit, ball(half) / unit))
@@ -154,20 +154,20 @@ class VerifiedTube:
             One polynomial for every direction.
         """
         states = self.rows.states
-        place = states.place(piece, start)
-        state, parts = self.rows.on(place, start, stop)
+        interval = states.place(piece, start)
+        state, effects = self.rows.on(interval, start, stop)
         state = self._moved(state, 1)
         mid = np.einsum("jmb,ib->ijm", state.mid, z)
-        lost = state.rad + rounding(z.shape[1]) * np.abs(state.mid)
-        rad, kinks, turning = np.abs(z) @ lost.sum(axis=(0, 1)), np.zeros(len(z)), np.zeros(len(z))
-        for convex, part in parts:
-            here = self._moved(part, 2)
-            moved, off, switching, of_box = bound_supports(
-                known(convex), self.flow.monomials, here.mid, here.rad, z, sharp
+        errors = state.rad + rounding(z.shape[1]) * np.abs(state.mid)
+        rad, kinks, turning = np.abs(z) @ errors.sum(axis=(0, 1)), np.zeros(len(z)), np.zeros(len(z))
+        for convex, effect in effects:
+            arguments = self._moved(effect, 2)
+            supports, support_errors, switching, of_box = bound_supports(
+                known(convex), self.flow.monomials, arguments.mid, arguments.rad, z, sharp
             )
-            rad += off + rounding(1) * (np.abs(mid) + np.abs(moved)).sum(axis=(1, 2))
-            mid, kinks, turning = mid + moved, kinks + switching, turning + of_box
-        blur = np.abs(z) @ (np.abs(self.rows.basis) @ states.blur(place))
+            rad += support_errors + rounding(1) * (np.abs(mid) + np.abs(supports)).sum(axis=(1, 2))
+            mid, kinks, turning = mid + supports, kinks + switching, turning + of_box
+        blur = np.abs(z) @ (np.abs(self.rows.basis) @ states.blur(interval))
         return [
             Polynomial(mid[i], float(rad[i]) * OUTWARD, float(blur[i]), float(kinks[i]), float(turning[i]))
             for i in range(len(z))
@@ -178,9 +178,9 @@ class VerifiedTube:
         moves = self._recentred
         if moves is None:
             return rows
-        mid, rad, size = (np.moveaxis(one, axis, -1) for one in (rows.mid, rows.rad, np.abs(rows.mid)))
-        off = (rad + rounding(moves.mid.shape[0]) * size) @ (np.abs(moves.mid) + moves.rad).T + size @ moves.rad.T
-        return Enclosed(np.moveaxis(mid @ moves.mid.T, -1, axis), np.moveaxis(off * OUTWARD, -1, axis))
+        mid, rad, size = (np.moveaxis(values, axis, -1) for values in (rows.mid, rows.rad, np.abs(rows.mid)))
+        errors = (rad + rounding(moves.mid.shape[0]) * size) @ (np.abs(moves.mid) + moves.rad).T + size @ moves.rad.T
+        return Enclosed(np.moveaxis(mid @ moves.mid.T, -1, axis), np.moveaxis(errors * OUTWARD, -1, axis))
 
 
 def bound_supports(
@@ -207,23 +207,25 @@ def bound_supports(
         of parameters.
     """
     pieces = every.shape[0]
-    mid, w, lost, error, kinks, share = _linear(shape, every, errors, z, pieces)
+    mid, w, argument_errors, error, kinks, share = _linear(shape, every, errors, z, pieces)
     k, mw = mid.shape[0], mid.shape[-1]
     if not sharp or shape.round is None:
-        moved = np.einsum("ilw,iljkw->ijk", w, mid)
-        return moved, error.sum(axis=1) * OUTWARD, kinks.sum(axis=1) * OUTWARD, (share * kinks).sum(axis=1)
+        coefficients = np.einsum("ilw,iljkw->ijk", w, mid)
+        return coefficients, error.sum(axis=1) * OUTWARD, kinks.sum(axis=1) * OUTWARD, (share * kinks).sum(axis=1)
     # for every piece, the better one of this linear bound and a polynomial above the length of L'f
     m, L = shape.round
-    parts = (mid @ L).reshape(-1, *mid.shape[2:4], L.shape[1])
-    above, off, over = (part.reshape(k, pieces, *part.shape[1:]) for part in lengths(monomials, parts))
-    spare = (lost + rounding(mw) * np.abs(mid).sum(axis=(2, 3))) @ np.abs(L)
-    off = off + np.linalg.norm(spare, axis=2) + lost @ np.abs(m)
-    off = (off + rounding(pieces) * np.abs(above).sum(axis=(2, 3))) * OUTWARD
-    better = off < error
+    transformed = (mid @ L).reshape(-1, *mid.shape[2:4], L.shape[1])
+    above, above_errors, over = (
+        values.reshape(k, pieces, *values.shape[1:]) for values in lengths(monomials, transformed)
+    )
+    transformed_errors = (argument_errors + rounding(mw) * np.abs(mid).sum(axis=(2, 3))) @ np.abs(L)
+    above_errors = above_errors + np.linalg.norm(transformed_errors, axis=2) + argument_errors @ np.abs(m)
+    above_errors = (above_errors + rounding(pieces) * np.abs(above).sum(axis=(2, 3))) * OUTWARD
+    better = above_errors < error
     linear = np.einsum("ilw,iljkw->iljk", w, mid)
-    moved = np.where(better[:, :, None, None], above + mid @ m, linear).sum(axis=1)
-    error, kinks = np.where(better, off, error), np.where(better, over, kinks)
-    return moved, error.sum(axis=1) * OUTWARD, kinks.sum(axis=1) * OUTWARD, (share * kinks).sum(axis=1)
+    coefficients = np.where(better[:, :, None, None], above + mid @ m, linear).sum(axis=1)
+    error, kinks = np.where(better, above_errors, error), np.where(better, over, kinks)
+    return coefficients, error.sum(axis=1) * OUTWARD, kinks.sum(axis=1) * OUTWARD, (share * kinks).sum(axis=1)
 
 
 def _linear(
@@ -245,11 +247,11 @@ def _linear(
     value, spread, of_box = _ranges(mid, rad)
     w, excess = shape.bound(value.reshape(-1, mw), spread.reshape(-1, mw))
     w, kinks = w.reshape(k, pieces, mw), excess.reshape(k, pieces) * OUTWARD
-    lost = rad.sum(axis=(2, 3)) + rounding(count * mw) * np.abs(mid).sum(axis=(2, 3))
+    argument_errors = rad.sum(axis=(2, 3)) + rounding(count * mw) * np.abs(mid).sum(axis=(2, 3))
     radius = np.array(shape.radius)
-    far, wide = spread @ radius, of_box @ radius
-    share = np.divide(wide, far, out=np.zeros_like(far), where=far > 0.0)
-    return mid, w, lost, np.einsum("ilw,ilw->il", np.abs(w), lost) * OUTWARD + kinks, kinks, share
+    total_width, box_width = spread @ radius, of_box @ radius
+    share = np.divide(box_width, total_width, out=np.zeros_like(total_width), where=total_width > 0.0)
+    return mid, w, argument_errors, np.einsum("ilw,ilw->il", np.abs(w), argument_errors) * OUTWARD + kinks, kinks, share
 
 
 def _ranges(mid: Array, rad: Array) -> tuple[Array, Array, Array]:
@@ -279,23 +281,23 @@ class LoopTube:
         `VerifiedTube.cells`. The part ``expansion`` of the error is due to the length of the cell. The true value may
         be far below a chord between its ends."""
         begin, end = self._height(piece, start, z), self._height(piece, stop, z)
-        bent = np.zeros(z.shape[0])
+        chord_errors = np.zeros(z.shape[0])
         if start < stop:
-            bent = self.loop.bent(piece, start, stop, _combined(z, self.basis))
-        lost = np.maximum(begin.rad, end.rad) + rounding(2) * (np.abs(begin.mid) + np.abs(end.mid)) + bent
+            chord_errors = self.loop.bent(piece, start, stop, _combined(z, self.basis))
+        errors = np.maximum(begin.rad, end.rad) + rounding(2) * (np.abs(begin.mid) + np.abs(end.mid)) + chord_errors
         chords = np.stack([begin.mid, end.mid - begin.mid] if start < stop else [begin.mid])
         return [
             Polynomial(chord[:, None], float(error) * OUTWARD, float(length), 0.0)
-            for chord, error, length in zip(chords.T, lost, bent, strict=True)
+            for chord, error, length in zip(chords.T, errors, chord_errors, strict=True)
         ]
 
     @remembered(key=lambda self, piece, time, z: (piece, time, z.tobytes()))
     def _height(self, piece: int, time: float, z: Array) -> Enclosed:
         """Return the largest ``c'x`` at a time in a piece of the grid, ``(k,)``."""
-        beside = None
+        answers = None
         if self.gains.shape[1]:
-            beside = exactly(_combined(z, self.gains)) * self.loop.answers(self.loop.on(piece))
-        return _of_column(self.loop.highest(piece, time, _combined(z, self.basis), beside))
+            answers = exactly(_combined(z, self.gains)) * self.loop.answers(self.loop.on(piece))
+        return _of_column(self.loop.highest(piece, time, _combined(z, self.basis), answers))
 
 
 @final
@@ -311,20 +313,20 @@ class Still:
     def cells(self, piece: int, start: float, stop: float, z: Array, sharp: bool = False) -> list[Polynomial]:
         """Return constants with error bounds at the place number ``piece``, with the parameters of
         `VerifiedTube.cells`."""
-        found = _of_column(self.heights(piece, exactly(_combined(z, self.basis))))
+        heights = _of_column(self.heights(piece, exactly(_combined(z, self.basis))))
         return [
             Polynomial(np.array([[height]]), float(error), 0.0, 0.0)
-            for height, error in zip(found.mid, found.rad, strict=True)
+            for height, error in zip(heights.mid, heights.rad, strict=True)
         ]
 
 
 def _combined(z: Array, basis: Array) -> Array | arb_mat:
     """Return ``z'basis (k, d)``: as floats where this needs no rounding, as balls elsewhere."""
-    alone = (np.count_nonzero(z, axis=1) <= 1).all() and np.isin(z, (-1.0, 0.0, 1.0)).all()
-    return np.asarray(z @ basis) if alone else exactly(z) * exactly(basis)
+    is_exact = (np.count_nonzero(z, axis=1) <= 1).all() and np.isin(z, (-1.0, 0.0, 1.0)).all()
+    return np.asarray(z @ basis) if is_exact else exactly(z) * exactly(basis)
 
 
 def _of_column(heights: Sequence[arb]) -> Enclosed:
     """Return balls as floats with radii, ``(k,)`` each."""
-    found = Enclosed.of(stacked([[height] for height in heights]))
-    return Enclosed(found.mid[:, 0], found.rad[:, 0])
+    enclosure = Enclosed.of(stacked([[height] for height in heights]))
+    return Enclosed(enclosure.mid[:, 0], enclosure.rad[:, 0])

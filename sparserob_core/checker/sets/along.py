@@ -52,8 +52,8 @@ class CurvedSide:
     def far(self) -> Array:
         """The upper bounds ``(mw,)`` of the distance from the point to the set's ends along every coordinate."""
         axes = np.vstack([np.eye(self.dimension), -np.eye(self.dimension)])
-        heights, off = _heights(self.shape, self.about, axes)
-        return np.asarray((heights + off).reshape(2, -1).max(axis=0) * OUTWARD)
+        heights, errors = _heights(self.shape, self.about, axes)
+        return np.asarray((heights + errors).reshape(2, -1).max(axis=0) * OUTWARD)
 
     def swept(self, plain: Array, off: Array, sizes: Array, ends: Array) -> tuple[Array, Array, Array, Array]:
         """Return the integral over ``u`` from -1 to ``ends (n,)`` of the support function at polynomials of ``u``.
@@ -75,50 +75,57 @@ class CurvedSide:
             Values, upper bounds of how much more and how much less the integral may be, and the largest support values,
             ``(n,)`` each.
         """
-        found = [np.zeros(0)] * 3
+        outputs = [np.zeros(0)] * 3
         for first in range(0, len(plain), AT_ONCE):
-            part = slice(first, first + AT_ONCE)
-            every = self._along(plain[part], ends[part])
-            found = [np.concatenate(both) for both in zip(found, every, strict=True)]
-        value, wrong, tops = found
-        wrong = (wrong + (ends + 1.0) * (off @ self.far)) * OUTWARD
-        return value, wrong, wrong, tops
+            batch = slice(first, first + AT_ONCE)
+            batch_outputs = self._along(plain[batch], ends[batch])
+            outputs = [np.concatenate(pair) for pair in zip(outputs, batch_outputs, strict=True)]
+        value, errors, tops = outputs
+        errors = (errors + (ends + 1.0) * (off @ self.far)) * OUTWARD
+        return value, errors, errors, tops
 
     def _along(self, plain: Array, ends: Array) -> tuple[Array, Array, Array]:
         count = plain.shape[1]
-        here, far = np.arange(len(plain)), self.far
-        value, wrong, length = np.zeros(len(plain)), np.zeros(len(plain)), (ends + 1.0) / 2.0
-        tops = np.abs(plain).sum(axis=1) @ far
+        owner, radii = np.arange(len(plain)), self.far
+        value, errors, length = np.zeros(len(plain)), np.zeros(len(plain)), (ends + 1.0) / 2.0
+        tops = np.abs(plain).sum(axis=1) @ radii
         # on the cell from -1 to the end, with s from -1 to 1: u = -1 + length (1 + s) = (length - 1) + length s
-        a, each = _stretched(plain, length), rounding(2 * count) * tops
-        lost = each.copy()
+        a, step_error = _stretched(plain, length), rounding(2 * count) * tops
+        coefficient_error = step_error.copy()
         nodes, weights = rule()
         orders, powers = np.arange(count), nodes[:, None] ** np.arange(count)
-        for turn in range(ROUNDS + 1):
+        for level in range(ROUNDS + 1):
             spread = np.einsum("n,mnw->mw", DISC ** orders[1:], np.abs(a[:, 1:])) * OUTWARD
-            most = _most(self.shape, self.about, a[:, 0], spread)
-            heights, off = _heights(self.shape, self.about, (powers @ a).reshape(-1, a.shape[2]))
+            bounds = _most(self.shape, self.about, a[:, 0], spread)
+            heights, height_errors = _heights(self.shape, self.about, (powers @ a).reshape(-1, a.shape[2]))
             total = heights.reshape(len(a), -1) @ weights
-            rounded = off.reshape(len(a), -1) @ weights + rounding(4 * count + NODES) * np.abs(a).sum(axis=1) @ far
-            missed = np.where(np.isfinite(most), LEFT * most, np.inf)
-            moved = 2.0 * np.abs(a[:, 1:]).sum(axis=1) @ far
-            begun, beside = _heights(self.shape, self.about, a[:, 0])
-            if not np.isfinite(rounded).all():
+            rounding_errors = (
+                height_errors.reshape(len(a), -1) @ weights
+                + rounding(4 * count + NODES) * np.abs(a).sum(axis=1) @ radii
+            )
+            rule_error = np.where(np.isfinite(bounds), LEFT * bounds, np.inf)
+            change = 2.0 * np.abs(a[:, 1:]).sum(axis=1) @ radii
+            middle_heights, middle_errors = _heights(self.shape, self.about, a[:, 0])
+            if not np.isfinite(rounding_errors).all():
                 raise Unchecked("a support function grows beyond what numbers can hold")
-            plainly = moved < missed
-            total, missed = np.where(plainly, 2.0 * begun, total), np.minimum(missed, moved)
-            rounded = np.where(plainly, np.maximum(rounded, 2.0 * beside), rounded)
-            width = length[here] * 0.5**turn
-            done = (missed * width <= SETTLED * tops[here]) | (missed <= rounded) | (turn == ROUNDS)
-            at = here[done]
-            np.add.at(value, at, (total * width)[done])
-            np.add.at(wrong, at, ((missed + rounded + 2.0 * lost[here]) * width)[done])
-            if done.all():
+            use_middle = change < rule_error
+            total, rule_error = np.where(use_middle, 2.0 * middle_heights, total), np.minimum(rule_error, change)
+            rounding_errors = np.where(use_middle, np.maximum(rounding_errors, 2.0 * middle_errors), rounding_errors)
+            width = length[owner] * 0.5**level
+            is_done = (
+                (rule_error * width <= SETTLED * tops[owner]) | (rule_error <= rounding_errors) | (level == ROUNDS)
+            )
+            finished = owner[is_done]
+            np.add.at(value, finished, (total * width)[is_done])
+            np.add.at(
+                errors, finished, ((rule_error + rounding_errors + 2.0 * coefficient_error[owner]) * width)[is_done]
+            )
+            if is_done.all():
                 break
-            a, here = a[~done], np.tile(here[~done], 2)
-            lost = lost + each
+            a, owner = a[~is_done], np.tile(owner[~is_done], 2)
+            coefficient_error = coefficient_error + step_error
             a = np.concatenate([np.einsum("kn,mnw->mkw", half, a) for half in _halves(count)])
-        return value, wrong + rounding(2 * ROUNDS) * np.abs(value), tops
+        return value, errors + rounding(2 * ROUNDS) * np.abs(value), tops
 
 
 @cache
@@ -128,8 +135,8 @@ def rule() -> tuple[Array, Array]:
     from flint import arb, ctx
 
     with ctx.workprec(128):
-        found = [arb.legendre_p_root(NODES, k, weight=True) for k in range(NODES)]
-        nodes, weights = ([float(x) for x in one] for one in zip(*found, strict=True))
+        pairs = [arb.legendre_p_root(NODES, k, weight=True) for k in range(NODES)]
+        nodes, weights = ([float(x) for x in column] for column in zip(*pairs, strict=True))
     return np.array(nodes), np.array(weights)
 
 
@@ -137,25 +144,25 @@ def rule() -> tuple[Array, Array]:
 def _halves(count: int) -> tuple[Array, Array]:
     """Return the matrices from coefficients of powers of ``x`` to those of ``s``, for ``x = -1/2 + s/2`` and ``x = 1/2
     + s/2``."""
-    found = [
+    matrices = [
         np.array(
             [[comb(n, k) * side ** (n - k) * 0.5**k if n >= k else 0.0 for n in range(count)] for k in range(count)]
         )
         for side in (-0.5, 0.5)
     ]
-    return found[0], found[1]
+    return matrices[0], matrices[1]
 
 
 def _stretched(plain: Array, length: Array) -> Array:
     """Return polynomials ``(M, p + 1, mw)`` at ``(length - 1) + length s``, by Horner's rule."""
-    found = np.zeros_like(plain)
+    polynomials = np.zeros_like(plain)
     shift, stretch = (length - 1.0)[:, None, None], length[:, None, None]
     for n in reversed(range(plain.shape[1])):
-        onward = np.zeros_like(found)
-        onward[:, 1:] = stretch * found[:, :-1]
-        found = shift * found + onward
-        found[:, 0] += plain[:, n]
-    return found
+        shifted = np.zeros_like(polynomials)
+        shifted[:, 1:] = stretch * polynomials[:, :-1]
+        polynomials = shift * polynomials + shifted
+        polynomials[:, 0] += plain[:, n]
+    return polynomials
 
 
 def _parts(shape: Shape, about: Array, *arrays: Array) -> list[tuple[Shape, list[Array]]]:
@@ -163,42 +170,42 @@ def _parts(shape: Shape, about: Array, *arrays: Array) -> list[tuple[Shape, list
     factor."""
     if not isinstance(shape, Joint):
         return [(shape, [about, *arrays])]
-    every = zip(shape.parts, shape.places, strict=True)
-    return [(part, [about[at], *(one[:, at] for one in arrays)]) for part, at in every]
+    pairs = zip(shape.parts, shape.places, strict=True)
+    return [(factor, [about[columns], *(array[:, columns] for array in arrays)]) for factor, columns in pairs]
 
 
 def _heights(shape: Shape, about: Array, values: Array) -> tuple[Array, Array]:
     """Return the support function of the set minus the point at exact directions ``(k, mw)``, and error bounds,
     ``(k,)`` each."""
-    total, off = np.zeros(len(values)), np.zeros(len(values))
-    for part, (own, c) in _parts(shape, about, values):
-        height, wrong = _height(part, own, c)
-        total, off = total + height, off + wrong + HALF_ULP * np.abs(total + height)
-    return total, off * OUTWARD
+    total, total_error = np.zeros(len(values)), np.zeros(len(values))
+    for factor, (point, c) in _parts(shape, about, values):
+        height, error = _height(factor, point, c)
+        total, total_error = total + height, total_error + error + HALF_ULP * np.abs(total + height)
+    return total, total_error * OUTWARD
 
 
 def _height(part: Shape, about: Array, c: Array) -> tuple[Array, Array]:
     size = np.abs(c)
     if isinstance(part, Boxed):
-        middle, half, off = _sides(part, about)
+        middle, half, error = _sides(part, about)
         high = c @ middle + size @ half
-        return high, (size @ (off + rounding(c.shape[1] + 2) * (np.abs(middle) + half))) * OUTWARD
+        return high, (size @ (error + rounding(c.shape[1] + 2) * (np.abs(middle) + half))) * OUTWARD
     if isinstance(part, Cornered):
-        corners, off = _corners(part, about)
+        corners, error = _corners(part, about)
         high = (c @ corners.T).max(axis=1)
-        return high, (size @ (off + rounding(c.shape[1] + 2) * np.abs(corners)).T).max(axis=1) * OUTWARD
+        return high, (size @ (error + rounding(c.shape[1] + 2) * np.abs(corners)).T).max(axis=1) * OUTWARD
     if isinstance(part, Segments):
-        ends, beside = np.abs(part.source.generators).T, part.source.centre - about
-        high = np.abs(c @ part.source.generators.T).sum(axis=1) + c @ beside
-        off = rounding(sum(ends.shape) + 2) * (size @ ends).sum(axis=1)
-        return high, (off + rounding(len(ends) + 4) * (size @ np.abs(beside))) * OUTWARD
+        ends, offset = np.abs(part.source.generators).T, part.source.centre - about
+        high = np.abs(c @ part.source.generators.T).sum(axis=1) + c @ offset
+        error = rounding(sum(ends.shape) + 2) * (size @ ends).sum(axis=1)
+        return high, (error + rounding(len(ends) + 4) * (size @ np.abs(offset))) * OUTWARD
     L, share, q = _root(part)
     y = c @ L
     norm = _norm(y, q)
-    wrong = _norm(size @ np.abs(L), q) * rounding(2 * len(L) + 8) + norm * (2.0 * share + rounding(64 * len(L)))
-    beside = part.centre - about
-    wrong = wrong + (size @ np.abs(beside)) * rounding(len(L) + 2)
-    return norm + c @ beside, wrong * OUTWARD
+    norm_error = _norm(size @ np.abs(L), q) * rounding(2 * len(L) + 8) + norm * (2.0 * share + rounding(64 * len(L)))
+    offset = part.centre - about
+    norm_error = norm_error + (size @ np.abs(offset)) * rounding(len(L) + 2)
+    return norm + c @ offset, norm_error * OUTWARD
 
 
 def _most(shape: Shape, about: Array, c: Array, spread: Array) -> Array:
@@ -209,46 +216,46 @@ def _most(shape: Shape, about: Array, c: Array, spread: Array) -> Array:
     shown to be analytic at all of them.
     """
     total = np.zeros(len(c))
-    for part, (own, value, apart) in _parts(shape, about, c, spread):
-        reach = np.abs(value) + apart
-        if isinstance(part, Boxed):
-            middle, half, off = _sides(part, own)
-            fixed = (np.abs(value) > apart) | (half + off == 0.0) | (reach == 0.0)
-            most = np.where(fixed.all(axis=1), reach @ (np.abs(middle) + half + off), np.inf)
-        elif isinstance(part, Cornered):
-            corners, off = _corners(part, own)
+    for factor, (point, value, deviation) in _parts(shape, about, c, spread):
+        reach = np.abs(value) + deviation
+        if isinstance(factor, Boxed):
+            middle, half, error = _sides(factor, point)
+            is_fixed = (np.abs(value) > deviation) | (half + error == 0.0) | (reach == 0.0)
+            bound = np.where(is_fixed.all(axis=1), reach @ (np.abs(middle) + half + error), np.inf)
+        elif isinstance(factor, Cornered):
+            corners, error = _corners(factor, point)
             heights = value @ corners.T
             best = corners[heights.argmax(axis=1)]
-            lost = 2.0 * (reach @ (off + rounding(value.shape[1] + 2) * np.abs(corners)).T)
-            behind = heights.max(axis=1, keepdims=True) - heights - lost
-            other = np.einsum("kvw,kw->kv", np.abs(best[:, None] - corners), apart) < behind
-            alone = other | (best[:, None] == corners).all(axis=2)
-            most = np.where(alone.all(axis=1), (reach @ (np.abs(corners) + off).T).max(axis=1), np.inf)
-        elif isinstance(part, Segments):
-            ends = np.abs(part.source.generators).T
-            moved = apart @ ends + rounding(len(ends) + 2) * (reach @ ends)
-            fixed = (np.abs(value @ part.source.generators.T) > moved) | (moved == 0.0)
-            heights = (reach @ ends).sum(axis=1) + reach @ (np.abs(part.source.centre - own) * OUTWARD)
-            most = np.where(fixed.all(axis=1), heights, np.inf)
+            rounding_error = 2.0 * (reach @ (error + rounding(value.shape[1] + 2) * np.abs(corners)).T)
+            gap = heights.max(axis=1, keepdims=True) - heights - rounding_error
+            is_below = np.einsum("kvw,kw->kv", np.abs(best[:, None] - corners), deviation) < gap
+            is_dominated = is_below | (best[:, None] == corners).all(axis=2)
+            bound = np.where(is_dominated.all(axis=1), (reach @ (np.abs(corners) + error).T).max(axis=1), np.inf)
+        elif isinstance(factor, Segments):
+            ends = np.abs(factor.source.generators).T
+            change = deviation @ ends + rounding(len(ends) + 2) * (reach @ ends)
+            is_fixed = (np.abs(value @ factor.source.generators.T) > change) | (change == 0.0)
+            heights = (reach @ ends).sum(axis=1) + reach @ (np.abs(factor.source.centre - point) * OUTWARD)
+            bound = np.where(is_fixed.all(axis=1), heights, np.inf)
         else:
-            L, share, q = _root(part)
-            y, b = np.abs(value @ L), apart @ np.abs(L)
+            L, share, q = _root(factor)
+            y, b = np.abs(value @ L), deviation @ np.abs(L)
             unit = np.maximum((y + b).max(axis=1, keepdims=True), TINY)
             y, b = y / unit, b / unit
             if q == 2.0:  # |sum (y + b)^2 - sum y^2| <= 2 |y| |b| + |b|^2
-                about_0, moved = np.linalg.norm(y, axis=1), np.linalg.norm(b, axis=1)
-                least, moved = about_0**2, 2.0 * about_0 * moved + moved**2
-                analytic = moved < ROOM * least
+                norm, change = np.linalg.norm(y, axis=1), np.linalg.norm(b, axis=1)
+                power_sum, change = norm**2, 2.0 * norm * change + change**2
+                is_analytic = change < ROOM * power_sum
             else:  # the slope of z^q is at most q (y + b)^(q - 1) between
-                least, moved = (y**q).sum(axis=1), (q * b * (y + b) ** (q - 1.0)).sum(axis=1)
-                analytic = (moved < ROOM * least) & (q < STEEP)
-            found = np.where(analytic, (least + moved) ** (1.0 / q), np.inf)
+                power_sum, change = (y**q).sum(axis=1), (q * b * (y + b) ** (q - 1.0)).sum(axis=1)
+                is_analytic = (change < ROOM * power_sum) & (q < STEEP)
+            norm_bound = np.where(is_analytic, (power_sum + change) ** (1.0 / q), np.inf)
             if q != 2.0:
-                away = ((y * ROOM > b) | (y + b == 0.0)).all(axis=1)
-                found = np.where(away, np.minimum(found, _led(y, b, q)), np.inf)
-            beside = np.abs(part.centre - own) * OUTWARD
-            most = unit[:, 0] * found * (1.0 + 2.0 * share) + reach @ beside
-        total = total + most
+                is_smooth = ((y * ROOM > b) | (y + b == 0.0)).all(axis=1)
+                norm_bound = np.where(is_smooth, np.minimum(norm_bound, _led(y, b, q)), np.inf)
+            offset = np.abs(factor.centre - point) * OUTWARD
+            bound = unit[:, 0] * norm_bound * (1.0 + 2.0 * share) + reach @ offset
+        total = total + bound
     return total * OUTWARD
 
 
@@ -264,8 +271,8 @@ def _led(y: Array, b: Array, q: float) -> Array:
     quotients = np.where(low > 0.0, (y + b) / np.where(low > 0.0, low, 1.0), 1.0)
     quotients = np.minimum(quotients * (1.0 + 16.0 * HALF_ULP), 1.0) ** q
     np.put_along_axis(quotients, lead, 0.0, axis=1)
-    rest = quotients.sum(axis=1)
-    return np.where((low[:, 0] > 0.0) & (rest < ROOM), high[:, 0] * (1.0 + rest) ** (1.0 / q), np.inf)
+    power_sum = quotients.sum(axis=1)
+    return np.where((low[:, 0] > 0.0) & (power_sum < ROOM), high[:, 0] * (1.0 + power_sum) ** (1.0 / q), np.inf)
 
 
 def _norm(y: Array, q: float) -> Array:
@@ -300,5 +307,5 @@ def _sides(part: Boxed, about: Array) -> tuple[Array, Array, Array]:
 def _corners(part: Cornered, about: Array) -> tuple[Array, Array]:
     """Return the corners of a set minus a point, and their error bounds, ``(v, d)`` each."""
     exact: Sequence[Sequence[Fraction]] = part.corners
-    found = [[float(x - Fraction(float(m))) for x, m in zip(corner, about, strict=True)] for corner in exact]
-    return np.array(found), HALF_ULP * np.abs(found)
+    corners = [[float(x - Fraction(float(m))) for x, m in zip(corner, about, strict=True)] for corner in exact]
+    return np.array(corners), HALF_ULP * np.abs(corners)

@@ -76,12 +76,12 @@ class Ellipsoidal(Shape):
         with ctx.workprec(DIGITS * ctx.prec):  # in a long ellipsoid most digits cancel
             inverse = arb_mat(L.tolist()).inv()
             shares = (inverse * arb_mat(self.source.shape.tolist()) * inverse.transpose()).tolist()
-            rest = [x - int(i == j) for i, row in enumerate(shares) for j, x in enumerate(row)]
+            residual = [x - int(i == j) for i, row in enumerate(shares) for j, x in enumerate(row)]
             # a square as a product: Arb gives no power of a ball that contains 0
-            found = above(total(x * x for x in rest).nonnegative_part().sqrt())
-        if not found < 1.0:
+            bound = above(total(x * x for x in residual).nonnegative_part().sqrt())
+        if not bound < 1.0:
             raise Unchecked("the ellipsoid is too long for its axes to be told in floats")
-        return found
+        return bound
 
 
 @final
@@ -104,14 +104,14 @@ class Ball(Shape):
         if p == 2.0:
             return total(c * c for c in direction).nonnegative_part().sqrt()
         q = ball(p) / (ball(p) - 1)
-        summed = total(_power(size, q) for size in sizes if not size.is_zero())
-        return summed if summed.is_zero() else _power(summed, 1 / q)
+        power_sum = total(_power(size, q) for size in sizes if not size.is_zero())
+        return power_sum if power_sum.is_zero() else _power(power_sum, 1 / q)
 
     def far(self, direction: Sequence[arb]) -> list[arb]:
         q = ball(self.source.p) / (ball(self.source.p) - 1)
-        steep = [_power(c, q - 1) if not c.is_zero() else c for c in direction]
-        size = self.gauge(steep)
-        return [v / size if c > 0 else -v / size for c, v in zip(direction, steep, strict=True)]
+        powers = [_power(c, q - 1) if not c.is_zero() else c for c in direction]
+        size = self.gauge(powers)
+        return [v / size if c > 0 else -v / size for c, v in zip(direction, powers, strict=True)]
 
     def holds(self, point: Sequence[arb]) -> bool:
         p, radius = self.source.p, ball(self.source.radius)
@@ -122,8 +122,8 @@ class Ball(Shape):
 
     def gauge(self, offsets: Sequence[arb]) -> arb:
         p = ball(self.source.p)
-        summed = total(_power(v, p) for v in offsets if not v.is_zero())
-        return (summed if summed.is_zero() else _power(summed, 1 / p)) / ball(self.source.radius)
+        power_sum = total(_power(v, p) for v in offsets if not v.is_zero())
+        return (power_sum if power_sum.is_zero() else _power(power_sum, 1 / p)) / ball(self.source.radius)
 
     def bound(self, value: Array, spread: Array) -> tuple[Array, Array]:
         """Return linear upper bounds of the support function: ``h(f) - w'f`` is convex, hence largest at a corner of a
@@ -135,20 +135,20 @@ class Ball(Shape):
         w = self.source.support_point(value)
         if d <= MOST_ENDS:
             ends = value[:, None] + spread[:, None] * np.array(list(product((-1.0, 1.0), repeat=d)))
-            over = (self._norm(ends) - np.einsum("kw,kew->ke", w - self.centre, ends)).max(axis=1)
+            excess = (self._norm(ends) - np.einsum("kw,kew->ke", w - self.centre, ends)).max(axis=1)
         else:
-            over = self._norm(value) - ((w - self.centre) * value).sum(axis=1)
-            over += self._norm(spread) + (np.abs(w - self.centre) * spread).sum(axis=1)
+            excess = self._norm(value) - ((w - self.centre) * value).sum(axis=1)
+            excess += self._norm(spread) + (np.abs(w - self.centre) * spread).sum(axis=1)
         reach = np.abs(value) + spread
-        lost = ROUNDING * (self._norm(reach) + (reach * (np.abs(w) + 2.0 * np.abs(self.centre))).sum(axis=1))
-        return w, (np.maximum(over, 0.0) + lost) * OUTWARD
+        rounding_error = ROUNDING * (self._norm(reach) + (reach * (np.abs(w) + 2.0 * np.abs(self.centre))).sum(axis=1))
+        return w, (np.maximum(excess, 0.0) + rounding_error) * OUTWARD
 
     def _norm(self, vectors: Array) -> Array:
         """Return the support values about the centre, up to rounding; no component overflows or underflows."""
         size = np.abs(vectors).max(axis=-1, keepdims=True)
         scaled = vectors / np.where(size > 0.0, size, 1.0)
-        answer: Array = self.source.radius * size[..., 0] * np.linalg.norm(scaled, ord=self.source.dual, axis=-1)
-        return answer
+        norms: Array = self.source.radius * size[..., 0] * np.linalg.norm(scaled, ord=self.source.dual, axis=-1)
+        return norms
 
     @cached_property
     def round(self) -> tuple[Array, Array] | None:
@@ -165,10 +165,12 @@ class Cylindrical(Shape):
     def __init__(self, source: Cylinder, base: Shape) -> None:
         super().__init__(source)
         self.base = base
-        given = np.zeros((base.dimension, source.dimension - base.dimension))
-        self.slopes = given if source.slopes is None else np.asarray(source.slopes, dtype=float)
-        whole = np.isin(self.slopes, (-1.0, 0.0, 1.0)).all() and (np.count_nonzero(self.slopes, axis=0) <= 1).all()
-        if self.slopes.shape != given.shape or not whole:
+        zero_slopes = np.zeros((base.dimension, source.dimension - base.dimension))
+        self.slopes = zero_slopes if source.slopes is None else np.asarray(source.slopes, dtype=float)
+        is_signed_sum = (
+            np.isin(self.slopes, (-1.0, 0.0, 1.0)).all() and (np.count_nonzero(self.slopes, axis=0) <= 1).all()
+        )
+        if self.slopes.shape != zero_slopes.shape or not is_signed_sum:
             raise Unchecked("the checker knows cylinders along sums and differences of coordinates")
 
     @property
@@ -185,21 +187,23 @@ class Cylindrical(Shape):
         return np.hstack([directions, directions @ self.slopes])
 
     def support(self, direction: Sequence[arb]) -> arb:
-        own = direction[: self.spanned]
-        for place, c in enumerate(direction[self.spanned :]):
-            (which,) = np.nonzero(self.slopes[:, place])
-            off = c - total(float(self.slopes[i, place]) * own[i] for i in which.tolist()) if which.size else c
+        base_direction = direction[: self.spanned]
+        for column, c in enumerate(direction[self.spanned :]):
+            (rows,) = np.nonzero(self.slopes[:, column])
+            residual = (
+                c - total(float(self.slopes[i, column]) * base_direction[i] for i in rows.tolist()) if rows.size else c
+            )
             # where `lifted` made the direction exactly, rounding leaves a ball that contains 0
-            if not (off.is_zero() if not which.size else off.contains(0)):
+            if not (residual.is_zero() if not rows.size else residual.contains(0)):
                 raise Broken("a direction points where its set is unbounded")
-        return self.base.support(own)
+        return self.base.support(base_direction)
 
     def _seen(self, point: Sequence[arb]) -> list[arb]:
         """Return a point projected onto the coordinates of the base."""
-        found = list(point[: self.spanned])
-        for i, place in np.argwhere(self.slopes).tolist():
-            found[i] = found[i] + float(self.slopes[i, place]) * point[self.spanned + place]
-        return found
+        projection = list(point[: self.spanned])
+        for i, column in np.argwhere(self.slopes).tolist():
+            projection[i] = projection[i] + float(self.slopes[i, column]) * point[self.spanned + column]
+        return projection
 
     def holds(self, point: Sequence[arb]) -> bool:
         return self.base.holds(self._seen(point))
@@ -224,25 +228,28 @@ class Joint(Shape):
     def __init__(self, source: Product, parts: Sequence[Shape]) -> None:
         super().__init__(source)
         self.parts = parts
-        ends = np.cumsum([0, *(part.dimension for part in parts)]).tolist()
+        ends = np.cumsum([0, *(factor.dimension for factor in parts)]).tolist()
         self.places = [slice(start, stop) for start, stop in pairwise(ends)]
 
     def support(self, direction: Sequence[arb]) -> arb:
-        return total(part.support(direction[place]) for part, place in zip(self.parts, self.places, strict=True))
+        return total(
+            factor.support(direction[columns]) for factor, columns in zip(self.parts, self.places, strict=True)
+        )
 
     def holds(self, point: Sequence[arb]) -> bool:
-        return all(part.holds(point[place]) for part, place in zip(self.parts, self.places, strict=True))
+        return all(factor.holds(point[columns]) for factor, columns in zip(self.parts, self.places, strict=True))
 
     def member(self, point: Sequence[float] | Array, near: float = NEAR) -> list[arb] | None:
-        each = [part.member(point[place], near) for part, place in zip(self.parts, self.places, strict=True)]
-        known = [one for one in each if one is not None]
-        return [x for one in known for x in one] if len(known) == len(each) else None
+        members = [factor.member(point[columns], near) for factor, columns in zip(self.parts, self.places, strict=True)]
+        proven = [member for member in members if member is not None]
+        return [x for member in proven for x in member] if len(proven) == len(members) else None
 
     def bound(self, value: Array, spread: Array) -> tuple[Array, Array]:
-        each = [
-            part.bound(value[:, place], spread[:, place]) for part, place in zip(self.parts, self.places, strict=True)
+        bounds = [
+            factor.bound(value[:, columns], spread[:, columns])
+            for factor, columns in zip(self.parts, self.places, strict=True)
         ]
-        return np.hstack([w for w, _ in each]), np.sum([excess for _, excess in each], axis=0) * OUTWARD
+        return np.hstack([w for w, _ in bounds]), np.sum([excess for _, excess in bounds], axis=0) * OUTWARD
 
 
 def _power(value: arb, exponent: arb) -> arb:
@@ -263,19 +270,21 @@ def _round_bound(centre: Array, S: Array, value: Array, spread: Array, power: in
     Directions are scaled by powers of two, such that the largest support value of an entry is from 1/2 to 1. Otherwise
     squares of numbers below 1e-162 would be 0, and the set a point.
     """
-    largest = (np.maximum(np.abs(value), spread) * np.sqrt(np.diag(S))).max(axis=1)
-    shift = np.frexp(np.where(np.isfinite(largest), largest, 1.0))[1][:, None]
+    largest_support = (np.maximum(np.abs(value), spread) * np.sqrt(np.diag(S))).max(axis=1)
+    shift = np.frexp(np.where(np.isfinite(largest_support), largest_support, 1.0))[1][:, None]
     value, spread = np.ldexp(value, -shift), np.ldexp(spread, -shift)
     middle = np.ldexp(centre, -power)
     square = np.maximum(np.einsum("ki,ij,kj->k", value, S, value), 0.0)
-    lost = ROUNDING * np.einsum("ki,ij,kj->k", np.abs(value), np.abs(S), np.abs(value))  # error by cancellation
+    error = ROUNDING * np.einsum("ki,ij,kj->k", np.abs(value), np.abs(S), np.abs(value))  # error by cancellation
     size = np.sqrt(square)
     safe = np.where(size > 0, size, 1.0)
     w = centre + np.ldexp(np.where(size[:, None] > 0, value @ S / safe[:, None], 0.0), power)
-    off = spread @ np.sqrt(np.diag(S)) * OUTWARD
+    change = spread @ np.sqrt(np.diag(S)) * OUTWARD
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):  # an overflow makes the bound infinite
-        excess = np.where(off < 0.5 * size, off**2 / (2.0 * (size - off)), 2.0 * off + np.where(size > 0, 0.0, off))
-    short = np.sqrt(square + lost) - size + lost / safe
-    lost = (excess + short) * OUTWARD + 1e-14 * (size + off + np.abs(value) @ np.abs(middle))
-    lost = np.ldexp(lost, shift[:, 0] + power)
-    return w, np.where(lost < LEAST, np.nextafter(lost, np.inf), lost)
+        excess = np.where(
+            change < 0.5 * size, change**2 / (2.0 * (size - change)), 2.0 * change + np.where(size > 0, 0.0, change)
+        )
+    shortfall = np.sqrt(square + error) - size + error / safe
+    error = (excess + shortfall) * OUTWARD + 1e-14 * (size + change + np.abs(value) @ np.abs(middle))
+    error = np.ldexp(error, shift[:, 0] + power)
+    return w, np.where(error < LEAST, np.nextafter(error, np.inf), error)

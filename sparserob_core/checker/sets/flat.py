@@ -59,8 +59,8 @@ class Flat(Shape):
     def shares(self, direction: Array) -> Array:
         from scipy.optimize import nnls
 
-        answer: Array = nnls(np.array([c for c, _ in self.sides]).T, direction)[0]
-        return answer
+        multipliers: Array = nnls(np.array([c for c, _ in self.sides]).T, direction)[0]
+        return multipliers
 
 
 @final
@@ -121,8 +121,8 @@ class Boxed(Flat):
         ends = zip(self._low, self._high, strict=True)
         points = [[low, high] + ([0 * low] if low <= 0 and high >= 0 else []) for low, high in ends]
         return [
-            _least([_height(up, down, s, v) for v in some])
-            for up, down, s, some in zip(ups, downs, slope, points, strict=True)
+            _least([_height(up, down, s, v) for v in values])
+            for up, down, s, values in zip(ups, downs, slope, points, strict=True)
         ]
 
     def shares(self, direction: Array) -> Array:
@@ -153,24 +153,25 @@ class Cornered(Flat):
     @cached_property
     def _offsets(self) -> list[list[Fraction]]:
         """The vectors from the first corner to the others, the longest first."""
-        first, *others = self.corners
-        return _longest_first([[a - b for a, b in zip(x, first, strict=True)] for x in others])
+        first, *remaining = self.corners
+        return _longest_first([[a - b for a, b in zip(x, first, strict=True)] for x in remaining])
 
     def nearest(self, point: Array) -> list[arb]:
         """Return a weighted mean of corners close to a point."""
         from scipy.optimize import nnls
 
-        single = self.segments is not None and len(self.segments) == 1
-        along = self._offsets[:1] if single else self._offsets
-        first, offsets = self.corners[0], [[Fraction(0)] * self.dimension, *along]
+        is_segment = self.segments is not None and len(self.segments) == 1
+        chosen = self._offsets[:1] if is_segment else self._offsets
+        first, offsets = self.corners[0], [[Fraction(0)] * self.dimension, *chosen]
         table = np.array([[float(x) for x in offset] for offset in offsets])
         size = float(np.abs(table).max(initial=0.0)) or 1.0
-        away = (point - np.array([float(x) for x in first])) / size
+        target = (point - np.array([float(x) for x in first])) / size
         weights = [
-            Fraction(float(w)) for w in nnls(np.vstack([table.T / size, np.ones(len(table))]), np.append(away, 1.0))[0]
+            Fraction(float(w))
+            for w in nnls(np.vstack([table.T / size, np.ones(len(table))]), np.append(target, 1.0))[0]
         ]
-        whole = sum(weights)
-        shares = [w / whole for w in weights]
+        weight_sum = sum(weights)
+        shares = [w / weight_sum for w in weights]
         columns = zip(first, zip(*offsets, strict=True), strict=True)
         return [rational(x + sum(w * v for w, v in zip(shares, column, strict=True))) for x, column in columns]
 
@@ -181,12 +182,13 @@ class Cornered(Flat):
         heights = value @ points.T
         best = heights.argmax(axis=1)
         w, reach = points[best], np.abs(value) + spread
-        apart = np.einsum("kvw,kw->kv", np.abs(points[None] - w[:, None]), spread)
-        ahead = heights - heights.max(axis=1, keepdims=True) + apart
+        change = np.einsum("kvw,kw->kv", np.abs(points[None] - w[:, None]), spread)
+        ahead = heights - heights.max(axis=1, keepdims=True) + change
         ahead += 3.0 * rounding(self.dimension) * (reach @ np.abs(points).max(axis=0))[:, None]
         ahead[np.arange(best.size), best] = 0.0
-        corner = 2.0 * HALF_ULP * (reach @ np.abs(points).T).max(axis=1)  # error of corners that are rounded to floats
-        return w, (np.maximum(ahead.max(axis=1), 0.0) + corner) * OUTWARD
+        # error of corners that are rounded to floats
+        corner_error = 2.0 * HALF_ULP * (reach @ np.abs(points).T).max(axis=1)
+        return w, (np.maximum(ahead.max(axis=1), 0.0) + corner_error) * OUTWARD
 
 
 @final
@@ -211,8 +213,8 @@ class Polyhedral(Cornered):
 
     def shares(self, direction: Array) -> Array:
         number, factor = facet(self.sides, direction)
-        answer: Array = float(factor) * np.eye(len(self.sides))[number]
-        return answer
+        multipliers: Array = float(factor) * np.eye(len(self.sides))[number]
+        return multipliers
 
     def _sizes(self, limit: arb) -> list[float]:
         return [abs(float(limit))]
@@ -258,14 +260,16 @@ class Segments(Flat):
         """
         if self.source.halfspaces() is None:  # too many facets: a run treats the set as curved
             return None
-        far, found = 2 * total(balls(self.radius)), []
+        reach, facets = 2 * total(balls(self.radius)), []
         for exact in self._normals:
             size = np.linalg.norm(np.array([float(v) for v in exact]))
             for length in (Fraction(float(size)), -Fraction(float(size))):
                 c = np.array([float(v / length) for v in exact])
-                off = total(rational(abs(Fraction(a) - v / length)) for a, v in zip(c.tolist(), exact, strict=True))
-                found.append((c, self.support(balls(c)) - 2 * off * far))
-        return found
+                normal_error = total(
+                    rational(abs(Fraction(a) - v / length)) for a, v in zip(c.tolist(), exact, strict=True)
+                )
+                facets.append((c, self.support(balls(c)) - 2 * normal_error * reach))
+        return facets
 
     @property
     def holding(self) -> list[Facet]:
@@ -277,22 +281,22 @@ class Segments(Flat):
         span its orthogonal complement."""
         from flint import fmpq, fmpq_mat
 
-        d, found = self.dimension, dict[tuple[str, ...], list[fmpq]]()
+        d, normals = self.dimension, dict[tuple[str, ...], list[fmpq]]()
         rows = [[fmpq(*v.as_integer_ratio()) for v in g] for g in self.source.generators.tolist() if any(g)]
-        across = _null_space(rows, d)
-        rank = d - len(across)
-        every = [[*chosen, *across] for chosen in combinations(rows, rank - 1)] if rank else []
-        every += [[*across[:i], *across[i + 1 :], *spanning(rows)] for i in range(len(across))]
-        for chosen in every:
+        complement = _null_space(rows, d)
+        rank = d - len(complement)
+        spanning_sets = [[*vectors, *complement] for vectors in combinations(rows, rank - 1)] if rank else []
+        spanning_sets += [[*complement[:i], *complement[i + 1 :], *spanning(rows)] for i in range(len(complement))]
+        for vectors in spanning_sets:
             minors = [
-                (-1) ** i * (fmpq_mat([[*r[:i], *r[i + 1 :]] for r in chosen]).det() if d > 1 else fmpq(1))
+                (-1) ** i * (fmpq_mat([[*r[:i], *r[i + 1 :]] for r in vectors]).det() if d > 1 else fmpq(1))
                 for i in range(d)
             ]
             lead = next((v for v in minors if v != 0), None)
             if lead is not None:
                 size = max(abs(v) for v in minors)
-                found.setdefault(tuple(str(v / lead) for v in minors), [v / size for v in minors])
-        return [tuple(Fraction(int(v.p), int(v.q)) for v in normal) for normal in found.values()]
+                normals.setdefault(tuple(str(v / lead) for v in minors), [v / size for v in minors])
+        return [tuple(Fraction(int(v.p), int(v.q)) for v in normal) for normal in normals.values()]
 
     def contains(self, point: Sequence[float] | Array) -> bool:
         """Return True where an exact point is proven to be in the set; the middle needs no proof."""
@@ -310,20 +314,20 @@ class Segments(Flat):
     def _sums(self) -> list[list[Fraction]]:
         """The long segments, the longest first. Parallel segments are added into one, so that the zonotope of the
         results lies in the set."""
-        found = list[list[Fraction]]()
+        sums = list[list[Fraction]]()
         rows = _longest_first([[Fraction(v) for v in g] for g in self.source.generators.tolist() if any(g)])
         widths = _widths(rows)
         for row in rows:
             if _share(row, widths) <= NEAR:
                 continue
-            for place, other in enumerate(found):
-                sign = 1 if sum(a * b for a, b in zip(row, other, strict=True)) > 0 else -1
-                if len(_apart([other, row], widths)) == 1:
-                    found[place] = [b + sign * a for a, b in zip(row, other, strict=True)]
+            for index, segment in enumerate(sums):
+                sign = 1 if sum(a * b for a, b in zip(row, segment, strict=True)) > 0 else -1
+                if len(_apart([segment, row], widths)) == 1:
+                    sums[index] = [b + sign * a for a, b in zip(row, segment, strict=True)]
                     break
             else:
-                found.append(row)
-        return _longest_first(found)
+                sums.append(row)
+        return _longest_first(sums)
 
     @property
     def generators(self) -> list[list[Fraction]]:
@@ -340,10 +344,10 @@ class Segments(Flat):
             return balls(middle)
         table = np.array([[float(v) for v in row] for row in sums])
         size = np.abs(table).max()
-        found = np.clip(lsq_linear(table.T / size, offset / size, (-1.0, 1.0), method="bvls").x, -1.0, 1.0).tolist()
+        weights = np.clip(lsq_linear(table.T / size, offset / size, (-1.0, 1.0), method="bvls").x, -1.0, 1.0).tolist()
         columns = zip(middle.tolist(), zip(*sums, strict=True), strict=True)
         return [
-            rational(Fraction(m) + sum(Fraction(s) * v for s, v in zip(found, column, strict=True)))
+            rational(Fraction(m) + sum(Fraction(s) * v for s, v in zip(weights, column, strict=True)))
             for m, column in columns
         ]
 
@@ -360,18 +364,18 @@ class Segments(Flat):
         """Return linear upper bounds of the support function, by ``|a + b| <= sign(a) (a + b) + 2 max(|b| - |a|, 0)``
         for every segment."""
         G = self.source.generators
-        heights, moved = value @ G.T, spread @ np.abs(G).T
-        moved = moved + rounding(self.dimension) * (np.abs(value) @ np.abs(G).T)  # rounding of the heights
+        heights, change = value @ G.T, spread @ np.abs(G).T
+        change = change + rounding(self.dimension) * (np.abs(value) @ np.abs(G).T)  # rounding of the heights
         signs = np.where(heights >= 0, 1.0, -1.0)
         w = self.source.centre + signs @ G
         size = np.abs(self.source.centre) + np.abs(G).sum(axis=0)
-        lost = rounding(len(G) + 1) * (np.abs(value) + spread) @ size  # w is rounded
-        excess: Array = (2.0 * np.maximum(moved - np.abs(heights), 0.0).sum(axis=1) + lost) * OUTWARD
+        rounding_error = rounding(len(G) + 1) * (np.abs(value) + spread) @ size  # w is rounded
+        excess: Array = (2.0 * np.maximum(change - np.abs(heights), 0.0).sum(axis=1) + rounding_error) * OUTWARD
         return w, excess
 
     def least(self, ups: Sequence[arb], downs: Sequence[arb], slope: Sequence[arb]) -> arb:
-        flat = self.facets is not None
-        return super().least(ups, downs, slope) if flat else Shape.least(self, ups, downs, slope)
+        has_facets = self.facets is not None
+        return super().least(ups, downs, slope) if has_facets else Shape.least(self, ups, downs, slope)
 
 
 def _size(row: Sequence[Fraction]) -> float:
@@ -404,14 +408,14 @@ def _apart(rows: Sequence[list[Fraction]], widths: Sequence[Fraction] | None = N
     units = _widths(rows) if widths is None else widths
     for row in rows:
         size = _share(row, units)
-        rest = np.array([float(v / unit) for v, unit in zip(row, units, strict=True)]) / (size or 1.0)
+        residual = np.array([float(v / unit) for v, unit in zip(row, units, strict=True)]) / (size or 1.0)
         for _ in range(2):
-            for other in basis:
-                rest = rest - (rest @ other) * other
-        away = float(np.linalg.norm(rest))
-        if size * away > NEAR:
+            for direction in basis:
+                residual = residual - (residual @ direction) * direction
+        distance = float(np.linalg.norm(residual))
+        if size * distance > NEAR:
             chosen.append(row)
-            basis.append(rest / away)
+            basis.append(residual / distance)
     return chosen
 
 
@@ -419,13 +423,13 @@ def _independent(rows: Sequence[list[Fraction]]) -> list[list[Fraction]]:
     """Return the rows that are not a linear combination of the rows before them."""
     chosen, reduced = list[list[Fraction]](), list[tuple[int, list[Fraction]]]()
     for row in rows:
-        rest = row
-        for lead, other in reduced:
-            rest = [a - rest[lead] * b for a, b in zip(rest, other, strict=True)]
-        places = [i for i, v in enumerate(rest) if v]
-        if places:
-            lead = places[0]
-            reduced.append((lead, [v / rest[lead] for v in rest]))
+        residual = row
+        for lead, pivot_row in reduced:
+            residual = [a - residual[lead] * b for a, b in zip(residual, pivot_row, strict=True)]
+        indices = [i for i, v in enumerate(residual) if v]
+        if indices:
+            lead = indices[0]
+            reduced.append((lead, [v / residual[lead] for v in residual]))
             chosen.append(row)
     return chosen
 
@@ -436,13 +440,13 @@ def _null_space(rows: Sequence[Sequence[fmpq]], d: int) -> list[list[fmpq]]:
 
     basis = spanning(rows)
     leads = [next(i for i, v in enumerate(row) if v != 0) for row in basis]
-    found = []
+    vectors = []
     for free in (i for i in range(d) if i not in leads):
         vector = [fmpq(int(i == free)) for i in range(d)]
         for row, lead in zip(basis, leads, strict=True):
             vector[lead] = -row[free]
-        found.append(vector)
-    return found
+        vectors.append(vector)
+    return vectors
 
 
 def _height(up: arb, down: arb, slope: arb, value: arb) -> arb:
@@ -473,7 +477,7 @@ def _meets(rows: tuple[tuple[float, ...], ...], planes: tuple[int, ...]) -> tupl
         raise Unchecked(f"a polytope with {len(rows)} facets in {d} dimensions has too many corners to be listed")
     exact = [[fmpq(*Fraction(x).as_integer_ratio()) for x in row] for row in rows]
     walls = exact + [[fmpq(int(i == plane)) for i in range(d)] + [fmpq(0)] for plane in planes]
-    found: set[tuple[Fraction, ...]] = set()
+    points: set[tuple[Fraction, ...]] = set()
     for chosen in combinations(walls, d):
         matrix = fmpq_mat([row[:d] for row in chosen])
         if matrix.det() == 0:
@@ -481,7 +485,7 @@ def _meets(rows: tuple[tuple[float, ...], ...], planes: tuple[int, ...]) -> tupl
         point = matrix.solve(fmpq_mat([[row[d]] for row in chosen]))
         x = [point[i, 0] for i in range(d)]
         if all(sum((a * b for a, b in zip(row[:d], x, strict=True)), fmpq(0)) <= row[d] for row in exact):
-            found.add(tuple(Fraction(int(v.p), int(v.q)) for v in x))
-    if not found:
+            points.add(tuple(Fraction(int(v.p), int(v.q)) for v in x))
+    if not points:
         raise Unchecked("a polytope has no corners")
-    return tuple(sorted(found))
+    return tuple(sorted(points))

@@ -62,7 +62,7 @@ def _seen(source: ConvexSet, precision: int) -> Shape:
 
 def middle(shape: ConvexSet) -> Array:
     """Return the middle ``(d,)`` of a bounded set; for a set without an interior, floats close to it."""
-    found = shape.middle()  # any point of the set would be right: claims are about deviations from it
-    if known(shape).member(found) is None:
+    point = shape.middle()  # any point of the set would be right: claims are about deviations from it
+    if known(shape).member(point) is None:
         raise Unchecked(f"the middle of the {shape.kind} is not shown to be in it")
-    return found
+    return point

@@ -61,15 +61,15 @@ class Parameters:
         """
         if self.is_box or self.shape is None or not slope.any():
             return []
-        found = [(slope[None], np.array([above(self.shape.support(balls(slope)))]), np.ones(1))]
+        combinations = [(slope[None], np.array([above(self.shape.support(balls(slope)))]), np.ones(1))]
         low, high = np.array(box[0]), np.array(box[1])
-        near = [(a, s) for a, s in halfspaces(self.shape, (low + high) / 2) if not -_least(-a, low, high) <= s]
-        if near:
+        cutting = [(a, s) for a, s in halfspaces(self.shape, (low + high) / 2) if not -_least(-a, low, high) <= s]
+        if cutting:
             from scipy.optimize import nnls
 
-            normals, limits = np.array([a for a, _ in near]), np.array([above(s) for _, s in near])
-            found.append((normals, limits, nnls(normals.T, slope)[0]))
-        return found  # type: ignore[return-value]
+            normals, limits = np.array([a for a, _ in cutting]), np.array([above(s) for _, s in cutting])
+            combinations.append((normals, limits, nnls(normals.T, slope)[0]))
+        return combinations  # type: ignore[return-value]
 
 
 def halfspaces(shape: Shape, point: Array) -> list[Facet]:

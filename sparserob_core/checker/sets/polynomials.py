@@ -60,8 +60,8 @@ class Enclosed:
 
 def product(left: Enclosed, right: Enclosed) -> Enclosed:
     """Return matrices ``(..., a, d)`` times matrices ``(..., d, n)``, with error bounds."""
-    size, there = np.abs(left.mid), np.abs(right.mid)
-    rad = size @ (right.rad + rounding(size.shape[-1]) * there) + left.rad @ (there + right.rad)
+    left_size, right_size = np.abs(left.mid), np.abs(right.mid)
+    rad = left_size @ (right.rad + rounding(left_size.shape[-1]) * right_size) + left.rad @ (right_size + right.rad)
     return Enclosed(left.mid @ right.mid, rad * OUTWARD)
 
 
@@ -81,40 +81,42 @@ class Truncated:
     def __mul__(self, other: Truncated) -> Truncated:
         left, right = self.coefficients, other.coefficients
         J, first, second, gather, degrees = left.shape[1], *_pairs(self.monomials)
-        found = np.empty_like(left)
+        coefficients = np.empty_like(left)
         for t in range(J):
             pairs = sum(left[:, s, first] * right[:, t - s, second] for s in range(t + 1))
-            found[:, t] = pairs @ gather
-        sizes = [np.abs(part) @ degrees for part in (left, right)]  # by time and degree
+            coefficients[:, t] = pairs @ gather
+        sizes = [np.abs(factor) @ degrees for factor in (left, right)]  # by time and degree
         kept = np.zeros(len(left))
         for t in range(J):
             for s in range(t + 1):
-                below = np.cumsum(sizes[1][:, t - s], axis=1)[:, ::-1]
-                kept += (sizes[0][:, s] * below).sum(axis=1)
+                partial_sums = np.cumsum(sizes[1][:, t - s], axis=1)[:, ::-1]
+                kept += (sizes[0][:, s] * partial_sums).sum(axis=1)
         a, b = self.size, other.size
         dropped = np.maximum(a * b - kept, 0.0) + rounding(J * len(first) + 4) * a * b
-        return Truncated(self.monomials, found, (dropped + a * other.lost + (b + other.lost) * self.lost) * OUTWARD)
+        return Truncated(
+            self.monomials, coefficients, (dropped + a * other.lost + (b + other.lost) * self.lost) * OUTWARD
+        )
 
     def __add__(self, other: Truncated) -> Truncated:
-        found, size = self.coefficients + other.coefficients, self.size + other.size
-        return Truncated(self.monomials, found, (self.lost + other.lost + rounding(1) * size) * OUTWARD)
+        coefficients, size = self.coefficients + other.coefficients, self.size + other.size
+        return Truncated(self.monomials, coefficients, (self.lost + other.lost + rounding(1) * size) * OUTWARD)
 
     def scaled(self, factors: Array) -> Truncated:
         """Return each polynomial times a number."""
-        found, sizes = self.coefficients * factors[:, None, None], np.abs(factors)
-        return Truncated(self.monomials, found, sizes * (self.lost + rounding(1) * self.size) * OUTWARD)
+        coefficients, sizes = self.coefficients * factors[:, None, None], np.abs(factors)
+        return Truncated(self.monomials, coefficients, sizes * (self.lost + rounding(1) * self.size) * OUTWARD)
 
     def plus(self, number: float) -> Truncated:
         """Return each polynomial plus a number."""
-        found = self.coefficients.copy()
-        found[:, 0, 0] += number
-        return Truncated(self.monomials, found, self.lost + rounding(1) * (self.size + abs(number)))
+        coefficients = self.coefficients.copy()
+        coefficients[:, 0, 0] += number
+        return Truncated(self.monomials, coefficients, self.lost + rounding(1) * (self.size + abs(number)))
 
     @cached_property
     def size(self) -> Array:
         """The upper bounds ``(n,)`` of the absolute values of the polynomials without their errors."""
-        answer: Array = np.abs(self.coefficients).sum(axis=(1, 2))
-        return answer
+        size: Array = np.abs(self.coefficients).sum(axis=(1, 2))
+        return size
 
 
 @lru_cache(maxsize=16)
@@ -154,17 +156,17 @@ def lengths(monomials: Monomials, parts: Array) -> tuple[Array, Array, Array]:
 def _lengths(monomials: Monomials, parts: Array, none: Array) -> tuple[Array, Array, Array]:
     square = Truncated(monomials, np.zeros(parts.shape[:3]), none)
     for r in range(parts.shape[3]):
-        part = Truncated(monomials, parts[..., r], none)
-        square = square + part * part
+        component = Truncated(monomials, parts[..., r], none)
+        square = square + component * component
     middle = square.coefficients[:, 0, 0] + square.coefficients[:, 1:, 0].sum(axis=1) / 2
-    there = np.isfinite(middle) & (middle > TINY)
-    middle = np.where(there, middle, 1.0)
+    is_valid = np.isfinite(middle) & (middle > TINY)
+    middle = np.where(is_valid, middle, 1.0)
     e = square.scaled(1.0 / middle).plus(-1.0)
-    over = np.abs(e.coefficients).sum(axis=(1, 2)) + e.lost
-    near = there & (over < NEAR)
+    deviation = np.abs(e.coefficients).sum(axis=(1, 2)) + e.lost
+    is_near = is_valid & (deviation < NEAR)
     root = (e * (e * e.scaled(none + 1.0 / 16.0).plus(-1.0 / 8.0)).plus(1.0 / 2.0)).plus(1.0).scaled(np.sqrt(middle))
-    over = np.where(near, over, 0.0)
-    above = np.sqrt(middle) * over**4 * 5.0 / 128.0 / (1.0 - over) ** 3.5
-    lost = (root.lost + rounding(8) * root.size) * OUTWARD
-    found = np.where(near[:, None, None], root.coefficients, 0.0)
-    return found, np.where(near, lost, np.inf), np.where(near, above, np.inf)
+    deviation = np.where(is_near, deviation, 0.0)
+    excess = np.sqrt(middle) * deviation**4 * 5.0 / 128.0 / (1.0 - deviation) ** 3.5
+    error = (root.lost + rounding(8) * root.size) * OUTWARD
+    coefficients = np.where(is_near[:, None, None], root.coefficients, 0.0)
+    return coefficients, np.where(is_near, error, np.inf), np.where(is_near, excess, np.inf)

@@ -83,12 +83,12 @@ class Shape(ABC):
         """
         if self.segments is None and self.holds(balls(point)):
             return balls(point)
-        found = self.nearest(np.asarray(point, dtype=float))
-        if found is None:
+        candidate = self.nearest(np.asarray(point, dtype=float))
+        if candidate is None:
             return None
         size = max(max(self.radius, default=0.0), float(np.abs(point).max(initial=0.0)))
-        far = total(abs(a - b) for a, b in zip(found, balls(point), strict=True))
-        return found if far <= near * size else None
+        distance = total(abs(a - b) for a, b in zip(candidate, balls(point), strict=True))
+        return candidate if distance <= near * size else None
 
     def nearest(self, point: Array) -> list[arb] | None:
         """Return a point of the set close to another one, in the span of the `segments` where there are some; ``None``
@@ -151,15 +151,15 @@ class Shape(ABC):
         a curved set. Opposite normals share a row of the basis."""
         if self.facets is None:
             return None
-        places: dict[bytes, int] = {}
+        numbers: dict[bytes, int] = {}
         normals, z = [c + 0.0 for c, _ in self.facets], np.zeros((len(self.facets), len(self.facets)))
         for i, c in enumerate(normals):
-            opposite = places.get((-c + 0.0).tobytes())
-            z[i, places.setdefault(c.tobytes(), len(places)) if opposite is None else opposite] = (
+            opposite = numbers.get((-c + 0.0).tobytes())
+            z[i, numbers.setdefault(c.tobytes(), len(numbers)) if opposite is None else opposite] = (
                 1.0 if opposite is None else -1.0
             )
-        kept = [np.frombuffer(key) for key in places]
-        return np.array(kept).reshape(len(kept), self.dimension), z[:, : len(kept)]
+        vectors = [np.frombuffer(key) for key in numbers]
+        return np.array(vectors).reshape(len(vectors), self.dimension), z[:, : len(vectors)]
 
     def shares(self, direction: Array) -> Array:
         """Return numbers ``y (k,) >= 0`` such that the facets' normals times ``y`` add up to the direction, up to
@@ -205,9 +205,9 @@ class Shape(ABC):
         """
         from flint import arb, ctx
 
-        middle, far, spare = balls(self.centre), self.far(balls(direction)), arb(2) ** (SPARE - ctx.prec)
+        middle, offset, spare = balls(self.centre), self.far(balls(direction)), arb(2) ** (SPARE - ctx.prec)
         while spare < 0.5:
-            point = [(m + (1 - spare) * v).mid() for m, v in zip(middle, far, strict=True)]
+            point = [(m + (1 - spare) * v).mid() for m, v in zip(middle, offset, strict=True)]
             if self.holds(point):
                 return point
             spare = spare * 1024
@@ -263,9 +263,9 @@ class Shape(ABC):
         worst, where = 0.0, ""
         for number, ((c, b), unit) in enumerate(zip(self.facets, self.units, strict=True)):
             terms = [a * x for a, x in zip(balls(c), point, strict=True) if not a.is_zero()]
-            more = total([] if beyond is None else [beyond(c)])
-            unit = max(unit, RESOLVED * float((abs(b) + abs(more) + total(abs(t) for t in terms)).mid())) or 1.0
-            over = float((total(terms) + more - b).upper()) / unit
+            extra = total([] if beyond is None else [beyond(c)])
+            unit = max(unit, RESOLVED * float((abs(b) + abs(extra) + total(abs(t) for t in terms)).mid())) or 1.0
+            over = float((total(terms) + extra - b).upper()) / unit
             if over > worst:
                 worst, where = over, _named(c, number)
         return worst, where
@@ -288,13 +288,13 @@ def widths(flat: Sequence[Facet]) -> list[float]:
     normals = np.array([c for c, _ in flat]).reshape(len(flat), -1)
     sizes = np.linalg.norm(normals, axis=1)
     heights = np.array([float(b) for _, b in flat])
-    turned = normals / sizes[:, None]
-    answer = []
+    unit_normals = normals / sizes[:, None]
+    distances = []
     for i in range(len(flat)):
-        opposite = np.abs(turned + turned[i]).max(axis=1) <= PARALLEL
+        opposite = np.abs(unit_normals + unit_normals[i]).max(axis=1) <= PARALLEL
         across = heights[i] + heights[opposite] * sizes[i] / sizes[opposite]
-        answer.append(float(across.min(initial=math.inf)))
-    return answer
+        distances.append(float(across.min(initial=math.inf)))
+    return distances
 
 
 def facet(flat: Sequence[Facet], direction: Array) -> tuple[int, Fraction]:
@@ -307,11 +307,11 @@ def facet(flat: Sequence[Facet], direction: Array) -> tuple[int, Fraction]:
     Broken
         Where the direction is the normal of no facet.
     """
-    place, best = int(np.abs(direction).argmax()), None
+    index, best = int(np.abs(direction).argmax()), None
     for number, (c, b) in enumerate(flat):
-        if c[place] * direction[place] <= 0.0:
+        if c[index] * direction[index] <= 0.0:
             continue
-        factor = Fraction(float(direction[place])) / Fraction(float(c[place]))
+        factor = Fraction(float(direction[index])) / Fraction(float(c[index]))
         if all(Fraction(float(a)) == factor * Fraction(float(b)) for a, b in zip(direction, c, strict=True)):
             height = float(b) * float(factor)
             best = min((height, number, factor), best or (np.inf, number, factor))

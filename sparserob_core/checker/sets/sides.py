@@ -126,11 +126,11 @@ class Sides:
         It is what the bound on the cell loses, since the limit in the middle is the true one.
         """
         assert self.low is not None and self.high is not None
-        free, found = np.flatnonzero(self.high > self.low), np.zeros(self.low.size)
+        free, slopes = np.flatnonzero(self.high > self.low), np.zeros(self.low.size)
         corners = np.asarray(tops, dtype=float).reshape((2,) * free.size)
-        for place, axis in enumerate(free):
-            found[axis] = abs(float((corners.take(1, axis=place) - corners.take(0, axis=place)).mean()))
-        return found
+        for number, axis in enumerate(free):
+            slopes[axis] = abs(float((corners.take(1, axis=number) - corners.take(0, axis=number)).mean()))
+        return slopes
 
     def halves(self, slopes: Array) -> list[Sides]:
         """Return both halves of the cell of directions, across the coordinate of the largest of the ``slopes (b,)``."""
@@ -139,6 +139,6 @@ class Sides:
         middle = (self.low[axis] + self.high[axis]) / 2
         if not self.low[axis] < middle < self.high[axis]:
             raise Unchecked("a cell of directions cannot be halved any more")
-        left, right = self.high.copy(), self.low.copy()
-        left[axis] = right[axis] = middle
-        return [Sides.cell(self.curved, self.low, left), Sides.cell(self.curved, right, self.high)]
+        left_high, right_low = self.high.copy(), self.low.copy()
+        left_high[axis] = right_low[axis] = middle
+        return [Sides.cell(self.curved, self.low, left_high), Sides.cell(self.curved, right_low, self.high)]

@@ -52,18 +52,18 @@ def check_suprema(case: Case) -> list[Finding]:
     with ctx.workprec(precision_of(case)):
         if type(case.certificate.get("format")) is not int or case.certificate["format"] != 1:
             return [Finding("bound", "fails", f"its format is {case.certificate.get('format')!r}, expected 1")]
-        found, entries = list[Finding](), list[Any]()
+        findings, entries = list[Finding](), list[Any]()
 
         def every() -> str:
             entries.extend(_matched(case))
             return f"{len(entries)} rows, each of the problem's once"
 
-        found.append(judged("rows", every))
-        for asked, entry in entries:
-            name = f"{asked.window.name}: {_sense(asked)} {entry.get('quantity')}"
+        findings.append(judged("rows", every))
+        for row, entry in entries:
+            name = f"{row.window.name}: {_sense(row)} {entry.get('quantity')}"
             name += f" at {entry['corner']}" if entry.get("corner") else ""
-            found.append(judged(name, lambda asked=asked, entry=entry: _enclosed(case, asked, entry)))  # type: ignore[misc]
-        return found
+            findings.append(judged(name, lambda row=row, entry=entry: _enclosed(case, row, entry)))  # type: ignore[misc]
+        return findings
 
 
 def _sense(asked: SupremumRow) -> str:
@@ -72,41 +72,43 @@ def _sense(asked: SupremumRow) -> str:
 
 def _asked(case: Case) -> list[SupremumRow]:
     """Return the rows of the problem: those of its constraints, or else of its outputs or states."""
-    found = [
+    rows = [
         SupremumRow(window, direction, b)
         for window in case.windows
         if window not in case.returned
         for direction, b in window.seen.facets or []
     ]
-    if found:
-        return found
-    d, measured = case.problem.system.states, case.problem.measurements
-    name, every = (STATE, np.eye(d)) if measured is None else (OUTPUT, np.asarray(measured.C, dtype=float))
+    if rows:
+        return rows
+    d, measurements = case.problem.system.states, case.problem.measurements
+    name, directions = (STATE, np.eye(d)) if measurements is None else (OUTPUT, np.asarray(measurements.C, dtype=float))
     free = Box(np.full(d, -np.inf), np.full(d, np.inf))
     window = ConstraintWindow(name, free, 0.0, case.problem.horizon, d)
-    return [SupremumRow(window, sign * direction, None) for direction in every for sign in (1.0, -1.0)]
+    return [SupremumRow(window, sign * direction, None) for direction in directions for sign in (1.0, -1.0)]
 
 
 def _matched(case: Case) -> list[tuple[SupremumRow, Mapping[str, Any]]]:
     """Return the rows of the certificate, each with the row of the problem that it is about; raise `Broken` unless both
     agree."""
-    left, found = _asked(case), []
+    remaining_rows, pairs = _asked(case), []
     for entry in listed(case.certificate, "rows"):
         if not isinstance(entry, Mapping):
             raise Broken("rows: expected a constraint, a direction and two bounds each")
         direction = numbers(entry.get("direction"), "direction")
-        same = [
-            one
-            for one in left
-            if one.window.name == entry.get("constraint") and np.array_equal(one.direction, direction)
+        matches = [
+            row
+            for row in remaining_rows
+            if row.window.name == entry.get("constraint") and np.array_equal(row.direction, direction)
         ]
-        if not same:
+        if not matches:
             raise Broken(f"{entry.get('constraint')}: {direction.tolist()} is no row of it, or is written twice")
-        left.remove(same[0])
-        found.append((same[0], entry))
-    if left:
-        raise Broken(f"{len(left)} rows of the problem are not written, such as one of {left[0].window.name}")
-    return found
+        remaining_rows.remove(matches[0])
+        pairs.append((matches[0], entry))
+    if remaining_rows:
+        raise Broken(
+            f"{len(remaining_rows)} rows of the problem are not written, such as one of {remaining_rows[0].window.name}"
+        )
+    return pairs
 
 
 def _enclosed(case: Case, asked: SupremumRow, entry: Mapping[str, Any]) -> str:
@@ -114,10 +116,10 @@ def _enclosed(case: Case, asked: SupremumRow, entry: Mapping[str, Any]) -> str:
     sense = _sense(asked)
     if entry.get("sense") != sense:
         raise Broken(f"it is called {entry.get('sense')!r}, its direction is that of {sense}")
-    least, most = (None if entry.get(side) is None else number(entry, side) for side in ("lower", "upper"))
-    if least is not None and most is not None and least > most:
-        raise Broken(f"from {least!r} to {most!r} is empty")
-    reached_side, proven_side = (least, most) if sense == "sup" else (most, least)
+    lower, upper = (None if entry.get(side) is None else number(entry, side) for side in ("lower", "upper"))
+    if lower is not None and upper is not None and lower > upper:
+        raise Broken(f"from {lower!r} to {upper!r} is empty")
+    reached_side, proven_side = (lower, upper) if sense == "sup" else (upper, lower)
     if reached_side is None:
         raise Unchecked("no value is written that is reached")
     sign = 1.0 if sense == "sup" else -1.0
@@ -170,9 +172,9 @@ def _witnessed(case: Case, asked: SupremumRow, entry: Mapping[str, Any], row: Fo
         raise Broken("the deviation of the initial state is not shown to be in its set")
     changes, signal = _signal(case, entry)
     low, high = row.beside(time, time)
-    delivered = case.sources.delivered_at(parameter.tolist())
-    if delivered is not None:  # an enclosure of the worst errors
-        errors = delivered.added(window.split(asked.direction)[0], time)
+    execution = case.sources.delivered_at(parameter.tolist())
+    if execution is not None:  # an enclosure of the worst errors
+        errors = execution.added(window.split(asked.direction)[0], time)
         slack = 2.0 * HALF_ULP * (abs(low) + abs(high) + abs(errors[1]))
         low, high = low + errors[0] - slack, high + errors[1] + slack
     if case.followed.are_possible:
@@ -198,16 +200,16 @@ def _signal(case: Case, entry: Mapping[str, Any]) -> tuple[Array, Array | None]:
             raise Broken("a disturbance is written, there is none")
         return changes, None
     signal = shaped(entry, "disturbance", (problem.disturbance.dimension, changes.size - 1))
-    held = ~columns_of(problem.disturbance, problem.disturbance_class, "measurable")
-    jumps = (signal[:, 1:] != signal[:, :-1]) & held[:, None]
+    is_held = ~columns_of(problem.disturbance, problem.disturbance_class, "measurable")
+    jumps = (signal[:, 1:] != signal[:, :-1]) & is_held[:, None]
     for time, jumping in zip(changes[1:-1].tolist(), jumps.T, strict=True):
         if (jumping & ~case.disturbances.may_jump(time)).any():
             raise Broken("the disturbance jumps within a piece")
-    shape, seen = known(problem.disturbance), set[tuple[float, ...]]()
+    shape, shown_values = known(problem.disturbance), set[tuple[float, ...]]()
     for value in case.clock.each(map(tuple, signal.T.tolist())):
-        if value not in seen and not shape.contains(value):
+        if value not in shown_values and not shape.contains(value):
             raise Broken(f"the disturbance {list(value)} is not shown to be in its set")
-        seen.add(value)
+        shown_values.add(value)
     return changes, signal
 
 
@@ -229,17 +231,17 @@ def _proven_in_cells(case: Case, asked: SupremumRow, limit: float) -> int:
     """Show that a row is at most the ``limit`` over the parameters and phases of the system; return the number of
     cells."""
     window = asked.window
-    alone = replace(window, shape=Polytope(asked.direction[None], np.array([limit])))
-    found = alone.seen.basis
-    assert found is not None
-    (basis, gains), z = np.split(found[0], [window.states], axis=1), found[1]
+    single_row = replace(window, shape=Polytope(asked.direction[None], np.array([limit])))
+    facet_basis = single_row.seen.basis
+    assert facet_basis is not None
+    (basis, gains), z = np.split(facet_basis[0], [window.states], axis=1), facet_basis[1]
     unit = SHARE * abs(limit) or 1.0  # the excused excess is subtracted from the limit, of which it is a rounding error
     bounded = Bounded(z[0], float(np.nextafter(limit - TOLERANCE * unit * OUTWARD, -np.inf)), unit)
     bound = case.problem.system.parameters
     box = None if bound is None else bound.bounding_box()
     ends = ([], []) if box is None else (box.lower.tolist(), box.upper.tolist())
     lower, upper = (np.array([[t, *p]]) for t, p in zip((window.start, window.stop), ends, strict=True))
-    covered(case, alone, lower, upper)
+    covered(case, single_row, lower, upper)
     times = cut_times(case, window, [(window.start, window.stop)])
     work: list[Work] = [((tuple(ends[0]), tuple(ends[1])), Sides([bounded]), times)]
-    return prove_on_cells(case, alone, (basis, gains), work, (lower, upper)).cells
+    return prove_on_cells(case, single_row, (basis, gains), work, (lower, upper)).cells
