@@ -1,1 +1,2 @@
-"""One finite convex program: standard form, solver, repair, checked residuals, and bounds from its multipliers."""
+"""Solution of one finite convex program: standard form, solver, repair, checked residuals, and bounds from
+multipliers."""

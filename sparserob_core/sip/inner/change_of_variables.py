@@ -92,10 +92,10 @@ def _of_size_one(program: FiniteProgram) -> NewVariables | None:
     if program.blocks is not None:  # a norm has one unit for all its entries
         return None
     sources = (program.lower, program.upper, program.weights)
-    found = _units.recall(sources, None, lambda: _scaled(*sources))
-    if found is None:
+    scaling = _units.recall(sources, None, lambda: _scaled(*sources))
+    if scaling is None:
         return None
-    unit, lower, upper, weights = found
+    unit, lower, upper, weights = scaling
     P = None
     if program.P is not None:
         from scipy.sparse import diags_array
@@ -110,10 +110,10 @@ def _of_size_one(program: FiniteProgram) -> NewVariables | None:
 
 def _scaled(lower: Array, upper: Array, weights: Array) -> tuple[Array, Array, Array, Array] | None:
     reach = np.maximum(np.abs(lower), np.abs(upper))
-    told = np.isfinite(reach) & (reach > 0.0)
-    if not ((reach[told] > ORDINARY) | (reach[told] < 1.0 / ORDINARY)).any():
+    has_size = np.isfinite(reach) & (reach > 0.0)
+    if not ((reach[has_size] > ORDINARY) | (reach[has_size] < 1.0 / ORDINARY)).any():
         return None
-    unit = np.where(told, np.exp2(np.round(np.log2(np.where(told, reach, 1.0)))), 1.0)
+    unit = np.where(has_size, np.exp2(np.round(np.log2(np.where(has_size, reach, 1.0)))), 1.0)
     return unit, lower / unit, upper / unit, weights * unit
 
 
@@ -129,7 +129,7 @@ def _inverse(S: csc_array) -> Array | None:
 def _curvature(P: csc_array, inverse: Array) -> csc_array | None:
     from scipy.sparse import csc_array, diags_array
 
-    bent = inverse.T @ (P @ inverse)
-    entries = np.diag(bent)
-    rest = np.abs(bent - np.diag(entries)).max(initial=0.0)
-    return csc_array(diags_array(entries)) if rest <= 1e-13 * entries.max(initial=0.0) else None
+    transformed = inverse.T @ (P @ inverse)
+    entries = np.diag(transformed)
+    off_diagonal = np.abs(transformed - np.diag(entries)).max(initial=0.0)
+    return csc_array(diags_array(entries)) if off_diagonal <= 1e-13 * entries.max(initial=0.0) else None

@@ -51,12 +51,12 @@ def least_curvature(P: Array) -> Array | None:
         factor = np.linalg.cholesky(scaled - share * np.eye(n))
     except np.linalg.LinAlgError:
         return None
-    lost = 2.0 * (n + 2) * ROUNDING * float(scaled.trace())
-    if not share > lost:
-        lost = _missed(scaled, share, factor)
-    if not share > lost:
+    error = 2.0 * (n + 2) * ROUNDING * float(scaled.trace())
+    if not share > error:
+        error = _missed(scaled, share, factor)
+    if not share > error:
         return None
-    return np.asarray((share - lost) / unit**2 * (1.0 - 4.0 * ROUNDING), dtype=float)
+    return np.asarray((share - error) / unit**2 * (1.0 - 4.0 * ROUNDING), dtype=float)
 
 
 def _missed(scaled: Array, share: float, factor: np.ndarray) -> float:
@@ -64,14 +64,16 @@ def _missed(scaled: Array, share: float, factor: np.ndarray) -> float:
     ``n + 2`` terms, and off by at most so many roundings of their absolute values (Higham 2002, section 3.1)."""
     wide, size = factor.astype(WIDE), np.abs(factor)
     shift = share * np.eye(len(scaled))
-    off = np.abs(scaled.astype(WIDE) - shift - wide @ wide.T)
-    off += (len(scaled) + 4) * UNIT * (np.abs(scaled) + shift + 2.0 * size @ size.T)
-    return float(off.sum(axis=1).max()) * (1.0 + 1e-9)
+    residual = np.abs(scaled.astype(WIDE) - shift - wide @ wide.T)
+    residual += (len(scaled) + 4) * UNIT * (np.abs(scaled) + shift + 2.0 * size @ size.T)
+    return float(residual.sum(axis=1).max()) * (1.0 + 1e-9)
 
 
 def curvature_of(program: FiniteProgram) -> Array | None:
-    """What of a quadratic cost every entry has for itself ``(n,)``, remembered; ``None`` where nothing is proven, or a
-    tangent does as well."""
+    """Return numbers ``c (n,)`` with ``P >= diag(c)`` for the matrix of a quadratic cost, remembered between calls.
+
+    ``None`` where nothing is proven, where a tangent of the cost bounds it as well, or beyond `LARGE` entries.
+    """
     P = program.P
     if P is None or program.S is not None or program.blocks is not None or program.separable or program.n > LARGE:
         return None
@@ -97,12 +99,12 @@ def curved_bound(program: FiniteProgram, bend: Array, y: Array, mu: Array, at: A
     2002, section 3.1).
     """
     assert program.P is not None
-    wide, here = program.P.toarray().astype(WIDE), at.astype(WIDE)
+    wide, point = program.P.toarray().astype(WIDE), at.astype(WIDE)
     rows, equalities = y.astype(WIDE), mu.astype(WIDE)
     h = np.where(y > 0.0, program.h, 0.0)
     pull = program.q + rows @ program.G + equalities @ program.A
-    offers: list[np.ndarray] = [here, _stationary(program, wide, pull, here)]
-    bounds = [_bound_at(program, wide, bend, (rows, equalities, h, pull), one) for one in offers]
+    offers: list[np.ndarray] = [point, _stationary(program, wide, pull, point)]
+    bounds = [_bound_at(program, wide, bend, (rows, equalities, h, pull), offer) for offer in offers]
     best = int(np.argmax(bounds))
     return bounds[best], offers[best].astype(float)
 
@@ -111,24 +113,24 @@ def _stationary(program: FiniteProgram, wide: np.ndarray, pull: np.ndarray, at: 
     """The point near ``at`` where the slope of every entry is 0 that no bound and no kink holds."""
     low, high, weights = program.lower, program.upper, program.weights
     width = np.where(np.isfinite(high - low), high - low, 1.0)
-    held = (at - low <= NEAR * width) | (high - at <= NEAR * width) | (weights > 0.0) & (at == 0.0)
-    moved = np.where(at - low <= NEAR * width, low, np.where(high - at <= NEAR * width, high, at))
-    free = np.flatnonzero(~held)
+    is_held = (at - low <= NEAR * width) | (high - at <= NEAR * width) | (weights > 0.0) & (at == 0.0)
+    point = np.where(at - low <= NEAR * width, low, np.where(high - at <= NEAR * width, high, at))
+    free = np.flatnonzero(~is_held)
     if not free.size:
-        return moved
+        return point
     inside = wide[np.ix_(free, free)].astype(float)
     unit = np.exp2(-np.round(0.5 * np.log2(inside.diagonal())))
     scaled = inside * unit * unit[:, np.newaxis]
     for _ in range(REFINEMENTS):
-        slope = wide @ moved + pull + weights * np.sign(at)
+        slope = wide @ point + pull + weights * np.sign(at)
         try:
             step = np.linalg.solve(scaled, -(slope[free].astype(float) * unit)) * unit
         except np.linalg.LinAlgError:
             return at
         if not np.isfinite(step).all():
             return at
-        moved[free] += step
-    return np.asarray(np.minimum(np.maximum(moved, low), high))
+        point[free] += step
+    return np.asarray(np.minimum(np.maximum(point, low), high))
 
 
 def _bound_at(
@@ -138,21 +140,21 @@ def _bound_at(
     y, mu, h, pull = given
     terms = program.n + y.size + mu.size + 4
     size = np.abs(wide) @ np.abs(at)
-    bent = wide @ at
-    slope = bent + pull
+    gradient = wide @ at
+    slope = gradient + pull
     sizes = np.abs(program.q) + y @ np.abs(program.G) + np.abs(mu) @ np.abs(program.A) + size
     with np.errstate(all="ignore"):
         away = bent_minimisers(program.weights, bend, slope - bend * at, program.lower, program.upper)
-    moved = away - at
-    values = program.weights * np.abs(away) + slope * moved + 0.5 * bend * moved**2
+    displacement = away - at
+    values = program.weights * np.abs(away) + slope * displacement + 0.5 * bend * displacement**2
     # at the point itself: 1/2 at'P at + pull'at, and what the slopes allow beyond it
     constant = program.constant - y @ h - mu @ program.b
-    value = constant + 0.5 * (at @ bent) + pull @ at + values.sum()
+    value = constant + 0.5 * (at @ gradient) + pull @ at + values.sum()
     magnitude = abs(program.constant) + y @ np.abs(h) + np.abs(mu) @ np.abs(program.b)
-    magnitude += sizes @ (2.0 * np.abs(at) + np.abs(moved)) + np.abs(values).sum()
+    magnitude += sizes @ (2.0 * np.abs(at) + np.abs(displacement)) + np.abs(values).sum()
     magnitude += program.weights @ np.abs(away)
-    # a slope that is off by e moves the minimum over one entry by e |moved|, and by e^2 / (2 c) where it is free
+    # a slope that is off by e moves the minimum over one entry by e |displacement|, and by e^2 / (2 c) where it is free
     error = terms * UNIT * sizes
-    bound = value - terms * UNIT * magnitude - error @ np.abs(moved) - (error**2 / bend).sum()
+    bound = value - terms * UNIT * magnitude - error @ np.abs(displacement) - (error**2 / bend).sum()
     lowered = float(np.nextafter(float(bound), -np.inf))
     return lowered if np.isfinite(lowered) else -np.inf

@@ -70,18 +70,18 @@ class DualNewton(Solver, Options):
             program.b,
             P=P,
         )
-        found, steps = from_nothing(finite, accuracy, self.points)
-        bent = 0.0 if finite.P is None else finite.P @ found.x
-        slope = program.q + bent + found.y @ finite.G + found.mu @ finite.A
-        low, high = found.x <= program.lower, found.x >= program.upper
+        solution, steps = from_nothing(finite, accuracy, self.points)
+        gradient = 0.0 if finite.P is None else finite.P @ solution.x
+        slope = program.q + gradient + solution.y @ finite.G + solution.mu @ finite.A
+        low, high = solution.x <= program.lower, solution.x >= program.upper
         box = np.where(low, np.minimum(-slope, 0.0), 0.0) + np.where(high, np.maximum(-slope, 0.0), 0.0)
-        done = found.residual <= accuracy and found.gap <= max(accuracy, _noise(found))
-        said = f"{steps} proximal points; residual {found.residual:.1e}, gap {found.gap:.1e}"
-        return Claim("solved" if done else "failed", found.x, found.y, found.mu, box, said)
+        converged = solution.residual <= accuracy and solution.gap <= max(accuracy, _noise(solution))
+        message = f"{steps} proximal points; residual {solution.residual:.1e}, gap {solution.gap:.1e}"
+        return Claim("solved" if converged else "failed", solution.x, solution.y, solution.mu, box, message)
 
 
 def not_separable(program: FiniteProgram) -> str:
-    """Why a program is not one for `DualNewton`, in words; empty where it is."""
+    """Return the reason why `DualNewton` cannot solve a program, in words; an empty text where it can."""
     if program.blocks is not None:
         return "its cost takes norms of several entries together"
     easier = None if program.S is None else in_new_variables(program)
@@ -113,10 +113,10 @@ def from_nothing(program: FiniteProgram, accuracy: float, points: int) -> tuple[
         if near is None:
             weight = HEAVIER * weight
             continue
-        found = measure(program, near.x, near.y, near.mu, message="dual Newton")
-        x, y, mu = found.x, found.y, found.mu
-        better = _size(found) < 0.5 * _size(best)
-        best, idle = (found, 0) if better else (best, idle + 1)
+        solution = measure(program, near.x, near.y, near.mu, message="dual Newton")
+        x, y, mu = solution.x, solution.y, solution.mu
+        is_better = _size(solution) < 0.5 * _size(best)
+        best, idle = (solution, 0) if is_better else (best, idle + 1)
         if best.residual <= accuracy and best.gap <= max(0.1 * accuracy, _noise(best)):
             break
         weight = max(LIGHTER * weight, LIGHTEST * cost)
@@ -136,9 +136,9 @@ def polish(
     curvature = program.curvature if program.separable else None
     if curvature is None or x.shape != program.q.shape or y.shape != program.h.shape or mu.shape != program.b.shape:
         return None
-    bent = float(curvature.min(initial=np.inf)) >= FLAT * program.steepest
-    found = newton_solve(program, y, mu, x0=x) if bent else None
-    return proximal_polish(program, x, y, mu) if found is None else found
+    is_curved = float(curvature.min(initial=np.inf)) >= FLAT * program.steepest
+    solution = newton_solve(program, y, mu, x0=x) if is_curved else None
+    return proximal_polish(program, x, y, mu) if solution is None else solution
 
 
 @shaped
@@ -156,21 +156,25 @@ def proximal_polish(
         return None
     from scipy.sparse import dia_array
 
-    flat = not curvature.min(initial=np.inf) > 0
+    is_flat = not curvature.min(initial=np.inf) > 0
     best: FiniteSolution | None = None
     for weight in _weights(program.steepest or 1.0, float(curvature.min(initial=np.inf))):
         P = dia_array(((curvature + weight)[None], [0]), shape=(program.n, program.n)).tocsc()
         near = newton_solve(replace(program, P=P, q=program.q - weight * x), y, mu)
         if near is None:
             break
-        found = measure(program, near.x, near.y, near.mu, message="proximal Newton")
-        moved = float(np.abs(found.x - x).max(initial=0.0))
-        x, y, mu = found.x, found.y, found.mu
-        improved = best is None or _better(found, best)
-        best = found if improved or best is None else best
-        if flat and not (improved and found.gap > _noise(found)):
+        solution = measure(program, near.x, near.y, near.mu, message="proximal Newton")
+        distance = float(np.abs(solution.x - x).max(initial=0.0))
+        x, y, mu = solution.x, solution.y, solution.mu
+        is_better = best is None or _better(solution, best)
+        best = solution if is_better or best is None else best
+        if is_flat and not (is_better and solution.gap > _noise(solution)):
             break
-        if not flat and moved <= STILL * (1.0 + float(np.abs(x).max(initial=0.0))) and weight <= 2 * curvature.min():
+        if (
+            not is_flat
+            and distance <= STILL * (1.0 + float(np.abs(x).max(initial=0.0)))
+            and weight <= 2 * curvature.min()
+        ):
             break
     return best
 
@@ -230,7 +234,7 @@ class _Dual:
 
     @shaped
     def free(self, x: Float[Array, " n"]) -> Bool[np.ndarray, " n"]:
-        """Which entries are between 0 and their bounds."""
+        """Return a mask of the entries that are strictly between their bounds and not 0."""
         free: np.ndarray = (x != 0) & (x > self.program.lower) & (x < self.program.upper)
         return free
 
@@ -295,14 +299,14 @@ def _predicted(dual: _Dual, start: Float[Array, " v"], x: Float[Array, " n"]) ->
     """The multipliers under which the free entries of ``x (n,)`` move to where the rows hold, while the others stay:
     where the program has changed a little, or only its curvature, mostly the optimal ones."""
     x = np.minimum(np.maximum(x, dual.program.lower), dual.program.upper)
-    free, rest = dual.free(x), dual.M @ x - dual.c
+    free, residual = dual.free(x), dual.M @ x - dual.c
     rows, curvature = dual.M[:, free], dual.curvature[free]
     linear = (
-        rest
+        residual
         - rows @ x[free]
         - (rows / curvature) @ (dual.program.q[free] + dual.program.weights[free] * np.sign(x[free]))
     )
-    return _non_negative(dual.hessian(_Point(start, x, rest)), linear, dual.signed, start > 0)
+    return _non_negative(dual.hessian(_Point(start, x, residual)), linear, dual.signed, start > 0)
 
 
 @shaped

@@ -96,9 +96,9 @@ def _proven(
     if bound > -np.inf:
         large = ROUND_OFF * terms.magnitude > NOTABLE * abs(bound)
         bound = max(bound, extended_bound(program, y, mu)) if large else bound
-        beyond = _overshot(terms, program, bound)
-        if beyond is not None:
-            shrunk = _shrunk_bound(program, y, mu, z, at, beyond)
+        is_beyond = _overshot(terms, program, bound)
+        if is_beyond is not None:
+            shrunk = _shrunk_bound(program, y, mu, z, at, is_beyond)
             if shrunk[0] > bound:
                 return shrunk
         return bound, y, mu, z
@@ -107,10 +107,10 @@ def _proven(
         bound = _bound(_terms(program, *better), program)
     if bound == -np.inf and not program.q.any() and program.blocks is None:
         slope = _terms(program, y, mu, z, at).slope
-        beyond = np.isinf(program.lower) & (slope > program.weights) | np.isinf(program.upper) & (
+        is_beyond = np.isinf(program.lower) & (slope > program.weights) | np.isinf(program.upper) & (
             slope < -program.weights
         )
-        return _shrunk_bound(program, y, mu, z, at, beyond)
+        return _shrunk_bound(program, y, mu, z, at, is_beyond)
     return (bound, y, mu, z) if better is None else (bound, *better[:3])
 
 
@@ -154,7 +154,7 @@ def farkas_proof(program: FiniteProgram, y: Array, mu: Array, z: Array | None, t
 
 
 def homogeneous(program: FiniteProgram) -> FiniteProgram:
-    """The same constraints without a cost."""
+    """Return the program with the same constraints and no cost."""
     q, weights = np.zeros_like(program.q), np.zeros_like(program.weights)
     return FiniteProgram(
         q, weights, program.lower, program.upper, program.G, program.h, program.A, program.b, S=program.S
@@ -170,7 +170,26 @@ def measure(
     z: Float[Array, " k"] | None = None,
     message: str = "",
 ) -> FiniteSolution:
-    """Everything that can be checked about a claim, as a `FiniteSolution` that nobody has judged yet (``failed``)."""
+    """Return a claim with its value, residual, lower bound and gap, computed here, as a `FiniteSolution`.
+
+    The decision is first moved into its bounds and onto the equalities, and the multipliers are made usable. The status
+    is ``failed``, since the solution is not judged yet.
+
+    Parameters
+    ----------
+    program : FiniteProgram
+        The program that the claim is about.
+    x : array, (n,)
+        Decision.
+    y : array, (r,)
+        Multipliers of the rows.
+    mu : array, (e,)
+        Multipliers of the equalities.
+    z : array, (k,), optional
+        Multipliers of the image; derived from the other multipliers where they are not given.
+    message : str
+        Words of the solver.
+    """
     x = within_bounds(program, x)
     x = onto_equalities(program, x) if program.b.size else x
     y = _usable(program, y)
@@ -235,11 +254,11 @@ def _terms(
     slope = program.q + _weighed(y, program.G, mu, program.A)
     if curvature is None and program.P is not None:
         at = np.zeros(program.n) if at is None else at
-        bent = np.asarray(program.P @ at)
-        added = np.asarray(abs(program.P) @ np.abs(at))  # what may cancel in the slope and in the square, and rounds
-        constant -= 0.5 * float(at @ bent)
-        magnitude += 0.5 * float(np.abs(at) @ added)
-        slope, noise = slope + bent, noise + added
+        gradient = np.asarray(program.P @ at)
+        sizes = np.asarray(abs(program.P) @ np.abs(at))  # what may cancel in the slope and in the square, and rounds
+        constant -= 0.5 * float(at @ gradient)
+        magnitude += 0.5 * float(np.abs(at) @ sizes)
+        slope, noise = slope + gradient, noise + sizes
     if program.P is None:
         curvature = None
     if program.S is None:
@@ -314,13 +333,13 @@ def _overshot(terms: Terms, program: FiniteProgram, bound: float) -> Bool[np.nda
     (`_shrunk_bound`)."""
     if program.q.any() or program.P is not None or program.blocks is not None or not isfinite(bound):
         return None
-    over = np.abs(terms.slope) - terms.weights
-    if not over.max(initial=0.0) > 0.0:
+    excess = np.abs(terms.slope) - terms.weights
+    if not excess.max(initial=0.0) > 0.0:
         return None
-    near = (over > 0.0) & (over <= NEAR * terms.weights)
+    near = (excess > 0.0) & (excess <= NEAR * terms.weights)
     reach = np.where(terms.slope > 0.0, -program.lower, program.upper)[near]
-    lost = float(over[near] @ np.maximum(reach, 0.0)) if near.any() else 0.0
-    return near if lost > NOTABLE * abs(bound) else None
+    loss = float(excess[near] @ np.maximum(reach, 0.0)) if near.any() else 0.0
+    return near if loss > NOTABLE * abs(bound) else None
 
 
 @shaped
@@ -385,18 +404,18 @@ def _corrected(
     if program.S is None:
         tight = _at_limit(program, -slope) & (tangent is not None or program.curvature == 0)
         target = np.sign(slope[tight]) * program.weights[tight] - slope[tight]
-        moved = _least_norm([block[tight] for block in blocks], target)
+        corrections = _least_norm([block[tight] for block in blocks], target)
     else:
         z = np.zeros(program.weights.size) if z is None else z.copy()
         tight = _at_limit(program, z)
         z[tight] = np.sign(z[tight]) * program.weights[tight]
-        moved = _least_norm([*blocks, program.S[np.flatnonzero(~tight)].toarray().T], -(program.S.T @ z + slope))
-        z[~tight] += 0.0 if moved is None else moved[3]
-    if moved is None:
+        corrections = _least_norm([*blocks, program.S[np.flatnonzero(~tight)].toarray().T], -(program.S.T @ z + slope))
+        z[~tight] += 0.0 if corrections is None else corrections[3]
+    if corrections is None:
         return None
     better = y.copy()
-    better[used] += moved[0]
-    return better, mu + moved[1], z, at if tangent is None or at is None else at + moved[2]
+    better[used] += corrections[0]
+    return better, mu + corrections[1], z, at if tangent is None or at is None else at + corrections[2]
 
 
 @shaped
@@ -443,8 +462,8 @@ def vertex_multipliers(
     free = away > FREE * width
     rows, equalities = program.G[active][:, free].T, program.A[:, free].T
     slope = -program.q[free] - program.weights[free] * sign[free]
-    found = _least_norm([rows, equalities], slope)
-    if found is None or found[0].min(initial=0.0) < -ACTIVE * found[0].max(initial=0.0):
+    multipliers = _least_norm([rows, equalities], slope)
+    if multipliers is None or multipliers[0].min(initial=0.0) < -ACTIVE * multipliers[0].max(initial=0.0):
         from scipy.optimize import nnls  # only here: its import takes as long as a small run
 
         try:
@@ -452,10 +471,10 @@ def vertex_multipliers(
         except RuntimeError:  # its iteration limit: these multipliers were an offer only
             return y, mu
         first, second, third = np.split(positive, [active.size, active.size + mu.size])
-        found = [first, second - third]
+        multipliers = [first, second - third]
     plain = np.zeros_like(y)
-    plain[active] = np.maximum(found[0], 0.0)
-    return plain, found[1]
+    plain[active] = np.maximum(multipliers[0], 0.0)
+    return plain, multipliers[1]
 
 
 @shaped
@@ -476,14 +495,16 @@ def nearest_multipliers(
     from scipy.optimize import nnls  # only here: its import takes as long as a small run
 
     slopes = np.hstack([program.G[:, free].T, program.A[:, free].T, -program.A[:, free].T])
-    given = np.concatenate([np.maximum(y, 0.0), np.maximum(mu, 0.0), np.maximum(-mu, 0.0)])
-    asks = np.concatenate([np.isfinite(program.h), np.ones(2 * mu.size, dtype=bool)])
-    columns = np.vstack([HEAVY * slopes, np.eye(given.size)])[:, asks]
+    target = np.concatenate([np.maximum(y, 0.0), np.maximum(mu, 0.0), np.maximum(-mu, 0.0)])
+    is_usable = np.concatenate([np.isfinite(program.h), np.ones(2 * mu.size, dtype=bool)])
+    columns = np.vstack([HEAVY * slopes, np.eye(target.size)])[:, is_usable]
     try:
-        found, _ = nnls(columns, np.concatenate([-HEAVY * program.q[free], given]), maxiter=PATIENT * given.size)
+        multipliers, _ = nnls(
+            columns, np.concatenate([-HEAVY * program.q[free], target]), maxiter=PATIENT * target.size
+        )
     except RuntimeError:  # its iteration limit: these multipliers were an offer only
         return y, mu
-    nearest = np.zeros(given.size)
-    nearest[asks] = found
+    nearest = np.zeros(target.size)
+    nearest[is_usable] = multipliers
     first, second, third = np.split(nearest, [y.size, y.size + mu.size])
     return first, second - third

@@ -26,22 +26,22 @@ def onto_equalities(program: FiniteProgram, x: Float[Array, " n"]) -> Float[Arra
     share = program.missed(x)
     if not ROUNDED < share <= NEARLY:
         return x
-    still = _still(program, x)
-    rows, free = (program.A[:, ~still], ~still) if program.S is None else (program.A, np.full(program.n, True))
+    is_still = _still(program, x)
+    rows, free = (program.A[:, ~is_still], ~is_still) if program.S is None else (program.A, np.full(program.n, True))
     if program.S is not None:
-        rows = np.vstack([rows, program.S[np.flatnonzero(still)].toarray()])
+        rows = np.vstack([rows, program.S[np.flatnonzero(is_still)].toarray()])
     for _ in range(STEPS):
-        rest = np.zeros(rows.shape[0])
-        rest[: program.b.size] = -program.excess(x)
+        residual = np.zeros(rows.shape[0])
+        residual[: program.b.size] = -program.excess(x)
         size = np.sqrt(np.einsum("ij,ij->i", rows, rows))
         size = np.where(size > 0.0, size, 1.0)
-        moved = x.copy()
-        moved[free] += np.linalg.lstsq(rows / size[:, None], rest / size, rcond=RANK)[0]
-        moved = within_bounds(program, moved)
-        after = program.missed(moved)
-        if not after < share:
+        trial = x.copy()
+        trial[free] += np.linalg.lstsq(rows / size[:, None], residual / size, rcond=RANK)[0]
+        trial = within_bounds(program, trial)
+        trial_share = program.missed(trial)
+        if not trial_share < share:
             break
-        x, share = moved, after
+        x, share = trial, trial_share
         if share <= ROUNDED:
             break
     return x

@@ -27,9 +27,9 @@ def extended_bound(program: FiniteProgram, y: Float[Array, " r"], mu: Float[Arra
     Why it is a bound (Higham 2002, sections 3.1 and 4.2). A sum of ``n`` products in floating point is off by at most
     ``gamma(n) = n u / (1 - n u)`` times the sum of their absolute values; here ``u`` is doubled (`UNIT`), which pays
     for the rounding of that sum of absolute values, and of ``gamma``, itself. So the exact slope is in
-    ``[slope - off, slope + off]``. The minimum over ``s`` is concave in the slope, so over that interval it is least at
-    one of the two ends. Without curvature it is attained at ``lower``, 0 or ``upper``. With curvature ``p`` the point
-    ``s`` that is computed may miss the minimiser by ``2 u (|slope| + weights) / p``, which costs at most
+    ``[slope - error, slope + error]``. The minimum over ``s`` is concave in the slope, so over that interval it is
+    least at one of the two ends. Without curvature it is attained at ``lower``, 0 or ``upper``. With curvature ``p``
+    the point ``s`` that is computed may miss the minimiser by ``2 u (|slope| + weights) / p``, which costs at most
     ``p/2`` times the square of that.
     """
     curvature = program.curvature if program.S is None else None
@@ -40,14 +40,14 @@ def extended_bound(program: FiniteProgram, y: Float[Array, " r"], mu: Float[Arra
     rows = np.vstack([program.G[used], program.A]).astype(WIDE)
     rhs = np.concatenate([program.h[used], program.b]).astype(WIDE)
     slope, terms = program.q + v @ rows, np.abs(program.q) + np.abs(v) @ np.abs(rows)
-    off = _gamma(v.size + 2) * terms
-    least = np.minimum(*(_least(program, curvature, slope + side * off) for side in (-1.0, 1.0)))
-    far = np.maximum(np.abs(program.lower), np.abs(program.upper)).astype(WIDE)
+    error = _gamma(v.size + 2) * terms
+    least = np.minimum(*(_least(program, curvature, slope + side * error) for side in (-1.0, 1.0)))
+    reach = np.maximum(np.abs(program.lower), np.abs(program.upper)).astype(WIDE)
     size = np.abs(v) @ np.abs(rhs) + np.abs(least).sum() + abs(program.constant)
     # the terms of each minimum are rounded too, and no larger than at the bound further away; where the slope is well
     # within the weight, the minimum is 0 without rounding
-    near = (least != 0.0) | ((1.0 + NEAR) * np.abs(slope) + off >= program.weights)
-    moving = np.where(near, (program.weights + terms + curvature * far) * far, 0.0)
+    near = (least != 0.0) | ((1.0 + NEAR) * np.abs(slope) + error >= program.weights)
+    moving = np.where(near, (program.weights + terms + curvature * reach) * reach, 0.0)
     size = size + 8.0 * moving.sum() / (program.n + v.size + 8)
     total = least.sum() - v @ rhs + program.constant - _gamma(program.n + v.size + 8) * size
     return float(np.nextafter(float(total), -np.inf))
@@ -59,12 +59,12 @@ def _gamma(count: int) -> float:
 
 def _least(program: FiniteProgram, curvature: Array, slope: Array) -> Array:
     """The minima ``(n,)`` over the bounds at a slope ``(n,)``; rounding of the terms apart."""
-    lower, upper, weights = (part.astype(WIDE) for part in (program.lower, program.upper, program.weights))
-    bent = curvature > 0.0
+    lower, upper, weights = (array.astype(WIDE) for array in (program.lower, program.upper, program.weights))
+    is_curved = curvature > 0.0
     pull = -slope - np.clip(-slope, -weights, weights)
-    stationary = np.where(bent, pull / np.where(bent, curvature, 1.0), 0.0)
+    stationary = np.where(is_curved, pull / np.where(is_curved, curvature, 1.0), 0.0)
     inner = np.clip(stationary, lower, upper)
     values = [weights * np.abs(s) + (0.5 * curvature * s + slope) * s for s in (lower, inner, upper)]
-    missed = np.zeros_like(slope)
-    missed[bent] = 2.0 * (UNIT * (np.abs(slope[bent]) + weights[bent])) ** 2 / curvature[bent]
-    return np.asarray(np.minimum(np.minimum(values[0], values[1]), values[2]) - missed)
+    error = np.zeros_like(slope)
+    error[is_curved] = 2.0 * (UNIT * (np.abs(slope[is_curved]) + weights[is_curved])) ** 2 / curvature[is_curved]
+    return np.asarray(np.minimum(np.minimum(values[0], values[1]), values[2]) - error)

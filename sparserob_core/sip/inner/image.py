@@ -1,4 +1,4 @@
-"""What depends on the image ``s = S x`` alone, remembered between programs that share it."""
+"""Quantities that depend on the image ``s = S x`` alone, remembered between programs that share it."""
 
 from __future__ import annotations
 
@@ -28,16 +28,17 @@ class Memory:
         self._made: OrderedDict[Hashable, tuple[tuple[object, ...], object]] = OrderedDict()
 
     def recall(self, sources: tuple[object, ...], key: Hashable, make: Callable[[], Made]) -> Made:
-        """What ``make`` returned for these very sources, or make it now."""
+        """Return the object that ``make`` made for these very sources and this key; call ``make`` if none is
+        remembered."""
         identity = (key, *map(id, sources))
         if identity in self._made:
             self._made.move_to_end(identity)
             return cast(Made, self._made[identity][1])
-        made = make()
-        self._made[identity] = (sources, made)
+        result = make()
+        self._made[identity] = (sources, result)
         if len(self._made) > self.size:
             self._made.popitem(last=False)
-        return made
+        return result
 
 
 HOLDS = 5
@@ -59,20 +60,20 @@ def onto_stationary(program: FiniteProgram, z: Float[Array, " k"], slope: Float[
     if S is None:
         return -slope
     unbounded_above, unbounded_below = np.isposinf(program.upper), np.isneginf(program.lower)
-    held = (program.weights == 0) & unbounded_below & unbounded_above
-    moved = z
+    is_held = (program.weights == 0) & unbounded_below & unbounded_above
+    projected = z
     for number in range(HOLDS):
-        if number or not _stationary(S, moved, slope, ROUNDED):
-            z = np.where(held, np.clip(z, -program.weights, program.weights), z)
-            project = _factors.recall((S,), held.tobytes(), partial(_projection, S, ~held))
-            moved = z - project(S.T @ z + slope)
-            moved = moved - project(S.T @ moved + slope)
-        limit = program.weights + CANCELLED * float(np.abs(moved).max(initial=0.0))
-        beyond = ~held & (unbounded_above & (moved > limit) | unbounded_below & (moved < -limit))
-        if not beyond.any():
+        if number or not _stationary(S, projected, slope, ROUNDED):
+            z = np.where(is_held, np.clip(z, -program.weights, program.weights), z)
+            project = _factors.recall((S,), is_held.tobytes(), partial(_projection, S, ~is_held))
+            projected = z - project(S.T @ z + slope)
+            projected = projected - project(S.T @ projected + slope)
+        limit = program.weights + CANCELLED * float(np.abs(projected).max(initial=0.0))
+        is_beyond = ~is_held & (unbounded_above & (projected > limit) | unbounded_below & (projected < -limit))
+        if not is_beyond.any():
             break
-        z, held = moved, held | beyond
-    return moved if _stationary(S, moved, slope) else np.full_like(moved, np.nan)
+        z, is_held = projected, is_held | is_beyond
+    return projected if _stationary(S, projected, slope) else np.full_like(projected, np.nan)
 
 
 @shaped
@@ -83,10 +84,10 @@ def within_bounds(program: FiniteProgram, x: Float[Array, " n"]) -> Float[Array,
         return np.minimum(np.maximum(x, program.lower), program.upper)
     rows, entries, factors = _factors.recall((program.S,), "alone", partial(_alone, program.S))
     ends = program.lower[rows] / factors, program.upper[rows] / factors
-    moved = x.copy()  # several images may be of one entry
-    np.maximum.at(moved, entries, np.minimum(*ends))
-    np.minimum.at(moved, entries, np.maximum(*ends))
-    return moved
+    clipped = x.copy()  # several images may be of one entry
+    np.maximum.at(clipped, entries, np.minimum(*ends))
+    np.minimum.at(clipped, entries, np.maximum(*ends))
+    return clipped
 
 
 def _alone(S: csc_array) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64], Array]:
@@ -99,16 +100,16 @@ def _alone(S: csc_array) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64], 
 
 
 def _stationary(S: csc_array, z: Array, slope: Array, share: float = CANCELLED) -> bool:
-    left, size = np.abs(S.T @ z + slope), np.abs(S).T @ np.abs(z) + np.abs(slope)
-    return bool((left <= share * size.max(initial=0.0)).all())
+    residual, size = np.abs(S.T @ z + slope), np.abs(S).T @ np.abs(z) + np.abs(slope)
+    return bool((residual <= share * size.max(initial=0.0)).all())
 
 
 def _projection(S: csc_array, used: npt.NDArray[np.bool_]) -> Callable[[Array], Array]:
     """``r -> S (S'S)^{-1} r`` on the used images."""
     from scipy.sparse.linalg import splu
 
-    part = S[np.flatnonzero(used)].tocsc()
-    gram = (part.T @ part).tocsc()
+    selected = S[np.flatnonzero(used)].tocsc()
+    gram = (selected.T @ selected).tocsc()
     try:
         factor = splu(gram)
     except RuntimeError:
@@ -117,7 +118,7 @@ def _projection(S: csc_array, used: npt.NDArray[np.bool_]) -> Callable[[Array], 
 
     def apply(residual: Array) -> Array:
         step = np.zeros(used.size)
-        step[rows] = part @ factor.solve(residual)
+        step[rows] = selected @ factor.solve(residual)
         return step
 
     return apply

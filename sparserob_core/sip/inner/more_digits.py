@@ -48,20 +48,20 @@ def refined(program: QuadraticProgram, solver: Solver, start: Claim | None, accu
     p = d = 1.0
     for number in range(STEPS):
         w = np.clip(w, lower, upper)
-        rest, slope = c - M @ w, q + P @ w + M.T @ y
+        residual, slope = c - M @ w, q + P @ w + M.T @ y
         if number or start is not None:
-            p = _factor(p, float(np.abs(rest).max(initial=0.0)))
+            p = _factor(p, float(np.abs(residual).max(initial=0.0)))
             d = _factor(d, _pull(slope, p * (w - lower), p * (upper - w)))
         below, above, cost = p * (lower - w), p * (upper - w), d * slope
-        held = (cost > DEAR) & (below > -1.0) | (cost < -DEAR) & (above < 1.0)
-        fixed, free = np.where(held, np.where(cost > 0.0, below, above), 0.0), np.flatnonzero(~held)
+        is_held = (cost > DEAR) & (below > -1.0) | (cost < -DEAR) & (above < 1.0)
+        fixed, free = np.where(is_held, np.where(cost > 0.0, below, above), 0.0), np.flatnonzero(~is_held)
         step = QuadraticProgram(
             csc_array(diags_array(np.full(free.size, d / p)) @ P[free][:, free]),
             cost[free],
             csc_array((0, free.size)),
             np.zeros(0),
             csc_array(M[:, free]),
-            p * rest - M @ fixed,
+            p * residual - M @ fixed,
             np.where(below < -FAR, -np.inf, below)[free],
             np.where(above > FAR, np.inf, above)[free],
         )
@@ -100,5 +100,8 @@ def _factor(before: float, missed: float) -> float:
 
 
 def _pull(slope: Array, below: Array, above: Array) -> float:
-    """By how much slopes miss those of an optimum: those that pull off a bound, or pull where there is room."""
+    """Return the dual residual: the largest absolute slope of an entry that has room to move against its slope.
+
+    ``below`` and ``above`` are the distances to the bounds, blown up; room is a distance of more than 1.
+    """
     return float(np.where(np.where(slope > 0.0, below, above) > 1.0, np.abs(slope), 0.0).max(initial=0.0))

@@ -1,5 +1,5 @@
-"""What stands for the norms of blocks: directions, for ``|s|`` is the largest of ``d's`` over the unit vectors ``d``,
-and second-order expansions where a block is not 0."""
+"""Replacements for the norms of blocks: directions, since ``|s|`` is the largest of ``d's`` over the unit vectors
+``d``, and second-order expansions where a block is not 0."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ def around(blocks: Blocks) -> Directions:
     """Directions all round for every block, to begin with."""
     width = blocks.table.shape[1]
     sizes = (blocks.table >= 0).sum(axis=1)
-    found = [Directions(np.zeros(0, dtype=int), np.zeros((0, width)))]
+    groups = [Directions(np.zeros(0, dtype=int), np.zeros((0, width)))]
     for size in np.unique(sizes).tolist():
         vectors = np.hstack([_around(size), np.zeros((len(_around(size)), width - size))])
-        which = np.flatnonzero(sizes == size)
-        found.append(Directions(np.repeat(which, len(vectors)), np.tile(vectors, (which.size, 1))))
-    return Directions(np.concatenate([one.block for one in found]), np.vstack([one.vectors for one in found]))
+        numbers = np.flatnonzero(sizes == size)
+        groups.append(Directions(np.repeat(numbers, len(vectors)), np.tile(vectors, (numbers.size, 1))))
+    return Directions(np.concatenate([group.block for group in groups]), np.vstack([group.vectors for group in groups]))
 
 
 def _around(size: int) -> Array:
@@ -54,21 +54,21 @@ def towards(
     """The directions of the blocks of ``S x``, and those that the multipliers of the rows ask for."""
     slope = program.q + y @ program.G + mu @ program.A
     slope = slope if program.P is None else slope + program.P @ x
-    asked = -slope
+    wanted = -slope
     if program.S is not None:
-        asked = onto_stationary(program, np.zeros(program.weights.size) if z is None else z, slope)
-    found = [_unit(blocks, vector) for vector in (program.image(x), asked) if np.isfinite(vector).all()]
-    return Directions(np.concatenate([one.block for one in found]), np.vstack([one.vectors for one in found]))
+        wanted = onto_stationary(program, np.zeros(program.weights.size) if z is None else z, slope)
+    groups = [_unit(blocks, vector) for vector in (program.image(x), wanted) if np.isfinite(vector).all()]
+    return Directions(np.concatenate([group.block for group in groups]), np.vstack([group.vectors for group in groups]))
 
 
 def near(directions: Directions, wanted: Directions) -> Directions:
-    """Of some directions, the few of every block that are nearest to one of its ``wanted``."""
+    """Return, for every block, the at most `KEPT` directions that are nearest to one of its ``wanted`` directions."""
     kept = []
     for block in np.unique(wanted.block):
-        mine = np.flatnonzero(directions.block == block)
-        others = wanted.vectors[wanted.block == block]
-        cosines = (directions.vectors[mine] @ others.T).max(axis=1, initial=-1.0)
-        kept.append(mine[np.argsort(-cosines, kind="stable")[:KEPT]])
+        candidates = np.flatnonzero(directions.block == block)
+        targets = wanted.vectors[wanted.block == block]
+        cosines = (directions.vectors[candidates] @ targets.T).max(axis=1, initial=-1.0)
+        kept.append(candidates[np.argsort(-cosines, kind="stable")[:KEPT]])
     chosen = np.concatenate([np.zeros(0, dtype=int), *kept])
     return Directions(directions.block[chosen], directions.vectors[chosen])
 
@@ -102,9 +102,9 @@ def bent(
 
 
 def _renumbered(number: np.ndarray) -> np.ndarray:
-    """The same blocks, numbered from 0 without a gap."""
-    _, found = np.unique(number, return_inverse=True)
-    answer: np.ndarray = found.reshape(-1) - int((number < 0).any())
+    """Return the numbers of the blocks without gaps, counted from 0; entries of no block keep -1."""
+    _, numbers = np.unique(number, return_inverse=True)
+    answer: np.ndarray = numbers.reshape(-1) - int((number < 0).any())
     return answer
 
 

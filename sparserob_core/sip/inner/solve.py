@@ -72,9 +72,12 @@ ADVICE = "try another solver, or state the problem in units in which its numbers
 
 @dataclass
 class _Case:
-    """One call of `solve_finite`: what was asked, the best unbelieved answer so far, why each was not believed, and the
-    best believed one that is not ``sharp``. ``crude``: what was wrong with the solver's own answer, where Newton's
-    method made it one that holds. ``lost``: how often in a row the solver has not solved what it was asked."""
+    """State of one call of `solve_finite`: the question, the answers so far, and why they were not believed.
+
+    ``best`` is the best answer that is not believed; ``attempts`` says why each was not believed. ``blunt`` is the best
+    believed answer that is not sharp. ``crude``: the fault of the solver's own answer, where Newton's method turned it
+    into one that holds. ``lost``: how often in a row the solver has not solved a program.
+    """
 
     program: FiniteProgram
     solver: Asked
@@ -94,7 +97,7 @@ class _Case:
 
     @property
     def given_up(self) -> bool:
-        """Whether the solver that was named has lost so often that another one is asked."""
+        """True where the named solver has failed so often in a row that another one is asked."""
         return self.solver.instead is not None and self.lost >= LOST
 
     def believes(self, solution: FiniteSolution) -> bool:
@@ -103,7 +106,8 @@ class _Case:
         )
 
     def _size(self, solution: FiniteSolution) -> float:
-        """What a gap is relative to where it is to be sharp."""
+        """Return the size that the gap of a sharp answer is relative to: the value, but at least ``small`` times the
+        sum of the absolute parts of the cost."""
         return max(abs(solution.value), self.small * self.program.added(solution.x))
 
     def judge(self, solution: FiniteSolution, name: str, by: str = "") -> FiniteSolution | None:
@@ -112,12 +116,12 @@ class _Case:
         if solution.residual <= self.tolerance and not self.believes(solution):
             solution = with_curvature(self.program, solution)
         if self.believes(solution):
-            said, attempts = f"{name}: {solution.message}", tuple(self.attempts)
-            found = replace(solution, status="optimal", attempts=attempts, message=said, by=by or solution.by)
+            message, attempts = f"{name}: {solution.message}", tuple(self.attempts)
+            believed = replace(solution, status="optimal", attempts=attempts, message=message, by=by or solution.by)
             if np.isinf(self.small) or solution.gap <= 10 * self.tolerance * self._size(solution):
-                return found
+                return believed
             if self.blunt is None or solution.gap < self.blunt.gap:
-                self.blunt = found
+                self.blunt = believed
             return None
         if self.best is None or _badness(solution) < _badness(self.best):
             self.best = solution
@@ -146,18 +150,18 @@ def solve_finite(
     `InputError` when the program's shapes or numbers are at fault; a hard program is ``failed``, never an exception.
     """
     program.validate()
-    asked = Asked.of(solver)
-    case = _Case(program, asked, tolerance, small)
-    found = _answer(case, guess)
-    if asked.instead is not None and found.status == "failed":
-        other = solve_finite(program, asked.instead, tolerance=tolerance, guess=guess, small=small)
-        why = next(iter(found.attempts), found.message)
-        if other.status != "failed":
-            return replace(other, attempts=(*found.attempts, *other.attempts), unanswered=why)
-        return replace(found, by=NOBODY, unanswered=why)
-    if asked.instead is not None and found.by == DUAL_NEWTON != asked.name:
-        return replace(found, unanswered=case.crude)
-    return found if found.by else replace(found, by=NOBODY if found.status == "failed" else asked.name)
+    counted = Asked.of(solver)
+    case = _Case(program, counted, tolerance, small)
+    solution = _answer(case, guess)
+    if counted.instead is not None and solution.status == "failed":
+        fallback = solve_finite(program, counted.instead, tolerance=tolerance, guess=guess, small=small)
+        reason = next(iter(solution.attempts), solution.message)
+        if fallback.status != "failed":
+            return replace(fallback, attempts=(*solution.attempts, *fallback.attempts), unanswered=reason)
+        return replace(solution, by=NOBODY, unanswered=reason)
+    if counted.instead is not None and solution.by == DUAL_NEWTON != counted.name:
+        return replace(solution, unanswered=case.crude)
+    return solution if solution.by else replace(solution, by=NOBODY if solution.status == "failed" else counted.name)
 
 
 def _answer(case: _Case, guess: FiniteSolution | None) -> FiniteSolution:
@@ -190,9 +194,9 @@ def _by_directions(case: _Case, blocks: Blocks, guess: FiniteSolution | None) ->
     program, directions = case.program, around(blocks)
     if guess is not None and np.isfinite(guess.x).all():
         wanted = towards(program, blocks, guess.x, guess.y, guess.mu, guess.z)
-        known = () if guess.directions is None else (near(guess.directions, wanted),)
-        for more in (wanted, *known):
-            directions = directions.joined(more)
+        guessed = () if guess.directions is None else (near(guess.directions, wanted),)
+        for addition in (wanted, *guessed):
+            directions = directions.joined(addition)
         if program.S is None:
             start = (guess.x, guess.y, guess.mu, guess.z)
             believed, _, _ = _newton(case, blocks, ACCURACIES[0] * case.tolerance, directions, start, np.inf)
@@ -259,10 +263,10 @@ def _kelley(
         idle = 0 if gap < 0.9 * closest else idle + 1
         closest = min(closest, gap)
         x, y, mu, z = answer
-        more = directions.joined(towards(program, blocks, x, y, mu, z))
-        if idle > PATIENCE or more.block.size == directions.block.size or case.given_up:
+        extended = directions.joined(towards(program, blocks, x, y, mu, z))
+        if idle > PATIENCE or extended.block.size == directions.block.size or case.given_up:
             break
-        directions = more
+        directions = extended
     return None, None, directions
 
 
@@ -290,21 +294,21 @@ def _newton(
     program = case.program
     norms = blocks.norms(answer[0])
     moving = norms > SMALLEST * norms.max(initial=0.0)
-    here = answer[0]
+    centre = answer[0]
     for _ in range(NEWTON):
         if not moving.any() or case.given_up:
             break
-        step = bent(program, blocks, here, moving)
-        rest = None if step.blocks is None else of_the_rest(directions, moving, step.blocks.table.shape[1])
-        _, found = _ask(case, step, "epigraph", accuracy, rest)
-        if found is None or not np.isfinite(found[0]).all():
+        step = bent(program, blocks, centre, moving)
+        fixed_directions = None if step.blocks is None else of_the_rest(directions, moving, step.blocks.table.shape[1])
+        _, candidate = _ask(case, step, "epigraph", accuracy, fixed_directions)
+        if candidate is None or not np.isfinite(candidate[0]).all():
             break
-        believed, after = _looked_at(case, found)
-        if believed is not None or not after < 0.5 * gap:
+        believed, candidate_gap = _looked_at(case, candidate)
+        if believed is not None or not candidate_gap < 0.5 * gap:
             return believed, answer, gap
-        answer, gap = found, after
-        moving = moving & (blocks.norms(found[0]) > SMALLEST * norms.max())
-        here = found[0]
+        answer, gap = candidate, candidate_gap
+        moving = moving & (blocks.norms(candidate[0]) > SMALLEST * norms.max())
+        centre = candidate[0]
     return None, answer, gap
 
 
@@ -314,8 +318,8 @@ def _tried(case: _Case) -> FiniteSolution:
     for form, factor in attempts:
         claim, answer = _ask(case, case.program, form, factor * case.tolerance)
         proof = _proof(case, answer, "the solver's ray") if claim is not None and claim.status == "infeasible" else None
-        said = "" if claim is None else claim.message
-        for by, solution in _candidates(case, answer, said) if proof is None else ():
+        message = "" if claim is None else claim.message
+        for by, solution in _candidates(case, answer, message) if proof is None else ():
             believed = case.judge(solution, f"{form} form", by)
             if believed is not None:
                 return believed
@@ -347,8 +351,8 @@ def _sharper(case: _Case, claim: Claim | None, answer: Recovered | None) -> Fini
     solved = claim is not None and claim.status == "solved" and answer is not None
     believed = _at_a_vertex(case) if solved else None
     believed = believed or _more_digits(case, claim)
-    lost = claim is not None and claim.status == "failed" and np.isfinite(claim.x).all() and claim.x.any()
-    return _at_a_vertex(case) if believed is None and lost else believed
+    is_stalled = claim is not None and claim.status == "failed" and np.isfinite(claim.x).all() and claim.x.any()
+    return _at_a_vertex(case) if believed is None and is_stalled else believed
 
 
 def _at_a_vertex(case: _Case) -> FiniteSolution | None:
@@ -381,9 +385,9 @@ def _more_digits(case: _Case, claim: Claim | None) -> FiniteSolution | None:
     for start in (None, claim) if usable else (None,):
         badness = np.inf
         try:
-            for one in refined(qp, case.solver, start, factor * case.tolerance):
-                case.heard(one)
-                candidates = list(_candidates(case, recover(one), one.message))
+            for refined_claim in refined(qp, case.solver, start, factor * case.tolerance):
+                case.heard(refined_claim)
+                candidates = list(_candidates(case, recover(refined_claim), refined_claim.message))
                 judged = [case.judge(solution, "with more digits", by) for by, solution in candidates]
                 believed = [solution for solution in judged if solution is not None]
                 if believed:  # digits are what was asked for: of those that are believed, the one that misses least
@@ -403,20 +407,21 @@ def _through(case: _Case, easier: NewVariables, guess: FiniteSolution | None) ->
     start = guess if guess is None or guess.x.size != program.n else replace(guess, x=easier.to(guess.x))
     inner = _Case(easier.program, case.solver, case.tolerance, case.small)
     easier.program.validate()
-    found = _answer(inner, start)
+    solution = _answer(inner, start)
     case.crude = inner.crude
     case.attempts += inner.attempts
     case.lost = inner.lost
-    x = easier.back(found.x)
-    if found.status == "infeasible":
-        proof = _proof(case, (x, found.y, found.mu, None), "the program in other variables")
-        return proof if proof is None else replace(proof, by=found.by)
-    measured = measure(program, x, found.y, found.mu, easier.dual(found.z), found.message)
-    return case.judge(replace(measured, by=found.by), "new variables") or case.blunt
+    x = easier.back(solution.x)
+    if solution.status == "infeasible":
+        proof = _proof(case, (x, solution.y, solution.mu, None), "the program in other variables")
+        return proof if proof is None else replace(proof, by=solution.by)
+    measured = measure(program, x, solution.y, solution.mu, easier.dual(solution.z), solution.message)
+    return case.judge(replace(measured, by=solution.by), "new variables") or case.blunt
 
 
 def cost_scale(program: FiniteProgram, value: float) -> float:
-    """What a gap is relative to: the value, but no less than the largest cost coefficient, or 1 if that is larger."""
+    """Return the size that a gap is relative to: the value, but at least the largest coefficient of the cost or 1,
+    whichever is smaller."""
     largest = program.steepest
     if program.P is not None:
         largest = max(largest, float(np.abs(program.P.data).max(initial=0.0)))
@@ -424,9 +429,11 @@ def cost_scale(program: FiniteProgram, value: float) -> float:
 
 
 def _cheap(case: _Case, guess: FiniteSolution | None) -> Iterator[tuple[str, FiniteSolution]]:
-    """What needs no solver, and who it is by: the optimum without rows, the simplex method where few of many entries
-    matter to it, and Newton's method from a guess, or from nothing where the program is large; where a solver was
-    named, nothing."""
+    """Yield answers that need no solver, each with the name of the method that it is by.
+
+    These are the optimum without rows; the simplex method, where few of many entries matter to it; and Newton's method
+    from a guess, or from nothing where the program is large. Where a solver was named, there are none.
+    """
     program, quick = case.program, case.solver.quick
     if CLOSED_FORM in quick and program.separable:
         x = minimisers(program.weights, program.curvature, program.q, program.lower, program.upper)
@@ -438,9 +445,9 @@ def _cheap(case: _Case, guess: FiniteSolution | None) -> Iterator[tuple[str, Fin
         if corner.status == "optimal":
             yield HIGHS, measure(program, corner.x, corner.y, corner.mu, message="simplex method")
     if DUAL_NEWTON in quick and guess is not None:
-        found = polish(program, guess.x, guess.y, guess.mu)
-        if found is not None:
-            yield DUAL_NEWTON, found
+        polished = polish(program, guess.x, guess.y, guess.mu)
+        if polished is not None:
+            yield DUAL_NEWTON, polished
     large = program.separable and program.h.size >= CROWDED and program.n >= WIDE
     if DUAL_NEWTON in quick and large and program.curvature is not None and program.curvature.min() > 0.0:
         yield DUAL_NEWTON, from_nothing(program, 0.1 * case.tolerance, POINTS)[0]
@@ -454,8 +461,8 @@ def _ask(
     try:
         claim = case.solver.solve(qp, accuracy)
     except Exception as error:  # noqa: BLE001  a foreign solver may raise anything; its failure must not be ours
-        said = str(error) if isinstance(error, PluginError) else f"the solver raised {type(error).__name__}: {error}"
-        case.attempts.append(f"{form} form: {said}")
+        message = str(error) if isinstance(error, PluginError) else f"the solver raised {type(error).__name__}: {error}"
+        case.attempts.append(f"{form} form: {message}")
         case.heard(None)
         return None, None
     case.heard(claim)
@@ -586,14 +593,14 @@ def _failed(case: _Case) -> FiniteSolution:
     program, best = case.program, case.best
     if best is None:
         best = measure(program, np.zeros(program.n), np.zeros(program.h.size), np.zeros(program.b.size))
-        found = "; ".join(dict.fromkeys(case.attempts)) or "the solver gave no answer"
+        reason = "; ".join(dict.fromkeys(case.attempts)) or "the solver gave no answer"
     else:
-        found = f"of {len(case.attempts)} answers none holds: the best {_short(best)}"
-    return replace(best, status="failed", message=f"{found}; {ADVICE}", attempts=tuple(case.attempts))
+        reason = f"of {len(case.attempts)} answers none holds: the best {_short(best)}"
+    return replace(best, status="failed", message=f"{reason}; {ADVICE}", attempts=tuple(case.attempts))
 
 
 def _short(solution: FiniteSolution) -> str:
-    """By how much an answer misses its rows, and its own lower bound."""
+    """Describe the residual of an answer and its distance to its own lower bound, in words."""
     side = "above" if solution.gap >= 0.0 else "below"  # where it misses its rows
     bound = "has no lower bound" if solution.gap == np.inf else f"is {abs(solution.gap):.1e} {side} its lower bound"
     return f"misses its rows by {solution.residual:.1e} and {bound}"

@@ -1,4 +1,5 @@
-"""From an L1-quadratic program to the plain quadratic program that a solver accepts, and back."""
+"""Conversion of an L1-quadratic program to the plain quadratic program that a solver accepts, and of its answer
+back."""
 
 from __future__ import annotations
 
@@ -74,8 +75,8 @@ def _model(program: FiniteProgram, form: Form) -> ImageModel:
         return _epigraph_model(program, np.full(weights.size, True))
     fixed = lower == upper
     offset = np.where(fixed, lower, 0.0)
-    bent = ~fixed & (weights > 0)
-    above, below = np.flatnonzero(bent & (upper > 0)), np.flatnonzero(bent & (lower < 0))
+    is_weighted = ~fixed & (weights > 0)
+    above, below = np.flatnonzero(is_weighted & (upper > 0)), np.flatnonzero(is_weighted & (lower < 0))
     plain = np.flatnonzero(~fixed & (weights == 0))
     entry = np.concatenate([above, below, plain])
     sign = np.concatenate([np.ones(above.size), -np.ones(below.size), np.ones(plain.size)])
@@ -91,11 +92,11 @@ def _epigraph_model(program: FiniteProgram, alone: npt.NDArray[np.bool_]) -> Ima
     lower, upper, weights = program.lower, program.upper, np.where(alone, program.weights, 0.0)
     fixed = lower == upper
     offset = np.where(fixed, lower, 0.0)
-    bent = ~fixed & (weights > 0) & (lower < 0) & (upper > 0)
-    plain, kinks = np.flatnonzero(~fixed), np.flatnonzero(bent)
+    has_kink = ~fixed & (weights > 0) & (lower < 0) & (upper > 0)
+    plain, kinks = np.flatnonzero(~fixed), np.flatnonzero(has_kink)
     entry = np.concatenate([plain, kinks])
     sign = np.concatenate([np.ones(plain.size), np.zeros(kinks.size)])
-    one_signed = np.where(bent, 0.0, np.where(program.lower >= 0, weights, -weights))
+    one_signed = np.where(has_kink, 0.0, np.where(program.lower >= 0, weights, -weights))
     cost = np.concatenate([one_signed[plain], weights[kinks]])
     floor = np.concatenate([program.lower[plain], np.zeros(kinks.size)])
     ceiling = np.concatenate([program.upper[plain], np.full(kinks.size, np.inf)])
@@ -138,7 +139,10 @@ def _with_cones(model: ImageModel, program: FiniteProgram, blocks: Blocks) -> Im
     that is fixed is fixed at 0 (`has_cones`), and is in no cone."""
     model, tops = _with_tops(model, program, blocks), model.entry.size
     places = _places(model, program)[blocks.table]
-    return replace(model, cones=tuple(np.concatenate([[tops + b], mine[mine >= 0]]) for b, mine in enumerate(places)))
+    return replace(
+        model,
+        cones=tuple(np.concatenate([[tops + b], variables[variables >= 0]]) for b, variables in enumerate(places)),
+    )
 
 
 def _with_tops(model: ImageModel, program: FiniteProgram, blocks: Blocks) -> ImageModel:
@@ -158,15 +162,18 @@ def _with_tops(model: ImageModel, program: FiniteProgram, blocks: Blocks) -> Ima
 
 
 def _places(model: ImageModel, program: FiniteProgram) -> np.ndarray:
-    """Where every entry of the image is among the variables, -1 for one that is fixed; and a last -1, which the -1 of
-    no entry finds."""
+    """Return the number of the variable of every entry of the image, ``(k + 1,)``; -1 for an entry that is fixed.
+
+    The array has one more value at its end, which is -1: the index -1, which stands for no entry, finds it.
+    """
     places = np.full(program.weights.size + 1, -1)
     places[model.entry[model.sign > 0]] = np.flatnonzero(model.sign > 0)
     return places
 
 
 def has_cones(program: FiniteProgram, blocks: Blocks) -> bool:
-    """Whether `standard_form` has one with ``cones``: no entry of a block is fixed at anything but 0."""
+    """Return whether the program has a `standard_form` with ``cones``: no entry of a block is fixed at a value other
+    than 0."""
     lower, upper = program.lower[blocks.entries], program.upper[blocks.entries]
     return not ((lower == upper) & (lower != 0.0)).any()
 
@@ -207,13 +214,13 @@ def _lifted(program: FiniteProgram, model: ImageModel) -> tuple[QuadraticProgram
     from scipy.sparse import block_diag, csc_array, hstack, vstack
 
     n, size, k = program.n, model.entry.size, program.weights.size
-    held = np.flatnonzero((program.weights > 0) | np.isfinite(program.lower) | np.isfinite(program.upper))
+    images = np.flatnonzero((program.weights > 0) | np.isfinite(program.lower) | np.isfinite(program.upper))
     T = csc_array((model.sign, (model.entry, np.arange(size))), shape=(k, size))
-    link = hstack([program.S, -T], format="csr")[held]
+    link = hstack([program.S, -T], format="csr")[images]
     free = np.full(n, np.inf)
-    whole = ImageModel(np.arange(n), np.ones(n), np.zeros(n), program.q, -free, free, None, np.zeros(0))
-    rows, h, keep, norms = _unit_rows(program.G, program.h, whole)
-    equal, b, keep_equal, norms_equal = _unit_rows(program.A, program.b, whole)
+    identity = ImageModel(np.arange(n), np.ones(n), np.zeros(n), program.q, -free, free, None, np.zeros(0))
+    rows, h, keep, norms = _unit_rows(program.G, program.h, identity)
+    equal, b, keep_equal, norms_equal = _unit_rows(program.A, program.b, identity)
     cost = np.concatenate([program.q, model.cost])
     kappa = _largest(cost) or _largest(None if program.P is None else program.P.data) or 1.0
     P = csc_array((n, n)) if program.P is None else program.P / kappa
@@ -230,7 +237,7 @@ def _lifted(program: FiniteProgram, model: ImageModel) -> tuple[QuadraticProgram
         G,
         right,
         A,
-        np.concatenate([b, model.offset[held]]),
+        np.concatenate([b, model.offset[images]]),
         np.concatenate([-free, model.lower]),
         np.concatenate([free, model.upper]),
         tuple(n + cone for cone in model.cones),
@@ -240,7 +247,7 @@ def _lifted(program: FiniteProgram, model: ImageModel) -> tuple[QuadraticProgram
         y, mu, z = np.zeros(program.h.size), np.zeros(program.b.size), np.zeros(k)
         y[keep] = claim.z[: h.size] * (kappa / norms)
         mu[keep_equal] = claim.y[: b.size] * (kappa / norms_equal)
-        z[held] = claim.y[b.size :] * kappa
+        z[images] = claim.y[b.size :] * kappa
         return claim.x[:n], y, mu, z
 
     return qp, recover
@@ -251,12 +258,12 @@ def _unit_rows(
     rows: Float[Array, "r n"], rhs: Float[Array, " r"], model: ImageModel
 ) -> tuple[Float[Array, "p v"], Float[Array, " p"], Int[np.ndarray, " p"], Float[Array, " p"]]:
     """Rows over ``v`` and right-hand sides, divided by the norm of the row; which rows were kept, and their norms."""
-    moved = rhs - rows @ model.offset
+    limits = rhs - rows @ model.offset
     block = rows[:, model.entry] * model.sign
     norms = np.sqrt(np.einsum("ij,ij->i", block, block))
-    keep = np.flatnonzero((norms > 0) & np.isfinite(moved))
+    keep = np.flatnonzero((norms > 0) & np.isfinite(limits))
     norms = norms[keep]
-    return block[keep] / norms[:, None], moved[keep] / norms, keep, norms
+    return block[keep] / norms[:, None], limits[keep] / norms, keep, norms
 
 
 def _stack(rows: Array, below: csc_array | None) -> csc_array:

@@ -22,8 +22,11 @@ SHARE = 0.05
 
 @dataclass(frozen=True, eq=False)
 class Corner:
-    """What the simplex method says: a vertex ``x (n,)`` with multipliers ``y (r,)`` of the rows, ``mu (e,)`` of the
-    equalities and ``z (k,)`` of the image unless that is ``x``, or none."""
+    """Answer of the simplex method: a vertex ``x (n,)`` with its multipliers.
+
+    The multipliers are ``y (r,)`` of the rows, ``mu (e,)`` of the equalities, and ``z (k,)`` of the image, unless the
+    image is ``x`` itself or no multipliers are known.
+    """
 
     status: Literal["optimal", "infeasible", "failed"]
     x: Array
@@ -42,11 +45,12 @@ def vertex(program: FiniteProgram, y: Array | None = None, mu: Array | None = No
 
 
 def many(program: FiniteProgram) -> bool:
-    """Whether a linear program is one for `sifted`: separable, with far more entries than rows."""
+    """Return whether a linear program is to be solved by `sifted`: separable, with at least `MANY` entries, and with
+    rows."""
     return bool(
         program.n >= MANY
         and program.h.size + program.b.size
-        and all(one is None for one in (program.P, program.S, program.blocks))
+        and all(term is None for term in (program.P, program.S, program.blocks))
     )
 
 
@@ -60,29 +64,33 @@ def sifted(program: FiniteProgram, y: Array | None = None, mu: Array | None = No
     mu = np.zeros(program.b.size) if mu is None or mu.shape != program.b.shape else mu
     near, count = np.zeros(program.n, dtype=bool), max(NEAREST, int(SHARE * program.n))
     near[:: max(1, program.n // count)] = True  # neighbours are alike: some of everything, then zoom in
-    x, doubt = _placed(program, y, mu)
+    x, distance = _placed(program, y, mu)
     while True:
         count = min(count, program.n)
-        near[np.argpartition(doubt, count - 1)[:count]] = True
-        near |= doubt < 0.0
+        near[np.argpartition(distance, count - 1)[:count]] = True
+        near |= distance < 0.0
         if near.sum() > program.n // 2:
             return simplex(program)
-        far = np.where(near, 0.0, x)
-        found = simplex(_on(program, near, far))
-        if found.status != "optimal":  # what is left out may be what is needed
+        fixed_values = np.where(near, 0.0, x)
+        corner = simplex(_on(program, near, fixed_values))
+        if corner.status != "optimal":  # what is left out may be what is needed
             count *= 4
             continue
-        now, doubt = _placed(program, found.y, found.mu)
-        wrong = np.flatnonzero(~near & (now != far))  # the others stay where they are: the next ones fit, as these do
-        if not wrong.size:
-            far[near] = found.x
-            return replace(found, x=far)
-        near[wrong[:: max(1, wrong.size // NEAREST)]] = True
+        values, distance = _placed(program, corner.y, corner.mu)
+        # the others stay where they are: the next ones fit, as these do
+        misplaced = np.flatnonzero(~near & (values != fixed_values))
+        if not misplaced.size:
+            fixed_values[near] = corner.x
+            return replace(corner, x=fixed_values)
+        near[misplaced[:: max(1, misplaced.size // NEAREST)]] = True
 
 
 def _placed(program: FiniteProgram, y: Array, mu: Array) -> tuple[Array, Array]:
-    """Where multipliers put every entry, ``(n,)``, and how far its slope is from where it moves, ``(n,)``; -1 for one
-    that is put at infinity."""
+    """Return the values ``(n,)`` of all entries at given multipliers, and the distance ``(n,)`` of each slope from a
+    change.
+
+    An entry changes where its absolute slope equals its weight. The distance is -1 for an entry that would be infinite.
+    """
     slope = program.q + y @ program.G + mu @ program.A
     ends = np.where(slope > 0.0, program.lower, program.upper)
     x = np.clip(np.where(np.abs(slope) <= program.weights, 0.0, ends), program.lower, program.upper)
@@ -111,17 +119,17 @@ def simplex(program: FiniteProgram, turns: int | None = None) -> Corner:
     whose right-hand side is infinite ask for nothing."""
     from scipy.optimize import linprog
 
-    asks = program.h < np.inf
-    if not asks.all():
-        found = simplex(replace(program, G=program.G[asks], h=program.h[asks]), turns)
-        if found.status != "optimal":
-            return found
+    is_finite = program.h < np.inf
+    if not is_finite.all():
+        answer = simplex(replace(program, G=program.G[is_finite], h=program.h[is_finite]), turns)
+        if answer.status != "optimal":
+            return answer
         y = np.zeros(program.h.size)
-        y[asks] = found.y
-        return replace(found, y=y)
+        y[is_finite] = answer.y
+        return replace(answer, y=y)
     n, k, r = program.n, program.weights.size, program.h.size
     columns = _separable(program) if program.S is None else _images(program)
-    found = linprog(
+    answer = linprog(
         columns["c"],
         A_ub=columns["rows"] if r else None,
         b_ub=program.h if r else None,
@@ -132,15 +140,15 @@ def simplex(program: FiniteProgram, turns: int | None = None) -> Corner:
         options={"primal_feasibility_tolerance": ACCURACY, "dual_feasibility_tolerance": ACCURACY}
         | ({} if turns is None else {"maxiter": turns}),
     )
-    if found.status != 0 or found.x is None:
+    if answer.status != 0 or answer.x is None:
         none = np.zeros(0)
-        return Corner("infeasible" if found.status == 2 else "failed", none, none, none)
-    y = -np.asarray(found.ineqlin.marginals) if r else np.zeros(0)
-    mu = -np.asarray(found.eqlin.marginals)[-program.b.size :] if program.b.size else np.zeros(0)
+        return Corner("infeasible" if answer.status == 2 else "failed", none, none, none)
+    y = -np.asarray(answer.ineqlin.marginals) if r else np.zeros(0)
+    mu = -np.asarray(answer.eqlin.marginals)[-program.b.size :] if program.b.size else np.zeros(0)
     if program.S is None:
-        x = np.clip(found.x[:k] - found.x[k:], program.lower, program.upper)
+        x = np.clip(answer.x[:k] - answer.x[k:], program.lower, program.upper)
         return Corner("optimal", x, np.maximum(y, 0.0), mu)
-    return Corner("optimal", np.asarray(found.x[:n]), np.maximum(y, 0.0), mu, -np.asarray(found.eqlin.marginals)[:k])
+    return Corner("optimal", np.asarray(answer.x[:n]), np.maximum(y, 0.0), mu, -np.asarray(answer.eqlin.marginals)[:k])
 
 
 def _sides(program: FiniteProgram) -> tuple[list[Array], list[Array]]:

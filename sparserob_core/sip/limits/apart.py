@@ -24,9 +24,26 @@ POSSIBLE = hasattr(os, "fork") and sys.platform != "darwin"  # libraries of Appl
 
 
 def call_apart(call: Callable[[], Value], deadline: Deadline) -> Value:
-    """What ``call`` returns, which can be pickled; it is made in a copy of this process, and what it prints is lost.
-    Raises what it raised, `SolverError` where the copy has died, and `OutOfTime` at the ``deadline``, or
-    `KeyboardInterrupt`: the copy is then ended."""
+    """Return the result of ``call``, made in a forked copy of this process.
+
+    The result must be picklable, and what the copy prints is lost.
+
+    Parameters
+    ----------
+    call : callable
+        Function without arguments.
+    deadline : Deadline
+        Time at which the copy is ended.
+
+    Raises
+    ------
+    SolverError
+        Where the copy has died.
+    OutOfTime
+        At the deadline, or another `KeyboardInterrupt` when that arrives: the copy is then ended.
+    Exception
+        Any exception that ``call`` raised.
+    """
     read, write = os.pipe()
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecationWarning)  # of threads, none of which the copy has or waits for
@@ -75,11 +92,11 @@ def _answer(call: Callable[[], object], write: int) -> NoReturn:
 
 def _received(read: int, deadline: Deadline) -> bytes:
     """All that comes out of a pipe; raises `OutOfTime` at the deadline."""
-    found = b""
+    answer = b""
     while True:
         if not select.select([read], [], [], deadline.left)[0]:
             raise OutOfTime(deadline.reason)
-        part = os.read(read, CHUNK)
-        if not part:
-            return found
-        found += part
+        chunk = os.read(read, CHUNK)
+        if not chunk:
+            return answer
+        answer += chunk

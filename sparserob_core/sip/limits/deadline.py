@@ -49,12 +49,12 @@ class Deadline:
 
     @property
     def bounded(self) -> bool:
-        """Whether there is a limit."""
+        """True where there is a limit of time."""
         return self.seconds is not None
 
     @property
     def reason(self) -> str:
-        """Why the time is over, in words; empty while it is not."""
+        """Reason why the time is over, in words; empty while it is not over."""
         if self._interrupted:
             return self._interrupted
         return f"the limit of {self.seconds:g} s is reached" if time.monotonic() >= self._ends else ""
@@ -65,22 +65,23 @@ class Deadline:
         return None if self.seconds is None else max(1e-3, self._ends - time.monotonic())
 
     def at_most(self, seconds: float) -> float:
-        """So many seconds, or as many as are left where these are fewer."""
+        """Return ``seconds``, or the seconds that are left where these are fewer."""
         return seconds if self.left is None else min(seconds, self.left)
 
     @property
     def used(self) -> float:
         """The share of the time that is over, 1 at most; 0 where there is no limit."""
-        left = self._ends - time.monotonic()
-        return 0.0 if self.seconds is None else 1.0 - max(0.0, left) / self.seconds if self.seconds > 0.0 else 1.0
+        remaining = self._ends - time.monotonic()
+        return 0.0 if self.seconds is None else 1.0 - max(0.0, remaining) / self.seconds if self.seconds > 0.0 else 1.0
 
     @property
     def passed(self) -> bool:
-        """Whether the time is over."""
+        """True where the time is over, by the limit or by an interrupt."""
         return bool(self._interrupted) or time.monotonic() >= self._ends
 
     def sooner(self, seconds: float) -> Deadline:
-        """The same, so many seconds earlier: for who leaves time to others before the limit."""
+        """Return a copy of the deadline that ends ``seconds`` earlier, for a step that leaves time for others before
+        the limit."""
         earlier = copy(self)
         earlier._ends -= seconds
         return earlier
@@ -115,7 +116,7 @@ class Deadline:
             bell.ring_at(max(before[0], time.monotonic() + LAST), before[1])
 
     def attempt(self, step: Callable[[], Value], otherwise: Callable[[], Value]) -> Value:
-        """What ``step`` returns, or what ``otherwise`` does where the time is over before."""
+        """Return the result of ``step``, or that of ``otherwise`` where the time is over before ``step`` ends."""
         try:
             with self.enforced():
                 return step()
@@ -142,7 +143,7 @@ class _Bell(ABC):
         self._set()
 
     def error(self) -> OutOfTime:
-        """What is raised."""
+        """Return the exception to raise, with the reason of the deadline."""
         return OutOfTime(self.deadline.reason or "the time is over")
 
     @abstractmethod
@@ -155,7 +156,7 @@ class _Bell(ABC):
 
 @final
 class _Alarm(_Bell):
-    """By the alarm of the operating system, which interrupts what waits too."""
+    """Bell that uses the alarm signal of the operating system, which also interrupts calls that wait."""
 
     def __init__(self) -> None:
         signal.signal(signal.SIGALRM, self._ring)
@@ -174,7 +175,7 @@ class _Alarm(_Bell):
 
 @final
 class _Call(_Bell):
-    """By the interpreter, at the call of another thread: for threads and systems without an alarm."""
+    """Bell that another thread rings through the interpreter, for threads and systems without an alarm."""
 
     def __init__(self) -> None:
         self._thread, self._changed, self._ended = threading.get_ident(), threading.Condition(), False
@@ -184,11 +185,11 @@ class _Call(_Bell):
     def _watch(self) -> None:
         with self._changed:
             while not self._ended:
-                left = self.due - time.monotonic()
-                if left <= 0.0:
+                remaining = self.due - time.monotonic()
+                if remaining <= 0.0:
                     self.rung, self.due = True, time.monotonic() + LAST
                     self._raise(OutOfTime)
-                self._changed.wait(min(max(left, 0.0), threading.TIMEOUT_MAX))
+                self._changed.wait(min(max(remaining, 0.0), threading.TIMEOUT_MAX))
 
     def _raise(self, error: type[OutOfTime]) -> None:
         ctypes.pythonapi.PyThreadState_SetAsyncExc(ctypes.c_ulong(self._thread), ctypes.py_object(error))

@@ -78,21 +78,21 @@ def prove(
     budgets = {
         family.name: cells if isinstance(cells, int) else cells.get(family.name, 0) for family in program.families
     }
-    proven = [family.reduced or family for family in program.families]
-    found: list[tuple[ConstraintFamily, Proof]] = []
+    families = [family.reduced or family for family in program.families]
+    proofs: list[tuple[ConstraintFamily, Proof]] = []
     try:
-        found.extend((one, _prove(one, x, notify, budgets[one.name], time_left)) for one in proven)
+        proofs.extend((family, _prove(family, x, notify, budgets[family.name], time_left)) for family in families)
     except OutOfTime as error:  # there is no time to bound the remaining families even once
-        found += [(one, _begun_only(one, error, time_left)) for one in proven[len(found) :]]
+        proofs += [(family, _begun_only(family, error, time_left)) for family in families[len(proofs) :]]
     return tuple(
         replace(
             proof,
-            formulation=one.formulation,
-            unit=one.row_unit(proof.row),
-            measured=one.measure(proof.row),
-            allowed=one.allowed(x),
+            formulation=family.formulation,
+            unit=family.row_unit(proof.row),
+            measured=family.measure(proof.row),
+            allowed=family.allowed(x),
         )
-        for one, proof in found
+        for family, proof in proofs
     )
 
 
@@ -246,14 +246,14 @@ class Course:
         cover."""
         factor = 1.0 if self.family.index_units is None else float(self.family.index_units[0])
         ends, box = factor * np.stack([lower[:, 0], upper[:, 0]]), self.family.index_set
-        whole = factor * float(box.upper[0] - box.lower[0]) if box.dimension else 0.0
-        if whole <= 0.0 or not np.isfinite(whole):
+        length = factor * float(box.upper[0] - box.lower[0]) if box.dimension else 0.0
+        if length <= 0.0 or not np.isfinite(length):
             return
         first = np.argsort(ends[0], kind="stable")
-        starts, reached = ends[0, first], np.maximum.accumulate(ends[1, first])
-        covered = float(np.maximum(reached - np.maximum(starts, np.append(starts[0], reached[:-1])), 0.0).sum())
+        starts, furthest = ends[0, first], np.maximum.accumulate(ends[1, first])
+        covered = float(np.maximum(furthest - np.maximum(starts, np.append(starts[0], furthest[:-1])), 0.0).sum())
         unit = f" {self.family.along}" if self.family.along else ""
-        self.along = f"open along {covered:.3g} of {whole:.3g}{unit}, from {starts[0]:.5g} to {reached[-1]:.5g}{unit}"
+        self.along = f"open along {covered:.3g} of {length:.3g}{unit}, from {starts[0]:.5g} to {furthest[-1]:.5g}{unit}"
 
     def tell(self, cells: int, bound: float, lower: Array, upper: Array, pending: int = 0) -> None:
         """Send an event about the open cells.
@@ -294,8 +294,8 @@ class Course:
         advice = "" if self.family.hindrance is None else self.family.hindrance(lower, upper)
         if self.deadline.passed:
             advice = f"there was no time to halve it; {more(self.deadline)}, or a larger method.tolerance"
-        known = self.family.index_units
-        lower, upper = (lower, upper) if known is None or known.size != lower.size else (lower * known, upper * known)
+        units = self.family.index_units
+        lower, upper = (lower, upper) if units is None or units.size != lower.size else (lower * units, upper * units)
         allowed = bound * (1.0 if self.family.row_units is None else float(self.family.row_units.max()))
         cell = f"the cell from {_shown(lower)} to {_shown(upper)} still allows {allowed:.1e}"
         cell += f" {self.family.measure()}" if self.family.measure() else ""
@@ -378,14 +378,14 @@ def _branch_and_bound(
     """Return what is known of one family after branch and bound, as a proof and as a supremum."""
     box = family.index_set
     lower, upper = family.partition
-    best, known = (-np.inf, lower[0], 0), np.full(lower.shape[0], np.inf)
+    best, parent_bounds = (-np.inf, lower[0], 0), np.full(lower.shape[0], np.inf)
     leaves: list[tuple[Array, Array, Array]] = []  # one entry per halving
     slacks: list[float] = []
 
     while True:
         # Bound every cell, and close those where no violation is left.
         bounds, split, bend = _bounded(course, x, lower, upper)
-        bounds = np.minimum(bounds, known)  # a part violates no more than the whole
+        bounds = np.minimum(bounds, parent_bounds)  # a part violates no more than the whole
         course.examined += bounds.size
         open_ = bounds > goal.closes(best[0])
 
@@ -396,10 +396,10 @@ def _branch_and_bound(
         if peaks.violations.size:
             best = (float(peaks.violations[0]), peaks.indices[0], int(peaks.rows[0]))
         elif first or open_.any():
-            best = max(best, _probe(family, x, lower, upper, bounds), key=lambda found: found[0])
+            best = max(best, _probe(family, x, lower, upper, bounds), key=lambda witness: witness[0])
         if open_.any() and not goal.ends(best[0]) and len(leaves) + 1 in CLIMBED and box.dimension > 1:
             worst_cell = (corner[bounds.argmax()] for corner in (lower, upper))
-            best = max(best, _climb(family, x, *worst_cell), key=lambda found: found[0])
+            best = max(best, _climb(family, x, *worst_cell), key=lambda witness: witness[0])
         open_ = bounds > goal.closes(best[0])
         leaves.append((lower[~open_], upper[~open_], bounds[~open_]))
         if goal.ends(best[0]):
@@ -413,24 +413,26 @@ def _branch_and_bound(
         course.opened(lower[open_], upper[open_])
         course.tell(int(open_.sum()), worst, lower[at], upper[at])
         low, high = lower[open_], upper[open_]
-        parts = (
+        children = (
             None
             if bend is None or family.uncertain is not None
             else _towards(peaks, low, high, bounds[open_], bend[open_])
         )
-        if parts is None or course.examined + parts[0].shape[0] > course.budget:
-            parts, known = _halved(low, high, split[open_]), np.tile(bounds[open_], 2)
+        if children is None or course.examined + children[0].shape[0] > course.budget:
+            children, parent_bounds = _halved(low, high, split[open_]), np.tile(bounds[open_], 2)
         else:
-            known = np.full(parts[0].shape[0], np.inf)
+            parent_bounds = np.full(children[0].shape[0], np.inf)
         slacks.append(worst - best[0])
-        spent = parts is None or course.examined + parts[0].shape[0] > course.budget or course.deadline.passed
-        rounded = box.dimension == 1 and bend is not None and _is_rounding(worst, float(bend[at]), goal.closes(best[0]))
-        if parts is None or spent or rounded or _at_rest(slacks):
+        is_spent = children is None or course.examined + children[0].shape[0] > course.budget or course.deadline.passed
+        is_rounding = (
+            box.dimension == 1 and bend is not None and _is_rounding(worst, float(bend[at]), goal.closes(best[0]))
+        )
+        if children is None or is_spent or is_rounding or _at_rest(slacks):
             hindrance = course.hindrance(worst, lower[at], upper[at])
             leaves.append((low, high, bounds[open_]))
             reason = f"{int(open_.sum())} of {course.examined} cells were left; {hindrance}"
             return _answers(course, "undecided", best, leaves, reason)
-        lower, upper = parts
+        lower, upper = children
 
 
 def _answers(
@@ -488,26 +490,26 @@ def _bounded(course: Course, x: Array, lower: Array, upper: Array) -> tuple[Arra
     """
     family, count = course.family, lower.shape[0]
     bounds, split, bend = np.full(count, np.inf), (upper - lower).argmax(axis=1), np.full(count, np.inf)
-    known, hurried = True, course.deadline.bounded or course.deadline.passed
+    has_bend, hurried = True, course.deadline.bounded or course.deadline.passed
     start, size = 0, FIRST_BATCH if hurried else BATCH
     order, ends = _together(lower, upper) if count > size else (np.arange(count), np.array([count]))
     while start < count and not (start and course.deadline.passed):
-        began, stop = time.perf_counter(), min(start + size, count)
+        started, stop = time.perf_counter(), min(start + size, count)
         if hurried:  # to the end of the group that shares work, unless that is far
             stop = min(int(ends[np.searchsorted(ends, stop)]), start + BATCH)
-        part = order[start:stop]
-        enclosed = family.enclosed(x, lower[part], upper[part])
-        bounds[part] = enclosed.bounds
-        split[part] = enclosed.split
-        known = known and enclosed.bend is not None
-        bend[part] = np.inf if enclosed.bend is None else enclosed.bend
+        batch = order[start:stop]
+        enclosed = family.enclosed(x, lower[batch], upper[batch])
+        bounds[batch] = enclosed.bounds
+        split[batch] = enclosed.split
+        has_bend = has_bend and enclosed.bend is not None
+        bend[batch] = np.inf if enclosed.bend is None else enclosed.bend
         start, ended = stop, time.perf_counter()
         if course.deadline.bounded:
-            size = min(BATCH, 2 * size) if ended - began < QUICK else max(1, size // 2)
+            size = min(BATCH, 2 * size) if ended - started < QUICK else max(1, size // 2)
         if start < count and ended - course.told > OFTEN:
             at = order[bounds[order[:start]].argmax()]
             course.tell(count, float(bounds[at]), lower[at], upper[at], start)
-    return bounds, split, bend if known else None
+    return bounds, split, bend if has_bend else None
 
 
 def _together(lower: Array, upper: Array) -> tuple[np.ndarray, np.ndarray]:
@@ -519,9 +521,9 @@ def _together(lower: Array, upper: Array) -> tuple[np.ndarray, np.ndarray]:
     count = lower.shape[0]
     if lower.shape[1] == 1:
         return np.arange(count), np.arange(1, count + 1)
-    _, which = np.unique(np.hstack([lower[:, 1:], upper[:, 1:]]), axis=0, return_inverse=True)
-    order = np.argsort(which.reshape(-1), kind="stable")
-    return order, np.append(np.flatnonzero(np.diff(which.reshape(-1)[order])) + 1, count)
+    _, groups = np.unique(np.hstack([lower[:, 1:], upper[:, 1:]]), axis=0, return_inverse=True)
+    order = np.argsort(groups.reshape(-1), kind="stable")
+    return order, np.append(np.flatnonzero(np.diff(groups.reshape(-1)[order])) + 1, count)
 
 
 def _towards(peaks: Separation, lower: Array, upper: Array, bounds: Array, bend: Array) -> tuple[Array, Array] | None:
@@ -555,7 +557,7 @@ def _towards(peaks: Separation, lower: Array, upper: Array, bounds: Array, bend:
             return None
         starts.append(cuts[:-1])
         stops.append(cuts[1:])
-    if all(one.size == 2 for one in starts):
+    if all(start.size == 2 for start in starts):
         return None
     return np.concatenate(starts)[:, None], np.concatenate(stops)[:, None]
 
@@ -593,7 +595,7 @@ def _climb(family: ConstraintFamily, x: Array, lower: Array, upper: Array) -> tu
 
 def _in_order(leaves: list[tuple[Array, Array, Array]]) -> tuple[Array, Array, Array]:
     """Return the corners of all leaves, sorted by lower and then by upper corners, and their bounds."""
-    lower, upper, bounds = (np.concatenate(parts) for parts in zip(*leaves, strict=True))
+    lower, upper, bounds = (np.concatenate(arrays) for arrays in zip(*leaves, strict=True))
     order = np.lexsort(np.hstack([lower, upper]).T[::-1])
     return lower[order], upper[order], bounds[order]
 
@@ -624,21 +626,21 @@ def _by_separation(family: ConstraintFamily, x: Array) -> Proof:
             np.inf,
             reason=f"family {family.name} offers no enclosure, so nothing can be excluded",
         )
-    found = family.separated(x)
-    violation = float(found.violations[0]) if found.violations.size else -np.inf
-    index, row = (found.indices[0], int(found.rows[0])) if found.violations.size else (None, 0)
+    separation = family.separated(x)
+    violation = float(separation.violations[0]) if separation.violations.size else -np.inf
+    index, row = (separation.indices[0], int(separation.rows[0])) if separation.violations.size else (None, 0)
     ends = np.stack([family.index_set.lower, family.index_set.upper])
-    met = _probe(family, x, ends, ends, np.zeros(2)) if np.isfinite(ends).all() else (-np.inf, ends[0], 0)
-    if met[0] > max(violation, TOLERANCE):  # the separation is believed, but not against the family's own rows
-        violation, index, row = met
+    witness = _probe(family, x, ends, ends, np.zeros(2)) if np.isfinite(ends).all() else (-np.inf, ends[0], 0)
+    if witness[0] > max(violation, TOLERANCE):  # the separation is believed, but not against the family's own rows
+        violation, index, row = witness
     if violation > TOLERANCE:
         return Proof(family.name, "refuted", np.inf, violation, index, row)
-    if found.bound <= family.allowed(x):
-        return Proof(family.name, "proven", found.bound, violation, index, row)
+    if separation.bound <= family.allowed(x):
+        return Proof(family.name, "proven", separation.bound, violation, index, row)
     return Proof(
         family.name,
         "undecided",
-        found.bound,
+        separation.bound,
         violation,
         index,
         row,

@@ -61,14 +61,14 @@ def reasons(program: SemiInfiniteProgram) -> list[Reason]:
     There is at most one reason for every row of a family. Of rows that mean the same in several cases, only the worst
     is returned.
     """
-    found = [
+    candidates = [
         reason
         for family in program.families
         if family.uncertain is None
         for reason in _of_family(program.finite, family.reduced or family)
     ]
     worst: dict[tuple[str, ...], Reason] = {}
-    for reason in found:  # none is reported twice
+    for reason in candidates:  # none is reported twice
         if reason.about not in worst or reason.amount > worst[reason.about].amount:
             worst[reason.about] = reason
     return list(worst.values())
@@ -84,17 +84,24 @@ def _of_family(base: FiniteProgram, family: ConstraintFamily) -> Iterator[Reason
     size = np.linalg.norm(G, axis=2)
     scale = REAL * np.maximum(1.0, np.abs(h))
     explained: set[int] = set()
-    bare = np.where(size <= NONE * size.max(initial=0.0), -h, -np.inf)
-    for row in np.flatnonzero((bare > scale).any(axis=0)):
+    empty_violation = np.where(size <= NONE * size.max(initial=0.0), -h, -np.inf)
+    for row in np.flatnonzero((empty_violation > scale).any(axis=0)):
         explained.add(int(row))
         yield _reason(
-            "beyond every decision", family, G, h, indices, int(bare[:, row].argmax()), [int(row)], np.ones(1)
+            "beyond every decision",
+            family,
+            G,
+            h,
+            indices,
+            int(empty_violation[:, row].argmax()),
+            [int(row)],
+            np.ones(1),
         )
-    for one, two, share, missing in _opposite(G, h, size):
-        if {one, two} & explained or not (worst := int(missing.argmax()), missing.max() > scale.max())[1]:
+    for first, second, share, missing in _opposite(G, h, size):
+        if {first, second} & explained or not (worst := int(missing.argmax()), missing.max() > scale.max())[1]:
             continue
-        explained |= {one, two}
-        yield _reason("nothing between", family, G, h, indices, worst, [one, two], np.array([1.0, share[worst]]))
+        explained |= {first, second}
+        yield _reason("nothing between", family, G, h, indices, worst, [first, second], np.array([1.0, share[worst]]))
     for row in np.flatnonzero((least > scale).any(axis=0)):
         if row not in explained:
             yield _reason(
@@ -157,9 +164,9 @@ def least_within(base: FiniteProgram, row: Array) -> float:
     float
         Lower bound by the multipliers of a linear program; ``-inf`` where that program is not solved.
     """
-    alone = replace(base, q=row, weights=np.zeros_like(base.weights), P=None, constant=0.0, blocks=None)
-    corner = simplex(alone)
-    return dual_bound(alone, corner.y, corner.mu, corner.z) if corner.status == "optimal" else -np.inf
+    single = replace(base, q=row, weights=np.zeros_like(base.weights), P=None, constant=0.0, blocks=None)
+    corner = simplex(single)
+    return dual_bound(single, corner.y, corner.mu, corner.z) if corner.status == "optimal" else -np.inf
 
 
 def _looked_at(family: ConstraintFamily) -> Array:
@@ -179,13 +186,15 @@ def _opposite(G: Array, h: Array, size: Array) -> Iterator[tuple[int, int, Array
     sum.
     """
     count = h.shape[1]
-    for one in range(count):
-        for two in range(one + 1, count):
+    for first in range(count):
+        for second in range(first + 1, count):
             with np.errstate(divide="ignore", invalid="ignore"):
-                share = size[:, one] / size[:, two]
-                apart = np.linalg.norm(G[:, one] + share[:, None] * G[:, two], axis=1)
-                missing = np.where(apart <= PARALLEL * size[:, one], -(h[:, one] + share * h[:, two]), -np.inf)
-            yield one, two, share, np.where(np.isnan(missing), -np.inf, missing)
+                share = size[:, first] / size[:, second]
+                distance = np.linalg.norm(G[:, first] + share[:, None] * G[:, second], axis=1)
+                missing = np.where(
+                    distance <= PARALLEL * size[:, first], -(h[:, first] + share * h[:, second]), -np.inf
+                )
+            yield first, second, share, np.where(np.isnan(missing), -np.inf, missing)
 
 
 def _reason(
@@ -206,8 +215,8 @@ def _reason(
     )
     rows = Rows(G[at, which], h[at, which], cuts)
     amount = float(-multipliers @ rows.h) if amount is None else amount
-    text, alike = sentence(kind, family, rows, multipliers, amount), [_told(family, cut).alike for cut in cuts]
-    return Reason(kind, rows, multipliers, amount, text, (kind, *alike) if all(alike) else (text,))
+    text, keys = sentence(kind, family, rows, multipliers, amount), [_told(family, cut).alike for cut in cuts]
+    return Reason(kind, rows, multipliers, amount, text, (kind, *keys) if all(keys) else (text,))
 
 
 def _told(family: ConstraintFamily, cut: Cut) -> Explanation:
@@ -238,9 +247,11 @@ def sentence(kind: Kind, family: ConstraintFamily, rows: Rows, multipliers: Arra
     """
     units = [family.row_unit(cut.row) for cut in rows.cuts]
     amount = amount * units[0]
-    told = [_told(family, cut) for cut in rows.cuts]
+    explanations = [_told(family, cut) for cut in rows.cuts]
     if kind == "beyond every decision":
-        return told[0].beyond(amount)
+        return explanations[0].beyond(amount)
     if kind == "nothing between":
-        return told[0].apart(told[1], float(multipliers[1] / multipliers[0]) * units[0] / units[1], amount)
-    return told[0].out_of_reach(amount, -float(rows.h[0]) * units[0])
+        return explanations[0].apart(
+            explanations[1], float(multipliers[1] / multipliers[0]) * units[0] / units[1], amount
+        )
+    return explanations[0].out_of_reach(amount, -float(rows.h[0]) * units[0])

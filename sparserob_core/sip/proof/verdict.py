@@ -91,8 +91,10 @@ def remarked(program: SemiInfiniteProgram, result: Result) -> Result:
     names = [family.name for family in program.families if family.enclosure is not None or family.worst is not None]
     if not names or result.status not in ("certified", "verified"):
         return result
-    said = f"what {', '.join(names[:NAMED])}{', ...' if len(names) > NAMED else ''} encloses or separates is believed"
-    return replace(result, message=f"{result.message}; {said}")
+    warning = (
+        f"what {', '.join(names[:NAMED])}{', ...' if len(names) > NAMED else ''} encloses or separates is believed"
+    )
+    return replace(result, message=f"{result.message}; {warning}")
 
 
 def _denied(program: SemiInfiniteProgram, result: Result) -> str:
@@ -104,22 +106,22 @@ def _denied(program: SemiInfiniteProgram, result: Result) -> str:
     worst, x = result.worst, result.decision
     if result.status == "refuted" and worst is not None and worst.constraint and x is not None:
         family = program.formulated(worst.constraint, worst.formulation)
-        met = np.inf if family is None else float(family.violations(x, worst.index[None])[0, worst.row])
-        if not met > TOLERANCE / 2:
+        violation = np.inf if family is None else float(family.violations(x, worst.index[None])[0, worst.row])
+        if not violation > TOLERANCE / 2:
             return (
                 f"{worst.constraint} is said to be violated by {worst.violation:.4g} at the index"
-                f" {worst.index.tolist()}, and its rows are by {met:.4g}"
+                f" {worst.index.tolist()}, and its rows are by {violation:.4g}"
             )
     for family in program.families:
         cuts = [cut for cut in result.dual.cuts if cut.family == family.name and cut.formulation == family.formulation]
         if family.chosen is None or not cuts:
             continue
         indices, rows = np.stack([cut.index for cut in cuts]), np.array([cut.row for cut in cuts])
-        every = [part[np.arange(len(cuts)), rows] for part in family.rows(indices)]
-        whole, chosen = (np.column_stack(parts) for parts in (every, family.chosen(indices, rows)))
-        apart = np.abs(whole - chosen).max(axis=1)
-        if not (apart <= CHOSEN * np.abs(whole).max(axis=1)).all():
-            at = int(np.argmax(apart))
+        selected = [table[np.arange(len(cuts)), rows] for table in family.rows(indices)]
+        expected, chosen = (np.column_stack(columns) for columns in (selected, family.chosen(indices, rows)))
+        difference = np.abs(expected - chosen).max(axis=1)
+        if not (difference <= CHOSEN * np.abs(expected).max(axis=1)).all():
+            at = int(np.argmax(difference))
             return f"{family.name}: the row chosen at the index {indices[at].tolist()} is another one among its rows"
     return ""
 
@@ -141,8 +143,8 @@ def as_bad_as_found(proofs: Sequence[Proof], separations: Sequence[tuple[Constra
     list of Proof
         The proofs.
     """
-    found = {family.name: (family, separation) for family, separation in separations}
-    return [_worse(proof, *found[proof.family]) if proof.family in found else proof for proof in proofs]
+    by_name = {family.name: (family, separation) for family, separation in separations}
+    return [_worse(proof, *by_name[proof.family]) if proof.family in by_name else proof for proof in proofs]
 
 
 def _worse(proof: Proof, family: ConstraintFamily, found: Separation) -> Proof:
@@ -164,12 +166,14 @@ def _worse(proof: Proof, family: ConstraintFamily, found: Separation) -> Proof:
 def worst_of(separations: Sequence[tuple[ConstraintFamily, Separation]]) -> WorstConstraint:
     """Return the most violated constraint that the separations of all families have found; families that define values
     are ignored."""
-    found = [
+    candidates = [
         WorstConstraint(float(s.violations[0]), family.name, s.indices[0], int(s.rows[0]), family.formulation)
         for family, s in separations
         if s.violations.size and not family.defines
     ]
-    return max(found, key=lambda one: one.violation, default=WorstConstraint(-np.inf, "", np.zeros(0)))
+    return max(
+        candidates, key=lambda constraint: constraint.violation, default=WorstConstraint(-np.inf, "", np.zeros(0))
+    )
 
 
 def witness(program: SemiInfiniteProgram, searched: WorstConstraint, proofs: Sequence[Proof]) -> WorstConstraint:
@@ -189,12 +193,12 @@ def witness(program: SemiInfiniteProgram, searched: WorstConstraint, proofs: Seq
     WorstConstraint
         The worst of all.
     """
-    found = [
+    candidates = [
         WorstConstraint(proof.violation, proof.family, proof.index, proof.row, proof.formulation)
         for proof in proofs
         if proof.index is not None and not program.family(proof.family).defines
     ]
-    return explained(program, max([searched, *found], key=lambda one: one.violation))
+    return explained(program, max([searched, *candidates], key=lambda constraint: constraint.violation))
 
 
 def explained(program: SemiInfiniteProgram, bare: WorstConstraint) -> WorstConstraint:
@@ -237,32 +241,32 @@ def infeasible_subsystem(
 
     Returns
     -------
-    found : InfeasibleSubsystem
+    subsystem : InfeasibleSubsystem
         The reasons.
     worst : WorstConstraint or None
         The most important constraint.
     """
     from sparserob_core.sip.proof.reasons import least_of, least_within, reasons, sentence
 
-    found, equalities = reasons(program), bool(program.finite.b.size)
+    evident, equalities = reasons(program), bool(program.finite.b.size)
     multipliers = y[y.size - rows.h.size :]
     active = np.flatnonzero(multipliers > 0)
-    if active.size == 1 and not equalities and (program.finite.S is not None or not found) and len(found) < 2:
+    if active.size == 1 and not equalities and (program.finite.S is not None or not evident) and len(evident) < 2:
         i = int(active[0])
         # Where the decision has more than bounds of its own (a polytope of controls), Farkas' multipliers, or a linear
         # program whose cost is this row alone, give a larger bound.
         norms = np.linalg.norm(np.vstack([program.finite.G, rows.G]), axis=1)
         farkas = amount * float(y @ norms / multipliers[i])
-        known = float(least_of(program.finite, rows.G[[i]], rows.h[[i]])[0])
-        alone = max(known, farkas, least_within(program.finite, rows.G[i]) - float(rows.h[i]))
-        if alone > max((reason.amount for reason in found), default=0.0):
+        own_bound = float(least_of(program.finite, rows.G[[i]], rows.h[[i]])[0])
+        violation = max(own_bound, farkas, least_within(program.finite, rows.G[i]) - float(rows.h[i]))
+        if violation > max((reason.amount for reason in evident), default=0.0):
             family = program.family(rows.cuts[i].family)
-            text = sentence("out of reach", family, rows.take(np.array([i])), np.ones(1), alone)
-            return InfeasibleSubsystem(reasons=(text,)), _worst_at(program, rows.cuts[i], alone)
-    if found:
-        texts = tuple(reason.text for reason in found[:NAMED])
-        told = InfeasibleSubsystem(reasons=texts, others=max(0, len(found) - NAMED))
-        return told, _worst_at(program, found[0].rows.cuts[0], found[0].amount)
+            text = sentence("out of reach", family, rows.take(np.array([i])), np.ones(1), violation)
+            return InfeasibleSubsystem(reasons=(text,)), _worst_at(program, rows.cuts[i], violation)
+    if evident:
+        texts = tuple(reason.text for reason in evident[:NAMED])
+        subsystem = InfeasibleSubsystem(reasons=texts, others=max(0, len(evident) - NAMED))
+        return subsystem, _worst_at(program, evident[0].rows.cuts[0], evident[0].amount)
     if not active.size:
         return InfeasibleSubsystem(amount=amount, equalities=equalities), None
     order = active[np.argsort(-multipliers[active], kind="stable")]
@@ -276,22 +280,24 @@ def _together(
     """Return several rows that cannot hold together, by their descriptions, with the weighted sum that proves it."""
     from sparserob_core.sip.proof.reasons import least_of, least_within
 
-    told = [_explanation(program, rows.cuts[i]) for i in order[:NAMED]]
+    explanations = [_explanation(program, rows.cuts[i]) for i in order[:NAMED]]
     units = np.array([program.family(cut.family).row_unit(cut.row) for cut in rows.cuts])
     y = multipliers / units
     share = 1.0 / y.max()
     y, weights = y * share, multipliers * share  # for rows in the user's units, and in their own
-    asked = -float(weights[order] @ rows.h[order])
-    together = weights[order] @ rows.G[order]
-    known = float(least_of(program.finite, together[None], np.array([-asked]))[0])
-    missing = max(known, least_within(program.finite, together) + asked)
-    demand, decides = "", told[0].decides
-    if missing > 0 and asked > 0:
-        more, less = told_apart(asked, asked - missing)
+    required = -float(weights[order] @ rows.h[order])
+    combined = weights[order] @ rows.G[order]
+    own_bound = float(least_of(program.finite, combined[None], np.array([-required]))[0])
+    missing = max(own_bound, least_within(program.finite, combined) + required)
+    demand, decides = "", explanations[0].decides
+    if missing > 0 and required > 0:
+        required_text, available_text = told_apart(required, required - missing)
         named = ", ".join(f"{y[i]:.3g}" for i in order[:NAMED]) + (", ..." if order.size > NAMED else "")
-        demand = f"weighted by {named} they ask the {decides} for {more}, and it can give at most {less}"
+        demand = (
+            f"weighted by {named} they ask the {decides} for {required_text}, and it can give at most {available_text}"
+        )
     return InfeasibleSubsystem(
-        members=tuple(one.text for one in told),
+        members=tuple(explanation.text for explanation in explanations),
         amount=amount,
         others=max(0, order.size - NAMED),
         equalities=bool(program.finite.b.size),

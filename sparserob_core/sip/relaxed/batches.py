@@ -37,10 +37,14 @@ START = 5.0
 
 @dataclass(frozen=True, eq=False)
 class Valued:
-    """What a chunk gave: ``values (k,)``; ``duals``, the lower bound from the multipliers of each tuple whose value was
-    the best so far in its chunk, by its place in it; and how many programs were solved, by how many ``calls`` of the
-    solver, by whom, and what the solver that was named did not answer. ``imposed``: the rows that each rests on, with
-    their multipliers. ``late``: why the time was over, if it was."""
+    """Values of ``g`` at a chunk of tuples, with the bounds and the account of the solver.
+
+    ``values (k,)``: the value at each tuple. ``duals``: the lower bound from the multipliers of each tuple whose value
+    was the best so far in its chunk, by the place of the tuple. ``solves``: programs that were solved; ``calls``: calls
+    of the solver; ``solved_by``: how many each solver solved; ``unanswered``: what the named solver did not answer.
+    ``imposed``: the rows that each value rests on, with their multipliers. ``late``: the reason why the time was over,
+    if it was.
+    """
 
     values: Array
     duals: dict[int, Dual]
@@ -57,8 +61,8 @@ def value_chunk(g: TupleValue, points: Array, best: float) -> Valued:
     is of use."""
     g.forget()
     relaxed, duals = g.relaxed, dict[int, Dual]()
-    solves, calls, known = relaxed.solves, relaxed.counted.calls, Counter(relaxed.solved_by)
-    missed = tuple(relaxed.counted.failures)
+    solves, calls, earlier = relaxed.solves, relaxed.counted.calls, Counter(relaxed.solved_by)
+    failures = tuple(relaxed.counted.failures)
     values, imposed = np.empty(len(points)), list[Imposed]()
     for k, point in enumerate(points):
         values[k] = g.at(point)
@@ -66,15 +70,18 @@ def value_chunk(g: TupleValue, points: Array, best: float) -> Valued:
         if np.isfinite(values[k]) and values[k] > best:
             best = float(values[k])
             duals[k] = relaxed.lower_bound(g.rows(), g.solution)
-    by = relaxed.solved_by - known
-    calls, missed = relaxed.counted.calls - calls, relaxed.counted.failures.since(missed)
-    return Valued(values, duals, relaxed.solves - solves, calls, dict(by), missed, imposed=imposed)
+    by = relaxed.solved_by - earlier
+    calls, failures = relaxed.counted.calls - calls, relaxed.counted.failures.since(failures)
+    return Valued(values, duals, relaxed.solves - solves, calls, dict(by), failures, imposed=imposed)
 
 
 @dataclass(frozen=True)
 class Oracle:
-    """How a worker makes ``g`` anew: the program and its components by ``rebuild``, in a ``formulation``, over tuples
-    of ``count`` indices. Equal oracles give equal values, and a worker keeps the last one that it has made."""
+    """Recipe by which a worker makes ``g`` anew.
+
+    ``rebuild`` makes the program and its components; ``g`` is over tuples of ``count`` indices in a ``formulation``.
+    Equal oracles give equal values, and a worker keeps the ``g`` that it made last.
+    """
 
     rebuild: Rebuild
     formulation: Literal["reduced", "literal"]
@@ -90,7 +97,7 @@ class Oracle:
 
 
 class _Kept(threading.local):
-    """What a worker has made last; g changes with every value, so each thread of a worker has its own."""
+    """The ``g`` that a worker made last, one for each thread, as every evaluation changes it."""
 
     oracle: Oracle | None = None
     g: TupleValue | None = None
@@ -134,18 +141,18 @@ class Batches:
             return np.concatenate([self._told(self._next(point), tell) for point in points])
         best = self._best
         chunks = [points[first : first + CHUNK] for first in range(0, len(points), CHUNK)]
-        began = time.perf_counter()
-        found = [self._told(value_chunk(self.g, chunks[0], best), tell)]
-        seconds = time.perf_counter() - began
+        start = time.perf_counter()
+        values = [self._told(value_chunk(self.g, chunks[0], best), tell)]
+        seconds = time.perf_counter() - start
         if self._worth(seconds, len(chunks) - 1, len(points)):
-            found += [self._told(one, tell) for one in self._elsewhere(chunks[1:], best)]
+            values += [self._told(valued, tell) for valued in self._elsewhere(chunks[1:], best)]
         else:
-            found += [self._told(value_chunk(self.g, chunk, best), tell) for chunk in chunks[1:]]
+            values += [self._told(value_chunk(self.g, chunk, best), tell) for chunk in chunks[1:]]
         self.g.forget(points[-1])
-        return np.concatenate(found)
+        return np.concatenate(values)
 
     def _next(self, point: Array) -> Valued:
-        """One value, from the solution of the one before."""
+        """Evaluate ``g`` at one point, from the solution of the point before."""
         value = self.g.at(point)
         better = np.isfinite(value) and value > self._best
         bound = self.g.relaxed.lower_bound(self.g.rows(), self.g.solution) if better else None
@@ -168,7 +175,8 @@ class Batches:
         return chunk.values
 
     def _worth(self, seconds: float, chunks: int, points: int) -> bool:
-        """Whether workers are to be asked: ``seconds`` is what a chunk has taken."""
+        """Return whether the chunks are to be sent to workers, when one chunk took ``seconds``; charge the ``points``
+        to the budget."""
         self.budget -= points
         if self.executor is None or self.oracle is None or seconds * chunks < WORTH:
             return False
@@ -176,28 +184,28 @@ class Batches:
         return self._started
 
     def _elsewhere(self, chunks: Sequence[Array], best: float) -> Sequence[Valued]:
-        g, left = self.g, self.g.relaxed.deadline.left
+        g, seconds = self.g, self.g.relaxed.deadline.left
         assert self.executor is not None
         assert self.oracle is not None
-        found, futures = list[Valued](), list[Future[Valued]]()
+        valued_chunks, futures = list[Valued](), list[Future[Valued]]()
         try:
             for chunk in chunks:
-                futures.append(self.executor.submit(on_worker, self.oracle, chunk, g.epsilon, best, left))
+                futures.append(self.executor.submit(on_worker, self.oracle, chunk, g.epsilon, best, seconds))
             for chunk, future in zip(chunks, futures, strict=True):
-                one = future.result()
-                if one.late:
-                    raise OutOfTime(g.relaxed.deadline.reason or one.late)
+                valued = future.result()
+                if valued.late:
+                    raise OutOfTime(g.relaxed.deadline.reason or valued.late)
                 self.sent += len(chunk)
-                g.relaxed.solves += one.solves
-                g.relaxed.counted.calls += one.calls
-                g.relaxed.counted.failures.calls += one.calls
-                g.relaxed.solved_by.update(one.solved_by)
-                for missed in one.unanswered:
-                    g.relaxed.counted.failures.add(missed.kind, missed.reason, missed.by, missed.count)
-                found.append(one)
+                g.relaxed.solves += valued.solves
+                g.relaxed.counted.calls += valued.calls
+                g.relaxed.counted.failures.calls += valued.calls
+                g.relaxed.solved_by.update(valued.solved_by)
+                for failure in valued.unanswered:
+                    g.relaxed.counted.failures.add(failure.kind, failure.reason, failure.by, failure.count)
+                valued_chunks.append(valued)
         except Exception:  # noqa: BLE001  whatever it was: what is missing is done here, or raised here
             self.executor = None
         finally:
             for future in futures:
                 future.cancel()
-        return [*found, *(value_chunk(g, chunk, best) for chunk in chunks[len(found) :])]
+        return [*valued_chunks, *(value_chunk(g, chunk, best) for chunk in chunks[len(valued_chunks) :])]

@@ -23,10 +23,10 @@ def index_gradient(family: ConstraintFamily, x: Array, indices: Array, rows: Arr
     """
     if family.gradient is not None:
         return np.asarray(family.gradient(x, indices, rows), dtype=float)
-    which = np.asarray(rows, dtype=int)
+    row_numbers = np.asarray(rows, dtype=int)
 
     def violation(points: Array, owner: np.ndarray) -> Array:
-        return np.asarray(family.violations(x, points)[np.arange(owner.size), which[owner]], dtype=float)
+        return np.asarray(family.violations(x, points)[np.arange(owner.size), row_numbers[owner]], dtype=float)
 
     return differences(violation, indices, family.index_set.lower, family.index_set.upper)
 
@@ -62,9 +62,9 @@ def _parabola_slopes(
     low, high = values[: owner.size], values[owner.size :]
     column = (slice(None), *[None] * (values.ndim - 1))
     slope: Array = (high - low) / gap[column]
-    aside = (points[:, axis] - middles[:, axis]) / step
-    beside = np.flatnonzero(aside)
-    if beside.size:
-        bend = high[beside] + low[beside] - 2.0 * function(middles[beside], beside)
-        slope[beside] += (2.0 * aside[beside] / gap[beside])[column] * bend
+    offsets = (points[:, axis] - middles[:, axis]) / step
+    shifted = np.flatnonzero(offsets)
+    if shifted.size:
+        bend = high[shifted] + low[shifted] - 2.0 * function(middles[shifted], shifted)
+        slope[shifted] += (2.0 * offsets[shifted] / gap[shifted])[column] * bend
     return slope

@@ -44,36 +44,42 @@ def extreme_program(
     ``G x - (h(2) - h(1)) f <= 2 h(1) - h(2)``; the bounds of the image do the same where they depend on the factor. A
     family's separation and enclosure are those of the program at the decision's factor.
     """
-    one, two = factored.at(1.0), factored.at(2.0)
-    first, second = one.finite, two.finite
+    unit_program, double_program = factored.at(1.0), factored.at(2.0)
+    first, second = unit_program.finite, double_program.finite
     slope_low, slope_high = _difference(second.lower, first.lower), _difference(second.upper, first.upper)
     moves = bool(slope_low.any() or slope_high.any())
     G, h = _appended(first.G, first.h, second.h)
     if moves:
-        rows, bounds = _moving_bounds(one, slope_low, slope_high)
+        rows, bounds = _moving_bounds(unit_program, slope_low, slope_high)
         G, h = np.vstack([G, rows]), np.concatenate([h, bounds])
     A, b = _appended(first.A, first.b, second.b)
-    q = np.zeros(one.n + 1)
+    q = np.zeros(unit_program.n + 1)
     q[-1] = -1.0 if sense == "largest" else 1.0
     free = np.full(first.lower.size, np.inf)
     return SemiInfiniteProgram(
-        n=one.n + 1,
+        n=unit_program.n + 1,
         q=q,
-        S=_image(one),
+        S=_image(unit_program),
         G=G if h.size else None,
         h=h if h.size else None,
         A=A if b.size else None,
         b=b if b.size else None,
         lower=np.append(-free if moves else first.lower, 0.0),
         upper=np.append(free if moves else first.upper, cap),
-        families=[_family(factored, left, right) for left, right in zip(one.families, two.families, strict=True)],
+        families=[
+            _family(factored, unit_family, double_family)
+            for unit_family, double_family in zip(unit_program.families, double_program.families, strict=True)
+        ],
     )
 
 
 def slack_program(program: SemiInfiniteProgram, lowest: float, highest: float) -> SemiInfiniteProgram:
-    """By how much the families' rows must be relaxed, all by the same ``t`` in ``[lowest, highest]``, until they can be
-    met; negative where they have that much to spare. The decision is ``(x, t)``; always feasible for a ``highest`` that
-    is large enough, and with a Slater point.
+    """Return the program of the least relaxation ``t`` in ``[lowest, highest]`` of all the families' rows that makes
+    them feasible.
+
+    All rows are relaxed by the same ``t``, which is negative where they have that much to spare. The decision is
+    ``(x, t)``. Where the other rows, equalities and bounds are feasible, the program is feasible for a ``highest`` that
+    is large enough, and the families' rows have a Slater point.
     """
     base = program.finite
     q = np.zeros(program.n + 1)
@@ -104,7 +110,8 @@ def _appended(rows: Array, one: Array, two: Array) -> tuple[Array, Array]:
 
 
 def _moving_bounds(program: SemiInfiniteProgram, slope_low: Array, slope_high: Array) -> tuple[Array, Array]:
-    """Both bounds of the image as rows, where they are finite."""
+    """Return the finite upper and lower bounds of the image, which change with the factor, as rows with right-hand
+    sides."""
     base = program.finite
     S = np.eye(program.n) if base.S is None else base.S.toarray()
     above, below = np.isfinite(base.upper), np.isfinite(base.lower)
@@ -159,8 +166,8 @@ def _relaxed(family: ConstraintFamily) -> ConstraintFamily:
         return np.concatenate([G, -np.ones((*h.shape, 1))], axis=2), h
 
     def worst(z: Array, separation: Callable[[Array], Separation]) -> Separation:
-        found = separation(z[:-1])
-        return replace(found, violations=found.violations - z[-1], bound=found.bound - z[-1])
+        answer = separation(z[:-1])
+        return replace(answer, violations=answer.violations - z[-1], bound=answer.bound - z[-1])
 
     index_set: Box = family.index_set
     return ConstraintFamily(

@@ -50,25 +50,25 @@ class PolicyValue:
         plain = [self._at_deviation(slot) for slot in slots if not np.isnan(slot).any()]
         order = [*np.flatnonzero(~np.isnan(slots).any(axis=1)), *np.flatnonzero(np.isnan(slots).any(axis=1))]
         until = time.monotonic() + LASTING
-        whose: list[np.ndarray] = []
+        moving: list[np.ndarray] = []
         if plain:
-            G, h, _ = (np.concatenate(part) for part in zip(*plain, strict=True))
+            G, h, _ = (np.concatenate(arrays) for arrays in zip(*plain, strict=True))
             counterpart.add(_plain(G, h, self.spread.size))
-            whose = [moves for _, _, moves in plain]
+            moving = [moves for _, _, moves in plain]
             self._begun(counterpart, slots[order[: len(plain)]].tobytes())
         for slot in order[len(plain) :]:
             blocks = self._rows(slots[slot])
             for rows in blocks:
                 counterpart.add(rows)
-            whose.append(self._flags(blocks))
+            moving.append(self._flags(blocks))
         answer = counterpart.solve(seconds=until - time.monotonic())
         while answer.solved and counterpart.sharpen(answer.x):
             answer = counterpart.solve(seconds=until - time.monotonic())
         if not answer.solved:
             self._weights = np.zeros(len(slots))
             return np.inf if "infeasible" in answer.said.lower() else np.nan
-        owner = np.repeat(order, [moves.size for moves in whose])
-        weights = np.bincount(owner, answer.y * np.concatenate(whose), len(slots))
+        owner = np.repeat(order, [moves.size for moves in moving])
+        weights = np.bincount(owner, answer.y * np.concatenate(moving), len(slots))
         self._weights = np.asarray(weights, dtype=float)
         return self.program.cost(np.clip(answer.x, self.program.finite.lower, self.program.finite.upper))
 
@@ -86,26 +86,26 @@ class PolicyValue:
         return self._weights
 
     def _flags(self, blocks: Sequence[UncertainRows]) -> np.ndarray:
-        """Which rows of all families ``(r,)`` move with their index."""
+        """Return a mask ``(r,)`` of the rows of all families that move with their index."""
         return np.concatenate([np.full(rows.h.size, moves) for rows, moves in zip(blocks, self._moves, strict=True)])
 
     def _rows(self, slot: Array) -> list[UncertainRows]:
-        found = []
+        blocks = []
         for family in self.program.families:
             box = family.index_set
             assert family.uncertain is not None
-            found.append(family.uncertain(np.clip(slot[: box.dimension], box.lower, box.upper)))
-        return found
+            blocks.append(family.uncertain(np.clip(slot[: box.dimension], box.lower, box.upper)))
+        return blocks
 
     def _at_deviation(self, slot: Array) -> Linear:
         key = slot.tobytes()
         if key not in self._known:
-            w, parts, blocks = slot[self.size :], [], self._rows(slot)
+            w, pairs, blocks = slot[self.size :], [], self._rows(slot)
             for rows in blocks:
-                turned = np.stack([w @ C for C in rows.C]) if rows.C else np.zeros((1, self.program.n))
-                G = rows.g.toarray() + rows.factor[:, np.newaxis] * turned[rows.part]
-                parts.append((G, rows.h - rows.factor * (rows.d @ w)[rows.part]))
-            G, h = (np.concatenate(part) for part in zip(*parts, strict=True))
+                products = np.stack([w @ C for C in rows.C]) if rows.C else np.zeros((1, self.program.n))
+                G = rows.g.toarray() + rows.factor[:, np.newaxis] * products[rows.part]
+                pairs.append((G, rows.h - rows.factor * (rows.d @ w)[rows.part]))
+            G, h = (np.concatenate(arrays) for arrays in zip(*pairs, strict=True))
             self._known[key] = G, h, self._flags(blocks)
         return self._known[key]
 

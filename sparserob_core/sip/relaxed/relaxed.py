@@ -60,7 +60,7 @@ class Rows:
         return Rows(self.G[positions], self.h[positions], tuple(self.cuts[i] for i in positions))
 
     def joined(self, other: Rows) -> Rows:
-        """These rows and then the others."""
+        """Return these rows followed by the ``other`` rows."""
         return Rows(np.vstack([self.G, other.G]), np.concatenate([self.h, other.h]), self.cuts + other.cuts)
 
     @staticmethod
@@ -77,21 +77,21 @@ def rows_at(
     if not indices.shape[0]:
         return Rows.none(program.n)
     constraints = program.family(family)
-    every = np.arange(indices.shape[0])
+    positions = np.arange(indices.shape[0])
     if rows is not None and constraints.chosen is not None:
-        where, which, (G, h) = every, rows, constraints.chosen(indices, rows)
+        where, row_numbers, (G, h) = positions, rows, constraints.chosen(indices, rows)
     else:
         G, h = constraints.rows_at(indices, program.n)
         if rows is not None and rows.max() >= h.shape[1]:
             raise InputError(f"family {family!r}: worst: expected a row below {h.shape[1]}, got {int(rows.max())}")
-        where, which = (
-            (every, rows)
+        where, row_numbers = (
+            (positions, rows)
             if rows is not None
-            else (np.repeat(every, h.shape[1]), np.tile(np.arange(h.shape[1]), every.size))
+            else (np.repeat(positions, h.shape[1]), np.tile(np.arange(h.shape[1]), positions.size))
         )
-        G, h = G[where, which], h[where, which]
+        G, h = G[where, row_numbers], h[where, row_numbers]
     form = constraints.formulation
-    cuts = tuple(Cut(family, indices[i], int(r), formulation=form) for i, r in zip(where, which, strict=True))
+    cuts = tuple(Cut(family, indices[i], int(r), formulation=form) for i, r in zip(where, row_numbers, strict=True))
     return Rows(np.asarray(G, dtype=float), np.asarray(h, dtype=float), cuts)
 
 
@@ -113,8 +113,8 @@ class RelaxedSolution:
 
 @dataclass(frozen=True, eq=False)
 class Imposed:
-    """Which rows of a pool are imposed: their ``positions (k,)`` and ``multipliers (k,)``, and the solution these are
-    from, if any."""
+    """Imposed rows of a pool: their ``positions (k,)`` and ``multipliers (k,)``, and the solution that gave these, if
+    any."""
 
     positions: np.ndarray
     multipliers: Array
@@ -144,21 +144,24 @@ def _most_violated(excess: Float[Array, " r"], kinds: Int[np.ndarray, " r"]) -> 
 
 def require_separable(program: SemiInfiniteProgram, solver: Solver, regulariser: Regulariser | None) -> None:
     """Raise `InputError` where the solver is `DualNewton`, and the relaxed programs are not for it."""
-    asked = Asked.of(solver)
-    if not isinstance(asked.solver, DualNewton):
+    counted = Asked.of(solver)
+    if not isinstance(counted.solver, DualNewton):
         return
     if program.spread is not None:
-        why = "under feedback rows hold for every deviation, which makes linear programs, and HiGHS solves these"
+        reason = "under feedback rows hold for every deviation, which makes linear programs, and HiGHS solves these"
     else:
         relaxed, none = RelaxedProgram(program, solver, regulariser), Rows.none(program.n)
-        why = not_separable(relaxed.finite(none.G, none.h, 1.0))
-    if why:
-        raise InputError(path="solver.name", expected=f"another solver, such as piqp: {why}", got="dual_newton")
+        reason = not_separable(relaxed.finite(none.G, none.h, 1.0))
+    if reason:
+        raise InputError(path="solver.name", expected=f"another solver, such as piqp: {reason}", got="dual_newton")
 
 
 def _touched(plain: FiniteProgram, y: Array, mu: Array, x: Array) -> Array:
-    """Where the cost is replaced by its tangent, for a bound from these multipliers: at their own minimiser where that
-    is explicit, which gives the bound of the cost itself; else at ``x``."""
+    """Return the point ``(n,)`` at which the cost is replaced by its tangent, for a bound from these multipliers.
+
+    The point is the minimiser for these multipliers where that is explicit, which gives the bound of the cost itself;
+    else it is ``x``, with 0 where ``x`` is not finite.
+    """
     if plain.P is not None and plain.separable:
         slope = plain.q + np.maximum(y, 0.0) @ plain.G + mu @ plain.A
         own = minimisers(plain.weights, plain.curvature, slope, plain.lower, plain.upper)
@@ -225,7 +228,7 @@ class RelaxedProgram:
             linear = plain.tangent(solution.x)
             offers.append((*vertex_multipliers(linear, solution.x, solution.y, solution.mu), solution.z))
         proven = [self._without(plain, solution), *(self._proven(plain, solution, *offer) for offer in offers)]
-        bound, y, mu, z, at = proven[int(np.argmax([one[0] for one in proven]))]
+        bound, y, mu, z, at = proven[int(np.argmax([proof[0] for proof in proven]))]
         curved = plain.P is not None or plain.blocks is not None
         return self.dual(rows, y, mu, solution.z if z is None else z, bound, at if curved else None)
 
@@ -242,15 +245,16 @@ class RelaxedProgram:
     def _proven(self, plain: FiniteProgram, solution: FiniteSolution, y: Array, mu: Array, z: Array) -> _Proven:
         """A lower bound, less its rounding, with the multipliers that prove it and where the cost is touched."""
         at = _touched(plain, y, mu, solution.x)
-        bound, y, mu, moved = proving(plain.tangent(at), y, mu, z, at=at)
+        bound, y, mu, z_proving = proving(plain.tangent(at), y, mu, z, at=at)
         if solution.value - bound > UNCLOSED * abs(solution.value) and self._bend is not None:
             better, point = curved_bound(plain, self._bend, y, mu, at)
             bound, at = (better, point) if better > bound else (bound, at)
-        return bound - self.rounding(plain, y, mu, solution.x), y, mu, moved, at
+        return bound - self.rounding(plain, y, mu, solution.x), y, mu, z_proving, at
 
     @cached_property
     def _bend(self) -> Array | None:
-        """What of the quadratic cost every entry has for itself ``(n,)``; ``None`` where a tangent does as well.
+        """Curvature ``c (n,)`` of the quadratic cost by entries (`curvature_of`); ``None`` where a tangent does as
+        well.
 
         Pieces of a control have bounds, and a certificate about them is judged by tangents alone.
         """
@@ -261,7 +265,8 @@ class RelaxedProgram:
     def rounding(
         self, plain: FiniteProgram, y: Float[Array, " r"], mu: Float[Array, " e"], x: Float[Array, " n"]
     ) -> float:
-        """What the rounding of the rows themselves may do to a lower bound from these multipliers near ``x (n,)``."""
+        """Return the error that rounding of the rows may cause in a lower bound from these multipliers, for ``x (n,)``
+        nearby."""
         used = (y > 0) & np.isfinite(plain.h)
         if not (used.any() or mu.any()):
             return 0.0
@@ -303,8 +308,8 @@ class RelaxedProgram:
         pool = Rows.none(self.program.n)
         for family, points in indices.items():
             pool = pool.joined(rows_at(self.program, family, points))
-        known = {} if self._last is None else self._last.multipliers()
-        start = [(i, y) for i, cut in enumerate(pool.cuts) if (y := known.get(_key(cut), 0.0)) > 0.0]
+        multipliers = {} if self._last is None else self._last.multipliers()
+        start = [(i, y) for i, cut in enumerate(pool.cuts) if (y := multipliers.get(_key(cut), 0.0)) > 0.0]
         kinds = {kind: number for number, kind in enumerate(dict.fromkeys((cut.family, cut.row) for cut in pool.cuts))}
         imposed = Imposed(
             np.array([i for i, _ in start], dtype=int),

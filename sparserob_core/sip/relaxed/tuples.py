@@ -23,13 +23,13 @@ TINY = float(np.finfo(float).tiny)
 
 @dataclass(frozen=True, eq=False)
 class TupleLayout:
-    """How ``count`` indices make one point: index after index, each with the coordinates of the longest index of all
-    families.
+    """Layout of ``count`` indices in one point: index after index, each with the coordinates of the longest index of
+    all families.
 
-    Every index of the tuple imposes *all* families, each at the point of its own index set that is nearest to the first
-    of these coordinates: a path constraint at ``(t, Beta, p)``, a terminal one at ``(T, Beta, p)``, as in the paper.
-    Every index of every family is met, so the supremum of ``g`` over tuples is what it would be with an index set for
-    each.
+    Every index of the tuple imposes *all* families. Each family is imposed at the point of its own index set that is
+    nearest to the first of these coordinates: a path constraint at ``(t, Beta, p)``, a terminal one at
+    ``(T, Beta, p)``, as in the paper. Every index of every family is met, so the supremum of ``g`` over tuples is the
+    same as with an index set for each family.
     """
 
     families: Sequence[ConstraintFamily]
@@ -154,22 +154,23 @@ class TupleValue:
         slope = np.zeros(self.slots.shape)
         slots, kinds = np.divmod(self.imposed.positions, self._h.shape[1])
         for family, first, last in self._columns:
-            mine = (kinds >= first) & (kinds < last) & (self.imposed.multipliers > 0.0)
-            where, box = slots[mine], family.index_set
+            mask = (kinds >= first) & (kinds < last) & (self.imposed.multipliers > 0.0)
+            where, box = slots[mask], family.index_set
             if not where.size:
                 continue
             wanted = self.slots[where][:, : box.dimension]
             indices = self.layout.indices(family, self.slots[where])
             steps = (
-                index_gradient(family, self.solution.x, indices, kinds[mine] - first)
-                * self.imposed.multipliers[mine][:, np.newaxis]
+                index_gradient(family, self.solution.x, indices, kinds[mask] - first)
+                * self.imposed.multipliers[mask][:, np.newaxis]
             )
             np.add.at(slope[:, : box.dimension], where, np.where(wanted == indices, steps, 0.0))
         return slope.ravel()
 
     @cached_property
     def linear(self) -> LinearBlocks | None:
-        """In which coordinates the indices are linear, where every family says it is in some."""
+        """Coordinates of the tuple in which the indices are linear; ``None`` unless every family has such
+        coordinates."""
         coordinates = np.ones(self.block, dtype=bool)
         for family in self.program.families:
             if family.linear is None or family.steepest is None:
@@ -197,29 +198,29 @@ class TupleValue:
         system without parameters, does not count.
         """
         count, rows = len(self.slots), self._h.shape[1]
-        tuples = np.repeat(np.arange(len(imposed)), [one.positions.size for one in imposed])
-        positions = np.concatenate([np.zeros(0, dtype=int), *(one.positions for one in imposed)])
-        multipliers = np.concatenate([np.zeros(0), *(one.multipliers for one in imposed)])
+        tuples = np.repeat(np.arange(len(imposed)), [entry.positions.size for entry in imposed])
+        positions = np.concatenate([np.zeros(0, dtype=int), *(entry.positions for entry in imposed)])
+        multipliers = np.concatenate([np.zeros(0), *(entry.multipliers for entry in imposed)])
         slots, kinds = np.divmod(positions, rows)
         weights = np.bincount(tuples * count + slots, multipliers * self._moving[kinds], len(imposed) * count)
         weights = weights.reshape(len(imposed), count)
         order = np.argsort(-weights, axis=1, kind="stable")[:, :most]
-        found = np.full((len(imposed), most), -1)
-        found[:, : order.shape[1]] = np.where(np.take_along_axis(weights, order, axis=1) > 0.0, order, -1)
-        return found
+        indices = np.full((len(imposed), most), -1)
+        indices[:, : order.shape[1]] = np.where(np.take_along_axis(weights, order, axis=1) > 0.0, order, -1)
+        return indices
 
     @cached_property
     def _moving(self) -> np.ndarray:
-        """Which rows of an index ``(r,)`` move with any of its `coordinates`, such as its time."""
+        """Mask ``(r,)`` of the rows of an index that move with any of its `coordinates`, such as its time."""
         moving = np.zeros(self._h.shape[1], dtype=bool)
         for family, first, last in self._columns:
             box = family.index_set
-            mine = [c for c in self.coordinates if c < box.dimension]
-            moving[first:last] = bool((box.upper[mine] > box.lower[mine]).any())
+            axes = [c for c in self.coordinates if c < box.dimension]
+            moving[first:last] = bool((box.upper[axes] > box.lower[axes]).any())
         return moving
 
     def acting(self) -> np.ndarray:
-        """Which indices ``(D,)`` of the last tuple have a multiplier."""
+        """Return a mask ``(D,)`` of the indices of the last tuple that have a multiplier."""
         self._settle()
         acts = np.zeros(self.layout.count, dtype=bool)
         acts[self.imposed.positions[self.imposed.multipliers > 0.0] // self._h.shape[1]] = True
@@ -234,16 +235,16 @@ class TupleValue:
         for position in self.imposed.positions[np.argsort(self.imposed.multipliers, kind="stable")]:
             slot, kind = divmod(int(position), self._h.shape[1])
             kinds[slot] = kind
-        most = np.full(len(slots), -np.inf)
+        largest = np.full(len(slots), -np.inf)
         for family, first, last in self._columns:
-            mine = np.flatnonzero((kinds < 0) | ((kinds >= first) & (kinds < last)))
-            rows = np.where(kinds[mine] < 0, -1, kinds[mine] - first)
+            candidates = np.flatnonzero((kinds < 0) | ((kinds >= first) & (kinds < last)))
+            rows = np.where(kinds[candidates] < 0, -1, kinds[candidates] - first)
             assert family.linear is not None and family.steepest is not None
-            found = family.steepest(x, self.layout.indices(family, slots[mine]), rows)
-            better = found.violations > most[mine]
-            moved, linear = mine[better], np.flatnonzero(family.linear)
-            most[moved] = found.violations[better]
-            slots[np.ix_(moved, linear)] = found.indices[better][:, linear]
+            steepest = family.steepest(x, self.layout.indices(family, slots[candidates]), rows)
+            better = steepest.violations > largest[candidates]
+            improved, linear = candidates[better], np.flatnonzero(family.linear)
+            largest[improved] = steepest.violations[better]
+            slots[np.ix_(improved, linear)] = steepest.indices[better][:, linear]
         return slots.ravel()
 
     def rows(self) -> Rows:
@@ -258,7 +259,8 @@ class TupleValue:
         return Rows(self._G[slots, kinds], self._h[slots, kinds], tuple(cuts))
 
     def _unmoved(self, changed: np.ndarray) -> bool:
-        """Whether the last optimum still is one: of its rows none has changed, and it keeps the changed ones."""
+        """Return whether the last optimum is still an optimum: none of its imposed rows has changed, and it satisfies
+        the rows of the indices that have."""
         if self.solution.status != "optimal" or self._solved_for != self.epsilon:
             return False
         if ((self.imposed.positions // self._h.shape[1])[:, None] == changed).any():
@@ -270,36 +272,40 @@ class TupleValue:
         changed = np.flatnonzero(_moved(self.slots, slots))
         if not changed.size:
             return changed
-        before, fresh, old = self._before, changed, self.slots[changed]
-        self._before = _Before(changed, old, self._G[changed], self._h[changed], self._norms[changed])
+        before, fresh, old_slots = self._before, changed, self.slots[changed]
+        self._before = _Before(changed, old_slots, self._G[changed], self._h[changed], self._norms[changed])
         self.slots[changed] = np.nan  # whatever is interrupted here, nobody takes their rows for those of an index
         if before.changed.size:
-            back, place = before.find(changed, slots[changed])
-            known, fresh, old = changed[back], changed[~back], old[~back]
-            self._G[known], self._h[known], self._norms[known] = before.G[place], before.h[place], before.norms[place]
+            back, positions = before.find(changed, slots[changed])
+            restored, fresh, old_slots = changed[back], changed[~back], old_slots[~back]
+            self._G[restored], self._h[restored], self._norms[restored] = (
+                before.G[positions],
+                before.h[positions],
+                before.norms[positions],
+            )
         if fresh.size:
-            self._build(fresh, old, slots[fresh])
+            self._build(fresh, old_slots, slots[fresh])
         self.slots[changed] = slots[changed]
         return changed
 
     def _build(self, fresh: np.ndarray, old: Array, wanted: Array) -> None:
         """The rows of some indices ``fresh (k,)`` that go from ``old`` to ``wanted (k, width)``."""
-        new = np.isnan(old).all(axis=1)
+        is_new = np.isnan(old).all(axis=1)
         for family, first, last in self._columns:
             # an index may move where the point at which it imposes a family does not, as at the end of the horizon
             indices = self.layout.indices(family, wanted)
-            moves = new | _moved(self.layout.indices(family, old), indices)
-            if moves.any():
-                moved = fresh[moves]
-                G, self._h[moved, first:last] = family.rows_at(indices[moves], self.program.n)
-                self._G[moved, first:last] = G
-                self._norms[moved, first:last] = np.maximum(np.sqrt((G * G).sum(axis=2)), TINY)
+            is_changed = is_new | _moved(self.layout.indices(family, old), indices)
+            if is_changed.any():
+                rebuilt = fresh[is_changed]
+                G, self._h[rebuilt, first:last] = family.rows_at(indices[is_changed], self.program.n)
+                self._G[rebuilt, first:last] = G
+                self._norms[rebuilt, first:last] = np.maximum(np.sqrt((G * G).sum(axis=2)), TINY)
 
 
 @dataclass(frozen=True, eq=False)
 class _Before:
-    """What the last change replaced: the indices ``changed (k,)`` of the tuple, sorted, with their coordinates, rows
-    and the norms of these."""
+    """State before the last change: the indices ``changed (k,)`` of the tuple, sorted, with their old coordinates, rows
+    and norms of rows."""
 
     changed: np.ndarray
     slots: Array
@@ -308,16 +314,18 @@ class _Before:
     norms: Array
 
     def find(self, changed: np.ndarray, slots: Array) -> tuple[np.ndarray, np.ndarray]:
-        """Which of the indices ``changed`` return to what they were ``(k,)``, and where that is kept."""
-        place = np.minimum(self.changed.searchsorted(changed), self.changed.size - 1)
-        back = (self.changed[place] == changed) & ~_moved(self.slots[place], slots)
-        return back, place[back]
+        """Return a mask ``(k,)`` of the indices ``changed`` that return to their old coordinates, and the places where
+        their old rows are kept."""
+        positions = np.minimum(self.changed.searchsorted(changed), self.changed.size - 1)
+        back = (self.changed[positions] == changed) & ~_moved(self.slots[positions], slots)
+        return back, positions[back]
 
 
 def _moved(old: Array, new: Array) -> np.ndarray:
-    """Which indices ``(k,)`` differ from what they were; a coordinate that was and is left open (NaN) does not."""
-    moved: np.ndarray = ((old != new) & ~(np.isnan(old) & np.isnan(new))).any(axis=1)
-    return moved
+    """Return a mask ``(k,)`` of the indices whose coordinates differ; a coordinate that is NaN (open) before and after
+    does not differ."""
+    differs: np.ndarray = ((old != new) & ~(np.isnan(old) & np.isnan(new))).any(axis=1)
+    return differs
 
 
 def _nothing(n: int) -> FiniteSolution:

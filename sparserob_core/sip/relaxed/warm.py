@@ -61,24 +61,25 @@ class WarmProgram:
     def solve(self, h: Array) -> tuple[Array, Array] | None:
         """``x (n,)`` and multipliers ``y (r,)``, for right-hand sides ``h (r,)``; ``None`` where there is no
         optimum."""
-        found, closed = None, False
+        answer, closed = None, False
         try:
-            found = self._pivoted(h)
-            closed = found is not None and self._closed(h, *found)
+            answer = self._pivoted(h)
+            closed = answer is not None and self._closed(h, *answer)
         except np.linalg.LinAlgError:
             pass
         finally:  # a basis that is wrong, or that was interrupted, is none to go on from
             if not closed:
                 self._begin()
         if closed:
-            return found
+            return answer
         n, none = self.weights.size, np.zeros(0)
         program = FiniteProgram(np.zeros(n), self.weights, self.lower, self.upper, self.G, h, np.zeros((0, n)), none)
         corner = simplex(program)
         return (corner.x, corner.y) if corner.status == "optimal" else None
 
     def _closed(self, h: Array, x: Array, y: Array) -> bool:
-        """Whether multipliers prove that a point costs no more than it must."""
+        """Return whether the multipliers prove a point optimal: its gap is at most `CLOSED` times the largest possible
+        cost."""
         largest = float(self.weights @ np.maximum(-self.lower, self.upper))
         return float(self.weights @ np.abs(x)) - self.bound(h, y) <= CLOSED * largest
 
@@ -87,36 +88,36 @@ class WarmProgram:
         for _ in range(PIVOTS + MORE * h.size):
             x = np.where(self._place > 0.0, self.upper, np.where(self._place < 0.0, self.lower, 0.0))
             x[self._free] = 0.0
-            rest, columns = h - self.G @ x, self.G[:, self._free]
+            residual, columns = h - self.G @ x, self.G[:, self._free]
             inverse = np.linalg.inv(columns[self._rows])
             if not np.abs(inverse).max(initial=0.0) < SINGULAR:
                 return None
-            x[self._free] = at = inverse @ rest[self._rows]
+            x[self._free] = at = inverse @ residual[self._rows]
             y = (self.weights[self._free] * self._side) @ inverse
-            slack = rest - columns @ at
+            slack = residual - columns @ at
             slack[self._rows] = np.inf
             row = int(slack.argmin()) if slack.size else -1
             short = -float(slack[row]) if slack.size else 0.0
-            beyond, entry, up = self._furthest(at.tolist())
-            if max(beyond, short) <= FEASIBLE:
+            excess, entry, up = self._furthest(at.tolist())
+            if max(excess, short) <= FEASIBLE:
                 multipliers = np.zeros(h.size)
                 multipliers[self._rows] = np.maximum(y, 0.0)
                 return np.minimum(np.maximum(x, self.lower), self.upper), multipliers
-            if short >= beyond:  # the multiplier of the row rises from 0
+            if short >= excess:  # the multiplier of the row rises from 0
                 change = -self.G[row, self._free] @ inverse
-                moved, kept = self.G[row] + change @ self.G[self._rows], self._free
+                slope_change, kept = self.G[row] + change @ self.G[self._rows], self._free
             else:  # the slope of the entry leaves its limit
                 change = inverse[entry] if up else -inverse[entry]
-                moved, kept = change @ self.G[self._rows], self._free[:entry] + self._free[entry + 1 :]
+                slope_change, kept = change @ self.G[self._rows], self._free[:entry] + self._free[entry + 1 :]
                 self._place[self._free[entry]] = (1 - self._side[entry]) // 2 - up
-            moved[kept] = 0.0
-            end = self._end(y, change, moved, max(beyond, short))
+            slope_change[kept] = 0.0
+            end = self._end(y, change, slope_change, max(excess, short))
             if end is None:
                 return None
             leaving, entering = end
             if leaving is not None:
                 del self._rows[leaving]
-            if short >= beyond:
+            if short >= excess:
                 self._rows.append(row)
             else:
                 del self._free[entry], self._side[entry]
@@ -126,13 +127,16 @@ class WarmProgram:
         return None
 
     def _furthest(self, at: list[float]) -> tuple[float, int, bool]:
-        """By how much the free entry that is furthest out is beyond 0 or its bound, which one it is, and whether it is
-        below."""
-        found = (0.0, -1, False)
+        """Return the largest violation of a free entry, its number among the free entries, and whether the entry is too
+        low.
+
+        A free entry must be between 0 and one of its bounds. The number is -1 where no entry is outside.
+        """
+        furthest = (0.0, -1, False)
         for number, (value, free, side) in enumerate(zip(at, self._free, self._side, strict=True)):
             low, high = (0.0, float(self.upper[free])) if side < 0 else (float(self.lower[free]), 0.0)
-            found = max(found, (low - value, number, True), (value - high, number, False))
-        return found
+            furthest = max(furthest, (low - value, number, True), (value - high, number, False))
+        return furthest
 
     def _end(
         self, y: Array, change: Array, moved: Array, rising: float
@@ -140,16 +144,16 @@ class WarmProgram:
         """Move multipliers ``y`` along ``change``, and slopes along ``moved (n,)``, while the dual rises, at first by
         ``rising``: the place of the multiplier that comes to 0, or the entry whose slope comes to a limit, and the sign
         of that; ``None`` where it rises for ever."""
-        slopes, size, ways = y @ self.G[self._rows], np.abs(moved), np.sign(moved)
-        ahead = ways * self._place  # 1: two limits are ahead of a slope; 0: one; -1: none
+        slopes, size, signs = y @ self.G[self._rows], np.abs(moved), np.sign(moved)
+        ahead = signs * self._place  # 1: two limits are ahead of a slope; 0: one; -1: none
         second = np.flatnonzero((ahead >= 0.0) & (size > LEAST * size.max(initial=0.0)))
         first = second[ahead[second] > 0.0]
-        met = np.concatenate([first, second])
-        lower_limit = np.concatenate([ways[first] > 0.0, ways[second] < 0.0])
+        entries = np.concatenate([first, second])
+        lower_limit = np.concatenate([signs[first] > 0.0, signs[second] < 0.0])
         limits = np.concatenate([-self.weights[first], self.weights[second]])
-        lengths = np.maximum((limits - ways[met] * slopes[met]) / size[met], 0.0)
+        lengths = np.maximum((limits - signs[entries] * slopes[entries]) / size[entries], 0.0)
         # beyond the lower limit of its slope, minus the weight, an entry is at its upper bound
-        drops = size[met] * np.where(lower_limit, self.upper[met], -self.lower[met])
+        drops = size[entries] * np.where(lower_limit, self.upper[entries], -self.lower[entries])
         order = np.argsort(lengths, kind="stable")
         passed = int(np.cumsum(drops[order]).searchsorted(rising))
         stop = float(lengths[order[passed]]) if passed < order.size else np.inf
@@ -161,12 +165,12 @@ class WarmProgram:
             return None
         if soonest <= stop:
             passed = int(lengths[order].searchsorted(soonest))
-        over = met[order[:passed]]
-        np.subtract.at(self._place, over, ways[over])
+        crossed = entries[order[:passed]]
+        np.subtract.at(self._place, crossed, signs[crossed])
         if soonest <= stop:
             return leaving, None
         enters = order[passed]
-        return None, (int(met[enters]), -1 if lower_limit[enters] else 1)
+        return None, (int(entries[enters]), -1 if lower_limit[enters] else 1)
 
     def bound(self, h: Array, y: Array) -> float:
         """A lower bound of the cost under right-hand sides ``h (r,)``, by weak duality from any ``y (r,) >= 0``, less

@@ -39,11 +39,11 @@ class Candidates:
     radius: Array
 
     def take(self, which: npt.NDArray[np.intp] | Truths) -> Candidates:
-        """Some of them, by position or mask."""
+        """Return the candidates at the given positions, or where the given mask is true."""
         return Candidates(self.points[which], self.rows[which], self.values[which], self.radius[which])
 
     def join(self, other: Candidates) -> Candidates:
-        """These and the others."""
+        """Return these candidates followed by the ``other`` candidates."""
         return Candidates(
             np.concatenate([self.points, other.points]),
             np.concatenate([self.rows, other.rows]),
@@ -87,14 +87,14 @@ def refine(function: VectorFunction, candidates: Candidates, least: float = -np.
     points, values, radius = candidates.points.copy(), candidates.values.copy(), candidates.radius.copy()
     for _ in range(STEPS):
         now = Candidates(points[active], candidates.rows[active], values[active], radius[active])
-        better, curved, done = _step(function, now, offsets, curvature[active], least)
+        better, curved, is_done = _step(function, now, offsets, curvature[active], least)
         points[active], values[active], radius[active], curvature[active] = (
             better.points,
             better.values,
             better.radius,
             curved,
         )
-        active = active[~done]
+        active = active[~is_done]
         if active.size == 0:
             break
     return replace(candidates, points=points, values=values, radius=radius)
@@ -106,26 +106,28 @@ def _step(
     radius = np.minimum(now.radius, 0.5)[:, np.newaxis]
     middle = np.clip(now.points, radius, 1 - radius)
     stencil = inside(middle[:, np.newaxis] + radius[:, np.newaxis] * offsets)
-    seen = _values(function, stencil, now.rows)
-    model = _fit(middle, seen, offsets)
+    stencil_values = _values(function, stencil, now.rows)
+    model = _fit(middle, stencil_values, offsets)
     steps = _climb(model, np.maximum(-REACH, -middle / radius), np.minimum(REACH, (1 - middle) / radius))
     trial = inside(middle + radius * steps)
-    reached = _values(function, trial[:, np.newaxis], now.rows)
+    trial_values = _values(function, trial[:, np.newaxis], now.rows)
     scale = np.maximum(1.0, np.abs(now.values))
     curved = np.einsum("aii->ai", model.hessian) / radius**2
     change = np.abs(np.nan_to_num(curved - curvature, nan=np.inf, posinf=np.inf)).max(axis=1) * radius[:, 0] ** 2
-    smooth = (np.abs(reached[:, 0] - model.at(steps)) <= 0.05 * model.spread + ACCURACY * scale) & (
+    is_smooth = (np.abs(trial_values[:, 0] - model.at(steps)) <= 0.05 * model.spread + ACCURACY * scale) & (
         change <= 0.1 * model.spread
     )
     points, values = _best(
-        now, np.concatenate([stencil, trial[:, np.newaxis]], axis=1), np.concatenate([seen, reached], axis=1)
+        now,
+        np.concatenate([stencil, trial[:, np.newaxis]], axis=1),
+        np.concatenate([stencil_values, trial_values], axis=1),
     )
-    moved = np.abs(points - now.points).max(axis=1) > 0.75 * radius[:, 0]
-    shrink = np.where(moved, FARTHER, np.where(smooth, 0.125, 1.0 / 4))
-    settled = smooth & (model.at(steps) - values <= ACCURACY * scale) & (values - now.values <= ACCURACY * scale)
-    done = settled | (model.spread <= 10 * ACCURACY * scale) | (radius[:, 0] < ACCURACY)
-    done |= values + HOPELESS * model.spread < least
-    return Candidates(points, now.rows, values, radius[:, 0] * shrink), curved, done
+    moved_far = np.abs(points - now.points).max(axis=1) > 0.75 * radius[:, 0]
+    shrink = np.where(moved_far, FARTHER, np.where(is_smooth, 0.125, 1.0 / 4))
+    is_settled = is_smooth & (model.at(steps) - values <= ACCURACY * scale) & (values - now.values <= ACCURACY * scale)
+    is_done = is_settled | (model.spread <= 10 * ACCURACY * scale) | (radius[:, 0] < ACCURACY)
+    is_done |= values + HOPELESS * model.spread < least
+    return Candidates(points, now.rows, values, radius[:, 0] * shrink), curved, is_done
 
 
 def _stencil(dimension: int) -> Array:
@@ -148,8 +150,8 @@ def inside(points: Array) -> Array:
 
 
 def _values(function: VectorFunction, points: Array, rows: Rows) -> Array:
-    count, each, dimension = points.shape
-    values = function(points.reshape(count * each, dimension)).reshape(count, each, -1)
+    count, size, dimension = points.shape
+    values = function(points.reshape(count * size, dimension)).reshape(count, size, -1)
     return np.take_along_axis(values, rows[:, np.newaxis, np.newaxis], axis=2)[:, :, 0]
 
 
@@ -193,8 +195,8 @@ def _climb(model: _Model, lower: Array, upper: Array) -> Array:
 
 def _best(now: Candidates, points: Array, values: Array) -> tuple[Array, Array]:
     top = np.argmax(values, axis=1)
-    each = np.arange(len(top))
-    better = values[each, top] > now.values
-    return np.where(better[:, np.newaxis], points[each, top], now.points), np.where(
-        better, values[each, top], now.values
+    indices = np.arange(len(top))
+    better = values[indices, top] > now.values
+    return np.where(better[:, np.newaxis], points[indices, top], now.points), np.where(
+        better, values[indices, top], now.values
     )

@@ -49,17 +49,17 @@ def separate(
         )
         return _Search(family, x, replace(tools, notify=notify), threshold)
 
-    known: dict[str, Separation | _Search] = {}
+    answers: dict[str, Separation | _Search] = {}
     for family in program.families:
         tools.deadline.check()
-        known[family.name] = search(family) if family.worst is None else family.separated(x)
-    searched = [one for one in known.values() if isinstance(one, _Search)]
-    highest = max((float(one.violations.max(initial=-np.inf)) for one in known.values()), default=-np.inf)
+        answers[family.name] = search(family) if family.worst is None else family.separated(x)
+    searched = [answer for answer in answers.values() if isinstance(answer, _Search)]
+    highest = max((float(answer.violations.max(initial=-np.inf)) for answer in answers.values()), default=-np.inf)
     _search_harder(searched, highest)
-    separations = ((family, known[family.name]) for family in program.families)
+    separations = ((family, answers[family.name]) for family in program.families)
     return [
-        (family, replace(one.result() if isinstance(one, _Search) else one, formulation=family.formulation))
-        for family, one in separations
+        (family, replace(answer.result() if isinstance(answer, _Search) else answer, formulation=family.formulation))
+        for family, answer in separations
     ]
 
 
@@ -115,7 +115,7 @@ class _Search:
         return self.found.values
 
     def result(self) -> Separation:
-        """What was found."""
+        """Return the worst distinct maxima found so far, with the bound."""
         worst = _distinct(self.found, self.kept)
         return Separation(self.field.indices(worst.points), worst.rows, worst.values, self.bound)
 
@@ -134,14 +134,14 @@ class _Search:
         from sparserob_core.sip.search.search import Rules, Target, maximise
         from sparserob_core.sip.separation.survey import survey_scattered
 
-        field, tools, asked, seen = self.field, self.tools, list[Array](), list[Array]()
+        field, tools, unit_points, violations = self.field, self.tools, list[Array](), list[Array]()
         if not field.dimension or tools.maximiser is None or tools.budget <= 0:
             return
 
         def worst(indices: Array) -> Array:
             values = field.at(indices)
-            asked.append(field.unit(indices))
-            seen.append(values)
+            unit_points.append(field.unit(indices))
+            violations.append(values)
             return np.asarray(values.max(axis=1), dtype=float)
 
         target = Target(worst, field.box)
@@ -149,7 +149,7 @@ class _Search:
         if report.interrupted:
             raise KeyboardInterrupt(report.stopped)
         self.bound = report.upper_bound
-        scattered = survey_scattered(np.concatenate(asked), np.concatenate(seen), self.survey)
+        scattered = survey_scattered(np.concatenate(unit_points), np.concatenate(violations), self.survey)
         self.found = self.found.join(self._refined(scattered))
 
     def _survey(self) -> Survey:
@@ -169,11 +169,11 @@ class _Search:
 
         share = max(2, min(max(REFINED_PER_ROW, self.kept), REFINED // survey.values.shape[1]))
         first = survey.best(share)
-        found = refine(self.field, survey.peaks.take(first))
-        if found.values.max(initial=-np.inf) <= self.threshold:
-            others = ~first & (survey.reach > self.threshold)
-            found = found.join(refine(self.field, survey.peaks.take(others), self.threshold))
-        return found
+        candidates = refine(self.field, survey.peaks.take(first))
+        if candidates.values.max(initial=-np.inf) <= self.threshold:
+            remaining = ~first & (survey.reach > self.threshold)
+            candidates = candidates.join(refine(self.field, survey.peaks.take(remaining), self.threshold))
+        return candidates
 
 
 class _Violation:
@@ -209,12 +209,12 @@ class _Violation:
 
     def at(self, indices: Array) -> Array:
         """Violations ``(k, r)`` at indices ``(k, d)``, in portions that fit into memory."""
-        parts, start = [], 0
+        portions, start = [], 0
         while start < len(indices):
             stop = start + (self.width if start or self.width < LARGEST_ARRAY else min(64, len(indices)))
-            parts.append(self._portion(indices[start:stop]))
-            self.width, start = max(16, LARGEST_ARRAY // max(1, parts[-1].shape[1] * self.x.size)), stop
-        return np.concatenate(parts) if len(parts) != 1 else parts[0]
+            portions.append(self._portion(indices[start:stop]))
+            self.width, start = max(16, LARGEST_ARRAY // max(1, portions[-1].shape[1] * self.x.size)), stop
+        return np.concatenate(portions) if len(portions) != 1 else portions[0]
 
     def _portion(self, indices: Array) -> Array:
         self.deadline.check()
@@ -241,8 +241,8 @@ def _distinct(found: Candidates, kept: int) -> Candidates:
     found = found.take(np.argsort(-found.values, kind="stable"))
     chosen = np.zeros(found.rows.size, dtype=bool)
     for row in np.unique(found.rows):
-        place = np.flatnonzero(found.rows == row)[: MAXIMA_PER_KEPT * kept]
-        points = found.points[place]
+        positions = np.flatnonzero(found.rows == row)[: MAXIMA_PER_KEPT * kept]
+        points = found.points[positions]
         near = np.abs(points[:, np.newaxis] - points).max(axis=2, initial=0.0) <= SAME
-        chosen[place[~np.tril(near, -1).any(axis=1)][:kept]] = True
+        chosen[positions[~np.tril(near, -1).any(axis=1)][:kept]] = True
     return found.take(chosen)

@@ -1,5 +1,5 @@
-"""Where the violation of a family is looked at first: grids, finer ones where they do not resolve it, and the local
-maxima of all points that were evaluated."""
+"""First survey of the violation of a family: grids, finer ones where they do not resolve it, and the local maxima of
+all points that were evaluated."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ class Survey:
         )
 
     def best(self, most: int) -> Truths:
-        """Which peaks are among the ``most`` promising of their row."""
+        """Return a mask of the peaks that are among the ``most`` promising ones of their row."""
         order = np.lexsort((-self.promise, self.peaks.rows))
         rows = self.peaks.rows[order]
         rank = np.arange(rows.size) - np.searchsorted(rows, rows)
@@ -89,32 +89,32 @@ def survey_grid(function: VectorFunction, dimension: int, side: int, threshold: 
 def survey_scattered(points: Array, values: Array, known: Survey | None = None) -> Survey:
     """The local maxima of scattered points ``(k, d)`` with values ``(k, r)``, beside those ``known``: those that
     neither neighbour exceeds for one coordinate, and none of the ``2 d`` nearest points for more."""
-    everything = points if known is None else np.concatenate([points, known.points])
-    every = values if known is None else np.concatenate([values, known.values])
+    all_points = points if known is None else np.concatenate([points, known.points])
+    all_values = values if known is None else np.concatenate([values, known.values])
     count, dimension = points.shape
-    if len(everything) == 1:
-        near, distance = np.zeros((1, 1), dtype=int), np.ones((1, 1))
+    if len(all_points) == 1:
+        neighbours, distance = np.zeros((1, 1), dtype=int), np.ones((1, 1))
     elif dimension == 1:
-        order = np.argsort(everything[:, 0], kind="stable")
-        place = np.empty(order.size, dtype=int)
-        place[order] = np.arange(order.size)
-        sides = place[:count, np.newaxis] + np.array([-1, 1])
-        near = order[np.where(sides < 0, 1, np.where(sides >= order.size, order.size - 2, sides))]
-        distance = np.abs(everything[near, 0] - points)
+        order = np.argsort(all_points[:, 0], kind="stable")
+        rank = np.empty(order.size, dtype=int)
+        rank[order] = np.arange(order.size)
+        sides = rank[:count, np.newaxis] + np.array([-1, 1])
+        neighbours = order[np.where(sides < 0, 1, np.where(sides >= order.size, order.size - 2, sides))]
+        distance = np.abs(all_points[neighbours, 0] - points)
     else:
         from scipy.spatial import cKDTree
 
-        asked = min(2 * dimension + 1, len(everything))
-        distance, near = cKDTree(everything).query(points, k=asked, p=np.inf)
-    beside = every[near]
-    peak = (values >= beside.max(axis=1)) & (values > beside.min(axis=1))
-    peak[values.argmax(axis=0), np.arange(values.shape[1])] = True
-    where, row = np.nonzero(peak)
+        k = min(2 * dimension + 1, len(all_points))
+        distance, neighbours = cKDTree(all_points).query(points, k=k, p=np.inf)
+    neighbour_values = all_values[neighbours]
+    is_peak = (values >= neighbour_values.max(axis=1)) & (values > neighbour_values.min(axis=1))
+    is_peak[values.argmax(axis=0), np.arange(values.shape[1])] = True
+    where, row = np.nonzero(is_peak)
     height = values[where, row]
     radius = np.clip(distance.max(axis=1), 1e-9, 0.5)[where]
     peaks = Candidates(points[where], row, height, radius)
     with np.errstate(invalid="ignore"):
-        rise = np.nan_to_num(height - beside.min(axis=1)[where, row], nan=0.0, posinf=0.0)
+        rise = np.nan_to_num(height - neighbour_values.min(axis=1)[where, row], nan=0.0, posinf=0.0)
     return Survey(points, values, peaks, height, height + rise)
 
 
@@ -131,11 +131,14 @@ class _Level:
         return range(1, self.points.ndim - 1)
 
     def survey(self) -> Survey:
-        """Its points, and those that no neighbour within their block exceeds; not where the block ends within the unit
-        box, for there a neighbour is not known."""
+        """Return the points of the level, and its peaks: the points that no neighbour within their block exceeds.
+
+        A point at an end of its block is no peak unless it is at an end of the unit box too, since a neighbour is
+        unknown. A single block always has a peak for every row, its highest point.
+        """
         values, rows = self.values, self.values.shape[-1]
         highest, lowest, promise, reach = values, values, values.copy(), values.copy()
-        complete = np.ones(self.points.shape[:-1], dtype=bool)
+        is_complete = np.ones(self.points.shape[:-1], dtype=bool)
         for axis in self.axes:
             highest = _window(highest, axis, np.maximum)
             lowest = _window(lowest, axis, np.minimum)
@@ -143,36 +146,40 @@ class _Level:
             reach += _window(np.abs(_second_difference(values, axis)), axis, np.maximum)
             ends = np.zeros(values.shape[axis], dtype=bool)
             ends[[0, -1]] = True
-            here = self.points[..., axis - 1]
-            shape = [-1 if one == axis else 1 for one in range(here.ndim)]
-            complete &= ~ends.reshape(shape) | (here <= 0.0) | (here >= 1.0)
-        peak = complete[..., np.newaxis] & (values >= highest) & (values > lowest)
+            coordinate = self.points[..., axis - 1]
+            shape = [-1 if k == axis else 1 for k in range(coordinate.ndim)]
+            is_complete &= ~ends.reshape(shape) | (coordinate <= 0.0) | (coordinate >= 1.0)
+        is_peak = is_complete[..., np.newaxis] & (values >= highest) & (values > lowest)
         flat = values.reshape(-1, rows)
-        peak = peak.reshape(flat.shape)
+        is_peak = is_peak.reshape(flat.shape)
         if len(values) == 1:  # where nothing rises above anything, still something to return
-            peak[flat.argmax(axis=0), np.arange(rows)] = True
-        where, row = np.nonzero(peak)
+            is_peak[flat.argmax(axis=0), np.arange(rows)] = True
+        where, row = np.nonzero(is_peak)
         points = self.points.reshape(len(flat), -1) if self.axes else np.zeros((1, 0))
         peaks = Candidates(points[where], row, flat[where, row], np.full(where.size, self.spacing))
-        shown = promise.reshape(flat.shape)[where, row], reach.reshape(flat.shape)[where, row]
-        return Survey(points, flat, peaks, *shown)
+        estimates = promise.reshape(flat.shape)[where, row], reach.reshape(flat.shape)[where, row]
+        return Survey(points, flat, peaks, *estimates)
 
     def unresolved(self, worth: float, most: int) -> Array:
-        """At most so many points ``(c, d)`` around which the second differences of the values change from one to the
-        next by about as much as they are, so that a maximum above ``worth`` may hide there; the highest first."""
+        """Return at most ``most`` points ``(c, d)`` around which the level does not resolve the values, the highest
+        first.
+
+        Around such a point, neighbouring second differences differ by about as much as their size, so that a maximum
+        above ``worth`` may hide there.
+        """
         values = self.values
-        reach, coarse = values.copy(), np.zeros(values.shape, dtype=bool)
+        reach, is_coarse = values.copy(), np.zeros(values.shape, dtype=bool)
         for axis in self.axes:
             bend = _second_difference(values, axis)
             size = _window(np.abs(bend), axis, np.maximum)
             change = np.zeros_like(bend)
-            moved, step = np.moveaxis(change, axis, 0), np.abs(np.diff(np.moveaxis(bend, axis, 0)[1:-1], axis=0))
-            moved[1:-2] = step
-            moved[2:-1] = np.maximum(moved[2:-1], step)
-            moved[0], moved[-1] = moved[1], moved[-2]
+            aligned, step = np.moveaxis(change, axis, 0), np.abs(np.diff(np.moveaxis(bend, axis, 0)[1:-1], axis=0))
+            aligned[1:-2] = step
+            aligned[2:-1] = np.maximum(aligned[2:-1], step)
+            aligned[0], aligned[-1] = aligned[1], aligned[-2]
             reach += size
-            coarse |= (change > RESOLVED * size) & (change > worth)
-        high = np.where(coarse & (reach > worth), reach, -np.inf).max(axis=-1).ravel()
+            is_coarse |= (change > RESOLVED * size) & (change > worth)
+        high = np.where(is_coarse & (reach > worth), reach, -np.inf).max(axis=-1).ravel()
         order = np.argsort(-high, kind="stable")[: min(most, int((high > -np.inf).sum()))]
         return self.points.reshape(high.size, -1)[order]
 
@@ -185,8 +192,8 @@ def _level(function: VectorFunction, corners: Array, side: int, spacing: float) 
     if count == 1:
         values = function(flat)
     else:
-        once, which = np.unique(flat, axis=0, return_inverse=True)
-        values = function(once)[which.reshape(-1)]
+        unique_points, inverse = np.unique(flat, axis=0, return_inverse=True)
+        values = function(unique_points)[inverse.reshape(-1)]
     shape = (count, *[side] * dimension)
     return _Level(flat.reshape(*shape, dimension), values.reshape(*shape, -1), spacing)
 
@@ -200,30 +207,30 @@ def _joined(surveys: Sequence[Survey]) -> Survey:
 
 def _window(values: Array, axis: int, of: Callable[..., Array]) -> Array:
     """The maximum, or the minimum, of every entry and its two neighbours along an axis."""
-    moved = np.moveaxis(values.copy(), axis, 0)
+    extremes = np.moveaxis(values.copy(), axis, 0)
     original = np.moveaxis(values, axis, 0)
-    of(moved[1:], original[:-1], out=moved[1:])
-    of(moved[:-1], original[1:], out=moved[:-1])
-    return np.moveaxis(moved, 0, axis)
+    of(extremes[1:], original[:-1], out=extremes[1:])
+    of(extremes[:-1], original[1:], out=extremes[:-1])
+    return np.moveaxis(extremes, 0, axis)
 
 
 def _second_difference(values: Array, axis: int) -> Array:
     """The second difference at every entry along an axis; 0 at both ends, and where it is no number."""
-    moved = np.moveaxis(values, axis, 0)
-    bend = np.zeros_like(moved)
+    aligned = np.moveaxis(values, axis, 0)
+    bend = np.zeros_like(aligned)
     with np.errstate(invalid="ignore", over="ignore"):
-        inner = moved[2:] - 2 * moved[1:-1] + moved[:-2]
+        inner = aligned[2:] - 2 * aligned[1:-1] + aligned[:-2]
     bend[1:-1] = np.where(np.isfinite(inner), inner, 0.0)
     return np.moveaxis(bend, 0, axis)
 
 
 def _peak_above(values: Array, axis: int) -> Array:
-    """How far the parabola through three neighbours rises above the middle one, at most as far as its neighbours lie
-    below."""
-    moved = np.moveaxis(values, axis, 0)
-    rise = np.zeros_like(moved)
+    """Return the rise of the parabola through three neighbours above the middle one, at most as far as both neighbours
+    together lie below it."""
+    aligned = np.moveaxis(values, axis, 0)
+    rise = np.zeros_like(aligned)
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
-        bend = 2 * moved[1:-1] - moved[:-2] - moved[2:]
-        peak = (moved[2:] - moved[:-2]) ** 2 / (8 * bend)
+        bend = 2 * aligned[1:-1] - aligned[:-2] - aligned[2:]
+        peak = (aligned[2:] - aligned[:-2]) ** 2 / (8 * bend)
         rise[1:-1] = np.where((bend > 0) & np.isfinite(peak), np.minimum(peak, bend), 0.0)
     return np.moveaxis(rise, 0, axis)

@@ -1,9 +1,10 @@
-"""One block eliminated from a Newton system: what it leaves of its parts, and solutions with its matrix.
+"""Elimination of one block from a Newton system: its share of the Schur complement, and solutions with its matrix.
 
-The matrix of a block of ``n`` variables is ``M = D + A' W A``: ``D`` diagonal, of absolute values in which one variable
-stands alone, and ``A (k, n)`` of the few in which several stand. Its coupling to the parts is ``B``. ``M u = r`` is
-``D u + A' y = r`` and ``A u - W^-1 y = 0``, whose pivots are the diagonal as far as that is safe, and then the rows: so
-a block with few rows costs ``k n`` instead of ``n^2`` operations for a part, and the Newton step about a quarter.
+The matrix of a block of ``n`` variables is ``M = D + A' W A``. ``D`` is the diagonal of the absolute values that hold a
+single variable; ``A (k, n)`` has the few that hold several. The coupling of the block to the parts is ``B``.
+``M u = r`` is ``D u + A' y = r`` and ``A u - W^-1 y = 0``. The pivots are the diagonal as far as that is safe, and then
+the rows. A block with few rows therefore costs ``k n`` instead of ``n^2`` operations for a part, and the Newton step
+about a quarter.
 """
 
 from __future__ import annotations
@@ -39,7 +40,8 @@ class Eliminated(Protocol):
 
 @final
 class Left:
-    """What blocks leave of their ``parts``: the sum of ``B' M^-1 B``, products of tall matrices made at once."""
+    """Contribution of eliminated blocks to the Schur complement over their ``parts``: the sum of ``B' M^-1 B``. Tall
+    matrices are multiplied at once."""
 
     def __init__(self, parts: int) -> None:
         self.parts = parts
@@ -69,9 +71,9 @@ class Left:
 
     def total(self) -> Array:
         """The sum."""
-        for sign, found in ((1.0, self._more), (-1.0, self._less)):
-            if found:
-                tall = np.vstack(found)
+        for sign, matrices in ((1.0, self._more), (-1.0, self._less)):
+            if matrices:
+                tall = np.vstack(matrices)
                 self._total += sign * (tall.T @ tall)
         self._total += self._cross + self._cross.T
         self._total.reshape(-1)[:: self.parts + 1] += self._diagonal
@@ -93,9 +95,9 @@ class Whole:
     def forward(self, r: Array) -> tuple[State, Array]:
         """A right-hand side among the pivots, and what it makes of the parts."""
         block, u = self.block, self._solved(r)
-        parts: Array = np.bincount(block.columns, self.single * u[block.of], self.parts).astype(float)
-        parts += np.bincount(block.mixed, self.rows @ u, self.parts)
-        return (r,), parts
+        reduced_rhs: Array = np.bincount(block.columns, self.single * u[block.of], self.parts).astype(float)
+        reduced_rhs += np.bincount(block.mixed, self.rows @ u, self.parts)
+        return (r,), reduced_rhs
 
     def back(self, state: State, parts: Array) -> Array:
         """The variables."""
@@ -105,8 +107,8 @@ class Whole:
 
     def _solved(self, r: Array) -> Array:
         lapack = _lapack()
-        one, _ = lapack.dtrtrs(self.factor, r, lower=1)
-        u, _ = lapack.dtrtrs(self.factor, one, lower=1, trans=1)
+        intermediate, _ = lapack.dtrtrs(self.factor, r, lower=1)
+        u, _ = lapack.dtrtrs(self.factor, intermediate, lower=1, trans=1)
         return np.asarray(u)
 
 
@@ -133,19 +135,19 @@ class Lean:
         """A right-hand side among the pivots, and what it makes of the parts."""
         lapack = _lapack()
         block, u = self.block, self.inverse * r
-        parts = np.zeros(self.Q.shape[1])
-        parts[block.columns] = self.single * u[block.of]
+        reduced_rhs = np.zeros(self.Q.shape[1])
+        reduced_rhs[block.columns] = self.single * u[block.of]
         if not block.at.size:
-            return (r,), parts
+            return (r,), reduced_rhs
         q = block.A @ u
         y, _ = lapack.dtrtrs(self.T, q, lower=1)
-        parts[block.mixed] += self.kept * q
-        parts -= y @ self.Q
+        reduced_rhs[block.mixed] += self.kept * q
+        reduced_rhs -= y @ self.Q
         v = r[self.others]
         if v.size:
             v, _ = lapack.dtrtrs(self.H, v - self.Z.T @ y, lower=1)
-            parts += v @ self.R
-        return (r, y, v), parts
+            reduced_rhs += v @ self.R
+        return (r, y, v), reduced_rhs
 
     def back(self, state: State, parts: Array) -> Array:
         """The variables."""
@@ -168,8 +170,8 @@ class Lean:
 def eliminate(block: Block, D: Array, weight: Array, lean: Array, left: Left) -> Eliminated:
     """A block eliminated, and what it leaves added to ``left``. ``D (n,)``: the diagonal; of all absolute values:
     ``weight (J,)``, and ``lean (J,)``, by which its part is coupled to it."""
-    found = _lean(block, D, weight, lean, left) if block.once and D.size > LARGE else None
-    return _whole(block, D, weight, lean, left) if found is None else found
+    lean_block = _lean(block, D, weight, lean, left) if block.once and D.size > LARGE else None
+    return _whole(block, D, weight, lean, left) if lean_block is None else lean_block
 
 
 def _whole(block: Block, D: Array, weight: Array, lean: Array, left: Left) -> Whole:
@@ -201,44 +203,44 @@ def _lean(block: Block, D: Array, weight: Array, lean: Array, left: Left) -> Lea
     lapack = _lapack()
     A, w, m = block.A, weight[block.at], lean[block.at]
     k, n = A.shape
-    others = np.flatnonzero(~block.alone | (SAFE * (w @ (A * A)) > D))
-    if k + others.size > SPARE * n:
+    unsafe = np.flatnonzero(~block.alone | (SAFE * (w @ (A * A)) > D))
+    if k + unsafe.size > SPARE * n:
         return None
     inverse = 1.0 / D
-    inverse[others] = 0.0
+    inverse[unsafe] = 0.0
     AD = A * inverse
     T = AD @ A.T
     diagonal = T.reshape(-1)[:: k + 1]
-    great = w * diagonal > 1.0
-    kept = np.where(great, 0.0, m)
+    is_heavy = w * diagonal > 1.0
+    kept = np.where(is_heavy, 0.0, m)
     single = block.value * lean[block.single]
     left.at(block.columns, single * single * inverse[block.of])
-    left.at(block.mixed, np.where(great, m * m / w, 0.0))
+    left.at(block.mixed, np.where(is_heavy, m * m / w, 0.0))
     Q = np.zeros((k, left.parts))
     Q[:, block.columns] = AD[:, block.of] * single
     rows = kept[:, None] * Q
     rows[:, block.mixed] += kept[:, None] * T * kept / 2.0
     left.cross(block.mixed, rows)
-    among = T * kept
-    among.reshape(-1)[:: k + 1] -= np.where(great, m / w, 0.0)
-    Q[:, block.mixed] += among
+    coupling = T * kept
+    coupling.reshape(-1)[:: k + 1] -= np.where(is_heavy, m / w, 0.0)
+    Q[:, block.mixed] += coupling
     diagonal += 1.0 / w
     T = cholesky(T)
     Q, _ = lapack.dtrtrs(T, Q, lower=1)
     left.less(Q)
-    Z, _ = lapack.dtrtrs(T, A[:, others], lower=1)
-    H, R = Z.T @ Z, np.zeros((others.size, left.parts))
-    if others.size:
-        H.reshape(-1)[:: others.size + 1] += D[others]
+    Z, _ = lapack.dtrtrs(T, A[:, unsafe], lower=1)
+    H, R = Z.T @ Z, np.zeros((unsafe.size, left.parts))
+    if unsafe.size:
+        H.reshape(-1)[:: unsafe.size + 1] += D[unsafe]
         H = cholesky(H)
-        place = np.full(n, -1)
-        place[others] = np.arange(others.size)
-        at = np.flatnonzero(place[block.of] >= 0)
-        R[place[block.of[at]], block.columns[at]] = single[at]
-        R[:, block.mixed] += A[:, others].T * kept
+        position = np.full(n, -1)
+        position[unsafe] = np.arange(unsafe.size)
+        entries = np.flatnonzero(position[block.of] >= 0)
+        R[position[block.of[entries]], block.columns[entries]] = single[entries]
+        R[:, block.mixed] += A[:, unsafe].T * kept
         R, _ = lapack.dtrtrs(H, R - Z.T @ Q, lower=1)
         left.more(R)
-    return Lean(block, inverse, single, kept, others, T, Q, Z, H, R)
+    return Lean(block, inverse, single, kept, unsafe, T, Q, Z, H, R)
 
 
 @cache
@@ -252,11 +254,11 @@ def _lapack() -> Any:
 def cholesky(M: Array) -> Array:
     """The lower factor of a positive definite matrix, whose diagonal is enlarged until it is one."""
     lapack = _lapack()
-    diagonal, grown = M.reshape(-1)[:: M.shape[0] + 1], GREATER
-    while grown < 1e-6:
-        diagonal *= 1.0 + grown
+    diagonal, increase = M.reshape(-1)[:: M.shape[0] + 1], GREATER
+    while increase < 1e-6:
+        diagonal *= 1.0 + increase
         factor, info = lapack.dpotrf(M, lower=1, clean=1)
         if not info:
             return np.asarray(factor)
-        grown *= 100.0
+        increase *= 100.0
     raise np.linalg.LinAlgError

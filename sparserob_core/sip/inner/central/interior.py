@@ -74,22 +74,26 @@ class Interior:
 
     @property
     def approximate(self) -> bool:
-        """Whether an answer can be as accurate as is asked for."""
+        """Always true: the accuracy of an answer can be chosen."""
         return True
 
     @property
     def many(self) -> bool:
-        """Whether there may be so many variables that it is worth it."""
+        """True where the program has so many variables that this method may be faster than the simplex method."""
         return self._layout.many
 
     def fits(self) -> bool:
-        """Whether cost and rows are of the kind that this knows, and so many variables that it is worth it."""
+        """Return whether this method can solve the program, and is worth it.
+
+        The deviations must be a box, no row exact, and the cost without a matrix or norms of blocks; `Layout.fits`
+        checks the rest.
+        """
         plain = self.spread.is_box and not any(block.exact for block in self.blocks)
         plain = plain and self.program.P is None and self.program.blocks is None
         return plain and self._layout.fits()
 
     def sharpen(self, x: Array) -> bool:
-        """Nothing stands for the rows but they themselves."""
+        """Return ``False``: the method has the rows themselves, with no finite set of points that could grow."""
         return False
 
     def solve(self, margin: float, accuracy: float, seconds: float = np.inf) -> RobustAnswer:
@@ -100,21 +104,21 @@ class Interior:
             self._change(margin)
         if self._stale:
             self._extend(margin)
-        first, left = self._limits.size, np.inf
+        first, predicted_error = self._limits.size, np.inf
         self._h[first:] = self._layout.h - self._layout.rest - margin
         with np.errstate(all="ignore"), one_thread():  # threads for thousands of small matrices wait for each other
             for _ in range(STEPS):
-                gap, lost, missed = self._residuals()
-                close = gap + lost <= accuracy or gap <= SPENT * accuracy
+                gap, dual_error, primal_residual = self._residuals()
+                close = gap + dual_error <= accuracy or gap <= SPENT * accuracy
                 # half of the gap that is small enough: one that only tends to it is met by chance. Smaller products
                 # would make steps short while residuals are still large; where these are rounding, only they help
-                enough = SPENT if lost > 2.0 * left else 1.0
-                self._floor = 0.5 * enough * accuracy / (self._y.size + 2 * self._plus.size)
-                if close and missed <= max(MET, SPENT * accuracy):
+                share = SPENT if dual_error > 2.0 * predicted_error else 1.0
+                self._floor = 0.5 * share * accuracy / (self._y.size + 2 * self._plus.size)
+                if close and primal_residual <= max(MET, SPENT * accuracy):
                     return self._answer(True, "interior point method: optimal")
                 if not self._y.max() < ENDLESS or not self._step():
                     return self._answer(False, "the interior point method came to a halt")
-                left = (1.0 - self._went) * lost
+                predicted_error = (1.0 - self._went) * dual_error
                 if time.monotonic() > until:
                     return self._answer(False, "the interior point method is out of time")
                 self.steps += 1
@@ -123,10 +127,10 @@ class Interior:
     def _change(self, margin: float) -> None:
         """Go on with another margin: where the last solve with it ended, for the way back from rows that were tightened
         for one decision is as long as the way there, or else in the middle of rows that the difference violates."""
-        here = self._mu, self._z, self._f, self._s, self._y, self._plus, self._minus, self._alpha, self._beta
-        there, self._elsewhere = self._elsewhere, (self._margin, here)
-        if there is not None and there[0] == margin:
-            self._mu, self._z, self._f, self._s, self._y, self._plus, self._minus, self._alpha, self._beta = there[1]
+        current = self._mu, self._z, self._f, self._s, self._y, self._plus, self._minus, self._alpha, self._beta
+        stored, self._elsewhere = self._elsewhere, (self._margin, current)
+        if stored is not None and stored[0] == margin:
+            self._mu, self._z, self._f, self._s, self._y, self._plus, self._minus, self._alpha, self._beta = stored[1]
         else:
             self._tightened = max(0.0, margin - self._margin)
         self._margin, self._stale = margin, True
@@ -154,9 +158,9 @@ class Interior:
         self._limits = np.concatenate([high[up], -low[down], np.zeros(2 * split.size)])
         self._z, self._f = np.zeros(self._size), np.zeros(self._layout.answering.size)
         self._z[:n], self._z[n:] = np.clip(0.0, low, high), ROOM
-        far = np.maximum(np.abs(program.lower), np.abs(program.upper))
-        far = np.where(np.isfinite(far), far, ROOM)
-        self._reach = np.concatenate([far[joint], np.full(split.size, ROOM)]), far[self._layout.answering]
+        reach = np.maximum(np.abs(program.lower), np.abs(program.upper))
+        reach = np.where(np.isfinite(reach), reach, ROOM)
+        self._reach = np.concatenate([reach[joint], np.full(split.size, ROOM)]), reach[self._layout.answering]
         self._mu = FIRST * max(float(np.abs(self._c).max(initial=0.0)), TINY)
         self._s = np.maximum(self._limits - self._plain @ self._z, ROOM)
         self._y = self._mu / self._s
@@ -180,42 +184,45 @@ class Interior:
         a = L.C @ self._f + L.offset
         worst = np.bincount(L.part, L.radius * np.abs(a), L.parts)
         free = self._h[first:] - self._g @ self._z - L.scale * worst[L.of]
-        many = np.bincount(L.part, minlength=L.parts) + 2.0  # a slack is as large as that of each absolute value
+        counts = np.bincount(L.part, minlength=L.parts) + 2.0  # a slack is as large as that of each absolute value
         violation = max(self._tightened, -float(free[had:].min(initial=0.0)))
         before: Array = np.bincount(L.of[:had], L.scale[:had] * self._y[first:], L.parts).astype(float)
         if had:
-            aim = SLACK * violation * float(self._y[first:].max()) / float(many.max())
+            aim = SLACK * violation * float(self._y[first:].max()) / float(counts.max())
             self._mu = max(self._mu, aim)
             # the smaller one grows: the other would leave residuals as large as what it is
             self._s = np.where(self._y > self._s, np.maximum(self._s, self._mu / self._y), self._s)
             self._y = np.maximum(self._y, self._mu / self._s)
         else:
             violation = max(ROOM, AROUND * violation)
-        self._appear(had, before, a, free, np.maximum(free, violation) / many[L.of])
+        self._appear(had, before, a, free, np.maximum(free, violation) / counts[L.of])
         self._stale, self._tightened = False, 0.0
 
     def _appear(self, had: int, before: Array, a: Array, free: Array, room: Array) -> None:
         """Slacks and multipliers of new rows, and those of all absolute values; ``room (r,)``: what a row of this
         freedom ``free`` has as slack in the middle."""
         L, first = self._layout, self._limits.size
-        y, old = np.concatenate([self._y[first:], self._mu / room[had:]]), self._plus.size
+        y, old_count = np.concatenate([self._y[first:], self._mu / room[had:]]), self._plus.size
         eta = np.bincount(L.of, L.scale * y, L.parts)
-        weight = (eta / np.maximum(before, TINY))[L.part[:old]]
+        weight = (eta / np.maximum(before, TINY))[L.part[:old_count]]
         self._alpha, self._beta = weight * self._alpha, weight * self._beta
         near = np.where(self._alpha > self._beta, self._plus, self._minus)
         price = np.maximum(self._alpha, self._beta)
-        grown = np.where(price > near, np.maximum(self._mu / price - near, 0.0), 0.0)
-        self._plus, self._minus = self._plus + grown, self._minus + grown
-        most = np.full(L.parts, np.inf)
-        np.minimum.at(most, L.of, room / np.maximum(L.scale, TINY))
-        t = np.abs(a) + np.minimum(self._mu / np.maximum(eta, TINY), most)[L.part] / L.radius
-        t[:old] = (self._plus + self._minus) / 2
+        increase = np.where(price > near, np.maximum(self._mu / price - near, 0.0), 0.0)
+        self._plus, self._minus = self._plus + increase, self._minus + increase
+        bounds = np.full(L.parts, np.inf)
+        np.minimum.at(bounds, L.of, room / np.maximum(L.scale, TINY))
+        t = np.abs(a) + np.minimum(self._mu / np.maximum(eta, TINY), bounds)[L.part] / L.radius
+        t[:old_count] = (self._plus + self._minus) / 2
         used = np.bincount(L.part, L.radius * (t - np.abs(a)), L.parts)
-        left = np.maximum(free - L.scale * used[L.of], room)[had:]
-        self._s = np.concatenate([self._s, left])
-        self._y = np.concatenate([self._y, self._mu / left])
-        self._plus, self._minus = np.append(self._plus, (t - a)[old:]), np.append(self._minus, (t + a)[old:])
-        none = np.zeros(t.size - old)
+        slacks = np.maximum(free - L.scale * used[L.of], room)[had:]
+        self._s = np.concatenate([self._s, slacks])
+        self._y = np.concatenate([self._y, self._mu / slacks])
+        self._plus, self._minus = (
+            np.append(self._plus, (t - a)[old_count:]),
+            np.append(self._minus, (t + a)[old_count:]),
+        )
+        none = np.zeros(t.size - old_count)
         self._alpha = np.maximum(np.append(self._alpha, none), self._mu / self._plus)
         self._beta = np.maximum(np.append(self._beta, none), self._mu / self._minus)
 
@@ -232,35 +239,37 @@ class Interior:
         gap = float(self._y @ self._s + self._alpha @ self._plus + self._beta @ self._minus)
         self._mu = gap / (self._y.size + 2 * self._plus.size)
         weight, _, slope = self._balanced(eta)
-        lost = float(np.abs(self._rz) @ self._reach[0] + (weight - eta) @ self._room + np.abs(slope) @ self._reach[1])
-        return gap, lost, float(np.abs(self._rp).max())
+        dual_error = float(
+            np.abs(self._rz) @ self._reach[0] + (weight - eta) @ self._room + np.abs(slope) @ self._reach[1]
+        )
+        return gap, dual_error, float(np.abs(self._rp).max())
 
     def _step(self) -> bool:
-        """One step towards the optimum; whether one was possible."""
+        """Take one step towards the optimum; return whether a step was possible."""
         try:
             self._factorise()
         except np.linalg.LinAlgError:
             return False
         values, prices = (self._s, self._plus, self._minus), (self._y, self._alpha, self._beta)
         products = [value * price for value, price in zip(values, prices, strict=True)]
-        predicted = self._direction(*(-one for one in products))
+        predicted = self._direction(*(-product for product in products))
         changes = list(zip(values, prices, *_moves(predicted), strict=True))
-        primal, dual = (_length(one, 1.0) for one in self._relative(predicted))
+        primal, dual = (_length(change, 1.0) for change in self._relative(predicted))
         after = sum(float((s + primal * ds) @ (y + dual * dy)) for s, y, ds, dy in changes)
-        share = after / sum(float(one.sum()) for one in products)
+        share = after / sum(float(product.sum()) for product in products)
         aim = max(self._mu * min(1.0, max(share, 0.0)) ** 3, self._floor)
         terms = [aim - s * y - ds * dy for s, y, ds, dy in changes]
         move, primal, dual = self._between(predicted, self._direction(*terms), primal * dual)
         for _ in range(CORRECTIONS):  # products that a longer step would make far from the middle are brought back
             if min(primal, dual) > 0.9:
                 break
-            further = min(1.0, primal + FURTHER), min(1.0, dual + FURTHER)
+            longer = min(1.0, primal + FURTHER), min(1.0, dual + FURTHER)
             changes = list(zip(values, prices, *_moves(move), strict=True))
-            terms = [s * dy + y * ds + _back(s, y, ds, dy, *further, aim) for s, y, ds, dy in changes]
-            other, *lengths = self._between(move, self._direction(*terms), primal * dual)
+            terms = [s * dy + y * ds + _back(s, y, ds, dy, *longer, aim) for s, y, ds, dy in changes]
+            candidate, *lengths = self._between(move, self._direction(*terms), primal * dual)
             if not sum(lengths) > primal + dual + 0.01:
                 break
-            move, (primal, dual) = other, lengths
+            move, (primal, dual) = candidate, lengths
         if not max(primal, dual) > 1e-8 or not np.isfinite(move[1]).all():
             return False
         dz, df, ds, dy, dplus, dminus, dalpha, dbeta = move
@@ -271,18 +280,21 @@ class Interior:
         return True
 
     def _between(self, move: Direction, corrected: Direction, least: float) -> tuple[Direction, float, float]:
-        """As much of a correction as makes the longest step, of slacks and of multipliers each, with their lengths:
-        what is corrected is what a whole step would do, and short ones need less of it (Colombo and Gondzio 2008)."""
+        """Return a direction with a share of a correction, and the step lengths of the slacks and of the multipliers.
+
+        For each of the two, the share of the correction is the one with the longest step. A correction is computed for
+        a whole step, so that a short step needs less of it (Colombo and Gondzio 2008).
+        """
         lengths, weights = list[float](), list[float]()
         for before, after in zip(self._relative(move), self._relative(corrected), strict=True):
-            tried = np.linspace(1.0, max(least, LEAST), SHARES).tolist()
-            length, weight = max((_length(before + one * (after - before), SHARE), one) for one in tried)
+            trial_shares = np.linspace(1.0, max(least, LEAST), SHARES).tolist()
+            length, weight = max((_length(before + share * (after - before), SHARE), share) for share in trial_shares)
             lengths.append(length)
             weights.append(weight)
         primal, dual = weights
         shares = (primal, primal, primal, dual, primal, primal, dual, dual)
-        found = tuple(a + share * (b - a) for a, b, share in zip(move, corrected, shares, strict=True))
-        return cast(Direction, found), lengths[0], lengths[1]
+        combined = tuple(a + share * (b - a) for a, b, share in zip(move, corrected, shares, strict=True))
+        return cast(Direction, combined), lengths[0], lengths[1]
 
     def _relative(self, move: Direction) -> tuple[Array, Array]:
         """The changes of all slacks and of all multipliers, relative to what they are."""
@@ -307,11 +319,11 @@ class Interior:
         diagonal = PROXIMAL + L.squares @ self._weight
         self._eliminated: list[tuple[Block, Eliminated, np.ndarray]] = []
         for group in L.groups:
-            left = Left(group.parts.size)
+            contribution = Left(group.parts.size)
             for block in group.blocks:
-                found = eliminate(block, diagonal[block.first : block.last], self._weight, lean, left)
-                self._eliminated.append((block, found, group.parts))
-            S[np.ix_(group.parts, group.parts)] += left.total()
+                eliminated = eliminate(block, diagonal[block.first : block.last], self._weight, lean, contribution)
+                self._eliminated.append((block, eliminated, group.parts))
+            S[np.ix_(group.parts, group.parts)] += contribution.total()
         self._D = self._y / self._s
         W = (L.scale[:, None] * S[np.ix_(L.of, L.of)]) * L.scale
         W.reshape(-1)[:: L.of.size + 1] += 1.0 / self._D[first:]
@@ -332,9 +344,9 @@ class Interior:
         kappa = np.bincount(L.part, L.radius * pull / self._both, L.parts)
         states = list[State]()
         for block, eliminated, parts in self._eliminated:
-            state, found = eliminated.forward(rhs[block.first : block.last])
+            state, reduced_rhs = eliminated.forward(rhs[block.first : block.last])
             states.append(state)
-            kappa[parts] += found
+            kappa[parts] += reduced_rhs
         lifted, _ = lapack.dtrtrs(self._W, self._rp[first:] + L.scale * kappa[L.of] + k[first:] / D[first:], lower=1)
         right = self._rz + self._plain.T @ (D[:first] * self._rp[:first] + k[:first]) + self._Y.T @ lifted
         dz, _ = lapack.dpotrs(self._K, -right, lower=1)
@@ -405,6 +417,7 @@ def _moves(move: Direction) -> tuple[tuple[Array, Array, Array], tuple[Array, Ar
 
 
 def _back(value: Array, price: Array, dvalue: Array, dprice: Array, primal: float, dual: float, aim: float) -> Array:
-    """What brings products that a longer step would make far from ``aim`` back to its neighbourhood."""
+    """Return corrections that bring products back to ``[0.1 aim, 10 aim]`` where a longer step would take them
+    outside."""
     product = (value + primal * dvalue) * (price + dual * dprice)
     return np.clip(np.clip(product, 0.1 * aim, 10.0 * aim) - product, -10.0 * aim, 10.0 * aim)

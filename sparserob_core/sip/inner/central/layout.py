@@ -108,9 +108,9 @@ class Layout:
         from scipy.sparse import csr_array, vstack
 
         self.entry, self.part, self.offset, self.radius = (
-            np.concatenate(one) for one in zip(*self._values, strict=True)
+            np.concatenate(arrays) for arrays in zip(*self._values, strict=True)
         )
-        row, variable, value = (np.concatenate(one) for one in zip(*self._entries, strict=True))
+        row, variable, value = (np.concatenate(arrays) for arrays in zip(*self._entries, strict=True))
         kept = self.label is not None and self._hang_together(row, variable)
         if not kept:
             self._partition(row, variable)
@@ -119,10 +119,10 @@ class Layout:
         self.single = np.flatnonzero(np.diff(self.C.indptr) == 1)
         alone = np.concatenate([block.single for block in self.blocks])
         at = self.C.indptr[alone]
-        place = (self.C.data[at] ** 2, (self.C.indices[at], alone))
-        self.squares = csr_array(place, shape=(self.answering.size, self.count))
+        entries = (self.C.data[at] ** 2, (self.C.indices[at], alone))
+        self.squares = csr_array(entries, shape=(self.answering.size, self.count))
         self.of, self.scale, self.h = (
-            np.concatenate(one) for one in ([rows[i] for rows in self._rows] for i in (1, 2, 3))
+            np.concatenate(arrays) for arrays in ([rows[i] for rows in self._rows] for i in (1, 2, 3))
         )
         self.g = csr_array(vstack([rows[0] for rows in self._rows]).tocsc()[:, self.joint])
         self.rest = self.scale * np.array(self._rests)[self.of]
@@ -131,10 +131,10 @@ class Layout:
 
     def _hang_together(self, row: np.ndarray, variable: np.ndarray) -> bool:
         assert self.label is not None
-        new = row >= self.taken
+        is_new = row >= self.taken
         Q = self.spread.size
-        return bool((self.label[Q + variable[new]] == self.label[self.entry[row[new]]]).all()) and bool(
-            (self._place[variable[new]] >= 0).all()
+        return bool((self.label[Q + variable[is_new]] == self.label[self.entry[row[is_new]]]).all()) and bool(
+            (self._place[variable[is_new]] >= 0).all()
         )
 
     def _partition(self, row: np.ndarray, variable: np.ndarray) -> None:
@@ -146,8 +146,8 @@ class Layout:
         _, self.label = connected_components(graph, directed=False)
         answers = np.zeros(n, dtype=bool)
         answers[variable] = True
-        self.joint, mine = np.flatnonzero(~answers), np.flatnonzero(answers)
-        self.answering = mine[np.argsort(self.label[Q + mine], kind="stable")]
+        self.joint, answering = np.flatnonzero(~answers), np.flatnonzero(answers)
+        self.answering = answering[np.argsort(self.label[Q + answering], kind="stable")]
         self._place = np.full(n, -1)
         self._place[self.answering] = np.arange(self.answering.size)
         _, starts, self._of = np.unique(self.label[Q + self.answering], return_index=True, return_inverse=True)
@@ -155,27 +155,27 @@ class Layout:
         self.taken, self.blocks = 0, []
 
     def _blocks(self) -> None:
-        """Of every block the absolute values, those that are new behind the others."""
+        """Append the new absolute values of every block to its earlier ones, and form the groups anew."""
         fresh = np.arange(self.taken, self.count)
         fresh = fresh[np.diff(self.C.indptr)[self.taken :] > 0]
-        one = np.diff(self.C.indptr)[fresh] == 1
+        is_single = np.diff(self.C.indptr)[fresh] == 1
         number = self._of[self.C.indices[self.C.indptr[fresh]]]
         order = np.argsort(number, kind="stable")
         cuts = np.searchsorted(number[order], np.arange(self.starts.size))
         for b in range(self.starts.size - 1):
             first, last = int(self.starts[b]), int(self.starts[b + 1])
-            mine = order[cuts[b] : cuts[b + 1]]
-            single, at = fresh[mine[one[mine]]], fresh[mine[~one[mine]]]
+            positions = order[cuts[b] : cuts[b + 1]]
+            single, at = fresh[positions[is_single[positions]]], fresh[positions[~is_single[positions]]]
             A = np.zeros((at.size, last - first))
             for i, j in enumerate(at.tolist()):
-                place = slice(self.C.indptr[j], self.C.indptr[j + 1])
-                A[i, self.C.indices[place] - first] = self.C.data[place]
+                entries = slice(self.C.indptr[j], self.C.indptr[j + 1])
+                A[i, self.C.indices[entries] - first] = self.C.data[entries]
             if b == len(self.blocks):
                 self.blocks.append(Block(first, last, single, at, A))
             else:
-                old = self.blocks[b]
-                old.single, old.at = np.concatenate([old.single, single]), np.concatenate([old.at, at])
-                old.A = np.vstack([old.A, A])
+                block = self.blocks[b]
+                block.single, block.at = np.concatenate([block.single, single]), np.concatenate([block.at, at])
+                block.A = np.vstack([block.A, A])
         self.taken = self.count
         self._group()
 
@@ -184,12 +184,12 @@ class Layout:
         self.groups: list[Group] = []
         open_, union = list[Block](), np.zeros(0, dtype=int)
         for block in self.blocks:
-            mine = np.unique(self.part[np.concatenate([block.single, block.at])])
-            both = np.union1d(union, mine)
-            if open_ and both.size > ALIKE * min(union.size, mine.size) + 4:
+            parts = np.unique(self.part[np.concatenate([block.single, block.at])])
+            merged = np.union1d(union, parts)
+            if open_ and merged.size > ALIKE * min(union.size, parts.size) + 4:
                 self._close(open_, union)
-                open_, both = [], mine
-            open_, union = [*open_, block], both
+                open_, merged = [], parts
+            open_, union = [*open_, block], merged
         self._close(open_, union)
 
     def _close(self, blocks: list[Block], parts: np.ndarray) -> None:
@@ -198,33 +198,38 @@ class Layout:
             block.of, block.value = self.C.indices[places] - block.first, self.C.data[places]
             block.columns = np.searchsorted(parts, self.part[block.single])
             block.mixed = np.searchsorted(parts, self.part[block.at])
-            block.once = all(np.unique(one).size == one.size for one in (block.columns, block.mixed))
+            block.once = all(np.unique(numbers).size == numbers.size for numbers in (block.columns, block.mixed))
             block.alone = np.bincount(block.of, minlength=block.last - block.first) <= 1
         self.groups.append(Group(tuple(blocks), parts))
 
     @property
     def many(self) -> bool:
-        """Whether there are so many variables in all."""
+        """True where the program has at least `WORTH` variables."""
         return self.program.n >= WORTH
 
     def fits(self) -> bool:
-        """Whether there are many variables, in small blocks, and nothing beside them that is not known here."""
+        """Return whether the interior point method suits the program: many answering variables, and small blocks of
+        them.
+
+        The program must have no equalities, matrix of the cost, image, plain rows or fixed variables, and no costs or
+        plain coefficients of answering variables. The rows are arranged for the answer.
+        """
         program = self.program
         if not self.count or not self.many or program.b.size or program.P is not None or program.S is not None:
             return False
         if program.G.shape[0] or not (program.lower < program.upper).all():
             return False
         self.arrange()
-        mine = self.answering
-        plain = not program.weights[mine].any() and not program.q[mine].any()
-        plain = plain and not any(rows[0].tocsc()[:, mine].nnz for rows in self._rows)
-        return plain and mine.size >= WORTH and int(np.diff(self.starts).max()) <= LARGEST
+        answering = self.answering
+        plain = not program.weights[answering].any() and not program.q[answering].any()
+        plain = plain and not any(rows[0].tocsc()[:, answering].nnz for rows in self._rows)
+        return plain and answering.size >= WORTH and int(np.diff(self.starts).max()) <= LARGEST
 
 
 def _digest(*arrays: np.ndarray) -> bytes:
     """A short name of arrays, the same for equal ones."""
-    found = hashlib.blake2b(digest_size=16)
+    hasher = hashlib.blake2b(digest_size=16)
     for array in arrays:
-        found.update(array.size.to_bytes(8, "little"))
-        found.update(np.ascontiguousarray(array).data)
-    return found.digest()
+        hasher.update(array.size.to_bytes(8, "little"))
+        hasher.update(np.ascontiguousarray(array).data)
+    return hasher.digest()

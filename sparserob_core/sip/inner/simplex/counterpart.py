@@ -85,9 +85,12 @@ class RobustAnswer:
 @final
 @dataclass(frozen=True, eq=False)
 class _Part:
-    """What stands for the worst case of one part: ``columns`` times ``sizes``, and a ``constant``; ``entries`` of the
-    deviations and the numbers ``at`` of the equalities whose multipliers say them. For sets that are no boxes, of every
-    block its entries, its variable, its known points and the numbers of their rows."""
+    """Linear expression of the worst case of one part: the variables ``columns`` times ``sizes``, plus a ``constant``.
+
+    ``entries`` are those of the deviations in the part; ``at`` are the numbers of the equalities whose multipliers give
+    these deviations. ``single``: every entry is a single variable, without equalities. For sets that are no boxes,
+    ``points`` holds for every block its entries, its variable, its known points and the numbers of their rows.
+    """
 
     columns: np.ndarray
     sizes: Array
@@ -147,10 +150,10 @@ class Counterpart:
             self._fixed = self._linear.rows([entries], program.b, program.b)
 
         if self.ceiling is not None:
-            (weights, most), column = self.ceiling, np.flatnonzero(self.ceiling[0])
+            (weights, limit), column = self.ceiling, np.flatnonzero(self.ceiling[0])
             both = np.concatenate([column, column + n])
             summed = (np.zeros(both.size, dtype=int), both, np.tile(weights[column], 2))
-            self._linear.rows([summed], np.full(1, -np.inf), np.full(1, most))
+            self._linear.rows([summed], np.full(1, -np.inf), np.full(1, limit))
 
     def add(self, block: UncertainRows) -> None:
         """Impose rows from now on; exact ones as equations, unless they may be relaxed."""
@@ -160,8 +163,8 @@ class Counterpart:
             entries = [_both(table.row, table.col, table.data, self.program.n)]
             if self.scales:  # what answers deviations answers those of the factor 1, times the factor
                 answers = np.arange(rhs.size) % (1 + self.spread.size) > 0
-                grown = np.flatnonzero(answers & (rhs != 0.0))
-                entries.append((grown, np.full(grown.size, 2 * self.program.n), -rhs[grown]))
+                scaled_rows = np.flatnonzero(answers & (rhs != 0.0))
+                entries.append((scaled_rows, np.full(scaled_rows.size, 2 * self.program.n), -rhs[scaled_rows]))
                 rhs = np.where(answers, 0.0, rhs)
             at = self._linear.rows(entries, rhs, rhs)
             self.blocks.append(block)
@@ -171,13 +174,13 @@ class Counterpart:
         count, limits = block.h.size, block.h.copy()
         entries = [_both(*entries_of(block.g), self.program.n)]
         for p, part in enumerate(parts):
-            mine = np.flatnonzero(block.part == p)
-            scale = np.abs(block.factor[mine])
+            rows = np.flatnonzero(block.part == p)
+            scale = np.abs(block.factor[rows])
             if self.scales:
-                entries.append((mine, np.full(mine.size, 2 * self.program.n), scale * part.constant))
+                entries.append((rows, np.full(rows.size, 2 * self.program.n), scale * part.constant))
             else:
-                limits[mine] -= scale * part.constant
-            row, column = np.repeat(mine, part.columns.size), np.tile(part.columns, mine.size)
+                limits[rows] -= scale * part.constant
+            row, column = np.repeat(rows, part.columns.size), np.tile(part.columns, rows.size)
             entries.append((row, column, (scale[:, None] * part.sizes).ravel()))
         if self.elastic:
             entries.append((np.arange(count), np.full(count, 2 * self.program.n), -np.ones(count)))
@@ -203,19 +206,21 @@ class Counterpart:
         split = [inner, (rows, pairs[0], -ones), (rows, pairs[1], ones)]
         if self.scales:
             split.append((rows, np.full(count, 2 * n), d[entries]))
-        rest = nothing if self.scales else -d[entries]
-        at = self._linear.rows(split, rest, rest)
+        rhs = nothing if self.scales else -d[entries]
+        at = self._linear.rows(split, rhs, rhs)
         if not self.scales:  # begin where the last solution leaves nothing of these equations
             self._linear.enter(np.where((C @ self._x + d)[entries] >= 0.0, *pairs), at)
         return _Part(np.concatenate(pairs), np.tile(radii[entries], 2), constant, entries, at)
 
     def _pointed(self, C: csr_array, d: Array) -> _Part:
-        """One variable for each block of the spread, above the part at every known point of the block: at 0, to begin
-        with."""
+        """Return a part with one new variable for each block of the spread.
+
+        The variable is at least the value of the block at each of its known points; at first only 0 is known.
+        """
         points: list[tuple[slice, int, list[Array], list[int]]] = []
-        for part, count, convex, _ in self.spread.parts:
+        for span, count, convex, _ in self.spread.parts:
             q = convex.dimension
-            for a in range(part.start, part.start + count * q, q):
+            for a in range(span.start, span.start + count * q, q):
                 if C.indptr[a + q] > C.indptr[a] or d[a : a + q].any():
                     (name,) = self._linear.variables(np.zeros(1), np.full(1, np.inf), np.zeros(1)).tolist()
                     points.append((slice(a, a + q), name, [], []))
@@ -223,31 +228,35 @@ class Counterpart:
         return _Part(names, np.ones(names.size), 0.0, none, none, points=tuple(points))
 
     def sharpen(self, x: Array) -> bool:
-        """Where the sets are no boxes: impose the worst points at ``x (n,)`` of every imposed row; ``False`` where all
-        were known."""
+        """Impose the worst points of every imposed row at ``x (n,)``, where the sets are no boxes.
+
+        Returns ``False`` where all of them were known, and for boxes, whose worst case is exact.
+        """
         if self.spread.is_box:
             return False
         entries: list[tuple[np.ndarray, np.ndarray, Array]] = []
         limits: list[float] = []
         first = self._linear.count
-        said = [block.coefficients(x) for block, (_, _, parts) in zip(self.blocks, self._imposed, strict=True) if parts]
-        found = self.spread.worst(np.concatenate([*said, np.zeros((0, self.spread.size))]))
-        many = 0
+        coefficients = [
+            block.coefficients(x) for block, (_, _, parts) in zip(self.blocks, self._imposed, strict=True) if parts
+        ]
+        deviations = self.spread.worst(np.concatenate([*coefficients, np.zeros((0, self.spread.size))]))
+        index = 0
         for block, (_, _, parts) in zip(self.blocks, self._imposed, strict=True):
             for part, C, d in zip(parts, block.C, block.d, strict=False):  # none of an equality
-                worst, many = found[many], many + 1
-                for place, name, known, at in part.points:
-                    point = worst[place]
-                    if any(np.abs(point - other).max() <= SAME for other in known):
+                worst, index = deviations[index], index + 1
+                for span, name, points, at in part.points:
+                    point = worst[span]
+                    if any(np.abs(point - previous).max() <= SAME for previous in points):
                         continue
-                    known.append(point)
+                    points.append(point)
                     at.append(first + len(limits))
-                    row = (C[place].T @ point).reshape(-1)
+                    row = (C[span].T @ point).reshape(-1)
                     column = np.flatnonzero(row)
                     number = np.full(column.size, len(limits))
                     entries.append(_both(number, column, row[column], self.program.n))
                     entries.append((np.array([len(limits)]), np.array([name]), -np.ones(1)))
-                    offset = float(point @ d[place])
+                    offset = float(point @ d[span])
                     if self.scales:
                         entries.append((np.array([len(limits)]), np.array([2 * self.program.n]), np.array([offset])))
                     limits.append(0.0 if self.scales else -offset)
@@ -257,7 +266,7 @@ class Counterpart:
 
     @property
     def basis(self) -> Any:
-        """Where the last answer was, for `begin` of a program with the same rows and variables."""
+        """Basis of the last answer, for `begin` of a program with the same rows and variables."""
         return self._linear.highs.getBasis()
 
     def begin(self, basis: Any) -> None:
@@ -266,7 +275,7 @@ class Counterpart:
 
     @property
     def approximate(self) -> bool:
-        """Whether an answer can be as accurate as is asked for: where the cost is replaced by tangents."""
+        """True where the cost is replaced by tangents, so that the accuracy of an answer can be chosen."""
         return self._tangents is not None
 
     def solve(self, margin: float = 0.0, accuracy: float = 0.0, seconds: float = np.inf) -> RobustAnswer:
@@ -280,15 +289,15 @@ class Counterpart:
                     self._linear.limit(where, limits - margin)
         until = time.monotonic() + seconds
         for rounds in reversed(range(TOUCHED)):
-            solved, said, columns, rows = self._linear.solve(until - time.monotonic())
+            solved, message, columns, rows = self._linear.solve(until - time.monotonic())
             self.answered[self._linear.by] += 1
             if not solved:
                 none = np.zeros(0)
-                return RobustAnswer(False, said, none, none, np.zeros((0, 0)), none)
+                return RobustAnswer(False, message, none, none, np.zeros((0, 0)), none)
             if self._tangents is None:
                 break
-            missed, decided, roots = self._tangents.below(columns)
-            if missed <= max(accuracy, FLAT * self.program.added(decided)) or not rounds:
+            shortfall, decided, roots = self._tangents.below(columns)
+            if shortfall <= max(accuracy, FLAT * self.program.added(decided)) or not rounds:
                 break  # the last ones are not sharpened: their multipliers are those of the rows that were solved with
             self._tangents.sharpen(decided, roots)
         n, mu = self.program.n, rows[self._fixed]
@@ -296,7 +305,7 @@ class Counterpart:
         at = None if self._tangents is None else self._tangents.touching(x, rows)
         y, deviations = self._multipliers(rows, mu, at)
         slack = float(columns[2 * n]) if self.elastic or self.scales else 0.0
-        return RobustAnswer(True, said, x, y, deviations, mu, slack, at)
+        return RobustAnswer(True, message, x, y, deviations, mu, slack, at)
 
     def _multipliers(self, even: Array, mu: Array, touched: Array | None) -> tuple[Array, Array]:
         """The multipliers ``(r,)`` of all rows, and the deviations ``(r, Q)`` that those of the parts stand for."""
@@ -305,14 +314,14 @@ class Counterpart:
         late: list[tuple[UncertainRows, int, _Part, np.ndarray, float]] = []
         first = 0
         for block, (where, _, parts) in zip(self.blocks, self._imposed, strict=True):
-            mine = y[first : first + block.h.size]
+            multipliers = y[first : first + block.h.size]
             if not parts:
                 terms.append(weighted(even[where], block.equations[0]))
-            elif mine.any():
-                terms.append(weighted(mine, block.g))
+            elif multipliers.any():
+                terms.append(weighted(multipliers, block.g))
             for p, part in enumerate(parts):
                 rows = np.flatnonzero(block.part == p)
-                total = float(mine[rows] @ np.abs(block.factor[rows]))
+                total = float(multipliers[rows] @ np.abs(block.factor[rows]))
                 if total <= 0.0:
                     continue
                 if part.single:
@@ -321,14 +330,14 @@ class Counterpart:
                 w = self._at_rest(block, p)
                 limit = self.spread.radii[part.entries]
                 w[part.entries] = np.clip(even[part.at] / total, -limit, limit)
-                for place, _, known, at in part.points:
+                for span, _, points, at in part.points:
                     shares = np.maximum(even[np.array(at, dtype=int)], 0.0)
-                    most = max(total, float(shares.sum()))  # what is missing to it is the share of 0
-                    w[place] = shares @ np.array(known) / most if known else 0.0
+                    weight = max(total, float(shares.sum()))  # what is missing to it is the share of 0
+                    w[span] = shares @ np.array(points) / weight if points else 0.0
                 terms.append(weighted(total * w, block.C[p]))
                 deviations[first + rows] = np.sign(block.factor[rows])[:, None] * w
             first += block.h.size
-        column, value = (np.concatenate(part) for part in zip(*terms, strict=True))
+        column, value = (np.concatenate(arrays) for arrays in zip(*terms, strict=True))
         priced = self.program if touched is None else self.program.tangent(touched)
         slope = mu @ self.program.A + (0.0 if self.elastic else priced.q)
         slope = slope + np.bincount(column, value, self.program.n)
@@ -342,15 +351,15 @@ class Counterpart:
         are those of one row at a deviation and of its opposite at none."""
         y, deviations = [np.zeros(0)], [np.zeros((0, self.spread.size))]
         for block, (where, _, parts) in zip(self.blocks, self._imposed, strict=True):
-            found, w = np.maximum(even[where], 0.0), np.zeros((block.h.size, self.spread.size))
+            multipliers, w = np.maximum(even[where], 0.0), np.zeros((block.h.size, self.spread.size))
             if not parts:
                 half = block.h.size // 2
                 table = even[where].reshape(half, -1)
-                found = np.zeros(block.h.size)
+                multipliers = np.zeros(block.h.size)
                 for row, (plain, *answers) in enumerate(table):
-                    found[row], w[row] = self._at_one(float(plain), np.array(answers))
-                    found[half + row] = found[row] - plain
-            y.append(found)
+                    multipliers[row], w[row] = self._at_one(float(plain), np.array(answers))
+                    multipliers[half + row] = multipliers[row] - plain
+            y.append(multipliers)
             deviations.append(w)
         return np.concatenate(y), np.vstack(deviations)
 
@@ -361,10 +370,10 @@ class Counterpart:
         size = max(plain, float((np.abs(answers[free]) / self.spread.radii[free]).max(initial=0.0)))
         if size <= 0.0:
             return 0.0, np.zeros(answers.size)
-        found = float(np.exp2(np.ceil(np.log2(size))))  # a power of two, by which nothing is rounded
-        while not self.spread.holds(answers / found):
-            found *= 2.0
-        return found, answers / found
+        multiplier = float(np.exp2(np.ceil(np.log2(size))))  # a power of two, by which nothing is rounded
+        while not self.spread.holds(answers / multiplier):
+            multiplier *= 2.0
+        return multiplier, answers / multiplier
 
     def _at_rest(self, block: UncertainRows, p: int) -> Array:
         """The worst deviations where no decision enters a part; 0 elsewhere."""
@@ -379,11 +388,11 @@ class Counterpart:
     ) -> None:
         """Deviations of the parts whose entries are single variables: such that no slope is left in these, as far as
         their sets allow, shared by the rows in which a variable is."""
-        most = np.zeros(self.program.n)
+        reach = np.zeros(self.program.n)
         for block, p, part, _, total in late:
-            np.add.at(most, block.C[p].indices, total * np.abs(block.C[p].data) * self.spread.radii[part.entries])
+            np.add.at(reach, block.C[p].indices, total * np.abs(block.C[p].data) * self.spread.radii[part.entries])
         share = np.zeros(self.program.n)
-        np.divide(-slope, most, out=share, where=most > 0.0)
+        np.divide(-slope, reach, out=share, where=reach > 0.0)
         share = np.clip(share, -1.0, 1.0)
         for block, p, part, rows, _ in late:
             w = self._at_rest(block, p)
@@ -427,10 +436,10 @@ class Growing:
         """New rows, by number; ``entries`` are rows counted from 0, columns and values."""
         import highspy
 
-        row, column, value = (np.concatenate(part) for part in zip(*entries, strict=True))
+        row, column, value = (np.concatenate(arrays) for arrays in zip(*entries, strict=True))
         starts, places, values = gathered(row, column, value, (upper.size, self.columns))
-        said = self.highs.addRows(upper.size, lower, upper, values.size, starts[:-1], places, values)
-        self.refused |= said == highspy.HighsStatus.kError  # an entry that is too large
+        status = self.highs.addRows(upper.size, lower, upper, values.size, starts[:-1], places, values)
+        self.refused |= status == highspy.HighsStatus.kError  # an entry that is too large
         self.count += upper.size
         return np.arange(self.count - upper.size, self.count)
 
@@ -445,7 +454,7 @@ class Growing:
 
         if not self._entering:
             return
-        columns, rows = (np.concatenate(part).tolist() for part in zip(*self._entering, strict=True))
+        columns, rows = (np.concatenate(arrays).tolist() for arrays in zip(*self._entering, strict=True))
         self._entering, status = [], highspy.HighsBasisStatus
         basis = self.highs.getBasis()
         if not basis.valid:  # the first solution: presolve takes out these equations, and begins in a better place
@@ -458,45 +467,48 @@ class Growing:
         self.highs.setBasis(basis)
 
     def limit(self, rows: np.ndarray, upper: Array) -> None:
-        """Other limits of rows."""
+        """Set new upper limits of rows that have no lower limit."""
         for row, value in zip(rows.tolist(), upper.tolist(), strict=True):
             self.highs.changeRowBounds(row, -np.inf, value)
 
     def solve(self, seconds: float = np.inf) -> tuple[bool, str, Array, Array]:
-        """Whether it was solved, in the solver's words, the values of the columns and the multipliers of the rows; it
-        is not where ``seconds`` do not suffice."""
+        """Solve the program within ``seconds``.
+
+        Returns whether it was solved, the solver's words, the values of the columns and the multipliers of the rows. It
+        is not solved where the time does not suffice.
+        """
         import highspy
 
         if self.refused:
             return False, "HiGHS: a row is refused", np.zeros(0), np.zeros(0)
-        why, self.by = "", HIGHS
+        reason, self.by = "", HIGHS
         if self.asked is not None:
             answer = self._posed(self.asked)
             if not isinstance(answer, str):
                 self.by = self.asked.name
                 return answer
-            why = answer
+            reason = answer
         self._begin()
         if np.isfinite(seconds):
             self.highs.setOptionValue("time_limit", self.highs.getRunTime() + max(seconds, 0.0))
-        begun, large = bool(self.highs.getBasis().valid), self.highs.getNumNz() >= LARGE
-        patience = PATIENT if begun and large else STALLED
+        has_basis, large = bool(self.highs.getBasis().valid), self.highs.getNumNz() >= LARGE
+        patience = PATIENT if has_basis and large else STALLED
         self.highs.setOptionValue("simplex_iteration_limit", int(patience * (self.columns + self.count)))
-        steps = self._run(inside=large and not begun)
+        steps = self._run(inside=large and not has_basis)
         status, stalled = self.highs.getModelStatus(), highspy.HighsModelStatus
         if status in (stalled.kUnknown, stalled.kIterationLimit, stalled.kSolveError):
             self.highs.clearSolver()  # this way led nowhere: once more from nothing, and not by the same
             self.highs.setOptionValue("simplex_iteration_limit", highspy.kHighsIInf)
-            steps += self._run(inside=large == begun)
+            steps += self._run(inside=large == has_basis)
             status = self.highs.getModelStatus()
         self.work = float(steps) * self.highs.getNumNz()
-        said = f"HiGHS: {self.highs.modelStatusToString(status)}"
+        message = f"HiGHS: {self.highs.modelStatusToString(status)}"
         if self.asked is not None and status in (stalled.kOptimal, stalled.kInfeasible):
-            self.asked.failures.add(ROBUST, why, HIGHS)
+            self.asked.failures.add(ROBUST, reason, HIGHS)
         if status != highspy.HighsModelStatus.kOptimal:
-            return False, said, np.zeros(0), np.zeros(0)
-        found = self.highs.getSolution()
-        return True, said, np.array(found.col_value), -np.array(found.row_dual)
+            return False, message, np.zeros(0), np.zeros(0)
+        solution = self.highs.getSolution()
+        return True, message, np.array(solution.col_value), -np.array(solution.row_dual)
 
     def _posed(self, asked: Asked) -> tuple[bool, str, Array, Array] | str:
         """The answer of who is asked, from nothing, where it holds; in words why it does not."""
@@ -525,7 +537,7 @@ class Growing:
             np.array(program.col_lower_),
             np.array(program.col_upper_),
         )
-        said = ""
+        message = ""
         for accuracy in (ACCURACY, BELIEVED):  # the last digit that is asked for may cost the others
             try:
                 claim = asked.solve(posed, accuracy)
@@ -535,10 +547,10 @@ class Growing:
                 break
             if not claim.met(posed, FAR):
                 return claim.message
-            missed = "; its rows, bounds, slopes or gap are missed by more than 1e-9"
-            said = said or f"{claim.message}{missed if claim.status == 'solved' else ''}"
+            note = "; its rows, bounds, slopes or gap are missed by more than 1e-9"
+            message = message or f"{claim.message}{note if claim.status == 'solved' else ''}"
         else:
-            return said
+            return message
         multipliers = np.zeros(self.count)
         multipliers[above] += claim.z[: above.size]
         multipliers[below] -= claim.z[above.size :]
@@ -554,8 +566,8 @@ class Growing:
         finally:
             if inside:
                 self.highs.setOptionValue("solver", "choose")
-        done = self.highs.getInfo()
-        return int(1 + max(0, done.simplex_iteration_count) + INNER * max(0, done.ipm_iteration_count))
+        info = self.highs.getInfo()
+        return int(1 + max(0, info.simplex_iteration_count) + INNER * max(0, info.ipm_iteration_count))
 
 
 def weighted(weights: Array, table: csr_array) -> tuple[np.ndarray, Array]:
@@ -591,19 +603,19 @@ def robust_bound(
     noise, first = np.abs(slope) + np.abs(mu) @ np.abs(program.A), 0
     terms = [(np.zeros(0, dtype=int), np.zeros(0))]
     for block in blocks:
-        mine, w = y[first : first + block.h.size], deviations[first : first + block.h.size]
+        multipliers, w = y[first : first + block.h.size], deviations[first : first + block.h.size]
         first += block.h.size
-        used = np.flatnonzero(mine)
+        used = np.flatnonzero(multipliers)
         if not used.size:
             continue
         weight = np.zeros(block.d.shape)
-        np.add.at(weight, block.part[used], (mine[used] * block.factor[used])[:, None] * w[used])
-        terms += [weighted(mine, block.g), weighted(weight.ravel(), block.stacked)]
+        np.add.at(weight, block.part[used], (multipliers[used] * block.factor[used])[:, None] * w[used])
+        terms += [weighted(multipliers, block.g), weighted(weight.ravel(), block.stacked)]
         constant += float(weight.ravel() @ block.d.ravel())
         size += float(np.abs(weight).ravel() @ np.abs(block.d).ravel())
-        constant -= float(mine @ block.h)
-        size += float(mine @ np.abs(block.h))
-    column, value = (np.concatenate(part) for part in zip(*terms, strict=True))
+        constant -= float(multipliers @ block.h)
+        size += float(multipliers @ np.abs(block.h))
+    column, value = (np.concatenate(arrays) for arrays in zip(*terms, strict=True))
     slope = slope + np.bincount(column, value, program.n)
     noise = noise + np.bincount(column, np.abs(value), program.n)
     weights = program.weights if priced else np.zeros(program.n)
@@ -613,6 +625,6 @@ def robust_bound(
     ends = np.stack([program.lower, program.upper, np.clip(0.0, program.lower, program.upper)])
     with np.errstate(invalid="ignore"):
         least = (weights * np.abs(ends) + np.where(slope == 0.0, 0.0, slope * ends)).min(axis=0)
-        far = np.where(noise > 0.0, noise * np.abs(ends[:2]).max(axis=0), 0.0)
+        magnitudes = np.where(noise > 0.0, noise * np.abs(ends[:2]).max(axis=0), 0.0)
     bound = constant + float(least.sum())
-    return (bound, size + float(far.sum())) if np.isfinite(bound) else (-np.inf, size)
+    return (bound, size + float(magnitudes.sum())) if np.isfinite(bound) else (-np.inf, size)

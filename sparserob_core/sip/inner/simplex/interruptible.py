@@ -28,11 +28,11 @@ def run(highs: Any) -> None:
     ends it; where it does not look for that in time, only the end of the process waits for it."""
     if threading.current_thread() is not threading.main_thread():
         # In a new thread all the same: that of the caller may have a scheduler with another number of threads.
-        apart = threading.Thread(target=highs.run, daemon=True)
-        apart.start()
-        apart.join()
+        thread = threading.Thread(target=highs.run, daemon=True)
+        thread.start()
+        thread.join()
         return
-    stop, done = threading.Event(), threading.Event()
+    stop, finished = threading.Event(), threading.Event()
 
     def asked(event: Any) -> None:
         if stop.is_set():
@@ -42,19 +42,19 @@ def run(highs: Any) -> None:
         try:
             highs.run()
         finally:
-            done.set()
+            finished.set()
 
     highs.cbSimplexInterrupt += asked
     highs.cbIpmInterrupt += asked
     highs.cbMipInterrupt += asked
     try:
         threading.Thread(target=solve, daemon=True).start()
-        while not done.wait(LOOK):  # a signal that another thread catches does not wake this one
+        while not finished.wait(LOOK):  # a signal that another thread catches does not wake this one
             pass
     except KeyboardInterrupt:
         stop.set()
-        if not done.wait(GRACE):
-            atexit.register(done.wait)  # a thread that asks for the interpreter after its end aborts the process
+        if not finished.wait(GRACE):
+            atexit.register(finished.wait)  # a thread that asks for the interpreter after its end aborts the process
         raise
     highs.cbSimplexInterrupt -= asked
     highs.cbIpmInterrupt -= asked
@@ -75,12 +75,14 @@ def with_integers(
     import highspy
     from scipy.sparse import csr_array, vstack
 
-    table = csr_array(vstack([csr_array(one.A) for one in couplings]))
+    table = csr_array(vstack([csr_array(coupling.A) for coupling in couplings]))
     sides = [
-        np.concatenate([np.broadcast_to(side, one.A.shape[0]) for side, one in zip(each, couplings, strict=True)])
-        for each in ([one.lb for one in couplings], [one.ub for one in couplings])
+        np.concatenate(
+            [np.broadcast_to(side, coupling.A.shape[0]) for side, coupling in zip(limits, couplings, strict=True)]
+        )
+        for limits in ([coupling.lb for coupling in couplings], [coupling.ub for coupling in couplings])
     ]
-    none, whole = np.zeros(0, dtype=np.int32), np.arange(continuous, cost.size, dtype=np.int32)
+    none, integers = np.zeros(0, dtype=np.int32), np.arange(continuous, cost.size, dtype=np.int32)
     with silent():
         highs: Any = highspy.Highs()
         for name, value in (("output_flag", False), ("threads", 1), ("time_limit", seconds), ("mip_rel_gap", gap)):
@@ -88,7 +90,7 @@ def with_integers(
         highs.addCols(cost.size, cost, lower, upper, 0, np.zeros(cost.size, dtype=np.int32), none, np.zeros(0))
         starts, places = table.indptr[:-1].astype(np.int32), table.indices.astype(np.int32)
         highs.addRows(table.shape[0], *sides, table.nnz, starts, places, table.data)
-        highs.changeColsIntegrality(whole.size, whole, np.full(whole.size, highspy.HighsVarType.kInteger))
+        highs.changeColsIntegrality(integers.size, integers, np.full(integers.size, highspy.HighsVarType.kInteger))
         run(highs)
     if highs.getInfo().primal_solution_status != int(highspy.SolutionStatus.kSolutionStatusFeasible):
         return None

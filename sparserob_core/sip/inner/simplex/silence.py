@@ -11,8 +11,8 @@ from pathlib import Path
 
 @contextmanager
 def silent() -> Iterator[None]:
-    """Nothing of what is written to the standard output meanwhile: HiGHS leaves remarks there, whatever
-    it is told, and a line about itself as it is made."""
+    """Discard the standard output of the process meanwhile: HiGHS prints notes whatever its settings, and a line about
+    itself when it is created."""
     try:
         sys.stdout.flush()
         kept = os.dup(1)

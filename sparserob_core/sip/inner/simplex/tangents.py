@@ -78,18 +78,18 @@ class Tangents:
         """Touch every norm at ``x (n,)`` and every square at the root ``(c,)`` that the linear program has."""
         count = squares.size
         if count:
-            place = np.arange(count)
+            numbers = np.arange(count)
             size = np.maximum(np.abs(squares), FINE)
-            entries = [(place, self._t, squares / size), (place, self._squares, -1.0 / size)]
+            entries = [(numbers, self._t, squares / size), (numbers, self._squares, -1.0 / size)]
             self._at.append(self.linear.rows(entries, np.full(count, -np.inf), squares**2 / size / 2.0))
-            self._which.append(place)
+            self._which.append(numbers)
             self._touched.append(squares / size)
         blocks = self.program.blocks
         if blocks is not None:
             table, unit = blocks.table, np.append(blocks.directions(x), 0.0)
-            found = Directions(np.arange(len(table)), unit[table])
-            kept = found.vectors.any(axis=1)
-            self._directed(Directions(found.block[kept], found.vectors[kept]))
+            directions = Directions(np.arange(len(table)), unit[table])
+            kept = directions.vectors.any(axis=1)
+            self._directed(Directions(directions.block[kept], directions.vectors[kept]))
 
     def _directed(self, directions: Directions) -> None:
         """``d's`` is at most the norm of its block."""
@@ -98,22 +98,25 @@ class Tangents:
         count = directions.block.size
         if not count:
             return
-        row, place = np.nonzero(directions.vectors)
-        column, value = blocks.table[directions.block[row], place], directions.vectors[row, place]
+        row, entry = np.nonzero(directions.vectors)
+        column, value = blocks.table[directions.block[row], entry], directions.vectors[row, entry]
         ones = np.arange(count), self._norms[directions.block], -np.ones(count)
         entries = [(row, column, value), (row, column + n, -value), ones]
         self._along.append((self.linear.rows(entries, np.full(count, -np.inf), np.zeros(count)), directions))
 
     def below(self, columns: Array) -> tuple[float, Array, Array]:
-        """By how much the variables of a solution are below what they stand for, with its decision ``(n,)`` and the
-        roots ``(c,)`` of its squares."""
+        """Return the shortfall of the cost variables of a solution below the squares and norms that they stand for, as
+        a cost.
+
+        Also returns the decision ``(n,)`` of the solution and the roots ``(c,)`` of its squares.
+        """
         n, blocks = self.program.n, self.program.blocks
         x, t = columns[:n] - columns[n : 2 * n], columns[self._t]
-        missed = float(np.maximum(t**2 / 2.0 - columns[self._squares], 0.0).sum())
+        shortfall = float(np.maximum(t**2 / 2.0 - columns[self._squares], 0.0).sum())
         if blocks is not None:
             weights = self.program.weights[blocks.first]
-            missed += float(weights @ np.maximum(blocks.norms(x) - columns[self._norms], 0.0))
-        return missed, x, t
+            shortfall += float(weights @ np.maximum(blocks.norms(x) - columns[self._norms], 0.0))
+        return shortfall, x, t
 
     def touching(self, x: Array, multipliers: Array) -> Array:
         """The decision ``(n,)`` at which the slope of the cost is that of all tangents with their multipliers: there
@@ -124,14 +127,14 @@ class Tangents:
             answer = x.copy()
             answer[blocks.entries] = 0.0
             for at, directions in self._along:
-                row, place = np.nonzero(directions.vectors)
-                shares = np.maximum(multipliers[at], 0.0)[row] * directions.vectors[row, place]
-                np.add.at(answer, blocks.table[directions.block[row], place], shares)
-        at, which, touched = (np.concatenate(part) for part in (self._at, self._which, self._touched))
-        wanted = np.bincount(which, np.maximum(multipliers[at], 0.0) * touched, self.roots.shape[1])
+                row, entry = np.nonzero(directions.vectors)
+                shares = np.maximum(multipliers[at], 0.0)[row] * directions.vectors[row, entry]
+                np.add.at(answer, blocks.table[directions.block[row], entry], shares)
+        at, squares, touched = (np.concatenate(arrays) for arrays in (self._at, self._which, self._touched))
+        wanted = np.bincount(squares, np.maximum(multipliers[at], 0.0) * touched, self.roots.shape[1])
         sizes = (self.roots**2).sum(axis=0)
-        moved: Array = answer + self.roots @ ((wanted - self.roots.T @ answer) / np.where(sizes > 0.0, sizes, 1.0))
-        return moved
+        point: Array = answer + self.roots @ ((wanted - self.roots.T @ answer) / np.where(sizes > 0.0, sizes, 1.0))
+        return point
 
 
 def _roots(program: FiniteProgram) -> Array:
@@ -139,12 +142,12 @@ def _roots(program: FiniteProgram) -> Array:
     if program.P is None:
         return np.zeros((program.n, 0))
     if program.curvature is not None:
-        entered = np.flatnonzero(program.curvature > 0.0)
-        return np.asarray(np.eye(program.n)[:, entered] * np.sqrt(program.curvature[entered]))
+        variables = np.flatnonzero(program.curvature > 0.0)
+        return np.asarray(np.eye(program.n)[:, variables] * np.sqrt(program.curvature[variables]))
     P: Any = program.P
-    entered = np.flatnonzero(np.diff(P.indptr))
-    values, vectors = np.linalg.eigh(P[entered][:, entered].toarray())
-    kept = values > RESOLVED * entered.size * values.max(initial=0.0)
+    variables = np.flatnonzero(np.diff(P.indptr))
+    values, vectors = np.linalg.eigh(P[variables][:, variables].toarray())
+    kept = values > RESOLVED * variables.size * values.max(initial=0.0)
     roots = np.zeros((program.n, int(kept.sum())))
-    roots[entered] = vectors[:, kept] * np.sqrt(values[kept])
+    roots[variables] = vectors[:, kept] * np.sqrt(values[kept])
     return roots
