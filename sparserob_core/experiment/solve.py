@@ -116,10 +116,12 @@ def maximise(
     if callback is not None and not callable(callback):
         raise InputError(f"callback: expected a function of points and values, got {callback!r}")
     chosen, share = _chosen(box, name, options, polish)
-    limit, told = as_seconds(seconds), _Told(f, callback)
-    rules = Rules(polish=share, seconds=np.inf if limit is None else limit, halt=told.halted, **_ends(target, patience))
+    limit, function = as_seconds(seconds), _Told(f, callback)
+    rules = Rules(
+        polish=share, seconds=np.inf if limit is None else limit, halt=function.halted, **_ends(target, patience)
+    )
     report = search(
-        Target(f if callback is None else told, box, gradient),
+        Target(f if callback is None else function, box, gradient),
         chosen,
         whole("budget", budget, 1),
         np.random.default_rng(whole("seed", seed, 0)),
@@ -198,7 +200,7 @@ def ask_tell(
     from sparserob_core.sip.search.search import maximise as search
 
     chosen, share = _chosen(box, name, options, polish)
-    first, earlier, ends = _placed(start, box), _known(known, box), _ends(target, patience)
+    start_points, earlier, ends = _placed(start, box), _known(known, box), _ends(target, patience)
     number, calls = whole("seed", seed, 0), whole("budget", budget, 1)
     Target(lambda points: points, box)  # raises InputError for a box without bounds
     if not isinstance(minimise, bool):
@@ -213,14 +215,14 @@ def ask_tell(
         )
     rules = Rules(polish=share, **{**ends, **({"target": sign * ends["target"]} if "target" in ends else {})})
     entry: object = {"name": name, **options} if isinstance(name, str) else name
-    about = {
+    description = {
         "maximiser": dict(entry) if isinstance(entry, Mapping) else type(entry).__name__,
         "budget": calls,
         "seed": number,
         "polish": rules.polish,
         "lower": box.lower.tolist(),
         "upper": box.upper.tolist(),
-        "start": None if first is None else first.tolist(),
+        "start": None if start_points is None else start_points.tolist(),
         "minimise": minimise,
         "integer": list(ranges.integer),
         "logarithmic": list(ranges.logarithmic),
@@ -228,7 +230,7 @@ def ask_tell(
         "patience": ends.get("patience"),
         "known": None if earlier is None else [earlier[0].tolist(), earlier[1].tolist()],
     }
-    begin = None if first is None else ranges.hidden(first)
+    hidden_start = None if start_points is None else ranges.hidden(start_points)
 
     def run(function: Callable[[Array], Array]) -> Report:
         report = search(
@@ -237,16 +239,16 @@ def ask_tell(
             calls,
             np.random.default_rng(number),
             rules,
-            start=begin,
+            start=hidden_start,
             known=None if earlier is None else (ranges.hidden(earlier[0]), sign * earlier[1]),
         )
         if not minimise or "target" not in ends:
             return report
-        mirrored, meant = (f"the target {one:.9g} is" for one in (rules.target, ends["target"]))
+        mirrored, meant = (f"the target {value:.9g} is" for value in (rules.target, ends["target"]))
         return replace(report, stopped=report.stopped.replace(mirrored, meant))
 
     keywords: dict[str, Any] = dict(options)
-    again = partial(
+    restart = partial(
         ask_tell,
         box,
         name,
@@ -262,7 +264,7 @@ def ask_tell(
         known=known,
         **keywords,
     )
-    return AskTell(ranges, run, about, state, again)
+    return AskTell(ranges, run, description, state, restart)
 
 
 def _chosen(

@@ -61,18 +61,18 @@ def benchmark(
     chosen = [component(registry, "maximiser", choice, Maximiser) for choice in maximisers]
 
     def find() -> Benchmark:
-        every = list(landscapes(suites, _configs(configs) if "g" in suites else ()))
+        suite_landscapes = list(landscapes(suites, _configs(configs) if "g" in suites else ()))
         searches: list[Search] = []
-        total, began = len(every) * len(names) * repeats, time.monotonic()
-        for landscape in every:
+        total, start = len(suite_landscapes) * len(names) * repeats, time.monotonic()
+        for landscape in suite_landscapes:
             for name, maximiser in zip(names, chosen, strict=True):
                 for seed in range(repeats):
                     searches.append(_search(landscape, name, maximiser, calls, seed, rules))
-                    gone = time.monotonic() - began
-                    left = gone / len(searches) * (total - len(searches))
-                    text = f"{landscape.name}: {len(searches)} of {total} searches, {left:.0f} s left"
+                    elapsed = time.monotonic() - start
+                    remaining = elapsed / len(searches) * (total - len(searches))
+                    text = f"{landscape.name}: {len(searches)} of {total} searches, {remaining:.0f} s left"
                     notify(StudyProgress(text=text, done=len(searches), total=total))
-        return _told(every, names, searches, calls, repeats, accuracy, suites)
+        return _told(suite_landscapes, names, searches, calls, repeats, accuracy, suites)
 
     if out is None:
         return find()
@@ -91,13 +91,22 @@ def _told(
 ) -> Benchmark:
     targets = []
     for landscape in every:
-        begin = landscape.begin(0)
-        slack = max(accuracy * (landscape.maximum - begin), DIGITS * abs(landscape.maximum))
+        median = landscape.begin(0)
+        slack = max(accuracy * (landscape.maximum - median), DIGITS * abs(landscape.maximum))
         targets.append(landscape.maximum - slack)
-    problems = [Instance(one.name, one.maximum, True, one.target.domain.dimension + 1.0) for one in every]
+    problems = [
+        Instance(landscape.name, landscape.maximum, True, landscape.target.domain.dimension + 1.0)
+        for landscape in every
+    ]
     times = [
         [
-            np.array([one.needed(target) for one in searches if one.landscape is landscape and one.contender == name])
+            np.array(
+                [
+                    search.needed(target)
+                    for search in searches
+                    if search.landscape is landscape and search.contender == name
+                ]
+            )
             for name in names
         ]
         for landscape, target in zip(every, targets, strict=True)
@@ -116,19 +125,19 @@ def _search(landscape: Landscape, name: str, maximiser: Maximiser, budget: int, 
 
     def clocked(points: Array) -> Array:
         nonlocal inside
-        began = time.process_time()
+        start = time.process_time()
         values = np.asarray(fresh.function(points))
-        inside += time.process_time() - began
+        inside += time.process_time() - start
         return values
 
-    began = time.process_time()
+    start = time.process_time()
     report: Report = maximise(replace(fresh, function=clocked), maximiser, budget, np.random.default_rng(seed), rules)
-    own = max(0.0, time.process_time() - began - inside)
+    own_seconds = max(0.0, time.process_time() - start - inside)
     if report.best_value > landscape.maximum + 10 * DIGITS * max(1.0, abs(landscape.maximum)):
         raise InputError(
             f"{landscape.name}: the value {report.best_value:.12g} exceeds its maximum {landscape.maximum:.12g}"
         )
-    return Search(landscape, name, seed, report.trace.best, own, report.best_point)
+    return Search(landscape, name, seed, report.trace.best, own_seconds, report.best_point)
 
 
 def _configs(configs: Sequence[str | Path] | None) -> list[Path]:
@@ -139,13 +148,13 @@ def _configs(configs: Sequence[str | Path] | None) -> list[Path]:
 
 def _labels(maximisers: Sequence[Choice | Maximiser]) -> list[str]:
     names = []
-    for one in maximisers:
-        if isinstance(one, Mapping):
-            options = ", ".join(f"{key} {value}" for key, value in one.items() if key != "name")
-            names.append(f"{one.get('name')}, {options}" if options else str(one.get("name")))
+    for choice in maximisers:
+        if isinstance(choice, Mapping):
+            options = ", ".join(f"{key} {value}" for key, value in choice.items() if key != "name")
+            names.append(f"{choice.get('name')}, {options}" if options else str(choice.get("name")))
         else:
-            names.append(one if isinstance(one, str) else type(one).__name__)
-    twice = {name for name in names if names.count(name) > 1}
-    if twice:
-        raise InputError(f"maximisers: expected each one once, got {', '.join(sorted(twice))} more than once")
+            names.append(choice if isinstance(choice, str) else type(choice).__name__)
+    repeated = {name for name in names if names.count(name) > 1}
+    if repeated:
+        raise InputError(f"maximisers: expected each one once, got {', '.join(sorted(repeated))} more than once")
     return names

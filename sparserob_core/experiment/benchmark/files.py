@@ -1,4 +1,4 @@
-"""What a benchmark leaves: the profiles as a picture, all numbers, and files that IOHanalyzer reads."""
+"""Files of a benchmark: the profiles as a picture, all numbers, and files that IOHanalyzer reads."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ IOH = "0.3.22"  # the version of IOHexperimenter whose files these look like
 
 @dataclass(frozen=True, kw_only=True)
 class Facts:
-    """What IOHprofiler keeps of one function, by its own names."""
+    """Record of one function in the format of IOHprofiler, with the names of its fields."""
 
     version: str
     suite: str
@@ -51,14 +51,16 @@ def ioh_files(found: Benchmark) -> Iterator[tuple[str, str]]:
     file of facts, and one table for every dimension, in which a line is an improvement."""
     for name in found.profiles.contenders:
         folder = f"ioh/{_plain(name)}"
-        mine = sorted((one for one in found.searches if one.contender == name), key=_function)
-        for (number, title), group in groupby(mine, key=_function):
+        contender_searches = sorted((search for search in found.searches if search.contender == name), key=_function)
+        for (number, title), group in groupby(contender_searches, key=_function):
             searches, scenarios = list(group), []
             for size, runs in groupby(sorted(searches, key=_dimension), _dimension):
                 table = f"data_f{number}_{title}/IOHprofiler_f{number}_DIM{size}.dat"
-                kept = list(runs)
-                yield f"{folder}/{table}", "".join(_table(one) for one in kept)
-                scenarios.append({"dimension": size, "path": table, "runs": [_facts(one) for one in kept]})
+                searches_of_size = list(runs)
+                yield f"{folder}/{table}", "".join(_table(search) for search in searches_of_size)
+                scenarios.append(
+                    {"dimension": size, "path": table, "runs": [_facts(search) for search in searches_of_size]}
+                )
             facts = Facts(
                 version=IOH,
                 suite=searches[0].landscape.suite,
@@ -83,9 +85,9 @@ def _plain(name: str) -> str:
 
 
 def _table(one: Search) -> str:
-    better = np.flatnonzero(np.diff(one.best, prepend=-np.inf) > 0.0)
-    rows = [f"{at + 1} {one.best[at]:.12g}" for at in better]
-    if better.size and better[-1] + 1 < one.best.size:
+    improvements = np.flatnonzero(np.diff(one.best, prepend=-np.inf) > 0.0)
+    rows = [f"{index + 1} {one.best[index]:.12g}" for index in improvements]
+    if improvements.size and improvements[-1] + 1 < one.best.size:
         rows.append(f"{one.best.size} {one.best[-1]:.12g}")
     return "\n".join(["evaluations raw_y", *rows]) + "\n"
 

@@ -63,9 +63,9 @@ def camel(x: Array) -> Array:
 def goldstein(x: Array) -> Array:
     """Goldstein's and Price's function of two coordinates, negated: -3 at (0, -1)."""
     a, b = x[:, 0], x[:, 1]
-    one = 1 + (a + b + 1) ** 2 * (19 - 14 * a + 3 * a**2 - 14 * b + 6 * a * b + 3 * b**2)
-    other = 30 + (2 * a - 3 * b) ** 2 * (18 - 32 * a + 12 * a**2 + 48 * b - 36 * a * b + 27 * b**2)
-    return np.asarray(-one * other)
+    first_factor = 1 + (a + b + 1) ** 2 * (19 - 14 * a + 3 * a**2 - 14 * b + 6 * a * b + 3 * b**2)
+    second_factor = 30 + (2 * a - 3 * b) ** 2 * (18 - 32 * a + 12 * a**2 + 48 * b - 36 * a * b + 27 * b**2)
+    return np.asarray(-first_factor * second_factor)
 
 
 def shekel(x: Array) -> Array:

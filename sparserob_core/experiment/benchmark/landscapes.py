@@ -1,4 +1,5 @@
-"""What maximisers are compared on: standard functions, the BBOB suite, and landscapes of ``g`` of configs."""
+"""Landscapes on which maximisers are compared: standard functions, the BBOB suite, and the function ``g`` of
+configs."""
 
 from __future__ import annotations
 
@@ -27,9 +28,9 @@ SAMPLE = 1000  # uniform points whose median is where a search is said to begin
 @final
 @dataclass(frozen=True, eq=False)
 class Landscape:
-    """What is to be maximised, its ``maximum``, and the number and the instance under which IOHprofiler knows it.
+    """Function to be maximised, with its ``maximum``, and its number and instance in IOHprofiler.
 
-    ``fresh`` makes the same anew, where it remembers what it was asked before.
+    ``fresh`` makes the landscape anew, where the function remembers earlier evaluations.
     """
 
     name: str
@@ -156,8 +157,8 @@ def landscape_of(
     method = {"name": "exchange", "exact": False}
     loaded = load_config(str(config), {**(overrides or {}), "method": method, "continuation": fixed})
     experiment, tools = assemble(loaded), tools_of(loaded)
-    own = experiment.program.own_units
-    sought = experiment.program if own is None else own.program  # in whose units the regulariser weighs
+    own_units = experiment.program.own_units
+    sought = experiment.program if own_units is None else own_units.program  # in whose units the regulariser weighs
     result = build(loaded, "method", loaded.config.method).solve(sought, tools)
     if result.status not in ("certified", "verified") or not sought.families:
         raise InputError(f"{config}: expected a config whose value is certified, got {result.status}: {result.message}")

@@ -1,4 +1,4 @@
-"""What a benchmark has found: every search, and what it amounts to."""
+"""Results of a benchmark: every search, and the figures of merit over all of them."""
 
 from __future__ import annotations
 
@@ -18,7 +18,8 @@ from sparserob_core.sip.convex_set import Array
 @final
 @dataclass(frozen=True, eq=False)
 class Search:
-    """One search of one contender on one landscape: the running best value, and what it thought beside."""
+    """Search of one contender on one landscape: the best value after every evaluation, the maximiser's own CPU time,
+    and the best point."""
 
     landscape: Landscape
     contender: str
@@ -52,37 +53,41 @@ class Benchmark:
         """All evaluations of a contender on a landscape, up to the target or the end, divided by the searches that
         reached the target: the ERT of Hansen and others (2009); infinite where none did."""
         label = self.profiles.problems[landscape].label
-        mine = [one for one in self.searches if one.contender == contender and one.landscape.name == label]
-        needed = np.array([one.needed(self.targets[landscape]) for one in mine])
-        spent = np.where(np.isfinite(needed), needed, [float(one.best.size) for one in mine])
+        searches = [
+            search for search in self.searches if search.contender == contender and search.landscape.name == label
+        ]
+        needed = np.array([search.needed(self.targets[landscape]) for search in searches])
+        spent = np.where(np.isfinite(needed), needed, [float(search.best.size) for search in searches])
         return float(spent.sum() / np.isfinite(needed).sum()) if np.isfinite(needed).any() else float("inf")
 
     def own_microseconds(self, contender: str) -> float:
         """CPU time of the maximiser itself for one evaluation, in microseconds, over all of its searches."""
-        mine = [one for one in self.searches if one.contender == contender]
-        return 1e6 * sum(one.own_seconds for one in mine) / max(1, sum(one.best.size for one in mine))
+        searches = [search for search in self.searches if search.contender == contender]
+        return (
+            1e6 * sum(search.own_seconds for search in searches) / max(1, sum(search.best.size for search in searches))
+        )
 
     def table(self) -> tuple[list[str], list[list[str]]]:
         """Column names, and one row per contender."""
         columns, rows = self.profiles.table()
-        keep = [columns.index(name) for name in ("contender", "runs solved", "fastest", "within 2x", "within 10x")]
-        told = [
-            [*(row[at] for at in keep), f"{self.own_microseconds(name):.1f}"]
+        indices = [columns.index(name) for name in ("contender", "runs solved", "fastest", "within 2x", "within 10x")]
+        entries = [
+            [*(row[index] for index in indices), f"{self.own_microseconds(name):.1f}"]
             for row, name in zip(rows, self.profiles.contenders, strict=True)
         ]
-        return [*(columns[at] for at in keep), "own us / evaluation"], told
+        return [*(columns[index] for index in indices), "own us / evaluation"], entries
 
     def times_table(self) -> tuple[list[str], list[list[str]]]:
         """Column names, and one row per landscape: the expected running time of every contender, in evaluations."""
         names = self.profiles.contenders
         rows = [
-            [problem.label, *(_count(self.expected_running_time(at, name)) for name in names)]
-            for at, problem in enumerate(self.profiles.problems)
+            [problem.label, *(_count(self.expected_running_time(index, name)) for name in names)]
+            for index, problem in enumerate(self.profiles.problems)
         ]
         return ["expected evaluations", *names], rows
 
     def remarks(self) -> Iterator[str]:
-        """What is to be said beside the tables."""
+        """Yield the notes to be printed with the tables."""
         count = "1 landscape" if len(self.targets) == 1 else f"{len(self.targets)} landscapes"
         yield (
             f"solved: within {self.profiles.accuracy:.3g} of the way from the median of uniform points to the maximum; "
@@ -93,7 +98,7 @@ class Benchmark:
             yield self.profiles.undrawn
 
     def summary(self) -> Mapping[str, Any]:
-        """All of it as plain data."""
+        """Return the profiles, the notes and the figures of merit of the benchmark as plain data."""
         names = self.profiles.contenders
         return {
             **self.profiles.summary(),
@@ -102,8 +107,8 @@ class Benchmark:
             "targets": list(self.targets),
             "own_microseconds": {name: self.own_microseconds(name) for name in names},
             "expected_running_time": {
-                problem.label: {name: self.expected_running_time(at, name) for name in names}
-                for at, problem in enumerate(self.profiles.problems)
+                problem.label: {name: self.expected_running_time(index, name) for name in names}
+                for index, problem in enumerate(self.profiles.problems)
             },
         }
 

@@ -82,31 +82,31 @@ def bound(
     if seconds is not None and (not hasattr(seconds, "__float__") or not float(seconds) > 0.0):
         raise InputError(f"seconds: expected a positive number, got {seconds!r}")
     started = time.perf_counter()
-    given = _control(config)
+    control = _control(config)
     loaded = load_config(as_config(config), overrides)
     problem = control_problem_of(loaded, "config: expected a control problem, whose rows have worst cases")
     dictionaries = dictionaries_of(loaded, problem.horizon)
     problem, shape = accumulated(problem), (problem.system.controls, dictionaries[0].functions)
-    if given is not None:
-        _require_fitting(given, shape, loaded, _answers(loaded, problem, dictionaries[0]))
+    if control is not None:
+        _require_fitting(control, shape, loaded, _answers(loaded, problem, dictionaries[0]))
     deadline = Deadline(loaded.config.limits.seconds if seconds is None else float(seconds))
 
     def told(text: str, done: int, total: int) -> None:
         notify(StudyProgress(text=text, done=done, total=total))
 
     def found() -> Bound:
-        theta = np.zeros(shape) if given is None else given
+        theta = np.zeros(shape) if control is None else control
         try:
-            every = bound_rows(problem, dictionaries, theta, float(tolerance), told, notify, deadline)
+            bounded_rows = bound_rows(problem, dictionaries, theta, float(tolerance), told, notify, deadline)
         except InputError as error:
             raise loaded.located(("problem",), error) from error
-        rows = tuple(worst_case(problem, one) for one in every)
+        rows = tuple(worst_case(problem, row) for row in bounded_rows)
         return Bound(
             loaded.config.title or name_of(loaded),
             "undecided" if any(row.reason for row in rows) else "certified",
             rows,
             float(tolerance),
-            given,
+            control,
             time.perf_counter() - started,
             remarks=tuple(
                 f"{row.constraint}: {row.sense} {row.quantity}"

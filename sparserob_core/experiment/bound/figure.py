@@ -64,8 +64,10 @@ def _panel(ax: Axes, rows: list[WorstCase]) -> None:
         name = "largest value" if row.sense == "sup" else "smallest value"
         below, above = (np.where(np.isfinite(band), band, np.nan) for band in (row.low, row.high))
         ax.stairs(above, row.edges, baseline=below, fill=True, color=colour, alpha=0.35, linewidth=0)
-        reached = row.low if row.sense == "sup" else row.high
-        ax.stairs(reached, row.edges, baseline=None, color=colour, linewidth=1.2, label=f"{name}, reached and proven")
+        attained_values = row.low if row.sense == "sup" else row.high
+        ax.stairs(
+            attained_values, row.edges, baseline=None, color=colour, linewidth=1.2, label=f"{name}, reached and proven"
+        )
         ax.plot(row.time, row.reached, "o", color=colour, markersize=4, zorder=4)
         if row.wall is not None:
             ends = (row.wall, ax.get_ylim()[1]) if row.sense == "sup" else (ax.get_ylim()[0], row.wall)

@@ -144,18 +144,18 @@ def worst_case(problem: OptimalControlProblem, found: BoundedRow) -> WorstCase:
 def _worst_of(rows: list[WorstCase]) -> WorstCase:
     """Return the worst case of one quantity over all corners of the parameters, with the witness of the worst
     corner."""
-    largest = rows[0].sense == "sup"
-    most, far = (max, np.maximum) if largest else (min, np.minimum)
-    worst = most(rows, key=lambda row: row.reached)
+    is_supremum = rows[0].sense == "sup"
+    extremum, elementwise_extremum = (max, np.maximum) if is_supremum else (min, np.minimum)
+    worst = extremum(rows, key=lambda row: row.reached)
     return replace(
         worst,
-        lower=most(row.lower for row in rows),
-        upper=most(row.upper for row in rows),
+        lower=extremum(row.lower for row in rows),
+        upper=extremum(row.upper for row in rows),
         margin=None if worst.margin is None else min(row.margin for row in rows if row.margin is not None),
         cells=sum(row.cells for row in rows),
         reason="; ".join(dict.fromkeys(row.reason for row in rows if row.reason)),
-        low=far.reduce([row.low for row in rows]),
-        high=far.reduce([row.high for row in rows]),
+        low=elementwise_extremum.reduce([row.low for row in rows]),
+        high=elementwise_extremum.reduce([row.high for row in rows]),
     )
 
 
@@ -204,11 +204,11 @@ class Bound:
     def over_parameters(self) -> tuple[WorstCase, ...]:
         """The worst cases of all quantities, each over all corners of the parameters; ``rows`` has every corner by
         itself."""
-        alike: dict[tuple[object, ...], list[WorstCase]] = {}
+        groups: dict[tuple[object, ...], list[WorstCase]] = {}
         for row in self.rows:
-            stated = row.direction if row.stated is None else row.stated
-            alike.setdefault((row.constraint, row.wall, row.start, row.stop, stated.tobytes()), []).append(row)
-        return tuple(_worst_of(rows) for rows in alike.values())
+            direction = row.direction if row.stated is None else row.stated
+            groups.setdefault((row.constraint, row.wall, row.start, row.stop, direction.tobytes()), []).append(row)
+        return tuple(_worst_of(rows) for rows in groups.values())
 
 
 ENVELOPE = ("edges", "low", "high")
@@ -262,5 +262,5 @@ def bound_rows_told(found: Bound) -> list[tuple[str, ...]]:
 def columns_told(found: Bound) -> tuple[str, ...]:
     """Return the names of the columns of `bound_rows_told`."""
     time = f"at t [{found.time_unit}]" if found.time_unit else "at t"
-    at = ("at parameters",) if any(row.corner for row in found.rows) else ()
-    return "constraint", "worst case", "at least", "at most", time, "wall", "margin", *at
+    corner_column = ("at parameters",) if any(row.corner for row in found.rows) else ()
+    return "constraint", "worst case", "at least", "at most", time, "wall", "margin", *corner_column

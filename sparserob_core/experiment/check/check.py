@@ -53,9 +53,9 @@ class Check:
 
     def __repr__(self) -> str:
         """Return the status, the number of claims that hold, and the claims that do not."""
-        doubtful = [one for one in self.claims if one.verdict != "holds"]
+        doubtful = [claim for claim in self.claims if claim.verdict != "holds"]
         lines = [f"Check: {self.status}", f"  title: {self.title}", f"  {len(self.claims) - len(doubtful)} claims hold"]
-        lines += [f"  {one.name} {one.verdict}: {one.text}" for one in doubtful]
+        lines += [f"  {claim.name} {claim.verdict}: {claim.text}" for claim in doubtful]
         return shortened([*lines, f"  seconds: {self.seconds:.3g}"])
 
     @property
@@ -142,8 +142,8 @@ def _worst_cases(path: Path, plugins: Iterable[str | Path], clock: Clock, starte
     except Unchecked as gap:
         return _of_no_case(title, gap, started)
     claims = check_suprema(case)
-    rest = tuple(name for name in ("envelopes.npz", "bound.png") if (path / name).is_file())
-    return Check(title, (_config(loaded, data, data), *claims), time.perf_counter() - started, rest)
+    not_compared = tuple(name for name in ("envelopes.npz", "bound.png") if (path / name).is_file())
+    return Check(title, (_config(loaded, data, data), *claims), time.perf_counter() - started, not_compared)
 
 
 def _policy(
@@ -189,8 +189,8 @@ def _largest(directory: Path, case: Case) -> int:
     They repeat the numbers of certificate and config a few times (8 bytes for a number of at least 3 characters), and
     hold the control on its pieces.
     """
-    said = sum((directory / name).stat().st_size for name in ("certificate.json", "config.yaml"))
-    return SPARE + REPEATED * (said + 8 * case.control.pieces * case.problem.system.controls)
+    file_bytes = sum((directory / name).stat().st_size for name in ("certificate.json", "config.yaml"))
+    return SPARE + REPEATED * (file_bytes + 8 * case.control.pieces * case.problem.system.controls)
 
 
 def _config(loaded: Loaded, data: Mapping[str, Any], summary: Mapping[str, Any]) -> Finding:
@@ -199,12 +199,12 @@ def _config(loaded: Loaded, data: Mapping[str, Any], summary: Mapping[str, Any])
     An earlier version knew fewer keys, so that the digest may be that of the config as it is read today or as it is
     written.
     """
-    found, written = loaded.config.digest(), digest(loaded.source.data)
-    if data.get("config") not in (found, written) or summary.get("config") != data.get("config"):
+    resolved_digest, source_digest = loaded.config.digest(), digest(loaded.source.data)
+    if data.get("config") not in (resolved_digest, source_digest) or summary.get("config") != data.get("config"):
         return Finding(
             "config",
             "fails",
-            f"config.yaml is {found}, the certificate is about {data.get('config')!r}, "
+            f"config.yaml is {resolved_digest}, the certificate is about {data.get('config')!r}, "
             f"result.json about {summary.get('config')!r}",
         )
     return Finding("config", "holds", f"the certificate is about this config ({data['config']})")

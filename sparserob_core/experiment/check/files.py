@@ -68,19 +68,19 @@ def compared(stored: StoredRun, loaded: Loaded, case: Case, summary: Mapping[str
 
 
 def _compared(stored: StoredRun, loaded: Loaded, case: Case, summary: Mapping[str, Any]) -> Compared:
-    found = Compared()
-    for name, (different, agrees, left) in (
+    comparison = Compared()
+    for name, (different, agrees, uncompared) in (
         ("result.json", _result(loaded, case, summary)),
         ("solution.npz", _solution(stored, case)),
     ):
-        found.claims.append(Finding(name, "fails" if different else "holds", "; ".join(different) or agrees))
-        if left:
-            found.left[name] = left
+        comparison.claims.append(Finding(name, "fails" if different else "holds", "; ".join(different) or agrees))
+        if uncompared:
+            comparison.left[name] = uncompared
     unread = sorted(_unread(case))
     if unread:
-        found.left["certificate.json"] = unread
-    found.left |= {path.name: [] for path in sorted(stored.directory.iterdir()) if path.name not in READ}
-    return found
+        comparison.left["certificate.json"] = unread
+    comparison.left |= {path.name: [] for path in sorted(stored.directory.iterdir()) if path.name not in READ}
+    return comparison
 
 
 ALWAYS = {"format", "config", "status", "multipliers"}
@@ -110,46 +110,53 @@ def _unread(case: Case) -> set[str]:
     noisy = case.answering and measured is not None and measured.noise is not None
     read = CERTIFICATE.get(str(data.get("status")), FIGURED)
     read = read | {*ANSWERS, "causal", "policy"} if case.answering else read
-    left = {name for name, value in data.items() if name not in read and not (name in SOMETIMES and value in NOTHING)}
-    pieced = {window.name for window in case.windows if window.is_mixed}
+    unread = {name for name, value in data.items() if name not in read and not (name in SOMETIMES and value in NOTHING)}
+    mixed_windows = {window.name for window in case.windows if window.is_mixed}
     proof, witness, fewest = (data.get(name) for name in ("proof", "witness", "fewest_active"))
     of_activity = fewest.get("multipliers") if isinstance(fewest, Mapping) else None
-    left |= _besides("fewest_active", fewest, {"lower", "upper", "multipliers", "decision", "proof"})
+    unread |= _besides("fewest_active", fewest, {"lower", "upper", "multipliers", "decision", "proof"})
     causal, policy = (data.get(name) if case.answering else None for name in ("causal", "policy"))
-    left |= _besides("policy", policy, {"cost", "answers"})
+    unread |= _besides("policy", policy, {"cost", "answers"})
     hidden = {"outputs", "initial_states"} if noisy else set()
-    left |= _besides("causal", causal, {"lower_bound", "signals", "multipliers", "shares"} | hidden)
+    unread |= _besides("causal", causal, {"lower_bound", "signals", "multipliers", "shares"} | hidden)
     rows = causal.get("multipliers") if isinstance(causal, Mapping) else None
     for entry in rows if isinstance(rows, list) else []:
-        left |= _besides("causal.multipliers", entry, (MULTIPLIER - {"parameter"}) | {"signal"})
+        unread |= _besides("causal.multipliers", entry, (MULTIPLIER - {"parameter"}) | {"signal"})
     for multipliers in (data.get("multipliers"), of_activity):
         if not isinstance(multipliers, Mapping):
             continue
-        touched = multipliers is not of_activity and not case.problem.cost.is_linear
-        touched = touched or multipliers.get("tangent") is None
+        is_tangent_read = multipliers is not of_activity and not case.problem.cost.is_linear
+        is_tangent_read = is_tangent_read or multipliers.get("tangent") is None
         unused = case.control.functions >= case.control.pieces and multipliers.get("pieces") is not None
-        told = {"constraints", "equalities", *(() if unused else ("pieces",)), *(("tangent",) if touched else ())}
-        told |= {"norms"} if multipliers is not of_activity and case.problem.cost.group is not None else set()
-        left |= _besides("multipliers", multipliers, told)
+        multiplier_keys = {
+            "constraints",
+            "equalities",
+            *(() if unused else ("pieces",)),
+            *(("tangent",) if is_tangent_read else ()),
+        }
+        multiplier_keys |= (
+            {"norms"} if multipliers is not of_activity and case.problem.cost.group is not None else set()
+        )
+        unread |= _besides("multipliers", multipliers, multiplier_keys)
         entries = multipliers.get("constraints")
         for entry in entries if isinstance(entries, list) else []:
-            mixed = isinstance(entry, Mapping) and str(entry.get("constraint")) in pieced
-            more = ({"piece"} if mixed else set()) | ({"disturbance"} if case.answering else set())
-            more |= BEGUN if case.answering and case.problem.initial_set is not None else set()
-            more |= NOISE if noisy else set()
-            more |= {"changes"} if case.measurable and case.answering else set()
-            left |= _besides("multipliers.constraints", entry, MULTIPLIER | more)
-            left |= {"multipliers.constraints.parameter"} if _of_a_curved_set_of_controls(case, entry) else set()
+            is_mixed = isinstance(entry, Mapping) and str(entry.get("constraint")) in mixed_windows
+            extra_keys = ({"piece"} if is_mixed else set()) | ({"disturbance"} if case.answering else set())
+            extra_keys |= BEGUN if case.answering and case.problem.initial_set is not None else set()
+            extra_keys |= NOISE if noisy else set()
+            extra_keys |= {"changes"} if case.measurable and case.answering else set()
+            unread |= _besides("multipliers.constraints", entry, MULTIPLIER | extra_keys)
+            unread |= {"multipliers.constraints.parameter"} if _of_a_curved_set_of_controls(case, entry) else set()
     if "proof" in read and isinstance(proof, Mapping):
         shapes = {window.name: window.shape for window in case.windows}
-        left |= _besides("proof", proof, set(shapes))
+        unread |= _besides("proof", proof, set(shapes))
         for name, shape in shapes.items():
-            left |= _besides(f"proof.{name}", proof.get(name), CELLS if _flat(shape) else CELLS | {"normals"})
-    known = WITNESS | (BEGUN if case.problem.initial_set is not None else set()) | (NOISE if noisy else set())
-    mixed = isinstance(witness, Mapping) and str(witness.get("constraint")) in pieced
-    known = known | {"piece"} if mixed else known
-    known = known - {"disturbance", *BEGUN} if case.measurable and not case.answering else known
-    return left | (_besides("witness", witness, known) if "witness" in read else set())
+            unread |= _besides(f"proof.{name}", proof.get(name), CELLS if _flat(shape) else CELLS | {"normals"})
+    witness_keys = WITNESS | (BEGUN if case.problem.initial_set is not None else set()) | (NOISE if noisy else set())
+    is_mixed = isinstance(witness, Mapping) and str(witness.get("constraint")) in mixed_windows
+    witness_keys = witness_keys | {"piece"} if is_mixed else witness_keys
+    witness_keys = witness_keys - {"disturbance", *BEGUN} if case.measurable and not case.answering else witness_keys
+    return unread | (_besides("witness", witness, witness_keys) if "witness" in read else set())
 
 
 def _besides(name: str, data: object, read: set[str]) -> set[str]:
@@ -163,8 +170,8 @@ def _of_a_curved_set_of_controls(case: Case, entry: object) -> bool:
     """
     if not isinstance(entry, Mapping) or entry.get("constraint") not in (case.of_control, "control_step"):
         return False
-    own = not any(window.name == entry["constraint"] for window in case.windows)
-    return own and bool(entry.get("parameter"))
+    has_no_window = not any(window.name == entry["constraint"] for window in case.windows)
+    return has_no_window and bool(entry.get("parameter"))
 
 
 def _flat(shape: ConvexSet) -> bool:
@@ -184,7 +191,7 @@ def _result(loaded: Loaded, case: Case, summary: Mapping[str, Any]) -> Verdicts:
     from sparserob_core.checker.outcome import Unchecked
 
     status = case.certificate.get("status")
-    wanted = {
+    expected_values = {
         "status": (status,),
         "lower_bound": (case.certificate.get("lower_bound"),),
         "config": (case.certificate.get("config"),),
@@ -201,10 +208,10 @@ def _result(loaded: Loaded, case: Case, summary: Mapping[str, Any]) -> Verdicts:
     }
     different = [
         f"{name} is {summary.get(name)!r}, not {' or '.join(dict.fromkeys(map(repr, values)))}"
-        for name, values in wanted.items()
+        for name, values in expected_values.items()
         if not any(_equal(summary.get(name), value) for value in values)
     ]
-    left, known = [], set(wanted)
+    uncompared, compared_names = [], set(expected_values)
     for name, compare in COMPARED.items():
         try:
             verdict = compare(case, summary)
@@ -213,17 +220,17 @@ def _result(loaded: Loaded, case: Case, summary: Mapping[str, Any]) -> Verdicts:
         except Broken as error:  # the certificate lacks the numbers from which the entry follows
             verdict = [f"{name}: {error}"]
         if verdict is None:
-            left += [name] if name in summary else []
+            uncompared += [name] if name in summary else []
         else:
             different += verdict
-        known.add(name)
-    left += [name for name in summary if name not in known]
+        compared_names.add(name)
+    uncompared += [name for name in summary if name not in compared_names]
     for name, read in (("worst", WORST), ("sparsity", SPARSITY)):
-        left += sorted(_besides(name, summary.get(name), read)) if name not in left else []
-    share = None if different or "sparsity" in left else summary["sparsity"]["active_fraction"]
-    where = ", in at least one channel" if case.problem.system.controls > 1 else ""
-    acts = "" if share is None else f"; its control acts {share:.1%} of the time{where}"
-    return different, f"it says what the certificate says{acts}", left
+        uncompared += sorted(_besides(name, summary.get(name), read)) if name not in uncompared else []
+    share = None if different or "sparsity" in uncompared else summary["sparsity"]["active_fraction"]
+    channel_note = ", in at least one channel" if case.problem.system.controls > 1 else ""
+    acts = "" if share is None else f"; its control acts {share:.1%} of the time{channel_note}"
+    return different, f"it says what the certificate says{acts}", uncompared
 
 
 def _causal(case: Case) -> dict[str, tuple[object, ...]]:
@@ -260,23 +267,23 @@ def _cost_scale(case: Case, summary: Mapping[str, Any]) -> list[str] | None:
         return None
     from sparserob_core.checker.claims.claims import added_up, compared, largest_cost
 
-    said, decided = summary["cost_scale"], case.certificate.get("decision") is not None
-    derived = added_up(case) if decided else 0.0
-    rounded = AGREED * CANCELLED * compared(case) if decided else 0.0
-    near = isinstance(said, float) and abs(said - derived) <= rounded
-    known = near or _same(said, derived, CLOSE) or _same(said, largest_cost(case), CLOSE)
-    return [] if known else [f"cost_scale is {said!r}, not {derived!r}"]
+    cost_scale, has_decision = summary["cost_scale"], case.certificate.get("decision") is not None
+    derived = added_up(case) if has_decision else 0.0
+    rounded = AGREED * CANCELLED * compared(case) if has_decision else 0.0
+    is_near = isinstance(cost_scale, float) and abs(cost_scale - derived) <= rounded
+    agrees = is_near or _same(cost_scale, derived, CLOSE) or _same(cost_scale, largest_cost(case), CLOSE)
+    return [] if agrees else [f"cost_scale is {cost_scale!r}, not {derived!r}"]
 
 
 def _sparsity(case: Case, summary: Mapping[str, Any]) -> list[str] | None:
     """Compare the share of time for which the certificate's control acts, and the number of its switches."""
-    said = summary.get("sparsity")
-    if not isinstance(said, Mapping):
+    entry = summary.get("sparsity")
+    if not isinstance(entry, Mapping):
         return ["sparsity is no mapping"]
     derived: dict[str, Any] = {"active_fraction": None, "switches": None}
-    if said.get("channels", case.problem.system.controls) != case.problem.system.controls:
-        return [f"sparsity: channels is {said['channels']!r}, not {case.problem.system.controls}"]
-    fewest, claimed = said.get("fewest_active"), case.certificate.get("fewest_active")
+    if entry.get("channels", case.problem.system.controls) != case.problem.system.controls:
+        return [f"sparsity: channels is {entry['channels']!r}, not {case.problem.system.controls}"]
+    fewest, claimed = entry.get("fewest_active"), case.certificate.get("fewest_active")
     if isinstance(claimed, Mapping):
         claimed = {name: claimed.get(name) for name in ("lower", "upper")}
     if fewest != claimed:
@@ -289,9 +296,9 @@ def _sparsity(case: Case, summary: Mapping[str, Any]) -> list[str] | None:
     elif case.certificate.get("status") == "infeasible":
         return None
     return [
-        f"sparsity: {name} is {said.get(name)!r}, not {value!r}"
+        f"sparsity: {name} is {entry.get(name)!r}, not {value!r}"
         for name, value in derived.items()
-        if not _same(said.get(name), value)
+        if not _same(entry.get(name), value)
     ]
 
 
@@ -318,24 +325,24 @@ def _worst(case: Case, summary: Mapping[str, Any]) -> list[str] | None:
 
     It must be that of the witness. Without one it is computed anew at its time and parameter, where its set is flat.
     """
-    said, status = summary.get("worst"), case.certificate.get("status")
-    if not isinstance(said, Mapping):
+    entry, status = summary.get("worst"), case.certificate.get("status")
+    if not isinstance(entry, Mapping):
         return ["worst is no mapping"]
     if status == "refuted":
         witness = case.certificate.get("witness")
         if not isinstance(witness, Mapping):
             return None
-        names = [name for name in ("violation", "constraint", "time") if not _same(said.get(name), witness.get(name))]
-        if said.get("parameter") and not _near(said["parameter"], witness.get("parameter")):
+        names = [name for name in ("violation", "constraint", "time") if not _same(entry.get(name), witness.get(name))]
+        if entry.get("parameter") and not _near(entry["parameter"], witness.get("parameter")):
             names.append("parameter")
-        names += [] if _begins(case, said, witness) else ["initial_state"]
-        return [f"worst: {name} is {said.get(name)!r}, that of the witness {witness.get(name)!r}" for name in names]
+        names += [] if _begins(case, entry, witness) else ["initial_state"]
+        return [f"worst: {name} is {entry.get(name)!r}, that of the witness {witness.get(name)!r}" for name in names]
     if status not in ("certified", "verified"):
         return None
-    if said.get("constraint") in (None, ""):  # a problem without constraints that can be violated
-        return [] if said.get("violation") is None and not case.windows else ["worst: no constraint is named"]
+    if entry.get("constraint") in (None, ""):  # a problem without constraints that can be violated
+        return [] if entry.get("violation") is None and not case.windows else ["worst: no constraint is named"]
     try:
-        return _attained(case, said)
+        return _attained(case, entry)
     except Unchecked:
         return None
     except Broken as error:
@@ -353,8 +360,8 @@ def _outside(bound: ConvexSet, begun: Array, centre: Array) -> float:
     rounded = np.finfo(float).eps * (np.abs(begun) + np.abs(centre))
     if shape.facets is not None:
         return shape.excess(balls(deviation), lambda c: balls([-float(np.abs(c) @ rounded)])[0])[0]
-    off = np.maximum(np.abs(deviation - shape.centre) - rounded, 0.0)
-    return shape.excess(balls(shape.centre + np.copysign(off, deviation - shape.centre)))[0]
+    distance = np.maximum(np.abs(deviation - shape.centre) - rounded, 0.0)
+    return shape.excess(balls(shape.centre + np.copysign(distance, deviation - shape.centre)))[0]
 
 
 def _attained(case: Case, said: Mapping[str, Any]) -> list[str]:
@@ -365,20 +372,20 @@ def _attained(case: Case, said: Mapping[str, Any]) -> list[str]:
     from sparserob_core.checker.claims.case import numbers
     from sparserob_core.checker.claims.replay import exceeded
 
-    found = [("", *exceeded(case, said))]
+    violations = [("", *exceeded(case, said))]
     if case.problem.initial_set is not None and not case.answering:
-        begun = numbers(_whole(case, said.get("initial_state")), "initial_state")
+        initial_state = numbers(_whole(case, said.get("initial_state")), "initial_state")
         centre = np.asarray(case.problem.initial_state)
-        if begun.shape != centre.shape or _outside(case.problem.initial_set, begun, centre) > CLOSE:
-            return [f"worst: {begun.tolist()} is no initial state"]
-        found.append((f" from {begun.tolist()}", *exceeded(case, said, begun)))
+        if initial_state.shape != centre.shape or _outside(case.problem.initial_set, initial_state, centre) > CLOSE:
+            return [f"worst: {initial_state.tolist()} is no initial state"]
+        violations.append((f" from {initial_state.tolist()}", *exceeded(case, said, initial_state)))
     elif "initial_state" in said:
         return ["worst: an initial state is named where there is one only, or none is known"]
     violation = said["violation"]
     return [
-        f"worst: the violation is {violation!r}, derived are {', '.join(f'{value:.3g}' for value in most)}{where}"
-        for where, most, slack in found
-        if not any(abs(violation - value) <= 1e-6 * abs(value) + slack for value in most)
+        f"worst: the violation is {violation!r}, derived are {', '.join(f'{value:.3g}' for value in values)}{origin}"
+        for origin, values, slack in violations
+        if not any(abs(violation - value) <= 1e-6 * abs(value) + slack for value in values)
     ]
 
 
@@ -387,11 +394,11 @@ def _begins(case: Case, said: Mapping[str, Any], witness: Mapping[str, Any]) -> 
     if case.problem.initial_set is None or (case.answering and "initial_state" not in said):
         return "initial_state" not in said
     deviation = witness.get("deviation")
-    if not isinstance(deviation, list) or not all(isinstance(one, int | float) for one in deviation):
+    if not isinstance(deviation, list) or not all(isinstance(coordinate, int | float) for coordinate in deviation):
         return False
     centre = np.asarray(case.problem.initial_state, dtype=float)
-    told = _whole(case, said.get("initial_state"))
-    return len(deviation) == centre.size and _near(told, (centre + deviation).tolist())
+    initial_state = _whole(case, said.get("initial_state"))
+    return len(deviation) == centre.size and _near(initial_state, (centre + deviation).tolist())
 
 
 def _whole(case: Case, said: object) -> object:
@@ -399,10 +406,10 @@ def _whole(case: Case, said: object) -> object:
 
     The added ones are known. A state that has all coordinates is returned as it is.
     """
-    begun = np.asarray(case.problem.initial_state, dtype=float)
+    initial_state = np.asarray(case.problem.initial_state, dtype=float)
     if not isinstance(said, list) or len(said) != case.stated.system.states:
         return said
-    return [*said, *begun[len(said) :].tolist()]
+    return [*said, *initial_state[len(said) :].tolist()]
 
 
 def _near(said: object, point: object) -> bool:
@@ -419,37 +426,37 @@ SPARSITY = {"active_fraction", "switches", "channels", "fewest_active"}
 def _added_up(case: Case, summary: Mapping[str, Any]) -> list[str] | None:
     """Compare the terms of the cost, in words."""
     words = case.problem.cost.words()
-    said = summary.get("cost_of", words)
-    return [] if said == words else [f"cost_of is {said!r}, not {words!r}"]
+    entry = summary.get("cost_of", words)
+    return [] if entry == words else [f"cost_of is {entry!r}, not {words!r}"]
 
 
 def _units(case: Case, summary: Mapping[str, Any]) -> list[str]:
     """Compare the units with those that the config names."""
-    said, names = summary.get("units") or {}, case.problem.names
-    known = {"", *names.state_units, *names.control_units}
-    rows = said.get("rows") if isinstance(said, Mapping) else None
-    if not isinstance(said, Mapping) or not isinstance(rows, Mapping | None):
+    entry, names = summary.get("units") or {}, case.problem.names
+    known_units = {"", *names.state_units, *names.control_units}
+    rows = entry.get("rows") if isinstance(entry, Mapping) else None
+    if not isinstance(entry, Mapping) or not isinstance(rows, Mapping | None):
         return ["units is no mapping with rows"]
-    told = [
-        said.get("worst", ""),
+    stated_units = [
+        entry.get("worst", ""),
         *(unit for row in (rows or {}).values() for unit in (row if isinstance(row, list) else [row])),
     ]
-    different = [unit for unit in told if not isinstance(unit, str) or unit not in known]
+    different = [unit for unit in stated_units if not isinstance(unit, str) or unit not in known_units]
     wrong = [f"units: {unit} is none of the config's" for unit in dict.fromkeys(map(repr, different))]
     effort = case.problem.cost_unit
     cost = names.time if case.counts else effort
-    stated, every = case.stated.system.states, list(names.state_units)
-    for key, mine in (("time", names.time), ("states", every[:stated]), ("cost", cost), ("J", effort)):
-        allowed = (mine, every) if key == "states" else (mine,)  # earlier versions wrote the units of added states too
-        wrong += [f"units: {key} is {said[key]!r}, not {mine!r}"] if key in said and said[key] not in allowed else []
+    user_states, units = case.stated.system.states, list(names.state_units)
+    for key, unit in (("time", names.time), ("states", units[:user_states]), ("cost", cost), ("J", effort)):
+        allowed = (unit, units) if key == "states" else (unit,)  # earlier versions wrote the units of added states too
+        wrong += [f"units: {key} is {entry[key]!r}, not {unit!r}"] if key in entry and entry[key] not in allowed else []
     return wrong
 
 
 def _parameters(case: Case, summary: Mapping[str, Any]) -> list[str] | None:
     """Compare the names of the uncertain parameters, in the order of their values."""
-    mine = [] if case.problem.system.parameters is None else list(case.problem.system.names)
-    said = summary.get("parameters", mine)
-    return [] if said == mine else [f"parameters are {said!r}, not {mine!r}"]
+    names = [] if case.problem.system.parameters is None else list(case.problem.system.names)
+    entry = summary.get("parameters", names)
+    return [] if entry == names else [f"parameters are {entry!r}, not {names!r}"]
 
 
 COMPARED: dict[str, Callable[[Case, Mapping[str, Any]], list[str] | None]] = {
@@ -471,7 +478,7 @@ def _equal(said: object, value: object) -> bool:
 
 def _same(said: object, value: object, figures: float = FIGURES) -> bool:
     """Return whether two entries of JSON agree, numbers up to rounding errors."""
-    numbers = [one for one in (said, value) if isinstance(one, int | float) and not isinstance(one, bool)]
+    numbers = [entry for entry in (said, value) if isinstance(entry, int | float) and not isinstance(entry, bool)]
     if len(numbers) == 2:
         return abs(numbers[0] - numbers[1]) <= figures * max(abs(numbers[0]), abs(numbers[1]))
     return type(said) is type(value) and said == value
@@ -495,7 +502,7 @@ def _solution(stored: StoredRun, case: Case) -> Verdicts:
         decision = np.array(case.certificate["decision"], dtype=float)
         size = case.control.summands(decision)
         answered = ANSWERS[: 1 if case.problem.measurements is None else 2] if case.answering else []
-        same = (
+        agrees = (
             np.array_equal(theta, decision)
             and np.array_equal(flat[: decision.size], decision.ravel())
             and (case.answering or flat.size == decision.size + _sizes(case))
@@ -510,10 +517,10 @@ def _solution(stored: StoredRun, case: Case) -> Verdicts:
         return [f"it holds no array {error}"], "", []
     except (ValueError, TypeError, OverflowError):
         return ["its control and the certificate's are no arrays of one shape"], "", []
-    left = sorted(set(arrays) - {*STORED, *answered} - set(_witnessed(case, arrays)))
-    different = [] if same else ["its control is not the certificate's"]
+    uncompared = sorted(set(arrays) - {*STORED, *answered} - set(_witnessed(case, arrays)))
+    different = [] if agrees else ["its control is not the certificate's"]
     different += [text for text in _witnessed(case, arrays).values() if text]
-    return different, "it holds the certificate's control", left
+    return different, "it holds the certificate's control", uncompared
 
 
 def _witnessed(case: Case, arrays: Mapping[str, Any]) -> dict[str, str]:
@@ -524,11 +531,11 @@ def _witnessed(case: Case, arrays: Mapping[str, Any]) -> dict[str, str]:
         return {}
     from sparserob_core.checker.claims.case import numbers
 
-    said = arrays["worst_disturbance"]
+    disturbance = arrays["worst_disturbance"]
     try:
         signal = numbers(witness["disturbance"], "disturbance")
-        size = np.abs(said).max(initial=0.0)
-        close = signal.shape == said.shape and bool((np.abs(signal - said) <= CLOSE * size).all())
+        size = np.abs(disturbance).max(initial=0.0)
+        close = signal.shape == disturbance.shape and bool((np.abs(signal - disturbance) <= CLOSE * size).all())
     except (Broken, TypeError):  # rows of different lengths, or text
         close = False
     return {"worst_disturbance": "" if close else "its worst disturbance is not that of the witness"}

@@ -51,14 +51,14 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
     Ctrl-C and SIGTERM end it with what is known by then, and the status 130; a second one ends it at once.
     """
-    given = sys.argv[1:] if arguments is None else arguments
+    command_line = sys.argv[1:] if arguments is None else arguments
     gc.set_threshold(*RARELY)
     listen()
     open_streams()
-    if given and QUESTIONS.isdisjoint(given):
+    if command_line and QUESTIONS.isdisjoint(command_line):
         spare_imports()
     try:
-        status = _status(given)
+        status = _status(command_line)
     finally:
         hand_back_output()
     sys.exit(status)
@@ -87,16 +87,16 @@ def _status(arguments: Sequence[str]) -> int:
     except MemoryError as error:
         return _end("out of memory; fewer pieces, cells or trajectories need less", error, 5)
     except Exception as error:  # noqa: BLE001  the last resort: a fault of the program is one line too
-        said = named(error)
-        return _end(f"internal error: {said}; {DEBUG}=1 shows where", error, 5)
+        description = named(error)
+        return _end(f"internal error: {description}; {DEBUG}=1 shows where", error, 5)
 
 
 def _usage(error: click.ClickException) -> str:
-    """What is wrong with the command line, in one line, with the command that says what is right."""
-    said = " ".join(error.format_message().split()).rstrip(".")
-    said = re.sub(r"\\u(dc[89a-f][0-9a-f])", lambda byte: chr(int(byte[1], 16)), said)  # click names things by `repr`
+    """Describe a fault of the command line in one line, with the command that prints the correct usage."""
+    text = " ".join(error.format_message().split()).rstrip(".")
+    text = re.sub(r"\\u(dc[89a-f][0-9a-f])", lambda byte: chr(int(byte[1], 16)), text)  # click names things by `repr`
     context = error.ctx if isinstance(error, click.UsageError) else None
-    return f"{said[:1].lower()}{said[1:]}" + (
+    return f"{text[:1].lower()}{text[1:]}" + (
         "" if context is None else f" (`{context.command_path} --help` says more)"
     )
 

@@ -51,28 +51,30 @@ def compare(
         raise InputError(f"runs: expected a list of at least one run directory, got {runs!r}")
     if out is not None:
         require_writable(Path(out))
-    places = [as_run(run)[0] for run in runs]
-    studies = [place for place in places if is_study(place)]
+    directories = [as_run(run)[0] for run in runs]
+    studies = [directory for directory in directories if is_study(directory)]
     broadcast = Broadcast([(type(observer).__name__, observer) for observer in observers])
     if studies and broadcast.heard:
         raise InputError(
             f"{studies[0]}: expected runs to be watched side by side, got a study; it is watched as it runs"
         )
-    if studies and len(studies) < len(places):
-        other = next(place for place in places if place not in studies)
-        raise InputError(f"{other}: expected a study beside {studies[0]}; a study is compared with studies only")
-    found: Comparison | Profiles
-    found = read_profiles(studies, accuracy, measure) if studies else _side_by_side(places)
+    if studies and len(studies) < len(directories):
+        run_directory = next(directory for directory in directories if directory not in studies)
+        raise InputError(
+            f"{run_directory}: expected a study beside {studies[0]}; a study is compared with studies only"
+        )
+    comparison: Comparison | Profiles
+    comparison = read_profiles(studies, accuracy, measure) if studies else _side_by_side(directories)
     if out is not None and (missing := missing_matplotlib()):
-        found = replace(found, undrawn=missing)
-    elif out is not None and isinstance(found, Profiles):
-        write_profiles(Path(out), found)
-    elif out is not None and isinstance(found, Comparison):
-        write_comparison(Path(out), found)
-    if broadcast.heard and isinstance(found, Comparison):
-        for event in events_of(found):
+        comparison = replace(comparison, undrawn=missing)
+    elif out is not None and isinstance(comparison, Profiles):
+        write_profiles(Path(out), comparison)
+    elif out is not None and isinstance(comparison, Comparison):
+        write_comparison(Path(out), comparison)
+    if broadcast.heard and isinstance(comparison, Comparison):
+        for event in events_of(comparison):
             broadcast(event)
-    return found
+    return comparison
 
 
 def events_of(comparison: Comparison) -> Iterator[Event]:
@@ -87,25 +89,25 @@ def events_of(comparison: Comparison) -> Iterator[Event]:
         arrangement="runs",
         runs=Path(),
     )
-    rows = {place: _row(curve) for place, curve in enumerate(comparison.curves)}
+    rows = {index: _row(curve) for index, curve in enumerate(comparison.curves)}
     yield SweepFinished(rows=rows, seconds=seconds, answer=next(comparison_remarks(comparison)))
 
 
 def _row(curve: Curve) -> dict[str, Any]:
     """The row of a run, as in the table of a study; what is not known is null."""
-    known = {
+    values = {
         "cost": curve.cost,
         "lower_bound": curve.lower_bound,
         "upper_bound": curve.upper_bound,
         "gap": curve.gap,
         "seconds": curve.all_seconds,
     }
-    numbers = {name: value if np.isfinite(value) else None for name, value in known.items()}
+    numbers = {name: value if np.isfinite(value) else None for name, value in values.items()}
     return {"run": str(curve.directory.resolve()), "status": curve.status, "message": curve.message, **numbers}
 
 
 def _side_by_side(places: Sequence[Path]) -> Comparison:
-    curves = [read_curve(place) for place in places]
+    curves = [read_curve(directory) for directory in places]
     for curve in curves[1:]:
         _require_same_problem(curves[0], curve)
     names = labels([curve.config for curve in curves], [curve.searched for curve in curves])
@@ -120,21 +122,21 @@ def _side_by_side(places: Sequence[Path]) -> Comparison:
 
 def comparison_table(comparison: Comparison) -> tuple[list[str], list[list[str]]]:
     """Column names, and one row per run; what is relative to the exact value only when it is known."""
-    known = np.isfinite(comparison.exact)
+    is_known = np.isfinite(comparison.exact)
     relative = (
-        ["share of exact", *(f"to {share:.4g} %" for share in (100 * share for share in SHARES))] if known else []
+        ["share of exact", *(f"to {share:.4g} %" for share in (100 * share for share in SHARES))] if is_known else []
     )
     unit = f" [{comparison.cost_unit}]" if comparison.cost_unit else ""
     bounds = [f"lower bound{unit}", f"cost{unit}"]
     columns = ["run", "status", *bounds, *relative, "worst violation", "evaluations", "seconds"]
     rows = []
     for curve, label in zip(comparison.curves, comparison.labels, strict=True):
-        part = (
+        relative_entries = (
             [
                 _text(comparison.share(curve.lower_bound), ".4%"),
                 *(_text(comparison.within(curve, share), ".0f") for share in SHARES),
             ]
-            if known
+            if is_known
             else []
         )
         rows.append(
@@ -143,7 +145,7 @@ def comparison_table(comparison: Comparison) -> tuple[list[str], list[list[str]]
                 curve.status,
                 _text(curve.lower_bound, ".9g"),
                 _text(curve.cost, ".9g"),
-                *part,
+                *relative_entries,
                 f"{_text(curve.violation, '.2e')} {curve.measured}".rstrip(),
                 _text(curve.all_evaluations, ".0f"),
                 _text(curve.all_seconds, ".3f"),
@@ -153,8 +155,8 @@ def comparison_table(comparison: Comparison) -> tuple[list[str], list[list[str]]
 
 
 def comparison_remarks(comparison: Comparison) -> Iterator[str]:
-    """What is to be said beside the table: where the exact value comes from, who has no curve, and bounds that
-    contradict it."""
+    """Yield the notes to be printed with the table: the source of the exact value, runs without a curve, and bounds
+    that contradict the exact value."""
     unit = f" {comparison.cost_unit}" if comparison.cost_unit else ""
     if comparison.certified is None:
         yield "no run is certified: the exact optimum is not known, and no line is drawn for it"
@@ -180,7 +182,7 @@ def comparison_remarks(comparison: Comparison) -> Iterator[str]:
 
 def comparison_summary(comparison: Comparison) -> dict[str, Any]:
     """The comparison as plain data; what is not known is null."""
-    known = np.isfinite(comparison.exact)
+    is_known = np.isfinite(comparison.exact)
     runs = [
         {
             "label": label,
@@ -192,7 +194,7 @@ def comparison_summary(comparison: Comparison) -> dict[str, Any]:
             "violation": curve.violation,
             "evaluations": curve.all_evaluations,
             "seconds": curve.all_seconds,
-            "evaluations_within": {str(share): comparison.within(curve, share) for share in SHARES} if known else {},
+            "evaluations_within": {str(share): comparison.within(curve, share) for share in SHARES} if is_known else {},
         }
         for curve, label in zip(comparison.curves, comparison.labels, strict=True)
     ]
@@ -220,10 +222,10 @@ def _require_same_problem(first: Curve, other: Curve) -> None:
             "expected runs whose costs mean the same"
         )
     for section in ("problem", "dictionaries"):
-        found = difference(first.config.get(section), other.config.get(section), section)
-        if found is not None:
-            path, here, there = found
+        mismatch = difference(first.config.get(section), other.config.get(section), section)
+        if mismatch is not None:
+            path, first_value, other_value = mismatch
             raise InputError(
                 f"{other.directory}: expected a run of the same problem as {first.directory}; "
-                f"{path} is {value_text(there)} here and {value_text(here)} there"
+                f"{path} is {value_text(other_value)} here and {value_text(first_value)} there"
             )

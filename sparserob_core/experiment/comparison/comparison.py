@@ -54,7 +54,9 @@ class Comparison:
     def differences(self) -> list[tuple[str, list[str]]]:
         """The keys in which the configs differ, each with its value in every run. Of components with different names
         the name stands for all of their options."""
-        configs = [{key: part for key, part in curve.config.items() if key not in BESIDE} for curve in self.curves]
+        configs = [
+            {key: section for key, section in curve.config.items() if key not in BESIDE} for curve in self.curves
+        ]
         return list(_differences("", configs))
 
 

@@ -1,5 +1,4 @@
-"""What a run directory says of the run's progress: the best lower bound against the evaluations and the seconds that it
-took."""
+"""Curve of a stored run: its best lower bound against the evaluations and the seconds that the bound took."""
 
 from __future__ import annotations
 
@@ -69,9 +68,20 @@ class Curve:
 
 
 def spent_until(target: float, best: Array, spent: Array) -> float:
-    """What was spent when the best value so far ``(n,)`` came to a target; infinite when it never did."""
-    there = np.flatnonzero(best >= target)
-    return float(spent[there[0]]) if there.size else np.inf
+    """Return the effort that was spent when the best value so far ``(n,)`` reached a target; infinite where it never
+    did.
+
+    Parameters
+    ----------
+    target : float
+        Value to be reached.
+    best : array, (n,)
+        Best value so far at each step.
+    spent : array, (n,)
+        Effort until each step, such as evaluations or seconds.
+    """
+    indices = np.flatnonzero(best >= target)
+    return float(spent[indices[0]]) if indices.size else np.inf
 
 
 def read_curve(directory: Path) -> Curve:
@@ -111,8 +121,8 @@ def read_curve(directory: Path) -> Curve:
 def _dimension(directory: Path, searched: bool) -> int:
     """The last dimension of the points that were searched, or else of the decision."""
     for name, column in (("evaluations.npz", "points"), ("solution.npz", "decision"))[0 if searched else 1 :]:
-        if (directory / name).is_file() and (found := read_arrays(directory / name).get(column)) is not None:
-            return int(found.shape[-1]) if found.ndim else 0
+        if (directory / name).is_file() and (array := read_arrays(directory / name).get(column)) is not None:
+            return int(array.shape[-1]) if array.ndim else 0
     return 0
 
 
@@ -149,8 +159,8 @@ def _config(file: Path) -> dict[str, Any]:
 
 
 def _mapping(data: Mapping[str, Any], key: str) -> Mapping[str, Any]:
-    found = data.get(key)
-    return found if isinstance(found, Mapping) else {}
+    entry = data.get(key)
+    return entry if isinstance(entry, Mapping) else {}
 
 
 def _number(data: Mapping[str, Any], key: str) -> float:

@@ -56,15 +56,15 @@ def draw_comparison(comparison: Comparison) -> Figure:
     columns = 2 if max(map(len, texts)) <= LINE // 2 else 1
     lines = ceil((sum(text.count("\n") + 1 for text in texts) + 1) / columns)
     figure = Figure(figsize=(look.WIDTH, 3.2 + 0.165 * lines), layout="constrained")
-    left, right = figure.subplots(1, 2, sharey=True)
+    left_ax, right_ax = figure.subplots(1, 2, sharey=True)
     for number, (curve, text) in enumerate(zip(curves, texts, strict=True)):
         pen = _pen(number, len(curves), curve.searched)
-        _draw_curve(left, curve.evaluations, curve.bound, curve.all_evaluations, {**pen, "label": text})
-        _draw_curve(right, curve.seconds, curve.bound, curve.all_seconds, pen)
-    _draw_axes(left, right, comparison.exact, curves, comparison.cost_unit)
+        _draw_curve(left_ax, curve.evaluations, curve.bound, curve.all_evaluations, {**pen, "label": text})
+        _draw_curve(right_ax, curve.seconds, curve.bound, curve.all_seconds, pen)
+    _draw_axes(left_ax, right_ax, comparison.exact, curves, comparison.cost_unit)
     figure.suptitle(plain(comparison.title), x=0.012, ha="left", fontsize=11.5)
     figure.legend(
-        *left.get_legend_handles_labels(),
+        *left_ax.get_legend_handles_labels(),
         loc="outside lower left",
         ncols=columns,
         fontsize=9,
@@ -115,7 +115,9 @@ def _draw_axes(left: Axes, right: Axes, exact: float, curves: list[Curve], unit:
     searched = {curve.searched for curve in curves}
     left.set_xlabel(
         " or ".join(
-            text for text, there in (("evaluations of $g$", True), ("relaxed programs", False)) if there in searched
+            text
+            for text, does_search in (("evaluations of $g$", True), ("relaxed programs", False))
+            if does_search in searched
         )
     )
     right.set_xlabel("seconds")

@@ -13,18 +13,18 @@ UNSEEN = frozenset({"problem", "dictionaries", "title", "observers", "plugins", 
 
 
 def labels(configs: Sequence[Mapping[str, Any]], searched: Sequence[bool]) -> list[str]:
-    """One label per resolved config; equal ones get a number.
+    """Return one label per resolved config; equal labels get a number.
 
-    It begins with the method, for a run that searches with the maximiser; options are compared between runs of the same
-    method (and those of a component between runs with the same component), since others have no such option or do not
-    use it. The seed is for runs that differ in nothing else.
+    A label begins with the method, or with the maximiser for a run that searches. Options are compared between runs of
+    the same method only, and options of a component between runs with the same component. Other runs have no such
+    option or do not use it. The seed is named where runs differ in nothing else.
     """
     names = {config["method"]["name"] for config in configs}
-    found = []
+    texts = []
     for config, searches in zip(configs, searched, strict=True):
-        peers = [other for other in configs if other["method"]["name"] == config["method"]["name"]]
-        found.append(", ".join([_head(config, peers, searches, len(names) > 1), *_differences(config, peers)]))
-    return _numbered(_with_seeds(found, [config.get("seed") for config in configs]))
+        peers = [peer for peer in configs if peer["method"]["name"] == config["method"]["name"]]
+        texts.append(", ".join([_head(config, peers, searches, len(names) > 1), *_differences(config, peers)]))
+    return _numbered(_with_seeds(texts, [config.get("seed") for config in configs]))
 
 
 def _head(config: Mapping[str, Any], peers: Sequence[Mapping[str, Any]], searches: bool, several: bool) -> str:
@@ -42,21 +42,21 @@ def _differences(config: Mapping[str, Any], peers: Sequence[Mapping[str, Any]]) 
             continue
         if section in COMPONENTS and len({_called(peer, section) for peer in peers}) > 1:
             yield f"{section} {_called(config, section)}"
-        same = [peer for peer in peers if _called(peer, section) == _called(config, section)]
-        yield from (f"{section} {option}" for option in _options(config, same, section))
+        matching_peers = [peer for peer in peers if _called(peer, section) == _called(config, section)]
+        yield from (f"{section} {option}" for option in _options(config, matching_peers, section))
 
 
 def _options(config: Mapping[str, Any], peers: Sequence[Mapping[str, Any]], section: str) -> Iterator[str]:
-    own = config.get(section)
-    if not isinstance(own, Mapping):
+    own_section = config.get(section)
+    if not isinstance(own_section, Mapping):
         return
-    same = [
+    peer_sections = [
         peer[section]
         for peer in peers
         if isinstance(peer.get(section), Mapping) and _name(peer, section) == _name(config, section)
     ]
-    for key, value in own.items():
-        if key != "name" and any(other.get(key) != value for other in same):
+    for key, value in own_section.items():
+        if key != "name" and any(peer_section.get(key) != value for peer_section in peer_sections):
             yield value if isinstance(value, str) else f"{key} {value_text(value)}"
 
 
@@ -74,16 +74,20 @@ def _called(config: Mapping[str, Any], section: str) -> str:
 
 
 def _with_seeds(found: list[str], seeds: list[object]) -> list[str]:
-    alike = {label: {str(seed) for other, seed in zip(found, seeds, strict=True) if other == label} for label in found}
+    seeds_of_label = {
+        label: {str(seed) for other_label, seed in zip(found, seeds, strict=True) if other_label == label}
+        for label in found
+    }
     return [
-        f"{label}, seed {seed}" if len(alike[label]) > 1 else label for label, seed in zip(found, seeds, strict=True)
+        f"{label}, seed {seed}" if len(seeds_of_label[label]) > 1 else label
+        for label, seed in zip(found, seeds, strict=True)
     ]
 
 
 def _numbered(found: list[str]) -> list[str]:
-    total, seen = Counter(found), Counter[str]()
+    totals, counts = Counter(found), Counter[str]()
     numbered = []
     for label in found:
-        seen[label] += 1
-        numbered.append(f"{label} ({seen[label]})" if total[label] > 1 else label)
+        counts[label] += 1
+        numbered.append(f"{label} ({counts[label]})" if totals[label] > 1 else label)
     return numbered

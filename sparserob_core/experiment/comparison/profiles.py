@@ -20,10 +20,13 @@ LISTED = 40  # rows of one problem and one contender that a terminal shows
 @final
 @dataclass(frozen=True, eq=False)
 class Instance:
-    """One problem of a comparison: its ``label``, the value ``exact`` that the bounds approach (the mean of the bounds
-    of the certified run with the least gap; where none is certified, ``certified`` is false and it is the best bound
-    that any run has proven), and the ``unit`` of its data profile: evaluations for a gradient by differences, 1 more
-    than its search has coordinates."""
+    """Problem of a comparison: its ``label``, the value ``exact`` that the bounds approach, and the ``unit`` of its
+    data profile.
+
+    ``exact`` is the mean of the two bounds of the certified run with the least gap. Where no run is certified,
+    ``certified`` is false, and ``exact`` is the best bound that any run has proven. The unit is the number of
+    evaluations for a gradient by differences: 1 more than the search has coordinates.
+    """
 
     label: str
     exact: float
@@ -36,13 +39,13 @@ class Instance:
 @final
 @dataclass(frozen=True, eq=False)
 class Profiles:
-    """What contenders (maximisers, solvers, methods, with their options) need on a set of problems.
+    """Times that contenders (maximisers, solvers, methods, with their options) need on a set of problems.
 
-    A run has solved its problem once its lower bound reaches ``1 - accuracy`` of the exact value; what it took until
-    then, in the ``measure`` evaluations or seconds, is its time, and a run that never came so far has an infinite one.
-    ``times[p][s]`` are the times of problem ``p`` and contender ``s``, one for each of the ``seeds[p]``. Over seeds the
-    median counts, and the quartiles are beside it: the least time within which that share of the seeds had solved the
-    problem, so that they exist where some never did.
+    A run has solved its problem once its lower bound reaches ``1 - accuracy`` of the exact value. Its time is the
+    effort until then, in the ``measure`` evaluations or seconds; the time of a run that never came so far is infinite.
+    ``times[p][s]`` are the times of problem ``p`` and contender ``s``, one for each of the ``seeds[p]``. Profiles use
+    the median over the seeds, with the quartiles: the least time within which that share of the seeds had solved the
+    problem. These exist also where some seeds never solved it.
     """
 
     title: str
@@ -106,17 +109,22 @@ class Profiles:
 
     def times_table(self) -> tuple[list[str], list[list[str]]]:
         """Column names, and one row per problem and contender: median and quartiles over the seeds."""
-        three = [self.quantile(share) for share in (MIDDLE, LOWER, UPPER)]
+        quantiles = [self.quantile(share) for share in (MIDDLE, LOWER, UPPER)]
         columns = ["problem", "contender", "seeds", f"median {self.measure}", "lower quartile", "upper quartile"]
         rows = [
-            [problem.label, name, str(self.times[p][s].size), *(_text(one[p, s], self.measure) for one in three)]
+            [
+                problem.label,
+                name,
+                str(self.times[p][s].size),
+                *(_text(quantile[p, s], self.measure) for quantile in quantiles),
+            ]
             for p, problem in enumerate(self.problems)
             for s, name in enumerate(self.contenders)
         ]
         return columns, rows
 
     def remarks(self) -> Iterator[str]:
-        """What is to be said beside the tables."""
+        """Yield the notes to be printed with the tables."""
         unit = "gradients by differences (n + 1 evaluations)" if self.measure == "evaluations" else "seconds"
         count = "1 problem" if len(self.problems) == 1 else f"{len(self.problems)} problems"
         yield (
@@ -138,7 +146,8 @@ class Profiles:
             yield self.undrawn
 
     def summary(self) -> Mapping[str, Any]:
-        """All of it as plain data; an infinite time is null."""
+        """Return contenders, problems, times, profiles and notes as plain data; an infinite time becomes null in
+        JSON."""
         return {
             "title": self.title,
             "measure": self.measure,
@@ -184,8 +193,8 @@ def _quantile(times: Array, share: float) -> float:
 
 def _steps(values: Array, problems: int) -> dict[str, list[float]]:
     """A profile as its steps: from each place ``at`` on it has the ``share``."""
-    at, counts = np.unique(values[np.isfinite(values)], return_counts=True)
-    return {"at": at.tolist(), "share": (np.cumsum(counts) / problems).tolist()}
+    positions, counts = np.unique(values[np.isfinite(values)], return_counts=True)
+    return {"at": positions.tolist(), "share": (np.cumsum(counts) / problems).tolist()}
 
 
 def _some(labels: Sequence[str]) -> str:

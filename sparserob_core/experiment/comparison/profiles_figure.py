@@ -38,8 +38,8 @@ def draw_profiles(profiles: Profiles) -> Figure:
     columns = 2 if max(map(len, texts)) <= LINE // 2 else 1
     lines = ceil(sum(text.count("\n") + 1 for text in texts) / columns)
     figure = Figure(figsize=(look.WIDTH, 3.2 + 0.165 * lines), layout="constrained")
-    left, right = figure.subplots(1, 2, sharey=True)
-    seeds = max(len(one) for one in profiles.seeds) > 1
+    left_ax, right_ax = figure.subplots(1, 2, sharey=True)
+    has_band = max(len(seeds) for seeds in profiles.seeds) > 1
     for s, text in enumerate(texts):
         pen = {
             "color": COLOURS[s % len(COLOURS)],
@@ -47,36 +47,46 @@ def draw_profiles(profiles: Profiles) -> Figure:
             "marker": MARKERS[s % len(MARKERS)],
             "linewidth": 1.2 + 1.2 * (len(texts) - 1 - s) / max(len(texts) - 1, 1),
         }
-        for ax, values in ((left, profiles.ratios), (right, profiles.costs)):
-            of = [values(share)[:, s] for share in (MIDDLE, LOWER, UPPER)]
-            _draw(ax, of, seeds, _ends(values(MIDDLE)), {**pen, "label": text} if ax is left else pen)
-    _axes(left, right, profiles)
-    figure.legend(*left.get_legend_handles_labels(), loc="outside lower left", ncols=columns, fontsize=9)
+        for ax, values in ((left_ax, profiles.ratios), (right_ax, profiles.costs)):
+            contender_values = [values(share)[:, s] for share in (MIDDLE, LOWER, UPPER)]
+            _draw(
+                ax, contender_values, has_band, _ends(values(MIDDLE)), {**pen, "label": text} if ax is left_ax else pen
+            )
+    _axes(left_ax, right_ax, profiles)
+    figure.legend(*left_ax.get_legend_handles_labels(), loc="outside lower left", ncols=columns, fontsize=9)
     figure.suptitle(profiles.title, x=0.012, ha="left", fontsize=11.5)
     return figure
 
 
 def _ends(values: Array) -> tuple[float, float]:
-    """Where the axis begins and ends: a little before the first step of anyone, and after the last one."""
-    known = values[np.isfinite(values)]
-    return (float(known.min()) / 1.05, 1.3 * float(known.max())) if known.size else (1.0, 2.0)
+    """Return the ends of the axis: a little before the first step of any contender, and after the last one."""
+    finite_values = values[np.isfinite(values)]
+    return (float(finite_values.min()) / 1.05, 1.3 * float(finite_values.max())) if finite_values.size else (1.0, 2.0)
 
 
 def _draw(ax: Axes, values: list[Array], band: bool, ends: tuple[float, float], pen: dict[str, Any]) -> None:
     """The steps of one contender, and the band between its quartiles."""
-    at, share = _profile(values[0], ends)
-    ax.plot(at, share, drawstyle="steps-post", markersize=4, markevery=slice(1, len(at) - 1), zorder=3, **pen)
+    step_positions, share = _profile(values[0], ends)
+    ax.plot(
+        step_positions,
+        share,
+        drawstyle="steps-post",
+        markersize=4,
+        markevery=slice(1, len(step_positions) - 1),
+        zorder=3,
+        **pen,
+    )
     if band:
-        steps = np.concatenate([one[(one > ends[0]) & (one < ends[1])] for one in values[1:]])
-        places = np.unique([*ends, *steps])
-        early, late = (np.array([np.mean(one <= place) for place in places]) for one in values[1:])
-        ax.fill_between(places, late, early, step="post", color=pen["color"], alpha=0.15, linewidth=0, zorder=2)
+        steps = np.concatenate([quartile[(quartile > ends[0]) & (quartile < ends[1])] for quartile in values[1:]])
+        positions = np.unique([*ends, *steps])
+        early, late = (np.array([np.mean(quartile <= position) for position in positions]) for quartile in values[1:])
+        ax.fill_between(positions, late, early, step="post", color=pen["color"], alpha=0.15, linewidth=0, zorder=2)
 
 
 def _profile(values: Array, ends: tuple[float, float]) -> tuple[Array, Array]:
-    at, counts = np.unique(values[np.isfinite(values)], return_counts=True)
+    positions, counts = np.unique(values[np.isfinite(values)], return_counts=True)
     share = np.cumsum(counts) / values.size
-    return np.array([ends[0], *at, ends[1]]), np.array([0.0, *share, share[-1] if at.size else 0.0])
+    return np.array([ends[0], *positions, ends[1]]), np.array([0.0, *share, share[-1] if positions.size else 0.0])
 
 
 def _axes(left: Axes, right: Axes, profiles: Profiles) -> None:

@@ -29,7 +29,7 @@ DIFFERENCES = 3  # parts of a problem that its label names at most
 
 
 def is_study(directory: Path) -> bool:
-    """Whether a directory holds a study."""
+    """Return whether a directory holds a study."""
     return (directory / FILE).is_file()
 
 
@@ -48,10 +48,12 @@ def read_profiles(studies: Sequence[Path], accuracy: float, measure: Measure | N
                 f"sparserob sweep --resume {quote(str(directory))} goes on with it"
             )
         titles.append(study.title)
-        places = [directory / RUNS / str(row["run"]) for row in study.table]
-        there = [place for place in places if (place / "config.yaml").is_file()]
-        missing += len(places) - len(there)
-        curves += [read_curve(place) for place in there]
+        run_directories = [directory / RUNS / str(row["run"]) for row in study.table]
+        existing_runs = [
+            run_directory for run_directory in run_directories if (run_directory / "config.yaml").is_file()
+        ]
+        missing += len(run_directories) - len(existing_runs)
+        curves += [read_curve(run_directory) for run_directory in existing_runs]
     notes = [f"{missing} points failed before they had a run; they count as not solved where their fellows have one"]
     return _profiles(curves, accuracy, measure, _common(titles), notes if missing else [])
 
@@ -59,7 +61,10 @@ def read_profiles(studies: Sequence[Path], accuracy: float, measure: Measure | N
 def _profiles(
     curves: Sequence[Curve], accuracy: float, measure: Measure | None, title: str, notes: list[str]
 ) -> Profiles:
-    contending, posed = [_key(_contender(one.config)) for one in curves], [_key(_posed(one.config)) for one in curves]
+    contending, posed = (
+        [_key(_contender(curve.config)) for curve in curves],
+        [_key(_posed(curve.config)) for curve in curves],
+    )
     contenders, problems = list(dict.fromkeys(contending)), list(dict.fromkeys(posed))
     if len(contenders) < 2:
         raise InputError(
@@ -67,61 +72,75 @@ def _profiles(
             f"{len(contenders)} in {len(curves)} runs"
         )
     first = [curves[contending.index(key)] for key in contenders]
-    names = labels([{**one.config, "seed": None} for one in first], [one.searched for one in first])
-    by: Measure = measure or ("evaluations" if all(one.searched for one in curves) else "seconds")
-    if by == "evaluations" and not all(one.searched for one in curves):
+    names = labels([{**curve.config, "seed": None} for curve in first], [curve.searched for curve in first])
+    by: Measure = measure or ("evaluations" if all(curve.searched for curve in curves) else "seconds")
+    if by == "evaluations" and not all(curve.searched for curve in curves):
         notes.append("an evaluation of a method that does not search is a relaxed program")
     shown = problem_labels([curves[posed.index(key)].config for key in problems])
     kept: list[Instance] = []
     seeds: list[list[Any]] = []
     times: list[list[np.ndarray]] = []
     for label, key in zip(shown, problems, strict=True):
-        mine = [(name, one) for name, one, problem in zip(contending, curves, posed, strict=True) if problem == key]
-        absent = [names[k] for k, name in enumerate(contenders) if name not in {other for other, _ in mine}]
-        exact = _exact([one for _, one in mine])
+        problem_curves = [
+            (name, curve) for name, curve, problem in zip(contending, curves, posed, strict=True) if problem == key
+        ]
+        absent = [
+            names[k] for k, name in enumerate(contenders) if name not in {contender for contender, _ in problem_curves}
+        ]
+        exact = _exact([curve for _, curve in problem_curves])
         if absent or exact is None:
             why = f"not every contender has run it ({', '.join(absent)} has not)" if absent else "no run has a bound"
             notes.append(f"left out: {label or 'the problem'}: {why}")
             continue
-        repeated = dict.fromkeys(one.config.get("seed") for _, one in mine)
-        notes += _contradictions(label, [one for _, one in mine])
+        repeated = dict.fromkeys(curve.config.get("seed") for _, curve in problem_curves)
+        notes += _contradictions(label, [curve for _, curve in problem_curves])
         target = exact[0] - accuracy * abs(exact[0])
-        kept.append(Instance(label, *exact, max(one.dimension for _, one in mine) + 1.0))
+        kept.append(Instance(label, *exact, max(curve.dimension for _, curve in problem_curves) + 1.0))
         seeds.append(list(repeated))
-        times.append([_times([one for name, one in mine if name == who], repeated, target, by) for who in contenders])
+        times.append(
+            [
+                _times([curve for name, curve in problem_curves if name == contender], repeated, target, by)
+                for contender in contenders
+            ]
+        )
     if not kept:
         raise InputError(f"studies: expected a problem that every contender has run, got none: {'; '.join(notes)}")
     failed = [
-        sum(one.status == "failed" for name, one in zip(contending, curves, strict=True) if name == who)
-        for who in contenders
+        sum(curve.status == "failed" for name, curve in zip(contending, curves, strict=True) if name == contender)
+        for contender in contenders
     ]
     return Profiles(title, by, accuracy, names, kept, seeds, times, failed, notes)
 
 
 def _times(curves: Sequence[Curve], seeds: Mapping[Any, None], target: float, measure: Measure) -> np.ndarray:
-    """What the runs of one contender on one problem needed, seed by seed; infinite where it never came there, or did
-    not run."""
-    found = dict.fromkeys(seeds, np.inf)
-    for one in curves:
-        needed = one.reached(target) if measure == "evaluations" else one.reached_after(target)
-        found[one.config.get("seed")] = float(np.fmin(found[one.config.get("seed")], needed))  # nan: it is not known
-    return np.array(list(found.values()))
+    """Return the times of one contender on one problem, seed by seed; infinite where a run did not reach the target, or
+    is missing."""
+    times = dict.fromkeys(seeds, np.inf)
+    for curve in curves:
+        needed = curve.reached(target) if measure == "evaluations" else curve.reached_after(target)
+        # nan: it is not known
+        times[curve.config.get("seed")] = float(np.fmin(times[curve.config.get("seed")], needed))
+    return np.array(list(times.values()))
 
 
 def _exact(curves: Sequence[Curve]) -> tuple[float, bool] | None:
     """The exact value, and whether it is certified."""
-    certified = min((one for one in curves if one.status == "certified"), key=lambda one: one.gap, default=None)
+    certified = min(
+        (curve for curve in curves if curve.status == "certified"), key=lambda curve: curve.gap, default=None
+    )
     if certified is not None:
         return (certified.lower_bound + certified.upper_bound) / 2, True
-    bounds = [float(one.bound[-1]) for one in curves if one.bound.size]
+    bounds = [float(curve.bound[-1]) for curve in curves if curve.bound.size]
     return (max(bounds), False) if bounds else None
 
 
 def _contradictions(label: str, curves: Sequence[Curve]) -> Iterator[str]:
-    above = min((one.upper_bound for one in curves if one.status == "certified"), default=np.inf)
-    wrong = [one for one in curves if one.bound.size and one.bound[-1] > above + SLACK * max(1.0, abs(above))]
-    for one in wrong:
-        yield f"{label}: the lower bound of {one.directory} exceeds the certified upper bound {above:.9g}: one is wrong"
+    above = min((curve.upper_bound for curve in curves if curve.status == "certified"), default=np.inf)
+    wrong = [curve for curve in curves if curve.bound.size and curve.bound[-1] > above + SLACK * max(1.0, abs(above))]
+    for curve in wrong:
+        yield (
+            f"{label}: the lower bound of {curve.directory} exceeds the certified upper bound {above:.9g}: one is wrong"
+        )
 
 
 def _contender(config: Mapping[str, Any]) -> dict[str, Any]:
@@ -137,26 +156,26 @@ def _key(data: Mapping[str, Any]) -> str:
 
 
 def problem_labels(configs: Sequence[Mapping[str, Any]]) -> list[str]:
-    """One label per config: its title, where they differ, and what differs in the problem."""
+    """Return one label per config: its title, where titles differ, and the options of the problem that differ."""
     flat = [dict(_leaves(_posed(config))) for config in configs]
-    keys = list(dict.fromkeys(key for one in flat for key in one))
-    differing = [key for key in keys if len({_key({"": one.get(key)}) for one in flat}) > 1]
+    keys = list(dict.fromkeys(key for leaves in flat for key in leaves))
+    differing = [key for key in keys if len({_key({"": leaves.get(key)}) for leaves in flat}) > 1]
     titles = [str(config.get("title") or "") for config in configs]
-    found = []
-    for one, title in zip(flat, titles, strict=True):
-        parts = [title] if len(set(titles)) > 1 and title else []
-        parts += [f"{key.removeprefix('problem.')} {value_text(one.get(key))}" for key in differing[:DIFFERENCES]]
-        found.append(", ".join(parts))
-    return [f"{label} ({k + 1})" if found.count(label) > 1 else label for k, label in enumerate(found)]
+    label_texts = []
+    for leaves, title in zip(flat, titles, strict=True):
+        phrases = [title] if len(set(titles)) > 1 and title else []
+        phrases += [f"{key.removeprefix('problem.')} {value_text(leaves.get(key))}" for key in differing[:DIFFERENCES]]
+        label_texts.append(", ".join(phrases))
+    return [f"{label} ({k + 1})" if label_texts.count(label) > 1 else label for k, label in enumerate(label_texts)]
 
 
 def _leaves(value: Any, path: str = "") -> Iterator[tuple[str, Any]]:
     if isinstance(value, Mapping):
-        for key, one in value.items():
-            yield from _leaves(one, f"{path}.{key}" if path else str(key))
-    elif isinstance(value, list) and any(isinstance(one, Mapping) for one in value):
-        for number, one in enumerate(value):
-            yield from _leaves(one, f"{path}.{number}")
+        for key, child in value.items():
+            yield from _leaves(child, f"{path}.{key}" if path else str(key))
+    elif isinstance(value, list) and any(isinstance(child, Mapping) for child in value):
+        for number, child in enumerate(value):
+            yield from _leaves(child, f"{path}.{number}")
     else:
         yield path, value
 

@@ -50,17 +50,17 @@ def example(name: str) -> Example:
     """Return the config of that name; raises `InputError` where there is none."""
     from sparserob_core.experiment.plugins.messages import nearest
 
-    known = [file.stem for file in _folder().glob("*.yaml")]
-    if name not in known:
-        raise InputError(f"examples: there is none called {name!r}{nearest(name, set(known))}")
+    names = [file.stem for file in _folder().glob("*.yaml")]
+    if name not in names:
+        raise InputError(f"examples: there is none called {name!r}{nearest(name, set(names))}")
     return _read(shipped(name))
 
 
 def _folder() -> Path:
     """Return the folder of the configs: next to the package in a repository, within it where it is installed."""
     package = Path(__file__).resolve().parents[2]
-    places = [folder / "configs" for folder in (package, package.parent)]
-    return next((place for place in places if place.is_dir()), places[-1])
+    folders = [folder / "configs" for folder in (package, package.parent)]
+    return next((folder for folder in folders if folder.is_dir()), folders[-1])
 
 
 def _read(file: Path) -> Example:
@@ -94,8 +94,8 @@ def _complete(file: Path) -> str:
 
 def _keys(text: str) -> dict[str, str]:
     """Return the lines of every key at the top of a config."""
-    parts = re.split(r"^(?=[a-z_]+:)", text, flags=re.MULTILINE)[1:]
-    return {part.partition(":")[0]: part if part.endswith("\n") else f"{part}\n" for part in parts}
+    sections = re.split(r"^(?=[a-z_]+:)", text, flags=re.MULTILINE)[1:]
+    return {section.partition(":")[0]: section if section.endswith("\n") else f"{section}\n" for section in sections}
 
 
 def _leading(lines: list[str]) -> Iterator[str]:

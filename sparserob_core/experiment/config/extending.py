@@ -39,11 +39,11 @@ def movable(source: Source) -> tuple[dict[str, Any], list[Complaint]]:
     Files of plugins have their absolute names, and the numbers of matrices replace their files.
     """
     data = copy.deepcopy(source.data)
-    wrong = list(resolve(data, lambda _: source.folder))
+    faults = list(resolve(data, lambda _: source.folder))
     files = data.get("plugins")
     if isinstance(files, list) and all(isinstance(file, str) for file in files):
         data["plugins"] = [name_of((source.folder / path_of(file)).resolve()) for file in files]
-    return data, wrong
+    return data, faults
 
 
 def _extended(source: Source, above: tuple[File, ...]) -> Source:
@@ -55,16 +55,16 @@ def _extended(source: Source, above: tuple[File, ...]) -> Source:
     above = (*above, File(source.name).resolve())
     file = source.folder / path_of(stated)
     if file.resolve() in above:
-        circle = " -> ".join(one.name for one in (*above[above.index(file.resolve()) :], file))
+        circle = " -> ".join(config.name for config in (*above[above.index(file.resolve()) :], file))
         raise _fault(source, f"the configs extend one another in a circle: {circle}")
     try:
         base = read_source(file)
     except ConfigError as error:
         raise _fault(source, str(error)) from None
     base = _extended(base, above)
-    data, wrong = movable(base)
-    if wrong:
-        raise ConfigError("\n".join(f"{base.where(one.path)}: {one}" for one in wrong))
+    data, faults = movable(base)
+    if faults:
+        raise ConfigError("\n".join(f"{base.where(fault.path)}: {fault}" for fault in faults))
     own = {key: value for key, value in source.data.items() if key != EXTENDS}
     return replace(source, data=_over(data, own, ()), base=base, own=own)
 
@@ -75,7 +75,7 @@ def _fault(source: Source, said: str) -> ConfigError:
 
 def _over(base: object, own: object, path: Path) -> Any:
     """Return the value at ``path`` of a config that extends another one, from the values of both."""
-    slot = next((slot for place, slot in SLOTS.items() if place == path), None)
+    slot = next((slot for slot_path, slot in SLOTS.items() if slot_path == path), None)
     if slot is not None:
         base, own = ({"name": value} if isinstance(value, str) else value for value in (base, own))
     elif path and path not in SECTIONS:
@@ -85,6 +85,6 @@ def _over(base: object, own: object, path: Path) -> Any:
     name = None if slot is None else base.get("name", slot.name)
     if slot is not None and own.get("name", name) != name:
         return copy.deepcopy(own)
-    told = {} if name is None else {"name": name}
+    component = {} if name is None else {"name": name}
     both = {key: _over(base[key], own[key], (*path, key)) if key in base else own[key] for key in own}
-    return {**told, **base, **copy.deepcopy(both)}
+    return {**component, **base, **copy.deepcopy(both)}

@@ -45,11 +45,11 @@ class Loaded:
     def located(self, slot: Path, error: InputError) -> ConfigError:
         """Return an error of the component at ``slot`` as one that names the place of the key at fault."""
         plain = self.config.plain()
-        path, rest = (*slot, *error.path), list[str | int]()
+        path, remainder = (*slot, *error.path), list[str | int]()
         while len(path) > len(slot) and _at(plain, path) is None:
-            rest.insert(0, path[-1])
+            remainder.insert(0, path[-1])
             path = path[:-1]
-        message = f"{dotted(tuple(rest))}: {error.sentence}" if rest else error.sentence
+        message = f"{dotted(tuple(remainder))}: {error.sentence}" if remainder else error.sentence
         return ConfigError(_line(self.source, self.overrides, Complaint(path, message)))
 
 
@@ -81,29 +81,29 @@ def load_config(
     ConfigError
         With one line for each key at fault: ``file:line:column: key.path: what is wrong (got ...)``.
     """
-    given = read_source(config)
-    given = extended(given) if known is None else given
-    if "axes" in given.data and "problem" not in given.data:
-        raise ConfigError(f"{given.name}: expected a config, got a study, which has axes; `sparserob sweep` takes it")
+    source = read_source(config)
+    source = extended(source) if known is None else source
+    if "axes" in source.data and "problem" not in source.data:
+        raise ConfigError(f"{source.name}: expected a config, got a study, which has axes; `sparserob sweep` takes it")
     changes = tuple(parse_overrides(overrides, read_value))
-    data = copy.deepcopy(given.data)
-    wrong = list(malformed(data))
-    if wrong:
-        raise _refusal(given, changes, wrong)
+    data = copy.deepcopy(source.data)
+    faults = list(malformed(data))
+    if faults:
+        raise _refusal(source, changes, faults)
     _spell_out(data)
     for change in changes:
         apply_override(data, change)
         _spell_out(data)
-    wrong = list(malformed(data))
-    if known is None and not wrong:  # a run directory has the numbers themselves: no file is read for it
-        wrong = list(resolve(data, lambda path: _folder(path, given, changes)))
-    registry = _registry(data, given, changes) if known is None else known
-    resolved, more = _checked(data, registry, strangers=known is not None)
-    if wrong or more or resolved is None:
-        raise _refusal(given, changes, wrong or more)
+    faults = list(malformed(data))
+    if known is None and not faults:  # a run directory has the numbers themselves: no file is read for it
+        faults = list(resolve(data, lambda path: _folder(path, source, changes)))
+    registry = _registry(data, source, changes) if known is None else known
+    resolved, key_faults = _checked(data, registry, strangers=known is not None)
+    if faults or key_faults or resolved is None:
+        raise _refusal(source, changes, faults or key_faults)
     if not resolved.title:
-        resolved = resolved.model_copy(update={"title": File(given.name).stem})
-    return Loaded(resolved, registry, given, changes)
+        resolved = resolved.model_copy(update={"title": File(source.name).stem})
+    return Loaded(resolved, registry, source, changes)
 
 
 def _folder(path: Path, source: Source, changes: tuple[Override, ...]) -> File:
@@ -139,8 +139,8 @@ def _registry(data: dict[str, Any], source: Source, changes: tuple[Override, ...
     try:
         return load_registry(data["plugins"])
     except PluginError as error:
-        said = _line(source, changes, Complaint(("plugins",), str(error)))
-        raise (ConfigError if isinstance(error, InputError) else PluginError)(said) from error
+        message = _line(source, changes, Complaint(("plugins",), str(error)))
+        raise (ConfigError if isinstance(error, InputError) else PluginError)(message) from error
 
 
 def _checked(data: dict[str, Any], registry: Registry, strangers: bool) -> tuple[RunConfig | None, list[Complaint]]:
@@ -215,7 +215,7 @@ def _line(source: Source, changes: tuple[Override, ...], complaint: Complaint) -
     change = _override(source, changes, complaint)
     if change is None:
         return f"{source.where(complaint.path)}: {complaint}"
-    unquoted = any(said in complaint.message for said in (NOT_TEXT, NOT_PLAIN))
+    unquoted = any(phrase in complaint.message for phrase in (NOT_TEXT, NOT_PLAIN))
     hint = f"; as text it is written {change.quoted}" if unquoted else ""
     return f"override {change.text}: {complaint}{hint}"
 
@@ -225,7 +225,7 @@ def _override(source: Source, changes: tuple[Override, ...], complaint: Complain
     path = [str(step) for step in complaint.path]
     for change in reversed(changes):
         changed = [str(step) for step in change.path]
-        made = path and changed[: len(path)] == path and _at(source.data, complaint.path) is None
-        if made or path[: len(changed)] == changed:
+        is_created = path and changed[: len(path)] == path and _at(source.data, complaint.path) is None
+        if is_created or path[: len(changed)] == changed:
             return change
     return None

@@ -41,7 +41,9 @@ def option_rows(record: Plugin, ask: bool = True) -> list[OptionRow]:
     """
     schema = options_schema(record, ask)
     prefix = f"#/$defs/{record.kind}.{record.name}."
-    return list(_Rows({prefix + name: part for name, part in schema.get("$defs", {}).items()}).rows(schema, ""))
+    return list(
+        _Rows({prefix + name: definition for name, definition in schema.get("$defs", {}).items()}).rows(schema, "")
+    )
 
 
 @final
@@ -56,28 +58,28 @@ class _Rows:
         for name, field in schema.get("properties", {}).items():
             members = [member for _, member in self._members(field)]
             below = list(self._references(field, above + name))
-            known = [f"keys as in {self.seen[reference]}" for reference, _ in below if reference in self.seen]
+            notes = [f"keys as in {self.seen[reference]}" for reference, _ in below if reference in self.seen]
             meaning = " ".join(str(field.get("description", "")).split())
             yield OptionRow(
                 name=above + name,
                 type=" or ".join(dict.fromkeys(self._type(member) for member in members)) or "anything",
                 default=_default(field, name in schema.get("required", [])),
                 range=", ".join(dict.fromkeys(_limits(field, members))),
-                meaning=" ".join([meaning, *(f"({known[0]})" for _ in known[:1])]).strip(),
+                meaning=" ".join([meaning, *(f"({notes[0]})" for _ in notes[:1])]).strip(),
             )
-            for reference, place in below:
-                if self.seen.setdefault(reference, place) == place:
-                    yield from self.rows(self.parts.get(reference, {}), f"{place}.")
+            for reference, key in below:
+                if self.seen.setdefault(reference, key) == key:
+                    yield from self.rows(self.parts.get(reference, {}), f"{key}.")
 
     def _members(self, field: Mapping[str, Any]) -> Iterator[tuple[str, Mapping[str, Any]]]:
         """Yield the alternatives of a type, each with the name of its definition."""
         reference = field.get("$ref", "")
-        whole = self.parts.get(reference, {}) if reference else field
-        several = whole.get("anyOf") or whole.get("oneOf") or whole.get("allOf")
-        if several is None:
-            yield reference, whole
+        definition = self.parts.get(reference, {}) if reference else field
+        alternatives = definition.get("anyOf") or definition.get("oneOf") or definition.get("allOf")
+        if alternatives is None:
+            yield reference, definition
             return
-        for member in several:
+        for member in alternatives:
             yield from self._members(member)
 
     def _references(self, field: Mapping[str, Any], place: str) -> Iterator[tuple[str, str]]:
@@ -111,7 +113,7 @@ def _default(field: Mapping[str, Any], required: bool) -> str:
 
 
 def _limits(field: Mapping[str, Any], members: list[Mapping[str, Any]]) -> Iterator[str]:
-    for part in (field, *members):
+    for definition in (field, *members):
         for key, words in LIMITS.items():
-            if key in part:
-                yield words.format(part[key])
+            if key in definition:
+                yield words.format(definition[key])

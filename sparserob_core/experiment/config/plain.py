@@ -38,8 +38,8 @@ def difference(one: Any, two: Any, path: str = "") -> tuple[str, Any, Any] | Non
         steps = [(str(key), *pair) for key, pair in enumerate(zip(one, two, strict=True))]
     else:
         return None if one == two else (path, one, two)
-    below = ((f"{path}.{key}" if path else key, here, there) for key, here, there in steps)
-    return next((found for key, here, there in below if (found := difference(here, there, key))), None)
+    below = ((f"{path}.{key}" if path else key, first, second) for key, first, second in steps)
+    return next((result for key, first, second in below if (result := difference(first, second, key))), None)
 
 
 def value_text(value: object) -> str:

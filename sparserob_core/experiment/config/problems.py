@@ -156,19 +156,19 @@ class SystemOptions(Options):
 
     def names(self) -> tuple[str, ...]:
         """Return the names of the parameters; raises `InputError` where one cannot be used in an expression."""
-        given = (
+        names = (
             self.parameters.names if isinstance(self.parameters, ParameterSetOptions) else list(self.parameters or {})
         )
-        for name in given:
+        for name in names:
             if not name.isidentifier() or keyword.iskeyword(name) or name in {*CONSTANTS, *FUNCTIONS, KEPLER}:
                 raise InputError(
                     f"{name!r} cannot name a parameter; expected letters, digits and underscores, and not one of"
                     f" {', '.join([*CONSTANTS, *FUNCTIONS, KEPLER])}",
                     path="system.parameters",
                 )
-        if len(set(given)) < len(given):
-            raise InputError(f"a name occurs twice, got {', '.join(given)}", path="system.parameters.names")
-        return tuple(given)
+        if len(set(names)) < len(names):
+            raise InputError(f"a name occurs twice, got {', '.join(names)}", path="system.parameters.names")
+        return tuple(names)
 
     def matrices(self) -> list[tuple[str, float | None, Matrices]]:
         """Return for each piece its key, its end, and its matrices ``A``, ``B``, ``E`` and ``c``.
@@ -209,18 +209,21 @@ class SystemOptions(Options):
             If a key is at fault; the error begins with the key.
         """
         names = self.names()
-        parameters, every = self._parameter_set(names), self.matrices()
-        where, until, first = every[0]
-        if self._changes(names, every):
-            return self._varying(every, horizon, parameters)
+        parameters, pieces = self._parameter_set(names), self.matrices()
+        where, until, first = pieces[0]
+        if self._changes(names, pieces):
+            return self._varying(pieces, horizon, parameters)
         try:
             defined = parse_definitions(self.define or {}, names)
         except InputError as error:
             raise error.under("system") from None
         if until is None:
             return _system(where, first, parameters, names, self.delay, defined)
-        made = [(float(stop or 0.0), _system(key, of, parameters, names, 0.0, defined)) for key, stop, of in every]
-        return SwitchedSystem(made, self.delay)
+        phases = [
+            (float(stop or 0.0), _system(key, matrices, parameters, names, 0.0, defined))
+            for key, stop, matrices in pieces
+        ]
+        return SwitchedSystem(phases, self.delay)
 
     def _changes(self, names: tuple[str, ...], every: list[tuple[str, float | None, Matrices]]) -> bool:
         """Return whether an entry or a definition contains the time ``t``, where no parameter has that name."""
@@ -241,8 +244,8 @@ class SystemOptions(Options):
         if self.pieces is None:
             A, B, E, c = every[0][2]
             return VaryingSystem.of(A, B, horizon, E, c, self.define, self.delay, parameters, self.names())
-        turns = [(float(until or 0.0), of) for _, until, of in every]
-        return VaryingSystem.taking_turns(turns, self.define, self.delay, parameters, self.names())
+        phases = [(float(until or 0.0), matrices) for _, until, matrices in every]
+        return VaryingSystem.taking_turns(phases, self.define, self.delay, parameters, self.names())
 
     def _parameter_set(self, names: tuple[str, ...]) -> ConvexSet | None:
         if isinstance(self.parameters, ParameterSetOptions):
@@ -538,10 +541,10 @@ class ProblemKeys(ProblemFactory, Options):
         """Return the initial state, or the centre of the initial states, one number per state; raises `InputError`."""
         if isinstance(self.initial_state, InitialStateOptions):
             return [float(value) for value in self.initial_state.around("initial_state", states)[0]]
-        given = self.initial_state if isinstance(self.initial_state, list) else [self.initial_state] * states
-        if len(given) != states:
-            raise InputError(path="initial_state", expected=f"{states} numbers, one per state", got=f"{len(given)}")
-        return given
+        values = self.initial_state if isinstance(self.initial_state, list) else [self.initial_state] * states
+        if len(values) != states:
+            raise InputError(path="initial_state", expected=f"{states} numbers, one per state", got=f"{len(values)}")
+        return values
 
     def deviations(self, states: int) -> ConvexSet | None:
         """Return the set of deviations from `initial`; ``None`` for a single initial state. Raises `InputError`."""
@@ -576,34 +579,34 @@ class ProblemKeys(ProblemFactory, Options):
         InputError
             If a key is at fault; the error begins with the key.
         """
-        found: list[Disturbance] = []
-        for i, one in enumerate(self.disturbance if isinstance(self.disturbance, list) else ()):
+        disturbances: list[Disturbance] = []
+        for i, entry in enumerate(self.disturbance if isinstance(self.disturbance, list) else ()):
             where = f"disturbance.{i}"
-            if one.E is not None and len(one.E) != system.states:
+            if entry.E is not None and len(entry.E) != system.states:
                 raise InputError(
-                    path=f"{where}.E", expected=f"{system.states} rows, one per state", got=f"{len(one.E)}"
+                    path=f"{where}.E", expected=f"{system.states} rows, one per state", got=f"{len(entry.E)}"
                 )
-            rows = None if one.E is None else one.E + [[0.0] * len(one.E[0])] * below
+            rows = None if entry.E is None else entry.E + [[0.0] * len(entry.E[0])] * below
             names = tuple(system.phases[0].names)
             E = None if rows is None else parse_matrix(f"{where}.E", rows, names)
-            width = system.disturbances if one.E is None else len(one.E[0])
-            bound, times = one.bound.build(f"{where}.set", width), one.times(where, self.horizon)
-            found.append(Disturbance(bound, E, one.kind, one.start or 0.0, one.stop, times))
-        return found
+            width = system.disturbances if entry.E is None else len(entry.E[0])
+            bound, times = entry.bound.build(f"{where}.set", width), entry.times(where, self.horizon)
+            disturbances.append(Disturbance(bound, E, entry.kind, entry.start or 0.0, entry.stop, times))
+        return disturbances
 
     def constraints(self) -> dict[str, Any]:
         """Return the constraints that are written field by field, by the key of their list in the problem."""
-        given = {name: getattr(self, name) for name in type(self).model_fields}
+        values = {name: getattr(self, name) for name in type(self).model_fields}
         return {
-            name: [one.build() for one in every]
-            for name, every in given.items()
-            if isinstance(every, list) and every and isinstance(every[0], TermOptions)
+            name: [term.build() for term in terms]
+            for name, terms in values.items()
+            if isinstance(terms, list) and terms and isinstance(terms[0], TermOptions)
         }
 
     def windows(self, states: int) -> list[PathConstraint | MixedConstraint]:
         """Return the path constraints, one per set or bound of state and control together; raises `InputError`."""
         listed = enumerate(self.path)
-        return [one for i, item in listed for one in item.entries(f"path.{i}", states, self.horizon)]
+        return [constraint for i, item in listed for constraint in item.entries(f"path.{i}", states, self.horizon)]
 
     def ends(self, states: int) -> list[ConvexSet | Equality]:
         """Return the terminal sets and equalities; raises `InputError`."""
@@ -695,10 +698,10 @@ class ControlKeys(ProblemKeys):
         )
 
     def _control_before(self, controls: int) -> list[float] | None:
-        given = self.initial_control
-        if given is None or isinstance(given, list):
-            return given
-        return [given] * controls
+        control = self.initial_control
+        if control is None or isinstance(control, list):
+            return control
+        return [control] * controls
 
 
 @final

@@ -59,21 +59,21 @@ def options_schema(record: Plugin, ask: bool = True) -> dict[str, Any]:
 def config_schema(registry: Registry) -> dict[str, Any]:
     """Return the JSON schema (draft 2020-12) of the whole config."""
     schema = RunConfig.model_json_schema(schema_generator=_Lenient)
-    parts: dict[str, Any] = schema["$defs"]
+    definitions: dict[str, Any] = schema["$defs"]
     for path, slot in SLOTS.items():
-        holder = schema if len(path) == 1 else parts["Dictionaries"]
+        holder = schema if len(path) == 1 else definitions["Dictionaries"]
         previous = holder["properties"][path[-1]]
-        choice = _choice(registry, Part(slot.kind), slot.name, parts)
+        choice = _choice(registry, Part(slot.kind), slot.name, definitions)
         if any(option.get("type") == "null" for option in previous.get("anyOf", [])):
             choice["anyOf"].append({"type": "null"})
         holder["properties"][path[-1]] = {
             **{key: previous[key] for key in ("default", "description") if key in previous},
             **choice,
         }
-    schema["properties"]["observers"]["items"] = _choice(registry, Part("observer"), None, parts)
+    schema["properties"]["observers"]["items"] = _choice(registry, Part("observer"), None, definitions)
     for unused in ("Entry", "MaximiserEntry"):
-        parts.pop(unused, None)
-    _add_kinds(registry, parts)
+        definitions.pop(unused, None)
+    _add_kinds(registry, definitions)
     schema["properties"] = {EXTENDS: {"type": "string", "description": MEANING}, **schema["properties"]}
     schema["anyOf"] = [{"required": schema.pop("required")}, {"required": [EXTENDS]}]
     return {"$schema": "https://json-schema.org/draft/2020-12/schema", **schema, "title": "SparseRob config"}
@@ -81,18 +81,18 @@ def config_schema(registry: Registry) -> dict[str, Any]:
 
 def _add_kinds(registry: Registry, parts: dict[str, Any]) -> None:
     """Add to the models with one key per component of a kind, such as sets, the keys of all registered components."""
-    for holder in [part for part in parts.values() if "kinds" in part]:
+    for holder in [definition for definition in parts.values() if "kinds" in definition]:
         kind = holder.pop("kinds")
         for name in registry.names(kind):
-            record, place = registry.get(kind, name), f"{kind}.{name}"
-            if place not in parts:
+            record, key = registry.get(kind, name), f"{kind}.{name}"
+            if key not in parts:
                 entry = options_schema(record)
-                parts.update({f"{place}.{part}": value for part, value in entry.pop("$defs", {}).items()})
-                parts[place] = entry
+                parts.update({f"{key}.{inner}": value for inner, value in entry.pop("$defs", {}).items()})
+                parts[key] = entry
             short = shorthand(record)
-            forms = [*_alternatives(parts[place]["properties"][short])] if short else []
+            forms = [*_alternatives(parts[key]["properties"][short])] if short else []
             holder.setdefault("properties", {})[name] = {
-                "anyOf": [*forms, {"$ref": f"#/$defs/{place}"}, {"type": "null"}],
+                "anyOf": [*forms, {"$ref": f"#/$defs/{key}"}, {"type": "null"}],
                 "default": None,
                 "description": record.summary,
             }
@@ -116,13 +116,13 @@ def _choice(
     for name in names:
         record = registry.get(kind, name)
         entry = options_schema(record, ask=False)
-        for key, part in ({} if record.open else components(record.options_type())).items():
+        for key, component in ({} if record.open else components(record.options_type())).items():
             described = entry["properties"][key]
             for extra in ("component", "of"):
                 described.pop(extra, None)
-            others = _choice(registry, part, None, parts, but=name if part.kind == kind else None)
-            described["anyOf"] = [*others["anyOf"], {"type": "null"}]
-        parts.update({f"{kind}.{name}.{part}": value for part, value in entry.pop("$defs", {}).items()})
+            inner_choice = _choice(registry, component, None, parts, but=name if component.kind == kind else None)
+            described["anyOf"] = [*inner_choice["anyOf"], {"type": "null"}]
+        parts.update({f"{kind}.{name}.{inner}": value for inner, value in entry.pop("$defs", {}).items()})
         entries.append(_named(entry, record, needs_name=name != default))
     return {"anyOf": [{"enum": names, "description": f"A {kind} with its default options."}, *entries]}
 

@@ -108,7 +108,7 @@ class SetOptions(Sparse, extra="allow", json_schema_extra={"kinds": KIND}):
         InputError
             If a set cannot be built, or has another dimension; the error begins with the key.
         """
-        found = []
+        members = []
         for kind, factory in self._made.items():
             try:
                 member = factory.build(dimension)
@@ -116,8 +116,8 @@ class SetOptions(Sparse, extra="allow", json_schema_extra={"kinds": KIND}):
                 raise error.under(where, *(() if error.path[:1] == (kind,) else (kind,))) from None
             if member.dimension != dimension:
                 raise InputError(path=f"{where}.{kind}", expected=f"{count(dimension)}", got=f"{member.dimension}")
-            found.append(member)
-        return found
+            members.append(member)
+        return members
 
     def build(self, where: str, dimension: int) -> ConvexSet:
         """Return the intersection of all keys as one set.
@@ -156,9 +156,9 @@ class SetOptions(Sparse, extra="allow", json_schema_extra={"kinds": KIND}):
 def _checked(registry: Registry, kind: str, value: object, keys: set[str]) -> tuple[Options | None, list[Complaint]]:
     """Return the typed options of one kind of set, or the faults in them; ``keys`` are the fields, which are no
     kinds."""
-    known = registry.names(KIND)
-    if kind not in known:
-        return None, [Complaint((), f"unknown key{nearest(kind, {*known, *keys})}{registry.notes()}")]
+    kinds = registry.names(KIND)
+    if kind not in kinds:
+        return None, [Complaint((), f"unknown key{nearest(kind, {*kinds, *keys})}{registry.notes()}")]
     short = shorthand(registry.get(KIND, kind))
     if not isinstance(value, Mapping) and short is None:
         return None, [Complaint((), f"must be a mapping (got {shown(value)})")]
@@ -248,18 +248,21 @@ class PathOptions(SetOptions, populate_by_name=True):
             raise InputError(
                 path=f"{where}.name", expected="one set in an entry with a name", got=f"{' and '.join(self._given())}"
             )
-        found: list[PathConstraint | MixedConstraint] = [
+        constraints: list[PathConstraint | MixedConstraint] = [
             PathConstraint(member, self.start, self.stop, self.name, self.relative_to) for member in members
         ]
         if self.mixed is None:
-            return found
+            return constraints
         if self.relative_to is not None:
             raise InputError(
                 "moves the set of states that stands in the same entry, and a mixed constraint is about the state"
                 " itself: write that as an entry of its own",
                 path=f"{where}.relative_to",
             )
-        return [*found, MixedConstraint(self.mixed.H, self.mixed.G, self.mixed.h, self.start, self.stop, self.name)]
+        return [
+            *constraints,
+            MixedConstraint(self.mixed.H, self.mixed.G, self.mixed.h, self.start, self.stop, self.name),
+        ]
 
 
 class TermOptions(Options, populate_by_name=True):
@@ -372,9 +375,9 @@ def _moved(convex: ConvexSet, centre: Array, where: str) -> ConvexSet:
         return NormBall(convex.p, convex.radius, convex.centre - centre)
     if not centre.any():
         return convex
-    other, record = cast("Any", convex), is_dataclass(convex)
-    if record and hasattr(other, "centre"):
-        return cast("ConvexSet", replace(other, centre=np.asarray(other.centre) - centre))
+    untyped, record = cast("Any", convex), is_dataclass(convex)
+    if record and hasattr(untyped, "centre"):
+        return cast("ConvexSet", replace(untyped, centre=np.asarray(untyped.centre) - centre))
     raise InputError(path=where, expected=f"the key centre beside {convex.kind}, and 0 within it", got="none")
 
 
@@ -390,11 +393,11 @@ class TerminalOptions(SetOptions):
 
     def ends(self, where: str, dimension: int) -> list[ConvexSet | Equality]:
         """Return one set or equality per key; raises `InputError` that begins with the key below ``where``."""
-        found: list[ConvexSet | Equality] = [*self.members(where, dimension)]
+        ends: list[ConvexSet | Equality] = [*self.members(where, dimension)]
         if self.equals is not None:
             if len(self.equals) != dimension:
                 raise InputError(
                     path=f"{where}.equals", expected=f"{count(dimension)}, null where free", got=f"{len(self.equals)}"
                 )
-            found.append(Equality(np.array([np.nan if value is None else value for value in self.equals])))
-        return found
+            ends.append(Equality(np.array([np.nan if value is None else value for value in self.equals])))
+        return ends

@@ -82,20 +82,20 @@ def propagated(model: Transcription, theta: Array, arrays: Mapping[str, Array]) 
     breakpoints = arrays["breakpoints"]
     grid = response.grid.refined(breakpoints)
     times = fine_times(Response(response.system, grid, response.initial_state), model.parameters, arrays["times"])
-    fine = Response(response.system, finer(grid, times), response.initial_state)
+    fine_response = Response(response.system, finer(grid, times), response.initial_state)
     disturbances = arrays["disturbances"] if arrays["disturbances"].shape[1] else None
     noises = arrays["noises"].transpose(1, 2, 0) if "noises" in arrays else None
-    acting, begun = controlled(model, theta, grid.control_piece, noises), arrays["initial_states"]
+    acting, initial_states = controlled(model, theta, grid.control_piece, noises), arrays["initial_states"]
     execution = model.functionals.execution
     if execution is not None and not callable(acting):
-        inner = finer(grid, times)  # an error of execution may change its sign within a piece
-        command = acting[:, inner.control_piece]
-        held = Response(response.system, inner, response.initial_state)
-        fine = Response(response.system, finer(inner, times), response.initial_state)
-        at = (arrays["times"], arrays["directions"], arrays["parameters"])
-        acting = delivered(command, worst_errors(held, execution, command, at))
-        disturbances = None if disturbances is None else disturbances[:, :, inner.disturbance_piece]
-    states = np.stack(list(walk(fine, acting, arrays["parameters"], disturbances, begun)))
+        fine_grid = finer(grid, times)  # an error of execution may change its sign within a piece
+        command = acting[:, fine_grid.control_piece]
+        inner_response = Response(response.system, fine_grid, response.initial_state)
+        fine_response = Response(response.system, finer(fine_grid, times), response.initial_state)
+        worst_cases = (arrays["times"], arrays["directions"], arrays["parameters"])
+        acting = delivered(command, worst_errors(inner_response, execution, command, worst_cases))
+        disturbances = None if disturbances is None else disturbances[:, :, fine_grid.disturbance_piece]
+    states = np.stack(list(walk(fine_response, acting, arrays["parameters"], disturbances, initial_states)))
     return times, np.ascontiguousarray(states.transpose(2, 1, 0))
 
 
@@ -139,8 +139,8 @@ def attained(arrays: Mapping[str, Array], times: Array, states: Array) -> Array:
     """Return the violations ``(f,)`` that the replayed ``states (f, d, T)`` reach at the adversaries' times and
     directions."""
     nearest = np.abs(times[None] - arrays["times"][:, None]).argmin(axis=1)
-    reached = states[np.arange(nearest.size), :, nearest]
-    return np.asarray((arrays["directions"] * reached).sum(axis=1) - arrays["bounds"])
+    attained_states = states[np.arange(nearest.size), :, nearest]
+    return np.asarray((arrays["directions"] * attained_states).sum(axis=1) - arrays["bounds"])
 
 
 def read_adversaries(directory: Path, model: Transcription) -> dict[str, Array]:
@@ -154,8 +154,8 @@ def read_adversaries(directory: Path, model: Transcription) -> dict[str, Array]:
         # an earlier version wrote this file, when there was one initial state only
         arrays = {**arrays, "initial_states": np.tile(model.response.initial_state, (arrays["names"].size, 1))}
     _require_shapes(file, arrays, model)
-    known = [constraint.name for constraint in model.constraints if constraint.name in arrays["names"]]
-    if arrays["names"].tolist() != known:
+    names = [constraint.name for constraint in model.constraints if constraint.name in arrays["names"]]
+    if arrays["names"].tolist() != names:
         raise InputError(f"{file}: names: expected constraints of the run, got {', '.join(map(str, arrays['names']))}")
     breakpoints, times = arrays["breakpoints"], arrays["times"]
     missing = [
@@ -196,30 +196,34 @@ def _require_shapes(file: Path, arrays: Mapping[str, Array], model: Transcriptio
             )
     if model.noise is not None:
         shape = (sizes["f"], model.control.pieces, model.noise.dimension)
-        given = arrays.get("noises", np.zeros(0))
-        if given.shape != shape or given.dtype.kind != "f" or not np.isfinite(given).all():
-            raise InputError(f"{file}: noises: expected finite numbers of shape {shape}, got shape {given.shape}")
+        noises = arrays.get("noises", np.zeros(0))
+        if noises.shape != shape or noises.dtype.kind != "f" or not np.isfinite(noises).all():
+            raise InputError(f"{file}: noises: expected finite numbers of shape {shape}, got shape {noises.shape}")
 
 
 def _stacked(found: Sequence[Adversary], model: Transcription) -> dict[str, Array]:
     """Return the arrays of adversaries, one row each, on the union of their breakpoints."""
-    points = np.unique(np.concatenate([one.breakpoints for one in found]))
+    points = np.unique(np.concatenate([adversary.breakpoints for adversary in found]))
     middles = (points[:-1] + points[1:]) / 2
     channels = 0 if model.functionals.disturbance is None else model.response.system.disturbances
     disturbances = np.zeros((len(found), channels, middles.size))
-    for position, one in enumerate(found):
-        if one.disturbance is not None:
-            disturbances[position] = one.disturbance[:, np.searchsorted(one.breakpoints, middles) - 1]
+    for position, adversary in enumerate(found):
+        if adversary.disturbance is not None:
+            disturbances[position] = adversary.disturbance[:, np.searchsorted(adversary.breakpoints, middles) - 1]
     return {
-        "names": np.array([one.name for one in found]),
-        "rows": np.array([one.row for one in found]),
-        "times": np.array([one.time for one in found]),
-        "directions": np.array([one.direction for one in found]),
-        "bounds": np.array([one.bound for one in found]),
-        "violations": np.array([one.violation for one in found]),
-        "parameters": np.array([one.parameter for one in found]),
+        "names": np.array([adversary.name for adversary in found]),
+        "rows": np.array([adversary.row for adversary in found]),
+        "times": np.array([adversary.time for adversary in found]),
+        "directions": np.array([adversary.direction for adversary in found]),
+        "bounds": np.array([adversary.bound for adversary in found]),
+        "violations": np.array([adversary.violation for adversary in found]),
+        "parameters": np.array([adversary.parameter for adversary in found]),
         "breakpoints": points,
         "disturbances": disturbances,
-        "initial_states": np.array([one.initial_state for one in found]),
-        **({"noises": np.array(noises)} if (noises := [one.noise for one in found if one.noise is not None]) else {}),
+        "initial_states": np.array([adversary.initial_state for adversary in found]),
+        **(
+            {"noises": np.array(noises)}
+            if (noises := [adversary.noise for adversary in found if adversary.noise is not None])
+            else {}
+        ),
     }

@@ -35,8 +35,8 @@ def write_whole(file: Path, content: bytes) -> None:
     except OSError as error:
         with suppress(OSError):
             temporary.unlink()
-        left = "the one that is there is what was written before" if _stands(file) else "nothing of it was kept"
-        raise SparseRobError(f"{file}: cannot be written: {error.strerror}; {left}") from error
+        note = "the one that is there is what was written before" if _stands(file) else "nothing of it was kept"
+        raise SparseRobError(f"{file}: cannot be written: {error.strerror}; {note}") from error
 
 
 def _stands(file: Path) -> bool:
@@ -177,8 +177,8 @@ def _require_empty(path: Path, unless: Sequence[str] = ()) -> None:
     """
     passing = (LOCK, *(f".{name}." for name in unless if name))
     # the files are listed first: a process that fills the directory at the same moment begins with a file of `unless`
-    others = any(not file.name.startswith(passing) for file in path.iterdir())
-    if others and not any(name and (path / name).exists() for name in unless):
+    has_others = any(not file.name.startswith(passing) for file in path.iterdir())
+    if has_others and not any(name and (path / name).exists() for name in unless):
         raise InputError(f"{path}: expected a new or an empty directory, got one that holds files")
 
 

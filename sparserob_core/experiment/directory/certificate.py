@@ -89,10 +89,10 @@ def certificate(experiment: Experiment, result: Result) -> dict[str, Any] | None
         else experiment.transcription.nominal(result.decision).reshape(program.channels, experiment.control.functions)
     )
     feedback = experiment.transcription.feedback
-    answered: dict[str, Any] = {}
+    policy_keys: dict[str, Any] = {}
     if feedback is not None:
-        answered["policy"] = {"cost": feedback.charge.cost, "answers": [_runs(row) for row in feedback.answers]}
-        answered |= feedback.loop.written(None if result.decision is None else np.asarray(result.decision))
+        policy_keys["policy"] = {"cost": feedback.charge.cost, "answers": [_runs(row) for row in feedback.answers]}
+        policy_keys |= feedback.loop.written(None if result.decision is None else np.asarray(result.decision))
     causal = result.causal if isinstance(result, ControlResult) and result.causal and result.causal.rows else None
     return {
         "format": FORMAT,
@@ -103,7 +103,7 @@ def certificate(experiment: Experiment, result: Result) -> dict[str, Any] | None
         "gap_tolerance": experiment.gap_tolerance,
         **({"repeat": True} if experiment.transcription.problem.repeat else {}),
         "decision": theta,
-        **answered,
+        **policy_keys,
         **_counted(experiment, result),
         **_fewest(experiment, result.activity),
         **({} if causal is None else {"causal": causal_data(causal)}),
@@ -128,8 +128,8 @@ def bare_certificate(experiment: Experiment, result: Result) -> dict[str, Any]:
 
 def _runs(row: np.ndarray) -> list[list[int]]:
     """Return the ranges ``[first, last]`` of consecutive true values among ``(K,)``."""
-    turns = np.flatnonzero(np.diff(np.concatenate([[0], row.astype(int), [0]])))
-    return [[int(first), int(end) - 1] for first, end in turns.reshape(-1, 2)]
+    changes = np.flatnonzero(np.diff(np.concatenate([[0], row.astype(int), [0]])))
+    return [[int(first), int(end) - 1] for first, end in changes.reshape(-1, 2)]
 
 
 def causal_data(bound: CausalBound) -> dict[str, Any]:
@@ -163,8 +163,8 @@ def _counted(experiment: ControlExperiment, result: Result) -> dict[str, Any]:
     parts."""
     if result.sparsest is None:
         return {"multipliers": _multipliers(experiment, result.dual)}
-    constraints: dict[str, int] = {}
-    told: list[dict[str, Any]] = []
+    numbers: dict[str, int] = {}
+    distinct_constraints: list[dict[str, Any]] = []
     nodes: list[dict[str, Any]] = []
     for node in result.sparsest.tree:
         if isinstance(node, Branch):
@@ -172,18 +172,20 @@ def _counted(experiment: ControlExperiment, result: Result) -> dict[str, Any]:
             at = {} if node.at is None else {"at": list(node.at)}
             nodes.append({"channel": channel, "piece": piece, "first": node.first, "second": node.second, **at})
             continue
-        said = _multipliers(experiment, node.dual) if node.dual.mu.size == experiment.program.finite.b.size else None
-        if said is None:
+        multipliers = (
+            _multipliers(experiment, node.dual) if node.dual.mu.size == experiment.program.finite.b.size else None
+        )
+        if multipliers is None:
             return {"multipliers": None, "J": result.sparsest.norm}
         pairs = []
-        for entry in said["constraints"]:
+        for entry in multipliers["constraints"]:
             plain = {name: value for name, value in entry.items() if name != "multiplier"}
-            number = constraints.setdefault(repr(plain), len(constraints))
-            if number == len(told):
-                told.append(plain)
+            number = numbers.setdefault(repr(plain), len(numbers))
+            if number == len(distinct_constraints):
+                distinct_constraints.append(plain)
             pairs.append([number, entry["multiplier"]])
-        nodes.append({"multipliers": pairs, "equalities": said["equalities"], "feasible": node.feasible})
-    tree = {"constraints": told, "nodes": nodes}
+        nodes.append({"multipliers": pairs, "equalities": multipliers["equalities"], "feasible": node.feasible})
+    tree = {"constraints": distinct_constraints, "nodes": nodes}
     norm = {} if result.status == "infeasible" else {"J": result.sparsest.norm}
     return {"multipliers": None, **norm, "tree": tree}
 
@@ -193,19 +195,19 @@ def _fewest(experiment: ControlExperiment, activity: Activity | None) -> dict[st
         return {}
     program = experiment.program
     own = None if activity.dual is None else _multipliers(experiment, activity.dual)
-    other: dict[str, Any] = {}
+    entries: dict[str, Any] = {}
     if activity.decision is not None:
         theta = experiment.transcription.nominal(activity.decision)
         theta = theta.reshape(program.channels, experiment.control.functions)
-        other = {"decision": theta, "proof": _proofs(experiment, activity.proofs)}
-    return {"fewest_active": {"lower": activity.lower, "upper": activity.upper, "multipliers": own, **other}}
+        entries = {"decision": theta, "proof": _proofs(experiment, activity.proofs)}
+    return {"fewest_active": {"lower": activity.lower, "upper": activity.upper, "multipliers": own, **entries}}
 
 
 def _proofs(experiment: ControlExperiment, proofs: Sequence[Proof]) -> dict[str, Any]:
     """Return the proof of each constraint; under feedback constraints on the control have none, as they need no
     cells."""
-    about = {one.name for one in experiment.transcription.constraints}
-    kept = [one for one in proofs if experiment.transcription.feedback is None or one.family in about]
+    names = {constraint.name for constraint in experiment.transcription.constraints}
+    kept = [proof for proof in proofs if experiment.transcription.feedback is None or proof.family in names]
     return {proof.family: _cells(experiment, proof) for proof in kept if proof.verdict == "proven"}
 
 
@@ -219,23 +221,23 @@ def _multipliers(experiment: ControlExperiment, dual: Dual) -> dict[str, Any] | 
     z = dual.z if problem.execution is None or dual.z is None else _without_sizes(program, dual.z)
     steps = Steps.of(problem, experiment.control)
     pairs = zip(dual.cuts, experiment.transcription.explained(dual.cuts), strict=True)
-    explained = [(cut, said) for cut, said in pairs if said is not None]
+    explained = [(cut, explanation) for cut, explanation in pairs if explanation is not None]
     if len(explained) < len(dual.cuts) or dual.mu.size != program.finite.b.size:
         return None
     return {
         "constraints": [
             {
                 "constraint": cut.family,
-                "time": said.time,
-                "parameter": [] if cut.family == "control_step" else _parameter(problem, said),
-                **_direction(said),
+                "time": explanation.time,
+                "parameter": [] if cut.family == "control_step" else _parameter(problem, explanation),
+                **_direction(explanation),
                 "multiplier": cut.multiplier,
-                **({} if program.spread is None else {"disturbance": _admissible(problem, said)}),
-                **({} if program.spread is None else _deviation(problem, said)),
-                **({} if said.changes is None else {"changes": said.changes}),
-                **_noise(problem, said),
+                **({} if program.spread is None else {"disturbance": _admissible(problem, explanation)}),
+                **({} if program.spread is None else _deviation(problem, explanation)),
+                **({} if explanation.changes is None else {"changes": explanation.changes}),
+                **_noise(problem, explanation),
             }
-            for cut, said in explained
+            for cut, explanation in explained
         ]
         + [
             {"constraint": "control_step", "time": t, "parameter": [], "direction": c + 0.0, "multiplier": y}
@@ -319,9 +321,9 @@ def _deviation(problem: OptimalControlProblem, said: TimedExplanation) -> dict[s
     bound = problem.initial_set
     if bound is None or said.deviation is None:
         return {}
-    said_of = {"deviation": said.deviation, "following": said.following}
+    deviations = {"deviation": said.deviation, "following": said.following}
     middle = bound.interior_point()
-    return {name: _inside(bound, one, middle) for name, one in said_of.items() if one is not None}
+    return {name: _inside(bound, deviation, middle) for name, deviation in deviations.items() if deviation is not None}
 
 
 def _noise(problem: OptimalControlProblem, said: TimedExplanation) -> dict[str, Array]:
@@ -344,10 +346,12 @@ def _inside(bound: ConvexSet, point: Array, middle: Array) -> Array:
 
 def _cells(experiment: ControlExperiment, proof: Proof) -> dict[str, Any]:
     lower, upper = proof.leaves if proof.leaves is not None else (np.zeros((0, 0)), np.zeros((0, 0)))
-    about = next((one for one in experiment.transcription.constraints if one.name == proof.family), None)
-    normals = {} if about is None or about.shape is None else {"normals": about.shape.frame}
-    if about is not None and lower.shape[0] >= MANY_CELLS and lower.shape[1] == 1:
-        lower, upper = _joined(lower[:, 0], upper[:, 0], *about.cells)
+    constraint = next(
+        (constraint for constraint in experiment.transcription.constraints if constraint.name == proof.family), None
+    )
+    normals = {} if constraint is None or constraint.shape is None else {"normals": constraint.shape.frame}
+    if constraint is not None and lower.shape[0] >= MANY_CELLS and lower.shape[1] == 1:
+        lower, upper = _joined(lower[:, 0], upper[:, 0], *constraint.cells)
     return {"tolerance": TOLERANCE, **normals, "lower": lower, "upper": upper}
 
 
@@ -359,8 +363,8 @@ def _joined(lower: Array, upper: Array, first: Array, last: Array) -> tuple[Arra
     """
     order = np.argsort(lower, kind="stable")
     lower, upper = lower[order], upper[order]
-    whole = np.isin(lower, first) & np.isin(upper, last)
-    begins = np.append(True, ~(whole[1:] & whole[:-1] & (upper[:-1] == lower[1:])))
+    is_piece = np.isin(lower, first) & np.isin(upper, last)
+    begins = np.append(True, ~(is_piece[1:] & is_piece[:-1] & (upper[:-1] == lower[1:])))
     return lower[begins, None], upper[np.append(begins[1:], True), None]
 
 
@@ -368,22 +372,22 @@ def _witness(experiment: ControlExperiment, result: Result) -> dict[str, Any] | 
     worst, problem = result.worst, experiment.problem
     if worst is None:
         return None
-    said = in_numbers(experiment.program, worst.constraint, worst.formulation, worst.index, worst.row)
-    if said is None:
+    explanation = in_numbers(experiment.program, worst.constraint, worst.formulation, worst.index, worst.row)
+    if explanation is None:
         return None
-    said = _driven(experiment, said, np.asarray(result.decision))
-    signal: Sequence[Any] | Array | None = said.disturbance
+    explanation = _driven(experiment, explanation, np.asarray(result.decision))
+    signal: Sequence[Any] | Array | None = explanation.disturbance
     if signal is not None and problem.disturbance is not None:
         middle = problem.disturbance.interior_point()
         signal = np.array([_inside(problem.disturbance, column, middle) for column in np.asarray(signal).T]).T
     return {
         "constraint": worst.constraint,
-        "time": said.time,
-        "parameter": _parameter(problem, said),
-        **_direction(said),
+        "time": explanation.time,
+        "parameter": _parameter(problem, explanation),
+        **_direction(explanation),
         "disturbance": signal,
-        **_deviation(problem, said),
-        **_noise(problem, said),
+        **_deviation(problem, explanation),
+        **_noise(problem, explanation),
         "violation": worst.violation,
     }
 

@@ -72,7 +72,7 @@ class StoredRun:
         file, arrays = self.directory / "solution.npz", self.arrays("solution.npz")
         for prefix in ("", BOUND):
             columns = {prefix + name: arrays[prefix + name] for name in IMPOSED if prefix + name in arrays}
-            counts = {other.shape[:1] for other in columns.values()}
+            counts = {column.shape[:1] for column in columns.values()}
             for name, column in columns.items():
                 plain = name.removeprefix(prefix)
                 dimensions = 2 if plain == "indices" else 1
@@ -120,7 +120,7 @@ class StoredRun:
         The index of a policy's constraint is followed by its deviation. There are none where ``solution.npz`` does not
         hold them.
         """
-        columns = {name.removeprefix(BOUND): one for name, one in self.solution.items() if name.startswith(BOUND)}
+        columns = {name.removeprefix(BOUND): column for name, column in self.solution.items() if name.startswith(BOUND)}
         cuts = cuts_of(columns, "literal") if {*CUTS} <= {*columns} else ()
         return cuts, np.ravel(columns.get("equalities", np.zeros(0)))
 
@@ -135,8 +135,8 @@ class StoredRun:
         entry = {"name": method} if isinstance(method, str) else method if isinstance(method, Mapping) else {}
         if entry.get("name") == "sparserob":
             return "literal" if entry.get("formulation") == "literal" else "reduced"
-        known: dict[object, Formulation] = {"nominal": "nominal", "scenario": "sampled"}
-        return known.get(entry.get("name"), "reduced")
+        formulations: dict[object, Formulation] = {"nominal": "nominal", "scenario": "sampled"}
+        return formulations.get(entry.get("name"), "reduced")
 
     @cached_property
     def evaluations(self) -> SearchTrace | None:
@@ -191,16 +191,16 @@ class FinishedRun:
         Raises `InputError` where ``solution.npz`` does not hold it, or where its arrays do not belong to one decision.
         """
         if self.experiment.transcription.feedback is None:
-            found = self.theta.ravel()
+            decision = self.theta.ravel()
         else:
-            found, shape = self.solution.get("decision", np.zeros(0)), (self.experiment.program.n,)
-            if found.shape != shape or found.dtype.kind != "f" or not np.isfinite(found).all():
+            decision, shape = self.solution.get("decision", np.zeros(0)), (self.experiment.program.n,)
+            if decision.shape != shape or decision.dtype.kind != "f" or not np.isfinite(decision).all():
                 raise InputError(
                     f"{self.directory / 'solution.npz'}: decision: expected finite numbers of shape {shape}, as"
-                    f" config.yaml says, got {found.dtype} of shape {found.shape}"
+                    f" config.yaml says, got {decision.dtype} of shape {decision.shape}"
                 )
-        self._agrees(found)
-        return found
+        self._agrees(decision)
+        return decision
 
     def require_certified(self) -> None:
         """Raise `InputError` where ``certificate.json``, if there is one, is about another control.
@@ -208,11 +208,11 @@ class FinishedRun:
         The truth of its claims about this control is left to `check`.
         """
         file = self.directory / "certificate.json"
-        said = read_json(file) if file.is_file() else {}
-        held = {"decision": self.theta} | {name: self.solution.get(name, np.zeros(0)) for name in ANSWERS}
-        for name in (name for name in held if said.get(name) is not None):
+        certificate = read_json(file) if file.is_file() else {}
+        stored = {"decision": self.theta} | {name: self.solution.get(name, np.zeros(0)) for name in ANSWERS}
+        for name in (name for name in stored if certificate.get(name) is not None):
             try:
-                same = np.array_equal(np.array(said[name], dtype=float), held[name])
+                same = np.array_equal(np.array(certificate[name], dtype=float), stored[name])
             except (TypeError, ValueError, OverflowError):
                 same = False
             if not same:
@@ -224,21 +224,21 @@ class FinishedRun:
     def _agrees(self, decision: Array) -> None:
         """Raise `InputError` where the other arrays of ``solution.npz`` do not follow from the decision."""
         model = self.experiment.transcription
-        followed = {"theta": model.nominal(decision), "control": model.pieces(decision)}
+        derived = {"theta": model.nominal(decision), "control": model.pieces(decision)}
         if model.feedback is not None:
-            followed |= model.feedback.loop.written(decision)
+            derived |= model.feedback.loop.written(decision)
         elif self.solution.get("decision", np.zeros(0)).shape == decision.shape:
-            followed["decision"] = decision
-        for name, value in followed.items():
-            held = self.solution.get(name)
-            if held is None and name not in ANSWERS:
+            derived["decision"] = decision
+        for name, value in derived.items():
+            stored = self.solution.get(name)
+            if stored is None and name not in ANSWERS:
                 continue
             size = float(np.abs(value).max(initial=0.0))
             if (
-                held is None
-                or held.size != value.size
-                or held.dtype.kind != "f"
-                or not (np.abs(held.ravel() - value.ravel()) <= SAME * size).all()
+                stored is None
+                or stored.size != value.size
+                or stored.dtype.kind != "f"
+                or not (np.abs(stored.ravel() - value.ravel()) <= SAME * size).all()
             ):
                 raise InputError(
                     f"{self.directory / 'solution.npz'}: {name}: expected what follows from the decision beside it, got"
@@ -266,8 +266,8 @@ def stored_run(directory: str | Path) -> StoredRun:
     path = Path(directory)
     for name in ("config.yaml", "result.json"):
         if not (path / name).is_file():
-            instead = f"one without {name}" if path.is_dir() else "a file" if path.exists() else "nothing"
-            raise InputError(f"{path}: expected the directory of a run, got {instead}")
+            actual = f"one without {name}" if path.is_dir() else "a file" if path.exists() else "nothing"
+            raise InputError(f"{path}: expected the directory of a run, got {actual}")
     return StoredRun(path)
 
 
@@ -351,7 +351,7 @@ def read_json(file: Path) -> dict[str, Any]:
     finite, since a run writes null instead.
     """
     try:
-        data, odd = _read(file)
+        data, has_suspects = _read(file)
     except InputError:
         raise
     except OSError as error:
@@ -362,49 +362,49 @@ def read_json(file: Path) -> dict[str, Any]:
         raise InputError(f"{file}: cannot be read: expected JSON: {error}") from None
     if not isinstance(data, dict):
         raise InputError(f"{file}: expected a JSON object, got {type(data).__name__}")
-    for place, value in _numbers(data) if odd else ():
+    for location, value in _numbers(data) if has_suspects else ():
         if not abs(value) <= sys.float_info.max:
             written = repr(value) if isinstance(value, float) else f"a whole number of {value.bit_length()} bits"
-            raise InputError(f"{file}: {place}: expected a finite number or null, got {written}")
+            raise InputError(f"{file}: {location}: expected a finite number or null, got {written}")
     return data
 
 
 def _read(file: Path) -> tuple[object, bool]:
     """Return the data of a JSON file, and whether any of its numbers may be infinite or NaN."""
-    size, odd = file.stat().st_size, list[str]()
+    size, suspects = file.stat().st_size, list[str]()
     if size > LARGEST_TEXT:
         raise InputError(f"{file}: cannot be read: expected at most {LARGEST_TEXT} bytes, got {size}")
     text = file.read_text(encoding="utf-8")
-    for what, count, most in (
+    for kind, count, limit in (
         ("entries", text.count(","), MOST_ENTRIES),
         ("lists and objects", text.count("[") + text.count("{"), MOST_LISTS),
     ):
-        if count > most:
-            raise InputError(f"{file}: cannot be read: expected at most {most} {what}, got {count}")
+        if count > limit:
+            raise InputError(f"{file}: cannot be read: expected at most {limit} {kind}, got {count}")
 
     def whole(digits: str) -> int:
-        odd.extend([digits] if len(digits) > sys.float_info.max_10_exp else [])
+        suspects.extend([digits] if len(digits) > sys.float_info.max_10_exp else [])
         return int(digits)
 
     def constant(name: str) -> float:
-        odd.append(name)
+        suspects.append(name)
         return float(name)
 
     data = json.loads(text, parse_int=whole, parse_constant=constant)
-    return data, bool(odd) or LARGE.search(text) is not None
+    return data, bool(suspects) or LARGE.search(text) is not None
 
 
 def _numbers(data: dict[str, Any]) -> Iterator[tuple[str, int | float]]:
     """Yield every number of JSON data, each with its place."""
     stack: list[tuple[str, Any]] = [("", data)]
     while stack:
-        place, value = stack.pop()
+        location, value = stack.pop()
         if isinstance(value, dict):
-            stack += [(f"{place}.{key}" if place else key, entry) for key, entry in reversed(value.items())]
+            stack += [(f"{location}.{key}" if location else key, entry) for key, entry in reversed(value.items())]
         elif isinstance(value, list):
-            stack += [(f"{place}[{number}]", value[number]) for number in reversed(range(len(value)))]
+            stack += [(f"{location}[{number}]", value[number]) for number in reversed(range(len(value)))]
         elif isinstance(value, int | float):
-            yield place, value
+            yield location, value
 
 
 def read_summary(file: Path) -> dict[str, Any]:

@@ -65,18 +65,18 @@ class Lock:
         guard exclusively may replace the lock, and only after a second look at it. Two processes that find the same
         dead owner therefore cannot both take the lock.
         """
-        found = self._content()
-        if found is None:
+        content = self._content()
+        if content is None:
             return False
         guard = self.file.with_name(GUARD)
-        if not _is_dead(found):
-            raise self._held(found)
+        if not _is_dead(content):
+            raise self._held(content)
         try:
             guard.touch(exist_ok=False)
         except FileExistsError:
-            raise self._held(found) from None
+            raise self._held(content) from None
         try:
-            if self._content() != found:
+            if self._content() != content:
                 return False
             temporary = self.file.with_name(f"{NAME}.{os.getpid()}.tmp")
             temporary.write_text(_me(), encoding="utf-8")

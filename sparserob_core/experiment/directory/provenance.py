@@ -59,15 +59,15 @@ def git_revision(folder: Path) -> dict[str, Any] | None:
     """
     command = ["git", "-c", "core.fsmonitor=false", "describe", "--always", "--dirty", "--abbrev=40", "--exclude=*"]
     try:
-        done = subprocess.run(
+        process = subprocess.run(
             command, cwd=folder, capture_output=True, text=True, timeout=PATIENCE, check=False, stdin=subprocess.DEVNULL
         )
     except (OSError, subprocess.SubprocessError):
         return None
-    said = done.stdout.strip()
-    if done.returncode or not said:
+    description = process.stdout.strip()
+    if process.returncode or not description:
         return None
-    return {"revision": said.removesuffix("-dirty"), "changed": said.endswith("-dirty")}
+    return {"revision": description.removesuffix("-dirty"), "changed": description.endswith("-dirty")}
 
 
 def _digest(file: Path) -> str | None:

@@ -85,14 +85,16 @@ def units_of(model: Transcription, result: Result) -> dict[str, Any]:
     names = model.problem.names
     if not (names.time or names.state_units or names.control_units):
         return {}
-    rows = {one.name: list(one.measured) for one in model.constraints}
-    every = set(names.control_units)
-    alike = every.pop() if len(every) == 1 and model.problem.control.halfspaces() is not None else ""
+    rows = {constraint.name: list(constraint.measured) for constraint in model.constraints}
+    control_units = set(names.control_units)
+    control_unit = (
+        control_units.pop() if len(control_units) == 1 and model.problem.control.halfspaces() is not None else ""
+    )
     rows |= {EQUALS: [measured_in(axis, names).strip() for axis in fixed(model.problem)[0]]}
-    rows |= {name: [alike] for name in (of_control(model.problem), "control_step") if name not in rows}
+    rows |= {name: [control_unit] for name in (of_control(model.problem), "control_step") if name not in rows}
     worst = result.worst
-    mine = [] if worst is None else rows.get(worst.constraint, [])
-    measured = mine[0 if len(mine) == 1 else worst.row] if worst is not None and mine else ""
+    row_units = [] if worst is None else rows.get(worst.constraint, [])
+    measured = row_units[0 if len(row_units) == 1 else worst.row] if worst is not None and row_units else ""
     effort = model.problem.cost_unit
     return {
         "time": names.time,
@@ -192,12 +194,12 @@ def arrays_of(
         ``bound_indices``, ``bound_rows``, and so on; ``bound_equalities`` are the multipliers of the equalities. Under
         feedback the index of each constraint of the bound is followed by its deviation.
     """
-    told = _told(result.indices)
-    count, width = told["indices"].shape
+    columns = _told(result.indices)
+    count, width = columns["indices"].shape
     arrays = {
         "decision": np.zeros(0) if result.decision is None else result.decision,
-        "times": told["indices"][:, 0] if dictionary is not None and width else np.full(count, np.nan),
-        **told,
+        "times": columns["indices"][:, 0] if dictionary is not None and width else np.full(count, np.nan),
+        **columns,
     }
     if answers or result.dual.mu.size or result.dual.cuts:
         proving = {**_told(result.dual.cuts), "equalities": result.dual.mu}
@@ -231,8 +233,11 @@ def _told(cuts: Sequence[Cut]) -> dict[str, Array]:
 
 def versions(packages: tuple[str, ...] = PACKAGES) -> dict[str, str]:
     """Return the versions of Python and of the packages that decide the numbers."""
-    found = {package: _version(package) for package in packages}
-    return {"python": platform.python_version(), **{name: one for name, one in found.items() if one is not None}}
+    installed = {package: _version(package) for package in packages}
+    return {
+        "python": platform.python_version(),
+        **{name: version for name, version in installed.items() if version is not None},
+    }
 
 
 @cache

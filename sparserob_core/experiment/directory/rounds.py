@@ -62,10 +62,10 @@ def with_decisions(
         raise ValueError(f"decisions: expected {len(history)} rounds, got {len(arrays['decisions'])}")
     complete, last = [], dict[tuple[str, bytes, int], Cut]()
     for number, entry in enumerate(history):
-        mine = arrays["rounds"] == number
+        mask = arrays["rounds"] == number
         cuts = tuple(
             replace(cut, multiplier=0.0)
-            for cut in cuts_of({name: arrays[name][mine] for name in (*CUTS, FORMULATIONS) if name in arrays}, before)
+            for cut in cuts_of({name: arrays[name][mask] for name in (*CUTS, FORMULATIONS) if name in arrays}, before)
         )
         now = {(cut.family, cut.index.tobytes(), cut.row): cut for cut in cuts}
         complete.append(
@@ -74,7 +74,7 @@ def with_decisions(
                 decision=arrays["decisions"][number],
                 cost=float(arrays["costs"][number]),
                 imposed=cuts,
-                multipliers=arrays["multipliers"][mine],
+                multipliers=arrays["multipliers"][mask],
                 added=tuple(cut for key, cut in now.items() if key not in last),
                 dropped=tuple(cut for key, cut in last.items() if key not in now),
             )
@@ -97,7 +97,7 @@ def cuts_of(arrays: Mapping[str, Array], before: Formulation = "reduced") -> tup
 
 
 def _formulation(name: str) -> Formulation:
-    known: dict[str, Formulation] = {form: form for form in get_args(Formulation)}
-    if name not in known:
-        raise ValueError(f"{FORMULATIONS}: expected one of {', '.join(known)}, got {name!r}")
-    return known[name]
+    formulations: dict[str, Formulation] = {form: form for form in get_args(Formulation)}
+    if name not in formulations:
+        raise ValueError(f"{FORMULATIONS}: expected one of {', '.join(formulations)}, got {name!r}")
+    return formulations[name]

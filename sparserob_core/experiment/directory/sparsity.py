@@ -51,20 +51,20 @@ def verdict(result: Result) -> str | None:
     It is proven where no admissible control acts less than an optimum of the usual cost. Where a control acts less, the
     difference is given in the units of time.
     """
-    found, known = result.sparsest, result.activity
-    if result.status != "certified" or known is None or known.upper is None or not known.norm:
+    sparsest, activity = result.sparsest, result.activity
+    if result.status != "certified" or activity is None or activity.upper is None or not activity.norm:
         return None
-    if found is not None:
-        if found.plain_count is None or found.plain is None:
+    if sparsest is not None:
+        if sparsest.plain_count is None or sparsest.plain is None:
             return None
-        less = found.plain_count - result.cost
-        if less <= SAME * found.plain_count:
+        saving = sparsest.plain_count - result.cost
+        if saving <= SAME * sparsest.plain_count:
             return PROVEN
-        same = found.norm - found.plain <= SAME * max(abs(found.plain), abs(found.norm))
-        rest = ", at the same cost, for the optimum is not unique" if same else ""
-        return f"the sparsest control acts {less:.6g} less than the optimum: here it is{rest}"
-    if known.decision is not None:
+        is_same_cost = sparsest.norm - sparsest.plain <= SAME * max(abs(sparsest.plain), abs(sparsest.norm))
+        note = ", at the same cost, for the optimum is not unique" if is_same_cost else ""
+        return f"the sparsest control acts {saving:.6g} less than the optimum: here it is{note}"
+    if activity.decision is not None:
         return "not decided: another admissible control acts less; method sparsest finds the one that acts least"
-    if known.upper - known.lower <= SAME * known.upper:
+    if activity.upper - activity.lower <= SAME * activity.upper:
         return PROVEN
     return "not decided: method sparsest finds the control that acts least"

@@ -27,43 +27,49 @@ class Active:
     states: np.ndarray | None = None
 
     def on(self, component: int) -> Array:
-        """When a constraint on a state is active."""
+        """Return the times at which a constraint on a state component is active; all times where the states are not
+        known."""
         return self.times if self.states is None else self.times[self.states[:, component]]
 
 
 def active_of(model: Transcription, cuts: Sequence[Cut]) -> Active:
-    """Where imposed constraints that carry a multiplier are active; of a policy those on the state."""
+    """Return the times of the imposed constraints that carry a multiplier; of a policy, only of constraints on the
+    state."""
     return marks_of(model, [cut for cut in cuts if cut.multiplier > 0.0 and _told(model, cut.family)])
 
 
 def stored_active(model: Transcription, solution: Mapping[str, Array]) -> Active:
-    """The same from ``solution.npz``; none where it has no multipliers."""
+    """Return the times of active constraints from the arrays of ``solution.npz``; none where these hold no multipliers.
+
+    Multipliers that are only rounding do not count.
+    """
     if not {"times", "multipliers", "families", "rows"} <= set(solution):
         return marks_of(model, ())
     multipliers = solution["multipliers"]
     kept = multipliers > NOTHING * multipliers.max(initial=0.0)
-    found = zip(*(solution[name][kept].tolist() for name in ("families", "times", "rows")), strict=True)
-    return _marks(model, [one for one in found if _told(model, one[0])])
+    entries = zip(*(solution[name][kept].tolist() for name in ("families", "times", "rows")), strict=True)
+    return _marks(model, [entry for entry in entries if _told(model, entry[0])])
 
 
 def marks_of(model: Transcription, cuts: Sequence[Cut]) -> Active:
-    """Where constraints are active."""
+    """Return the times and states of constraints, whatever their multipliers."""
     return _marks(model, [(cut.family, float(cut.index[0]), cut.row) for cut in cuts])
 
 
 def _marks(model: Transcription, found: Sequence[tuple[str, float, int]]) -> Active:
-    """Those of families, times and rows."""
-    times, which = np.unique(np.array([time for _, time, _ in found], dtype=float), return_inverse=True)
+    """Return the times and states of constraints that are given as family, time and row."""
+    times, time_indices = np.unique(np.array([time for _, time, _ in found], dtype=float), return_inverse=True)
     states = np.zeros((times.size, model.problem.system.states), dtype=bool)
-    constraints = {one.name: one for one in model.constraints}
-    rows = {(family, row) for family, _, row in found if family in constraints}  # far fewer than constraints
-    reached = {one: constraints[one[0]].states_of(one[1])[: states.shape[1]] for one in rows}
-    for place, (family, _, row) in zip(which.tolist(), found, strict=True):
-        if (family, row) in reached:
-            states[place] |= reached[family, row]
+    constraints = {constraint.name: constraint for constraint in model.constraints}
+    keys = {(family, row) for family, _, row in found if family in constraints}  # far fewer than constraints
+    states_of_key = {key: constraints[key[0]].states_of(key[1])[: states.shape[1]] for key in keys}
+    for index, (family, _, row) in zip(time_indices.tolist(), found, strict=True):
+        if (family, row) in states_of_key:
+            states[index] |= states_of_key[family, row]
     return Active(times, states)
 
 
 def _told(model: Transcription, family: str) -> bool:
-    """Whether the first coordinate of a family's indices is a time: under feedback those of states."""
-    return model.feedback is None or family in {one.name for one in model.constraints}
+    """Return whether the first coordinate of a family's indices is a time; under feedback only for constraints on the
+    state."""
+    return model.feedback is None or family in {constraint.name for constraint in model.constraints}

@@ -40,7 +40,7 @@ def draw_adversary(arrays: Mapping[str, Array], data: FigureData) -> Figure:
     paths = [_path(*worst, data) for worst in zip(arrays["states"], arrays["directions"], strict=True)]
     for number, name in enumerate(arrays["names"].tolist()):
         pen = {"color": COLOURS[number % len(COLOURS)], "linestyle": DASHES[number // len(COLOURS) % len(DASHES)]}
-        at = int(np.abs(arrays["state_times"] - arrays["times"][number]).argmin())
+        index = int(np.abs(arrays["state_times"] - arrays["times"][number]).argmin())
         for component, ax in zip(data.drawn_states, axes[:states], strict=True):
             path = paths[number][component]
             ax.plot(
@@ -54,7 +54,7 @@ def draw_adversary(arrays: Mapping[str, Array], data: FigureData) -> Figure:
             if arrays["directions"][number, component]:
                 ax.plot(
                     arrays["times"][number],
-                    path[at],
+                    path[index],
                     "o",
                     color=pen["color"],
                     markersize=5,
@@ -89,16 +89,18 @@ def _path(states: Array, direction: Array, data: FigureData) -> Array:
 
 
 def _uncertain(arrays: Mapping[str, Array], data: FigureData) -> str:
-    """What differs in a worst case from the nominal one, of what there is."""
-    known = ~np.isnan(data.state[:, 0])
-    begun = not np.allclose(arrays["initial_states"][:, known], data.state[known, 0], rtol=1e-9, atol=0.0)
+    """Name the quantities in which the worst cases differ from the nominal case, such as the disturbance, in words."""
+    is_known = ~np.isnan(data.state[:, 0])
+    initial_state_varies = not np.allclose(
+        arrays["initial_states"][:, is_known], data.state[is_known, 0], rtol=1e-9, atol=0.0
+    )
     kinds = {
         "disturbance": arrays["disturbances"].any(),
         "parameter": arrays["parameters"].shape[1] > 0 or bool(data.names.corners),
         "noise": "noises" in arrays,
-        "initial state": begun,
+        "initial state": initial_state_varies,
     }
-    words = [kind for kind, there in kinds.items() if there]
+    words = [kind for kind, differs in kinds.items() if differs]
     return " and ".join(filter(None, [", ".join(words[:-1]), *words[-1:]])) or "nothing is uncertain"
 
 

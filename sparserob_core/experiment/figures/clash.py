@@ -36,9 +36,12 @@ ROOM = (
 @final
 @dataclass(frozen=True)
 class Strip:
-    """One quantity ``label``: allowed in ``[low, high]``, brought by the control to ``[reach_low, reach_high]`` where
-    nothing disturbs it, and moved from there by the worst disturbance by ``sigma_low`` downwards and ``sigma_high``
-    upwards; all of them in ``unit``, empty where none is known."""
+    """Quantity ``label`` of a picture, with its allowed interval, its reach and the effect of the disturbance.
+
+    The quantity is allowed in ``[low, high]``. The control brings it to ``[reach_low, reach_high]`` where nothing
+    disturbs it. The worst disturbance moves it from there by ``sigma_low`` downwards and ``sigma_high`` upwards. All of
+    these are in ``unit``, which is empty where no unit is known.
+    """
 
     label: str
     low: float
@@ -51,8 +54,11 @@ class Strip:
 
     @property
     def view(self) -> tuple[float, float]:
-        """What a picture shows: what is allowed, and what the worst disturbance makes of the best, with room around
-        them. The control may reach a thousand times farther, and a wall would be a line."""
+        """Interval that a picture shows: the allowed interval, and the effect of the worst disturbance on the best
+        value, with room around them.
+
+        The reach of the control may be a thousand times larger, and a bound would then look like a line.
+        """
         ends = [self.low, self.high, self.best - self.sigma_low, self.best + self.sigma_high]
         shown = [value for value in ends if np.isfinite(value)]
         room = ROOM * max(max(shown) - min(shown), 1e-9)
@@ -60,17 +66,17 @@ class Strip:
 
     @property
     def short(self) -> float:
-        """By how much the best that the control does still misses what is allowed; 0 where it can be met."""
+        """Distance of the worst case of the best value to the allowed interval; 0 where the constraint can be met."""
         return max(self.low - (self.best - self.sigma_low), self.best + self.sigma_high - self.high, 0.0)
 
     @property
     def best(self) -> float:
-        """Where the control does best to bring it: in the middle of what is allowed and possible once the disturbance
-        has taken its part."""
+        """Best value of the quantity without disturbance: the middle of the interval that is left once the disturbance
+        has its share, as far as the control can reach it."""
         low, high = self.low + self.sigma_low, self.high - self.sigma_high
-        wanted = (low + high) / 2 if np.isfinite(low + high) else low if np.isfinite(low) else high
-        wanted = float(np.clip(self.reach_low, low, high)) if low <= high and np.isinf(high - low) else wanted
-        return float(np.clip(wanted, self.reach_low, self.reach_high))
+        target = (low + high) / 2 if np.isfinite(low + high) else low if np.isfinite(low) else high
+        target = float(np.clip(self.reach_low, low, high)) if low <= high and np.isinf(high - low) else target
+        return float(np.clip(target, self.reach_low, self.reach_high))
 
 
 def draw_clash(experiment: Experiment, result: Result, directory: Path) -> list[Path]:
@@ -102,8 +108,8 @@ def clash_figure(experiment: Experiment, result: Result) -> Figure:
         for ax, strip in zip(axes, strips, strict=True):
             _draw(ax, strip)
         alone = any(strip.short > 0.0 for strip in strips)
-        rest = "" if alone else "\neach of them can be met, but not all by one control"
-        figure.suptitle(plain(experiment.title) + rest, x=0.01, ha="left", fontsize=11.5)
+        suffix = "" if alone else "\neach of them can be met, but not all by one control"
+        figure.suptitle(plain(experiment.title) + suffix, x=0.01, ha="left", fontsize=11.5)
         handles = [axes_handles for ax in axes for axes_handles in zip(*ax.get_legend_handles_labels(), strict=True)]
         entries = {label: handle for handle, label in handles}
         figure.legend(
@@ -114,10 +120,10 @@ def clash_figure(experiment: Experiment, result: Result) -> Figure:
 
 def clash_strips(program: SemiInfiniteProgram, result: Result) -> list[Strip]:
     """The strips of a figure: of every separate reason, else of the rows of the certificate."""
-    found = reasons(program)
+    separate_reasons = reasons(program)
     cuts = (
-        [cut for reason in found for cut in reason.rows.cuts]
-        if found
+        [cut for reason in separate_reasons for cut in reason.rows.cuts]
+        if separate_reasons
         else [cut for cut in result.indices if cut.multiplier > 0]
     )
     strips: dict[str, Strip] = {}
@@ -130,24 +136,29 @@ def clash_strips(program: SemiInfiniteProgram, result: Result) -> list[Strip]:
 
 
 def _strip(program: SemiInfiniteProgram, family: ConstraintFamily, cut: Cut) -> Strip | None:
-    told = partial(in_numbers, program, cut.family, cut.formulation, cut.index)
-    said = told(cut.row)
-    if said is None or not said.quantity:
+    explain_row = partial(in_numbers, program, cut.family, cut.formulation, cut.index)
+    description = explain_row(cut.row)
+    if description is None or not description.quantity:
         return None
     G, h = family.rows(cut.index[None])
     row = rows_at(_reduced(program, family), family.name, cut.index[None], np.array([cut.row])).G[0]
     towards, away = (float(least_of(program.finite, sign * row[None], np.zeros(1))[0]) for sign in (1.0, -1.0))
-    reach = sorted([said.free + said.sign * towards, said.free - said.sign * away])
-    limits, sigmas = {said.sign: said.limit}, {said.sign: said.sigma}
+    reach = sorted([description.free + description.sign * towards, description.free - description.sign * away])
+    limits, sigmas = {description.sign: description.limit}, {description.sign: description.sigma}
     opposite = [
         j
         for j in range(h.shape[1])
         if j != cut.row and np.abs(G[0, j] + row).max() <= 1e-12 * np.abs(row).max(initial=1e-300)
     ]
-    for other in map(told, opposite):
-        if other is not None and other.quantity == said.quantity:
-            limits[other.sign], sigmas[other.sign] = other.limit, other.sigma
-    label = f"{said.quantity}\n{family.name}" + (f", {said.where}" if said.where and said.time else "")
+    for opposite_description in map(explain_row, opposite):
+        if opposite_description is not None and opposite_description.quantity == description.quantity:
+            limits[opposite_description.sign], sigmas[opposite_description.sign] = (
+                opposite_description.limit,
+                opposite_description.sigma,
+            )
+    label = f"{description.quantity}\n{family.name}" + (
+        f", {description.where}" if description.where and description.time else ""
+    )
     return Strip(
         label,
         limits.get(-1.0, -np.inf),
@@ -156,7 +167,7 @@ def _strip(program: SemiInfiniteProgram, family: ConstraintFamily, cut: Cut) -> 
         reach[1],
         sigmas.get(-1.0, 0.0),
         sigmas.get(1.0, 0.0),
-        said.unit,
+        description.unit,
     )
 
 
@@ -165,18 +176,18 @@ def _reduced(program: SemiInfiniteProgram, family: ConstraintFamily) -> SemiInfi
 
 
 def _draw(ax: Axes, strip: Strip) -> None:
-    left, right = strip.view
-    ax.set_xlim(left, right)
-    _forbidden(ax, strip, 0.0, left, right)
+    view_left, view_right = strip.view
+    ax.set_xlim(view_left, view_right)
+    _forbidden(ax, strip, 0.0, view_left, view_right)
     worst = "what the worst disturbance makes of its best"
     _bar(ax, strip.best - strip.sigma_low, strip.best + strip.sigma_high, -0.17, look.ORANGE, worst)
     _bar(ax, strip.reach_low, strip.reach_high, 0.17, look.BLUE, "where the control can bring it")
     ax.plot([strip.best], [-0.17], "|", color=look.INK, markersize=9, zorder=4, linewidth=0, label="its best")
     unit = f" {plain(strip.unit)}" if strip.unit else ""
-    said = [f"misses by {strip.short:.3g}{unit}"] if strip.short > 0.0 else []
-    if strip.reach_low < left or strip.reach_high > right:
-        said.append(f"the control reaches {strip.reach_low:.3g} to {strip.reach_high:.3g}{unit}")
-    ax.set_title("  ·  ".join(said), loc="right", fontsize=9, color=look.INK, pad=2)
+    notes = [f"misses by {strip.short:.3g}{unit}"] if strip.short > 0.0 else []
+    if strip.reach_low < view_left or strip.reach_high > view_right:
+        notes.append(f"the control reaches {strip.reach_low:.3g} to {strip.reach_high:.3g}{unit}")
+    ax.set_title("  ·  ".join(notes), loc="right", fontsize=9, color=look.INK, pad=2)
     ax.set_yticks([0.0], [plain(strip.label)])
     ax.set_ylim(-0.45, 0.45)
     ax.tick_params(axis="y", length=0)

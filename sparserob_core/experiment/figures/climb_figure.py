@@ -48,8 +48,8 @@ def draw_climb(trace: SearchTrace, title: str, upper: float = np.inf, *, exact: 
     first."""
     from matplotlib.figure import Figure
 
-    noted = _noted(trace)
-    heights = [2.6, 1.35, *[0.95] * len(noted)]
+    note_names = _noted(trace)
+    heights = [2.6, 1.35, *[0.95] * len(note_names)]
     figure = Figure(figsize=(look.WIDTH, sum(heights) + 1.25), layout="constrained")
     axes: list[Axes] = list(
         figure.subplots(len(heights), 1, sharex=True, squeeze=False, height_ratios=heights)[:, 0],
@@ -57,14 +57,14 @@ def draw_climb(trace: SearchTrace, title: str, upper: float = np.inf, *, exact: 
     stages = list(_stages(trace))
     _draw_climb(axes[0], trace, stages, unit)
     _draw_bound(axes[1], trace, upper, exact, unit)
-    for ax, name in zip(axes[2:], noted, strict=True):
+    for ax, name in zip(axes[2:], note_names, strict=True):
         changing = np.nan_to_num(trace.gains) != 0.0 if name == "accepted" else True
         _draw_note(ax, name, np.where(changing, trace.notes[name], np.nan), stages)
     for ax in axes:
         for _, first, _ in stages[1:]:
             ax.axvline(first + 0.5, color=look.GREY, linewidth=0.6, linestyle=":", zorder=0)
-        for place in _restarts(trace):
-            ax.axvline(place + 0.5, color=look.PURPLE, linewidth=0.7, zorder=0, label="walk heated again")
+        for evaluation in _restarts(trace):
+            ax.axvline(evaluation + 0.5, color=look.PURPLE, linewidth=0.7, zorder=0, label="walk heated again")
     axes[-1].set_xlabel("evaluations of $g$")
     axes[-1].set_xlim(0.0, trace.value.size + 1.0)
     axes[0].set_title(title, pad=36)
@@ -82,24 +82,36 @@ def _stages(trace: SearchTrace) -> Iterator[tuple[float, int, int]]:
 
 
 def _draw_climb(ax: Axes, trace: SearchTrace, stages: list[tuple[float, int, int]], unit: str) -> None:
-    short, lead, tops = _below(trace, stages)
-    floor = _floor(np.concatenate([short, lead]), tops)
-    short, lead = np.maximum(short, floor), np.maximum(lead, floor)
-    _dots(ax, trace, short)
-    walked = _accepted(trace)
-    number = np.arange(1, short.size + 1)
+    distances, best_distances, tops = _below(trace, stages)
+    floor = _floor(np.concatenate([distances, best_distances]), tops)
+    distances, best_distances = np.maximum(distances, floor), np.maximum(best_distances, floor)
+    _dots(ax, trace, distances)
+    is_accepted = _accepted(trace)
+    evaluations = np.arange(1, distances.size + 1)
     for k, (_, first, last) in enumerate(stages):
-        mine = np.flatnonzero(walked[first:last]) + first
-        one: dict[str, Any] = {"drawstyle": "steps-post"}
-        ax.plot(number[first:last], lead[first:last], color=look.ORANGE, linewidth=2.4, label="best so far", **one)
-        if mine.size:  # the walk stays where it was until the end
-            places = np.append(number[mine], last)
+        accepted = np.flatnonzero(is_accepted[first:last]) + first
+        line_style: dict[str, Any] = {"drawstyle": "steps-post"}
+        ax.plot(
+            evaluations[first:last],
+            best_distances[first:last],
+            color=look.ORANGE,
+            linewidth=2.4,
+            label="best so far",
+            **line_style,
+        )
+        if accepted.size:  # the walk stays where it was until the end
+            places = np.append(evaluations[accepted], last)
             ax.plot(
-                places, short[np.append(mine, mine[-1])], color=look.BLUE, linewidth=0.9, label="accepted walk", **one
+                places,
+                distances[np.append(accepted, accepted[-1])],
+                color=look.BLUE,
+                linewidth=0.9,
+                label="accepted walk",
+                **line_style,
             )
         _stage_words(ax, k, stages, tops[k])
     ax.set_yscale("log")
-    ax.set_ylim(_deepest([*short, *lead]) * 2.0, floor / 2.0)  # the highest value is at the top
+    ax.set_ylim(_deepest([*distances, *best_distances]) * 2.0, floor / 2.0)  # the highest value is at the top
     ticks = [10.0**power for power in range(-15, 16) if 3.0 * floor <= 10.0**power <= ax.get_ylim()[0]]
     ax.set_yticks([floor, *ticks], ["highest", *(f"$10^{{{round(np.log10(tick))}}}$" for tick in ticks)], minor=False)
     ax.minorticks_off()
@@ -107,14 +119,17 @@ def _draw_climb(ax: Axes, trace: SearchTrace, stages: list[tuple[float, int, int
 
 
 def _below(trace: SearchTrace, stages: list[tuple[float, int, int]]) -> tuple[Array, Array, list[float]]:
-    """How far every value, and the best so far, is below the highest of its stage, nan where it is not finite; and the
-    highest of every stage."""
-    short, lead, tops = np.full(trace.value.size, np.nan), np.full(trace.value.size, np.nan), []
+    """Return the distance of every value, and of the best value so far, to the highest value of its stage, ``(n,)``
+    each.
+
+    The distance is NaN where a value is not finite. Also returns the highest value of every stage.
+    """
+    distances, best_distances, tops = np.full(trace.value.size, np.nan), np.full(trace.value.size, np.nan), []
     for _, first, last in stages:
-        mine = np.where(np.isfinite(trace.value[first:last]), trace.value[first:last], np.nan)
-        tops.append(float(np.nanmax(mine)) if np.isfinite(mine).any() else np.nan)
-        short[first:last], lead[first:last] = tops[-1] - mine, tops[-1] - np.fmax.accumulate(mine)
-    return short, lead, tops
+        values = np.where(np.isfinite(trace.value[first:last]), trace.value[first:last], np.nan)
+        tops.append(float(np.nanmax(values)) if np.isfinite(values).any() else np.nan)
+        distances[first:last], best_distances[first:last] = tops[-1] - values, tops[-1] - np.fmax.accumulate(values)
+    return distances, best_distances, tops
 
 
 def _floor(below: Array, tops: list[float]) -> float:
@@ -146,17 +161,17 @@ def _stage_words(ax: Axes, k: int, stages: list[tuple[float, int, int]], top: fl
 
 
 def _dots(ax: Axes, trace: SearchTrace, short: Array) -> None:
-    noted = trace.notes.get("accepted", np.full(short.size, np.nan))
-    number = np.arange(1, short.size + 1)
-    refused = noted == 0.0
-    for mine, colour, label in (
+    accepted = trace.notes.get("accepted", np.full(short.size, np.nan))
+    evaluations = np.arange(1, short.size + 1)
+    refused = accepted == 0.0
+    for mask, colour, label in (
         (refused, look.MIST, "proposal, refused"),
         (~refused & ~_accepted(trace), "#A9CDE3", "evaluated"),
     ):
-        if np.isfinite(short[mine]).any():
+        if np.isfinite(short[mask]).any():
             ax.plot(
-                number[mine],
-                short[mine],
+                evaluations[mask],
+                short[mask],
                 ".",
                 markersize=4.0,
                 markeredgewidth=0,
@@ -172,20 +187,21 @@ def _accepted(trace: SearchTrace) -> np.ndarray:
 
 
 def _restarts(trace: SearchTrace) -> list[int]:
-    """Where a walk was heated again within a search: its temperature rises tenfold from one note to the next."""
-    heat = trace.notes.get("temperature", np.zeros(0))
-    where = np.flatnonzero(np.isfinite(heat))
-    one, other = where[:-1], where[1:]
-    risen = (heat[other] > 10.0 * heat[one]) & (trace.outer[one] == trace.outer[other])
-    return [int(place) for place in other[risen]]
+    """Return the evaluations at which a walk was heated again within a search: its temperature rises more than tenfold
+    from one note to the next."""
+    temperatures = trace.notes.get("temperature", np.zeros(0))
+    indices = np.flatnonzero(np.isfinite(temperatures))
+    earlier, later = indices[:-1], indices[1:]
+    is_restart = (temperatures[later] > 10.0 * temperatures[earlier]) & (trace.outer[earlier] == trace.outer[later])
+    return [int(evaluation) for evaluation in later[is_restart]]
 
 
 def _draw_bound(ax: Axes, trace: SearchTrace, upper: float, exact: bool, unit: str) -> None:
-    number = np.arange(1, trace.bound.size + 1)
-    known = np.isfinite(trace.bound)
+    evaluations = np.arange(1, trace.bound.size + 1)
+    is_known = np.isfinite(trace.bound)
     ax.plot(
-        number[known],
-        trace.bound[known],
+        evaluations[is_known],
+        trace.bound[is_known],
         drawstyle="steps-post",
         color=look.GREEN,
         linewidth=1.5,
@@ -193,17 +209,17 @@ def _draw_bound(ax: Axes, trace: SearchTrace, upper: float, exact: bool, unit: s
         zorder=3,
     )
     ax.set_ylabel(measured("cost $J$", unit))
-    if not known.any():
+    if not is_known.any():
         ax.text(0.5, 0.5, "no bound was proven", transform=ax.transAxes, ha="center", color=look.GREY)
         return
-    top = float(max(upper if np.isfinite(upper) else -np.inf, trace.bound[known].max()))
-    low = max(float(trace.bound[known].min()), top - VIEW * abs(top)) if top else float(trace.bound[known].min())
+    top = float(max(upper if np.isfinite(upper) else -np.inf, trace.bound[is_known].max()))
+    low = max(float(trace.bound[is_known].min()), top - VIEW * abs(top)) if top else float(trace.bound[is_known].min())
     margin = 0.08 * max(top - low, 1e-9 * max(1.0, abs(top)))
     ax.set_ylim(low - margin, top + margin)
     if np.isfinite(upper):
-        said = f"exact value of $J$: {upper:.7g}" if exact else f"proven upper bound of $J$: {upper:.7g}"
+        label = f"exact value of $J$: {upper:.7g}" if exact else f"proven upper bound of $J$: {upper:.7g}"
         ax.axhline(
-            upper, color=look.INK if exact else look.VERMILLION, linewidth=0.9, linestyle=(0, (6, 4)), label=said
+            upper, color=look.INK if exact else look.VERMILLION, linewidth=0.9, linestyle=(0, (6, 4)), label=label
         )
         if upper > 0.0:
             share = ax.secondary_yaxis(
@@ -214,25 +230,25 @@ def _draw_bound(ax: Axes, trace: SearchTrace, upper: float, exact: bool, unit: s
 
 def _noted(trace: SearchTrace) -> list[str]:
     """The notes that are drawn."""
-    known = [name for name, column in trace.notes.items() if np.isfinite(column).any()]
-    return sorted(known, key=lambda name: FIRST.index(name) if name in FIRST else len(FIRST))[:NOTES]
+    names = [name for name, column in trace.notes.items() if np.isfinite(column).any()]
+    return sorted(names, key=lambda name: FIRST.index(name) if name in FIRST else len(FIRST))[:NOTES]
 
 
 def _draw_note(ax: Axes, name: str, column: Array, stages: list[tuple[float, int, int]]) -> None:
-    noted = column[np.isfinite(column)]
+    finite_values = column[np.isfinite(column)]
     if name == "accepted":
         ax.set_ylim(-0.05, 1.05)
-    elif (noted > 0).all() and noted.max() > 100.0 * noted.min():
+    elif (finite_values > 0).all() and finite_values.max() > 100.0 * finite_values.min():
         ax.set_yscale("log")
     for _, first, last in stages:
-        where = np.flatnonzero(np.isfinite(column[first:last])) + first
-        values = _mean(column[where]) if name == "accepted" else column[where]
-        ax.plot(where + 1, values, color=look.VERMILLION, linewidth=1.0)
+        indices = np.flatnonzero(np.isfinite(column[first:last])) + first
+        values = _mean(column[indices]) if name == "accepted" else column[indices]
+        ax.plot(indices + 1, values, color=look.VERMILLION, linewidth=1.0)
     ax.set_ylabel(f"accepted, of the\nlast {MEAN} changes" if name == "accepted" else name.replace("_", " "))
 
 
 def _mean(values: Array) -> Array:
     """The mean of the last `MEAN` values at every place."""
-    sums, place = np.concatenate([[0.0], np.cumsum(values)]), np.arange(1, values.size + 1)
-    first = np.maximum(place - MEAN, 0)
-    return np.asarray((sums[place] - sums[first]) / (place - first))
+    sums, positions = np.concatenate([[0.0], np.cumsum(values)]), np.arange(1, values.size + 1)
+    first = np.maximum(positions - MEAN, 0)
+    return np.asarray((sums[positions] - sums[first]) / (positions - first))

@@ -1,4 +1,4 @@
-"""From a solved experiment to its figures: the nominal trajectory, the worst-case tube around it, and what constrains
+"""Figures of a solved experiment: the nominal trajectory, the worst-case tube around it, and the constraints on
 them."""
 
 from __future__ import annotations
@@ -84,9 +84,37 @@ def figure_data(
     status: str = "",
     states: Sequence[int] | None = None,
 ) -> FigureData:
-    """What figures of a decision (``theta (m, N)``, or whole) show, of all ``states`` or of those that are named; under
-    feedback also what so many random disturbances and the worst one make of the control. The title says so where a
-    ``status`` claims no proof. Raises `InputError` when the program is no control problem."""
+    """Return the data for the figures of a decision.
+
+    Parameters
+    ----------
+    experiment : Experiment
+        A control problem with its program.
+    theta : array, (m, N), or the whole decision
+        Coefficients of the control.
+    active : Active, optional
+        Times of the active constraints.
+    history : sequence of RoundFinished
+        Rounds of the method.
+    cost : float, optional
+        Cost of the decision.
+    draws : int
+        Number of random disturbances under which the control is shown, together with the worst one; feedback only.
+    status : str
+        Status of the result. The title says so where the status claims no proof.
+    states : sequence of int, optional
+        States to be shown; all by default.
+
+    Returns
+    -------
+    FigureData
+        The data of all figures.
+
+    Raises
+    ------
+    InputError
+        When the program is no control problem.
+    """
     data = _data(
         experiment.of_control("figures: expected a control problem"), theta, active, history, cost, draws, states
     )
@@ -145,36 +173,46 @@ def _shown(experiment: Experiment, theta: Array) -> Sequence[int] | None:
     model = experiment.model
     if model is None or model.problem.system.states <= MOST_STATES:
         return None
-    problem, own = model.problem, model.problem.names.corners.own(model.problem.system.states)
-    if len(own) <= MOST_STATES:
-        return own
-    rough = _tube(model, np.ravel(theta), np.linspace(0.0, problem.horizon, ROUGH), own)
-    reach = rough.upper.max(axis=1) - rough.lower.min(axis=1)
+    problem, own_states = model.problem, model.problem.names.corners.own(model.problem.system.states)
+    if len(own_states) <= MOST_STATES:
+        return own_states
+    rough_tube = _tube(model, np.ravel(theta), np.linspace(0.0, problem.horizon, ROUGH), own_states)
+    reach = rough_tube.upper.max(axis=1) - rough_tube.lower.min(axis=1)
     return sorted({*telling(reach, [*_walls(model)])[:MOST_STATES], *(problem.names.in_plane or ())})
 
 
 def _tube(model: Transcription, decision: Array, times: Array, states: Sequence[int]) -> Tube:
     """The tube of the ``states`` that are named, in rows of all of them; NaN stands in the others."""
-    found, rows = tube(model, decision, times, states), np.full((3, model.problem.system.states, times.size), np.nan)
-    rows[:, states] = found.nominal, found.lower, found.upper
+    named_tube, rows = (
+        tube(model, decision, times, states),
+        np.full((3, model.problem.system.states, times.size), np.nan),
+    )
+    rows[:, states] = named_tube.nominal, named_tube.lower, named_tube.upper
     return Tube(times, *rows)
 
 
 def _answered(model: Transcription, decision: Array, times: Array, draws: int, states: Sequence[int]) -> dict[str, Any]:
-    """What feedback adds to the figures: the tube that the nominal control alone has, how far the disturbance moves the
-    control, and the gains; with ``draws`` the effort under so many of them, and what moves the control in the worst
-    case."""
-    loop, alone = model.answering.loop, _tube(replace(model, feedback=None), model.nominal(decision), times, states)
+    """Return the additional data of figures under feedback.
+
+    These are the tube of the nominal control alone, the extremes of the control under the disturbance, the gains and
+    the outputs. With ``draws`` there are also the effort under so many random disturbances and the terms of the control
+    in the worst case.
+    """
+    loop, nominal_tube = (
+        model.answering.loop,
+        _tube(replace(model, feedback=None), model.nominal(decision), times, states),
+    )
     nominal, effects = loop.nominal(decision), loop.effects(decision)
-    held = model.problem.disturbance_class == "piecewise_constant"  # of all measurable functions none is drawn evenly
+    # of all measurable functions none is drawn evenly
+    is_piecewise = model.problem.disturbance_class == "piecewise_constant"
     return {
-        "alone_lower": alone.lower,
-        "alone_upper": alone.upper,
+        "alone_lower": nominal_tube.lower,
+        "alone_upper": nominal_tube.upper,
         "control_least": nominal - loop.spread.support(-effects).T,
         "control_most": nominal + loop.spread.support(effects).T,
         "gains": loop.gains(decision),
         "outputs": _outputs(model, decision, times),
-        **(_drawn(loop, nominal, effects, draws) if draws and held else {}),
+        **(_drawn(loop, nominal, effects, draws) if draws and is_piecewise else {}),
         **(_moved(model, decision) if draws else {}),
     }
 
@@ -204,26 +242,26 @@ def _times(points: Array) -> Array:
     """Breakpoints and times between them that show how a state moves; of very many breakpoints some."""
     if points.size > TIMES + 1:
         return np.asarray(points[np.unique(np.linspace(0, points.size - 1, TIMES + 1).round().astype(int))])
-    each = max(1, SMOOTH // (points.size - 1))
-    between = points[:-1, None] + np.diff(points)[:, None] * (np.arange(each) / each)
-    return np.append(between.ravel(), points[-1])
+    per_piece = max(1, SMOOTH // (points.size - 1))
+    times = points[:-1, None] + np.diff(points)[:, None] * (np.arange(per_piece) / per_piece)
+    return np.append(times.ravel(), points[-1])
 
 
 def _drawn(loop: ClosedLoop, nominal: Array, effects: Array, draws: int) -> dict[str, Any]:
     """Quantiles of ``|u|`` over uniform draws from the sets of the deviations; always the same ones."""
     rng = np.random.default_rng(0)
-    parts = [
+    deviations = [
         convex.sample(draws * count, rng).reshape(draws, -1) - np.tile(middle, count)
         for _, count, convex, middle in loop.spread.parts
     ]
-    z = np.concatenate([np.zeros((draws, 0)), *parts], axis=1)
-    found = [np.quantile(np.abs(v + z @ F.T), QUANTILES, axis=0) for v, F in zip(nominal.T, effects, strict=True)]
-    return {"effort": np.stack(found, axis=2), "draws": draws}
+    z = np.concatenate([np.zeros((draws, 0)), *deviations], axis=1)
+    quantiles = [np.quantile(np.abs(v + z @ F.T), QUANTILES, axis=0) for v, F in zip(nominal.T, effects, strict=True)]
+    return {"effort": np.stack(quantiles, axis=2), "draws": draws}
 
 
 def _moved(model: Transcription, decision: Array) -> dict[str, Any]:
-    """What every innovation adds to the control on every piece, in the worst case of the constraint that comes nearest
-    to being violated."""
+    """Return the term of every innovation in the control on every piece, in the worst case of the constraint that comes
+    nearest to a violation."""
     worst = max(find_adversaries(model, decision), key=lambda one: one.violation, default=None)
     if worst is None or worst.deviation is None:
         return {}
@@ -235,7 +273,8 @@ def _moved(model: Transcription, decision: Array) -> dict[str, Any]:
 
 
 def _plane(model: Transcription, decision: Array, times: Array) -> Plane | None:
-    """Where the system moves, if the problem says in which plane."""
+    """Return the places of the system in its plane and the limits on them; ``None`` where the problem names no
+    plane."""
     pair, problem = model.problem.names.in_plane, model.problem
     if pair is None:
         return None
@@ -244,24 +283,27 @@ def _plane(model: Transcription, decision: Array, times: Array) -> Plane | None:
     directions = np.zeros((CORNERS, problem.system.states))
     directions[:, pair] = normals
     heights = supports(model, decision, times, directions)
-    after, next_heights = np.roll(normals, -1, axis=0), np.roll(heights, -1, axis=0)
-    left, next_left = (np.stack([-one[:, 1], one[:, 0]], axis=1)[:, None] for one in (normals, after))
+    next_normals, next_heights = np.roll(normals, -1, axis=0), np.roll(heights, -1, axis=0)
+    tangents, next_tangents = (
+        np.stack([-vectors[:, 1], vectors[:, 0]], axis=1)[:, None] for vectors in (normals, next_normals)
+    )
     # where the lines c'y = h of two neighbouring directions meet
-    places = (next_heights[..., None] * left - heights[..., None] * next_left) / np.sin(2.0 * np.pi / CORNERS)
+    places = (next_heights[..., None] * tangents - heights[..., None] * next_tangents) / np.sin(2.0 * np.pi / CORNERS)
     return Plane(states=pair, places=places.transpose(1, 0, 2), limits=tuple(_limits(model.stated, pair, normals)))
 
 
 def _limits(problem: OptimalControlProblem, pair: tuple[int, int], around: Array) -> Iterator[Limit]:
-    """What path and terminal constraints say of the place alone; of a curved set the sides ``around (q, 2)`` it."""
+    """Yield the limits that path and terminal constraints set to the place alone; of a curved set, its sides
+    ``around (q, 2)`` it."""
     end, names = problem.horizon, problem.called("path")
     for name, entry in zip(names, problem.path, strict=True):
         if not isinstance(entry, PathConstraint):
             continue
         normals, bounds = _lines(entry.set, pair, around)
-        stop, moved = end if entry.stop is None else float(entry.stop), Reference.of(entry.relative_to)
-        times = np.unique(np.concatenate([np.linspace(entry.start, stop, STEPS), moved.kinks(entry.start, stop)]))
-        off = moved.along(times, np.eye(entry.set.dimension)[list(pair)])
-        limit = Limit(name=printable(name), normals=normals, times=times, bounds=bounds + off @ normals.T)
+        stop, reference = end if entry.stop is None else float(entry.stop), Reference.of(entry.relative_to)
+        times = np.unique(np.concatenate([np.linspace(entry.start, stop, STEPS), reference.kinks(entry.start, stop)]))
+        offsets = reference.along(times, np.eye(entry.set.dimension)[list(pair)])
+        limit = Limit(name=printable(name), normals=normals, times=times, bounds=bounds + offsets @ normals.T)
         if len(normals):
             yield replace(limit, is_wall=not limit.moves and entry.start <= 0.0 and stop >= end)
     for terminal in problem.ends:
@@ -279,21 +321,25 @@ def _lines(bounds: ConvexSet, pair: tuple[int, int], around: Array) -> tuple[Arr
         reach = bounds.support(directions)
         return around[np.isfinite(reach)], reach[np.isfinite(reach)]
     H, h = sides
-    alone = (np.delete(H, pair, axis=1) == 0.0).all(axis=1) & (H[:, pair] != 0.0).any(axis=1)
-    return H[alone][:, pair], h[alone]
+    is_planar = (np.delete(H, pair, axis=1) == 0.0).all(axis=1) & (H[:, pair] != 0.0).any(axis=1)
+    return H[is_planar][:, pair], h[is_planar]
 
 
 def _walls(model: Transcription) -> Iterator[Wall]:
-    """Those of the stated constraints, and of the integrals that are states of the problem that is solved."""
+    """Yield the bounds on single states: of the constraints as stated, and of integrals that are states of the solved
+    problem."""
     problem, end = model.stated, model.problem.horizon
-    for entry in [*problem.of_states, *(one for one in model.problem.of_states if isinstance(one, Accumulated))]:
+    for entry in [
+        *problem.of_states,
+        *(constraint for constraint in model.problem.of_states if isinstance(constraint, Accumulated)),
+    ]:
         stop = end if entry.stop is None else entry.stop
-        moved = Reference.of(entry.relative_to)
-        if not moved.moves:
+        reference = Reference.of(entry.relative_to)
+        if not reference.moves:
             yield from (replace(wall, final=stop >= end) for wall in _sides(entry.set, entry.start, stop))
             continue
-        times = np.concatenate([[entry.start], moved.kinks(entry.start, stop), [stop]])
-        points = moved.at(times)
+        times = np.concatenate([[entry.start], reference.kinks(entry.start, stop), [stop]])
+        points = reference.at(times)
         for wall in _sides(entry.set, entry.start, stop):
             for k in range(times.size - 1):
                 begin, last = points[k : k + 2, wall.state].tolist()

@@ -1,4 +1,4 @@
-"""What the figures of a run show, as one plain record."""
+"""Data of the figures of a run, as one plain record."""
 
 from __future__ import annotations
 
@@ -22,9 +22,11 @@ IDLE = 1e-7  # of the largest control: less than that is no action but rounding
 
 @dataclass(frozen=True, kw_only=True)
 class Wall:
-    """One state component must stay in ``[lower, upper]`` for ``start <= t <= end``; ``start == end`` is a terminal
-    constraint, or one at a time before where it is not ``final``. Where the set moves, the bounds go in straight lines
-    to ``lower_end`` and ``upper_end``."""
+    """Bounds on one component of the state: it must stay in ``[lower, upper]`` for ``start <= t <= end``.
+
+    ``start == end`` is a terminal constraint, or a constraint at an earlier time where it is not ``final``. Where the
+    set moves, the bounds go in straight lines to ``lower_end`` and ``upper_end``.
+    """
 
     state: int
     lower: float = -np.inf
@@ -50,15 +52,19 @@ class Wall:
 
     @property
     def moves(self) -> bool:
-        """Whether a bound is another at the end."""
+        """True where a bound at the end differs from the bound at the start."""
         return any(first != last for first, last in self.sides)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Outputs:
-    """What is measured: ``y = C x`` with ``C (p, d)`` at ``nominal (p, T)``, and the worst case ``lower``, ``upper
-    (p, T)``, at the times of the figure; at the breakpoints ``instants (k,)`` that some piece of the control knows, the
-    readings ``read_lower``, ``read_upper (p, k)``, noise included, which are known ``latency`` later."""
+    """Measured outputs ``y = C x`` with ``C (p, d)``: ``nominal (p, T)`` and the worst cases ``lower``,
+    ``upper (p, T)``.
+
+    These are at the times of the figure. ``instants (k,)`` are the breakpoints whose readings some piece of the control
+    knows. The readings lie between ``read_lower`` and ``read_upper (p, k)``, noise included, and are known ``latency``
+    later.
+    """
 
     C: Array
     nominal: Array
@@ -138,11 +144,11 @@ class FigureData:
     def drawn_states(self) -> tuple[int, ...]:
         """The states that figures show, in their order: all that are known, or `MOST_STATES` of them, `telling`."""
         reach = self.tube_upper.max(axis=1) - self.tube_lower.min(axis=1)
-        return tuple(sorted(one for one in telling(reach, self.walls)[:MOST_STATES] if not np.isnan(reach[one])))
+        return tuple(sorted(state for state in telling(reach, self.walls)[:MOST_STATES] if not np.isnan(reach[state])))
 
     @property
     def path(self) -> Array:
-        """Where the system is at the ``times``, ``(T, 2)``, of one that moves in a plane."""
+        """Places of a system that moves in a plane at the ``times``, ``(T, 2)``."""
         assert self.plane is not None
         return np.asarray(self.state[list(self.plane.states)].T)
 
@@ -153,19 +159,19 @@ class FigureData:
         acts = (size > IDLE * np.maximum(size.max(axis=1, initial=0.0), np.finfo(float).tiny)[:, None]).any(axis=0)
         if acts.all():
             return []
-        turns, found = np.diff(np.concatenate([[False], acts, [False]]).astype(int)), []
-        begun, ended = (self.breakpoints[np.flatnonzero(turns == sign)] for sign in (1, -1))
-        for begin, end in zip(begun, ended, strict=True):
+        changes, arcs = np.diff(np.concatenate([[False], acts, [False]]).astype(int)), []
+        starts, ends = (self.breakpoints[np.flatnonzero(changes == sign)] for sign in (1, -1))
+        for begin, end in zip(starts, ends, strict=True):
             inside = self.times[(self.times > begin) & (self.times < end)]
             times = np.unique(np.concatenate([[begin, end], inside]))
-            found.append(np.stack([np.interp(times, self.times, coordinate) for coordinate in path.T], axis=1))
-        return found
+            arcs.append(np.stack([np.interp(times, self.times, coordinate) for coordinate in path.T], axis=1))
+        return arcs
 
     @property
     def of_states(self) -> str:
-        """What a title adds where not every state is shown."""
-        drawn, known = len(self.drawn_states), len(self.names.corners.own(self.state.shape[0]))
-        return "" if drawn == known else f", {drawn} of {known} states"
+        """Addition to a title where not every state is shown; empty otherwise."""
+        drawn, total = len(self.drawn_states), len(self.names.corners.own(self.state.shape[0]))
+        return "" if drawn == total else f", {drawn} of {total} states"
 
     def control_label(self, channel: int) -> str:
         """The axis label of one control channel."""
@@ -187,8 +193,8 @@ class FigureData:
         if measured_as is None:
             return f"gain on $y_{{{component + 1}}}$"
         u, x = self.names.control_units, self.names.state_units
-        known = u and x and u[channel] and x[measured_as]
-        unit = f" [{plain(u[channel])} per {plain(x[measured_as])}]" if known else ""
+        has_units = u and x and u[channel] and x[measured_as]
+        unit = f" [{plain(u[channel])} per {plain(x[measured_as])}]" if has_units else ""
         return f"gain on {label(self.names.states, (), 'x', measured_as, self.state.shape[0])}{unit}"
 
     def _measured_state(self, output: int) -> int | None:
@@ -206,8 +212,10 @@ class FigureData:
 def telling(reach: Array, walls: Sequence[Wall]) -> list[int]:
     """All states, first those that ``walls`` are about, then those that move the farthest in their units, by ``reach
     (d,)``; last those of which it is not known."""
-    walled = {wall.state for wall in walls}
-    return sorted(range(reach.size), key=lambda one: (np.isnan(reach[one]), one not in walled, -reach[one]))
+    walled_states = {wall.state for wall in walls}
+    return sorted(
+        range(reach.size), key=lambda state: (np.isnan(reach[state]), state not in walled_states, -reach[state])
+    )
 
 
 def label(names: Sequence[str], units: Sequence[str], letter: str, index: int, count: int, at: str = "t") -> str:

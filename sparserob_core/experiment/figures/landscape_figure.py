@@ -55,10 +55,12 @@ class LandscapeData:
 
     @property
     def flat(self) -> bool:
-        """Whether g is the same everywhere on the slice."""
-        known = self.values[np.isfinite(self.values)]
-        spread = float(known.max() - known.min()) if known.size else 0.0
-        return bool(known.size == self.values.size and spread <= FLAT * max(1.0, float(np.abs(known).max())))
+        """True where ``g`` is constant on the slice, up to rounding, and finite."""
+        finite_values = self.values[np.isfinite(self.values)]
+        spread = float(finite_values.max() - finite_values.min()) if finite_values.size else 0.0
+        return bool(
+            finite_values.size == self.values.size and spread <= FLAT * max(1.0, float(np.abs(finite_values).max()))
+        )
 
 
 def write_landscape(directory: Path, data: LandscapeData) -> list[Path]:
@@ -102,16 +104,16 @@ def _map(figure: Figure, ax: Axes, data: LandscapeData) -> None:
     from matplotlib.patheffects import Normal, Stroke
 
     across, up = data.axes
-    known = np.where(np.isfinite(data.values), data.values, np.nan)
-    if np.isfinite(known).any():
-        low, high = float(np.nanmin(known)), float(np.nanmax(known))
+    values = np.where(np.isfinite(data.values), data.values, np.nan)
+    if np.isfinite(values).any():
+        low, high = float(np.nanmin(values)), float(np.nanmax(values))
         if data.flat:
             low, high = low - max(abs(low), 1.0), high + max(abs(high), 1.0)  # one colour, in the middle of the bar
         image = ax.pcolormesh(
-            across, up, known.T, shading="nearest", cmap="viridis", vmin=low, vmax=high, rasterized=True
+            across, up, values.T, shading="nearest", cmap="viridis", vmin=low, vmax=high, rasterized=True
         )
         if not data.flat:
-            ax.contour(across, up, known.T, levels=9, colors="white", linewidths=0.35, alpha=0.6)
+            ax.contour(across, up, values.T, levels=9, colors="white", linewidths=0.35, alpha=0.6)
             bar = figure.colorbar(image, ax=ax, pad=0.02)
             bar.set_label(rf"$g$ at $\varepsilon$ = {data.epsilon:.3g}")
             bar.ax.ticklabel_format(axis="y", useOffset=False)
@@ -120,9 +122,9 @@ def _map(figure: Figure, ax: Axes, data: LandscapeData) -> None:
     if np.isposinf(data.values).any():
         ax.plot([], [], "s", color=look.MIST, markeredgecolor="#C4C4C4", label="no control meets these constraints")
     walked = np.flatnonzero(data.accepted == 1.0)
-    refused, other = data.accepted == 0.0, np.isnan(data.accepted)
-    for mine, colour, label in ((refused, "#D9D9D9", "refused"), (other, "white", "evaluated")):
-        few = _few(np.flatnonzero(mine))
+    refused, evaluated = data.accepted == 0.0, np.isnan(data.accepted)
+    for mask, colour, label in ((refused, "#D9D9D9", "refused"), (evaluated, "white", "evaluated")):
+        few = _few(np.flatnonzero(mask))
         if few.size:
             ax.plot(
                 *data.visited[few].T,
@@ -137,8 +139,8 @@ def _map(figure: Figure, ax: Axes, data: LandscapeData) -> None:
             )
     if walked.size:
         path = data.visited[walked]
-        moved = np.append(True, (np.diff(path, axis=0) != 0.0).any(axis=1))
-        few = _few(np.flatnonzero(moved))
+        has_moved = np.append(True, (np.diff(path, axis=0) != 0.0).any(axis=1))
+        few = _few(np.flatnonzero(has_moved))
         edge = [Stroke(linewidth=2.6, foreground=look.INK), Normal()]  # white in ink: seen on dark and on bright ground
         ax.plot(*path[few].T, color="white", linewidth=1.1, zorder=4, label="accepted walk", path_effects=edge)
     ax.plot(
@@ -180,5 +182,5 @@ def _curve(ax: Axes, data: LandscapeData) -> None:
 
 
 def _few(places: np.ndarray) -> np.ndarray:
-    """At most `MOST` of them, the first and the last among them."""
+    """Return at most `MOST` of the places, evenly chosen, with the first and the last among them."""
     return places[np.unique(np.linspace(0, places.size - 1, MOST).astype(int))] if places.size > MOST else places

@@ -1,4 +1,4 @@
-"""Where a system moves in a plane: its places, what limits them, and how much of it is worth showing."""
+"""Movement of a system in a plane: its places, the limits on them, and the section that is worth showing."""
 
 from __future__ import annotations
 
@@ -19,9 +19,11 @@ NEAR = 0.3  # of the larger side: a wall that is nearer to the path is within th
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Limit:
-    """What a constraint that is called ``name`` says of the place alone: ``normals (r, 2) y <= bounds (k, r)`` at
-    ``times (k,)``, between which the bounds go in straight lines; of the final place (``is_final``) one time.
-    ``is_wall``: it holds all the time, and stands still."""
+    """Constraint on the place alone, called ``name``: ``normals (r, 2) y <= bounds (k, r)`` at ``times (k,)``.
+
+    Between the times the bounds go in straight lines; a limit of the final place (``is_final``) has one time.
+    ``is_wall``: the constraint holds all the time, and stands still.
+    """
 
     name: str
     normals: Array
@@ -32,23 +34,30 @@ class Limit:
 
     @property
     def moves(self) -> bool:
-        """Whether a bound changes."""
+        """True where a bound changes with time."""
         return bool((self.bounds != self.bounds[0]).any())
 
     def allowed(self, frame: Array) -> Array:
-        """What of a convex polygon ``(k, 2)`` is within it, at its last time."""
+        """Return the part of a convex polygon ``(k, 2)`` that satisfies the constraint at its last time."""
         return clipped(frame, self.normals, self.bounds[-1])
 
     def beyond(self, frame: Array) -> list[Array]:
-        """What of a convex polygon ``(k, 2)`` is beyond each of its sides, at its last time."""
+        """Return, for each side of the constraint, the part of a convex polygon ``(k, 2)`` that violates it at the last
+        time.
+
+        Empty parts are left out.
+        """
         sides = zip(-self.normals, -self.bounds[-1], strict=True)
-        return [part for normal, bound in sides if len(part := clipped(frame, normal[None], bound[None]))]
+        return [polygon for normal, bound in sides if len(polygon := clipped(frame, normal[None], bound[None]))]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Plane:
-    """Where a system moves in a plane: the two ``states`` that are its place, drawn to the right and upwards; a polygon
-    ``places (T, q, 2)`` for every time, that contains wherever the worst case may bring it; and the ``limits``."""
+    """Plane in which a system moves, with its places and their ``limits``.
+
+    The two ``states`` are the place of the system, drawn to the right and upwards. ``places (T, q, 2)`` holds a polygon
+    for every time, which contains all places of the worst case.
+    """
 
     states: tuple[int, int]
     places: Array
@@ -56,7 +65,7 @@ class Plane:
 
     @property
     def walls(self) -> list[Limit]:
-        """What holds all the time and stands still."""
+        """Limits that hold all the time and stand still."""
         return [limit for limit in self.limits if limit.is_wall]
 
     def outlined(self, frame: Array) -> Iterator[tuple[Limit, Array]]:

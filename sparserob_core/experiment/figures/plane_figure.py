@@ -69,9 +69,9 @@ def _draw(ax: Axes, data: FigureData, low: Array, high: Array) -> None:
             _gate(ax, data, limit, path, allowed, next(colour, look.INK))
     pair = list(plane.states)
     if (data.tube_upper[pair] > data.tube_lower[pair]).any():
-        said = "worst case" if data.gains is None else "worst case, with feedback"
-        for number, place in enumerate(plane.places):  # they overlap: one opaque colour, that of the tube of a state
-            ax.fill(*place.T, color=PALE, linewidth=0.4, zorder=2, label="" if number else said)
+        label = "worst case" if data.gains is None else "worst case, with feedback"
+        for number, polygon in enumerate(plane.places):  # they overlap: one opaque colour, that of the tube of a state
+            ax.fill(*polygon.T, color=PALE, linewidth=0.4, zorder=2, label="" if number else label)
     ax.plot(*path.T, color=look.BLUE, linewidth=1.5, zorder=3, label="nominal")
     for number, arc in enumerate(data.arcs):
         ax.plot(*arc.T, color=look.ORANGE, linewidth=4.0, zorder=3.5, solid_capstyle="round",
@@ -95,53 +95,54 @@ def _hatched(ax: Axes, frame: Array, walls: list[Limit]) -> None:
     if len(hole) == len(frame) and np.allclose(np.sort(hole, axis=0), np.sort(frame, axis=0)):
         return  # no wall is within the view
     corners = np.vstack([frame, frame[:1], hole, hole[:1]])
-    drawn = [Path.LINETO] * (len(hole) - 1)
-    codes = [Path.MOVETO, *[Path.LINETO] * 3, Path.CLOSEPOLY, Path.MOVETO, *drawn, Path.CLOSEPOLY]
+    hole_codes = [Path.LINETO] * (len(hole) - 1)
+    codes = [Path.MOVETO, *[Path.LINETO] * 3, Path.CLOSEPOLY, Path.MOVETO, *hole_codes, Path.CLOSEPOLY]
     ax.add_patch(PathPatch(Path(corners, codes), **look.EXCLUDED, label="forbidden"))
-    for one, other in zip(allowed, np.roll(allowed, -1, axis=0), strict=True):
-        if not ((one == other) & ((one == frame[0]) | (one == frame[2]))).any():  # the edge of the picture is no wall
-            ax.plot(*np.stack([one, other]).T, color=look.GREY, linewidth=1.0, zorder=1)
+    for corner, next_corner in zip(allowed, np.roll(allowed, -1, axis=0), strict=True):
+        # the edge of the picture is no wall
+        if not ((corner == next_corner) & ((corner == frame[0]) | (corner == frame[2]))).any():
+            ax.plot(*np.stack([corner, next_corner]).T, color=look.GREY, linewidth=1.0, zorder=1)
 
 
 def _gate(ax: Axes, data: FigureData, limit: Limit, path: Array, allowed: Array, colour: str) -> None:
     """A set that holds for a part of the time, or moves: the outline of what is ``allowed (k, 2)``, or where its sides
     are when the path is beside them, and that part of the path."""
-    during = (data.times >= limit.times[0]) & (data.times <= limit.times[-1])
+    is_active = (data.times >= limit.times[0]) & (data.times <= limit.times[-1])
     unit = f" {plain(data.names.time)}" if data.names.time else ""
-    said = f"{plain(limit.name)}, $t$ from {limit.times[0]:.6g} to {limit.times[-1]:.6g}{unit}"
-    ax.plot(*path[during].T, color=colour, linewidth=4.0, alpha=0.6, zorder=2.5, solid_capstyle="butt", label=said)
+    label = f"{plain(limit.name)}, $t$ from {limit.times[0]:.6g} to {limit.times[-1]:.6g}{unit}"
+    ax.plot(*path[is_active].T, color=colour, linewidth=4.0, alpha=0.6, zorder=2.5, solid_capstyle="butt", label=label)
     if not limit.moves:
         if len(allowed):
             ax.fill(*allowed.T, fill=False, edgecolor=colour, linewidth=1.1, linestyle=(0, (4, 2)), zorder=1.5)
         return
     for normal, bounds in zip(limit.normals, limit.bounds.T, strict=True):
-        here = np.stack([np.interp(limit.times, data.times, coordinate) for coordinate in path.T], axis=1)
-        beside = here + ((bounds - here @ normal) / (normal @ normal))[:, None] * normal
-        ax.plot(*beside.T, color=colour, linewidth=1.1, zorder=1.5)
+        positions = np.stack([np.interp(limit.times, data.times, coordinate) for coordinate in path.T], axis=1)
+        side_positions = positions + ((bounds - positions @ normal) / (normal @ normal))[:, None] * normal
+        ax.plot(*side_positions.T, color=colour, linewidth=1.1, zorder=1.5)
 
 
 def _marks(ax: Axes, data: FigureData, path: Array, frame: Array) -> None:
     """Times along the path from where it is in the ``frame (4, 2)`` for good, and those of the active constraints."""
     from matplotlib.patheffects import withStroke
 
-    outside = np.flatnonzero(((path < frame[0]) | (path > frame[2])).any(axis=1))
-    since = data.times[min(outside[-1] + 1, path.shape[0] - 1)] if outside.size else data.times[0]
-    at = np.linspace(since, data.times[-1], MARKS + 1)
-    marked = np.stack([np.interp(at, data.times, coordinate) for coordinate in path.T], axis=1)
-    ax.plot(*marked.T, "o", color="white", markeredgecolor=look.BLUE, markersize=4.5, zorder=5)
+    outside_indices = np.flatnonzero(((path < frame[0]) | (path > frame[2])).any(axis=1))
+    start_time = data.times[min(outside_indices[-1] + 1, path.shape[0] - 1)] if outside_indices.size else data.times[0]
+    times = np.linspace(start_time, data.times[-1], MARKS + 1)
+    marked_points = np.stack([np.interp(times, data.times, coordinate) for coordinate in path.T], axis=1)
+    ax.plot(*marked_points.T, "o", color="white", markeredgecolor=look.BLUE, markersize=4.5, zorder=5)
     unit = f" {plain(data.names.time)}" if data.names.time else ""
-    near = BESIDE * (ax.get_xlim()[1] - ax.get_xlim()[0])
-    crowded = np.abs(marked[:, None] - marked).max(axis=2) < near
-    said: list[int] = []
+    spacing = BESIDE * (ax.get_xlim()[1] - ax.get_xlim()[0])
+    is_crowded = np.abs(marked_points[:, None] - marked_points).max(axis=2) < spacing
+    labelled_marks: list[int] = []
     for number in range(MARKS, -1, -1):  # of marks that crowd, the last ones have their times
-        if crowded[number, said].sum() < 2:
-            said.append(number)
-    for number in said:
-        higher = crowded[number, said] & (marked[said, 1] > marked[number, 1])
+        if is_crowded[number, labelled_marks].sum() < 2:
+            labelled_marks.append(number)
+    for number in labelled_marks:
+        is_higher = is_crowded[number, labelled_marks] & (marked_points[labelled_marks, 1] > marked_points[number, 1])
         ax.annotate(
-            f"{at[number]:.6g}{unit}",
-            marked[number],
-            xytext=(5, -13) if higher.any() else (5, 5),
+            f"{times[number]:.6g}{unit}",
+            marked_points[number],
+            xytext=(5, -13) if is_higher.any() else (5, 5),
             textcoords="offset points",
             fontsize=8.5,
             color=look.GREY,
@@ -149,5 +150,7 @@ def _marks(ax: Axes, data: FigureData, path: Array, frame: Array) -> None:
             zorder=6,
         )
     if len(data.active.times):
-        where = np.stack([np.interp(data.active.times, data.times, coordinate) for coordinate in path.T], axis=1)
-        ax.plot(*where.T, "^", color=look.PURPLE, markersize=6, markeredgewidth=0, zorder=5, label="active constraint")
+        positions = np.stack([np.interp(data.active.times, data.times, coordinate) for coordinate in path.T], axis=1)
+        ax.plot(
+            *positions.T, "^", color=look.PURPLE, markersize=6, markeredgewidth=0, zorder=5, label="active constraint"
+        )

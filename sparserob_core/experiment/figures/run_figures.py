@@ -43,7 +43,7 @@ def write_figures(directory: Path, data: FigureData) -> list[Path]:
 
 def run_pictures(data: FigureData) -> dict[str, Callable[[], Figure]]:
     """The figures that there are of a decision, by name."""
-    known: dict[str, tuple[bool, Callable[[FigureData], Figure]]] = {
+    candidates: dict[str, tuple[bool, Callable[[FigureData], Figure]]] = {
         "control": (True, draw_control),
         "switching": (data.push is not None and bool(data.push.any()), draw_switching),
         "states": (True, draw_states),
@@ -54,7 +54,7 @@ def run_pictures(data: FigureData) -> dict[str, Callable[[], Figure]]:
         "answers": (data.answers is not None, draw_answers),
         "convergence": (bool(data.history), draw_convergence),
     }
-    return {name: partial(draw, data) for name, (there, draw) in known.items() if there}
+    return {name: partial(draw, data) for name, (has_data, draw) in candidates.items() if has_data}
 
 
 def draw_control(data: FigureData) -> Figure:
@@ -89,7 +89,7 @@ def draw_control(data: FigureData) -> Figure:
 
 
 def draw_switching(data: FigureData) -> Figure:
-    """How hard the constraints push every channel, in units of what it costs to act there: the control acts where that
+    """Draw the switching function of every channel, in units of the cost of acting there: the control acts where it
     leaves the band, and nowhere else."""
     assert data.push is not None
     figure, axes = panels(len(data.push), 1.9, extra=0.5)
@@ -206,34 +206,34 @@ def draw_gains(data: FigureData) -> Figure:
     shown = sorted(np.argsort(-sizes.ravel(), kind="stable")[:MOST_GAINS].tolist())
     across = 1 if len(shown) < 3 else d if d <= 4 and len(shown) == m * d else 4
     figure, axes = _grid(len(shown), across)
-    seen = np.tril(np.ones((K, K))) > 0
-    for place, (number, ax) in enumerate(zip(shown, axes, strict=True)):
+    is_causal = np.tril(np.ones((K, K))) > 0
+    for index, (number, ax) in enumerate(zip(shown, axes, strict=True)):
         channel, state = divmod(number, d)
-        table = np.where(seen, data.gains[:, :, channel, state], np.nan)
-        most = float(sizes[channel, state]) or 1.0
+        table = np.where(is_causal, data.gains[:, :, channel, state], np.nan)
+        largest = float(sizes[channel, state]) or 1.0
         mesh = ax.pcolormesh(
-            data.breakpoints, data.breakpoints, table, cmap="PuOr", vmin=-most, vmax=most, rasterized=True
+            data.breakpoints, data.breakpoints, table, cmap="PuOr", vmin=-largest, vmax=largest, rasterized=True
         )
-        if place % across == 0 or len(shown) < m * d:
+        if index % across == 0 or len(shown) < m * d:
             ax.set_ylabel(f"{data.control_label(channel)} answers at")
         figure.colorbar(mesh, ax=ax, pad=0.01).set_label(data.gain_label(channel, state))
-        ax.set_xlabel(f"innovation seen at {data.time_label()}" if place >= len(shown) - across else "")
-    left = f"  ·  the largest {len(shown)} of {m * d}" if len(shown) < m * d else ""
-    axes[0].set_title(f"{data.title}: gains{left}")
+        ax.set_xlabel(f"innovation seen at {data.time_label()}" if index >= len(shown) - across else "")
+    note = f"  ·  the largest {len(shown)} of {m * d}" if len(shown) < m * d else ""
+    axes[0].set_title(f"{data.title}: gains{note}")
     return figure
 
 
 def draw_answers(data: FigureData) -> Figure:
-    """Which innovation moves the control on each piece, and by how much, in the worst case that is named."""
+    """Draw the term of every innovation in the control on each piece, in the worst case that the title names."""
     assert data.answers is not None
     K, _, m = data.answers.shape
     figure, axes = panels(m, 2.6, extra=0.3)
-    seen = np.tril(np.ones((K, K))) > 0
+    is_causal = np.tril(np.ones((K, K))) > 0
     for channel, ax in enumerate(axes):
-        table = np.where(seen, data.answers[:, :, channel], np.nan)
-        most = float(np.nanmax(np.abs(table))) or 1.0
+        table = np.where(is_causal, data.answers[:, :, channel], np.nan)
+        largest = float(np.nanmax(np.abs(table))) or 1.0
         mesh = ax.pcolormesh(
-            data.breakpoints, data.breakpoints, table, cmap="PuOr", vmin=-most, vmax=most, rasterized=True
+            data.breakpoints, data.breakpoints, table, cmap="PuOr", vmin=-largest, vmax=largest, rasterized=True
         )
         ax.set_ylabel(f"{data.control_label(channel)} answers at")
         figure.colorbar(mesh, ax=ax, pad=0.01).set_label(f"adds to {data.control_label(channel)}")
@@ -243,32 +243,39 @@ def draw_answers(data: FigureData) -> Figure:
 
 
 def draw_effort(data: FigureData) -> Figure:
-    """How large the control is: quantiles over random disturbances, the nominal control, and the most that any
-    disturbance causes; the ground is white where the control is off whatever happens."""
+    """Draw the size of the control: quantiles over random disturbances, the nominal control, and the largest size that
+    any disturbance causes.
+
+    The background is white where the control is off under every disturbance.
+    """
     assert data.effort is not None and data.control_least is not None and data.control_most is not None
     figure, axes = panels(len(data.control), 1.9, extra=0.5)
     ends, lengths = data.breakpoints, np.diff(data.breakpoints)
-    most = np.maximum(np.abs(data.control_least), np.abs(data.control_most))
+    largest = np.maximum(np.abs(data.control_least), np.abs(data.control_most))
     bound = np.maximum(np.abs(data.control_lower), np.abs(data.control_upper))
-    acts = most > IDLE * np.where(np.isfinite(bound), bound, most.max(axis=1))[:, None]
+    acts = largest > IDLE * np.where(np.isfinite(bound), bound, largest.max(axis=1))[:, None]
     for channel, ax in enumerate(axes):
         low, middle, high = data.effort[:, channel]
-        top = max(float(most[channel].max()), 1e-9) * 1.12
+        top = max(float(largest[channel].max()), 1e-9) * 1.12
         ax.stairs(
             np.where(acts[channel], top, 0.0), ends, fill=True, color=look.MIST, linewidth=0, zorder=0, label="may act"
         )
         ax.stairs(high, ends, baseline=low, fill=True, color=look.SKY, alpha=0.6, linewidth=0, zorder=2,
                   label="90 % of the draws")  # fmt: skip
         ax.stairs(middle, ends, baseline=None, color=look.SKY, linewidth=1.2, zorder=3, label="median")
-        ax.stairs(most[channel], ends, baseline=None, color=look.VERMILLION, linewidth=1.2, zorder=4,
+        ax.stairs(largest[channel], ends, baseline=None, color=look.VERMILLION, linewidth=1.2, zorder=4,
                   label="most, under any disturbance")  # fmt: skip
         ax.stairs(np.abs(data.control[channel]), ends, baseline=None, color=look.BLUE, linewidth=1.5, zorder=3,
                   label="nominal")  # fmt: skip
         ax.set_ylim(0.0, top)
         ax.set_ylabel(f"size of {data.control_label(channel)}")
     draw_time_axis(axes[-1], data)
-    off = float((~acts.any(axis=0) * lengths).sum() / lengths.sum())
-    _title(axes[0], data.title, f"off whatever happens for {100 * off:.1f} % of the time  ·  {data.draws} random draws")
+    off_share = float((~acts.any(axis=0) * lengths).sum() / lengths.sum())
+    _title(
+        axes[0],
+        data.title,
+        f"off whatever happens for {100 * off_share:.1f} % of the time  ·  {data.draws} random draws",
+    )
     draw_legend(figure, axes)
     return figure
 
@@ -287,8 +294,10 @@ def _grid(count: int, across: int) -> tuple[Figure, list[Axes]]:
 
 
 def draw_convergence(data: FigureData) -> Figure:
-    """Both bounds against the rounds, and below them the violation and the gap of each lower bound to the best upper
-    bound, on a logarithmic axis."""
+    """Draw both bounds against the rounds, and below them the violation and the gap of each lower bound.
+
+    The gap is to the best upper bound. The lower panel has a logarithmic axis.
+    """
     from matplotlib.ticker import MaxNLocator
 
     figure, (bounds, gaps) = panels(2, 1.9, extra=0.2)
@@ -334,13 +343,13 @@ def _title(ax: Axes, title: str, summary: str) -> None:
 
 
 def _summary(data: FigureData) -> str:
-    said = f" ({data.cost_of})" if data.cost_of else ""
+    terms = f" ({data.cost_of})" if data.cost_of else ""
     unit = f" {plain(data.cost_unit)}" if data.cost_unit else ""
-    known = [] if data.cost is None else [f"{data.cost:.6g}{unit}"]
-    parts = [f"acts for {text}" if data.counts else f"$J$ = {text}{said}" for text in known]
+    costs = [] if data.cost is None else [f"{data.cost:.6g}{unit}"]
+    phrases = [f"acts for {text}" if data.counts else f"$J$ = {text}{terms}" for text in costs]
     if data.active_fraction is not None:
-        parts.append(f"active {100 * data.active_fraction:.1f} % of the time")
-    return "  ·  ".join(parts)
+        phrases.append(f"active {100 * data.active_fraction:.1f} % of the time")
+    return "  ·  ".join(phrases)
 
 
 def _bounds(ax: Axes, lower: float, upper: float, steps: Array) -> None:
@@ -446,6 +455,6 @@ def _decades(values: Array) -> tuple[float, float]:
 def _stages(bounds: Axes, gaps: Axes, epsilons: list[float]) -> None:
     changes = [k + 0.5 for k in range(1, len(epsilons)) if epsilons[k] != epsilons[k - 1]]
     for ax in (bounds, gaps):
-        for k, place in enumerate(changes):
+        for k, change in enumerate(changes):
             label = r"$\varepsilon$ reduced" if k == 0 and ax is gaps else None
-            ax.axvline(place, color=look.GREY, linewidth=0.6, linestyle=":", zorder=0, label=label)
+            ax.axvline(change, color=look.GREY, linewidth=0.6, linestyle=":", zorder=0, label=label)

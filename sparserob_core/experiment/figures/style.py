@@ -1,4 +1,4 @@
-"""How the figures look: one palette that every eye can tell apart, one typeface, one way to a file."""
+"""Style of the figures: one palette that every eye can tell apart, one typeface, one way to a file."""
 
 from __future__ import annotations
 
@@ -90,7 +90,7 @@ def panels(rows: int, height: float, *, extra: float = 0.0) -> tuple[Figure, lis
 
 
 def draw_legend(figure: Figure, axes: list[Axes]) -> None:
-    """One legend below all panels."""
+    """Draw a single legend below all panels."""
     entries = {label: handle for ax in axes for handle, label in zip(*ax.get_legend_handles_labels(), strict=True)}
     letters = len("".join(entries))
     alone = letters <= 64 and letters + BESIDE * len(entries) <= LETTERS
@@ -115,15 +115,15 @@ def write_figure(file: Path, figure: Figure) -> list[Path]:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
 
     FigureCanvasAgg(figure)
-    named = file.suffix.lower() in KINDS
-    files = [file] if named else [file.with_name(f"{file.name}{kind}") for kind in (".pdf", ".png")]
-    for one in files:
-        stream, kind = BytesIO(), one.suffix.lower()
+    has_suffix = file.suffix.lower() in KINDS
+    files = [file] if has_suffix else [file.with_name(f"{file.name}{kind}") for kind in (".pdf", ".png")]
+    for path in files:
+        stream, kind = BytesIO(), path.suffix.lower()
         with _letters_told():
             figure.savefig(stream, format=kind[1:], **KINDS[kind])
         figure.set_layout_engine("none")  # everything has its place now, in the next file too
         try:
-            write_whole(one, stream.getvalue())
+            write_whole(path, stream.getvalue())
         except SparseRobError as error:
             raise InputError(str(error)) from error
     return files
@@ -133,19 +133,19 @@ def write_figure(file: Path, figure: Figure) -> list[Path]:
 def _letters_told() -> Iterator[None]:
     """Letters that no font here has, such as those of a title, are told once, in one line; matplotlib says it for every
     letter and file."""
-    with warnings.catch_warnings(record=True) as heard:
+    with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         yield
     missing = set[str]()
-    for one in heard:
-        glyph = re.match(r"Glyph (\d+) .*missing from", str(one.message))
+    for warning in caught:
+        glyph = re.match(r"Glyph (\d+) .*missing from", str(warning.message))
         if glyph is None:
-            warnings.warn_explicit(one.message, one.category, one.filename, one.lineno)
+            warnings.warn_explicit(warning.message, warning.category, warning.filename, warning.lineno)
         else:
             missing.add(chr(int(glyph[1])))
-    if new := missing - _told:
-        _told.update(new)
-        logger.warning("figures: no font here has %s: boxes stand there", " ".join(sorted(new)))
+    if new_letters := missing - _told:
+        _told.update(new_letters)
+        logger.warning("figures: no font here has %s: boxes stand there", " ".join(sorted(new_letters)))
 
 
 def require_writable(file: Path) -> None:
@@ -158,13 +158,14 @@ def require_writable(file: Path) -> None:
 
 
 def missing_matplotlib() -> str:
-    """What is to be said where matplotlib is missing, with the way to install it; empty where it is there.
+    """Return a note that matplotlib is missing, with the way to install it; an empty text where it is installed.
 
-    A figure is an extra: commands say this beside their result, whose exit status is theirs."""
+    A figure is an extra: a command prints the note with its result, which alone determines the exit status.
+    """
     from importlib.util import find_spec
 
-    there = find_spec("matplotlib") is not None
-    return "" if there else f"no figure: {not_installed('matplotlib')}"
+    is_installed = find_spec("matplotlib") is not None
+    return "" if is_installed else f"no figure: {not_installed('matplotlib')}"
 
 
 def require_matplotlib() -> None:

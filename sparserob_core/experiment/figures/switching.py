@@ -1,4 +1,5 @@
-"""Why a control switches where it does: how strongly the active constraints push it at every moment."""
+"""Switching function of a control, which explains where it switches: multipliers times rows of the active
+constraints."""
 
 from __future__ import annotations
 
@@ -41,8 +42,8 @@ class Switching:
             self.dense = np.asarray(program.finite.S.toarray())
             if self.erring:
                 self.dense = self.dense[: self.pieces, : self.pieces]
-            whole = self.dense.shape == (self.pieces, self.pieces)
-            self.known = bool(whole and np.linalg.matrix_rank(self.dense) == self.pieces)
+            has_all_pieces = self.dense.shape == (self.pieces, self.pieces)
+            self.known = bool(has_all_pieces and np.linalg.matrix_rank(self.dense) == self.pieces)
 
     def push(self, cuts: Sequence[Cut], mu: Array | None) -> Array | None:
         """The switching function ``(m, K)`` under these constraints with their multipliers, or ``None`` where it is not

@@ -73,7 +73,7 @@ class InitialStates:
 
     @property
     def units(self) -> tuple[str, str]:
-        """What the two coordinates are measured in; empty where that is not known."""
+        """Units of the two coordinates; empty where they are not known."""
         named = self.called.state_units
         return (named[self.states[0]], named[self.states[1]]) if named else ("", "")
 
@@ -98,12 +98,13 @@ class InitialStates:
         return 1.0 - self.inner_area / self.outer_area if self.outer_area > 0.0 else np.nan
 
     def where(self, point: npt.ArrayLike) -> Literal["inside", "outside", "open"]:
-        """Whether a point ``(2,)`` is proven to be in the set, proven not to be, or between the polygons."""
+        """Return whether a point ``(2,)`` is proven to be in the set, proven to be outside, or open between the
+        polygons."""
         x = _point(point)
         if not self.outer.shape[0]:
             return "outside" if self.status == "infeasible" else "open"
-        added = np.abs(self.directions) @ np.abs(self.outer).max(axis=0)  # what is added up to a bound
-        if (self.directions @ x > self.bounds + ROUNDING * np.maximum(added, np.abs(self.bounds))).any():
+        term_sizes = np.abs(self.directions) @ np.abs(self.outer).max(axis=0)  # what is added up to a bound
+        if (self.directions @ x > self.bounds + ROUNDING * np.maximum(term_sizes, np.abs(self.bounds))).any():
             return "outside"
         return "inside" if self.inner.shape[0] > 2 and bool(inside(self.inner, x[None])[0]) else "open"
 
@@ -176,7 +177,7 @@ class InitialStates:
         return {name: getattr(self, name) for name in (*names, *(["gains"] if self.gains.size else []))}
 
     def rows(self) -> list[tuple[str, str]]:
-        """What a user wants to know, as rows of a table."""
+        """Return the main results for a user, as rows of a table."""
         rows = [("status", f"{self.status}: {self.message}")]
         if self.outer.shape[0]:
             rows += [
@@ -224,6 +225,6 @@ def _combination(points: Array, x: Array, costs: Array) -> Array | None:
     size = np.where(size > 0.0, size, 1.0)
     price = float(np.abs(costs).max(initial=0.0)) or 1.0
     rows = np.vstack([(points / size).T, np.ones(points.shape[0])])
-    found = linprog(costs / price, A_eq=rows, b_eq=np.append(x / size, 1.0))
-    missed = np.inf if found.status else np.abs((found.x @ points - x) / size).max()
-    return np.asarray(found.x) if missed <= ON_EDGE else None
+    solution = linprog(costs / price, A_eq=rows, b_eq=np.append(x / size, 1.0))
+    residual = np.inf if solution.status else np.abs((solution.x @ points - x) / size).max()
+    return np.asarray(solution.x) if residual <= ON_EDGE else None

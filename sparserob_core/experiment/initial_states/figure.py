@@ -136,11 +136,11 @@ def envelope(points: Array, costs: Array) -> np.ndarray:
 
 
 def _boundaries(ax: Axes, found: InitialStates) -> None:
-    (left, right), (bottom, top) = ax.get_xlim(), ax.get_ylim()
-    seen = [
-        polygon for polygon in found.path if ((polygon > [left, bottom]) & (polygon < [right, top])).all(axis=1).any()
+    (x_min, x_max), (y_min, y_max) = ax.get_xlim(), ax.get_ylim()
+    visible_polygons = [
+        polygon for polygon in found.path if ((polygon > [x_min, y_min]) & (polygon < [x_max, y_max])).all(axis=1).any()
     ]
-    for number, polygon in enumerate(seen):
+    for number, polygon in enumerate(visible_polygons):
         ax.plot(
             *_closed(polygon),
             color=look.GREY,

@@ -73,8 +73,8 @@ def initial_states(
             got="true",
         )
     if about is not None:
-        begun = np.asarray(model.problem.initial_state, dtype=float)[model.stated.system.states :]
-        model = from_state(model, np.append(_about(about, model.stated), begun))
+        added_states = np.asarray(model.problem.initial_state, dtype=float)[model.stated.system.states :]
+        model = from_state(model, np.append(_about(about, model.stated), added_states))
     pair = check_states(states, model.stated.system.states)
     with transcribed_by(tools.deadline):
         own, units = in_own_units(model)  # what is looked at and what is told are in other units (docs/decisions/0016)
@@ -85,8 +85,8 @@ def initial_states(
     search = InitialStatesSearch(plane, tools, _tolerance(loaded), notify, least, x, limit is not None)
 
     def find() -> InitialStates:
-        found = search.states(experiment.title, directions, values)
-        return _in_users_units(replace(found, path=_path(own.problem, found)), units, limit)
+        feasible_set = search.states(experiment.title, directions, values)
+        return _in_users_units(replace(feasible_set, path=_path(own.problem, feasible_set)), units, limit)
 
     if out is None:
         return find()
@@ -97,7 +97,7 @@ def initial_states(
 
 
 def _in_users_units(own: InitialStates, units: Units, limit: float | None) -> InitialStates:
-    """What was found in the problem's own units, in the user's; ``limit``: the bound that was asked for."""
+    """Convert results from the problem's own units to the user's units; ``limit`` is the bound that the user gave."""
     x = units.states[list(own.states)]
     normals, outer = own.directions / x, own.outer * x
     norms = np.linalg.norm(normals, axis=1)
@@ -134,15 +134,15 @@ def _limit(within: object) -> float | None:
 
 def _far(problem: OptimalControlProblem) -> float:
     """A size beyond which a coordinate counts as unbounded."""
-    flat = [entry.set.halfspaces() for entry in problem.of_states]
-    flat += [end.halfspaces() for end in problem.terminal_sets]
+    halfspaces = [entry.set.halfspaces() for entry in problem.of_states]
+    halfspaces += [end.halfspaces() for end in problem.terminal_sets]
     sizes = [
         float((np.abs(h) / np.linalg.norm(H, axis=1)).max())
-        for H, h in (sides for sides in flat if sides is not None)
+        for H, h in (sides for sides in halfspaces if sides is not None)
         if h.size
     ]
-    moved = [entry.relative_to for entry in problem.of_states]
-    sizes += [float(np.abs(np.asarray(rows)[:, 1:]).max()) for rows in moved if rows is not None]
+    references = [entry.relative_to for entry in problem.of_states]
+    sizes += [float(np.abs(np.asarray(rows)[:, 1:]).max()) for rows in references if rows is not None]
     sizes += [float(np.abs(end.values[end.fixed]).max()) for end in problem.terminal_equalities]
     return FAR * max([1.0, float(np.abs(np.asarray(problem.initial_state)).max()), *sizes])
 
@@ -167,12 +167,12 @@ def _path(problem: OptimalControlProblem, found: InitialStates) -> tuple[Array, 
     if not found.outer.shape[0]:
         return ()
     middle = (found.inner if found.inner.shape[0] else found.outer).mean(axis=0)
-    held = [entry for entry in problem.of_states if entry.start == 0.0]
+    constraints = [entry for entry in problem.of_states if entry.start == 0.0]
     view, states, polygons = 10.0 * float(np.abs(found.outer - middle).max()), list(found.states), []
-    for entry in held:
-        off = Reference.of(entry.relative_to).along(np.zeros(1), np.eye(found.origin.size))[0]
-        polygon = section(entry.set, found.origin - off, found.states, middle - off[states], view)
-        polygons.append(polygon + off[states])
+    for entry in constraints:
+        offset = Reference.of(entry.relative_to).along(np.zeros(1), np.eye(found.origin.size))[0]
+        polygon = section(entry.set, found.origin - offset, found.states, middle - offset[states], view)
+        polygons.append(polygon + offset[states])
     return tuple(polygons)
 
 

@@ -42,10 +42,11 @@ PROVEN = ("certified", "verified")
 @final
 @dataclass(eq=False)
 class InitialStatesSearch:
-    """One search: the plane, the cuts that each direction needed, and the controls of the points found.
+    """State of one search: the plane, the cuts that each direction needed, and the controls of the points found.
 
-    ``least (2,)``: radii of the plane below which a coordinate has no interior; ``units (2,)``: what one of each
-    coordinate is in the user's units, for messages only."""
+    ``least (2,)``: radii of the plane below which a coordinate has no interior. ``units (2,)``: one unit of each
+    coordinate in the user's units, for messages only.
+    """
 
     plane: InitialPlane
     tools: Tools
@@ -69,7 +70,7 @@ class InitialStatesSearch:
         self.directions = directions
         problem = self.plane.model.problem
         origin = np.asarray(problem.initial_state, dtype=float)
-        bare = InitialStates(
+        template = InitialStates(
             title=title,
             states=self.plane.states,
             status="undecided",
@@ -85,13 +86,13 @@ class InitialStatesSearch:
         except KeyboardInterrupt as pressed:
             self._interrupt(pressed)
             if self.frame is None:
-                return self._finished(bare, message="nothing is known of the set yet")
+                return self._finished(template, message="nothing is known of the set yet")
             self.plane, framed = self.frame
         if isinstance(framed, Result):
             # amounts would be relative to rows that hold the initial state in units of the box: of no use
-            why = framed.message if framed.infeasible is None else framed.infeasible.sentence(amounts=False)
-            message = f"no initial state of this plane, up to {limit} in size, is feasible{self._under}: {why}"
-            return self._finished(bare, status="infeasible", message=message)
+            reason = framed.message if framed.infeasible is None else framed.infeasible.sentence(amounts=False)
+            message = f"no initial state of this plane, up to {limit} in size, is feasible{self._under}: {reason}"
+            return self._finished(template, status="infeasible", message=message)
         try:
             self._tell("direction", len(framed), directions)
             with self.tools.deadline.enforced():
@@ -101,22 +102,25 @@ class InitialStatesSearch:
             supports = sorted([*framed, *self.asked], key=lambda one: float(np.arctan2(*one.direction[::-1])))
         inner = inner_polygon(supports)
         points, results = self._measured(inner, values)
-        found = replace(
-            self._polygons(bare, supports, inner),
+        feasible_set = replace(
+            self._polygons(template, supports, inner),
             points=self.plane.point(points),
             costs=np.array([r.upper_bound for r in results]),
             lower_bounds=np.array([r.lower_bound for r in results]),
         )
         if not inner.shape[0]:
             return self._finished(
-                found, message="no initial state is proven feasible, and none in the outer polygon is proven infeasible"
+                feasible_set,
+                message="no initial state is proven feasible, and none in the outer polygon is proven infeasible",
             )
         size = polygon_area(outer_polygon(supports))
         if size <= max(SLIVER, self.plane.strip):
-            return self._finished(found, status="certified", message="proven from both sides; the set has no interior")
+            return self._finished(
+                feasible_set, status="certified", message="proven from both sides; the set has no interior"
+            )
         share = 1.0 - polygon_area(inner) / size
         return self._finished(
-            found,
+            feasible_set,
             status="certified" if share <= CLOSED else "verified",
             message=f"between two polygons, both proven{self._under}, that differ by {share:.2%} of the area",
         )
@@ -150,7 +154,7 @@ class InitialStatesSearch:
 
     @property
     def _under(self) -> str:
-        """What is known of the control, for messages: what is proven infeasible is so for such policies."""
+        """Restriction of a proof of infeasibility to affine policies, for messages; empty without feedback."""
         return "" if self.plane.model.feedback is None else " for affine policies"
 
     def _size(self, radius: Array) -> str:
@@ -208,15 +212,21 @@ class InitialStatesSearch:
         return support
 
     def _supported(self, direction: Array) -> Result:
-        near = sorted(self.cuts, key=lambda other: -float(np.dot(other, direction)))[:2]
-        known = {(cut.family, cut.row, cut.index.tobytes()): cut for other in near for cut in self.cuts[other]}
-        program = self.plane.support(direction, list(known.values()))
+        nearest_directions = sorted(
+            self.cuts, key=lambda solved_direction: -float(np.dot(solved_direction, direction))
+        )[:2]
+        start_cuts = {
+            (cut.family, cut.row, cut.index.tobytes()): cut
+            for solved_direction in nearest_directions
+            for cut in self.cuts[solved_direction]
+        }
+        program = self.plane.support(direction, list(start_cuts.values()))
         # The cost is linear and the point is all that is wanted: a regulariser of the control would only be in the way.
         result = Exchange(tolerance=self.tolerance).solve(program, replace(self.tools, regulariser=None))
         result = self.plane.weakened(result)
         self.programs += result.counts.get("relaxed_programs", 0)
         self.tools.deadline.check()
-        self.cuts[tuple(direction.tolist())] = result.indices or tuple(known.values())
+        self.cuts[tuple(direction.tolist())] = result.indices or tuple(start_cuts.values())
         return result
 
     def _support(self, direction: Array, result: Result) -> Support:
@@ -273,8 +283,8 @@ def _lattice(inner: Array, values: int) -> Array:
     lattice, step = np.array(list(product(*sides))), np.ptp(inner, axis=0) / (values + 1)
     around = [
         corner
-        + np.linspace(0.0, 1.0, int(np.ceil(np.abs((after - corner) / step).max())), endpoint=False)[:, None]
-        * (after - corner)
-        for corner, after in zip(corners, np.roll(corners, -1, axis=0), strict=True)
+        + np.linspace(0.0, 1.0, int(np.ceil(np.abs((next_corner - corner) / step).max())), endpoint=False)[:, None]
+        * (next_corner - corner)
+        for corner, next_corner in zip(corners, np.roll(corners, -1, axis=0), strict=True)
     ]
     return np.vstack([lattice[inside(corners, lattice)], *around])

@@ -31,7 +31,8 @@ def section(value: ConvexSet, origin: Array, states: tuple[int, int], middle: Ar
 
 
 def _corners(value: ConvexSet, origin: Array, states: tuple[int, int], middle: Array) -> Array:
-    """Where two sides of a set with flat sides meet in the plane."""
+    """Return the points ``(k, 2)`` where two sides of a set with flat sides meet in the plane; none for a curved
+    set."""
     flat = value.halfspaces()
     if flat is None:
         return np.zeros((0, 2))

@@ -103,22 +103,22 @@ def loop(
     whole("periods", periods, 1)
     if out is not None:
         require_writable(Path(out))
-    began = clock.perf_counter()
+    start = clock.perf_counter()
     directory, experiment = as_run(run)
     finished = read_finished(directory, plugins, experiment)
     require_room(finished.directory)
     if periods > 1 and not finished.experiment.transcription.problem.repeat:
         raise InputError(f"periods: expected 1 of a plan that ends at its horizon, or problem.repeat, got {periods}")
     acting = controller(run, resolve, seconds=seconds, plugins=plugins)
-    found = replace(
-        _closed(finished, acting, resolve, (count, periods), seed, notify), seconds=clock.perf_counter() - began
+    loops = replace(
+        _closed(finished, acting, resolve, (count, periods), seed, notify), seconds=clock.perf_counter() - start
     )
-    RunDirectory(finished.directory).write_json("loop.json", found.summary())
+    RunDirectory(finished.directory).write_json("loop.json", loops.summary())
     if out is not None and (missing := missing_matplotlib()):
-        return replace(found, undrawn=missing)
+        return replace(loops, undrawn=missing)
     if out is not None:
-        write_loops(Path(out), found, finished)
-    return found
+        write_loops(Path(out), loops, finished)
+    return loops
 
 
 def _closed(
@@ -128,45 +128,61 @@ def _closed(
     worst = adversaries(finished.experiment, finished.decision)
     breaks = worst.get("breakpoints", model.response.grid.breakpoints)
     grid = model.response.grid.refined(breaks)
-    ends = [moment for one in model.constraints for moment in (one.start, one.stop)]
+    ends = [moment for constraint in model.constraints for moment in (constraint.start, constraint.stop)]
     times = fine_times(
         Response(model.response.system, grid, model.response.initial_state),
         model.parameters,
         np.concatenate([ends, worst.get("times", np.zeros(0))]),
     )
     shown = np.unique(np.linspace(0, times.size - 1, min(times.size, SHOWN)).round().astype(int))
-    beside = ParametersInTime.of(model.stated)
-    drawn = [*_replayed(worst, beside, periods), *_sampled(model, worst, beside, counts, np.random.default_rng(seed))]
-    spent, paid, kept, laws = list[float](), list[float](), list[tuple[str, Array, Array]](), dict[str, int]()
-    found = {one.name: -np.inf for one in model.constraints}
-    limits = {one.name: TOLERANCE * float(row_units(one, model.problem.control).min()) for one in model.constraints}
-    resolved, uncovered, outside, stepped = 0, 0, -np.inf, -np.inf
-    for number, (law, disturbances, parameter, here, begun, seen) in enumerate(drawn):
-        told = None if beside is None or here is None else partial(beside.at, rows=here)
-        on = grid if law == ADVERSARY else model.response.grid
-        fine = Response(model.response.system, finer(on, times), model.response.initial_state)
+    parameters_in_time = ParametersInTime.of(model.stated)
+    draws = [
+        *_replayed(worst, parameters_in_time, periods),
+        *_sampled(model, worst, parameters_in_time, counts, np.random.default_rng(seed)),
+    ]
+    milliseconds, mean_costs, kept_loops, laws = (
+        list[float](),
+        list[float](),
+        list[tuple[str, Array, Array]](),
+        dict[str, int](),
+    )
+    largest_violations = {constraint.name: -np.inf for constraint in model.constraints}
+    limits = {
+        constraint.name: TOLERANCE * float(row_units(constraint, model.problem.control).min())
+        for constraint in model.constraints
+    }
+    resolved, uncovered, control_violation, step_violation = 0, 0, -np.inf, -np.inf
+    for number, (law, disturbances, parameter, parameter_rows, initial_state, noise_signals) in enumerate(draws):
+        to_user_states = (
+            None
+            if parameters_in_time is None or parameter_rows is None
+            else partial(parameters_in_time.at, rows=parameter_rows)
+        )
+        law_grid = grid if law == ADVERSARY else model.response.grid
+        fine = Response(model.response.system, finer(law_grid, times), model.response.initial_state)
         laws[law] = laws.get(law, 0) + 1
         acting.reset()
-        costs, before = list[float](), np.zeros((0, model.problem.system.controls))
-        for period, (disturbance, noise) in enumerate(zip(disturbances, seen, strict=True)):
-            which = on.control_piece if law == ADVERSARY else np.arange(on.pieces)
-            closing = _Closing(model, acting, which, noise, period * model.problem.horizon, told)
-            path = walk(fine, closing, parameter, disturbance, begun)
-            states = np.stack(list(path if told is None else map(told, path)))
+        costs, previous_control = list[float](), np.zeros((0, model.problem.system.controls))
+        for period, (disturbance, noise) in enumerate(zip(disturbances, noise_signals, strict=True)):
+            pieces = law_grid.control_piece if law == ADVERSARY else np.arange(law_grid.pieces)
+            closing = _Closing(model, acting, pieces, noise, period * model.problem.horizon, to_user_states)
+            path = walk(fine, closing, parameter, disturbance, initial_state)
+            states = np.stack(list(path if to_user_states is None else map(to_user_states, path)))
             for name, largest in _violations(model, finished, states, times, closing.applied).items():
-                found[name] = max(found[name], largest)
-            outside = max(outside, float(model.problem.control.violation(closing.applied.T).max()))
-            stepped = max(stepped, _stepped(model, np.vstack([before, closing.applied.T])))
+                largest_violations[name] = max(largest_violations[name], largest)
+            control_violation = max(control_violation, float(model.problem.control.violation(closing.applied.T).max()))
+            step_violation = max(step_violation, _stepped(model, np.vstack([previous_control, closing.applied.T])))
             costs.append(_paid(model, closing.applied))
             if laws[law] <= DRAWN and not period:
-                kept.append((law, states[shown, :, 0].T, closing.applied))
-            before, begun = closing.applied[:, -1:].T, states[-1].T.copy()
-            begun[:, model.stated.system.states :] = 0.0  # integrals, and states that parameters add, begin at 0 again
-        spent += [1e3 * one.seconds for one in acting.steps]
-        resolved += sum(one.resolved for one in acting.steps)
-        uncovered += max(sum(not one.covered for one in acting.steps), int(acting.ever_uncovered))
-        paid.append(float(np.mean(costs)))
-        notify(StudyProgress(text=f"{number + 1} of {len(drawn)} loops", done=number + 1, total=len(drawn)))
+                kept_loops.append((law, states[shown, :, 0].T, closing.applied))
+            previous_control, initial_state = closing.applied[:, -1:].T, states[-1].T.copy()
+            # integrals, and states that parameters add, begin at 0 again
+            initial_state[:, model.stated.system.states :] = 0.0
+        milliseconds += [1e3 * step.seconds for step in acting.steps]
+        resolved += sum(step.resolved for step in acting.steps)
+        uncovered += max(sum(not step.covered for step in acting.steps), int(acting.ever_uncovered))
+        mean_costs.append(float(np.mean(costs)))
+        notify(StudyProgress(text=f"{number + 1} of {len(draws)} loops", done=number + 1, total=len(draws)))
     size = float(model.problem.control.reach(np.eye(model.problem.system.controls)).max())
     return ClosedLoops(
         title=finished.experiment.title,
@@ -177,24 +193,24 @@ def _closed(
         seed=seed,
         laws=laws,
         constraints={
-            **{name: (found[name], limits[name]) for name in found},
-            CONTROL: (outside, TOLERANCE * size),
-            **({} if np.isinf(stepped) else {STEP: (stepped, TOLERANCE * size)}),
+            **{name: (largest_violations[name], limits[name]) for name in largest_violations},
+            CONTROL: (control_violation, TOLERANCE * size),
+            **({} if np.isinf(step_violation) else {STEP: (step_violation, TOLERANCE * size)}),
         },
-        milliseconds=np.array(spent),
+        milliseconds=np.array(milliseconds),
         resolved=resolved,
         uncovered=uncovered,
         cost=float(finished.summary["cost"]),
         planned=_paid(model, model.pieces(finished.decision)),
-        costs=np.array(paid),
+        costs=np.array(mean_costs),
         seconds=0.0,
         shown=times[shown],
-        paths=[(law, path) for law, path, _ in kept],
-        controls=[(law, control) for law, _, control in kept],
+        paths=[(law, path) for law, path, _ in kept_loops],
+        controls=[(law, control) for law, _, control in kept_loops],
         cost_unit=str((finished.summary.get("units") or {}).get("cost") or ""),
         paid_in=model.problem.cost_unit,
         units={
-            **{one.name: joined(one.measured).strip() for one in model.constraints},
+            **{constraint.name: joined(constraint.measured).strip() for constraint in model.constraints},
             CONTROL: joined(model.problem.names.control_units).strip() if model.problem.control.halfspaces() else "",
             STEP: joined(model.problem.names.control_units).strip() if model.problem.control.halfspaces() else "",
         },
@@ -241,8 +257,8 @@ class _Closing:
         middle = (grid.breakpoints[piece] + grid.breakpoints[piece + 1]) / 2
         if self._asked < points.size - 1 and middle > points[self._asked]:
             time = self.begins + float(points[self._asked])
-            here = state if self.told is None else self.told(state)
-            self.applied[:, self._asked] = self.acting.step(time, self._measured(here[:, 0]))
+            user_state = state if self.told is None else self.told(state)
+            self.applied[:, self._asked] = self.acting.step(time, self._measured(user_state[:, 0]))
             self._asked += 1
         return np.asarray(grid.inputs(self.applied)[:, piece, None])
 
@@ -260,12 +276,21 @@ def _replayed(worst: Mapping[str, Array], beside: ParametersInTime | None, perio
     follows."""
     count = worst["names"].size if worst else 0
     for row in range(count):
-        turns = [(row + period) % count for period in range(periods)]
-        disturbances = [worst["disturbances"][at : at + 1] if worst["disturbances"].shape[1] else None for at in turns]
-        seen = [worst["noises"][at] if "noises" in worst else None for at in turns]
-        one = slice(row, row + 1)
-        here = None if beside is None else beside.seen(worst["directions"][row])[None]
-        yield ADVERSARY, disturbances, worst["parameters"][one], here, worst["initial_states"][one], seen
+        cases = [(row + period) % count for period in range(periods)]
+        disturbances = [
+            worst["disturbances"][case : case + 1] if worst["disturbances"].shape[1] else None for case in cases
+        ]
+        noise_signals = [worst["noises"][case] if "noises" in worst else None for case in cases]
+        row_slice = slice(row, row + 1)
+        parameter_rows = None if beside is None else beside.seen(worst["directions"][row])[None]
+        yield (
+            ADVERSARY,
+            disturbances,
+            worst["parameters"][row_slice],
+            parameter_rows,
+            worst["initial_states"][row_slice],
+            noise_signals,
+        )
 
 
 def _sampled(
@@ -280,18 +305,27 @@ def _sampled(
     if not functionals.disturbed and parameters.set is None and model.noise is None and beside is None:
         yield "iid", [None] * periods, np.zeros((1, 0)), None, None, [None] * periods
         return
-    known = tuple(worst[name] for name in ("times", "directions", "parameters")) if worst else (np.zeros(0),) * 3
-    uncertainty = Uncertainty(functionals, parameters, model.constraints, (known[0], known[1], known[2]))
+    worst_points = tuple(worst[name] for name in ("times", "directions", "parameters")) if worst else (np.zeros(0),) * 3
+    uncertainty = Uncertainty(
+        functionals, parameters, model.constraints, (worst_points[0], worst_points[1], worst_points[2])
+    )
     for law in (law for law in LAWS if law != ADVERSARY and (worst or law != "neighbours")):
-        disturbances, drawn, begun = uncertainty.draw(cast(LawName, law), count * periods, rng)
-        seen = noises(model.noise, cast(LawName, law), count * periods, model.control.pieces, rng)
-        here = None if beside is None else beside.draw(cast(LawName, law), count, None, rng)
+        disturbances, drawn_parameters, initial_states = uncertainty.draw(cast(LawName, law), count * periods, rng)
+        noise_signals = noises(model.noise, cast(LawName, law), count * periods, model.control.pieces, rng)
+        parameter_rows = None if beside is None else beside.draw(cast(LawName, law), count, None, rng)
         for row in range(count):
-            one, turns = slice(row, row + 1), range(row, count * periods, count)
-            every = [None if disturbances is None else disturbances[p : p + 1] for p in turns]
-            heard = [None if seen is None else seen[:, :, p] for p in turns]
-            rows = None if here is None else here[one]
-            yield law, every, drawn[one], rows, None if begun is None else begun[one], heard
+            row_slice, draws = slice(row, row + 1), range(row, count * periods, count)
+            loop_disturbances = [None if disturbances is None else disturbances[p : p + 1] for p in draws]
+            loop_noises = [None if noise_signals is None else noise_signals[:, :, p] for p in draws]
+            loop_rows = None if parameter_rows is None else parameter_rows[row_slice]
+            yield (
+                law,
+                loop_disturbances,
+                drawn_parameters[row_slice],
+                loop_rows,
+                None if initial_states is None else initial_states[row_slice],
+                loop_noises,
+            )
 
 
 def _stepped(model: Transcription, applied: Array) -> float:
@@ -308,13 +342,13 @@ def _violations(
     ``applied (m, K)`` is the control that was applied.
     """
     theta = applied.ravel() if model.control.is_indicators else finished.theta.ravel()
-    counts: Sequence[ViolationCount] = [_count(one, model, times, theta) for one in model.constraints]
+    counts: Sequence[ViolationCount] = [_count(constraint, model, times, theta) for constraint in model.constraints]
     for position, state in enumerate(states):
-        for one in counts:
-            one.add(position, state)
-    for one in counts:
-        one.close()
-    return {one.constraint.name: one.largest for one in counts}
+        for count in counts:
+            count.add(position, state)
+    for count in counts:
+        count.close()
+    return {count.constraint.name: count.largest for count in counts}
 
 
 def _count(one: StateConstraint, model: Transcription, times: Array, theta: Array) -> ViolationCount:

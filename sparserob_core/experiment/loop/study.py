@@ -132,7 +132,8 @@ class ClosedLoops:
                 "least": float(self.costs.min()),
                 "largest": float(self.costs.max()),
                 "laws": {
-                    law: {"mean": float(one.mean()), "largest": float(one.max())} for law, one in self.paid.items()
+                    law: {"mean": float(costs.mean()), "largest": float(costs.max())}
+                    for law, costs in self.paid.items()
                 },
             },
             "constraints": [
@@ -148,7 +149,7 @@ class ClosedLoops:
         """Return the columns and rows of a table."""
         summary = self.summary()
         time, cost = summary["milliseconds"], summary["cost"]
-        unit, paid_in = (f" {one}" if one else "" for one in (self.cost_unit, self.paid_in))
+        unit, paid_in = (f" {unit_name}" if unit_name else "" for unit_name in (self.cost_unit, self.paid_in))
         rows = [
             ("loops", f"{sum(self.laws.values())} ({', '.join(f'{n} {law}' for law, n in self.laws.items())})"),
             *([("periods of each", f"{self.periods}")] if self.periods > 1 else []),
@@ -161,12 +162,12 @@ class ClosedLoops:
                 f"{cost['mean']:.7g}{paid_in} on average, {cost['least']:.7g} to {cost['largest']:.7g}{paid_in}",
             ),
             *(
-                (f"cost under {law}", f"{one.mean():.7g}{paid_in} on average, {one.max():.7g}{paid_in} at most")
-                for law, one in self.paid.items()
+                (f"cost under {law}", f"{costs.mean():.7g}{paid_in} on average, {costs.max():.7g}{paid_in} at most")
+                for law, costs in self.paid.items()
             ),
             *(
-                (f"largest violation of {name}", f"{found:.3e} {self.units.get(name, '')}".rstrip())
-                for name, (found, _) in self.constraints.items()
+                (f"largest violation of {name}", f"{largest:.3e} {self.units.get(name, '')}".rstrip())
+                for name, (largest, _) in self.constraints.items()
             ),
         ]
         return (), rows

@@ -50,28 +50,28 @@ def causal_upper(
     """
     from sparserob_core.experiment.run.events import StudyProgress
 
-    known = [factor for factor, result in results.items() if factor > 0.0 and result.decision is not None]
-    base = max(known, default=1.0)
+    factors = [factor for factor, result in results.items() if factor > 0.0 and result.decision is not None]
+    base = max(factors, default=1.0)
     model = model_at(base)
     charge, result = model.answering.charge, results.get(base)
     if not charge.causal_signals:
         return np.nan, None
     notify(StudyProgress(text=f"looking for the factor of {scaling.of} above which no causal policy exists"))
-    refused = [one for factor, one in results.items() if one.status == "infeasible" and factor > 0.0]
-    rests = [] if result is None else active(model, result)
-    rests += [at for one in refused for at in active(model, one)]
-    search = searched(model, None if result is None else result.decision, rests)
+    infeasible = [entry for factor, entry in results.items() if entry.status == "infeasible" and factor > 0.0]
+    constraints = [] if result is None else active(model, result)
+    constraints += [constraint for entry in infeasible for constraint in active(model, entry)]
+    search = searched(model, None if result is None else result.decision, constraints)
     limits = Limits.of(charge, list(results.values()), model.program.n, lambda: tools.deadline.passed)
-    found = search.largest_factor(scaling.highest / base, limits)
-    if found is None:
+    solved_tree = search.largest_factor(scaling.highest / base, limits)
+    if solved_tree is None:
         return np.nan, limits.ended
-    tree, grown = found
+    tree, solution = solved_tree
     for step in BEYOND:
-        factor = base * grown.value * (1.0 + step)
+        factor = base * solution.value * (1.0 + step)
         if not 0.0 < factor <= scaling.highest:
             break
         problem = scaling.at(factor)
-        stated = search.bound(tree, grown, np.inf, problem.disturbance, limits.ended, factor / base)
+        stated = search.bound(tree, solution, np.inf, problem.disturbance, limits.ended, factor / base)
         if proven(model, problem, stated, tools.deadline) is not None:
             return factor, limits.ended
     return np.nan, limits.ended

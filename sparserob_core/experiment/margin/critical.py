@@ -86,13 +86,13 @@ def critical_factor(
         The factor.
     """
     if joined is not None:
-        found = _by_one_program(joined, scaling, tools, width)
-        if found.status != "unknown" or not scaling.nested:
-            return found
+        critical = _by_one_program(joined, scaling, tools, width)
+        if critical.status != "unknown" or not scaling.nested:
+            return critical
     if scaling.of == "disturbance":
-        found = _by_scaled_gains(programs, scaling, tools)
-        if found.status != "unknown":
-            return found
+        critical = _by_scaled_gains(programs, scaling, tools)
+        if critical.status != "unknown":
+            return critical
     return _by_slack(programs, scaling, tools, width, notify, seen)
 
 
@@ -128,7 +128,7 @@ def _by_one_program(programs: ParametricProgram, scaling: Scaling, tools: Tools,
 
 def _in_users_units(program: SemiInfiniteProgram, cuts: Sequence[Cut]) -> list[Cut]:
     """Return the ``cuts`` of a program in its own units in those of the user."""
-    units = {one.name: 1.0 if one.index_units is None else one.index_units for one in program.families}
+    units = {family.name: 1.0 if family.index_units is None else family.index_units for family in program.families}
     return [replace(cut, index=cut.index * units[cut.family]) for cut in cuts]
 
 
@@ -180,8 +180,10 @@ def _slack(programs: ParametricProgram, factor: float, tools: Tools) -> float:
 
 
 def _room(program: SemiInfiniteProgram) -> tuple[float, float]:
-    rest = np.zeros(program.n)
-    violations = [float(family.worst(rest).violations.max()) for family in program.families if family.worst is not None]
+    origin = np.zeros(program.n)
+    violations = [
+        float(family.worst(origin).violations.max()) for family in program.families if family.worst is not None
+    ]
     size = ROOM * (1.0 + max(map(abs, violations), default=0.0))
     return -size, size
 

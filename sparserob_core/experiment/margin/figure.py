@@ -70,12 +70,12 @@ def draw_margin(found: Margin, varied: Scaling) -> Figure:
         zorder=4,
         label="certified lower bound",
     )
-    others = [point.factor for point in found.curve if point.status not in FEASIBLE]
+    unproven_factors = [point.factor for point in found.curve if point.status not in FEASIBLE]
     ax.set_ylim(*_view(np.concatenate([upper, lower])))
-    if others:
+    if unproven_factors:
         ax.plot(
-            others,
-            np.full(len(others), ax.get_ylim()[0]),
+            unproven_factors,
+            np.full(len(unproven_factors), ax.get_ylim()[0]),
             "x",
             color=look.VERMILLION,
             clip_on=False,
@@ -117,8 +117,8 @@ def _forbid(ax: Axes, found: Margin, factors: Array) -> None:
     if found.infeasible is not None:
         edge, critical = found.infeasible.factor, (found.lower + found.upper) / 2
         left, right = (left, edge + room) if found.sense == "largest" else (max(edge - room, 0.0), right)
-        beyond = (edge, right) if found.sense == "largest" else (left, edge)
-        ax.axvspan(*beyond, **look.EXCLUDED, label="proven infeasible")
+        band = (edge, right) if found.sense == "largest" else (left, edge)
+        ax.axvspan(*band, **look.EXCLUDED, label="proven infeasible")
         ax.axvline(critical, color=look.VERMILLION, linewidth=1.1, zorder=1, label=f"critical factor {critical:.7g}")
     ax.set_xlim(left, right)
 
@@ -126,18 +126,18 @@ def _forbid(ax: Axes, found: Margin, factors: Array) -> None:
 def _unit_axis(ax: Axes, found: Margin) -> None:
     """Draw a second axis in the unit of the problem, where its quantity is a multiple of the factor."""
     share = found.amounts[0] / found.lower if np.isfinite(found.lower) and found.lower > 0 else np.nan
-    straight = (
+    is_linear = (
         found.curve
         and np.isfinite(share)
         and all(abs(point.amount - share * point.factor) <= 1e-9 * (1 + abs(point.amount)) for point in found.curve)
     )
-    if not straight:
+    if not is_linear:
         return
-    above = ax.secondary_xaxis(
+    unit_axis = ax.secondary_xaxis(
         "top", functions=(lambda x: share * np.asarray(x, dtype=float), lambda y: np.asarray(y, dtype=float) / share)
     )
-    above.set_xlabel(_mathematics(plain(found.quantity)))
-    above.spines["top"].set_visible(True)
+    unit_axis.set_xlabel(_mathematics(plain(found.quantity)))
+    unit_axis.spines["top"].set_visible(True)
 
 
 def _mathematics(quantity: str) -> str:
@@ -145,7 +145,7 @@ def _mathematics(quantity: str) -> str:
 
 
 def _view(values: Array) -> tuple[float, float]:
-    shown = values[np.isfinite(values)]
-    low, high = (float(shown.min()), float(shown.max())) if shown.size else (0.0, 1.0)
-    spread = max(high - low, 0.05 * abs(high), 1e-9)
-    return low - 0.08 * spread, high + 0.1 * spread
+    finite = values[np.isfinite(values)]
+    low, high = (float(finite.min()), float(finite.max())) if finite.size else (0.0, 1.0)
+    extent = max(high - low, 0.05 * abs(high), 1e-9)
+    return low - 0.08 * extent, high + 0.1 * extent

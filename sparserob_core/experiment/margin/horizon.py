@@ -60,21 +60,21 @@ class HorizonSearch:
 
         The margin has a curve of ``count`` runs.
         """
-        started, best, stuck = time.perf_counter(), None, ""
+        started, best, reason = time.perf_counter(), None, ""
         longest = self.problem.horizon
         scan = longest * np.arange(1, max(count, SCAN) + 1) / max(count, SCAN)
         try:
             with self.tools.deadline.enforced():
-                stuck = self._cover(scan.tolist())
+                reason = self._cover(scan.tolist())
                 if count:
                     for horizon in scan:
                         self._run(float(horizon))
-        except KeyboardInterrupt as pressed:
-            stuck = str(pressed) or "interrupted from the keyboard"
+        except KeyboardInterrupt as interrupt:
+            reason = str(interrupt) or "interrupted from the keyboard"
         proven = [point for point in self.points.values() if point.status in FEASIBLE]
         best = min(proven, key=lambda point: point.factor, default=None)
         low = self.covered[-1][1] if self.covered else 0.0
-        status, message = self._answer(best, low, stuck)
+        status, message = self._answer(best, low, reason)
         upper = best.factor if best is not None else np.nan
         curve = tuple(self.points[key] for key in sorted(self.points) if key in scan or self.points[key] is best)
         kept = f"{self.control.pieces} pieces at every horizon; windows begin at the times that the config says"
@@ -149,10 +149,10 @@ class HorizonSearch:
             short = high - low <= self.width
             if short and status in FEASIBLE:
                 break
-            stuck = self._stuck(low, high, short)
-            if stuck:
+            reason = self._stuck(low, high, short)
+            if reason:
                 self._descend(low, [point for point in (*points, best) if low < point <= best and np.isfinite(point)])
-                return stuck
+                return reason
             cells += [((low + high) / 2, high), (low, (low + high) / 2)]
         return ""
 
@@ -188,8 +188,8 @@ class HorizonSearch:
 
     def _excluded(self, low: float, high: float) -> bool:
         """Return whether multipliers of a run at one of the two ends prove that nothing is feasible between them."""
-        known = [self._multipliers(end) for end in (high, low)]
-        return any(self._cells.amount(rows, low, high) > 0.0 for rows in known if rows)
+        multipliers = [self._multipliers(end) for end in (high, low)]
+        return any(self._cells.amount(rows, low, high) > 0.0 for rows in multipliers if rows)
 
     def _run(self, horizon: float) -> Point:
         """Return the run at a horizon, which is made only once."""
@@ -218,7 +218,7 @@ class HorizonSearch:
     ) -> tuple[Transcription, Result]:
         from sparserob_core.control.transcription.transcribe import prepare
 
-        control, disturbance = (stretched(one, horizon) for one in (self.control, self.disturbance))
+        control, disturbance = (stretched(dictionary, horizon) for dictionary in (self.control, self.disturbance))
         model = prepare(at_horizon(problem, horizon), control, disturbance)
         return model, solve_in_own_units(self.method, model.program, replace(self.tools, notify=notify))
 
@@ -284,31 +284,36 @@ def _multipliers_of(model: Transcription, result: Result) -> list[Multiplier]:
 
     Rows of a curved set of controls are left out, since the proof takes the least value over that set.
     """
-    problem, found = model.problem, []
-    starts = {one.name: one.start for one in model.constraints[: len(problem.path)]}  # terminal sets come after them
+    problem, multipliers = model.problem, []
+    # terminal sets come after those of the path
+    starts = {entry.name: entry.start for entry in model.constraints[: len(problem.path)]}
     shares = model.control.breakpoints / model.control.horizon
     middle = model.parameters.middle
     for cut in result.dual.cuts:
         constraint = model.constraint(model.program.family(cut.family))
         if constraint is None:
             continue
-        said = in_numbers(model.program, cut.family, cut.formulation, cut.index, cut.row)
-        if said is not None and cut.multiplier > 0.0:
-            moved = float(constraint.reference.along(np.array([said.time]), said.direction[None])[0, 0])
-            within = (0.0, 1.0) if said.piece is None else (float(shares[said.piece]), float(shares[said.piece + 1]))
-            found.append(
+        explanation = in_numbers(model.program, cut.family, cut.formulation, cut.index, cut.row)
+        if explanation is not None and cut.multiplier > 0.0:
+            offset = float(constraint.reference.along(np.array([explanation.time]), explanation.direction[None])[0, 0])
+            interval = (
+                (0.0, 1.0)
+                if explanation.piece is None
+                else (float(shares[explanation.piece]), float(shares[explanation.piece + 1]))
+            )
+            multipliers.append(
                 Multiplier(
                     weight=float(cut.multiplier),
-                    share=min(1.0, said.time / problem.horizon),
-                    direction=said.direction,
-                    parameter=np.asarray(said.parameter_or(middle), dtype=float),
-                    limit=said.sign * said.limit - moved,
+                    share=min(1.0, explanation.time / problem.horizon),
+                    direction=explanation.direction,
+                    parameter=np.asarray(explanation.parameter_or(middle), dtype=float),
+                    limit=explanation.sign * explanation.limit - offset,
                     earliest=starts.get(cut.family, 0.0),
                     reference=constraint.reference,
-                    gain=said.gain,
-                    piece=within,
+                    gain=explanation.gain,
+                    piece=interval,
                 )
             )
     for axis, value, price in zip(*fixed(problem), result.dual.mu, strict=False):
-        found.append(Multiplier(float(price), 1.0, axis, middle, float(value), uncertain=False))
-    return found
+        multipliers.append(Multiplier(float(price), 1.0, axis, middle, float(value), uncertain=False))
+    return multipliers

@@ -39,20 +39,20 @@ def draw_horizons(found: Margin) -> Figure:
     ax.plot(horizons, upper, "v", color=look.BLUE, markersize=4.5, zorder=3, label="certified upper bound")
     ax.plot(horizons, lower, "^", color=look.ORANGE, markersize=4.5, zorder=4, label="certified lower bound")
     longest = max((point.factor for point in found.curve), default=1.0)
-    top = float(upper.max(initial=0.0)) or 1.0
+    highest = float(upper.max(initial=0.0)) or 1.0
     ax.set_xlim(0.0, 1.03 * longest)
-    ax.set_ylim(0.0, 1.15 * top)
+    ax.set_ylim(0.0, 1.15 * highest)
     for status, colour, label in (
         ("infeasible", look.VERMILLION, "proven infeasible"),
         ("other", look.GREY, "not decided"),
     ):
-        where = [
+        crosses = [
             point.factor
             for point in found.curve
             if point.status not in FEASIBLE and (point.status == "infeasible") == (status == "infeasible")
         ]
-        if where:
-            ax.plot(where, np.zeros(len(where)), "x", color=colour, clip_on=False, zorder=5, label=label)
+        if crosses:
+            ax.plot(crosses, np.zeros(len(crosses)), "x", color=colour, clip_on=False, zorder=5, label=label)
     if found.lower > 0.0:
         ax.axvspan(
             0.0,

@@ -108,16 +108,16 @@ def margin(
     try:
         if out is None and not write:
             broadcast(_opening(search, Path()))
-            found = search.margin(int(curve))
+            result = search.margin(int(curve))
         else:
             with create_directory(out, f"{name_of(loaded)}-margin", loaded.config.digest()) as directory:
                 heading = f"The experiment whose margin of {of} was sought."
                 directory.write_text("config.yaml", write_yaml(loaded.config.plain(), heading))
                 broadcast(_opening(search, directory.path))
-                found = search.margin(int(curve))
-                found = _written(directory, found, None if isinstance(search, HorizonSearch) else search.scaling)
-        answer, stopped = "; ".join(f"{name}: {value}" for name, value in margin_rows(found)[:3]), deadline.reason
-        return found
+                result = search.margin(int(curve))
+                result = _written(directory, result, None if isinstance(search, HorizonSearch) else search.scaling)
+        answer, stopped = "; ".join(f"{name}: {value}" for name, value in margin_rows(result)[:3]), deadline.reason
+        return result
     except BaseException as error:
         stopped = named(error)
         raise
@@ -209,8 +209,8 @@ def _search(loaded: Loaded, tools: Tools, of: str, tolerance: float, notify: Not
     if of == HORIZON:
         if policy is not None:
             raise InputError(path="policy.name", expected="open_loop for the margin of the horizon", got="feedback")
-        both, method = (control, disturbance), _method(loaded)
-        return horizon_search(experiment.title, problem, both, method, tools, tolerance, notify)
+        dictionaries, method = (control, disturbance), _method(loaded)
+        return horizon_search(experiment.title, problem, dictionaries, method, tools, tolerance, notify)
     chosen = scaling(problem, of, *_positions(loaded, problem))
     programs = ParametricProgram(lambda factor: transcribe(chosen.at(factor), control, disturbance, policy=policy))
     joined: ParametricProgram | None = None
@@ -244,8 +244,8 @@ def _positions(loaded: Loaded, problem: OptimalControlProblem) -> tuple[list[lis
         return [[i] for i in range(len(problem.path))], [[i] for i in range(len(problem.terminal))]
     states = problem.system.states
     entries = [item.entries(f"path.{i}", states, factory.horizon) for i, item in enumerate(factory.path)]
-    members = [[_restricts(one.set) for one in entry] for entry in entries]
-    ends = [[_restricts(one) for one in item.ends(f"terminal.{i}", states)] for i, item in enumerate(factory.terminal)]
+    members = [[_restricts(constraint.set) for constraint in entry] for entry in entries]
+    ends = [[_restricts(end) for end in item.ends(f"terminal.{i}", states)] for i, item in enumerate(factory.terminal)]
     return _counted(members), _counted(ends)
 
 

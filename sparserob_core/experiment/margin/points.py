@@ -53,26 +53,26 @@ class Points:
 
     def begin(self, factor: float) -> Notify:
         """Report the beginning of a run at a factor; returns the function that receives its events."""
-        place, self.count = self.count, self.count + 1
+        position, self.count = self.count, self.count + 1
         text = f"{self.of} at {factor:.9g} is run"
-        self._tell(text, found=[(float(factor),)], now=[place], running=1)
+        self._tell(text, found=[(float(factor),)], now=[position], running=1)
 
         def moved(number: int, lower: float, upper: float) -> None:
             self.notify(
-                PointProgress(point=place, round=number, lower_bound=lower, upper_bound=upper, seconds=self.seconds)
+                PointProgress(point=position, round=number, lower_bound=lower, upper_bound=upper, seconds=self.seconds)
             )
 
         return Bounds(moved).receive
 
     def end(self, point: Point) -> None:
         """Report the answer of the run that began last."""
-        place, proven = self.count - 1, np.isfinite(point.upper_bound)
+        position, proven = self.count - 1, np.isfinite(point.upper_bound)
         gap = relative_gap(point.lower_bound, point.upper_bound)
-        told = {"status": point.status, "message": point.message, "cost": point.upper_bound if proven else None}
-        self.rows[place] = finite(
-            {**told, "lower_bound": point.lower_bound, "upper_bound": point.upper_bound, "gap": gap}
+        answer = {"status": point.status, "message": point.message, "cost": point.upper_bound if proven else None}
+        self.rows[position] = finite(
+            {**answer, "lower_bound": point.lower_bound, "upper_bound": point.upper_bound, "gap": gap}
         )
-        self._tell(f"{self.of} at {point.factor:.9g}: {point.status}", row=self.rows[place], places=[place])
+        self._tell(f"{self.of} at {point.factor:.9g}: {point.status}", row=self.rows[position], places=[position])
 
     def _tell(self, text: str, **more: Any) -> None:
         self.notify(

@@ -103,10 +103,10 @@ def scaling(
         "terminal": problem.terminal,
         **problem.lists,
     }
-    part = of.split(".", maxsplit=1)[0]
-    if part in absent and not absent[part]:
+    field = of.split(".", maxsplit=1)[0]
+    if field in absent and not absent[field]:
         raise InputError(
-            f"of: '{of}' cannot be varied, the problem has no {part}; expected one of {', '.join(sorted(choices))}"
+            f"of: '{of}' cannot be varied, the problem has no {field}; expected one of {', '.join(sorted(choices))}"
         )
     raise InputError(f"of: expected what is to be varied, got '{of}'{nearest(of, {*choices, 'horizon'})}")
 
@@ -165,12 +165,12 @@ def _listed(problem: OptimalControlProblem, field: str, of: str, positions: Sequ
     resized = {i: _resizing(of, entries[i]) for i in positions}
 
     def at(factor: float) -> OptimalControlProblem:
-        changed: Any = [resized[i](factor) if i in resized else entry for i, entry in enumerate(entries)]
-        return replace(problem, **{field: changed})
+        scaled: Any = [resized[i](factor) if i in resized else entry for i, entry in enumerate(entries)]
+        return replace(problem, **{field: scaled})
 
     width = max(_half_width(_bounds(entries[i])) for i in positions)
-    what = "bounds" if field in problem.sums else "set"
-    return Scaling(of, f"factor on the {what} {of}", "smallest", at, "largest half-width", _times(width))
+    kind = "bounds" if field in problem.sums else "set"
+    return Scaling(of, f"factor on the {kind} {of}", "smallest", at, "largest half-width", _times(width))
 
 
 def _parameters(problem: OptimalControlProblem) -> Scaling:
@@ -198,13 +198,13 @@ def _initial_state(problem: OptimalControlProblem) -> Scaling:
             " another thing to vary"
         )
     if bound is not None:
-        one, reach = np.ones(bound.dimension), bound.reach(np.eye(bound.dimension))
+        ones, reach = np.ones(bound.dimension), bound.reach(np.eye(bound.dimension))
         return Scaling(
             "initial_state",
             "factor on the set of initial states",
             "largest",
             # scaled about the centre, which is the deviation 0, not about the middle of the deviations
-            lambda f: replace(problem, initial_set=bound.in_units(one / f) if f > 0.0 else None),
+            lambda f: replace(problem, initial_set=bound.in_units(ones / f) if f > 0.0 else None),
             "largest deviation of x_i(0)",
             _times(float(reach.max())),
             unit=_of_largest(problem, reach),
@@ -226,8 +226,8 @@ def _initial_state(problem: OptimalControlProblem) -> Scaling:
 
 def _of_largest(problem: OptimalControlProblem, sizes: Array) -> str:
     """Return the unit of the states with the largest of the ``sizes (d,)``, where they have the same one."""
-    known, largest = problem.names.state_units, np.flatnonzero(sizes == sizes.max()).tolist()
-    units = {known[one] for one in largest if known}
+    names, states = problem.names.state_units, np.flatnonzero(sizes == sizes.max()).tolist()
+    units = {names[state] for state in states if names}
     return units.pop() if len(units) == 1 else ""
 
 
@@ -241,16 +241,16 @@ def _control(problem: OptimalControlProblem) -> Scaling:
 
 def _execution(problem: OptimalControlProblem) -> Scaling:
     shares = np.atleast_1d(np.asarray(problem.execution, dtype=float))
-    most = float(shares.max())
+    largest = float(shares.max())
     return Scaling(
         "execution",
         "factor on the errors of execution",
         "largest",
         lambda f: replace(problem, execution=np.minimum(f * shares, 1.0)),
         "largest share of a command",
-        _times(most),
+        _times(largest),
         affine=False,  # the factor multiplies the sizes of the decision
-        highest=1.0 / most,
+        highest=1.0 / largest,
     )
 
 
@@ -260,10 +260,10 @@ def _window(problem: OptimalControlProblem, path: str, positions: Sequence[int])
     if any(paths[i].lasting for i in positions):
         latest *= 1.0 - SHORT
     for i in positions:
-        moved = paths[i].relative_to
-        if moved is not None and np.asarray(moved)[0, 0] > 0.0:
+        rows = paths[i].relative_to
+        if rows is not None and np.asarray(rows)[0, 0] > 0.0:
             raise InputError(
-                f"of: {path}.from is varied from 0 on, relative_to begins at {np.asarray(moved)[0, 0]:g}; expected rows"
+                f"of: {path}.from is varied from 0 on, relative_to begins at {np.asarray(rows)[0, 0]:g}; expected rows"
                 " that say where the set is from time 0 on"
             )
     return Scaling(

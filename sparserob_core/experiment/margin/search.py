@@ -177,22 +177,22 @@ class MarginSearch:
         try:
             self.told.say(f"looking for the {self.scaling.sense} factor of {self.scaling.of}")
             with self.tools.deadline.enforced():
-                found = self._found()
-                self.cuts = found.cuts
-                sides = self._sides(found)
+                critical = self._found()
+                self.cuts = critical.cuts
+                sides = self._sides(critical)
                 feasible = sides[2]
                 curve = self._curve(feasible, sides[0], count) if feasible is not None else ()
-        except KeyboardInterrupt as pressed:
-            said = str(pressed) or "interrupted from the keyboard"
-            sides, known = self._known(said, sides)
-            curve = known if count else ()
+        except KeyboardInterrupt as interrupt:
+            reason = str(interrupt) or "interrupted from the keyboard"
+            sides, points = self._known(reason, sides)
+            curve = points if count else ()
         causal, ended = np.nan, None
         if self.beyond is not None:
             try:
                 with self.tools.deadline.enforced():
                     causal, ended = self.beyond(self.results)
-            except KeyboardInterrupt as pressed:
-                self.tools.deadline.interrupt(pressed)
+            except KeyboardInterrupt as interrupt:
+                self.tools.deadline.interrupt(interrupt)
         status, message, feasible, infeasible = sides
         inner, outer = feasible.factor if feasible else np.nan, infeasible.factor if infeasible else np.nan
         if status == "unbounded":
@@ -226,8 +226,8 @@ class MarginSearch:
         """
         if self.scaling.sense == "largest" and self.scaling.nested and self.run(0.0).status == "infeasible":
             return Critical("never")
-        asked = self.programs, self.joined, self.scaling, self.tools, self.width
-        return critical_factor(*asked, self.told.notify, self.seen)
+        arguments = self.programs, self.joined, self.scaling, self.tools, self.width
+        return critical_factor(*arguments, self.told.notify, self.seen)
 
     def _known(self, said: str, sides: Sides | None) -> tuple[Sides, tuple[Point, ...]]:
         """Return the sides that an interrupted search knows, and every proven run on the feasible side as a curve.
@@ -235,16 +235,18 @@ class MarginSearch:
         They are both sides where these were proven before. Otherwise they are the nearest two runs of which each proves
         one side.
         """
-        proven = sorted((one for one in self.points if one.status in FEASIBLE), key=lambda one: one.factor)
+        proven = sorted((point for point in self.points if point.status in FEASIBLE), key=lambda point: point.factor)
         if sides is not None:
             return (sides[0], f"{sides[1]}; no more of the curve: {said}", *sides[2:]), tuple(proven)
-        refused = sorted((one for one in self.points if one.status == "infeasible"), key=lambda one: one.factor)
+        refused = sorted(
+            (point for point in self.points if point.status == "infeasible"), key=lambda point: point.factor
+        )
         last, first = (-1, 0) if self.scaling.sense == "largest" else (0, -1)
         feasible, infeasible = proven[last] if proven else None, refused[first] if refused else None
-        looked = [f"{answer} at {factor:.4g}" for factor, answer in sorted(self.seen.items())]
-        seems = f"; not proven: it seems {', '.join(looked)}" if looked else ""
-        none = "" if proven or refused else ", of which none proves anything" if self.points else ": nothing is proven"
-        return ("undecided", f"{said} after {len(self.points)} runs{none}{seems}", feasible, infeasible), tuple(proven)
+        attempts = [f"{answer} at {factor:.4g}" for factor, answer in sorted(self.seen.items())]
+        hint = f"; not proven: it seems {', '.join(attempts)}" if attempts else ""
+        note = "" if proven or refused else ", of which none proves anything" if self.points else ": nothing is proven"
+        return ("undecided", f"{said} after {len(self.points)} runs{note}{hint}", feasible, infeasible), tuple(proven)
 
     def _sides(self, found: Critical) -> Sides:
         largest = self.scaling.sense == "largest"
@@ -274,27 +276,29 @@ class MarginSearch:
 
     def _never(self, found: Critical) -> Sides:
         """Return the sides where nothing is feasible; the run at the most favourable factor says why."""
-        kindest = {"largest": 0.0, "smallest": self.scaling.highest}[self.scaling.sense] if self.scaling.nested else 1.0
-        refused = self.run(kindest)
-        if refused.status != "infeasible":
+        best_factor = (
+            {"largest": 0.0, "smallest": self.scaling.highest}[self.scaling.sense] if self.scaling.nested else 1.0
+        )
+        point = self.run(best_factor)
+        if point.status != "infeasible":
             words = (
-                f"nothing seems to be feasible, but the run at the factor {kindest:g} is {refused.status}:"
-                f" {refused.message}"
+                f"nothing seems to be feasible, but the run at the factor {best_factor:g} is {point.status}:"
+                f" {point.message}"
             )
             return "undecided", words, None, None
-        at = f"even at {kindest:g} " if self.scaling.nested else ""
-        return "infeasible", f"{at}nothing is feasible: {refused.message}", None, refused
+        at = f"even at {best_factor:g} " if self.scaling.nested else ""
+        return "infeasible", f"{at}nothing is feasible: {point.message}", None, point
 
     def _proven(self, factor: float, outward: float, wanted: tuple[Status, ...]) -> Point | None:
         """Return the run nearest to the critical factor whose status is one of those ``wanted`` on that side."""
         width = self.width * (max(1.0, abs(factor)) if self.scaling.affine else 1.0)
-        tried = [float(np.clip(factor + outward * step * width, 0.0, self.scaling.highest)) for step in FARTHER]
+        candidates = [float(np.clip(factor + outward * step * width, 0.0, self.scaling.highest)) for step in FARTHER]
         first = None
         if "infeasible" in wanted:  # without this test, a run too close to the critical factor would take very long
-            first = next((i for i, beside in enumerate(tried) if self._excludes(beside)), None)
-        begun = () if first is None else self.cuts
-        for beside in tried[: len(STEPS)] if first is None else tried[first:]:
-            point = self.run(beside, begun)
+            first = next((i for i, candidate in enumerate(candidates) if self._excludes(candidate)), None)
+        initial_cuts = () if first is None else self.cuts
+        for candidate in candidates[: len(STEPS)] if first is None else candidates[first:]:
+            point = self.run(candidate, initial_cuts)
             if point.status in wanted:
                 return point
         return None

@@ -27,8 +27,8 @@ def attributed(origin: str, what: str, but: tuple[type[Exception], ...] = PASSIN
     except passing:
         raise
     except BaseException as error:
-        said = named(error)
-        raise PluginError(f"{origin}: {what} raised {said}") from error
+        description = named(error)
+        raise PluginError(f"{origin}: {what} raised {description}") from error
 
 
 def asked(origin: str, what: str, question: Callable[[], object], expected: type[Answer]) -> Answer:

@@ -40,10 +40,12 @@ class Part:
 
 def _clash(first: Plugin, second: Plugin) -> str:
     """Return the error of two records with one name: their plugins, and the setting that disables one of them."""
-    who = [f"by plugin '{one.plugin}'" + (f" ({one.source})" if one.source else "") for one in (first, second)]
-    apart = [*sorted(second.switches - first.switches), *sorted(first.switches - second.switches)]
-    mend = f"disable one of them, for example {DISABLE}={apart[0]}" if apart else "rename one, or leave one out"
-    return f"{first} is registered twice, {who[0]} and {who[1]}; {mend}"
+    who = [
+        f"by plugin '{record.plugin}'" + (f" ({record.source})" if record.source else "") for record in (first, second)
+    ]
+    switches = [*sorted(second.switches - first.switches), *sorted(first.switches - second.switches)]
+    remedy = f"disable one of them, for example {DISABLE}={switches[0]}" if switches else "rename one, or leave one out"
+    return f"{first} is registered twice, {who[0]} and {who[1]}; {remedy}"
 
 
 @cache
@@ -59,8 +61,8 @@ def parts(model: type[Options]) -> dict[str, Part]:
 
 def _class(place: str) -> type:
     module, _, name = place.partition(":")
-    found: type = getattr(import_module(module), name)
-    return found
+    component_class: type = getattr(import_module(module), name)
+    return component_class
 
 
 @final
@@ -82,10 +84,10 @@ class Registry:
             self._add(record)
 
     def _add(self, record: Plugin) -> None:
-        known = self._records[record.kind]
-        if record.name in known:
-            raise UnknownPluginError(_clash(known[record.name], record))
-        known[record.name] = record
+        records = self._records[record.kind]
+        if record.name in records:
+            raise UnknownPluginError(_clash(records[record.name], record))
+        records[record.name] = record
 
     def names(self, kind: str, of: type | None = None) -> list[str]:
         """Return the registered names of a kind, sorted.
@@ -102,8 +104,8 @@ class Registry:
         list of str
             The names.
         """
-        known = self._records[record_type(kind).kind]
-        return sorted(name for name, record in known.items() if of is None or record.may_be(of))
+        records = self._records[record_type(kind).kind]
+        return sorted(name for name, record in records.items() if of is None or record.may_be(of))
 
     def records(self) -> Iterator[Plugin]:
         """Yield every record, by kind and name."""
@@ -131,11 +133,13 @@ class Registry:
         UnknownPluginError
             If there is none; the message has the most similar names and every plugin that failed.
         """
-        found = self._records[record_type(kind).kind].get(name)
-        if found is not None and (of is None or found.may_be(of)):
-            return found
-        what = kind if of is None else f"{kind} of the class {of.__name__}"
-        raise UnknownPluginError(f"no {what} is named '{name}'{nearest(name, self.names(kind, of))}{self.notes()}")
+        record = self._records[record_type(kind).kind].get(name)
+        if record is not None and (of is None or record.may_be(of)):
+            return record
+        description = kind if of is None else f"{kind} of the class {of.__name__}"
+        raise UnknownPluginError(
+            f"no {description} is named '{name}'{nearest(name, self.names(kind, of))}{self.notes()}"
+        )
 
     def check(self, kind: str, name: str, options: Mapping[str, object]) -> tuple[Options | None, list[Complaint]]:
         """Return the typed options of a component, and the errors in them.
@@ -160,17 +164,17 @@ class Registry:
 
         record = self.get(kind, name)
         model = record.options_type()
-        given, wrong = dict(options), list[Complaint]()
-        for key, part in parts(model).items():
-            entry = given.get(key, model.model_fields[key].default)
+        values, wrong = dict(options), list[Complaint]()
+        for key, component in parts(model).items():
+            entry = values.get(key, model.model_fields[key].default)
             if isinstance(entry, str | Mapping):
-                given[key], faults = self._spelt_out(part, entry)
+                values[key], faults = self._spelt_out(component, entry)
                 wrong += [fault.under((key,)) for fault in faults]
                 if faults:
-                    del given[key]  # its errors are reported already
+                    del values[key]  # its errors are reported already
         try:
             with attributed(record.origin, "checking its options", but=(SparseRobError, ValidationError)):
-                checked = model.model_validate(given, context={"registry": self})
+                checked = model.model_validate(values, context={"registry": self})
         except ValidationError as error:
             return None, [*complaints(error, model, options), *wrong]
         return (None if wrong else checked), wrong
@@ -184,8 +188,8 @@ class Registry:
             else (entry.get("name"), {key: entry[key] for key in entry if key != "name"})
         )
         if not isinstance(name, str):
-            known = ", ".join(self.names(part.kind, part.of))
-            return entry, [Complaint(("name",), f"expected the name of one of {known} (got {shown(name)})")]
+            choices = ", ".join(self.names(part.kind, part.of))
+            return entry, [Complaint(("name",), f"expected the name of one of {choices} (got {shown(name)})")]
         try:
             self.get(part.kind, name, part.of)
             checked, wrong = self.check(part.kind, name, options)
@@ -217,8 +221,8 @@ class Registry:
         if checked is None:
             raise InputError("\n".join(f"{kind} {name}: {complaint}" for complaint in wrong))
         inner = {
-            key: self._part(part, value)
-            for key, part in parts(type(checked)).items()
+            key: self._part(component, value)
+            for key, component in parts(type(checked)).items()
             if isinstance(value := getattr(checked, key), Mapping)
         }
         return self.get(kind, name).create(checked.model_copy(update=inner))
@@ -236,13 +240,13 @@ class Registry:
 
         Raises `UnknownPluginError` with the most similar names where there are none.
         """
-        found = [record for record in self.records() if name in {record.name, f"{record.kind}.{record.name}"}]
-        if not found:
-            known = {record.name for record in self.records()}
+        records = [record for record in self.records() if name in {record.name, f"{record.kind}.{record.name}"}]
+        if not records:
+            names = {record.name for record in self.records()}
             raise UnknownPluginError(
-                f"no component is named '{name}'{nearest(name.rpartition('.')[2], known)}{self.notes()}"
+                f"no component is named '{name}'{nearest(name.rpartition('.')[2], names)}{self.notes()}"
             )
-        return found
+        return records
 
     def notes(self) -> str:
         """Return the reasons why a name may be missing, one line each: plugins that failed, are disabled, or are not

@@ -174,12 +174,12 @@ class _Solver(Solver):
             )
         if claim.status != "solved":
             return claim
-        parts = {"x": program.q, "z": program.h, "y": program.b, "z_box": program.q}
-        for name, like in parts.items():
+        templates = {"x": program.q, "z": program.h, "y": program.b, "z_box": program.q}
+        for name, template in templates.items():
             value = getattr(claim, name)
-            if np.shape(value) != like.shape or np.asarray(value).dtype.kind not in "fiu":
+            if np.shape(value) != template.shape or np.asarray(value).dtype.kind not in "fiu":
                 raise PluginError(
-                    f"{self.origin}: solve claimed {name} = {short_repr(value)}, expected {like.size} numbers"
+                    f"{self.origin}: solve claimed {name} = {short_repr(value)}, expected {template.size} numbers"
                 )
         return claim
 

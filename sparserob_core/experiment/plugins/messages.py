@@ -69,14 +69,14 @@ def nearest(name: str, known: Iterable[str], below: Iterable[str] = ()) -> str:
     names = sorted(known)
     if not names:
         return "; there are none"
-    asked = str(name).lower()
-    further = {key.rpartition(".")[2]: key for key in reversed(list(below))}  # of equal names the first key
-    close = [further[asked]] if asked in further else []
-    close += difflib.get_close_matches(asked, names, n=2 - len(close), cutoff=0.6)
+    target = str(name).lower()
+    lower_keys = {key.rpartition(".")[2]: key for key in reversed(list(below))}  # of equal names the first key
+    close = [lower_keys[target]] if target in lower_keys else []
+    close += difflib.get_close_matches(target, names, n=2 - len(close), cutoff=0.6)
     if not close:
-        close = [further[last] for last in difflib.get_close_matches(asked, further, n=1, cutoff=0.6)]
-    guess = "; did you mean " + " or ".join(repr(match) for match in close) + "?" if close else ";"
-    return f"{guess} (known: {', '.join(names)})" if close else f"; known: {', '.join(names)}"
+        close = [lower_keys[last] for last in difflib.get_close_matches(target, lower_keys, n=1, cutoff=0.6)]
+    suggestion = "; did you mean " + " or ".join(repr(match) for match in close) + "?" if close else ";"
+    return f"{suggestion} (known: {', '.join(names)})" if close else f"; known: {', '.join(names)}"
 
 
 def complaints(
@@ -100,7 +100,7 @@ def complaints(
     list of Complaint
         The errors. Those of several members of a union about one key are joined by *or*.
     """
-    found: dict[Path, list[tuple[str, str]]] = {}
+    faults_by_path: dict[Path, list[tuple[str, str]]] = {}
     items = error.errors(include_url=False)
     misspelt = [item["loc"] for item in items if item["type"] == "extra_forbidden"]
     for item in items:
@@ -108,19 +108,19 @@ def complaints(
             continue  # the error of the unknown key with a similar name shows this one
         path = visible(item["loc"], data, missing=item["type"] == "missing")
         path += tuple(item.get("ctx", {}).get("below", ())) if item["type"] == COMPLAINT else ()
-        faults = found.setdefault(path, [])
+        faults = faults_by_path.setdefault(path, [])
         fault = _fault(dict(item), model, below)
         if fault not in faults:
             faults.append(fault)
-    return [Complaint(path, _joined(faults)) for path, faults in found.items()]
+    return [Complaint(path, _joined(faults)) for path, faults in faults_by_path.items()]
 
 
 def _joined(faults: list[tuple[str, str]]) -> str:
     """Return the errors of one key as one sentence; a value that several of them name stands once, at the end."""
     last = faults[-1][1]
     return " or ".join(
-        f"{wrong} (got {got})" if got and (position == len(faults) - 1 or got != last) else wrong
-        for position, (wrong, got) in enumerate(faults)
+        f"{sentence} (got {got})" if got and (position == len(faults) - 1 or got != last) else sentence
+        for position, (sentence, got) in enumerate(faults)
     )
 
 
@@ -155,10 +155,10 @@ def _fault(item: dict[str, Any], model: type[BaseModel], below: Sequence[str]) -
         case "missing":
             return "missing, and it has no default", ""
         case "extra_forbidden":
-            known = _known_keys(model, item["loc"][:-1])
-            further = below if len(item["loc"]) == 1 else ()
-            said = nearest(str(item["loc"][-1]), known, further) if known else "; it has no options"
-            return f"unknown key{said}", ""
+            keys = _known_keys(model, item["loc"][:-1])
+            lower_keys = below if len(item["loc"]) == 1 else ()
+            sentence = nearest(str(item["loc"][-1]), keys, lower_keys) if keys else "; it has no options"
+            return f"unknown key{sentence}", ""
         case "value_error":
             cause = item.get("ctx", {}).get("error")
             return str(cause), "" if isinstance(cause, InputError) and cause.got else got
@@ -170,8 +170,8 @@ def _fault(item: dict[str, Any], model: type[BaseModel], below: Sequence[str]) -
         case kind if kind in MUST_BE:
             return f"must be {MUST_BE[kind]}", got
         case _:
-            said = str(item["msg"]).replace("Input should", "should", 1).replace("should be", "must be", 1)
-            return said, got
+            sentence = str(item["msg"]).replace("Input should", "should", 1).replace("should be", "must be", 1)
+            return sentence, got
 
 
 def _known_keys(model: type[BaseModel], loc: Path) -> set[str]:
@@ -179,14 +179,14 @@ def _known_keys(model: type[BaseModel], loc: Path) -> set[str]:
     for step in loc:
         named = {inner for inner in models if inner.__name__ == step}
         inner = {
-            found
+            member
             for outer in models
             for name, field in outer.model_fields.items()
             if step in {name, field.alias}
-            for found in models_in(field.annotation)
+            for member in models_in(field.annotation)
         }
         models = named or inner or models
-    return {field.alias or name for found in models for name, field in found.model_fields.items()}
+    return {field.alias or name for member in models for name, field in member.model_fields.items()}
 
 
 def models_in(annotation: object) -> Iterator[type[BaseModel]]:

@@ -177,10 +177,10 @@ class Plugin:
             factory = self.resolved()
             options = factory if isinstance(factory, type) and issubclass(factory, Options) else Options
         self._refuse_hidden(options, self.factory)
-        taken = self.taken(options)
-        if taken:
+        reserved = self.taken(options)
+        if reserved:
             raise PluginError(
-                f"{self.origin}: the option {taken[0]!r} bears a name that the framework uses itself; rename it "
+                f"{self.origin}: the option {reserved[0]!r} bears a name that the framework uses itself; rename it "
                 f"(reserved: {', '.join(sorted(self.reserved))})"
             )
         return options
@@ -202,7 +202,7 @@ class Plugin:
         module, _, attribute = self.component.partition(":")
         kind = getattr(import_module(module), attribute)
         for key in sorted(options.model_fields):
-            owner = next((one for one in factory.__mro__ if key in vars(one)), object)
+            owner = next((base for base in factory.__mro__ if key in vars(base)), object)
             value = vars(owner).get(key)
             if inspect.isroutine(value) or inspect.isdatadescriptor(value) or (value is not None and owner is kind):
                 raise PluginError(f"{self.origin}: the option {key!r} bears a name that its class uses; rename it")

@@ -125,14 +125,14 @@ class _Loaded:
 def _load(disabled: Sequence[str], installed: Finder, hint: str = "") -> Registry:
     from sparserob_core.experiment.plugins import builtin
 
-    found, failures = [_Loaded("core", "", builtin)], list[Failure]()
+    plugins, failures = [_Loaded("core", "", builtin)], list[Failure]()
     for entry in installed(disabled, failures):
         with _noted(failures, _identity(entry)):
             module = entry.load()
             if module is not builtin:
-                found.append(_Loaded(entry.name, _source(entry), module))
+                plugins.append(_Loaded(entry.name, _source(entry), module))
     records: list[Plugin] = []
-    for plugin in found:
+    for plugin in plugins:
         with _noted(failures, plugin.name):
             records += _records(plugin)
     return Registry(records, failures, disabled, hint)
@@ -163,12 +163,12 @@ def _said(error: BaseException) -> str:
 
 
 def _entry_points(disabled: Sequence[str], failures: list[Failure]) -> list[metadata.EntryPoint]:
-    allowed = (one for one in _found(failures) if not {one.name, _distribution(one)} & set(disabled))
+    allowed = (entry for entry in _found(failures) if not {entry.name, _distribution(entry)} & set(disabled))
     return sorted(allowed, key=lambda entry: entry.name)
 
 
 def _own_entry_points(disabled: Sequence[str], failures: list[Failure]) -> list[metadata.EntryPoint]:
-    return [one for one in _entry_points(disabled, failures) if _distribution(one) == OWN]
+    return [entry for entry in _entry_points(disabled, failures) if _distribution(entry) == OWN]
 
 
 def _found(failures: list[Failure]) -> Iterator[metadata.EntryPoint]:
@@ -179,15 +179,15 @@ def _found(failures: list[Failure]) -> Iterator[metadata.EntryPoint]:
     `importlib.metadata.entry_points` would stop at the first error, which one broken folder can cause. pip writes ``~``
     in front of the name while it replaces a distribution: such a folder is a copy that was left behind.
     """
-    known = set[str]()
+    names = set[str]()
     for distribution in metadata.distributions():
-        place = getattr(distribution, "_path", None)
-        with _noted(failures, f"{place or 'a distribution'}"):
-            if place is not None and str(place.name).startswith("~"):
+        folder = getattr(distribution, "_path", None)
+        with _noted(failures, f"{folder or 'a distribution'}"):
+            if folder is not None and str(folder.name).startswith("~"):
                 raise PluginError("it is what an interrupted installation left behind; delete this folder")
             name = _normalised(distribution)
-            if name not in known:
-                known.add(name)
+            if name not in names:
+                names.add(name)
                 yield from list(distribution.entry_points.select(group=GROUP))
 
 
@@ -236,10 +236,10 @@ def _records(plugin: _Loaded) -> Sequence[Plugin]:
     manager = _free.pop() if _free else _manager()
     with attributed(who, "registering it", but=()):
         manager.register(plugin.module, name=plugin.name)
-    found = list(_yielded(plugin, who, manager.get_hookcallers(plugin.module) or []))
+    records = list(_yielded(plugin, who, manager.get_hookcallers(plugin.module) or []))
     manager.unregister(plugin.module)
     _free.append(manager)
-    return found
+    return records
 
 
 def _manager() -> pluggy.PluginManager:
@@ -262,10 +262,10 @@ def _yielded(plugin: _Loaded, who: str, callers: Sequence[pluggy.HookCaller]) ->
                 raise PluginError(
                     f"{who}: {caller.name} yielded {short_repr(record)}, expected records of type {expected.__name__}"
                 )
-            known = replace(record, plugin=plugin.name, source=plugin.source)
-            if not isinstance(known.factory, str):  # the options of a lazy factory are checked when it is imported
-                known.options_type()
-            yield known
+            copy = replace(record, plugin=plugin.name, source=plugin.source)
+            if not isinstance(copy.factory, str):  # the options of a lazy factory are checked when it is imported
+                copy.options_type()
+            yield copy
 
 
 def _refuse_unmarked(who: str, module: ModuleType, marked: set[str]) -> None:

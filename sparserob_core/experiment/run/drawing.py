@@ -86,16 +86,16 @@ def draw_run(directory: Path, plugins: Iterable[str | Path] = (), notify: Notify
     else:
         status, message = run.summary["status"], run.summary["message"]
         raise InputError(f"{directory}: there is no control in it; the status is '{status}': {message}")
-    files, refused = list[Path](), list[InputError]()
+    files, refusals = list[Path](), list[InputError]()
     for draw in drawings(experiment, stored_result(run), run.directory, worst, notify):
         try:
             files += draw()
         except InputError as error:
-            refused.append(error)
-    if refused and not files:
-        raise refused[0]
-    for one in refused:
-        logger.warning("%s", one)
+            refusals.append(error)
+    if refusals and not files:
+        raise refusals[0]
+    for refusal in refusals:
+        logger.warning("%s", refusal)
     if not files:
         raise InputError(f"{directory}: there is nothing to draw; the status is '{run.summary['status']}'")
     return files
@@ -173,28 +173,30 @@ def pictures(experiment: Experiment, result: Result) -> dict[str, Callable[[], F
     from sparserob_core.experiment.figures.landscape_figure import draw_landscape
     from sparserob_core.experiment.figures.run_figures import run_pictures
 
-    known: dict[str, Callable[[], Figure | None]] = {}
+    figures: dict[str, Callable[[], Figure | None]] = {}
     model = experiment.model
     if model is not None and result.status == "infeasible":
-        known["clash"] = lambda: clash_figure(experiment, result)
+        figures["clash"] = lambda: clash_figure(experiment, result)
     elif model is not None and result.decision is not None:
         decision, active = np.asarray(result.decision, dtype=float).ravel(), active_of(model, result.indices)
         data = figure_data(experiment, decision, active, result.history, result.cost, DRAWS, result.status)
-        known |= run_pictures(replace(data, push=switching(experiment, result)))
+        figures |= run_pictures(replace(data, push=switching(experiment, result)))
         worst = adversaries(experiment, decision)
         if worst:
-            known["adversary"] = lambda: draw_adversary(worst, data)
+            figures["adversary"] = lambda: draw_adversary(worst, data)
     trace = result.trace
     if trace is not None and np.isfinite(trace.value).any():
         title, exact = plain(experiment.title), result.status == "certified"
-        known["climb"] = lambda: draw_climb(trace, title, result.upper_bound, exact=exact, unit=_cost_unit(experiment))
+        figures["climb"] = lambda: draw_climb(
+            trace, title, result.upper_bound, exact=exact, unit=_cost_unit(experiment)
+        )
 
         def landscape() -> Figure | None:
-            found = landscape_of(Inspection(experiment.loaded, experiment), trace, title)
-            return None if found is None else draw_landscape(found)
+            landscape_data = landscape_of(Inspection(experiment.loaded, experiment), trace, title)
+            return None if landscape_data is None else draw_landscape(landscape_data)
 
-        known["landscape"] = landscape
-    return known
+        figures["landscape"] = landscape
+    return figures
 
 
 def plot(experiment: Experiment, result: Result, name: str | None) -> Figure:
@@ -223,13 +225,13 @@ def plot(experiment: Experiment, result: Result, name: str | None) -> Figure:
     from sparserob_core.experiment.figures.style import require_matplotlib, style
 
     require_matplotlib()
-    known = pictures(experiment, result)
+    figures = pictures(experiment, result)
     name = name or ("clash" if result.status == "infeasible" else "states")
-    if name not in known:
-        there = ", ".join(known) or f"none: the result is {result.status}, without a control"
-        raise InputError(path="name", expected=f"a figure that there is ({there})", got=f"{name!r}")
+    if name not in figures:
+        available = ", ".join(figures) or f"none: the result is {result.status}, without a control"
+        raise InputError(path="name", expected=f"a figure that there is ({available})", got=f"{name!r}")
     with style():
-        figure = known[name]()
+        figure = figures[name]()
     if figure is None:
         raise InputError(f"name: there is no {name} to draw: nothing can move in it")
     figure._repr_png_ = partial(_png, figure)  # type: ignore[attr-defined]  # notebooks without pyplot show it as well
@@ -270,9 +272,9 @@ def switching(experiment: Experiment, result: Result) -> Array | None:
     if result.status not in ("certified", "verified"):
         return None
     view, dual = Inspection(experiment.loaded, experiment), result.dual
-    known = Switching(view.program, view.row)
-    found = known.push(dual.cuts, dual.mu) if len(dual.cuts) or dual.mu.size else None
-    return known.push([cut for cut in result.indices if cut.multiplier > 0.0], None) if found is None else found
+    function = Switching(view.program, view.row)
+    values = function.push(dual.cuts, dual.mu) if len(dual.cuts) or dual.mu.size else None
+    return function.push([cut for cut in result.indices if cut.multiplier > 0.0], None) if values is None else values
 
 
 def _landscape(experiment: Experiment, result: Result, directory: Path, notify: Notify) -> list[Path]:
@@ -313,27 +315,30 @@ def landscape_of(
     -----
     The grid is refined until `SECONDS` are over; the finest complete grid is returned.
     """
-    mine = np.flatnonzero(trace.epsilon == trace.epsilon[-1]) if trace.epsilon.size else np.empty(0, dtype=int)
-    mine = mine[np.isfinite(trace.value[mine])]
-    if not mine.size or not trace.points.size:
+    evaluations = np.flatnonzero(trace.epsilon == trace.epsilon[-1]) if trace.epsilon.size else np.empty(0, dtype=int)
+    evaluations = evaluations[np.isfinite(trace.value[evaluations])]
+    if not evaluations.size or not trace.points.size:
         return None
-    epsilon, top = float(trace.epsilon[-1]), int(mine[np.argmax(trace.value[mine])])
+    epsilon, top = float(trace.epsilon[-1]), int(evaluations[np.argmax(trace.value[evaluations])])
     slot = inspection.relaxed_value(1, epsilon).slot
-    width, rest = slot.dimension, trace.points.shape[1] % slot.dimension
-    if rest or not np.isfinite(trace.points).all():
+    width, remainder = slot.dimension, trace.points.shape[1] % slot.dimension
+    if remainder or not np.isfinite(trace.points).all():
         raise InputError(
             f"evaluations: points: expected finite tuples of indices of {width} coordinates each, as the config says, "
-            f"got points of {trace.points.shape[1]}" + ("" if rest else ", not all finite")
+            f"got points of {trace.points.shape[1]}" + ("" if remainder else ", not all finite")
         )
     count = trace.points.shape[1] // width
-    g, tuples = inspection.relaxed_value(count, epsilon), trace.points[mine].reshape(mine.size, count, width)
+    g, tuples = (
+        inspection.relaxed_value(count, epsilon),
+        trace.points[evaluations].reshape(evaluations.size, count, width),
+    )
     anchor = trace.points[top].reshape(count, width)
     value, reach = g.at(anchor), dict[Axis, Reach]()
     pair = deciding_pair(g, anchor)
     for _ in LandscapeAxes.measure(g, anchor, pair, reach):
         pass
     axes = LandscapeAxes.over(g, count, reach=reach)
-    accepted = trace.notes.get("accepted", np.full(trace.value.size, np.nan))[mine]
+    accepted = trace.notes.get("accepted", np.full(trace.value.size, np.nan))[evaluations]
     if axes is None:
         if not moving_of(g):
             return None
@@ -349,18 +354,18 @@ def landscape_of(
             best_value=value,
             own_value=value,
             visited=tuples[:, 0, [c]],
-            visited_values=trace.value[mine],
+            visited_values=trace.value[evaluations],
             accepted=accepted,
         )
     landscape = Landscape(g, anchor, *axes.places(pair, anchor), GRID, epsilon, axes)
     _fill(landscape, notify)
-    notes = {name: column[mine] for name, column in trace.notes.items()}
+    notes = {name: column[evaluations] for name, column in trace.notes.items()}
     coordinates, (across, up, values) = list(g.coordinates), landscape.shown
     widths = (g.slot.upper - g.slot.lower)[coordinates]
     slots = deciding_slots(
-        deciding_again(g, trace.points[mine], notes, SECONDS), tuples[:, :, coordinates], widths, pair
+        deciding_again(g, trace.points[evaluations], notes, SECONDS), tuples[:, :, coordinates], widths, pair
     )
-    places = tuples[:, :, coordinates][np.arange(mine.size)[:, np.newaxis], slots]
+    places = tuples[:, :, coordinates][np.arange(evaluations.size)[:, np.newaxis], slots]
     visited = axes.of(tuple(coordinates), places)
     assert visited is not None
     return LandscapeData(
@@ -373,19 +378,19 @@ def landscape_of(
         best_value=landscape.value,
         own_value=value,
         visited=visited,
-        visited_values=trace.value[mine],
+        visited_values=trace.value[evaluations],
         accepted=accepted,
     )
 
 
 def _fill(landscape: Landscape, notify: Notify) -> None:
     """Evaluate a landscape to its finest grid, or to the one that is complete in time."""
-    began = time.monotonic()
+    start = time.monotonic()
     for complete in landscape.evaluate():
         if complete:
             size = " x ".join(str(axis.size) for axis in landscape.shown[:2])
             notify(StudyProgress(text=f"figures: the landscape of g on {size}"))
-        if landscape.level and time.monotonic() - began > SECONDS:
+        if landscape.level and time.monotonic() - start > SECONDS:
             return
 
 
@@ -393,8 +398,8 @@ def _curve(g: RelaxedValue, anchor: Array, c: int) -> tuple[Array, Array]:
     """Return the values of g of a tuple with one index along its coordinate ``c``, at `GRID` values and at its own."""
     across = np.union1d(np.linspace(g.slot.lower[c], g.slot.upper[c], GRID), anchor[0, c])
     slots, values = anchor.copy(), list[float]()
-    for to in across:
-        slots[0, c] = to
+    for value in across:
+        slots[0, c] = value
         values.append(g.at(slots))
     return across, np.nan_to_num(np.array(values), nan=-np.inf, posinf=np.inf, neginf=-np.inf)
 

@@ -198,8 +198,8 @@ class Inspection:
             if index.size == size:
                 return None
             rows = family.uncertain(index[:size])
-            part, factor = int(rows.part[cut.row]), float(rows.factor[cut.row])
-            return np.asarray(rows.g[[cut.row]].toarray()[0] + factor * (index[size:] @ rows.C[part]))
+            group, factor = int(rows.part[cut.row]), float(rows.factor[cut.row])
+            return np.asarray(rows.g[[cut.row]].toarray()[0] + factor * (index[size:] @ rows.C[group]))
         imposed = self._sampled.get(cut.family) if cut.formulation == "sampled" else family.formulated(cut.formulation)
         return None if imposed is None else imposed.rows(index[np.newaxis])[0][0, cut.row]
 
@@ -259,8 +259,10 @@ class Inspection:
         own = self.program.own_units
         program = users if own is None else imposed_program(own.program, formulation)
         if self.literal:
-            open_ = np.array([kind == "disturbance" for kind in self.kinds(self.width)])
-            program = replace(program, families=[_with_the_worst(family, open_) for family in program.families])
+            is_disturbance = np.array([kind == "disturbance" for kind in self.kinds(self.width)])
+            program = replace(
+                program, families=[_with_the_worst(family, is_disturbance) for family in program.families]
+            )
         value = TupleValue(program, RelaxedProgram(program, quickest(tools.solver), tools.regulariser), count)
         value.epsilon = epsilon if tools.regulariser is not None and np.isfinite(epsilon) else 0.0
         width, cost = value.layout.slot.dimension, 1.0 if own is None else own.cost
@@ -305,7 +307,7 @@ class Inspection:
         times = [family.index_set for family in self.program.families if not family.defines]
         lower, upper = min(float(box.lower[0]) for box in times), max(float(box.upper[0]) for box in times)
         kinds: tuple[CoordinateKind, ...] = ("time", *_repeated("disturbance", deviations))
-        far = np.full(deviations, 1.0 / TOLERANCE)  # no coefficient of a deviation is an axis: any large box will do
+        radii = np.full(deviations, 1.0 / TOLERANCE)  # no coefficient of a deviation is an axis: any large box will do
 
         def deciding() -> np.ndarray:
             weights = value.weights()
@@ -317,7 +319,7 @@ class Inspection:
             value.weights,
             lambda: np.zeros((value.weights().size, width)),
             deciding,
-            Box(np.concatenate([[lower], -far]), np.concatenate([[upper], far])),
+            Box(np.concatenate([[lower], -radii]), np.concatenate([[upper], radii])),
             ("t", *(f"w{k + 1}" for k in range(deviations))),
             kinds,
             interchangeable=False,
@@ -338,9 +340,9 @@ class Inspection:
         (a direction). They are ``xi1``, ... where there is no control problem.
         """
         kinds, problem = self.kinds(width), self.problem
-        given = iter(() if problem is None else problem.system.names)
+        parameter_names = iter(() if problem is None else problem.system.names)
         return tuple(
-            next(given)
+            next(parameter_names)
             if kind == "parameter"
             else LETTERS[kind] + ("" if kind == "time" else str(kinds[: k + 1].count(kind)))
             for k, kind in enumerate(kinds)
@@ -352,10 +354,10 @@ class Inspection:
         if problem is None:
             return tuple(_repeated("index", width))
         parameters = _repeated("parameter", problem.system.parameter_count)
-        rest = width - 1 - len(parameters)
+        count = width - 1 - len(parameters)
         if self.literal:  # in the order of LiteralConstraint: time, coefficients, then the rest of the reduced index
-            return ("time", *_repeated("disturbance", rest), *parameters)
-        return ("time", *parameters, *_repeated("direction", rest))
+            return ("time", *_repeated("disturbance", count), *parameters)
+        return ("time", *parameters, *_repeated("direction", count))
 
     @cached_property
     def _experiment(self) -> Experiment:
@@ -368,15 +370,15 @@ def _with_the_worst(family: ConstraintFamily, coefficients: np.ndarray) -> Const
 
     The rows are then the reduced ones, at the other coordinates of the index.
     """
-    reduced, literal, mine = family.reduced, family.rows, coefficients[: family.index_set.dimension]
+    reduced, literal, is_coefficient = family.reduced, family.rows, coefficients[: family.index_set.dimension]
     if reduced is None:  # no uncertainty acts on it
         return family
 
     def rows(indices: Array) -> tuple[Array, Array]:
-        at_worst = np.isnan(indices[:, mine]).any(axis=1)
+        at_worst = np.isnan(indices[:, is_coefficient]).any(axis=1)
         if not at_worst.any():
             return literal(indices)
-        G, h = reduced.rows(indices[:, ~mine])
+        G, h = reduced.rows(indices[:, ~is_coefficient])
         if not at_worst.all():
             G[~at_worst], h[~at_worst] = literal(indices[~at_worst])
         return G, h

@@ -215,8 +215,8 @@ def _notes(loaded: Loaded, result: Result, asked: bool) -> Iterator[Mapping[str,
     if not result.history:
         return  # the run ended before any component was needed
     if not asked:
-        said = "it was never asked: the worst cases of this problem are known in closed form, or nothing can be moved"
-        yield from _of(loaded, ("maximiser",), said)
+        note = "it was never asked: the worst cases of this problem are known in closed form, or nothing can be moved"
+        yield from _of(loaded, ("maximiser",), note)
     weights = [event.epsilon for event in result.history]
     searched = [] if result.trace is None else list(result.trace.epsilon)
     if not any(weight > 0.0 for weight in (*weights, *searched, result.epsilon)):
@@ -226,13 +226,15 @@ def _notes(loaded: Loaded, result: Result, asked: bool) -> Iterator[Mapping[str,
 def _on_solver(loaded: Loaded, result: Result) -> Iterator[Mapping[str, str]]:
     chosen = loaded.config.solver.name
     name = whole_name(build(loaded, "solver", loaded.config.solver), chosen)
-    reasons: dict[tuple[str, str], list[Unanswered]] = {}
-    for missed in result.unanswered:
-        reasons.setdefault((missed.kind, missed.by), []).append(missed)
-    for (kind, by), found in reasons.items():  # one note, whose number is that of the table, for all reasons together
-        why = found[0].reason if len(found) == 1 else "; ".join(f"{one.count} of them: {one.reason}" for one in found)
-        said = f"{name} did not answer {sum(one.count for one in found)} of the {kind} programs, {by} did: {why}"
-        yield from _of(loaded, ("solver",), said)
+    groups: dict[tuple[str, str], list[Unanswered]] = {}
+    for item in result.unanswered:
+        groups.setdefault((item.kind, item.by), []).append(item)
+    for (kind, by), items in groups.items():  # one note, whose number is that of the table, for all reasons together
+        reason = (
+            items[0].reason if len(items) == 1 else "; ".join(f"{item.count} of them: {item.reason}" for item in items)
+        )
+        note = f"{name} did not answer {sum(item.count for item in items)} of the {kind} programs, {by} did: {reason}"
+        yield from _of(loaded, ("solver",), note)
     if chosen != AUTO and not result.counts.get("solver_calls"):
         yield from _of(loaded, ("solver",), f"{name} was not asked: this run came to its end without a finite program")
 
@@ -243,11 +245,11 @@ def _of(loaded: Loaded, slot: Path, note: str) -> Iterator[Mapping[str, str]]:
     A complete config, such as that of a run directory, names every component. A note is then given only for one that is
     not the default.
     """
-    place, written = loaded.place(slot), loaded.config.plain()
+    location, written = loaded.place(slot), loaded.config.plain()
     if set(written) <= set(loaded.source.data) and written[str(slot[0])]["name"] == _default(slot):
-        place = None
-    if place is not None:
-        yield {"key": dotted((*slot, "name")), "place": place, "note": note}
+        location = None
+    if location is not None:
+        yield {"key": dotted((*slot, "name")), "place": location, "note": note}
 
 
 def _default(slot: Path) -> str:

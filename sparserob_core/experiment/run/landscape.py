@@ -96,15 +96,15 @@ class Landscape:
     def __post_init__(self) -> None:
         self._open = np.array([kind == "disturbance" for kind in self.g.kinds])
         heads = (self.first[0], self.second[0])
-        plain = [k for k in range(self.g.slot.dimension) if not self._open[k] and k != self.first[1]]
-        alike = bool((self.anchor[heads[0], plain] == self.anchor[heads[1], plain]).all())
+        coordinates = [k for k in range(self.g.slot.dimension) if not self._open[k] and k != self.first[1]]
+        is_equal = bool((self.anchor[heads[0], coordinates] == self.anchor[heads[1], coordinates]).all())
         # the axes are one coordinate of two indices that can be exchanged: each value holds for both orders
-        self._mirrored = self.first[1] == self.second[1] and alike and self.g.interchangeable
-        one, other = self._axis(self.first), self._axis(self.second)
-        self.axes, self._bases, self._always = (one[0], other[0]), (one[1], other[1]), (one[2], other[2])
+        self._mirrored = self.first[1] == self.second[1] and is_equal and self.g.interchangeable
+        across, up = self._axis(self.first), self._axis(self.second)
+        self.axes, self._bases, self._always = (across[0], up[0]), (across[1], up[1]), (across[2], up[2])
         self.at = (
-            int(np.searchsorted(one[0], self.anchor[self.first])),
-            int(np.searchsorted(other[0], self.anchor[self.second])),
+            int(np.searchsorted(across[0], self.anchor[self.first])),
+            int(np.searchsorted(up[0], self.anchor[self.second])),
         )
         self._moving = [[k for k in range(len(self.anchor)) if self._beside(k, heads) == head] for head in heads]
         self._found: dict[tuple[float, float], float] = {}
@@ -113,11 +113,13 @@ class Landscape:
     def _beside(self, slot: int, heads: tuple[int, int]) -> int:
         """Return the head to which an index is `NEAR` and with which it moves; -1 where there is none."""
         widths = np.where(self.g.slot.upper > self.g.slot.lower, self.g.slot.upper - self.g.slot.lower, np.inf)
-        away = {head: (np.abs(self.anchor[slot] - self.anchor[head]) / widths)[~self._open].max() for head in heads}
+        distances = {
+            head: (np.abs(self.anchor[slot] - self.anchor[head]) / widths)[~self._open].max() for head in heads
+        }
         if not self.g.interchangeable:
             return slot if slot in heads else -1
-        nearest = slot if slot in heads else min(heads, key=lambda head: away[head])
-        return nearest if away[nearest] < NEAR else -1
+        nearest = slot if slot in heads else min(heads, key=lambda head: distances[head])
+        return nearest if distances[nearest] < NEAR else -1
 
     def _axis(self, place: Place) -> tuple[Array, np.ndarray, np.ndarray]:
         """Return the values along an axis, those of them in the even grid, and those of the anchor.
@@ -126,13 +128,15 @@ class Landscape:
         value of the even grid that is close to the anchor is moved onto it.
         """
         even = np.linspace(self.g.slot.lower[place[1]], self.g.slot.upper[place[1]], self.grid)
-        through = np.unique([self.anchor[at] for at in ((self.first, self.second) if self._mirrored else (place,))])
-        for value in through:
+        anchor_values = np.unique(
+            [self.anchor[at] for at in ((self.first, self.second) if self._mirrored else (place,))]
+        )
+        for value in anchor_values:
             nearest = int(np.abs(even - value).argmin())
             if abs(even[nearest] - value) < CLOSE * (even[-1] - even[0]) / self.grid:
                 even[nearest] = value
-        values = np.union1d(even, through)
-        return values, np.searchsorted(values, even), np.searchsorted(values, through)
+        values = np.union1d(even, anchor_values)
+        return values, np.searchsorted(values, even), np.searchsorted(values, anchor_values)
 
     @property
     def strides(self) -> tuple[int, ...]:
@@ -142,11 +146,11 @@ class Landscape:
     def lines(self, stride: int) -> tuple[np.ndarray, np.ndarray]:
         """Return the positions on either axis of the grid with a stride; the ends and the anchor always belong
         to it."""
-        one, other = (
+        across, up = (
             np.union1d(base[np.union1d(np.arange(0, self.grid, stride), [self.grid - 1])], always)
             for base, always in zip(self._bases, self._always, strict=True)
         )
-        return one, other
+        return across, up
 
     def evaluate(self) -> Iterator[bool]:
         """Evaluate one point at each step, the anchor first; yields ``True`` where a level has become complete."""
@@ -154,9 +158,9 @@ class Landscape:
         yield False
         for stride in self.strides:
             across, up = self.lines(stride)
-            for turn, i in enumerate(across):
+            for number, i in enumerate(across):
                 # the next point is a neighbour of the last one, whose optimum is a good start
-                for j in up if turn % 2 == 0 else up[::-1]:
+                for j in up if number % 2 == 0 else up[::-1]:
                     if np.isnan(self.values[i, j]):
                         self._fill(int(i), int(j))
                         yield False
@@ -173,15 +177,15 @@ class Landscape:
     def reach(self) -> Reach:
         """The change of g along ``first``, from the values that `cross` has evaluated."""
         values = self.values[:, self.at[1]]
-        known = values[np.isfinite(values)]
-        return float(np.mean(values == np.inf)), float(np.ptp(known)) if known.size else 0.0
+        finite = values[np.isfinite(values)]
+        return float(np.mean(values == np.inf)), float(np.ptp(finite)) if finite.size else 0.0
 
     def _fill(self, i: int, j: int) -> None:
-        to = self._order(float(self.axes[0][i]), float(self.axes[1][j]))
-        if to not in self._found:
-            self._found[to] = self.g.at(self._tuple(to))
+        point = self._order(float(self.axes[0][i]), float(self.axes[1][j]))
+        if point not in self._found:
+            self._found[point] = self.g.at(self._tuple(point))
             self.spent += 1
-        value = self._found[to]
+        value = self._found[point]
         self.values[i, j] = value if not np.isnan(value) else -np.inf
 
     def _order(self, one: float, other: float) -> tuple[float, float]:
@@ -218,8 +222,8 @@ class Landscape:
     def limits(self) -> tuple[float, float]:
         """The smallest and the largest finite value of the complete grid; both NaN where there is none."""
         values = self.shown[2]
-        known = values[np.isfinite(values)]
-        return (float(known.min()), float(known.max())) if known.size else (np.nan, np.nan)
+        finite = values[np.isfinite(values)]
+        return (float(finite.min()), float(finite.max())) if finite.size else (np.nan, np.nan)
 
     @property
     def flat(self) -> bool:
@@ -237,8 +241,8 @@ class Landscape:
         shares = []
         for axis in (across, up):
             even = axis[0] + (axis[-1] - axis[0]) * (np.arange(size) + 0.5) / size
-            left = np.clip(np.searchsorted(axis, even, side="right") - 1, 0, axis.size - 2)
-            shares.append((left, (even - axis[left]) / (axis[left + 1] - axis[left])))
+            cells = np.clip(np.searchsorted(axis, even, side="right") - 1, 0, axis.size - 2)
+            shares.append((cells, (even - axis[cells]) / (axis[cells + 1] - axis[cells])))
         (i, s), (j, t) = shares
         s, t = s[:, np.newaxis], t[np.newaxis, :]
         corners = [values[np.ix_(i + di, j + dj)] for di, dj in ((0, 0), (1, 0), (0, 1), (1, 1))]
@@ -254,15 +258,15 @@ class Landscape:
         It is only ``t`` where a tuple has a single index. A time is followed by its ``unit``, where one is given: ``t
         of the earlier, in s``.
         """
-        (one, c), (other, k) = self.first, self.second
-        in_unit = [f", in {unit}" if unit and self.g.kinds[place] == "time" else "" for place in (c, k)]
+        (slot, c), (other_slot, k) = self.first, self.second
+        in_unit = [f", in {unit}" if unit and self.g.kinds[axis] == "time" else "" for axis in (c, k)]
         if len(self.anchor) == 1:
             return self.g.names[c] + in_unit[0], self.g.names[k] + in_unit[1]
         if c == k:
-            which = ("the earlier", "the later") if self.g.kinds[c] == "time" else ("the lower", "the upper")
+            labels = ("the earlier", "the later") if self.g.kinds[c] == "time" else ("the lower", "the upper")
         else:
-            which = ("the one", "the one" if one == other else "the other")
-        return f"{self.g.names[c]} of {which[0]}{in_unit[0]}", f"{self.g.names[k]} of {which[1]}{in_unit[1]}"
+            labels = ("the one", "the one" if slot == other_slot else "the other")
+        return f"{self.g.names[c]} of {labels[0]}{in_unit[0]}", f"{self.g.names[k]} of {labels[1]}{in_unit[1]}"
 
 
 @final
@@ -315,12 +319,12 @@ class LandscapeAxes:
             If there is no coordinate of that name, or one is named twice.
         """
         if named is not None:
-            one, other = (coordinate(name, g) for name in named)
-            if one == other:
+            first, second = (coordinate(name, g) for name in named)
+            if first == second:
                 raise InputError(f"landscape: coordinates: expected two, got {named[0]!r} twice")
-            return cls((one[0], other[0]), (one[1], other[1]))
-        known = reach or {}
-        axes = sorted(axes_of(g, count), key=lambda axis: known.get(axis, (0.0, 0.0)), reverse=True)
+            return cls((first[0], second[0]), (first[1], second[1]))
+        changes = reach or {}
+        axes = sorted(axes_of(g, count), key=lambda axis: changes.get(axis, (0.0, 0.0)), reverse=True)
         if len(axes) < 2:
             return None
         (rank, c), (next_rank, k) = sorted(axes[:2], key=lambda axis: axis[::-1])
@@ -345,8 +349,8 @@ class LandscapeAxes:
         """
         axes = axes_of(g, 1 if pair[0] == pair[1] else 2)
         for rank, c in axes if len(axes) > 2 else ():
-            other = next((r, k) for r, k in axes if (r, k) != (rank, c))
-            line = Landscape(g, anchor, (pair[rank], c), (pair[other[0]], other[1]), PROBES)
+            other_axis = next((r, k) for r, k in axes if (r, k) != (rank, c))
+            line = Landscape(g, anchor, (pair[rank], c), (pair[other_axis[0]], other_axis[1]), PROBES)
             yield from line.cross()
             reach[rank, c] = line.reach
 
@@ -366,8 +370,8 @@ class LandscapeAxes:
             The places of the axis to the right and of the axis upwards. Where both are the same coordinate, the index
             with the smaller value is to the right.
         """
-        one, other = ((pair[rank], c) for rank, c in zip(self.ranks, self.coordinates, strict=True))
-        return (other, one) if self.orders and anchor[other] < anchor[one] else (one, other)
+        first, second = ((pair[rank], c) for rank, c in zip(self.ranks, self.coordinates, strict=True))
+        return (second, first) if self.orders and anchor[second] < anchor[first] else (first, second)
 
     def of(self, told: tuple[int, ...], places: Array) -> Array | None:
         """Return the points of the map at the places of two indices.
@@ -411,8 +415,8 @@ def coordinate(name: str, g: RelaxedValue) -> tuple[int, int]:
 
     A name with ``[2]`` is that of the index that decides second. Raises `InputError` where there is no such name.
     """
-    letter, bracket, rest = name.partition("[")
-    number = rest.removesuffix("]") if bracket else "1"
+    letter, bracket, suffix = name.partition("[")
+    number = suffix.removesuffix("]") if bracket else "1"
     if letter not in g.names or number not in ("1", "2"):
         raise InputError(
             f"landscape: coordinates: there is no {name!r}; expected one of {', '.join(g.names[:6])}"
@@ -461,9 +465,9 @@ def two_of(ranked: Sequence[int] | np.ndarray, slots: Array, widths: Array, othe
     tuple of int
         The two indices; the same one twice where there is only one.
     """
-    first, *rest = [int(k) for k in ranked if k >= 0] or [int(others[0])]
-    apart = [k for k in rest if np.abs((slots[k] - slots[first]) / widths).max() > NEAR]
-    second = next((k for k in (*apart, *others, *rest, *range(len(slots))) if k != first), first)
+    first, *lower_ranked = [int(k) for k in ranked if k >= 0] or [int(others[0])]
+    distinct = [k for k in lower_ranked if np.abs((slots[k] - slots[first]) / widths).max() > NEAR]
+    second = next((k for k in (*distinct, *others, *lower_ranked, *range(len(slots))) if k != first), first)
     return first, int(second)
 
 
@@ -488,18 +492,18 @@ def deciding_slots(deciding: np.ndarray, tuples: Array, widths: Array, pair: tup
     """
     rows, first = np.arange(len(tuples)), deciding[:, 0]
     heads = tuples[rows, first]  # of a row in which nothing decides it is any index, and not used
-    apart = np.abs((tuples[rows[:, np.newaxis], deciding] - heads[:, np.newaxis]) / widths).max(axis=2) > NEAR
-    apart &= deciding >= 0
-    second = np.where(apart.any(axis=1), deciding[rows, apart.argmax(axis=1)], -1)
-    found = list[tuple[int, int]]()
-    for row, (most, next_most) in enumerate(zip(first.tolist(), second.tolist(), strict=True)):
-        if most >= 0 and next_most < 0:  # one decides alone, or all that decide stand for the same constraint
-            next_most = next((k for k in pair if k != most), -1)
-        if most >= 0 and next_most < 0:
-            most, next_most = two_of(deciding[row], tuples[row], widths, pair)
-        pair = (most, next_most) if most >= 0 else pair
-        found.append(pair)
-    return np.array(found, dtype=int).reshape(-1, 2)
+    is_distinct = np.abs((tuples[rows[:, np.newaxis], deciding] - heads[:, np.newaxis]) / widths).max(axis=2) > NEAR
+    is_distinct &= deciding >= 0
+    second = np.where(is_distinct.any(axis=1), deciding[rows, is_distinct.argmax(axis=1)], -1)
+    pairs = list[tuple[int, int]]()
+    for row, (first_slot, second_slot) in enumerate(zip(first.tolist(), second.tolist(), strict=True)):
+        if first_slot >= 0 and second_slot < 0:  # one decides alone, or all that decide stand for the same constraint
+            second_slot = next((k for k in pair if k != first_slot), -1)
+        if first_slot >= 0 and second_slot < 0:
+            first_slot, second_slot = two_of(deciding[row], tuples[row], widths, pair)
+        pair = (first_slot, second_slot) if first_slot >= 0 else pair
+        pairs.append(pair)
+    return np.array(pairs, dtype=int).reshape(-1, 2)
 
 
 def deciding_again(g: RelaxedValue, points: Array, notes: Mapping[str, Array], seconds: float) -> np.ndarray:
@@ -509,12 +513,12 @@ def deciding_again(g: RelaxedValue, points: Array, notes: Mapping[str, Array], s
     No run directory keeps them. The tuples that the search accepted are evaluated once more for some ``seconds``, the
     last ones first.
     """
-    found = np.full((len(points), DECIDING), -1)
+    deciding = np.full((len(points), DECIDING), -1)
     accepted = notes.get("accepted", np.ones(len(points))) > 0.0
     end = time.monotonic() + seconds
     for row in np.flatnonzero(accepted)[::-1]:
         if time.monotonic() > end:
             break
         g.at(points[row].reshape(-1, g.slot.dimension))
-        found[row] = g.deciding()
-    return found
+        deciding[row] = g.deciding()
+    return deciding

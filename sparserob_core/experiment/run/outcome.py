@@ -67,14 +67,14 @@ class Asked:
 
     def source(self) -> Source:
         """Return the config with the same meaning; raises `InputError` where there is none."""
-        registry, beside = load_registry(), dict(self.rest)
+        registry, keys = load_registry(), dict(self.rest)
         for kind, choice in self.choices.items():
-            beside[kind] = None if choice is None else component_keys(registry, kind, choice)
-        beside["maximiser"] = {**beside["maximiser"], **beside.pop("search")}
-        beside["dictionaries"] = {
-            which: dictionary_keys(registry, which, choice) for which, choice in self.dictionaries.items()
+            keys[kind] = None if choice is None else component_keys(registry, kind, choice)
+        keys["maximiser"] = {**keys["maximiser"], **keys.pop("search")}
+        keys["dictionaries"] = {
+            signal: dictionary_keys(registry, signal, choice) for signal, choice in self.dictionaries.items()
         }
-        return source_of(self.problem, beside)
+        return source_of(self.problem, keys)
 
 
 @final
@@ -117,9 +117,9 @@ class SolvedProblem(ControlResult):
         """
         loaded = experiment.loaded
         stated = Source(loaded.source.name, loaded.source.folder, loaded.config.plain())
-        made = SolvedProblem.asked(result, experiment.transcription, stated, causal)
-        made.__dict__["experiment"] = experiment
-        return made
+        solved = SolvedProblem.asked(result, experiment.transcription, stated, causal)
+        solved.__dict__["experiment"] = experiment
+        return solved
 
     @staticmethod
     def asked(
@@ -143,8 +143,8 @@ class SolvedProblem(ControlResult):
         SolvedProblem
             The result.
         """
-        known = {one.name: getattr(result, one.name) for one in fields(Result)}
-        return SolvedProblem(**known, model=model, causal=causal, origin=origin)
+        values = {entry.name: getattr(result, entry.name) for entry in fields(Result)}
+        return SolvedProblem(**values, model=model, causal=causal, origin=origin)
 
     @cached_property
     def experiment(self) -> ControlExperiment:
@@ -213,8 +213,8 @@ class SolvedProblem(ControlResult):
 
     @property
     def _loaded(self) -> Loaded:
-        known = self.__dict__.get("experiment")
-        return load_config(_source(self.origin)) if known is None else known.loaded
+        experiment = self.__dict__.get("experiment")
+        return load_config(_source(self.origin)) if experiment is None else experiment.loaded
 
     def _saved(self, path: Path, figures: bool) -> Outcome:
         experiment = self.experiment
@@ -252,8 +252,8 @@ class SolvedProblem(ControlResult):
 
     def __reduce__(self) -> tuple[Callable[..., Any], tuple[Any, ...]]:
         model = self.model
-        given = (model.problem, model.control, model.disturbance, model.formulation, model.policy)
-        return _reread, (self.plain, *given, self.causal, self.origin)
+        arguments = (model.problem, model.control, model.disturbance, model.formulation, model.policy)
+        return _reread, (self.plain, *arguments, self.causal, self.origin)
 
 
 def concluded(experiment: Experiment, result: Result, tools: Tools, notify: Notify = ignore) -> Result:
@@ -285,12 +285,12 @@ def concluded(experiment: Experiment, result: Result, tools: Tools, notify: Noti
     if result.sparsest is None:
         result = attempt(lambda: bounded(experiment, result, tools.deadline), lambda: unbounded(result))
     notify(StudyProgress(text="fewest active: how little any admissible control must act", phase=True))
-    known = attempt(lambda: with_activity(experiment, result, tools), lambda: result).accounted(tools.solver)
+    bounded_result = attempt(lambda: with_activity(experiment, result, tools), lambda: result).accounted(tools.solver)
     notify(StudyProgress(text="causal bound: what no causal policy can do", phase=True))
-    solved = SolvedProblem.run(known, experiment)
-    concluding = attempt(lambda: with_causal(solved, tools), lambda: solved)
-    concluding.__dict__["experiment"] = experiment
-    return concluding
+    solved = SolvedProblem.run(bounded_result, experiment)
+    conclusion = attempt(lambda: with_causal(solved, tools), lambda: solved)
+    conclusion.__dict__["experiment"] = experiment
+    return conclusion
 
 
 def _source(origin: Source | Asked) -> Source:
@@ -390,8 +390,8 @@ class Outcome:
         return self.result
 
     def __repr__(self) -> str:
-        said = [f"  {name}: {value}" for name, value in result_rows(self.summary)[:ROWS]]
-        return "\n".join([f"Outcome of {self.experiment.title!r} in {self.directory}", *said])
+        lines = [f"  {name}: {value}" for name, value in result_rows(self.summary)[:ROWS]]
+        return "\n".join([f"Outcome of {self.experiment.title!r} in {self.directory}", *lines])
 
     def _repr_html_(self) -> str:
         """Return the table of the run and the figure of its control, for notebooks."""

@@ -77,8 +77,8 @@ def replay(
         raise InputError(f"{directory}: expected a finished run, got one that is still going on or was killed")
     title = printable(run.summary["title"] or run.directory.name)
     inspection, result = Inspection(run.config(plugins)), stored_result(run)
-    said = play(events(inspection, title, run.directory, result), save=save, serve=serve, connect=connect)
-    for line in said:
+    sentences = play(events(inspection, title, run.directory, result), save=save, serve=serve, connect=connect)
+    for line in sentences:
         remark(line)
     return run.directory
 
@@ -148,8 +148,8 @@ def stored_result(run: StoredRun) -> Result:
             stopped=str(summary.get("stopped") or ""),
             worst=_worst(summary["worst"], solution),
             proofs=[
-                Proof(str(name), "proven", _number(one, "proven"))
-                for name, one in summary.get("tolerances", {}).items()
+                Proof(str(name), "proven", _number(tolerance, "proven"))
+                for name, tolerance in summary.get("tolerances", {}).items()
             ],
             counts={str(name): int(count) for name, count in summary["counts"].items() if isinstance(count, int)},
             scenario_bound=None
@@ -171,13 +171,13 @@ def _worst(said: Mapping[str, Any], solution: Mapping[str, Array]) -> WorstConst
     """Return the worst constraint; its index is empty, since no file keeps it."""
     if said.get("violation") is None:
         return None
-    violation, constraint, nowhere = float(said["violation"]), str(said["constraint"]), np.empty(0)
+    violation, constraint, no_index = float(said["violation"]), str(said["constraint"]), np.empty(0)
     if said.get("time") is None:
-        return WorstConstraint(violation, constraint, nowhere)
+        return WorstConstraint(violation, constraint, no_index)
     return Witness(
         violation,
         constraint,
-        nowhere,
+        no_index,
         time=float(said["time"]),
         parameter=None if said.get("parameter") is None else np.asarray(said["parameter"], dtype=float),
         disturbance=solution.get("worst_disturbance"),
@@ -196,58 +196,59 @@ def _searches(trace: SearchTrace, inspection: Inspection) -> Iterator[tuple[int,
     The events have the tuples of indices as far as these were kept.
     """
     size, width = trace.points.shape[1], inspection.width
-    whole = bool(size) and size % width == 0 and inspection.program.spread is None
+    has_tuples = bool(size) and size % width == 0 and inspection.program.spread is None
     for outer in np.unique(trace.outer):
-        which = np.flatnonzero(trace.outer == outer)
-        values, seconds = trace.value[which], trace.seconds[which] - trace.seconds[which[0]]
-        points, notes = trace.points[which], {name: column[which] for name, column in trace.notes.items()}
+        evaluations = np.flatnonzero(trace.outer == outer)
+        values, seconds = trace.value[evaluations], trace.seconds[evaluations] - trace.seconds[evaluations[0]]
+        points, notes = trace.points[evaluations], {name: column[evaluations] for name, column in trace.notes.items()}
         ranked = np.where(np.isnan(values), -np.inf, values)
         domain, deciding = None, np.zeros((0, DECIDING), dtype=int)
         coordinates: tuple[int, ...] = ()
-        if whole:
-            g = inspection.relaxed_value(size // width, float(trace.epsilon[which[0]]))
+        if has_tuples:
+            g = inspection.relaxed_value(size // width, float(trace.epsilon[evaluations[0]]))
             domain = Box(np.tile(g.slot.lower, size // width), np.tile(g.slot.upper, size // width))
             coordinates, deciding = g.coordinates, deciding_again(g, points, notes, DECIDING_SECONDS)
-        best, done = np.maximum.accumulate(ranked), 0
-        batches = min(which.size, max(1, BATCHES * which.size // trace.outer.size))
-        walked = int((~trace.polished[which]).sum())
-        ends = [part[-1] + 1 for part in np.array_split(np.arange(which.size), batches)]
-        for part in np.split(np.arange(which.size), sorted({*ends, walked} - {0, which.size})):
-            before, stood = -np.inf if not done else float(best[done - 1]), _standing(notes, done)
-            moments = [(1, float(moment)) for moment in seconds[part]]
-            said = {
-                name: [(k + 1.0, column[k]) for k in part if not np.isnan(column[k])] for name, column in notes.items()
+        best, total = np.maximum.accumulate(ranked), 0
+        batches = min(evaluations.size, max(1, BATCHES * evaluations.size // trace.outer.size))
+        search_size = int((~trace.polished[evaluations]).sum())
+        ends = [indices[-1] + 1 for indices in np.array_split(np.arange(evaluations.size), batches)]
+        for indices in np.split(np.arange(evaluations.size), sorted({*ends, search_size} - {0, evaluations.size})):
+            previous_best, standing = -np.inf if not total else float(best[total - 1]), _standing(notes, total)
+            moments = [(1, float(moment)) for moment in seconds[indices]]
+            note_points = {
+                name: [(k + 1.0, column[k]) for k in indices if not np.isnan(column[k])]
+                for name, column in notes.items()
             }
             batch = Batch(
-                points=[points[part]],
-                values=[values[part]],
+                points=[points[indices]],
+                values=[values[indices]],
                 moments=moments,
-                notes={name: rows for name, rows in said.items() if rows},
-                first=done,
-                best=before,
-                origin=points[stood] if size and done else None,
-                stood=float(values[stood]) if done else np.nan,
+                notes={name: rows for name, rows in note_points.items() if rows},
+                first=total,
+                best=previous_best,
+                origin=points[standing] if size and total else None,
+                stood=float(values[standing]) if total else np.nan,
             )
-            done = int(part[-1]) + 1
-            top = int(ranked[:done].argmax())
+            total = int(indices[-1]) + 1
+            best_index = int(ranked[:total].argmax())
             yield (
                 int(outer) + 1,
                 EvaluationsFinished(
-                    count=part.size,
-                    total=done,
-                    best_value=float(best[done - 1]),
-                    seconds=float(seconds[part[-1]]),
-                    budget=which.size,
-                    best_point=points[top],
+                    count=indices.size,
+                    total=total,
+                    best_value=float(best[total - 1]),
+                    seconds=float(seconds[indices[-1]]),
+                    budget=evaluations.size,
+                    best_point=points[best_index],
                     block=width if size and size % width == 0 else max(1, size),
-                    phase="polish" if part[0] >= walked else "search",
+                    phase="polish" if indices[0] >= search_size else "search",
                     round=int(outer) + 1,
-                    epsilon=float(trace.epsilon[which[0]]),
-                    lower_bound=float(trace.bound[which[part[-1]]]),
+                    epsilon=float(trace.epsilon[evaluations[0]]),
+                    lower_bound=float(trace.bound[evaluations[indices[-1]]]),
                     batch=batch,
                     domain=domain,
                     coordinates=coordinates,
-                    deciding=deciding[part] if whole else deciding,
+                    deciding=deciding[indices] if has_tuples else deciding,
                 ),
             )
 
@@ -258,5 +259,5 @@ def _standing(notes: Mapping[str, np.ndarray], done: int) -> int:
     It is the last one that was accepted or, where none was, the last one of all.
     """
     accepted = notes.get("accepted")
-    taken = np.zeros(0, dtype=int) if accepted is None else np.flatnonzero(accepted[:done] > 0.0)
-    return int(taken[-1]) if taken.size else done - 1
+    accepted_indices = np.zeros(0, dtype=int) if accepted is None else np.flatnonzero(accepted[:done] > 0.0)
+    return int(accepted_indices[-1]) if accepted_indices.size else done - 1

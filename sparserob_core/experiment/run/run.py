@@ -162,12 +162,12 @@ def _run(
                 with deadline.enforced():
                     result = solve_in_own_units(method, experiment.program, _notifying(tools, broadcast))
                     result = result.accounted(tools.solver)
-            except KeyboardInterrupt as pressed:  # a method that returns no result when it is interrupted
-                said = deadline.interrupt(pressed)
-                result = journal.known(said, time.perf_counter() - started)
-                if result is None and not isinstance(pressed, OutOfTime):
+            except KeyboardInterrupt as interrupt:  # a method that returns no result when it is interrupted
+                reason = deadline.interrupt(interrupt)
+                result = journal.known(reason, time.perf_counter() - started)
+                if result is None and not isinstance(interrupt, OutOfTime):
                     raise
-                result = result or Result(status="undecided", message=f"{said}; {more(deadline)}", stopped=said)
+                result = result or Result(status="undecided", message=f"{reason}; {more(deadline)}", stopped=reason)
             result = concluded(experiment, result, tools, broadcast)
             ending = RunFinished(
                 status=result.status,

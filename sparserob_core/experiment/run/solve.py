@@ -181,7 +181,7 @@ def solve(
 
     result = with_final_states(model, result, getattr(chosen, "tolerance", None))
     result = remarked(model.problem, result, model.feedback is not None)
-    asked = Asked(
+    arguments = Asked(
         problem=model.stated,
         choices={
             "method": _with_tolerance(registry, method, tolerance),
@@ -205,7 +205,7 @@ def solve(
             "seed": int(seed),
         },
     )
-    return SolvedProblem.asked(result, model, asked)
+    return SolvedProblem.asked(result, model, arguments)
 
 
 def _announced(problem: OptimalControlProblem, deadline: Deadline) -> Deadline:
@@ -215,10 +215,10 @@ def _announced(problem: OptimalControlProblem, deadline: Deadline) -> Deadline:
     """
     from sparserob_core.control.transcription.provable import SECONDS, announced, unprovable
 
-    why = unprovable(problem)
-    if why is None:
+    reason = unprovable(problem)
+    if reason is None:
         return deadline
-    logger.warning("no control of this problem can be certified: %s", announced(why, deadline.bounded))
+    logger.warning("no control of this problem can be certified: %s", announced(reason, deadline.bounded))
     return deadline if deadline.bounded else Deadline(SECONDS)
 
 

@@ -67,8 +67,8 @@ def recorded(observer: Observer, save: str | Path | None) -> tuple[str, ...]:
     for."""
     if save is None:
         return ()
-    why = observer.incomplete.partition(" is not a complete recording: ")[2] or observer.incomplete
-    return (f"{save} is not complete: {why}" if why else f"recorded into {save}",)
+    reason = observer.incomplete.partition(" is not a complete recording: ")[2] or observer.incomplete
+    return (f"{save} is not complete: {reason}" if reason else f"recorded into {save}",)
 
 
 def _writable(file: Path) -> Path:
@@ -81,11 +81,11 @@ def _writable(file: Path) -> Path:
         raise InputError(f"save: expected a file, got the directory {file}")
     if path.is_file() and path.stat().st_size:
         raise InputError(path="save", expected="a new file, or an empty one", got=f"{file}, which holds something")
-    there = path.exists()
+    existed = path.exists()
     try:
         with path.open("ab"):
             pass
-        if not there:  # a command that fails at its config must leave no file behind
+        if not existed:  # a command that fails at its config must leave no file behind
             path.unlink()
     except OSError as error:
         raise InputError(f"save: {file} cannot be written to: {error.strerror}") from error

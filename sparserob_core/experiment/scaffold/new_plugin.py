@@ -34,7 +34,7 @@ def new_plugin(kind: str, name: str, out: str | Path = ".") -> Path:
     installed component, plugin or module, and for a folder that exists, or cannot be written: nothing of the package
     is left then.
     """
-    spelt = {one.replace("_", "-"): one for one in kinds()}
+    spelt = {known_kind.replace("_", "-"): known_kind for known_kind in kinds()}
     if kind.replace("_", "-") not in spelt:
         raise InputError(path="kind", expected=f"one of {', '.join(spelt)}", got=repr(kind))
     chosen = spelt[kind.replace("_", "-")]
@@ -56,9 +56,9 @@ def new_plugin(kind: str, name: str, out: str | Path = ".") -> Path:
     texts = {**_files(PACKAGE, words), **_files(chosen, words)}
     try:
         for path, text in texts.items():
-            place = folder / path
-            place.parent.mkdir(parents=True, exist_ok=True)
-            place.write_text(text, encoding="utf-8", newline="\n")
+            file = folder / path
+            file.parent.mkdir(parents=True, exist_ok=True)
+            file.write_text(text, encoding="utf-8", newline="\n")
     except OSError as error:
         rmtree(folder, ignore_errors=True)
         got = f"{out}: {error.strerror}"
@@ -67,38 +67,45 @@ def new_plugin(kind: str, name: str, out: str | Path = ".") -> Path:
 
 
 def kinds() -> list[str]:
-    """What a package can be begun with: the kinds of components, in the order of the hooks; for rules the `RULES`."""
-    return [one for kind in RECORDS for one in (RULES if kind == "rule" else (kind,))]
+    """Return the kinds of components of which a package can be made, in the order of the hooks; for rules the
+    `RULES`."""
+    return [name for kind in RECORDS for name in (RULES if kind == "rule" else (kind,))]
 
 
 def _check_name(kind: str, name: str) -> None:
-    said = f"{name!r}"
+    quoted_name = f"{name!r}"
     if not re.fullmatch(r"[a-z][a-z0-9]*(_[a-z0-9]+)*", name) or len(name) > LONGEST:
         raise InputError(
             path="name",
             expected=f"lower-case letters, digits and single underscores, a letter first, at most {LONGEST} of them",
-            got=said,
+            got=quoted_name,
         )
     registry = load_registry()
     if name in registry.names(kind):
-        taken = registry.get(kind, name)
-        raise InputError(path="name", expected=f"a name that no {kind} has", got=f"{said}, which is {taken.origin}")
-    plugins = {one.plugin: one.source for one in registry.records()}
+        existing = registry.get(kind, name)
+        raise InputError(
+            path="name", expected=f"a name that no {kind} has", got=f"{quoted_name}, which is {existing.origin}"
+        )
+    plugins = {record.plugin: record.source for record in registry.records()}
     if name in plugins:
-        where = plugins[name] or "the core"
-        raise InputError(path="name", expected="a name that no plugin has", got=f"{said}, which is that of {where}")
+        owner = plugins[name] or "the core"
+        raise InputError(
+            path="name", expected="a name that no plugin has", got=f"{quoted_name}, which is that of {owner}"
+        )
     if find_spec(f"sparserob_{name}") is not None:
-        raise InputError(path="name", expected="a name that is free", got=f"{said}: there is a module sparserob_{name}")
+        raise InputError(
+            path="name", expected="a name that is free", got=f"{quoted_name}: there is a module sparserob_{name}"
+        )
 
 
 def _files(template: str, words: Mapping[str, str]) -> dict[str, str]:
     """The files that a template holds, by path, with the words put in."""
     text = (files(__package__) / "templates" / f"{template}.txt").read_text(encoding="utf-8")
     filled = Template(text).substitute(words)
-    parts = HEADING.split(filled)[1:]
-    bodies = (body.strip("\n") for body in parts[1::2])
-    return {path: f"{body}\n" if body else "" for path, body in zip(parts[::2], bodies, strict=True)}
+    sections = HEADING.split(filled)[1:]
+    bodies = (body.strip("\n") for body in sections[1::2])
+    return {path: f"{body}\n" if body else "" for path, body in zip(sections[::2], bodies, strict=True)}
 
 
 def _camel(name: str) -> str:
-    return "".join(part[:1].upper() + part[1:] for part in name.split("_"))
+    return "".join(word[:1].upper() + word[1:] for word in name.split("_"))

@@ -117,19 +117,24 @@ def simulate(
     if law == ADVERSARY:
         replayed = read_adversaries(finished.directory, model) or worst
         moments, states = propagated(model, finished.decision, replayed)
-        if (beside := ParametersInTime.of(model.stated)) is not None:
+        if (parameters_in_time := ParametersInTime.of(model.stated)) is not None:
             pairs = zip(states, replayed["directions"], strict=True)
-            states = np.stack([beside.at(one, beside.seen(direction)[None]) for one, direction in pairs])
+            states = np.stack(
+                [
+                    parameters_in_time.at(trajectory, parameters_in_time.seen(direction)[None])
+                    for trajectory, direction in pairs
+                ]
+            )
         replayed = {**replayed, "state_times": moments, "states": states}
-        found = _replayed(finished, replayed, started)
+        simulation = _replayed(finished, replayed, started)
     else:
-        found = _sampled(finished, worst, cast(LawName, law), count, seed, notify, started)
-    RunDirectory(finished.directory).write_json(f"simulation-{law}.json", found.summary())
+        simulation = _sampled(finished, worst, cast(LawName, law), count, seed, notify, started)
+    RunDirectory(finished.directory).write_json(f"simulation-{law}.json", simulation.summary())
     if out is not None and (missing := missing_matplotlib()):
-        return replace(found, undrawn=missing)
+        return replace(simulation, undrawn=missing)
     if out is not None:
-        write_simulation(Path(out), found, finished, replayed)
-    return found
+        write_simulation(Path(out), simulation, finished, replayed)
+    return simulation
 
 
 def _sampled(
@@ -143,45 +148,52 @@ def _sampled(
 ) -> Simulation:
     model = finished.experiment.transcription
     response, parameters = model.response, model.parameters
-    acting, beside = _Acting(), ParametersInTime.of(model.stated)
+    acting, parameters_in_time = _Acting(), ParametersInTime.of(model.stated)
     ends = [moment for constraint in model.constraints for moment in (constraint.start, constraint.stop)]
     times = fine_times(response, parameters, np.concatenate([ends, worst.get("times", np.zeros(0))]))
     fine = Response(response.system, finer(response.grid, times), response.initial_state)
     shown = np.unique(np.linspace(0, times.size - 1, min(times.size, SHOWN)).round().astype(int))
-    known = tuple(worst[name] for name in ("times", "directions", "parameters"))
-    uncertainty = Uncertainty(model.functionals, parameters, model.constraints, (known[0], known[1], known[2]))
-    counts, envelope = (
+    worst_points = tuple(worst[name] for name in ("times", "directions", "parameters"))
+    uncertainty = Uncertainty(
+        model.functionals, parameters, model.constraints, (worst_points[0], worst_points[1], worst_points[2])
+    )
+    violation_counts, envelope = (
         [
-            ViolationCount(one, times, row_units(one, model.problem.control), finished.theta.ravel())
-            for one in model.constraints
+            ViolationCount(constraint, times, row_units(constraint, model.problem.control), finished.theta.ravel())
+            for constraint in model.constraints
         ],
         _Envelope(shown, response.initial_state.size),
     )
-    rng, block, done, out = np.random.default_rng(seed), trajectories_at_once(fine, parameters.count > 0), 0, 0
-    while done < count:
-        size = min(block, count - done)
-        near = uncertainty.bases(law, size, rng)
-        disturbances, drawn, begun = uncertainty.draw(law, size, rng, near)
-        looked = None if near is None else uncertainty.directions(near)
-        here = None if beside is None else beside.draw(law, size, looked, rng)
-        seen = noises(model.noise, law, size, model.control.pieces, rng)
-        control = controlled(model, finished.decision, np.arange(response.grid.pieces), seen)
+    rng, block, simulated, violating = (
+        np.random.default_rng(seed),
+        trajectories_at_once(fine, parameters.count > 0),
+        0,
+        0,
+    )
+    while simulated < count:
+        size = min(block, count - simulated)
+        bases = uncertainty.bases(law, size, rng)
+        disturbances, drawn_parameters, initial_states = uncertainty.draw(law, size, rng, bases)
+        directions = None if bases is None else uncertainty.directions(bases)
+        parameter_rows = None if parameters_in_time is None else parameters_in_time.draw(law, size, directions, rng)
+        noise_signals = noises(model.noise, law, size, model.control.pieces, rng)
+        control = controlled(model, finished.decision, np.arange(response.grid.pieces), noise_signals)
         if callable(control):
             control = acting.of(control)
         elif (errors := uncertainty.errors(law, size, control, rng)) is not None:
             control = delivered(control, errors)
-        for one in counts:
-            one.begin(size)
-        for position, state in enumerate(walk(fine, control, drawn, disturbances, begun)):
-            if beside is not None and here is not None:
-                state = beside.at(state, here)
+        for violation_count in violation_counts:
+            violation_count.begin(size)
+        for position, state in enumerate(walk(fine, control, drawn_parameters, disturbances, initial_states)):
+            if parameters_in_time is not None and parameter_rows is not None:
+                state = parameters_in_time.at(state, parameter_rows)
             envelope.add(position, state)
-            for one in counts:
-                one.add(position, state, acting.now(position, model.functionals.channels))
-        out += int(np.any([one.close() for one in counts], axis=0).sum())
-        done += size
-        notify(StudyProgress(text=f"{done} of {count} trajectories", done=done, total=count))
-    shares = _shares(counts, worst, count)
+            for violation_count in violation_counts:
+                violation_count.add(position, state, acting.now(position, model.functionals.channels))
+        violating += int(np.any([violation_count.close() for violation_count in violation_counts], axis=0).sum())
+        simulated += size
+        notify(StudyProgress(text=f"{simulated} of {count} trajectories", done=simulated, total=count))
+    shares = _shares(violation_counts, worst, count)
     return Simulation(
         title=finished.experiment.title,
         directory=finished.directory,
@@ -192,7 +204,7 @@ def _sampled(
         times=times.size,
         inside=times_inside(times, response.grid.breakpoints),
         constraints=shares,
-        any_violated=_together(shares, out) if len(shares) > 1 else None,
+        any_violated=_together(shares, violating) if len(shares) > 1 else None,
         shown=times[shown],
         fan=envelope.fan(),
         lower=envelope.lower,
@@ -247,14 +259,14 @@ class _Envelope:
 
 def _replayed(finished: FinishedRun, stored: Mapping[str, Array], started: float) -> Simulation:
     times, states = stored["state_times"], stored["states"]
-    reached = attained(stored, times, states)
+    attained_violations = attained(stored, times, states)
     shares = []
     for position, name in enumerate(stored["names"].tolist()):
         model = finished.experiment.transcription
-        constraint = next(one for one in model.constraints if one.name == name)
+        constraint = next(candidate for candidate in model.constraints if candidate.name == name)
         tolerance = TOLERANCE * float(row_units(constraint, model.problem.control).min())
-        violated = int(reached[position] > tolerance)
-        when = float(stored["times"][position])
+        violated = int(attained_violations[position] > tolerance)
+        worst_time = float(stored["times"][position])
         shares.append(
             ConstraintShare(
                 name=name,
@@ -263,10 +275,10 @@ def _replayed(finished: FinishedRun, stored: Mapping[str, Array], started: float
                 lower=np.nan,
                 upper=np.nan,
                 tolerance=tolerance,
-                largest=float(reached[position]),
-                time=when,
+                largest=float(attained_violations[position]),
+                time=worst_time,
                 worst=float(stored["violations"][position]),
-                worst_time=when,
+                worst_time=worst_time,
                 worst_parameter=stored["parameters"][position].tolist(),
                 **_measured(constraint),
             )
@@ -294,22 +306,25 @@ def _replayed(finished: FinishedRun, stored: Mapping[str, Array], started: float
 def _shares(counts: Sequence[ViolationCount], worst: Mapping[str, Array], count: int) -> list[ConstraintShare]:
     rows = {name: position for position, name in enumerate(worst["names"].tolist())} if worst else {}
     shares = []
-    for one in counts:
-        row, (lower, upper) = rows.get(one.constraint.name), clopper_pearson(one.violated, count)
+    for violation_count in counts:
+        row, (lower, upper) = (
+            rows.get(violation_count.constraint.name),
+            clopper_pearson(violation_count.violated, count),
+        )
         shares.append(
             ConstraintShare(
-                name=one.constraint.name,
-                violated=one.violated,
+                name=violation_count.constraint.name,
+                violated=violation_count.violated,
                 trajectories=count,
                 lower=lower,
                 upper=upper,
-                tolerance=one.tolerance,
-                largest=one.largest,
-                time=one.time,
+                tolerance=violation_count.tolerance,
+                largest=violation_count.largest,
+                time=violation_count.time,
                 worst=np.nan if row is None else float(worst["violations"][row]),
                 worst_time=np.nan if row is None else float(worst["times"][row]),
                 worst_parameter=() if row is None else worst["parameters"][row].tolist(),
-                **_measured(one.constraint),
+                **_measured(violation_count.constraint),
             )
         )
     return shares
@@ -322,22 +337,22 @@ def _measured(constraint: StateConstraint) -> dict[str, str]:
 
 def _together(shares: Sequence[ConstraintShare], violated: int) -> ConstraintShare:
     """Return all constraints as one, which a trajectory violates when it violates any of them."""
-    seen, worst = max(shares, key=lambda one: one.largest), max(shares, key=lambda one: one.worst)
-    lower, upper = clopper_pearson(violated, seen.trajectories)
+    most_violated, worst = max(shares, key=lambda share: share.largest), max(shares, key=lambda share: share.worst)
+    lower, upper = clopper_pearson(violated, most_violated.trajectories)
     return ConstraintShare(
         name=ANY,
         violated=violated,
-        trajectories=seen.trajectories,
+        trajectories=most_violated.trajectories,
         lower=lower,
         upper=upper,
-        tolerance=seen.tolerance,
-        largest=seen.largest,
-        time=seen.time,
+        tolerance=most_violated.tolerance,
+        largest=most_violated.largest,
+        time=most_violated.time,
         worst=worst.worst,
         worst_time=worst.worst_time,
         worst_parameter=worst.worst_parameter,
-        unit=seen.unit if len({one.unit for one in shares}) == 1 else "",
-        time_unit=seen.time_unit,
+        unit=most_violated.unit if len({share.unit for share in shares}) == 1 else "",
+        time_unit=most_violated.time_unit,
     )
 
 

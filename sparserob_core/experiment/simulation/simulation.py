@@ -138,8 +138,10 @@ class Simulation:
     @property
     def contradicts(self) -> bool:
         """True where a trajectory contradicts a proof of the run, or is worse than the worst case that was found."""
-        worse = any(one.largest > one.worst + one.tolerance for one in self.constraints if np.isfinite(one.worst))
-        return worse or (self.status in PROVEN and any(one.violated for one in self.constraints))
+        worse = any(
+            share.largest > share.worst + share.tolerance for share in self.constraints if np.isfinite(share.worst)
+        )
+        return worse or (self.status in PROVEN and any(share.violated for share in self.constraints))
 
     def summary(self) -> dict[str, Any]:
         """Return the contents of ``simulation-<law>.json``."""
@@ -154,7 +156,7 @@ class Simulation:
             "times": self.times,
             "times_inside_a_piece": self.inside,
             "status": self.status,
-            "constraints": [{**vars(one), "share": one.share} for one in rows],
+            "constraints": [{**vars(share), "share": share.share} for share in rows],
             "contradicts": self.contradicts,
             "remarks": list(self.remarks()),
             "seconds": self.seconds,
@@ -166,14 +168,14 @@ class Simulation:
             names = ["constraint", "time", "parameter", "predicted violation", "attained", "difference"]
             return names, [
                 [
-                    one.name,
-                    _number(one.worst_time, ".6g", one.time_unit),
-                    _vector(one.worst_parameter),
-                    _number(one.worst, ".6e", one.unit),
-                    _number(one.largest, ".6e", one.unit),
-                    f"{one.largest - one.worst:.1e}",
+                    share.name,
+                    _number(share.worst_time, ".6g", share.time_unit),
+                    _vector(share.worst_parameter),
+                    _number(share.worst, ".6e", share.unit),
+                    _number(share.largest, ".6e", share.unit),
+                    f"{share.largest - share.worst:.1e}",
                 ]
-                for one in self.constraints
+                for share in self.constraints
             ]
         names = [
             "constraint",
@@ -187,15 +189,15 @@ class Simulation:
         rows = [*self.constraints, *([] if self.any_violated is None else [self.any_violated])]
         return names, [
             [
-                one.name,
-                str(one.violated),
-                _percent(one.share),
-                f"{_percent(one.lower)} to {_percent(one.upper)}",
-                _violation(one),
-                _number(one.worst, ".3e", one.unit),
-                _number(one.worst_time, ".6g", one.time_unit),
+                share.name,
+                str(share.violated),
+                _percent(share.share),
+                f"{_percent(share.lower)} to {_percent(share.upper)}",
+                _violation(share),
+                _number(share.worst, ".3e", share.unit),
+                _number(share.worst_time, ".6g", share.time_unit),
             ]
-            for one in rows
+            for share in rows
         ]
 
     def remarks(self) -> Iterator[str]:
@@ -267,8 +269,8 @@ def _number(value: float, form: str, unit: str) -> str:
 
 
 def _violation(one: ConstraintShare) -> str:
-    seen = f"{one.largest:.3e} {one.unit}".rstrip()
-    return f"{seen} at t = {_number(one.time, '.6g', one.time_unit)}" if np.isfinite(one.time) else seen
+    text = f"{one.largest:.3e} {one.unit}".rstrip()
+    return f"{text} at t = {_number(one.time, '.6g', one.time_unit)}" if np.isfinite(one.time) else text
 
 
 def _vector(values: Sequence[float]) -> str:

@@ -56,9 +56,9 @@ class ViolationCount:
                     own = self._in_own_units.outwardness(state, self._beside_own[position])
                 self._take(position, state, value, own)
         elif position and self._inside[position - 1] and self._inside[position]:
-            for at, x in ((position - 1, self._last), (position, state)):
-                value, own = (_mixed(one, x, control) for one in (self.constraint, self._in_own_units))
-                self._take(at, x, value, own)
+            for index, x in ((position - 1, self._last), (position, state)):
+                value, own = (_mixed(constraint, x, control) for constraint in (self.constraint, self._in_own_units))
+                self._take(index, x, value, own)
         self._last = state
 
     def _take(self, position: int, state: Array, value: Array, own: Array | None) -> None:
@@ -73,16 +73,16 @@ class ViolationCount:
 
     def close(self) -> np.ndarray:
         """End the block, and return which of its trajectories ``(n,)`` violate the constraint."""
-        found = self._best
+        violations = self._best
         if self._is_curved:  # outwardness increases outwards, but it is no distance
-            found = self.constraint.excess(self._states)
-            self._own = found / self.units.max()
-        out = self._own > TOLERANCE
-        self.violated += int(out.sum())
-        top = int(found.argmax())
-        if found[top] > self.largest:
-            self.largest, self.time = float(found[top]), float(self.times[self._when[top]])
-        return out
+            violations = self.constraint.excess(self._states)
+            self._own = violations / self.units.max()
+        is_violated = self._own > TOLERANCE
+        self.violated += int(is_violated.sum())
+        top = int(violations.argmax())
+        if violations[top] > self.largest:
+            self.largest, self.time = float(violations[top]), float(self.times[self._when[top]])
+        return is_violated
 
 
 def _mixed(constraint: StateConstraint, state: Array, control: Array) -> Array:

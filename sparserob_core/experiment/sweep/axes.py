@@ -129,28 +129,28 @@ def parse_axes(given: Mapping[str, object] | Sequence[str] | None) -> list[Axis]
     if isinstance(given, str):
         raise InputError(f"axes: expected a list of texts or a mapping, got {shown(given)}")
     pairs: list[tuple[str, object]] = []
-    for one in given.items() if isinstance(given, Mapping) else given or ():
-        if isinstance(one, str):
-            key, equals, text = one.partition("=")
+    for entry in given.items() if isinstance(given, Mapping) else given or ():
+        if isinstance(entry, str):
+            key, equals, text = entry.partition("=")
             if not equals:
-                raise InputError(f"axis {shown(one)}: expected key=values, for example seed=0:19:20")
+                raise InputError(f"axis {shown(entry)}: expected key=values, for example seed=0:19:20")
             pairs.append((key.strip(), text))
         else:
-            pairs.append((str(one[0]), one[1]))
+            pairs.append((str(entry[0]), entry[1]))
     axes = [axis for key, value in pairs for axis in _axes(key, value)]
     for position, axis in enumerate(axes):
-        if axis.path in (other.path for other in axes[:position]):
+        if axis.path in (earlier.path for earlier in axes[:position]):
             raise InputError(path=axis.key, expected="every key once", got="it twice")
     return axes
 
 
 def _axes(key: str, value: Any) -> list[Axis]:
     """Return the axis of a key, or the axes of several keys that are paired."""
-    keys = [one.strip() for one in key.split(",")]
+    keys = [name.strip() for name in key.split(",")]
     if len(keys) == 1:
         return [_axis(key, value)]
-    whole = _rows(key, value) if isinstance(value, str) else value
-    rows = [_plain(row) for row in whole] if isinstance(whole, list | tuple) or hasattr(whole, "tolist") else []
+    entries = _rows(key, value) if isinstance(value, str) else value
+    rows = [_plain(row) for row in entries] if isinstance(entries, list | tuple) or hasattr(entries, "tolist") else []
     if not rows or not all(isinstance(row, list) and len(row) == len(keys) for row in rows):
         raise InputError(
             path=key,
@@ -159,11 +159,11 @@ def _axes(key: str, value: Any) -> list[Axis]:
         )
     _counted(key, tuple(rows))
     axes = []
-    for one, column in zip(keys, zip(*rows, strict=True), strict=True):
-        if path_of(one)[0] in FIXED:
-            raise InputError(path=one, expected="a key that decides a result, where keys are paired", got="this one")
+    for name, column in zip(keys, zip(*rows, strict=True), strict=True):
+        if path_of(name)[0] in FIXED:
+            raise InputError(path=name, expected="a key that decides a result, where keys are paired", got="this one")
         paired = tuple(keys) if len(rows) > 1 else ()
-        axes.append(Axis(one, column, list(column), log=_geometric(column), paired=paired))
+        axes.append(Axis(name, column, list(column), log=_geometric(column), paired=paired))
     return axes
 
 
@@ -171,10 +171,10 @@ def require_whole(axes: Sequence[Axis]) -> None:
     """Raise `InputError` where one of several paired keys was changed, and the others were not."""
     groups = {axis.key: axis.paired for axis in axes}
     for axis in axes:
-        for other in axis.paired:
-            if groups.get(other) != axis.paired:
+        for paired_key in axis.paired:
+            if groups.get(paired_key) != axis.paired:
                 raise InputError(
-                    path=other,
+                    path=paired_key,
                     expected=f"values for {','.join(axis.paired)} together, since these keys are paired",
                     got="values for this one alone",
                 )
@@ -189,35 +189,35 @@ def _axis(key: str, value: object) -> Axis:
     if isinstance(value, str):
         return _written(key, value)
     if isinstance(value, list | tuple | range):
-        values = tuple(_plain(one) for one in value)
+        values = tuple(_plain(entry) for entry in value)
         return Axis(key, _counted(key, values), list(values), log=_geometric(values))
     return Axis(key, (_plain(value),), _plain(value))
 
 
 def _rows(key: str, text: str) -> list[Any]:
     """Return the values of paired keys from one line of text."""
-    parts = list(split(text))
-    rows = [_value(key.partition(",")[0], part, len(parts)) for part in parts]
-    within = rows[0] if len(rows) == 1 and isinstance(rows[0], list) else []
-    return within if within and all(isinstance(row, list) for row in within) else rows
+    tokens = list(split(text))
+    rows = [_value(key.partition(",")[0], token, len(tokens)) for token in tokens]
+    inner_rows = rows[0] if len(rows) == 1 and isinstance(rows[0], list) else []
+    return inner_rows if inner_rows and all(isinstance(row, list) for row in inner_rows) else rows
 
 
 def _written(key: str, text: str) -> Axis:
     """Return the axis of a key from one line of text."""
     values, logs, span = list[Any](), list[bool](), None
-    parts = list(split(text))
-    for part in parts:
-        found = RANGE.fullmatch(part)
-        if found is None and part.startswith("log:"):
-            raise InputError(path=key, expected=AS_WRITTEN, got=shown(part))
-        if found is None:
-            values.append(_value(key, part, len(parts)))
+    tokens = list(split(text))
+    for token in tokens:
+        match = RANGE.fullmatch(token)
+        if match is None and token.startswith("log:"):
+            raise InputError(path=key, expected=AS_WRITTEN, got=shown(token))
+        if match is None:
+            values.append(_value(key, token, len(tokens)))
             continue
-        logs.append(bool(found[1]))
-        if found[4] is not None:
-            values += _range(key, part, found)
-        elif len(parts) == 1:
-            span = _span(key, part, found)
+        logs.append(bool(match[1]))
+        if match[4] is not None:
+            values += _range(key, token, match)
+        elif len(tokens) == 1:
+            span = _span(key, token, match)
         else:
             raise InputError(path=key, expected=f"one range, or {AS_WRITTEN}", got=shown(text))
     if len(values) == 1 and span is None and isinstance(values[0], list) and _of_components(key):
@@ -228,11 +228,11 @@ def _written(key: str, text: str) -> Axis:
 
 def split(text: str) -> Iterator[str]:
     """Yield the parts of a text between commas; commas inside brackets, braces and quotes do not count."""
-    depth, quote, start, before = 0, "", 0, ","
+    depth, quote, start, previous_letter = 0, "", 0, ","
     for position, letter in enumerate(text):
         if quote:
             quote = "" if letter == quote else quote
-        elif letter in "'\"" and before in ",:" + OPENING:
+        elif letter in "'\"" and previous_letter in ",:" + OPENING:
             quote = letter
         elif letter in OPENING:
             depth += 1
@@ -241,7 +241,7 @@ def split(text: str) -> Iterator[str]:
         elif letter == "," and depth == 0:
             yield text[start:position].strip()
             start = position + 1
-        before = before if letter.isspace() else letter
+        previous_letter = previous_letter if letter.isspace() else letter
     yield text[start:].strip()
 
 
@@ -292,17 +292,19 @@ def _check_ends(key: str, part: str, low: float, high: float, log: bool) -> None
 def _counted(key: str, values: tuple[Any, ...]) -> tuple[Any, ...]:
     if not 1 <= len(values) <= MOST:
         raise InputError(path=key, expected=f"1 to {MOST} values", got=str(len(values)))
-    seen = set[str]()
+    reprs = set[str]()
     for value in values:
-        if repr(value) in seen:
+        if repr(value) in reprs:
             raise InputError(path=key, expected="every value once", got=f"{shown(value)} twice")
-        seen.add(repr(value))
+        reprs.add(repr(value))
     return values
 
 
 def _geometric(values: Sequence[Any]) -> bool:
     """Return whether listed numbers are meant for a logarithmic axis: at least three, over at least two decades."""
-    numbers = [float(one) for one in values if isinstance(one, int | float) and not isinstance(one, bool) and one > 0]
+    numbers = [
+        float(value) for value in values if isinstance(value, int | float) and not isinstance(value, bool) and value > 0
+    ]
     return len(numbers) == len(values) >= 3 and max(numbers) >= 100.0 * min(numbers)
 
 

@@ -61,16 +61,16 @@ def draw_study(study: Study) -> Figure:
         raise InputError("no figure of the study: no point has a cost")
     leading = [axis for axis in study.axes if not axis.follows]
     numeric = [axis for axis in leading if axis.numeric and not _is_seed(axis)]
-    others = [axis for axis in leading if not axis.numeric]
+    categorical = [axis for axis in leading if not axis.numeric]
     if study.arrangement == "zip":  # one line through the values, drawn over the first axis
-        numeric, others = numeric[:1], others[:1] if not numeric else []
+        numeric, categorical = numeric[:1], categorical[:1] if not numeric else []
     drawn = study.arrangement in ("random", "sobol")
-    if len(numeric) == 2 and not others and (drawn or min(_size(study, axis) for axis in numeric) >= CELLS):
+    if len(numeric) == 2 and not categorical and (drawn or min(_size(study, axis) for axis in numeric) >= CELLS):
         return _map(study, numeric)
     if numeric:
         numeric.sort(key=lambda axis: -_size(study, axis))
-        return _curves(study, numeric[0], [*numeric[1:], *others])
-    return _categories(study, others)
+        return _curves(study, numeric[0], [*numeric[1:], *categorical])
+    return _categories(study, categorical)
 
 
 @final
@@ -84,21 +84,21 @@ class _Spread:
 
 
 def _spread(values: Sequence[float | None]) -> _Spread:
-    known = [value for value in values if value is not None]
-    if not known:
+    known_values = [value for value in values if value is not None]
+    if not known_values:
         return _Spread(np.nan, np.nan, np.nan)
-    low, middle, high = (float(one) for one in np.quantile(known, (0.25, 0.5, 0.75)))
+    low, middle, high = (float(quantile) for quantile in np.quantile(known_values, (0.25, 0.5, 0.75)))
     return _Spread(middle, low, high)
 
 
 def _grouped(rows: Sequence[Row], axes: Sequence[Axis]) -> dict[str, list[Row]]:
     """Return rows by the values of axes, in words."""
-    found: dict[str, list[Row]] = {}
+    groups: dict[str, list[Row]] = {}
     for row in rows:
         alone = len(axes) == 1 and not axes[0].numeric
-        said = ", ".join(value_text(row[one.key]) if alone else _named(one, row[one.key]) for one in axes)
-        found.setdefault(plain(shorten(said, LETTERS, placeholder="...")) if axes else "", []).append(row)
-    return found
+        label = ", ".join(value_text(row[axis.key]) if alone else _named(axis, row[axis.key]) for axis in axes)
+        groups.setdefault(plain(shorten(label, LETTERS, placeholder="...")) if axes else "", []).append(row)
+    return groups
 
 
 def _named(axis: Axis, value: object) -> str:
@@ -111,9 +111,9 @@ def _curves(study: Study, along: Axis, others: Sequence[Axis]) -> Figure:
     groups = _grouped(study.table, others)
     legend_rows = -(-(len(groups) + 2) // 2) if len(groups) <= len(COLOURS) * len(DASHES) else 1
     figure, (ax,) = look.panels(1, 2.9, extra=0.2 * legend_rows)
-    told = len(groups) <= len(COLOURS) * len(DASHES)
+    has_legend = len(groups) <= len(COLOURS) * len(DASHES)
     for number, (label, rows) in enumerate(groups.items()):
-        colour = COLOURS[number % len(COLOURS)] if told else look.GREY
+        colour = COLOURS[number % len(COLOURS)] if has_legend else look.GREY
         dash = DASHES[number // len(COLOURS) % len(DASHES)]
         by_value: dict[float, list[Row]] = {}
         for row in rows:
@@ -133,7 +133,7 @@ def _curves(study: Study, along: Axis, others: Sequence[Axis]) -> Figure:
     _cost_scale(ax.set_yscale, study.table)
     ax.set_xlabel(measured(along.key, axis_unit(along.key, study.table)))
     ax.set_ylabel(measured("cost $J$", study.cost_unit))
-    _finish(figure, ax, study, told)
+    _finish(figure, ax, study, has_legend)
     return figure
 
 
@@ -141,8 +141,8 @@ def _marks(ax: Axes, x: Array, y: Array, statuses: Sequence[str], colour: str) -
     """Draw the status of every point: on its cost, or at the lower edge where there is none."""
     edge = ax.get_xaxis_transform()
     for status in dict.fromkeys(statuses):
-        here = np.array([one == status for one in statuses])
-        known = here & np.isfinite(y)
+        has_status = np.array([point_status == status for point_status in statuses])
+        with_cost = has_status & np.isfinite(y)
         filled = MARKS[status] in FILLED
         style: dict[str, Any] = {
             "marker": MARKS[status],
@@ -154,12 +154,12 @@ def _marks(ax: Axes, x: Array, y: Array, statuses: Sequence[str], colour: str) -
             "zorder": 4,
         }
         places: list[tuple[Any, Any, dict[str, Any]]] = [
-            (known, y, style),
-            (here & ~known, np.full(x.size, 0.02), {**style, "transform": edge}),
+            (with_cost, y, style),
+            (has_status & ~with_cost, np.full(x.size, 0.02), {**style, "transform": edge}),
         ]
-        for which, height, looks in places:
-            if which.any():
-                ax.plot(x[which], height[which], **looks)[0].set_in_layout(False)
+        for mask, height, looks in places:
+            if mask.any():
+                ax.plot(x[mask], height[mask], **looks)[0].set_in_layout(False)
 
 
 def _map(study: Study, axes: Sequence[Axis]) -> Figure:
@@ -176,14 +176,18 @@ def _map(study: Study, axes: Sequence[Axis]) -> Figure:
     _scale(ax.set_xscale, first, x)
     _scale(ax.set_yscale, second, y)
     if study.arrangement in ("random", "sobol"):
-        at = np.array(list(cells))
+        points = np.array(list(cells))
         costs = np.array([_spread([row.get("cost") for row in rows]).middle for rows in cells.values()])
-        known = np.isfinite(costs)
-        drawn: Any = ax.scatter(at[known, 0], at[known, 1], c=costs[known], cmap="viridis", s=26, linewidths=0)
+        is_finite = np.isfinite(costs)
+        drawn: Any = ax.scatter(
+            points[is_finite, 0], points[is_finite, 1], c=costs[is_finite], cmap="viridis", s=26, linewidths=0
+        )
     else:
         costs = np.full((y.size, x.size), np.nan)
-        for (value, other), rows in cells.items():
-            costs[np.searchsorted(y, other), np.searchsorted(x, value)] = _spread([r.get("cost") for r in rows]).middle
+        for (first_value, second_value), rows in cells.items():
+            costs[np.searchsorted(y, second_value), np.searchsorted(x, first_value)] = _spread(
+                [r.get("cost") for r in rows]
+            ).middle
         drawn = ax.pcolormesh(_edges(x, first.log), _edges(y, second.log), costs, cmap="viridis", linewidth=0)
         drawn.set_edgecolor("face")
     for status in MARKS:
@@ -199,7 +203,7 @@ def _map(study: Study, axes: Sequence[Axis]) -> Figure:
     ax.set_ylabel(measured(second.key, axis_unit(second.key, study.table)))
     for spine in ("top", "right"):
         ax.spines[spine].set_visible(True)
-    _finish(figure, ax, study, told=False, marked=[one for one in MARKS if one != "certified"])
+    _finish(figure, ax, study, told=False, marked=[status for status in MARKS if status != "certified"])
     return figure
 
 
@@ -212,14 +216,14 @@ def _categories(study: Study, axes: Sequence[Axis]) -> Figure:
 
     groups = _grouped(study.table, axes)
     figure = Figure(figsize=(look.WIDTH, 0.32 * len(groups) + 1.6), layout="constrained")
-    left, right = figure.subplots(1, 2, sharey=True, width_ratios=(3, 2))
-    for place, rows in enumerate(groups.values()):
+    left_ax, right_ax = figure.subplots(1, 2, sharey=True, width_ratios=(3, 2))
+    for position, rows in enumerate(groups.values()):
         shift = np.linspace(-0.22, 0.22, len(rows)) if len(rows) > 1 else np.zeros(1)
         for offset, row in zip(shift, rows, strict=True):
             cost, lower = row.get("cost"), row.get("lower_bound")
             if cost is not None and lower is not None:
-                left.plot([lower, cost], [place + offset] * 2, color=look.SKY, linewidth=2.5, zorder=1)
-            status, edge = str(row["status"]), left.get_yaxis_transform()
+                left_ax.plot([lower, cost], [position + offset] * 2, color=look.SKY, linewidth=2.5, zorder=1)
+            status, edge = str(row["status"]), left_ax.get_yaxis_transform()
             style: dict[str, Any] = {
                 "marker": MARKS[status],
                 "linestyle": "none",
@@ -230,25 +234,25 @@ def _categories(study: Study, axes: Sequence[Axis]) -> Figure:
                 "zorder": 3,
             }
             if cost is not None:
-                left.plot([cost], [place + offset], **style)
+                left_ax.plot([cost], [position + offset], **style)
             else:
-                left.plot([0.0], [place + offset], transform=edge, **style)
+                left_ax.plot([0.0], [position + offset], transform=edge, **style)
         seconds = [float(row["seconds"]) for row in rows if row.get("seconds")]
         if len(seconds) >= SEVERAL:
-            right.boxplot([seconds], positions=[place], orientation="horizontal", widths=0.5, **_BOX)
+            right_ax.boxplot([seconds], positions=[position], orientation="horizontal", widths=0.5, **_BOX)
         else:
-            right.plot(seconds, [place] * len(seconds), "o", color=look.VERMILLION, markersize=4)
-    left.set_yticks(range(len(groups)), [label or "all" for label in groups])
-    left.set_ylim(len(groups) - 0.5, -0.5)
-    _cost_scale(left.set_xscale, study.table)
+            right_ax.plot(seconds, [position] * len(seconds), "o", color=look.VERMILLION, markersize=4)
+    left_ax.set_yticks(range(len(groups)), [label or "all" for label in groups])
+    left_ax.set_ylim(len(groups) - 0.5, -0.5)
+    _cost_scale(left_ax.set_xscale, study.table)
     times = [float(row["seconds"]) for row in study.table if row.get("seconds")]
     if times and max(times) > 20.0 * min(times):
-        right.set_xscale("log")
+        right_ax.set_xscale("log")
     else:
-        right.set_xlim(left=0.0)
-    left.set_xlabel(measured("cost $J$", study.cost_unit) + ", down to its proven lower bound")
-    right.set_xlabel("seconds of the method (s)")
-    _finish(figure, left, study, told=False)
+        right_ax.set_xlim(left=0.0)
+    left_ax.set_xlabel(measured("cost $J$", study.cost_unit) + ", down to its proven lower bound")
+    right_ax.set_xlabel("seconds of the method (s)")
+    _finish(figure, left_ax, study, told=False)
     return figure
 
 
@@ -268,7 +272,7 @@ def _finish(figure: Figure, ax: Axes, study: Study, told: bool, marked: Iterable
 
     ax.set_title(plain(study.title))
     handles, labels = ax.get_legend_handles_labels() if told else ([], [])
-    for status in (one for one in marked if one in study.counts):
+    for status in (mark for mark in marked if mark in study.counts):
         filled = MARKS[status] in FILLED
         handles.append(
             Line2D(
@@ -292,17 +296,17 @@ def _worst_status(rows: Sequence[Row]) -> str:
 
 
 def _values(spreads: Sequence[_Spread], name: str) -> Array:
-    return np.array([getattr(one, name) for one in spreads])
+    return np.array([getattr(spread, name) for spread in spreads])
 
 
 def _edges(values: Array, log: bool) -> Array:
     """Return the edges of cells about values, half-way between them."""
-    at = np.log(values) if log else values
-    if at.size == 1:
-        edges = np.array([at[0] - 0.5, at[0] + 0.5])
+    centres = np.log(values) if log else values
+    if centres.size == 1:
+        edges = np.array([centres[0] - 0.5, centres[0] + 0.5])
     else:
-        middle = (at[1:] + at[:-1]) / 2
-        edges = np.concatenate([[2 * at[0] - middle[0]], middle, [2 * at[-1] - middle[-1]]])
+        middle = (centres[1:] + centres[:-1]) / 2
+        edges = np.concatenate([[2 * centres[0] - middle[0]], middle, [2 * centres[-1] - middle[-1]]])
     return np.exp(edges) if log else edges
 
 

@@ -92,8 +92,8 @@ class Plan:
 
     def loaded(self, values: Sequence[Any]) -> Loaded:
         """Return the checked config of a point."""
-        rest = iter(values)
-        changes = {axis.key: axis.values[0] if axis.single else next(rest) for axis in self.changes}
+        remaining_values = iter(values)
+        changes = {axis.key: axis.values[0] if axis.single else next(remaining_values) for axis in self.changes}
         return load_config(self.base, changes)
 
     def values(self) -> list[tuple[Any, ...]]:
@@ -113,8 +113,8 @@ class Plan:
         if self.points == "zip":
             counts = {axis.key: len(axis.values) for axis in self.axes}
             if len(set(counts.values())) > 1:
-                said = ", ".join(f"{count} of {key}" for key, count in counts.items())
-                raise InputError(path="zip", expected="axes with equally many values", got=said)
+                counts_text = ", ".join(f"{count} of {key}" for key, count in counts.items())
+                raise InputError(path="zip", expected="axes with equally many values", got=counts_text)
             return list(zip(*(axis.values for axis in self.axes), strict=True)) if self.axes else [()]
         places = list(product(*(range(len(axis.values)) for axis in self._leading(MOST))))
         return [self._values_at(row) for row in places]
@@ -130,8 +130,8 @@ class Plan:
 
     def _values_at(self, places: Sequence[int]) -> tuple[Any, ...]:
         """Return the values of all axes, where the leading ones are at these ``places``."""
-        known = dict(zip((axis.key for axis in self._leading()), places, strict=True))
-        return tuple(axis.values[known[axis.paired[0] if axis.paired else axis.key]] for axis in self.axes)
+        index_of_key = dict(zip((axis.key for axis in self._leading()), places, strict=True))
+        return tuple(axis.values[index_of_key[axis.paired[0] if axis.paired else axis.key]] for axis in self.axes)
 
     def _drawn(self) -> list[tuple[Any, ...]]:
         leading = self._leading()
@@ -167,8 +167,8 @@ class Plan:
             plain = self.loaded(values).config.plain()
             points.append(Point(values, json.dumps(plain), identity(plain)))
             if len(points) % OFTEN == 0:
-                said = f"{len(points)} of {len(rows)} configs are checked"
-                notify(StudyProgress(text=said, done=len(points), total=len(rows)))
+                text = f"{len(points)} of {len(rows)} configs are checked"
+                notify(StudyProgress(text=text, done=len(points), total=len(rows)))
         return points
 
     def written(self) -> str:
@@ -178,8 +178,10 @@ class Plan:
             if not axis.paired:
                 axes[axis.key] = _listed(axis)
             elif not axis.follows:
-                group = [next(one for one in self.changes if one.key == key) for key in axis.paired]
-                axes[",".join(axis.paired)] = [list(row) for row in zip(*(one.values for one in group), strict=True)]
+                group = [next(change for change in self.changes if change.key == key) for key in axis.paired]
+                axes[",".join(axis.paired)] = [
+                    list(row) for row in zip(*(change.values for change in group), strict=True)
+                ]
         data: dict[str, Any] = {"base": self.base.data, "axes": axes, "points": self.points}
         if self.number is not None:
             data |= {"number": self.number, "seed": self.seed}
@@ -187,11 +189,15 @@ class Plan:
 
     def apart_from(self, other: Plan) -> str:
         """Return the difference of the base from another study's in what decides results; empty where there is none."""
-        here, there = (
+        own_base, other_base = (
             {key: value for key, value in plan.base.data.items() if key not in BESIDE} for plan in (self, other)
         )
-        found = difference(here, there)
-        return "" if found is None else f"{found[0]} is {value_text(found[2])} there and {value_text(found[1])} here"
+        mismatch = difference(own_base, other_base)
+        return (
+            ""
+            if mismatch is None
+            else f"{mismatch[0]} is {value_text(mismatch[2])} there and {value_text(mismatch[1])} here"
+        )
 
 
 def make_plan(
@@ -231,14 +237,14 @@ def make_plan(
     plan = _stored(source) if {"base", "axes"} & set(source.data) else Plan(_based(source), ())
     kept = list(plan.changes)
     changes = _changes(overrides)
-    given = parse_axes(list(axes) if isinstance(axes, Iterable) and not isinstance(axes, str | Mapping) else axes)
-    for both in {change.path for change in changes} & {axis.path for axis in given}:
-        raise InputError(path=both, expected="an axis or an override", got="both")
-    for axis in given:
-        place = next((k for k, other in enumerate(kept) if other.path == axis.path), len(kept))
-        kept[place : place + 1] = [axis]
+    new_axes = parse_axes(list(axes) if isinstance(axes, Iterable) and not isinstance(axes, str | Mapping) else axes)
+    for path in {change.path for change in changes} & {axis.path for axis in new_axes}:
+        raise InputError(path=path, expected="an axis or an override", got="both")
+    for axis in new_axes:
+        index = next((k for k, kept_change in enumerate(kept) if kept_change.path == axis.path), len(kept))
+        kept[index : index + 1] = [axis]
     for change in reversed(changes):
-        kept = [change, *(other for other in kept if other.path != change.path)]
+        kept = [change, *(kept_change for kept_change in kept if kept_change.path != change.path)]
     require_whole(kept)
     plan = replace(
         plan,
@@ -252,8 +258,8 @@ def make_plan(
 
 def _changes(overrides: Mapping[str, object] | Iterable[str] | None) -> list[Axis]:
     """Return overrides as changes with a single value each, lists and texts with commas included."""
-    found = parse_overrides(overrides, read_value)
-    return [Axis(".".join(map(str, one.path)), (one.value,), one.value) for one in found]
+    parsed_overrides = parse_overrides(overrides, read_value)
+    return [Axis(".".join(map(str, override.path)), (override.value,), override.value) for override in parsed_overrides]
 
 
 def _listed(axis: Axis) -> object:

@@ -146,8 +146,8 @@ def _import_what_runs(loaded: Loaded) -> None:
     if (entry.name, repr(entry.options)) in _solved_with:
         return
     _solved_with.add((entry.name, repr(entry.options)))
-    one, none = csc_array(np.ones((1, 1))), csc_array((0, 1))
-    smallest = QuadraticProgram(one, -np.ones(1), one, np.ones(1), none, np.zeros(0), np.zeros(1), np.ones(1))
+    unit, empty = csc_array(np.ones((1, 1))), csc_array((0, 1))
+    smallest = QuadraticProgram(unit, -np.ones(1), unit, np.ones(1), empty, np.zeros(0), np.zeros(1), np.ones(1))
     with suppress(SparseRobError):  # the run itself reports the error
         build(loaded, "solver", entry).solve(smallest, ACCURACY)
 
@@ -156,10 +156,10 @@ def keep(partial: Path, ends: Path) -> None:
     """Give a complete run directory its final name; a directory with that name, of a run that ended early, is
     removed."""
     for attempt in range(TRIES):
-        old = partial.with_name(f"{partial.name}.old{attempt}")
+        retired = partial.with_name(f"{partial.name}.old{attempt}")
         try:
-            ends.rename(old)
-            shutil.rmtree(old, ignore_errors=True)
+            ends.rename(retired)
+            shutil.rmtree(retired, ignore_errors=True)
         except FileNotFoundError:
             pass
         try:

@@ -141,11 +141,11 @@ def remarks_of(study: Study) -> Iterator[str]:
 def _by_status(table: Sequence[Row], unit: str) -> tuple[list[str], list[list[str]]]:
     rows = []
     for status in sorted({str(row["status"]) for row in table}):
-        of = [row for row in table if row["status"] == status]
-        costs = [row["cost"] for row in of if row.get("cost") is not None]
-        seconds = sum(row.get("seconds") or 0.0 for row in of)
-        least, most = (_number(pick(costs), ".9g") if costs else "-" for pick in (min, max))
-        rows.append([status, str(len(of)), least, most, f"{seconds:.2f}"])
+        rows_of_status = [row for row in table if row["status"] == status]
+        costs = [row["cost"] for row in rows_of_status if row.get("cost") is not None]
+        seconds = sum(row.get("seconds") or 0.0 for row in rows_of_status)
+        smallest, largest = (_number(pick(costs), ".9g") if costs else "-" for pick in (min, max))
+        rows.append([status, str(len(rows_of_status)), smallest, largest, f"{seconds:.2f}"])
     return ["status", "points", f"least cost{unit}", f"largest cost{unit}", "seconds"], rows
 
 

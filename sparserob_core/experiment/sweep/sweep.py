@@ -180,14 +180,14 @@ def sweep(
     walk = None
     try:
         if point is not None and out is not None:
-            made = share_directory(out, FILE, plan.written())
-            _require_same_study(made.path, plan)
-            walk = _Walk(plan, checked, made, figures, notify, broadcast, alone=True)
+            study_directory = share_directory(out, FILE, plan.written())
+            _require_same_study(study_directory.path, plan)
+            walk = _Walk(plan, checked, study_directory, figures, notify, broadcast, alone=True)
             return walk.run(factory)
-        with create_directory(out, f"{plan.name}-sweep", checked[0].hash[:8], again=FILE) as made:
-            _require_same_base(made.path, plan)
-            made.write_text(FILE, plan.written())
-            walk = _Walk(plan, checked, made, figures, notify, broadcast)
+        with create_directory(out, f"{plan.name}-sweep", checked[0].hash[:8], again=FILE) as study_directory:
+            _require_same_base(study_directory.path, plan)
+            study_directory.write_text(FILE, plan.written())
+            walk = _Walk(plan, checked, study_directory, figures, notify, broadcast)
             return _drawn(walk.run(factory))
     except BaseException as error:
         if walk is not None:
@@ -234,8 +234,8 @@ def outline(
     if directory is not None:
         _require_same_base(directory, plan)
     walk = _Walk(plan, checked, RunDirectory(directory or Path()), False, notify, Broadcast([]))
-    left = walk.left() if directory is not None else walk.by_hash
-    return Outline(plan, checked, walk.names, frozenset(left))
+    unfinished = walk.left() if directory is not None else walk.by_hash
+    return Outline(plan, checked, walk.names, frozenset(unfinished))
 
 
 def _found(config: GivenConfig, out: str | Path | None) -> tuple[GivenConfig, str | Path | None]:
@@ -284,10 +284,11 @@ def _executors(point: Point, chosen: str | Mapping[str, Any] | None) -> Executor
 
 def _require_same_base(directory: Path, plan: Plan) -> None:
     if (directory / FILE).is_file():
-        apart = plan.apart_from(read_plan(directory / FILE))
-        if apart:
+        mismatch = plan.apart_from(read_plan(directory / FILE))
+        if mismatch:
             raise InputError(
-                f"{directory}: holds a study of another base config ({apart}); expected another directory, or that base"
+                f"{directory}: holds a study of another base config ({mismatch}); "
+                "expected another directory, or that base"
             )
 
 
@@ -295,11 +296,14 @@ def _require_same_study(directory: Path, plan: Plan) -> None:
     """Raise `InputError` where the study in the directory is another one, in which the number would be another
     point."""
     _require_same_base(directory, plan)
-    there, here = ({axis.key: axis for axis in one.changes} for one in (read_plan(directory / FILE), plan))
+    stored_axes, own_axes = (
+        {axis.key: axis for axis in compared_plan.changes} for compared_plan in (read_plan(directory / FILE), plan)
+    )
     if read_plan(directory / FILE).written() != plan.written():
         raise InputError(
-            f"{directory / FILE}: expected the same study, got {_axes_text(there)} there and {_axes_text(here)} here, "
-            "or another title or arrangement; a point of what stands there: --resume DIR --point N"
+            f"{directory / FILE}: expected the same study, got {_axes_text(stored_axes)} there and "
+            f"{_axes_text(own_axes)} here, or another title or arrangement; "
+            "a point of what stands there: --resume DIR --point N"
         )
 
 
@@ -328,8 +332,8 @@ class _Walk:
         self.plan, self.points, self.made, self.figures, self.notify = plan, points, made, figures, notify
         self.broadcast, self.parallel, self.stopped, self.pressed = broadcast, True, "", False
         self.places: dict[str, list[int]] = {}
-        for place, point in enumerate(points):
-            self.places.setdefault(point.hash, []).append(place)
+        for index, point in enumerate(points):
+            self.places.setdefault(point.hash, []).append(index)
         self.directory = made.path.resolve()
         self.git = git_revision(plan.base.folder)
         self.by_hash = {point.hash: point for point in reversed(points)}  # the first of equal configs names the run
@@ -390,24 +394,24 @@ class _Walk:
 
     def _known(self, but: Collection[str] = ()) -> dict[int, Row]:
         """Return the rows that are known, by the places of their points, without the hashes ``but``."""
-        known = [digest for digest in self.answers if digest not in but and digest in self.places]
-        return {place: self._row(self.points[place]) for digest in known for place in self.places[digest]}
+        digests = [digest for digest in self.answers if digest not in but and digest in self.places]
+        return {index: self._row(self.points[index]) for digest in digests for index in self.places[digest]}
 
     def left(self) -> list[str]:
         """Return the hashes of the points that must be run; the answers of the others are read."""
         self._read(dict.fromkeys(point.hash for point in self.points))
-        left = []
+        unfinished = []
         for digest in dict.fromkeys(point.hash for point in self.points):
             summary = self.answers[digest].summary if digest in self.answers else None
             if summary is None or summary["status"] == "failed" or summary.get("stopped"):
-                left.append(digest)
-        return left
+                unfinished.append(digest)
+        return unfinished
 
     def _read(self, digests: Iterable[str]) -> None:
         """Read the answers of these points from the directory."""
-        found = {one.rpartition("-")[2]: one for one in _directories(self.directory / RUNS)}
+        names_by_digest = {name.rpartition("-")[2]: name for name in _directories(self.directory / RUNS)}
         for digest in digests:
-            name = found.get(digest[:DIGITS])
+            name = names_by_digest.get(digest[:DIGITS])
             summary = None if name is None else _readable(self.directory / RUNS / name, digest)
             if name is not None and summary is not None:
                 self.names[digest], self.answers[digest] = name, Answer(summary)
@@ -425,16 +429,16 @@ class _Walk:
                 if self._round(factory, [digest]):
                     self._take(digest, Answer(failure="the process that ran it died, twice"))
                 continue
-            lost, before = self._round(factory, waiting), len(waiting)
-            suspects = [digest for digest in lost if self._partial(digest).exists()]
-            waiting = [digest for digest in lost if digest not in set(suspects)]
+            unanswered, before = self._round(factory, waiting), len(waiting)
+            suspects = [digest for digest in unanswered if self._partial(digest).exists()]
+            waiting = [digest for digest in unanswered if digest not in set(suspects)]
             stillborn = stillborn + 1 if len(waiting) == before else 0
             if stillborn >= STILLBORN:
                 raise SparseRobError("the executor's workers die before they begin a point; is there memory for them?")
 
     def _round(self, factory: ExecutorFactory, batch: list[str]) -> list[str]:
         """Run a batch on a new executor; returns the points that have no answer since a worker died."""
-        lost: list[str] = []
+        unanswered: list[str] = []
         with _workers(factory) as executor:
             ended: SimpleQueue[Future[Answer]] = SimpleQueue()
             open_ones: dict[Future[Answer], str] = {}
@@ -443,30 +447,30 @@ class _Walk:
                 try:
                     future = executor.submit(run_point, self._task(digest), self._watching(digest))
                 except BrokenExecutor:
-                    lost.append(digest)
+                    unanswered.append(digest)
                     continue
                 open_ones[future] = digest
                 future.add_done_callback(ended.put)
                 while not ended.empty():
-                    self._collect(ended.get(), open_ones, lost)
+                    self._collect(ended.get(), open_ones, unanswered)
             while open_ones:
                 try:
-                    self._collect(ended.get(timeout=PAUSE), open_ones, lost)
+                    self._collect(ended.get(timeout=PAUSE), open_ones, unanswered)
                 except Empty:
                     self._tell("", open_ones)
-        return lost
+        return unanswered
 
     def _watching(self, digest: str) -> list[Observer]:
         """Return the observer of a point's run: one that reports its bounds, where the run is in this process and
         observed."""
         if self.parallel or not self.broadcast.heard:
             return []
-        place = self.places[digest][0]
+        index = self.places[digest][0]
 
         def tell(number: int, lower: float, upper: float) -> None:
             seconds = time.monotonic() - self.began
             self.broadcast(
-                PointProgress(point=place, round=number, lower_bound=lower, upper_bound=upper, seconds=seconds)
+                PointProgress(point=index, round=number, lower_bound=lower, upper_bound=upper, seconds=seconds)
             )
 
         return [Bounds(tell)]
@@ -530,26 +534,30 @@ class _Walk:
         """Remove the partial run directories of dead processes, and of this one."""
         for name in _directories(self.directory / RUNS, hidden=True):
             path = self.directory / RUNS / name
-            begun = BEGUN_BY.search(name)
+            match = BEGUN_BY.search(name)
             # a run has no lock before its first file and after its last one: the process in its name is checked as well
-            owners = [owner_of(path), *([(int(begun[2]), begun[1])] if begun else [])]
+            owners = [owner_of(path), *([(int(match[2]), match[1])] if match else [])]
             if all(not owner[0] or owner == (os.getpid(), platform.node()) or is_dead(*owner) for owner in owners):
                 shutil.rmtree(path, ignore_errors=True)
 
     def _tell(self, digest: str, open_ones: Mapping[Future[Answer], str] | None = None) -> None:
-        now = [one for future, one in (open_ones or {}).items() if future.running() and self._partial(one).exists()]
-        left = (time.monotonic() - self.began) / self.new * len(self.pending) if self.new else None
+        running = [
+            point_hash
+            for future, point_hash in (open_ones or {}).items()
+            if future.running() and self._partial(point_hash).exists()
+        ]
+        seconds_left = (time.monotonic() - self.began) / self.new * len(self.pending) if self.new else None
         event = SweepProgress(
-            text=_said(self.done, len(self.points), len(now), self.failed, left),
+            text=_said(self.done, len(self.points), len(running), self.failed, seconds_left),
             done=self.done,
             total=len(self.points),
-            running=len(now),
+            running=len(running),
             failed=self.failed,
-            left=left,
+            left=seconds_left,
             row=self._row(self.by_hash[digest]) if digest else None,
             axes=[axis.key for axis in self.plan.axes],
             places=self.places[digest] if digest else (),
-            now=[self.places[one][0] for one in now],
+            now=[self.places[point_hash][0] for point_hash in running],
             seconds=time.monotonic() - self.began,
         )
         self.notify(event)
@@ -559,11 +567,11 @@ class _Walk:
 def run_name(axes: Sequence[Axis], point: Point) -> str:
     """Return the name of a point's directory: its values for a reader, and the beginning of its hash for the
     program."""
-    parts = []
+    settings = []
     for axis, value in zip(axes, point.values, strict=True):
         steps = [str(step) for step in axis.path if step != "name"]
-        parts.append(f"{steps[-1] if steps else axis.key}={value_text(value)}")
-    text = re.sub(r"[^A-Za-z0-9=.,+_-]+", "-", re.sub(r"[][(){}]|(?<=,)\s", "", "_".join(parts)))
+        settings.append(f"{steps[-1] if steps else axis.key}={value_text(value)}")
+    text = re.sub(r"[^A-Za-z0-9=.,+_-]+", "-", re.sub(r"[][(){}]|(?<=,)\s", "", "_".join(settings)))
     return f"{text[:LETTERS].strip('-.,') or 'point'}-{point.hash[:DIGITS]}"
 
 
@@ -580,7 +588,7 @@ def _workers(factory: ExecutorFactory) -> Iterator[Any]:
 def _directories(folder: Path, hidden: bool = False) -> list[str]:
     if not folder.is_dir():
         return []
-    return sorted(one.name for one in folder.iterdir() if one.name.startswith(".") == hidden and one.is_dir())
+    return sorted(path.name for path in folder.iterdir() if path.name.startswith(".") == hidden and path.is_dir())
 
 
 def _readable(directory: Path, digest: str) -> dict[str, Any] | None:
@@ -595,11 +603,11 @@ def _readable(directory: Path, digest: str) -> dict[str, Any] | None:
 
 
 def _said(done: int, total: int, running: int, failed: int, left: float | None) -> str:
-    parts = [f"{done} of {total} points done"]
-    parts += [f"{failed} failed"] if failed else []
-    parts += [f"{running} running"] if running else []
-    parts += [f"about {_duration(left)} left"] if left is not None and done < total else []
-    return ", ".join(parts)
+    phrases = [f"{done} of {total} points done"]
+    phrases += [f"{failed} failed"] if failed else []
+    phrases += [f"{running} running"] if running else []
+    phrases += [f"about {_duration(left)} left"] if left is not None and done < total else []
+    return ", ".join(phrases)
 
 
 def _duration(seconds: float) -> str:

@@ -90,27 +90,32 @@ def row_of(axes: Mapping[str, Any], summary: Mapping[str, Any] | None, run: str,
     dict
         The row.
     """
-    found: Row = {"status": "failed", "message": said} if summary is None else {}
+    entries: Row = {"status": "failed", "message": said} if summary is None else {}
     for name, value in (summary or {}).items():
         inside = dict(_entries(name, value))
         if name not in LEFT:
-            found |= {
-                key: one for key, one in inside.items() if key not in LEFT and not isinstance(one, list | Mapping)
+            entries |= {
+                key: entry for key, entry in inside.items() if key not in LEFT and not isinstance(entry, list | Mapping)
             }
     units = (summary or {}).get("units") or {}
-    found |= {name: units[name.partition(".")[2]] for name in UNITS.values() if units.get(name.partition(".")[2])}
-    told = {**_numbers(axes), **axes}
-    return {**told, **{key: one for key, one in found.items() if key not in told}, "run": run, "hash": digest}
+    entries |= {name: units[name.partition(".")[2]] for name in UNITS.values() if units.get(name.partition(".")[2])}
+    axis_columns = {**_numbers(axes), **axes}
+    return {
+        **axis_columns,
+        **{key: entry for key, entry in entries.items() if key not in axis_columns},
+        "run": run,
+        "hash": digest,
+    }
 
 
 def _numbers(axes: Mapping[str, Any]) -> Row:
     """Return the entries of values that are lists of numbers, each under the key that the config has for it."""
     lists = {key: value for key, value in axes.items() if isinstance(value, list | tuple)}
     return {
-        f"{key}.{place}": one
+        f"{key}.{index}": entry
         for key, value in lists.items()
-        if all(isinstance(one, int | float) and not isinstance(one, bool) for one in value)
-        for place, one in enumerate(value)
+        if all(isinstance(entry, int | float) and not isinstance(entry, bool) for entry in value)
+        for index, entry in enumerate(value)
     }
 
 
@@ -122,11 +127,11 @@ def _entries(name: str, value: Any) -> Iterator[tuple[str, Any]]:
     if not isinstance(value, Mapping):
         yield name, value
         return
-    for key, one in value.items():
-        if name == "sparsity" and isinstance(one, Mapping):
-            yield from _entries(f"{name}.{key}", one)
+    for key, entry in value.items():
+        if name == "sparsity" and isinstance(entry, Mapping):
+            yield from _entries(f"{name}.{key}", entry)
         else:
-            yield f"{name}.{key}", one
+            yield f"{name}.{key}", entry
 
 
 def columns_of(axes: Sequence[str], rows: Iterable[Row]) -> list[str]:
@@ -139,21 +144,21 @@ def columns_of(axes: Sequence[str], rows: Iterable[Row]) -> list[str]:
     entries = {
         axis: max((sum(_entry_of(name, axes) == axis for name in row) for row in kept), default=0) for axis in axes
     }
-    first = [
+    axis_columns = [
         name
         for axis in axes
-        for name in (axis, *(f"{axis}.{place}" for place in range(entries[axis])))
+        for name in (axis, *(f"{axis}.{index}" for index in range(entries[axis])))
         if name == axis or name not in axes
     ]
-    seen = {name for row in kept for name in row} - set(first)
-    rest = sorted(seen - {*FIRST, *LAST})
-    return [*first, *(name for name in (*FIRST, *rest, *LAST) if name not in first)]
+    run_columns = {name for row in kept for name in row} - set(axis_columns)
+    other_columns = sorted(run_columns - {*FIRST, *LAST})
+    return [*axis_columns, *(name for name in (*FIRST, *other_columns, *LAST) if name not in axis_columns)]
 
 
 def _entry_of(name: str, axes: Sequence[str]) -> str | None:
     """Return the axis of whose value a column holds one number."""
-    axis, _, place = name.rpartition(".")
-    return axis if axis in axes and place.isdigit() and name not in axes else None
+    axis, _, index = name.rpartition(".")
+    return axis if axis in axes and index.isdigit() and name not in axes else None
 
 
 def table_text(axes: Sequence[str], rows: Sequence[Row]) -> str:
@@ -168,8 +173,8 @@ def table_text(axes: Sequence[str], rows: Sequence[Row]) -> str:
 def shared_unit(rows: Iterable[Row], kind: str = "cost") -> str:
     """Return the unit of the costs, constraints or times of `UNITS`; empty unless all rows with a cost have the same
     one."""
-    found = {str(row.get(UNITS[kind]) or "") for row in rows if row.get("cost") is not None}
-    return found.pop() if len(found) == 1 else ""
+    units = {str(row.get(UNITS[kind]) or "") for row in rows if row.get("cost") is not None}
+    return units.pop() if len(units) == 1 else ""
 
 
 def axis_unit(key: str, rows: Iterable[Row]) -> str:

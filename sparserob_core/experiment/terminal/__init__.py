@@ -1,1 +1,1 @@
-"""What the terminal shows: tables and printable text; exit statuses."""
+"""Output on the terminal: tables and printable text; exit statuses."""

@@ -1,7 +1,7 @@
-"""How the commands print and end: text without control characters, JSON, exit statuses.
+"""Output and end of the commands: text without control characters, JSON, exit statuses.
 
-The standard output belongs to the command: what it says goes through here, and what anybody else prints meanwhile (a
-plugin, a library) goes to the standard error stream, so that a result stays what a program can read.
+The standard output belongs to the command, whose words go through this module. All other output in the meantime, of a
+plugin or a library, goes to the standard error stream, so that a program can read the result.
 """
 
 from __future__ import annotations
@@ -19,10 +19,14 @@ EXIT = {"certified": 0, "verified": 0, "infeasible": 3, "refuted": 4, "undecided
 
 
 def printable(text: str) -> str:
-    """The same text with every control character written out, as in ``\\x1b``, but line feeds: what a config says must
-    not steer the terminal. Bytes of a path that a narrow locale has no letters for are read as UTF-8."""
+    """Return a text with every control character but line feeds written out, as in ``\\x1b``.
+
+    The text of a config must not steer the terminal. Bytes of a path for which a narrow locale has no letters are read
+    as UTF-8.
+    """
     return "".join(
-        one if one == "\n" or one.isprintable() else one.encode("unicode_escape").decode() for one in as_utf8(text)
+        character if character == "\n" or character.isprintable() else character.encode("unicode_escape").decode()
+        for character in as_utf8(text)
     )
 
 

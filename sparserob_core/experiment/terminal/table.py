@@ -46,7 +46,7 @@ def _write(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]]) ->
 
 
 def result_rows(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """What a user wants to know of a finished run, from the contents of ``result.json``."""
+    """Return the main facts of a finished run for a user, as rows of a table, from the contents of ``result.json``."""
     worst, sparsity, counts = summary["worst"], summary["sparsity"], summary["counts"]
     units = summary.get("units") or {}
     rows = [
@@ -83,20 +83,20 @@ WHO = {
 
 
 def _solved_by(counts: Mapping[str, int] | None) -> str:
-    """Who solved the relaxed programs, and how many."""
+    """Name the solvers of the relaxed programs, each with the number that it solved."""
     if not counts:
         return "unknown"
     return ", ".join(f"{count} {WHO.get(name, f'by {name}')}" for name, count in counts.items())
 
 
 def _active(sparsity: Mapping[str, Any]) -> str:
-    """How much of the time the control acts."""
-    share, several = sparsity["active_fraction"], (sparsity.get("channels") or 1) > 1
-    return _number(share, ".1%") + (", in at least one channel" if several and share is not None else "")
+    """Format the share of the time in which the control acts."""
+    share, is_multichannel = sparsity["active_fraction"], (sparsity.get("channels") or 1) > 1
+    return _number(share, ".1%") + (", in at least one channel" if is_multichannel and share is not None else "")
 
 
 def _fewest(known: Mapping[str, Any] | None, channels: int | None) -> str:
-    """How little any admissible control must act, in the words of the checker."""
+    """State the least share of the time that any admissible control must act, in the words of the checker."""
     if not known:
         return "unknown"
     lower, upper = _number(known["lower"], ".1%"), known["upper"]
@@ -115,7 +115,7 @@ def _amount(value: float | None, unit: str | None) -> str:
 
 
 def _causal(summary: Mapping[str, Any], unit: str | None) -> str:
-    """What no causal policy can do."""
+    """State the lower bound of the cost of every causal policy, or that none exists."""
     if summary.get("causal_infeasible"):
         return "none exists: proven"
     lower = summary.get("causal_lower_bound")
@@ -131,10 +131,12 @@ def _kept(
 ) -> str:
     """Return to what every constraint is kept, with what is excused, in the user's units: of rows with the same unit
     the largest."""
-    entries = {name: (one.get("kept"), one["rows"], one["proven"]) for name, one in tolerances.items()}
+    entries = {
+        name: (tolerance.get("kept"), tolerance["rows"], tolerance["proven"]) for name, tolerance in tolerances.items()
+    }
     if equalities:
         entries["equals"] = equalities["missed"], equalities["excused"], None
-    return ", ".join(_kept_to(name, *one, units.get(name) or [""]) for name, one in entries.items()) or "unknown"
+    return ", ".join(_kept_to(name, *entry, units.get(name) or [""]) for name, entry in entries.items()) or "unknown"
 
 
 def _kept_to(name: str, kept: Any, excused: Any, share: float | None, units: Sequence[str]) -> str:
@@ -142,31 +144,34 @@ def _kept_to(name: str, kept: Any, excused: Any, share: float | None, units: Seq
         kept, excused, units = [share or 0.0], [0.0], [""]
     measured = list(units) * len(kept) if len(units) == 1 else list(units)
     largest: dict[str, tuple[float, float]] = {}
-    for unit, mine, most in zip(measured, kept, excused, strict=True):
+    for unit, kept_value, excused_value in zip(measured, kept, excused, strict=True):
         before = largest.get(unit, (float("-inf"), 0.0))
-        largest[unit] = max(before[0], mine), max(before[1], most)
+        largest[unit] = max(before[0], kept_value), max(before[1], excused_value)
     if max(kept, default=0.0) <= 0.0:
-        spared = [_measured(abs(mine), unit, ".1e") for unit, (mine, _) in largest.items()]
+        spared = [_measured(abs(kept_value), unit, ".1e") for unit, (kept_value, _) in largest.items()]
         return f"{name} with {', '.join(spared)} to spare"
-    parts = [f"{_measured(max(mine, 0.0), unit, '.1e')} ({most:.1e} excused)" for unit, (mine, most) in largest.items()]
-    return f"{name} to {', '.join(parts)}"
+    phrases = [
+        f"{_measured(max(kept_value, 0.0), unit, '.1e')} ({excused_value:.1e} excused)"
+        for unit, (kept_value, excused_value) in largest.items()
+    ]
+    return f"{name} to {', '.join(phrases)}"
 
 
 def _worst(worst: Mapping[str, Any], units: Mapping[str, Any], parameters: Sequence[str]) -> str:
     if worst["violation"] is None:
         return "unknown"
     unit, time, states = (units.get(key) or "" for key in ("worst", "time", "states"))
-    at = "" if worst["time"] is None else f" at t = {_measured(worst['time'], time)}"
+    description = "" if worst["time"] is None else f" at t = {_measured(worst['time'], time)}"
     if worst["parameter"] is not None and len(worst["parameter"]):
         values = [f"{value:.6g}" for value in worst["parameter"]]
-        named = [f"{name} = {value}" for name, value in zip(parameters, values, strict=False)]
-        at += ", " + (_listed(named) if len(named) == len(values) else f"p = ({_listed(values)})")
-    at += f", {worst['corner']}" if worst.get("corner") else ""
+        assignments = [f"{name} = {value}" for name, value in zip(parameters, values, strict=False)]
+        description += ", " + (_listed(assignments) if len(assignments) == len(values) else f"p = ({_listed(values)})")
+    description += f", {worst['corner']}" if worst.get("corner") else ""
     if worst.get("initial_state") is not None:
-        begun = worst["initial_state"]
-        measured = zip(begun, states or [""] * len(begun), strict=True)
-        at += f", from ({_listed([_measured(value, one) for value, one in measured])})"
-    return f"{worst['violation']:.2e}{f' {unit}' if unit else ''} in {worst['constraint']}{at}"
+        initial_state = worst["initial_state"]
+        measured = zip(initial_state, states or [""] * len(initial_state), strict=True)
+        description += f", from ({_listed([_measured(value, state_unit) for value, state_unit in measured])})"
+    return f"{worst['violation']:.2e}{f' {unit}' if unit else ''} in {worst['constraint']}{description}"
 
 
 def _listed(values: Sequence[str]) -> str:

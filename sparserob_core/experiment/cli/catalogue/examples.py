@@ -26,7 +26,7 @@ def examples(name: str | None, out: Path) -> int:
     from sparserob_core.experiment.terminal.table import print_table
 
     if name is None:
-        rows = [(one.name, one.title, one.story) for one in every()]
+        rows = [(entry.name, entry.title, entry.story) for entry in every()]
         print_table("Examples; sparserob examples NAME copies one", ("name", "title", "what it is about"), rows)
         return 0
     chosen, file = example(name), out / f"{name}.yaml"

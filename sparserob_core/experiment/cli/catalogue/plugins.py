@@ -31,10 +31,14 @@ def plugins(name: str | None, files: tuple[Path, ...]) -> int:
     registry = load_registry(files)
     if name is not None:
         return _describe(registry, name)
-    found = list(registry.records())
-    rows = [(one.kind, one.name, one.plugin, one.distribution, one.summary) for one in found if not one.missing]
+    records = list(registry.records())
+    rows = [
+        (record.kind, record.name, record.plugin, record.distribution, record.summary)
+        for record in records
+        if not record.missing
+    ]
     print_table("Components", ("kind", "name", "plugin", "from", "what it is"), rows)
-    for record in found:
+    for record in records:
         if record.missing:
             say(record.missing)
     for failure in registry.failures:

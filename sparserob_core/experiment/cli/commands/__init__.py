@@ -1,1 +1,1 @@
-"""One command in every file."""
+"""Commands of the command line, one in every file."""

@@ -55,11 +55,11 @@ def bound(
     from sparserob_core.experiment.terminal.table import print_table
 
     with LiveLine() as line:
-        found = find(config, overrides, tolerance=tolerance, seconds=seconds, out=out, write=True, notify=line.receive)
+        bounds = find(config, overrides, tolerance=tolerance, seconds=seconds, out=out, write=True, notify=line.receive)
     if as_json:
-        print_json(summary_of_bound(found))
+        print_json(summary_of_bound(bounds))
     else:
-        print_table(found.title, columns_told(found), bound_rows_told(found))
-        for remark in (*found.remarks, f"{found.status} in {found.seconds:.2f} s", f"written to {found.directory}"):
+        print_table(bounds.title, columns_told(bounds), bound_rows_told(bounds))
+        for remark in (*bounds.remarks, f"{bounds.status} in {bounds.seconds:.2f} s", f"written to {bounds.directory}"):
             say(printable(remark))
-    return status_unless_interrupted(EXIT[found.status])
+    return status_unless_interrupted(EXIT[bounds.status])

@@ -36,22 +36,24 @@ def check(directory: Path, as_json: bool, plugins: tuple[Path, ...], seconds: fl
     from sparserob_core.experiment.check.check import check as verify
     from sparserob_core.experiment.terminal.table import print_table
 
-    found = verify(directory, plugins, seconds)
+    verification = verify(directory, plugins, seconds)
     if as_json:
         print_json(
             {
-                "title": found.title,
-                "status": found.status,
-                "seconds": found.seconds,
-                "claims": [asdict(claim) for claim in found.claims],
-                "not_compared": list(found.not_compared),
+                "title": verification.title,
+                "status": verification.status,
+                "seconds": verification.seconds,
+                "claims": [asdict(claim) for claim in verification.claims],
+                "not_compared": list(verification.not_compared),
             }
         )
     else:
         print_table(
-            found.title, ("claim", "verdict", "what was derived"), [(c.name, c.verdict, c.text) for c in found.claims]
+            verification.title,
+            ("claim", "verdict", "what was derived"),
+            [(c.name, c.verdict, c.text) for c in verification.claims],
         )
-        every = "every claim holds; " if found.status == "verified" else ""
-        say(f"not compared: {'; '.join(found.not_compared) or 'nothing'}")
-        say(f"{found.status}: {every}in {found.seconds:.2f} s")
-    return EXIT[found.status]
+        all_hold = "every claim holds; " if verification.status == "verified" else ""
+        say(f"not compared: {'; '.join(verification.not_compared) or 'nothing'}")
+        say(f"{verification.status}: {all_hold}in {verification.seconds:.2f} s")
+    return EXIT[verification.status]

@@ -68,21 +68,25 @@ def compare(
     from sparserob_core.experiment.terminal.table import print_table
 
     watched = watch or serve or save is not None or connect is not None
-    watching = [recorder(save, serve, connect)] if watched else []
-    asked: dict[str, Any] = {"accuracy": ACCURACY if accuracy is None else accuracy, "measure": measure}
-    found = side_by_side(runs, out, **asked, observers=watching)
-    recordings = [line for one in watching for line in recorded(one, save)]
+    observers = [recorder(save, serve, connect)] if watched else []
+    options: dict[str, Any] = {"accuracy": ACCURACY if accuracy is None else accuracy, "measure": measure}
+    comparison = side_by_side(runs, out, **options, observers=observers)
+    recordings = [line for observer in observers for line in recorded(observer, save)]
     if as_json:
-        summary = found.summary() if isinstance(found, Profiles) else comparison_summary(found)
+        summary = comparison.summary() if isinstance(comparison, Profiles) else comparison_summary(comparison)
         print_json(finite({**summary, **({"remarks": [*summary["remarks"], *recordings]} if recordings else {})}))
         return 0
-    tables = [found.table(), found.times_table()] if isinstance(found, Profiles) else [comparison_table(found)]
+    tables = (
+        [comparison.table(), comparison.times_table()]
+        if isinstance(comparison, Profiles)
+        else [comparison_table(comparison)]
+    )
     for number, (columns, rows) in enumerate(tables):
         if number == 0 or len(rows) <= LISTED:
-            print_table((found.title or "Comparison") if number == 0 else "", columns, rows)
-    for line in found.remarks() if isinstance(found, Profiles) else comparison_remarks(found):
+            print_table((comparison.title or "Comparison") if number == 0 else "", columns, rows)
+    for line in comparison.remarks() if isinstance(comparison, Profiles) else comparison_remarks(comparison):
         say(printable(line))
-    if not found.undrawn:
+    if not comparison.undrawn:
         say(f"written to {out}")
     for line in recordings:
         say(printable(line))
@@ -131,10 +135,10 @@ def benchmark(
     from sparserob_core.experiment.directory.artefacts import finite
     from sparserob_core.experiment.terminal.table import print_table
 
-    named = [_choice(text) for text in maximisers]
+    choices = [_choice(text) for text in maximisers]
     with LiveLine() as line:
-        found = side_by_side(
-            named,
+        results = side_by_side(
+            choices,
             suites or ("standard",),
             budget=budget,
             seeds=seeds,
@@ -145,11 +149,11 @@ def benchmark(
             notify=line.receive,
         )
     if as_json:
-        print_json(finite(found.summary()))
+        print_json(finite(results.summary()))
         return 0
-    for title, (columns, rows) in ((found.profiles.title, found.table()), ("", found.times_table())):
+    for title, (columns, rows) in ((results.profiles.title, results.table()), ("", results.times_table())):
         print_table(title, columns, rows)
-    for remark in found.remarks():
+    for remark in results.remarks():
         say(printable(remark))
     if out is not None:
         say(f"written to {out}")

@@ -73,10 +73,10 @@ def initial_states(
     from sparserob_core.experiment.initial_states.initial_states import initial_states as find
     from sparserob_core.experiment.terminal.table import print_table
 
-    chosen = [int(one) - 1 for one in _numbers("states", states)]
+    chosen = [int(number) - 1 for number in _numbers("states", states)]
     try:
         with LiveLine() as line:
-            found = find(
+            feasible_set = find(
                 config,
                 overrides,
                 chosen,
@@ -92,17 +92,17 @@ def initial_states(
             raise
         raise InputError(path="--states", expected="two different states, counted from 1", got=repr(states)) from None
     if as_json:
-        print_json(finite(found.summary()))
+        print_json(finite(feasible_set.summary()))
     else:
-        print_table(found.title, (), found.rows())
-        for remark in (*found.remarks, *([f"written to {out}"] if out is not None else [])):
+        print_table(feasible_set.title, (), feasible_set.rows())
+        for remark in (*feasible_set.remarks, *([f"written to {out}"] if out is not None else [])):
             say(printable(remark))
-    return status_unless_interrupted(EXIT[found.status])
+    return status_unless_interrupted(EXIT[feasible_set.status])
 
 
 def _numbers(name: str, text: str) -> list[float]:
     try:
-        numbers = [float(part) for part in text.split(",")]
+        numbers = [float(token) for token in text.split(",")]
     except ValueError:
         numbers = []
     if not numbers or (name == "states" and any(not number.is_integer() or number < 1 for number in numbers)):

@@ -60,8 +60,10 @@ def loop(
     finished: object = source
     if source.is_dir():
         if overrides or out is not None:
-            given = f"{overrides[0]!r}" if overrides else "--out"
-            raise InputError(f"{source} is a finished run: expected no KEY=VALUE and no --out beside it, got {given}")
+            argument = f"{overrides[0]!r}" if overrides else "--out"
+            raise InputError(
+                f"{source} is a finished run: expected no KEY=VALUE and no --out beside it, got {argument}"
+            )
     else:
         outcome = run(source, overrides, out, quiet=as_json, figures=figures)
         if outcome.status not in PROVEN:
@@ -72,7 +74,7 @@ def loop(
     directory = Path(getattr(finished, "directory", source))
     picture = directory / "figures" / "loop.png" if figures else None
     with LiveLine() as line:
-        found = close(
+        loops = close(
             finished,  # type: ignore[arg-type]
             resolve,
             trajectories,
@@ -84,9 +86,9 @@ def loop(
             notify=line.receive,
         )
     if as_json:
-        print_json(finite(found.summary()))
+        print_json(finite(loops.summary()))
     else:
-        print_table(f"{found.title}: closed loop", *found.table())
-        for remark in (*found.remarks(), f"written to {directory / 'loop.json'}"):
+        print_table(f"{loops.title}: closed loop", *loops.table())
+        for remark in (*loops.remarks(), f"written to {directory / 'loop.json'}"):
             say(printable(remark))
-    return status_unless_interrupted(4 if found.contradicts else 0)
+    return status_unless_interrupted(4 if loops.contradicts else 0)

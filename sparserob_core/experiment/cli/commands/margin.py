@@ -79,20 +79,26 @@ def margin(
     from sparserob_core.experiment.run.viewer import recorded, recorder
     from sparserob_core.experiment.terminal.table import print_table
 
-    watching = [recorder(save, serve, connect)] if watch or serve or save is not None or connect is not None else []
-    asked: dict[str, Any] = {"tolerance": tolerance, "curve": curve, "out": out, "write": True, "observers": watching}
+    observers = [recorder(save, serve, connect)] if watch or serve or save is not None or connect is not None else []
+    options: dict[str, Any] = {
+        "tolerance": tolerance,
+        "curve": curve,
+        "out": out,
+        "write": True,
+        "observers": observers,
+    }
     with LiveLine() as line:
-        found = find(config, of, overrides, notify=line.receive, **asked)
+        answer = find(config, of, overrides, notify=line.receive, **options)
     if as_json:
-        print_json(summary_of_margin(found))
+        print_json(summary_of_margin(answer))
     else:
-        print_table(found.title, (), margin_rows(found))
-        if found.of == "horizon" and found.curve:
+        print_table(answer.title, (), margin_rows(answer))
+        if answer.of == "horizon" and answer.curve:
             columns = ("horizon", "status", "lower bound", "upper bound")
-            print_table("Cost against the horizon", columns, curve_rows(found))
-        recordings = (one for observer in watching for one in recorded(observer, save))
-        for remark in (*found.remarks, f"written to {found.directory}", *recordings):
+            print_table("Cost against the horizon", columns, curve_rows(answer))
+        recordings = (recording for observer in observers for recording in recorded(observer, save))
+        for remark in (*answer.remarks, f"written to {answer.directory}", *recordings):
             say(printable(remark))
-    if serve and found.status != "undecided":  # the Ctrl-C that ends a page has cut nothing short
-        return EXIT[found.status]
-    return status_unless_interrupted(EXIT[found.status])
+    if serve and answer.status != "undecided":  # the Ctrl-C that ends a page has cut nothing short
+        return EXIT[answer.status]
+    return status_unless_interrupted(EXIT[answer.status])

@@ -54,15 +54,15 @@ def simulate(
     from sparserob_core.experiment.terminal.table import print_table
 
     with LiveLine() as line:
-        found = propagate(directory, trajectories, law, seed, out=out, plugins=plugins, notify=line.receive)
+        simulation = propagate(directory, trajectories, law, seed, out=out, plugins=plugins, notify=line.receive)
     if as_json:
-        print_json(finite(found.summary()))
+        print_json(finite(simulation.summary()))
     else:
-        print_table(f"{found.title}: {found.law}", *found.table())
+        print_table(f"{simulation.title}: {simulation.law}", *simulation.table())
         for remark in (
-            *found.remarks(),
-            *([] if out is None or found.undrawn else [f"drawn into {out}"]),
-            f"written to {found.directory / f'simulation-{found.law}.json'}",
+            *simulation.remarks(),
+            *([] if out is None or simulation.undrawn else [f"drawn into {out}"]),
+            f"written to {simulation.directory / f'simulation-{simulation.law}.json'}",
         ):
             say(printable(remark))
-    return 4 if found.contradicts else 0
+    return 4 if simulation.contradicts else 0

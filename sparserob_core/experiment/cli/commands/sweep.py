@@ -92,18 +92,18 @@ def sweep(
         raise InputError("expected either CONFIG or --resume DIR, got " + ("neither" if config is None else "both"))
     if resume is not None and out is not None:
         raise InputError("--out: a study that is resumed stays in its directory; expected --resume DIR alone")
-    given = {"zip": zipped or None, "random": random, "sobol": sobol}
-    chosen = [name for name, value in given.items() if value is not None]
+    arrangements = {"zip": zipped or None, "random": random, "sobol": sobol}
+    chosen = [name for name, value in arrangements.items() if value is not None]
     if len(chosen) > 1:
         raise InputError(
-            "expected one of --zip, --random and --sobol, got " + " and ".join(f"--{one}" for one in chosen)
+            "expected one of --zip, --random and --sobol, got " + " and ".join(f"--{name}" for name in chosen)
         )
     watched = watch or serve or save is not None or connect is not None
     if dry_run and (watched or point is not None):
         raise InputError("--dry-run: expected neither --point nor a viewer beside it, for nothing is run")
-    watching = [recorder(save, serve, connect)] if watched else []
+    observers = [recorder(save, serve, connect)] if watched else []
     live = LiveTable()
-    asked: dict[str, Any] = {
+    options: dict[str, Any] = {
         "config": config if config is not None else resume,
         "axes": axes,
         "points": chosen[0] if chosen else None,
@@ -114,22 +114,24 @@ def sweep(
     }
     if dry_run:
         with live:
-            planned = outline(**asked)
+            planned = outline(**options)
         _print_outline(planned, quiet, as_json)
         return 0
     with live:
-        study = run_study(**asked, point=point, figures=figures, observers=watching)
-    study = replace(study, remarks=(*study.remarks, *(line for one in watching for line in recorded(one, save))))
+        study = run_study(**options, point=point, figures=figures, observers=observers)
+    study = replace(
+        study, remarks=(*study.remarks, *(line for observer in observers for line in recorded(observer, save)))
+    )
     if as_json:
         print_json({**study.summary(), "table": study.table})
     elif not quiet:
         print_table(study.title, *shown(study))
-        whole = (
+        hint = (
             ""
             if point is None
             else f"; the table of all points: sparserob sweep --resume {quote(str(study.directory))}"
         )
-        for remark in (*remarks_of(study), f"written to {study.directory}{whole}"):
+        for remark in (*remarks_of(study), f"written to {study.directory}{hint}"):
             say(printable(remark))
     status = 5 if study.failed else 0
     # the Ctrl-C that ends a page has cut nothing short

@@ -1,1 +1,1 @@
-"""What every command shares with the shell that started it: signals, streams, a line of progress."""
+"""Functions of every command that concern the shell which started it: signals, streams, a line of progress."""

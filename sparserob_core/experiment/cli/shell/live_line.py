@@ -1,4 +1,4 @@
-"""One line of progress, for commands that take a while."""
+"""Progress in a single line, for commands that take a while."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class LiveLine:
             sys.stderr.flush()
 
     def receive(self, event: Event) -> None:
-        """What is handed to a study as ``notify``."""
+        """Show an event of a study, whose ``notify`` this method is; events other than `StudyProgress` are ignored."""
         now = time.monotonic()
         pause = RENEWED if self._terminal else WRITTEN
         if not isinstance(event, StudyProgress) or now - self._started < PATIENCE:

@@ -46,7 +46,8 @@ class LiveTable:
             self._live.stop()
 
     def receive(self, event: Event) -> None:
-        """What is handed to a sweep as ``notify``."""
+        """Show an event of a sweep, whose ``notify`` this method is: rows and progress in the table, or in a line
+        without one."""
         if self._live is None:
             self._line.receive(event)
         elif isinstance(event, SweepProgress):

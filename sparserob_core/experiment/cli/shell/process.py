@@ -27,9 +27,12 @@ _masks = threading.local()
 
 
 def listen() -> None:
-    """From now on Ctrl-C and SIGTERM raise `KeyboardInterrupt`, which says what it was unless it is from the keyboard.
+    """Let Ctrl-C and SIGTERM raise `KeyboardInterrupt` from now on; its message names the signal, unless it is from the
+    keyboard.
+
     A signal that is ignored, as Ctrl-C is in the background of a shell, stays ignored. SIGTERM ends a process that is
-    forked from this one, as a pool of workers expects."""
+    forked from this one, as a pool of workers expects.
+    """
     with suppress(ValueError):  # not in the main thread
         if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
             signal.signal(signal.SIGINT, _interrupted)
@@ -71,11 +74,11 @@ def spare_imports() -> None:
     import numpy as np
 
     for name in ("char", "f2py", "polynomial", "testing"):
-        known = f"{np.__name__}.{name}"
-        spec = None if known in sys.modules else find_spec(known)
+        module_name = f"{np.__name__}.{name}"
+        spec = None if module_name in sys.modules else find_spec(module_name)
         if spec is not None and spec.loader is not None:
             spec.loader = LazyLoader(spec.loader)
-            module = sys.modules[known] = module_from_spec(spec)
+            module = sys.modules[module_name] = module_from_spec(spec)
             spec.loader.exec_module(module)
             setattr(np, name, module)
 
@@ -146,10 +149,10 @@ def _give_letters(stream: io.TextIOWrapper) -> None:
 
 
 def _own_descriptor() -> int:
-    """Another descriptor of what the standard output is; the standard output itself becomes the error stream."""
-    own = os.dup(1)
+    """Return a new descriptor of the present standard output, and redirect the standard output to the error stream."""
+    descriptor = os.dup(1)
     os.dup2(2, 1)
-    return own
+    return descriptor
 
 
 def hand_back_output() -> None:
@@ -179,8 +182,10 @@ def _leave_output() -> None:
 
 
 def _rewrapped(stream: io.TextIOWrapper, kind: type[io.TextIOWrapper]) -> io.TextIOWrapper:
-    """Another text stream over the buffer of this one, which it takes over; an `Output` over the standard output gets a
-    descriptor of its own."""
+    """Return a text stream of the given kind that takes over the buffer of a stream.
+
+    An `Output` over the standard output gets a descriptor of its own.
+    """
     encoding, errors = stream.encoding, stream.errors
     line_buffering, write_through = stream.line_buffering, stream.write_through
     buffer = stream.detach()
@@ -194,8 +199,8 @@ def _rewrapped(stream: io.TextIOWrapper, kind: type[io.TextIOWrapper]) -> io.Tex
 
 def drop_output() -> None:
     """Let what is still to be written to the standard output go nowhere."""
-    own = _descriptor(sys.stdout)
-    os.dup2(os.open(os.devnull, os.O_WRONLY), 1 if own is None else own)
+    descriptor = _descriptor(sys.stdout)
+    os.dup2(os.open(os.devnull, os.O_WRONLY), 1 if descriptor is None else descriptor)
 
 
 def _descriptor(stream: Any) -> int | None:

@@ -26,9 +26,9 @@ def read_arrays(file: Path, largest: int | None = None) -> dict[str, Array]:
     try:
         with ZipFile(file) as archive:
             size = sum(entry.file_size for entry in archive.infolist())
-        most = LARGEST if largest is None else largest
-        if size > most:
-            raise InputError(f"{file}: cannot be read: expected arrays of at most {most} bytes in all, got {size}")
+        limit = LARGEST if largest is None else largest
+        if size > limit:
+            raise InputError(f"{file}: cannot be read: expected arrays of at most {limit} bytes in all, got {size}")
         with np.load(file, allow_pickle=False) as stored:
             arrays = {name: stored[name] for name in stored.files}
     except InputError:

@@ -30,12 +30,12 @@ def resolve(data: dict[str, Any], folder: Callable[[Path], File]) -> Iterator[Co
 
     ``folder`` maps the path of a key to the folder that its file is relative to.
     """
-    known: dict[File, dict[str, Array]] = {}
+    cache: dict[File, dict[str, Array]] = {}
     size = 0
     for path, holder, key in list(_references(data.get("problem"), ("problem",))):
-        given = holder[key]
+        reference = holder[key]
         try:
-            holder[key] = pack(_read(given, folder(path), known).array)
+            holder[key] = pack(_read(reference, folder(path), cache).array)
             size += sum(len(text) for text in holder[key].values() if isinstance(text, str))
             if size > MOST_TEXT:
                 expected = f"matrices of at most {MOST_TEXT} characters together, as a run directory holds them"
@@ -85,14 +85,14 @@ def matrix_in(arrays: Mapping[str, Array], name: str) -> Packed:
         matrix = dense.reshape(-1, 1) if dense.ndim == 1 else dense
         shape_of(matrix.shape, name)
         return checked(matrix, name)
-    missing = [part for part in PARTS if f"{name}_{part}" not in arrays]
+    missing = [suffix for suffix in PARTS if f"{name}_{suffix}" not in arrays]
     if missing:
-        there = ", ".join(sorted(arrays)) or "nothing"
-        expected = f"an array {name}, or a sparse matrix as {', '.join(f'{name}_{part}' for part in PARTS)}"
-        raise InputError(path=name, expected=expected, got=there)
+        available = ", ".join(sorted(arrays)) or "nothing"
+        expected = f"an array {name}, or a sparse matrix as {', '.join(f'{name}_{suffix}' for suffix in PARTS)}"
+        raise InputError(path=name, expected=expected, got=available)
     shape = shape_of(_numbers(arrays, f"{name}_shape", "iu").tolist(), f"{name}_shape")
     values = _numbers(arrays, f"{name}_data", "fiu").astype(float)
-    indices, pointers = (_numbers(arrays, f"{name}_{part}", "iu") for part in ("indices", "indptr"))
+    indices, pointers = (_numbers(arrays, f"{name}_{suffix}", "iu") for suffix in ("indices", "indptr"))
     return checked(spread(shape, values, indices, pointers, f"{name}_indptr"), f"{name}_data")
 
 

@@ -52,9 +52,9 @@ def pack(matrix: Array) -> dict[str, Any]:
     rows, columns = np.nonzero(matrix)
     pointers = np.searchsorted(rows, np.arange(len(matrix) + 1))
     sparse = [pointers.astype("<i4"), columns.astype("<i4"), matrix[rows, columns].astype("<f8")]
-    parts = {CSR: b"".join(part.tobytes() for part in sparse), DENSE: matrix.astype("<f8").tobytes()}
-    kind = min(parts, key=lambda name: len(parts[name]))
-    return {"shape": list(matrix.shape), kind: base64.b64encode(parts[kind]).decode()}
+    encodings = {CSR: b"".join(array.tobytes() for array in sparse), DENSE: matrix.astype("<f8").tobytes()}
+    kind = min(encodings, key=lambda name: len(encodings[name]))
+    return {"shape": list(matrix.shape), kind: base64.b64encode(encodings[kind]).decode()}
 
 
 def unpack(data: Mapping[str, Any]) -> Packed:
@@ -86,8 +86,8 @@ def unpack(data: Mapping[str, Any]) -> Packed:
 def shape_of(given: object, where: str) -> tuple[int, int]:
     """Return the numbers of rows and columns; raises `InputError` unless they are positive and not too large."""
     sizes = list(given) if isinstance(given, Sequence | np.ndarray) and not isinstance(given, str) else []
-    whole = [isinstance(size, int | np.integer) and not isinstance(size, bool) and size > 0 for size in sizes]
-    if len(sizes) != 2 or not all(whole):
+    is_count = [isinstance(size, int | np.integer) and not isinstance(size, bool) and size > 0 for size in sizes]
+    if len(sizes) != 2 or not all(is_count):
         raise InputError(path=where, expected="two whole numbers, rows and columns", got=f"{given!r}"[:60])
     rows, columns = map(int, sizes)
     if rows * columns > MOST:
@@ -136,8 +136,10 @@ def spread(shape: tuple[int, int], values: Array, indices: Whole, pointers: Whol
 def checked(matrix: Array, where: str) -> Packed:
     """Return the rows of a matrix of finite numbers; raises `InputError` for other numbers."""
     if not np.isfinite(matrix).all():
-        place = tuple(int(i) + 1 for i in np.argwhere(~np.isfinite(matrix))[0])
-        raise InputError(path=where, expected="finite numbers", got=f"{matrix[place[0] - 1, place[1] - 1]} at {place}")
+        position = tuple(int(i) + 1 for i in np.argwhere(~np.isfinite(matrix))[0])
+        raise InputError(
+            path=where, expected="finite numbers", got=f"{matrix[position[0] - 1, position[1] - 1]} at {position}"
+        )
     return Packed(np.asarray(matrix, dtype=float).tolist())
 
 

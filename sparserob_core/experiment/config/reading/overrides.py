@@ -40,23 +40,23 @@ def parse_value(text: str, parse: Callable[[str], object]) -> object:
     Raises `ConfigError` where YAML cannot read the value, or would drop a part of it as a comment; the error shows how
     to quote it.
     """
-    given = text.partition("=")[2]
+    value_text = text.partition("=")[2]
     try:
-        value = parse(given)
+        value = parse(value_text)
     except ConfigError as error:
         raise ConfigError(f"{error}; as text it is written {quoted(text)}") from error
-    if value == "" and given.strip() not in ('""', "''"):  # a block of no lines
+    if value == "" and value_text.strip() not in ('""', "''"):  # a block of no lines
         raise ConfigError(
-            f"override {shown(text)}: {shown(given)} reads as an empty text; as text it is written {quoted(text)}"
+            f"override {shown(text)}: {shown(value_text)} reads as an empty text; as text it is written {quoted(text)}"
         )
-    for mark in re.finditer(r"(?:^|(?<=\s))#", given):
+    for mark in re.finditer(r"(?:^|(?<=\s))#", value_text):
         try:
-            comment = parse(given[: mark.start()]) == value
+            comment = parse(value_text[: mark.start()]) == value
         except ConfigError:
             comment = False  # the mark is within quotes
         if comment:
             raise ConfigError(
-                f"override {shown(text)}: {shown(given[mark.start() :])} would be a comment, which is left out; "
+                f"override {shown(text)}: {shown(value_text[mark.start() :])} would be a comment, which is left out; "
                 f"as text the value is written {quoted(text)}"
             )
     return value
@@ -73,13 +73,13 @@ def parse_overrides(
         return []
     if isinstance(given, Mapping):
         return [Override(_path(key), value, f"{key}={value}") for key, value in given.items()]
-    found = []
+    overrides = []
     for text in (as_utf8(argument, "strict") for argument in given):
         key, equals, _ = text.partition("=")
         if not equals:
             raise ConfigError(f"override {shown(text)}: expected key=value, for example method.name=nominal")
-        found.append(Override(_path(key), parse_value(text, parse), text))
-    return found
+        overrides.append(Override(_path(key), parse_value(text, parse), text))
+    return overrides
 
 
 def _path(key: str) -> Path:
@@ -95,9 +95,9 @@ def apply_override(data: dict[str, Any], override: Override) -> None:
     Keys on its path that are missing or null are added. Raises `ConfigError` where the path leads nowhere.
     """
     node: Any = data
-    for position, given in enumerate(override.path):
+    for position, key in enumerate(override.path):
         last = position == len(override.path) - 1
-        step: Any = _fitting(node, given, override, position)
+        step: Any = _fitting(node, key, override, position)
         if last:
             _put(node, step, override.value)
             return

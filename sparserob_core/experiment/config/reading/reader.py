@@ -78,13 +78,13 @@ class Source:
 
     def position(self, path: Path) -> tuple[int, int]:
         """Return line and column of a key, counted from 0; ``(0, 0)`` where positions are unknown."""
-        node, place = self.writer(path).marks, (0, 0)
+        node, position = self.writer(path).marks, (0, 0)
         for step in path:
-            found = _position(node, step)
-            if found is None:
+            entry = _position(node, step)
+            if entry is None:
                 break
-            place, node = found
-        return place
+            position, node = entry
+        return position
 
 
 def read_source(config: str | File | Mapping[str, Any] | Source) -> Source:
@@ -197,8 +197,8 @@ def _parsed(file: File, text: str) -> Any:
     except ReaderError as error:
         before = text[: error.position]
         line, column = before.count("\n") + 1, len(before) - before.rfind("\n")
-        said = f"the character U+{ord(text[error.position]):04X} is not allowed in a config"
-        raise ConfigError(f"{file}:{line}:{column}: {said}") from None
+        message = f"the character U+{ord(text[error.position]):04X} is not allowed in a config"
+        raise ConfigError(f"{file}:{line}:{column}: {message}") from None
     except (YAMLError, tomllib.TOMLDecodeError) as error:
         raise ConfigError(f"{file}: {' '.join(str(error).split())}") from None
     except RecursionError:
@@ -220,9 +220,9 @@ def _counted(data: object, known: dict[int, int]) -> int:
 
 
 def _problem(error: Any) -> str:
-    said = " ".join(str(part) for part in (error.context, error.problem) if part)
-    hint = "; indent with spaces" if "'\\t'" in said else ""
-    return f"not valid YAML: {' '.join(said.split())}{hint}"
+    message = " ".join(str(text) for text in (error.context, error.problem) if text)
+    hint = "; indent with spaces" if "'\\t'" in message else ""
+    return f"not valid YAML: {' '.join(message.split())}{hint}"
 
 
 def _position(node: Any, step: str | int) -> tuple[tuple[int, int], object] | None:

@@ -46,7 +46,7 @@ def problem_keys(problem: OptimalControlProblem) -> dict[str, Any]:
 
     Raises `InputError` that begins with the key where no config can describe the problem.
     """
-    unknown = {one.name for one in fields(problem)} - WRITTEN - set(problem.lists)
+    unknown = {field.name for field in fields(problem)} - WRITTEN - set(problem.lists)
     if unknown:
         raise InputError(path=sorted(unknown)[0], expected="a field that a config can say", got="another one")
     stated = {name: [entry for entry in entries if entry.stated] for name, entries in problem.lists.items()}
@@ -61,7 +61,7 @@ def problem_keys(problem: OptimalControlProblem) -> dict[str, Any]:
         "weights": np.asarray(problem.weights).tolist(),
         "disturbance_class": _class_of(problem, 0),
         "terminal": [_terminal_keys(f"terminal.{i}", entry) for i, entry in enumerate(ends)],
-        **{name: [_term_keys(f"{name}.{i}", one) for i, one in enumerate(every)] for name, every in stated.items()},
+        **{name: [_term_keys(f"{name}.{i}", term) for i, term in enumerate(terms)] for name, terms in stated.items()},
         **_cost_keys(problem.cost),
         **_names_keys(problem.names),
     }
@@ -95,14 +95,14 @@ def _disturbance_keys(problem: OptimalControlProblem, system: dict[str, Any]) ->
             expected="sets with flat sides and of one class, or one system for all of the horizon",
             got=bound.kind,
         )
-    found, begin, rows = [], 0, system.pop("E")
-    for i, part in enumerate(bound.parts):
-        columns = [row[begin : begin + part.dimension] for row in rows]
-        begin += part.dimension
-        keys = {"set": set_keys(f"disturbance.{i}.set", part), "E": columns, "class": _class_of(problem, i)}
+    entries, begin, rows = [], 0, system.pop("E")
+    for i, factor in enumerate(bound.parts):
+        columns = [row[begin : begin + factor.dimension] for row in rows]
+        begin += factor.dimension
+        keys = {"set": set_keys(f"disturbance.{i}.set", factor), "E": columns, "class": _class_of(problem, i)}
         own = None if problem.disturbance_breakpoints is None else problem.disturbance_breakpoints[i]
-        found.append(keys if own is None else {**keys, "breakpoints": own.tolist()})
-    return found
+        entries.append(keys if own is None else {**keys, "breakpoints": own.tolist()})
+    return entries
 
 
 def _class_of(problem: OptimalControlProblem, part: int) -> str:
@@ -122,12 +122,12 @@ def set_keys(where: str, convex: ConvexSet) -> dict[str, Any]:
         options = factory.options_of(convex) if issubclass(factory, SetFactory) else None
         if options is not None:
             return {kind: dict(options)}
-    known = ", ".join(registry.names(SetPlugin.kind))
-    raise InputError(path=where, expected=f"a set that a config can name ({known})", got=type(convex).__name__)
+    kinds = ", ".join(registry.names(SetPlugin.kind))
+    raise InputError(path=where, expected=f"a set that a config can name ({kinds})", got=type(convex).__name__)
 
 
 def _system_keys(system: System) -> dict[str, Any]:
-    unknown = {one.name for one in fields(system)} - WRITTEN_OF_SYSTEM
+    unknown = {field.name for field in fields(system)} - WRITTEN_OF_SYSTEM
     if unknown or system.stated is not system:
         raise InputError(path="system", expected="a system in the units of the user", got="another")
     phases = system.phases
@@ -148,19 +148,19 @@ def _matrix_keys(phase: Phase) -> dict[str, Any]:
 
 def _defined_keys(phases: Sequence[Phase]) -> dict[str, Any]:
     """Return the definitions that the entries of phases use; all phases share them."""
-    entries = [getattr(one, name) for one in phases for name in PARTS]
-    defined = next((one.defined for one in entries if isinstance(one, ExpressionMatrix) and one.defined), ())
-    return {"define": {name: one.text for name, one in defined}} if defined else {}
+    entries = [getattr(phase, name) for phase in phases for name in PARTS]
+    defined = next((entry.defined for entry in entries if isinstance(entry, ExpressionMatrix) and entry.defined), ())
+    return {"define": {name: expression.text for name, expression in defined}} if defined else {}
 
 
 def _rows(phase: Phase, name: str) -> Any:
     """Return the rows of numbers and expressions of a matrix; a large matrix is packed into one text."""
-    given = getattr(phase, name)
-    if isinstance(given, ExpressionMatrix):
-        return [[entry.text for entry in row] for row in given.entries]
-    if callable(given):
-        return traced(name, given, phase.names, phase.probes)
-    matrix: Array = np.asarray(given, dtype=float)
+    value = getattr(phase, name)
+    if isinstance(value, ExpressionMatrix):
+        return [[entry.text for entry in row] for row in value.entries]
+    if callable(value):
+        return traced(name, value, phase.names, phase.probes)
+    matrix: Array = np.asarray(value, dtype=float)
     return pack(matrix) if matrix.size > MANY else matrix.tolist()
 
 
@@ -190,12 +190,14 @@ def _term_keys(where: str, term: Term) -> dict[str, Any]:
 
     An infinite bound is null, and an end that follows the horizon is not written.
     """
-    told = {one.name: value for one in fields(cast("Any", term)) if (value := getattr(term, one.name)) is not None}
+    values = {
+        field.name: value for field in fields(cast("Any", term)) if (value := getattr(term, field.name)) is not None
+    }
     keys: dict[str, Any] = {}
     if isinstance(term, MixedConstraint):
         kept = np.isfinite(np.asarray(term.h))
-        keys["mixed"] = {name: _listed(told.pop(name)[kept]) for name in ("H", "G", "h")}
-    for name, value in told.items():
+        keys["mixed"] = {name: _listed(values.pop(name)[kept]) for name in ("H", "G", "h")}
+    for name, value in values.items():
         if isinstance(value, UntilHorizon):
             continue
         if not isinstance(value, ConvexSet):
@@ -210,9 +212,9 @@ def _term_keys(where: str, term: Term) -> dict[str, Any]:
 def _listed(value: Any) -> Any:
     """Return numbers as nested lists, with null where they are not finite."""
     numbers = np.asarray(value, dtype=float)
-    found = numbers.astype(object)
-    found[~np.isfinite(numbers)] = None
-    return found.tolist()
+    entries = numbers.astype(object)
+    entries[~np.isfinite(numbers)] = None
+    return entries.tolist()
 
 
 def _terminal_keys(where: str, entry: ConvexSet | Equality) -> dict[str, Any]:
@@ -235,6 +237,6 @@ def _names_keys(names: Names) -> dict[str, Any]:
     keys: dict[str, Any] = {kind: list(getattr(names, kind)) for kind in ("states", "controls", "disturbances")}
     units = {kind: list(getattr(names, f"{kind[:-1]}_units")) for kind in keys}
     stated = {**units, "time": names.time}
-    found = {key: value for key, value in {**keys, "plane": list(names.plane)}.items() if value}
-    measured = {key: value for key, value in stated.items() if value}
-    return {"names": {**found, **({"units": measured} if measured else {})}} if found or measured else {}
+    entries = {key: value for key, value in {**keys, "plane": list(names.plane)}.items() if value}
+    unit_keys = {key: value for key, value in stated.items() if value}
+    return {"names": {**entries, **({"units": unit_keys} if unit_keys else {})}} if entries or unit_keys else {}

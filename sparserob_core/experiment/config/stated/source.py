@@ -68,6 +68,6 @@ def dictionary_keys(registry: Registry, which: str, choice: object) -> dict[str,
             expected="indicators of its pieces, or a dictionary by name, so that a config can say which",
             got=f"{choice.functions} functions on {pieces} pieces",
         )
-    equal = np.array_equal(choice.breakpoints, np.linspace(0.0, choice.horizon, pieces + 1))
-    grid = {"pieces": pieces} if equal else {"breakpoints": choice.breakpoints.tolist()}
+    is_uniform = np.array_equal(choice.breakpoints, np.linspace(0.0, choice.horizon, pieces + 1))
+    grid = {"pieces": pieces} if is_uniform else {"breakpoints": choice.breakpoints.tolist()}
     return {"name": "piecewise_constant", **grid, **({} if choice.is_indicators else {"functions": choice.functions})}

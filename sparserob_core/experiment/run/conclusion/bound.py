@@ -70,39 +70,39 @@ def _bounded(experiment: ControlExperiment, result: Result, deadline: Deadline) 
     is over before.
     """
     tolerance = experiment.gap_tolerance
-    prices = None if any(counting(experiment.loaded)) else experiment.program.finite.weights
-    safe = rounded_down(experiment.transcription, result, tolerance, prices)
+    weights = None if any(counting(experiment.loaded)) else experiment.program.finite.weights
+    rounded = rounded_down(experiment.transcription, result, tolerance, weights)
     if result.status not in ("certified", "verified") or tolerance is None or result.stopped:
-        return safe
+        return rounded
     feedback = experiment.transcription.feedback
     exact = experiment.problem.execution is None and (feedback is None or feedback.loop.spread.is_box)
-    if exact and safe.gap <= tolerance + SMALL_GAP:
-        return safe
-    data = certificate(experiment, safe)
+    if exact and rounded.gap <= tolerance + SMALL_GAP:
+        return rounded
+    data = certificate(experiment, rounded)
     if data is None:
-        return safe
+        return rounded
     from sparserob_core.checker.claims.case import Case
     from sparserob_core.checker.claims.claims import derived_bound
     from sparserob_core.checker.outcome import Broken, Clock, Unchecked
 
-    given = experiment.problem, experiment.control, experiment.disturbance
+    arguments = experiment.problem, experiment.control, experiment.disturbance
     try:
         clock = Clock(deadline.at_most(SECONDS if exact else np.inf))
-        derived = derived_bound(Case(*given, finite(data), clock, policy=experiment.transcription.policy))
+        derived = derived_bound(Case(*arguments, finite(data), clock, policy=experiment.transcription.policy))
     except (Broken, Unchecked, ZeroDivisionError):
         if not exact:
             deadline.check()
-        return safe
+        return rounded
     if derived - result.cost > _allowed(result):
-        return replace(safe, status="failed", message=CROSSED.format(derived, result.cost, ADVICE))
+        return replace(rounded, status="failed", message=CROSSED.format(derived, result.cost, ADVICE))
     lowered = min(derived - INWARDS * abs(derived), result.cost)
-    if not np.isfinite(lowered) or (lowered <= safe.lower_bound if exact else lowered == safe.lower_bound):
-        return safe
-    closer = replace(safe, lower_bound=lowered, dual=replace(safe.dual, bound=lowered))
-    status, message = verdict(result.proofs, closer.gap, tolerance)
+    if not np.isfinite(lowered) or (lowered <= rounded.lower_bound if exact else lowered == rounded.lower_bound):
+        return rounded
+    improved = replace(rounded, lower_bound=lowered, dual=replace(rounded.dual, bound=lowered))
+    status, message = verdict(result.proofs, improved.gap, tolerance)
     ending = result.message.partition("; ")[2]  # why the method came to an end
     message = f"{message}; {ending}" if ending and status != "certified" else message
-    return replace(closer, status=status, message=message)
+    return replace(improved, status=status, message=message)
 
 
 def _allowed(result: Result) -> float:
@@ -113,6 +113,6 @@ def _allowed(result: Result) -> float:
     units = {proof.family: proof.units for proof in result.proofs}
     allowed = np.inf if result.dual.mu.size else ROUNDING * abs(result.cost)
     for cut in result.dual.cuts:
-        known = units.get(cut.family)
-        allowed += np.inf if known is None else cut.multiplier * TOLERANCE * float(known[cut.row])
+        row_units = units.get(cut.family)
+        allowed += np.inf if row_units is None else cut.multiplier * TOLERANCE * float(row_units[cut.row])
     return allowed

@@ -45,12 +45,14 @@ def with_causal(result: ControlResult, tools: Tools) -> ControlResult:
         limits = Limits.of(charge, [result], model.program.n, lambda: tools.deadline.passed)
         cost = result.cost if result.status in ("certified", "verified") else np.inf
         for hides in (True, False):  # of an unstable plant, balls may be too wide to show what a noise hides
-            found = search.least_cost(cost, limits, hides)
-            nothing = replace(result, causal=CausalBound(-np.inf, ended=limits.ended))
-            if found is None:
-                return nothing
-            tree, grown, none = found
-            stated = search.bound(tree, grown, np.inf if none else grown.value, model.problem.disturbance, limits.ended)
+            solved_tree = search.least_cost(cost, limits, hides)
+            no_bound = replace(result, causal=CausalBound(-np.inf, ended=limits.ended))
+            if solved_tree is None:
+                return no_bound
+            tree, solution, excludes_all = solved_tree
+            stated = search.bound(
+                tree, solution, np.inf if excludes_all else solution.value, model.problem.disturbance, limits.ended
+            )
             derived = proven(model, model.problem, stated, tools.deadline)
             if derived is not None or not stated.outputs:
                 break
@@ -58,12 +60,12 @@ def with_causal(result: ControlResult, tools: Tools) -> ControlResult:
         tools.deadline.interrupt(error)
         return result
     if derived is None:
-        return nothing
+        return no_bound
     if not stated.rows:  # every cost is at least 0: worth reporting only where the cost of the policy is 0
-        return replace(result, causal=CausalBound(0.0, ended=limits.ended)) if cost == 0.0 else nothing
-    if none:
-        said = WORDS.format(len(stated.signals)) if result.status == "infeasible" else ""
-        return replace(result, causal=replace(stated, lower=np.inf), message=result.message + said)
+        return replace(result, causal=CausalBound(0.0, ended=limits.ended)) if cost == 0.0 else no_bound
+    if excludes_all:
+        note = WORDS.format(len(stated.signals)) if result.status == "infeasible" else ""
+        return replace(result, causal=replace(stated, lower=np.inf), message=result.message + note)
     return replace(result, causal=replace(stated, lower=min(derived, cost)))
 
 
@@ -72,18 +74,20 @@ def _from(rest: Array, signal: Array) -> Array:
 
     ``rest`` holds the values at rest of the disturbance, followed by those of the initial state.
     """
-    found: Array = signal.T.ravel() - rest[: signal.size]
-    return found
+    deviations: Array = signal.T.ravel() - rest[: signal.size]
+    return deviations
 
 
 def active(model: Transcription, result: Result) -> list[tuple[str, float, Array | None]]:
     """Return the name, the time and the deviations of each constraint that the lower bound of a result rests on."""
-    rest, found = model.answering.loop.spread.middle, []
-    for cut, said in zip(result.dual.cuts, model.explained(result.dual.cuts), strict=True):
-        if said is not None:
-            signal = None if model.answering.loop.measurable is not None else said.disturbance
-            found.append((cut.family, said.time, None if signal is None else _from(rest, np.asarray(signal))))
-    return found
+    middle, constraints = model.answering.loop.spread.middle, []
+    for cut, explanation in zip(result.dual.cuts, model.explained(result.dual.cuts), strict=True):
+        if explanation is not None:
+            signal = None if model.answering.loop.measurable is not None else explanation.disturbance
+            constraints.append(
+                (cut.family, explanation.time, None if signal is None else _from(middle, np.asarray(signal)))
+            )
+    return constraints
 
 
 def searched(
@@ -130,7 +134,7 @@ def proven(
     from sparserob_core.checker.claims.claims import derived_causal_bound
     from sparserob_core.checker.outcome import Broken, Clock, Unchecked
 
-    policy, none = model.answering.policy, stated.lower == np.inf
+    policy, excludes_all = model.answering.policy, stated.lower == np.inf
     try:
         case = Case(
             problem,
@@ -140,7 +144,7 @@ def proven(
             Clock((deadline or Deadline()).at_most(SECONDS)),
             policy=policy,
         )
-        derived = derived_causal_bound(case, finite(causal_data(stated)), priced=not none)
+        derived = derived_causal_bound(case, finite(causal_data(stated)), priced=not excludes_all)
     except (Broken, Unchecked, ZeroDivisionError):
         return None
-    return None if none and not derived > 0.0 else derived
+    return None if excludes_all and not derived > 0.0 else derived

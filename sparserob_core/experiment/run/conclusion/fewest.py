@@ -51,21 +51,27 @@ def with_activity(experiment: ControlExperiment, result: Result, tools: Tools) -
         upper = _share(program, result.cost) if proven else None
         return replace(result, activity=Activity(_share(program, result.lower_bound) or 0.0, upper, norm=norm))
     # a cut of a sample is known by its number only, from which a check cannot derive its row
-    told = result.sparsest is None and all(cut.formulation != "sampled" for cut in result.dual.cuts)
-    factor = _factor(experiment) if told else None
-    least = -np.inf if factor is None else _safe(program, factor * result.lower_bound)
-    most, other = count(program, np.asarray(result.decision)) if proven else np.inf, None
+    is_checkable = result.sparsest is None and all(cut.formulation != "sampled" for cut in result.dual.cuts)
+    factor = _factor(experiment) if is_checkable else None
+    lower_count = -np.inf if factor is None else _safe(program, factor * result.lower_bound)
+    upper_count, count_result = count(program, np.asarray(result.decision)) if proven else np.inf, None
     if factor is None or (proven and not is_vertex(program, result)):
-        other = _other(experiment, result, tools, most)
-    if other is not None:  # only the account of the solver changes, not the relaxed programs of the method
-        result = replace(result, solved_by=result.charged([other]).solved_by)
-    activity = Activity(_share(program, least) or 0.0, _share(program, most), norm=norm)
-    if other is not None and _safe(program, other.lower_bound) > least:
-        least = _safe(program, other.lower_bound)
-        activity = replace(activity, lower=_share(program, least) or 0.0, dual=other.dual)
-    if other is not None and other.decision is not None and _admissible(program, other, most):
-        most = count(program, other.decision)
-        activity = replace(activity, upper=_share(program, most), decision=other.decision, proofs=other.proofs)
+        count_result = _other(experiment, result, tools, upper_count)
+    if count_result is not None:  # only the account of the solver changes, not the relaxed programs of the method
+        result = replace(result, solved_by=result.charged([count_result]).solved_by)
+    activity = Activity(_share(program, lower_count) or 0.0, _share(program, upper_count), norm=norm)
+    if count_result is not None and _safe(program, count_result.lower_bound) > lower_count:
+        lower_count = _safe(program, count_result.lower_bound)
+        activity = replace(activity, lower=_share(program, lower_count) or 0.0, dual=count_result.dual)
+    if (
+        count_result is not None
+        and count_result.decision is not None
+        and _admissible(program, count_result, upper_count)
+    ):
+        upper_count = count(program, count_result.decision)
+        activity = replace(
+            activity, upper=_share(program, upper_count), decision=count_result.decision, proofs=count_result.proofs
+        )
     lower = activity.lower if activity.upper is None else min(activity.lower, activity.upper)
     return replace(result, activity=replace(activity, lower=lower))
 
@@ -87,8 +93,8 @@ def _factor(experiment: ControlExperiment) -> float | None:
     if program.finite.blocks is None or cost.is_quadratic or not cost.l1:
         return multiple(program)
     channels = experiment.problem.system.controls
-    taken = {channel for block in cost.blocks for channel in block}
-    groups = [*cost.blocks, *((channel,) for channel in range(channels) if channel not in taken)]
+    grouped_channels = {channel for block in cost.blocks for channel in block}
+    groups = [*cost.blocks, *((channel,) for channel in range(channels) if channel not in grouped_channels)]
     lengths = [longest(experiment.problem.control, group) for group in groups]
     counts, highest = experiment.problem.counts, by_time(experiment.problem.weights)[1].max(axis=0)
     shares = [
@@ -120,12 +126,12 @@ def _other(experiment: ControlExperiment, result: Result, tools: Tools, most: fl
     if result.stopped or tools.deadline.passed:
         return None
     try:
-        known = [*result.dual.cuts, *result.indices]
+        cuts = [*result.dual.cuts, *result.indices]
         beaten, rounds = most if np.isfinite(most) else 0.0, max(ROUNDS, len(result.history))
         cells = {proof.family: max(CELLS, proof.cells) for proof in result.proofs}
-        method = LeastCount(known, beaten, rounds, cells)
-        found = solve_in_own_units(method, experiment.program, tools)
+        method = LeastCount(cuts, beaten, rounds, cells)
+        count_result = solve_in_own_units(method, experiment.program, tools)
     except KeyboardInterrupt as error:
         tools.deadline.interrupt(error)
         return None
-    return None if found.status in ENDED else rounded_down(experiment.transcription, found, None)
+    return None if count_result.status in ENDED else rounded_down(experiment.transcription, count_result, None)

@@ -34,15 +34,15 @@ def with_final_states(model: Transcription, result: Result, tolerance: float | N
     errors = result.errors
     if errors is None or errors.kept or result.decision is None or result.status != "undecided":
         return result
-    missed = _enclosed(model, result)
-    if missed is None:
+    error_bounds = _enclosed(model, result)
+    if error_bounds is None:
         return result
-    closer = replace(result, errors=replace(errors, missed=np.minimum(errors.missed, missed)))
-    assert closer.errors is not None
-    if not closer.errors.kept:
-        return closer
+    improved = replace(result, errors=replace(errors, missed=np.minimum(errors.missed, error_bounds)))
+    assert improved.errors is not None
+    if not improved.errors.kept:
+        return improved
     upper, lower = result.cost, min(result.lower_bound, result.cost)
-    bounded = replace(closer, upper_bound=upper, lower_bound=lower)
+    bounded = replace(improved, upper_bound=upper, lower_bound=lower)
     status, message = verdict(result.proofs, bounded.gap, tolerance or 0.0)
     return replace(bounded, status=status, message=message)
 
@@ -62,7 +62,7 @@ def _enclosed(model: Transcription, result: Result) -> np.ndarray | None:
     case = Case(model.stated, model.control, model.disturbance, {"decision": theta.tolist()}, Clock(SECONDS))
     try:
         with ctx.workprec(precision_of(case)):
-            found = [float(off.upper()) * OUTWARDS for off, _ in missed(case)]
+            error_bounds = [float(error_bound.upper()) * OUTWARDS for error_bound, _ in missed(case)]
     except (Broken, Unchecked, ZeroDivisionError):
         return None
-    return np.array(found) if np.isfinite(found).all() else None
+    return np.array(error_bounds) if np.isfinite(error_bounds).all() else None
