@@ -27,8 +27,8 @@ def lifted_matrix(space: TaylorSpace, coefficients: Array, rows: bool) -> Array:
 
 def lifted_transitions(space: TaylorSpace, A: Array, durations: Array, rows: bool) -> tuple[Array, Array]:
     """`transitions` of the lifted matrix of ``A (M, d, d)`` over durations ``(k,)``, ``(k, M d, M d)`` each."""
-    flow, driven = (lifted_matrix(space, part, rows) for part in flows_of(space, A, durations))
-    return flow, driven
+    flow, integral = (lifted_matrix(space, polynomial, rows) for polynomial in flows_of(space, A, durations))
+    return flow, integral
 
 
 def flows_of(space: TaylorSpace, A: Array, durations: Array) -> tuple[Array, Array]:
@@ -62,15 +62,15 @@ def exponential(space: TaylorSpace, polynomials: Array) -> Array:
     norms = np.abs(polynomials).sum(axis=-2).max(axis=-1).sum(axis=-1)
     squarings = np.maximum(0, np.ceil(np.log2(np.maximum(norms, np.finfo(float).tiny)))).astype(int)
     scaled = polynomials / np.exp2(squarings)[:, None, None, None]
-    one = np.zeros_like(scaled)
-    one[:, 0] = np.eye(scaled.shape[-1])
+    identity = np.zeros_like(scaled)
+    identity[:, 0] = np.eye(scaled.shape[-1])
     second = times(scaled, scaled)
-    third, powers = times(second, scaled), (one, scaled, second)
-    result: Array = COEFFICIENTS[18] * one
+    third, powers = times(second, scaled), (identity, scaled, second)
+    result: Array = COEFFICIENTS[18] * identity
     for block in (15, 12, 9, 6, 3, 0):
         result = times(result, third) + sum(COEFFICIENTS[block + i] * powers[i] for i in range(3))
-    for done in range(int(squarings.max(initial=0))):
-        result = np.where((squarings > done)[:, None, None, None], times(result, result), result)
+    for squaring in range(int(squarings.max(initial=0))):
+        result = np.where((squarings > squaring)[:, None, None, None], times(result, result), result)
     return result
 
 

@@ -1,7 +1,7 @@
-"""How large the parts of a linear system's state can become, block by block: comparison systems.
+"""Comparison systems: bounds of the norms of the parts of a linear system's state, block by block.
 
 For ``z' = A z`` in blocks ``z_1, ..., z_q``, the norms obey ``|z_j|' <= mu(A_jj) |z_j| + sum_k |A_jk| |z_k|`` with the
-logarithmic norm ``mu`` (Dahlquist 1958), so ``|z(r)| <= e^{M r} |z(0)|`` entry by entry, with ``M`` of these numbers
+logarithmic norm ``mu`` (Dahlquist 1958). So ``|z(r)| <= e^{M r} |z(0)|`` entry by entry, with ``M`` of these numbers
 (Strom 1975, section 4; Bellman 1962). ``M`` is as stable as the blocks are, where one norm of all of ``A`` would count
 the fastest decay as the fastest growth; and it does not change when a block is measured in another unit.
 """
@@ -63,8 +63,8 @@ def comparison_matrix(D: Float[Array, "d d"], starts: Int[np.ndarray, " q"]) -> 
 
 @dataclass(frozen=True, eq=False)
 class NormBounds:
-    """A matrix of bounds for each of ``k`` durations: ``matrices (u, q', q)``, of which ``which (k,)`` says whose is
-    whose. Durations that are nearly equal share one, which holds for all of them."""
+    """A matrix of bounds for each of ``k`` durations: ``matrices (u, q', q)``, and the index ``which (k,)`` of the
+    matrix of each duration. Durations that are nearly equal share one matrix, which holds for all of them."""
 
     matrices: Array
     which: np.ndarray
@@ -76,52 +76,57 @@ class NormBounds:
 
     @shaped
     def on(self, norms: Float[Array, "*r k q"]) -> Float[Array, "*r k p"]:
-        """What each duration makes of block norms of its own."""
+        """Return the bounds ``(..., k, q')`` after each duration, from block norms ``(..., k, q)`` of its own."""
         if self.matrices.shape[0] == 1:
             return product(norms, self.matrices[0].T)
         if self.which.size < FEW * self.matrices.shape[0] and self.matrices[0].size * self.which.size <= MOST:
             return np.asarray(product(self.matrices[self.which], norms[..., None])[..., 0])
-        found = np.empty((*norms.shape[:-1], self.matrices.shape[1]))
-        for number, here in enumerate(self._places):
-            found[..., here, :] = product(norms[..., here, :], self.matrices[number].T)
-        return found
+        bounds = np.empty((*norms.shape[:-1], self.matrices.shape[1]))
+        for number, indices in enumerate(self._places):
+            bounds[..., indices, :] = product(norms[..., indices, :], self.matrices[number].T)
+        return bounds
 
     @shaped
     def summed(self, start: Float[Array, "*r q"], added: Float[Array, "*r k q"]) -> Float[Array, "*r points q"]:
-        """What begins at ``start`` and grows by these bounds and what is ``added``, duration after duration: ``k + 1``
-        vectors."""
-        found = np.empty((*added.shape[:-2], added.shape[-2] + 1, added.shape[-1]))
-        found[..., 0, :], found[..., 1:, :] = start, added
+        """Return the ``k + 1`` vectors of bounds that begin at ``start (..., q)``.
+
+        Each duration multiplies the vector by its matrix and then adds its row of ``added (..., k, q)``.
+        """
+        sums = np.empty((*added.shape[:-2], added.shape[-2] + 1, added.shape[-1]))
+        sums[..., 0, :], sums[..., 1:, :] = start, added
         with np.errstate(over="ignore", invalid="ignore"):
             if self.matrices.shape[0] == 1 and self.which.size >= LONG:
-                self._sum_in_blocks(found)
+                self._sum_in_blocks(sums)
             else:
-                for place, number in enumerate(self.which.tolist()):
-                    found[..., place + 1, :] += found[..., place, :] @ self.matrices[number].T
-        if not np.isfinite(found).all():  # something is infinite, and nothing times that is nothing
-            found[..., 0, :], found[..., 1:, :] = start, added
-            for place, number in enumerate(self.which.tolist()):
-                found[..., place + 1, :] += product(found[..., place, None, :], self.matrices[number].T)[..., 0, :]
-        return found
+                for step, number in enumerate(self.which.tolist()):
+                    sums[..., step + 1, :] += sums[..., step, :] @ self.matrices[number].T
+        if not np.isfinite(sums).all():  # something is infinite, and nothing times that is nothing
+            sums[..., 0, :], sums[..., 1:, :] = start, added
+            for step, number in enumerate(self.which.tolist()):
+                sums[..., step + 1, :] += product(sums[..., step, None, :], self.matrices[number].T)[..., 0, :]
+        return sums
 
     def _sum_in_blocks(self, found: Array) -> None:
-        """`summed`, for one matrix: first from 0 in every block of as many durations, all blocks at once, then what
-        each begins with."""
+        """Fill ``found`` with the result of `summed` for one matrix.
+
+        The sums are taken first from 0 in every block of as many durations, all blocks at once. The vector at the
+        beginning of each block is added after that.
+        """
         flow, size, count = self.matrices[0].T, int(np.sqrt(self.which.size)), self.which.size
         blocks, q = count // size, flow.shape[0]
         inside = found[..., 1 : blocks * size + 1, :].reshape(*found.shape[:-2], blocks, size, q)
-        for place in range(1, size):
-            inside[..., place, :] += inside[..., place - 1, :] @ flow
+        for step in range(1, size):
+            inside[..., step, :] += inside[..., step - 1, :] @ flow
         powers = [flow]  # the bounds over 1, 2, 3, ... durations
         while len(powers) < size:
             powers.append(powers[-1] @ flow)
-        begun, every = found[..., 0, :], np.concatenate(powers, axis=1)
-        for number in range(blocks):
-            inside[..., number, :, :] += (begun @ every).reshape(*begun.shape[:-1], size, q)
-            begun = inside[..., number, -1, :]
+        start, joined_powers = found[..., 0, :], np.concatenate(powers, axis=1)
+        for block in range(blocks):
+            inside[..., block, :, :] += (start @ joined_powers).reshape(*start.shape[:-1], size, q)
+            start = inside[..., block, -1, :]
         found[..., 1 : blocks * size + 1, :] = inside.reshape(*found.shape[:-2], blocks * size, q)
-        for place in range(blocks * size, count):
-            found[..., place + 1, :] += found[..., place, :] @ flow
+        for step in range(blocks * size, count):
+            found[..., step + 1, :] += found[..., step, :] @ flow
 
     @cached_property
     def _places(self) -> list[np.ndarray]:
@@ -148,20 +153,21 @@ class ComparisonSystem:
     _known: dict[bytes, tuple[Array, Array, Array, Array]] = field(default_factory=dict, repr=False)
 
     def over(self, widths: Array, cells: bool = False) -> Reach:
-        """The bounds for ``widths (k,)``; those of ``cells``, which may be halved, are rougher where they are many.
+        """Return the bounds for ``widths (k,)``; the bounds of ``cells``, which may be halved, are rougher where they
+        are many.
 
-        With ``M = P - N``, ``P >= 0`` and ``N >= 0`` diagonal, ``e^{M r} <= I + P int_0^r e^{M s} ds``: a stable
-        system stays bounded however long it runs.
+        With ``M = P - N``, ``P >= 0`` and ``N >= 0`` diagonal, ``e^{M r} <= I + P int_0^r e^{M s} ds``: a stable system
+        stays bounded however long it runs.
         """
         if widths.size * self.sizes.size <= SMALL:  # each for itself: it takes longer to see which are alike
-            shortest, longest, which = widths, widths, np.arange(widths.size)
+            shortest, longest, groups = widths, widths, np.arange(widths.size)
         else:
-            shortest, longest, which = alike(widths, self.sizes.size, rough=cells)
+            shortest, longest, groups = alike(widths, self.sizes.size, rough=cells)
         key = shortest.tobytes() + longest.tobytes()
         if key not in self._known:
-            most = MOST // max(1, shortest.size * self.sizes.size)
-            remember(self._known, key, self._over(shortest, longest), max(1, min(KEPT, most)))
-        return Reach(*(NormBounds(part, which) for part in self._known[key]))
+            capacity = MOST // max(1, shortest.size * self.sizes.size)
+            remember(self._known, key, self._over(shortest, longest), max(1, min(KEPT, capacity)))
+        return Reach(*(NormBounds(bounds, groups) for bounds in self._known[key]))
 
     @cached_property
     def rising(self) -> Array:
@@ -170,20 +176,22 @@ class ComparisonSystem:
 
     @shaped
     def slips(self, slack: Float[Array, "q q"], widths: Float[Array, " k"]) -> tuple[NormBounds, NormBounds]:
-        """How much ``e^{(A + S) r}`` and its integral differ from those of ``A`` at ``r = width (k,)``, for any ``S``
-        with blocks of norm ``slack (q, q)``.
+        """Return bounds of the difference of ``e^{(A + S) r}``, and of its integral, from those of ``A`` at
+        ``r = width (k,)``.
 
-        The difference is ``int_0^r e^{A (r - s)} S e^{(A + S) s} ds``, which is a block of one exponential.
+        The bounds hold for any ``S`` with blocks of norm ``slack (q, q)``. The difference is
+        ``int_0^r e^{A (r - s)} S e^{(A + S) s} ds``, which is a block of one exponential.
         """
         q = slack.shape[0]
         both = np.block([[self.metzler, slack], [np.zeros((q, q)), self.metzler + slack]])
-        shortest, longest, which = alike(widths, both.size, rough=True)  # however rough, they are as small as the slack
+        # however rough, they are as small as the slack
+        shortest, longest, groups = alike(widths, both.size, rough=True)
         with np.errstate(over="ignore", invalid="ignore"):
-            flow, integral = (part[:, :q, q:] for part in flows_between(both, shortest, longest))
-        return NormBounds(flow, which), NormBounds(integral, which)
+            flow, integral = (matrices[:, :q, q:] for matrices in flows_between(both, shortest, longest))
+        return NormBounds(flow, groups), NormBounds(integral, groups)
 
     def _over(self, shortest: Array, longest: Array) -> tuple[Array, Array, Array, Array]:
-        one = np.eye(self.metzler.shape[0])
+        identity = np.eye(self.metzler.shape[0])
         with np.errstate(over="ignore", invalid="ignore"):
             rates = np.diagonal(self.metzler)
             coupling = self.metzler - np.diag(rates)
@@ -191,8 +199,8 @@ class ComparisonSystem:
                 flow, integral = flows_apart(rates, coupling, shortest, longest)
             else:
                 flow, integral = flows_between(self.metzler, shortest, longest)
-            peak = one + SAFE * product(self.rising, integral)
-            departure = np.minimum(SAFE * product(self.sizes, integral), one + peak)
+            peak = identity + SAFE * product(self.rising, integral)
+            departure = np.minimum(SAFE * product(self.sizes, integral), identity + peak)
         return flow, integral, peak, departure
 
 
@@ -200,10 +208,24 @@ class ComparisonSystem:
 def alike(
     durations: Float[Array, " k"], numbers: int, rough: bool = False
 ) -> tuple[Float[Array, " u"], Float[Array, " u"], Int[np.ndarray, " k"]]:
-    """Nearly equal durations together: the shortest and the longest ``(u,)`` of each group, those of a group that
-    differ rounded outwards, and which group each is of; ``numbers`` are there to be kept of every group, in a square
-    matrix; ``rough``: groups may be wide where they would take long."""
-    distinct, which = np.unique(durations, return_inverse=True)
+    """Group nearly equal durations.
+
+    Parameters
+    ----------
+    durations : array (k,)
+        The durations.
+    numbers : int
+        Numbers to be kept for every group, in a square matrix.
+    rough : bool
+        True where groups may be wide, to save time.
+
+    Returns
+    -------
+    array (u,), array (u,), array (k,)
+        The shortest and the longest duration of each group, rounded outwards where they differ; and the group of each
+        duration.
+    """
+    distinct, inverse = np.unique(durations, return_inverse=True)
     nothing, share = NOTHING * distinct.max(initial=0.0), EQUAL
     group = np.cumsum(np.diff(distinct, prepend=distinct[:1]) > share * distinct + nothing)
     count = int(group[-1]) + 1 if group.size else 0
@@ -215,7 +237,7 @@ def alike(
     shortest, longest = distinct[first], distinct[np.append(first, distinct.size)[1:] - 1]
     differ = shortest < longest
     shortest = np.where(differ, _rounded(shortest, np.floor), shortest)
-    return shortest, np.where(differ, _rounded(longest, np.ceil), longest), group[which.reshape(-1)]
+    return shortest, np.where(differ, _rounded(longest, np.ceil), longest), group[inverse.reshape(-1)]
 
 
 def _rounded(values: Array, to: np.ufunc) -> Array:
@@ -232,14 +254,14 @@ def flows_between(metzler: Array, shortest: Array, longest: Array) -> tuple[Arra
     flow, integral = np.empty((2, durations.size, *metzler.shape))
     step = max(1, AT_ONCE // (4 * metzler.size))
     for start in range(0, durations.size, step):
-        part = slice(start, start + step)
-        flow[part], integral[part] = (finite(SAFE * one) for one in transitions(metzler, durations[part]))
+        batch = slice(start, start + step)
+        flow[batch], integral[batch] = (finite(SAFE * bound) for bound in transitions(metzler, durations[batch]))
     flow = flow[: shortest.size]
     if differ.size:  # e^{M (r + s)} = e^{M r} e^{M s}
-        rest, integral = integral[shortest.size :], integral[: shortest.size].copy()
-        begun, one = flow[differ], np.eye(metzler.shape[0])
-        integral[differ] += SAFE * product(begun, rest)
-        flow[differ] = product(begun, one + SAFE * product(rising(metzler), rest))
+        extra_integral, integral = integral[shortest.size :], integral[: shortest.size].copy()
+        early_flow, identity = flow[differ], np.eye(metzler.shape[0])
+        integral[differ] += SAFE * product(early_flow, extra_integral)
+        flow[differ] = product(early_flow, identity + SAFE * product(rising(metzler), extra_integral))
     return flow, integral
 
 
@@ -255,18 +277,18 @@ def flows_apart(rates: Array, coupling: Array, shortest: Array, longest: Array) 
     largest coupling ``s``.
     """
     q, early, late = rates.size, shortest[:, None], longest[:, None]
-    alone, added = np.exp(rates * np.where(rates < 0, early, late)), _grown(rates, late)
+    diagonal_flow, diagonal_integral = np.exp(rates * np.where(rates < 0, early, late)), _grown(rates, late)
     larger, difference = np.maximum.outer(rates, rates), -np.abs(np.subtract.outer(rates, rates))
     early, late = early[..., None], late[..., None]
     share = np.exp(larger * np.where(larger < 0, early, late)) * _grown(difference, late)
     triangle = late**2 / 2 * np.exp(np.maximum(larger, 0.0) * late)
-    twice = np.minimum(added[:, :, None] * added[:, None, :], triangle)
+    twice = np.minimum(diagonal_integral[:, :, None] * diagonal_integral[:, None, :], triangle)
     third = (q * coupling.max() * late) ** 3 / (5 * q)  # e^x - 1 - x - x^2 / 2 <= x^3 / 5 where x <= 1/2
     higher = _scaled(late**2 / 2 * product(coupling, coupling) + third, np.exp(max(0.0, float(rates.max())) * late))
     flow, integral = _scaled(coupling, share) + higher, _scaled(coupling, twice) + late * higher
-    here = np.arange(q)
-    flow[:, here, here] += alone
-    integral[:, here, here] += added
+    indices = np.arange(q)
+    flow[:, indices, indices] += diagonal_flow
+    integral[:, indices, indices] += diagonal_integral
     return finite(SAFE * flow), finite(SAFE * integral)
 
 
@@ -287,17 +309,16 @@ def rising(metzler: Array) -> Array:
 
 
 def finite(values: Array) -> Array:
-    """Bounds; those that overflowed are infinite."""
+    """Return bounds that are at least 0, and infinite where they overflowed."""
     return np.where(np.isnan(values), np.inf, np.maximum(values, 0.0))
 
 
 def product(left: Array, right: Array) -> Array:
-    """The product of matrices of bounds, in which nothing times infinity is nothing; what is no number is taken for
-    infinite."""
+    """Return the product of matrices of bounds, in which 0 times infinity is 0; NaN is taken for infinity."""
     largest = np.maximum.reduce(left, axis=None, initial=0.0), np.maximum.reduce(right, axis=None, initial=0.0)
     if largest[0] < np.inf and largest[1] < np.inf:  # and is a number
         return np.asarray(left @ right)
-    endless_left, endless_right = ~np.isfinite(left), ~np.isfinite(right)
-    met = (endless_left * 1.0) @ (endless_right | (right > 0)) + (left > 0) @ (endless_right * 1.0)
-    found = np.where(endless_left, 0.0, left) @ np.where(endless_right, 0.0, right)
-    return np.asarray(np.where(met > 0, np.inf, found))
+    infinite_left, infinite_right = ~np.isfinite(left), ~np.isfinite(right)
+    infinite_terms = (infinite_left * 1.0) @ (infinite_right | (right > 0)) + (left > 0) @ (infinite_right * 1.0)
+    finite_product = np.where(infinite_left, 0.0, left) @ np.where(infinite_right, 0.0, right)
+    return np.asarray(np.where(infinite_terms > 0, np.inf, finite_product))

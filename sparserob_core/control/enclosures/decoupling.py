@@ -62,8 +62,8 @@ class Decoupling:
         D = np.where((group[:, None] == group) & (block[:, None] <= block), moved, 0.0)
         for i in np.flatnonzero(np.diff(np.append(self.starts, d)) == 2):
             at = self.starts[i]
-            rate, turn = (D[at, at] + D[at + 1, at + 1]) / 2, (D[at, at + 1] - D[at + 1, at]) / 2
-            D[at : at + 2, at : at + 2] = [[rate, turn], [-turn, rate]]
+            rate, rotation = (D[at, at] + D[at + 1, at + 1]) / 2, (D[at, at + 1] - D[at + 1, at]) / 2
+            D[at : at + 2, at : at + 2] = [[rate, rotation], [-rotation, rate]]
         return D
 
     def vector(self, columns: Array) -> tuple[Array, Array]:
@@ -76,8 +76,8 @@ class Decoupling:
         """``V A T`` for matrices ``A (..., d, d)``, and a bound of ``|T^-1 A T - V A T|``, entry by entry."""
         if self.is_identity:
             return A, np.zeros(A.shape)
-        moved = self.inverse @ A.astype(np.longdouble) @ self.transform
-        return self._rounded(moved, np.abs(A) @ np.abs(self.transform))
+        transformed = self.inverse @ A.astype(np.longdouble) @ self.transform
+        return self._rounded(transformed, np.abs(A) @ np.abs(self.transform))
 
     def _rounded(self, moved: LongArray, sizes: Array) -> tuple[Array, Array]:
         """``moved`` in double precision, and how far it may be from the truth; ``sizes`` bound what the inverse was
@@ -98,7 +98,7 @@ class Decoupling:
 
     @property
     def is_identity(self) -> bool:
-        """Whether nothing is transformed, and so nothing rounded."""
+        """True where no coordinates are transformed, so that nothing is rounded."""
         return not self.defect.any()
 
 
@@ -110,15 +110,15 @@ def decoupled(A: Array) -> Decoupling:
         return identity(d)
     scale = balance(A)
     balanced = A * scale / scale[:, None]
-    for found in _candidates(balanced):
-        checked = _checked(scale[:, None] * found[0], *found[1:])
+    for candidate in _candidates(balanced):
+        checked = _checked(scale[:, None] * candidate[0], *candidate[1:])
         if checked is not None:
             return checked
     return identity(d)
 
 
 def identity(d: int) -> Decoupling:
-    """No change of coordinates, and every state a block of its own."""
+    """Return the decoupling without a change of coordinates, with every state as a block of its own, in one group."""
     return Decoupling(np.eye(d), np.eye(d, dtype=np.longdouble), np.zeros((d, d)), np.arange(d), np.zeros(1, dtype=int))
 
 
@@ -129,15 +129,15 @@ def _checked(T: Array, starts: np.ndarray, groups: np.ndarray) -> Decoupling | N
     except np.linalg.LinAlgError:
         return None
     d = T.shape[0]
-    better = V + (np.eye(d) - V.astype(np.longdouble) @ T) @ V  # one step of Newton's method (Schulz 1933)
-    long = np.abs(better @ T - np.eye(d)) + _long_rounding(d) * (np.abs(better) @ np.abs(T))
-    residual = 1.001 * long.astype(float)
+    inverse = V + (np.eye(d) - V.astype(np.longdouble) @ T) @ V  # one step of Newton's method (Schulz 1933)
+    long_residual = np.abs(inverse @ T - np.eye(d)) + _long_rounding(d) * (np.abs(inverse) @ np.abs(T))
+    residual = 1.001 * long_residual.astype(float)
     size = float(residual.sum(axis=1).max())
     if not size < 0.5:
         return None
     # T^-1 = (I + S)^-1 V with |S| <= residual, and (I + S)^-1 - I is at most residual + residual^2 + ...
     defect = residual + residual @ residual + size**3 / (1.0 - size)
-    return Decoupling(T, better, defect, starts, groups)
+    return Decoupling(T, inverse, defect, starts, groups)
 
 
 def _long_rounding(terms: int) -> float:
@@ -154,8 +154,8 @@ def _candidates(A: Array) -> Iterator[tuple[Array, np.ndarray, np.ndarray]]:
         if values[i].imag < 0:
             continue
         starts.append(len(columns))
-        parts = (vectors[:, i].real,) if values[i].imag == 0 else (vectors[:, i].real, vectors[:, i].imag)
-        columns += [part / np.linalg.norm(vectors[:, i]) for part in parts]
+        components = (vectors[:, i].real,) if values[i].imag == 0 else (vectors[:, i].real, vectors[:, i].imag)
+        columns += [component / np.linalg.norm(vectors[:, i]) for component in components]
     modal = np.stack(columns, axis=1)
     condition = np.linalg.cond(modal) if modal.shape[0] == modal.shape[1] else np.inf
     if condition < WELL_CONDITIONED:
@@ -168,14 +168,14 @@ def _candidates(A: Array) -> Iterator[tuple[Array, np.ndarray, np.ndarray]]:
         clusters = _clusters(values, closeness * np.abs(values).max())
         if len(clusters) == 1:
             break
-        found = _grouped(form, basis, clusters)
-        if found is not None and np.linalg.cond(found[0]) < WELL_CONDITIONED:
-            yield found
+        candidate = _grouped(form, basis, clusters)
+        if candidate is not None and np.linalg.cond(candidate[0]) < WELL_CONDITIONED:
+            yield candidate
     if len(A) >= MANY and condition < POORLY_CONDITIONED:
         yield modal, np.array(starts), np.array(starts)
-    found = _grouped(form, basis, [np.ones(values.size, dtype=bool)])
-    if found is not None:
-        yield found
+    candidate = _grouped(form, basis, [np.ones(values.size, dtype=bool)])
+    if candidate is not None:
+        yield candidate
 
 
 def _eigenvalues(form: Array) -> np.ndarray:
@@ -186,8 +186,10 @@ def _eigenvalues(form: Array) -> np.ndarray:
 
 
 def _clusters(values: np.ndarray, distance: float) -> list[np.ndarray]:
-    """Which eigenvalues are within ``distance`` of each other, in chains, conjugates always together; the order is that
-    of their numbers."""
+    """Return the masks of clusters of eigenvalues, in the order of their first eigenvalues.
+
+    Eigenvalues within ``distance`` of each other are in one cluster, also in chains, and conjugates always together.
+    """
     upper = np.where(values.imag < 0, values.conj(), values)
     linked = np.abs(upper[:, None] - upper) <= distance
     for _ in range(values.size.bit_length()):
@@ -201,31 +203,33 @@ def _grouped(form: Array, basis: Array, clusters: list[np.ndarray]) -> tuple[Arr
     the front of one Schur form (Bai and Demmel 1993)."""
     from scipy.linalg.lapack import dtrsen
 
-    bases, starts, groups, done = [], [], [], 0
+    bases, starts, groups, start = [], [], [], 0
     for cluster in clusters:
-        moved, turned, count = form, basis, int(cluster.sum())
+        reordered, reordered_basis, count = form, basis, int(cluster.sum())
         if len(clusters) > 1:
-            moved, turned, *_, error = dtrsen(cluster.astype(np.int32), form, basis, job="N", lwork=form.shape[0])
-            if error or (count < form.shape[0] and abs(moved[count, count - 1]) > 0):
+            reordered, reordered_basis, *_, error = dtrsen(
+                cluster.astype(np.int32), form, basis, job="N", lwork=form.shape[0]
+            )
+            if error or (count < form.shape[0] and abs(reordered[count, count - 1]) > 0):
                 return None
-        columns = turned[:, :count].copy()
-        places, at = [], 0
-        while at < count:
-            places.append(done + at)
-            pair = at + 1 < count and moved[at + 1, at] != 0
-            if pair:  # a rotation: equal off-diagonal entries make it normal
-                columns[:, at + 1] *= np.sqrt(abs(moved[at + 1, at] / moved[at, at + 1]))
-            at += 2 if pair else 1
+        columns = reordered_basis[:, :count].copy()
+        block_starts, offset = [], 0
+        while offset < count:
+            block_starts.append(start + offset)
+            is_pair = offset + 1 < count and reordered[offset + 1, offset] != 0
+            if is_pair:  # a rotation: equal off-diagonal entries make it normal
+                columns[:, offset + 1] *= np.sqrt(abs(reordered[offset + 1, offset] / reordered[offset, offset + 1]))
+            offset += 2 if is_pair else 1
         bases.append(columns)
-        starts += places
-        groups.append(done)
-        done += count
+        starts += block_starts
+        groups.append(start)
+        start += count
     return np.hstack(bases), np.array(starts), np.array(groups)
 
 
 def pace(A: Array) -> float:
-    """About how fast a system moves: the norm of ``A (d, d)`` in units of the states in which it is balanced, or as it
-    is, whichever is less."""
+    """Return an estimate of how fast a system moves: the 2-norm of ``A (d, d)`` as it is or in balanced units of the
+    states, the smaller one."""
     scale = balance(A)
     return float(min(np.linalg.norm(A, 2), np.linalg.norm(A * scale / scale[:, None], 2)))
 
@@ -242,7 +246,7 @@ def _swept(A: Array, scale: Array) -> Array:
     size = np.abs(A - np.diag(np.diag(A))) * scale / scale[:, None]
     scale = scale.copy()
     for _ in range(SWEEPS):
-        moved = False
+        changed = False
         for i in range(A.shape[0]):
             row, column = float(size[i].sum()), float(size[:, i].sum())
             if row > 0 and column > 0:
@@ -251,8 +255,8 @@ def _swept(A: Array, scale: Array) -> Array:
                     scale[i] *= factor
                     size[:, i] *= factor
                     size[i] /= factor
-                    moved = True
-        if not moved:
+                    changed = True
+        if not changed:
             break
     return scale
 
@@ -263,10 +267,10 @@ def _near_one(A: Array) -> Array:
     i, j = np.nonzero(A - np.diag(np.diag(A)))
     logs, d = np.log2(np.abs(A[i, j])), A.shape[0]
     graph, sums = np.zeros((d, d)), np.zeros(d)
-    for sign, here, there in ((1.0, i, j), (-1.0, j, i)):
-        np.add.at(graph, (here, here), 1.0)
-        np.add.at(graph, (here, there), -1.0)
-        np.add.at(sums, here, sign * logs)
+    for sign, row, column in ((1.0, i, j), (-1.0, j, i)):
+        np.add.at(graph, (row, row), 1.0)
+        np.add.at(graph, (row, column), -1.0)
+        np.add.at(sums, row, sign * logs)
     return np.asarray(np.exp2(np.round(np.linalg.lstsq(graph, sums, rcond=None)[0])))
 
 
@@ -274,11 +278,11 @@ def decoupled_transitions(decoupling: Decoupling, D: Array, durations: Array) ->
     """``e^{D r}`` and its integral for durations ``(...)``, ``(..., d, d)`` each, group by group: a fast mode does not
     cost the slow ones their digits, as squaring a whole matrix would."""
     d = D.shape[-1]
-    flow, driven = np.zeros((*durations.shape, d, d)), np.zeros((*durations.shape, d, d))
-    for part, single in decoupling.parts:
-        found = (_mode if single else transitions)(D[part, part], durations)
-        flow[..., part, part], driven[..., part, part] = found
-    return flow, driven
+    flow, integral = np.zeros((*durations.shape, d, d)), np.zeros((*durations.shape, d, d))
+    for block, single in decoupling.parts:
+        blocks = (_mode if single else transitions)(D[block, block], durations)
+        flow[..., block, block], integral[..., block, block] = blocks
+    return flow, integral
 
 
 def decoupled_rounding(decoupling: Decoupling, D: Array, durations: Array) -> Array:
@@ -288,14 +292,14 @@ def decoupled_rounding(decoupling: Decoupling, D: Array, durations: Array) -> Ar
     decays, ``|a r| e^{a r} <= 1``.
     """
     worst = np.zeros(durations.shape)
-    for part, single in decoupling.parts:
-        block = D[part, part]
+    for block, single in decoupling.parts:
+        matrix = D[block, block]
         if single:
-            turned = abs(block[0, -1]) if block.shape[0] == 2 else 0.0
-            found = EPSILON * (6.0 + 2.0 * (max(block[0, 0], 0.0) + turned) * durations)
+            rotation = abs(matrix[0, -1]) if matrix.shape[0] == 2 else 0.0
+            error = EPSILON * (6.0 + 2.0 * (max(matrix[0, 0], 0.0) + rotation) * durations)
         else:
-            found = exponential_rounding(2 * block.shape[0], np.abs(block).sum(axis=0).max() * durations)
-        worst = np.maximum(worst, found)
+            error = exponential_rounding(2 * matrix.shape[0], np.abs(matrix).sum(axis=0).max() * durations)
+        worst = np.maximum(worst, error)
     return worst
 
 
@@ -304,12 +308,12 @@ def _mode(D: Array, durations: Array) -> tuple[Array, Array]:
     rotates = D.shape[0] == 2
     rate = complex(D[0, 0], D[0, 1]) if rotates else D[0, 0]
     flow = np.exp(rate * durations)
-    driven = np.expm1(rate * durations) / rate if rate != 0 else durations
+    integral = np.expm1(rate * durations) / rate if rate != 0 else durations
     if not rotates:
-        return flow[..., None, None], driven[..., None, None]
+        return flow[..., None, None], integral[..., None, None]
     both = np.empty((2, *durations.shape, 2, 2))
-    for turned, z in zip(both, (flow, driven), strict=True):
-        turned[..., 0, 0] = turned[..., 1, 1] = z.real
-        turned[..., 0, 1] = z.imag
-        turned[..., 1, 0] = -z.imag
+    for matrix, z in zip(both, (flow, integral), strict=True):
+        matrix[..., 0, 0] = matrix[..., 1, 1] = z.real
+        matrix[..., 0, 1] = z.imag
+        matrix[..., 1, 0] = -z.imag
     return both[0], both[1]

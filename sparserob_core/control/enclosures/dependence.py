@@ -1,9 +1,9 @@
-"""How the state of a system that changes with time depends on its parameters: affinely, or as its expansion says.
+"""Dependence of the state of a time-varying system on its parameters: affine, or by an expansion.
 
-Entries of ``B``, ``E`` and ``c`` in which parameters stand to the first power make the state an affine function of
-them, ``x(t; p) = x_0(t) + sum_j (p_j - centre_j) / unit_j y_j(t)``: every part of it is a state that obeys a known
-system. So do entries of ``A``, where what they multiply depends on no parameter. What is linear in the parameters is
-largest at a corner of their box, whatever the times, controls and disturbances.
+Entries of ``B``, ``E`` and ``c`` in which parameters stand to the first power make the state an affine function of the
+parameters, ``x(t; p) = x_0(t) + sum_j (p_j - centre_j) / unit_j y_j(t)``: every part of it is a state that obeys a
+known system. The same holds for entries of ``A`` that multiply states independent of the parameters. A function that is
+linear in the parameters is largest at a corner of their box, whatever the times, controls and disturbances.
 """
 
 from __future__ import annotations
@@ -48,16 +48,21 @@ class AnyNumber:
 
 
 def _is_array(other: object) -> bool:
-    """Whether numpy is to go through the entries, as where a function multiplies a whole matrix by a parameter."""
+    """Return whether an operand is an array with axes, through whose entries numpy is to go.
+
+    A function that multiplies a whole matrix by a parameter is an example.
+    """
     return isinstance(other, np.ndarray) and other.ndim > 0
 
 
 @final
 @dataclass(frozen=True, eq=False)
 class Dependent:
-    """A power series in ``delta`` up to a ``degree``, whatever numbers its coefficients are: floats, Taylor models,
-    balls. ``value`` is the constant one, ``others`` are those of the other monomials by their exponents, as far as
-    there are any; ``beyond``: there may be more of higher degrees."""
+    """A power series in ``delta`` up to a ``degree``, with any numbers as coefficients: floats, Taylor models, balls.
+
+    ``value`` is the constant coefficient. ``others`` are the coefficients of the other monomials by their exponents, as
+    far as there are any. ``beyond``: there may be terms of higher degrees.
+    """
 
     value: Value
     others: Mapping[Exponents, Value]
@@ -66,25 +71,27 @@ class Dependent:
 
     @property
     def free(self) -> bool:
-        """Whether no parameter is in it."""
+        """True where the series depends on no parameter."""
         return not self.others and not self.beyond
 
     def _like(self, other: object) -> Dependent:
         return other if isinstance(other, Dependent) else Dependent(other, {}, self.degree)
 
     def _each(self, of: Callable[[Value], Value]) -> Dependent:
-        """A function that is linear, of every coefficient."""
-        return Dependent(of(self.value), {key: of(one) for key, one in self.others.items()}, self.degree, self.beyond)
+        """Return the series with a linear function applied to every coefficient."""
+        return Dependent(
+            of(self.value), {key: of(coefficient) for key, coefficient in self.others.items()}, self.degree, self.beyond
+        )
 
     def __add__(self, other: object) -> Dependent:
         if _is_array(other):
             return NotImplemented
-        more = self._like(other)
-        sums = _added([dict(self.others), dict(more.others)])
-        return Dependent(self.value + more.value, sums, self.degree, self.beyond or more.beyond)
+        summand = self._like(other)
+        sums = _added([dict(self.others), dict(summand.others)])
+        return Dependent(self.value + summand.value, sums, self.degree, self.beyond or summand.beyond)
 
     def __neg__(self) -> Dependent:
-        return self._each(lambda one: -one)
+        return self._each(lambda value: -value)
 
     def __pos__(self) -> Dependent:
         return self
@@ -104,28 +111,28 @@ class Dependent:
             return NotImplemented
         factor = self._like(other)
         if factor.free:
-            return self._each(lambda one: one * factor.value)
+            return self._each(lambda value: value * factor.value)
         if self.free:
             return factor * self
         products = _added([
-            {key: one * factor.value for key, one in self.others.items()},
-            {key: self.value * one for key, one in factor.others.items()},
+            {key: coefficient * factor.value for key, coefficient in self.others.items()},
+            {key: self.value * coefficient for key, coefficient in factor.others.items()},
         ])  # fmt: skip
-        beyond = self.beyond or factor.beyond
-        for left, one in self.others.items():
-            for right, two in factor.others.items():
-                key = tuple(a + b for a, b in zip(left, right, strict=True))
+        is_truncated = self.beyond or factor.beyond
+        for first_key, first in self.others.items():
+            for second_key, second in factor.others.items():
+                key = tuple(a + b for a, b in zip(first_key, second_key, strict=True))
                 if sum(key) > self.degree:
-                    beyond = True
+                    is_truncated = True
                     continue
-                products[key] = products[key] + one * two if key in products else one * two
-        return Dependent(self.value * factor.value, products, self.degree, beyond)
+                products[key] = products[key] + first * second if key in products else first * second
+        return Dependent(self.value * factor.value, products, self.degree, is_truncated)
 
     def __truediv__(self, other: object) -> Dependent:
         if _is_array(other):
             return NotImplemented
-        under = self._like(other)
-        return self._each(lambda one: one / under.value) if under.free else self * under.raised(-1.0)
+        divisor = self._like(other)
+        return self._each(lambda value: value / divisor.value) if divisor.free else self * divisor.raised(-1.0)
 
     def __rtruediv__(self, other: object) -> Dependent:
         if _is_array(other):
@@ -141,11 +148,11 @@ class Dependent:
             return (exponent * self.log()).exp()
         if power < 0 or power != int(power):
             return self.raised(float(power))
-        found, base, count = self._like(1.0), self, int(power)
+        product, base, count = self._like(1.0), self, int(power)
         while count:
-            found, count = found * base if count & 1 else found, count >> 1
+            product, count = product * base if count & 1 else product, count >> 1
             base = base * base if count else base
-        return found
+        return product
 
     def __rpow__(self, other: object) -> Dependent:
         return self._like(other) ** self
@@ -155,25 +162,27 @@ class Dependent:
     @property
     def parts(self) -> list[Part]:
         """The coefficients degree by degree, ``degree + 1`` of them."""
-        nothing = (0,) * len(next(iter(self.others), ()))
-        found: list[Part] = [{nothing: self.value}, *({} for _ in range(self.degree))]
-        for key, one in self.others.items():
-            found[sum(key)][key] = one
-        return found
+        constant = (0,) * len(next(iter(self.others), ()))
+        by_degree: list[Part] = [{constant: self.value}, *({} for _ in range(self.degree))]
+        for key, coefficient in self.others.items():
+            by_degree[sum(key)][key] = coefficient
+        return by_degree
 
     def _made(self, parts: Sequence[Part]) -> Dependent:
         """The series with these coefficients, which goes on."""
         (first,) = parts[0].values()
-        return Dependent(first, {key: one for part in parts[1:] for key, one in part.items()}, self.degree, True)
+        return Dependent(
+            first, {key: coefficient for part in parts[1:] for key, coefficient in part.items()}, self.degree, True
+        )
 
     def _solved(self, first: Value, step: Callable[[int, list[Part]], Part]) -> Dependent:
         """The series that begins with a number and of which every ``step`` makes the coefficients of a degree from
         those before: along a line through the centre they are those of powers of one number, and obey what these do."""
-        (nothing,) = self.parts[0]
-        found: list[Part] = [{nothing: first}]
+        (constant,) = self.parts[0]
+        parts: list[Part] = [{constant: first}]
         for n in range(1, self.degree + 1):
-            found.append(step(n, found))
-        return self._made(found)
+            parts.append(step(n, parts))
+        return self._made(parts)
 
     def exp(self) -> Dependent:
         """The exponential, from ``g' = f' g``."""
@@ -212,8 +221,8 @@ class Dependent:
 
     def _turned(self) -> tuple[Dependent, Dependent]:
         """Sine and cosine, from ``s' = f' c`` and ``c' = -f' s``."""
-        f, (nothing,) = self.parts, self.parts[0]
-        s, c = [{nothing: np.sin(self.value)}], [{nothing: np.cos(self.value)}]
+        f, (constant,) = self.parts, self.parts[0]
+        s, c = [{constant: np.sin(self.value)}], [{constant: np.cos(self.value)}]
         for n in _upto(self.degree):
             s.append(_convolved((k / n, f[k], c[n - k]) for k in _upto(n)))
             c.append(_convolved((-k / n, f[k], s[n - k]) for k in _upto(n)))
@@ -239,14 +248,14 @@ class Dependent:
         if self.free:
             return self._each(np.tanh)
         f, first = self.parts, np.tanh(self.value)
-        (nothing,) = f[0]
-        h = [{nothing: 1.0 - first * first}]
+        (constant,) = f[0]
+        h = [{constant: 1.0 - first * first}]
 
         def step(n: int, g: list[Part]) -> Part:
-            found = _convolved((k / n, f[k], h[n - k]) for k in _upto(n))
-            whole = [*g, found]
-            h.append(_convolved((-1.0, whole[k], whole[n - k]) for k in range(n + 1)))
-            return found
+            next_part = _convolved((k / n, f[k], h[n - k]) for k in _upto(n))
+            parts = [*g, next_part]
+            h.append(_convolved((-1.0, parts[k], parts[n - k]) for k in range(n + 1)))
+            return next_part
 
         return self._solved(first, step)
 
@@ -256,17 +265,17 @@ class Dependent:
         first = of(eccentricity)
         if self.free:
             return Dependent(first, {}, self.degree)
-        M, (nothing,) = self.parts, self.parts[0]
-        s, c = [{nothing: np.sin(first)}], [{nothing: np.cos(first)}]
-        inverse = 1.0 / (1.0 - eccentricity * c[0][nothing])
+        M, (constant,) = self.parts, self.parts[0]
+        s, c = [{constant: np.sin(first)}], [{constant: np.cos(first)}]
+        inverse = 1.0 / (1.0 - eccentricity * c[0][constant])
 
         def step(n: int, E: list[Part]) -> Part:
             before = _convolved((eccentricity * k / n, E[k], c[n - k]) for k in _upto(n - 1))
-            found = _scaled(_added([M[n], before]), inverse)
-            whole = [*E, found]
-            s.append(_convolved((k / n, whole[k], c[n - k]) for k in _upto(n)))
-            c.append(_convolved((-k / n, whole[k], s[n - k]) for k in _upto(n)))
-            return found
+            next_part = _scaled(_added([M[n], before]), inverse)
+            parts = [*E, next_part]
+            s.append(_convolved((k / n, parts[k], c[n - k]) for k in _upto(n)))
+            c.append(_convolved((-k / n, parts[k], s[n - k]) for k in _upto(n)))
+            return next_part
 
         return self._solved(first, step)
 
@@ -277,34 +286,36 @@ def _upto(n: int) -> range:
 
 def _added(parts: Iterable[Mapping[Exponents, Value]]) -> Part:
     """The sum of coefficients."""
-    found: Part = {}
+    total: Part = {}
     for part in parts:
-        for key, one in part.items():
-            found[key] = found[key] + one if key in found else one
-    return found
+        for key, coefficient in part.items():
+            total[key] = total[key] + coefficient if key in total else coefficient
+    return total
 
 
 def _scaled(part: Part, factor: Value) -> Part:
-    return {key: one * factor for key, one in part.items()}
+    return {key: coefficient * factor for key, coefficient in part.items()}
 
 
 def _convolved(terms: Iterable[tuple[float, Part, Part]]) -> Part:
     """The sum of products of coefficients of two degrees each, each times its number."""
-    found: Part = {}
-    for number, left, right in terms:
-        for a, one in left.items():
-            for b, two in right.items():
-                key, made = tuple(i + j for i, j in zip(a, b, strict=True)), (one * two) * number
-                found[key] = found[key] + made if key in found else made
-    return found
+    total: Part = {}
+    for factor, first, second in terms:
+        for a, u in first.items():
+            for b, v in second.items():
+                key, term = tuple(i + j for i, j in zip(a, b, strict=True)), (u * v) * factor
+                total[key] = total[key] + term if key in total else term
+    return total
 
 
 @final
 @dataclass(frozen=True, eq=False)
 class Split:
-    """A matrix that is a polynomial in ``delta (nu,)``: ``parts``, its coefficients by their exponents, ``(rows,
-    columns)`` of objects each, the constant one first; of the entries ``beyond`` it is the power series, up to a
-    degree."""
+    """A matrix that is a polynomial in ``delta (nu,)``.
+
+    ``parts`` are its coefficients by their exponents, ``(rows, columns)`` of objects each, the constant one first. The
+    entries ``beyond`` are power series, of which the coefficients go up to a degree.
+    """
 
     parts: Mapping[Exponents, Table]
     beyond: list[tuple[int, int]]
@@ -312,34 +323,55 @@ class Split:
 
     @staticmethod
     def of(entry: object, time: Value, centre: Array, units: Array, degree: int = MOST_POWERS) -> Split:
-        """That of an entry of a law, an array or a function of the time and of the parameters, about their ``centre``
-        and in ``units`` of theirs, 0 of a parameter that is known."""
+        """Return the expansion of an entry of a law in its parameters.
+
+        Parameters
+        ----------
+        entry : object
+            An array, or a function of the time and of the parameters.
+        time : Value
+            The time, a number or another object with arithmetic.
+        centre, units : Array
+            Centre ``(nu,)`` of the parameters, and their units ``(nu,)``, 0 for a parameter that is known.
+        degree : int
+            The degree in all parameters together up to which coefficients are kept.
+
+        Returns
+        -------
+        Split
+            The coefficients.
+
+        Raises
+        ------
+        InputError
+            Where the entry is not a matrix of arithmetic in single parameters.
+        """
         nu = centre.size
         p = np.empty(1 + nu, dtype=object)
         time = np.float64(time) if isinstance(time, float) else time  # which divides by 0 without an exception
         p[0] = Dependent(time, {}, degree)
         with np.errstate(all="ignore"):  # what is not finite is reported where the numbers are used
-            nothing = 0.0 * time  # a number of the kind of the time, which counts what is rounded
+            zero = 0.0 * time  # a number of the kind of the time, which counts what is rounded
             for j, (middle, unit) in enumerate(zip(centre.tolist(), units.tolist(), strict=True)):
-                slope = {single(nu, j): nothing + unit} if unit and degree else {}
-                p[1 + j] = Dependent(nothing + middle, slope, degree, bool(unit) and not degree)
+                slope = {single(nu, j): zero + unit} if unit and degree else {}
+                p[1 + j] = Dependent(zero + middle, slope, degree, bool(unit) and not degree)
             table = np.asarray(entry(p) if callable(entry) else entry, dtype=object)
         if table.ndim != 2:
             raise InputError(
                 path="system", expected="matrices of arithmetic in single parameters", got="a whole matrix"
             )
-        parts: dict[Exponents, Table] = {(0,) * nu: np.zeros(table.shape, dtype=object)}
-        beyond = list[tuple[int, int]]()
-        for place, found in np.ndenumerate(table):
-            one = found if isinstance(found, Dependent) else Dependent(found, {})
-            parts[(0,) * nu][place] = one.value
-            if one.beyond:
-                beyond.append((place[0], place[1]))
-            for key, slope in one.others.items():
-                if key not in parts:
-                    parts[key] = np.zeros(table.shape, dtype=object)
-                parts[key][place] = slope
-        return Split(parts, beyond, nu)
+        tables: dict[Exponents, Table] = {(0,) * nu: np.zeros(table.shape, dtype=object)}
+        truncated = list[tuple[int, int]]()
+        for position, number in np.ndenumerate(table):
+            series = number if isinstance(number, Dependent) else Dependent(number, {})
+            tables[(0,) * nu][position] = series.value
+            if series.beyond:
+                truncated.append((position[0], position[1]))
+            for key, slope in series.others.items():
+                if key not in tables:
+                    tables[key] = np.zeros(table.shape, dtype=object)
+                tables[key][position] = slope
+        return Split(tables, truncated, nu)
 
     @property
     def whole(self) -> Table:
@@ -350,14 +382,14 @@ class Split:
     @property
     def degree(self) -> int:
         """The largest degree of an entry that is a polynomial and other than 0 at `AnyNumber`."""
-        there = {key: _there(table) for key, table in self.parts.items()}
-        for found in there.values():
-            found[tuple(np.array(self.beyond, dtype=int).reshape(-1, 2).T)] = False
-        return max((sum(key) for key, found in there.items() if found.any()), default=0)
+        masks = {key: _there(table) for key, table in self.parts.items()}
+        for mask in masks.values():
+            mask[tuple(np.array(self.beyond, dtype=int).reshape(-1, 2).T)] = False
+        return max((sum(key) for key, mask in masks.items() if mask.any()), default=0)
 
     @property
     def there(self) -> np.ndarray:
-        """Where the `whole` is other than 0 at `AnyNumber`."""
+        """True where the `whole` is other than 0 at `AnyNumber`, an array of the same shape."""
         return _there(self.whole)
 
 
@@ -367,15 +399,20 @@ def single(nu: int, j: int) -> Exponents:
 
 
 def _there(table: Table) -> np.ndarray:
-    found = np.array([isinstance(one, AnyNumber) or float(one) != 0.0 for one in table.ravel()], dtype=bool)
-    return found.reshape(table.shape)
+    is_nonzero = np.array(
+        [isinstance(number, AnyNumber) or float(number) != 0.0 for number in table.ravel()], dtype=bool
+    )
+    return is_nonzero.reshape(table.shape)
 
 
 @final
 @dataclass(frozen=True, eq=False)
 class Dependence:
-    """Which states ``y_j`` there are: those that parameter ``j`` reaches, ``reached (nu, d)``, about the ``centre
-    (nu,)`` of the parameters and in ``units (nu,)`` of theirs."""
+    """Affine dependence of the state on parameters: the states ``y_j`` that parameter ``j`` reaches,
+    ``reached (nu, d)``.
+
+    The parameters are counted from their ``centre (nu,)`` in ``units (nu,)``.
+    """
 
     reached: np.ndarray
     centre: Array
@@ -383,7 +420,7 @@ class Dependence:
 
     @property
     def states(self) -> int:
-        """How many states there are in all."""
+        """Number of all states: those of the system, and those that parameters reach."""
         return int(self.reached.shape[1] + self.reached.sum())
 
     def rows(self, shares: Array) -> Array:
@@ -395,18 +432,20 @@ class Dependence:
 
     def matrix(self, name: str, entry: object, time: Value) -> Table:
         """``A``, or one of ``B``, ``E``, ``c``, of the system of all states at a time."""
-        whole, (nu, d) = Split.of(entry, time, self.centre, self.units).whole, self.reached.shape
+        tables, (nu, d) = Split.of(entry, time, self.centre, self.units).whole, self.reached.shape
         if name != "A":
-            return np.concatenate([whole[0], *(whole[1 + j][self.reached[j]] for j in range(nu))])
+            return np.concatenate([tables[0], *(tables[1 + j][self.reached[j]] for j in range(nu))])
         below = []
         for j in range(nu):
-            mine = self.reached[j]
-            row = [whole[1 + j][mine]]
+            is_reached = self.reached[j]
+            row = [tables[1 + j][is_reached]]
             for i in range(nu):
-                own = whole[0][np.ix_(mine, mine)]
-                row.append(own if i == j else np.zeros((int(mine.sum()), int(self.reached[i].sum())), dtype=object))
+                own = tables[0][np.ix_(is_reached, is_reached)]
+                row.append(
+                    own if i == j else np.zeros((int(is_reached.sum()), int(self.reached[i].sum())), dtype=object)
+                )
             below.append(np.concatenate(row, axis=1))
-        first = np.concatenate([whole[0], np.zeros((d, self.states - d), dtype=object)], axis=1)
+        first = np.concatenate([tables[0], np.zeros((d, self.states - d), dtype=object)], axis=1)
         return np.concatenate([first, *below])
 
 
@@ -427,14 +466,16 @@ class Superposed:
 @final
 @dataclass(frozen=True, eq=False)
 class Left:
-    """What entries are at most beyond a degree in the parameters, whatever these are: ``sizes (s, d, d + n)`` of ``[A B
-    c E]`` between the times ``ends (s + 1,)``."""
+    """Bounds of the entries of a law beyond a degree in the parameters, for all values of the parameters.
+
+    ``sizes (s, d, d + n)`` are the bounds of ``[A B c E]`` between the times ``ends (s + 1,)``.
+    """
 
     ends: Array
     sizes: Array
 
     def over(self, times: Array) -> Array:
-        """Between every two of ``times (K + 1,)``, ``(K, d, d + n)``."""
+        """Return the bounds ``(K, d, d + n)`` between neighbours of ``times (K + 1,)``."""
         first = np.searchsorted(self.ends[1:-1], times[:-1], side="right")
         last = np.searchsorted(self.ends[1:-1], times[1:], side="left")
         return np.array([self.sizes[a : b + 1].max(axis=0) for a, b in zip(first, last, strict=True)])
@@ -443,11 +484,14 @@ class Left:
 @final
 @dataclass(frozen=True, eq=False)
 class Spread:
-    """The state of a system of ``d`` states as a polynomial in its parameters: ``x = sum_a delta^a x_a`` and what is
-    left of higher degrees. The ``x_a`` are the blocks of a larger state, in the
-    order of the monomials of the ``space``, and obey ``x_a' = sum_b A_b x_(a-b) + B_a u + E_a w + c_a``; about the
-    ``centre (nu,)`` of the parameters and in ``units (nu,)`` of theirs.
-    Of entries that are no polynomials of that degree ``left`` tells what is beyond the degree of the space."""
+    """The state of a system of ``d`` states as a polynomial in its parameters, ``x = sum_a delta^a x_a``, with a
+    remainder of higher degrees.
+
+    The ``x_a`` are the blocks of a larger state, in the order of the monomials of the ``space``. They obey
+    ``x_a' = sum_b A_b x_(a-b) + B_a u + E_a w + c_a``, about the ``centre (nu,)`` of the parameters and in
+    ``units (nu,)``. ``left`` bounds the terms beyond the degree of the space, of entries that are no polynomials of
+    that degree.
+    """
 
     d: int
     space: TaylorSpace
@@ -457,7 +501,7 @@ class Spread:
 
     @property
     def states(self) -> int:
-        """How many states there are in all."""
+        """Number of all states: ``d`` for each monomial."""
         return self.d * self.space.size
 
     def on_cell(self, low: Array, high: Array, ends: Array, law: Array) -> tuple[Spread, np.ndarray]:
@@ -479,79 +523,100 @@ class Spread:
             is beyond is `left`.
         """
         nu = self.space.nu
-        degrees = [one for one in range(1, MOST_ON_CELL + 1) if self.d * comb(nu + one, nu) <= NUMBERS_ON_CELL]
+        degrees = [degree for degree in range(1, MOST_ON_CELL + 1) if self.d * comb(nu + degree, nu) <= NUMBERS_ON_CELL]
         space = taylor_space(nu, max([1, *degrees]))
         kept = np.flatnonzero(self.space.degrees <= space.degree)
-        beyond = law[:, self.space.degrees > space.degree].sum(axis=1)
+        truncated = law[:, self.space.degrees > space.degree].sum(axis=1)
         if self.left is not None:
-            beyond = beyond + self.left.over(ends)
-        left = Left(ends, beyond * OUTWARD) if beyond.any() else None
-        return Spread(self.d, space, (low + high) / 2, (high - low) / 2, left), kept
+            truncated = truncated + self.left.over(ends)
+        remainder = Left(ends, truncated * OUTWARD) if truncated.any() else None
+        return Spread(self.d, space, (low + high) / 2, (high - low) / 2, remainder), kept
 
     def shares(self, parameters: Array) -> Array:
         """``delta (k, nu)`` of parameters ``(k, nu)``."""
         return np.asarray((parameters - self.centre) / np.where(self.units > 0.0, self.units, 1.0))
 
     def filled(self, first: Array) -> Array:
-        """What all coefficients become, ``(k, states, states)``, from what the constant ones do, ``(k, states, d)``."""
+        """Return matrices ``(k, states, states)`` on all coefficients from their columns ``(k, states, d)`` for the
+        constant coefficient."""
         left, right, target = self.space.products
-        apart, size = first.reshape(len(first), self.space.size, self.d, self.d), self.space.size
-        whole = np.zeros((len(first), size, size, self.d, self.d))
-        whole[:, target, right] = apart[:, left]
-        return whole.swapaxes(2, 3).reshape(len(first), self.states, self.states)
+        columns, size = first.reshape(len(first), self.space.size, self.d, self.d), self.space.size
+        blocks = np.zeros((len(first), size, size, self.d, self.d))
+        blocks[:, target, right] = columns[:, left]
+        return blocks.swapaxes(2, 3).reshape(len(first), self.states, self.states)
 
     def recentred(self, low: Array, high: Array) -> Array:
-        """What makes of the coefficients of a polynomial in ``delta`` those, ``(M, M)``, of it on a cell ``[low,
-        high]`` of parameters, from -1 to 1 in each: of the cell but for what is rounded."""
+        """Return the matrix ``(M, M)`` that takes the coefficients of a polynomial in ``delta`` to those on a cell of
+        parameters.
+
+        On the cell ``[low, high]`` the new variables run from -1 to 1. The cell is enlarged by a bound of its rounding.
+        """
         units = np.where(self.units > 0.0, self.units, 1.0)
         middle, radius = (low + high) / 2, (high - low) / 2
         c = (middle - self.centre) / units
         r = radius / units * (1.0 + 8.0 * EPSILON) + 8.0 * EPSILON * (np.abs(low) + np.abs(high)) / units
-        exponents, found = self.space.exponents, np.ones((self.space.size, self.space.size))
+        exponents, matrix = self.space.exponents, np.ones((self.space.size, self.space.size))
         for i in range(self.space.nu):
             a, b = exponents[None, :, i], exponents[:, None, i]
             binomials = np.array([[comb(int(n), int(k)) for n in a[0]] for k in b[:, 0]], dtype=float)
-            found *= np.where(a >= b, binomials * c[i] ** np.maximum(a - b, 0) * r[i] ** b, 0.0)
-        return found
+            matrix *= np.where(a >= b, binomials * c[i] ** np.maximum(a - b, 0) * r[i] ** b, 0.0)
+        return matrix
 
     def matrix(self, name: str, entry: object, time: Value) -> Table:
         """``A``, or one of ``B``, ``E``, ``c``, of the system of all states at a time."""
-        parts = Split.of(entry, time, self.centre, self.units, self.space.degree).parts
-        places = {self.space.index[key]: table for key, table in parts.items()}
-        rows, columns = parts[(0,) * self.space.nu].shape
+        tables = Split.of(entry, time, self.centre, self.units, self.space.degree).parts
+        by_index = {self.space.index[key]: table for key, table in tables.items()}
+        rows, columns = tables[(0,) * self.space.nu].shape
         if name != "A":
-            found = np.zeros((self.space.size, rows, columns), dtype=object)
-            for place, table in places.items():
-                found[place] = table
-            return found.reshape(self.states, columns)
-        whole = np.zeros((self.space.size, rows, self.space.size, columns), dtype=object)
-        for left, right, target in zip(*(one.tolist() for one in self.space.products), strict=True):
-            if left in places:
-                whole[target, :, right] = places[left]
-        return whole.reshape(self.states, self.states)
+            stacked = np.zeros((self.space.size, rows, columns), dtype=object)
+            for index, table in by_index.items():
+                stacked[index] = table
+            return stacked.reshape(self.states, columns)
+        blocks = np.zeros((self.space.size, rows, self.space.size, columns), dtype=object)
+        for left, right, target in zip(*(indices.tolist() for indices in self.space.products), strict=True):
+            if left in by_index:
+                blocks[target, :, right] = by_index[left]
+        return blocks.reshape(self.states, self.states)
 
 
 def dependence(laws: Sequence[Sequence[object]], centre: Array, units: Array) -> Dependence | int:
-    """That of a system whose laws have these ``A``, ``B``, ``E`` and ``c`` (or ``None``), and whose parameters are at
-    most ``units (nu,)`` from their ``centre``: so states are in units of what they do, and rows at a corner are sums
-    and differences of them. Where the state is no affine function of the parameters, the largest degree of an entry
-    that is a polynomial in them."""
-    every: list[tuple[Split, list[Split]]] = []
+    """Return the affine dependence of the state of a system on its parameters, or a degree where the state is not
+    affine.
+
+    The states of the dependence are the effects of whole units, so rows at a corner are sums and differences of them.
+
+    Parameters
+    ----------
+    laws : sequence
+        ``A``, ``B``, ``E`` and ``c`` (or ``None``) of every law of the system.
+    centre : Array
+        Centre ``(nu,)`` of the parameters.
+    units : Array
+        Largest deviation ``(nu,)`` of the parameters from their centre.
+
+    Returns
+    -------
+    Dependence or int
+        The dependence; or the largest degree of an entry that is a polynomial in the parameters.
+    """
+    split_laws: list[tuple[Split, list[Split]]] = []
     for entries in laws:
-        parts = [Split.of(entry, AnyNumber(), centre, units) for entry in entries if entry is not None]
-        every.append((parts[0], parts[1:]))
-    splits = [split for A, others in every for split in (A, *others)]
+        law_splits = [Split.of(entry, AnyNumber(), centre, units) for entry in entries if entry is not None]
+        split_laws.append((law_splits[0], law_splits[1:]))
+    splits = [split for A, inputs in split_laws for split in (A, *inputs)]
     powers = max((split.degree for split in splits), default=0)
     if powers > 1 or any(split.beyond for split in splits):
         return powers
-    d, nu = every[0][0].there.shape[1], centre.size
-    moves = np.any([A.there[0] for A, _ in every], axis=0)
-    reached = np.zeros((nu, d), dtype=bool)
+    d, nu = split_laws[0][0].there.shape[1], centre.size
+    coupling = np.any([A.there[0] for A, _ in split_laws], axis=0)
+    is_reached = np.zeros((nu, d), dtype=bool)
     for j in range(nu):
-        reached[j] = np.any([split.there[1 + j].any(axis=1) for A, others in every for split in (A, *others)], axis=0)
+        is_reached[j] = np.any(
+            [split.there[1 + j].any(axis=1) for A, inputs in split_laws for split in (A, *inputs)], axis=0
+        )
         for _ in range(d):
-            reached[j] = reached[j] | moves[:, reached[j]].any(axis=1)
-    for A, _ in every:
-        if (A.there[1:].any(axis=0) & reached.any(axis=0)).any():  # columns of states that a parameter reaches
+            is_reached[j] = is_reached[j] | coupling[:, is_reached[j]].any(axis=1)
+    for A, _ in split_laws:
+        if (A.there[1:].any(axis=0) & is_reached.any(axis=0)).any():  # columns of states that a parameter reaches
             return powers
-    return Dependence(reached, centre, units)
+    return Dependence(is_reached, centre, units)

@@ -27,31 +27,32 @@ def product(hi: Array, lo: Array | None, other_hi: Array, other_lo: Array | None
     if not max(np.abs(hi).max(), np.abs(other_hi).max()) < LARGE:
         return hi @ other_hi, np.zeros_like(hi)
     rows, columns = _leading(hi, 1), _leading(other_hi, 0)
-    exact, rest = rows @ columns, rows @ (other_hi - columns) + (hi - rows) @ other_hi
+    exact, correction = rows @ columns, rows @ (other_hi - columns) + (hi - rows) @ other_hi
     if other_lo is not None:
-        rest += hi @ other_lo
+        correction += hi @ other_lo
     if lo is not None:
-        rest += lo @ other_hi
-    return _two(exact, rest)
+        correction += lo @ other_hi
+    return _two(exact, correction)
 
 
 def flows(A: Array) -> tuple[Array, Array, Array]:
     """``e^A`` as ``hi + lo``, and ``int_0^1 e^{A s} ds``, ``(d, d)`` each, where the norm of ``A (d, d)`` is at most
     1: by its series, from the last term."""
-    one = np.eye(A.shape[0])
-    hi = np.asarray(one / factorial(TERMS))
+    identity = np.eye(A.shape[0])
+    hi = np.asarray(identity / factorial(TERMS))
     for order in range(TERMS - 1, LONG_TERMS, -1):
-        hi = A @ hi + one / factorial(order)
+        hi = A @ hi + identity / factorial(order)
     lo: Array | None = None
     for order in range(LONG_TERMS, 0, -1):
         hi, lo = product(A, None, hi, lo)
         share = Fraction(1, factorial(order))
-        near = float(share)
-        hi, more = _two(one * near, hi)  # what is added to is larger than any entry of what is added, or 0
-        lo = lo + more + one * float(share - Fraction(near))
-    flow, rest = product(A, None, hi, lo)
-    flow, more = _two(one, flow)
-    return flow, rest + more, hi
+        rounded_share = float(share)
+        # what is added to is larger than any entry of what is added, or 0
+        hi, error = _two(identity * rounded_share, hi)
+        lo = lo + error + identity * float(share - Fraction(rounded_share))
+    flow, flow_lo = product(A, None, hi, lo)
+    flow, error = _two(identity, flow)
+    return flow, flow_lo + error, hi
 
 
 def _leading(A: Array, axis: int) -> Array:
@@ -59,12 +60,12 @@ def _leading(A: Array, axis: int) -> Array:
     products of two has no more than a float."""
     kept = (DIGITS - int(np.ceil(np.log2(A.shape[0])))) // 2
     _, exponent = np.frexp(np.abs(A).max(axis=axis, keepdims=True))
-    far = np.ldexp(1.5, exponent + DIGITS - 1 - kept)
-    return np.asarray((A + far) - far)
+    shift = np.ldexp(1.5, exponent + DIGITS - 1 - kept)
+    return np.asarray((A + shift) - shift)
 
 
 def _two(large: Array, small: Array) -> tuple[Array, Array]:
     """The rounded sum, and what was rounded away (Knuth 1997, section 4.2.2)."""
     total = large + small
-    part = total - large
-    return total, (large - (total - part)) + (small - part)
+    included = total - large
+    return total, (large - (total - included)) + (small - included)

@@ -1,4 +1,4 @@
-"""Taylor series of elementary functions on an interval, with a bound of what a truncated series leaves out.
+"""Taylor series of elementary functions on an interval, with a bound of their truncation error.
 
 Every function takes ``degree n``, ``centre`` and the interval ``[low, high]`` around it, and returns the coefficients
 of ``1, y, ..., y^n`` with ``y = x - centre`` and a bound of ``|f^(n+1)| / (n+1)!`` on the interval (Lagrange's form of
@@ -87,15 +87,15 @@ def kepler_series(eccentricity: float, degree: int, centre: float, low: float, h
     slope = 1.0 - e * cosine
     terms, s, c = [E], [sine], [cosine]
     for n in range(degree):
-        pushed = sum((k + 1) * terms[k + 1] * e * c[n - k] for k in range(n))
-        terms.append(((1.0 if n == 0 else 0.0) + pushed) / (slope * (n + 1)))
+        convolution = sum((k + 1) * terms[k + 1] * e * c[n - k] for k in range(n))
+        terms.append(((1.0 if n == 0 else 0.0) + convolution) / (slope * (n + 1)))
         s.append(sum((k + 1) * terms[k + 1] * c[n - k] for k in range(n + 1)) / (n + 1))
         c.append(-sum((k + 1) * terms[k + 1] * s[n - k] for k in range(n + 1)) / (n + 1))
     half, best = max(centre - low, high - centre), math.inf
     for step in range(KEPLER_CIRCLES):
         R = 4.0 * 0.85**step
-        bent = 0.5 * e * (abs(sine) * math.cosh(R) + abs(cosine) * math.sinh(R)) * R * R
-        r = (R * slope - bent) * (1.0 - 1e-9)  # what is rounded here is far less
+        q = 0.5 * e * (abs(sine) * math.cosh(R) + abs(cosine) * math.sinh(R)) * R * R
+        r = (R * slope - q) * (1.0 - 1e-9)  # what is rounded here is far less
         if r > half:
             best = min(best, R / r ** (degree + 1) / (1.0 - half / r))
     if best == math.inf:
@@ -110,13 +110,13 @@ def eccentric_anomaly(anomaly: npt.ArrayLike, eccentricity: float) -> Any:
     low, high = M - eccentricity, M + eccentricity
     E = M + eccentricity * np.sin(M)
     for _ in range(KEPLER_STEPS):
-        missed = E - eccentricity * np.sin(E) - M
-        low, high = np.where(missed < 0.0, E, low), np.where(missed > 0.0, E, high)
-        moved = E - missed / (1.0 - eccentricity * np.cos(E))
-        E = np.where((moved >= low) & (moved <= high), moved, (low + high) / 2)
+        residual = E - eccentricity * np.sin(E) - M
+        low, high = np.where(residual < 0.0, E, low), np.where(residual > 0.0, E, high)
+        iterate = E - residual / (1.0 - eccentricity * np.cos(E))
+        E = np.where((iterate >= low) & (iterate <= high), iterate, (low + high) / 2)
     return E if M.ndim else np.float64(E)
 
 
 def undefined(what: str) -> NoReturn:
-    """Raises `NotEnclosable`."""
+    """Raise `NotEnclosable`: an operation has no enclosure on this cell of parameters."""
     raise NotEnclosable(f"{what} has no enclosure on this cell of parameters; a smaller cell may have one")

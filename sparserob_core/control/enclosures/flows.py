@@ -29,14 +29,15 @@ class Exponentials(Protocol):
     """``e^{A r}`` and ``int_0^r e^{A s} ds`` of one matrix ``A (d, d)``, over any durations ``r``."""
 
     def rows(self, rows: Array, durations: Array) -> tuple[Array, Array]:
-        """Both of ``rows (k, d)`` over ``durations (k,)``, ``(k, d)`` each."""
+        """Return ``c'e^{A r}`` and ``c'int_0^r e^{A s} ds`` for ``rows (k, d)`` over ``durations (k,)``, ``(k, d)``
+        each."""
 
     def transitions(self, durations: Array) -> tuple[Array, Array]:
-        """Both as matrices, for durations ``(k,)``: ``(k, d, d)`` each."""
+        """Return ``e^{A r}`` and ``int_0^r e^{A s} ds`` for durations ``(k,)``, ``(k, d, d)`` each."""
 
 
 def products(A: Array):  # type: ignore[no-untyped-def]  # an array, or one of scipy's sparse arrays
-    """The matrix as products with it take the least time: that of its entries where few of them are not 0."""
+    """Return the matrix in the form whose products take the least time: sparse where few of its entries are not 0."""
     if A.shape[0] < 1.0 / SPARSE or np.count_nonzero(A) > SPARSE * A.size:  # one entry of a short row is more
         return A
     from scipy.sparse import csr_array
@@ -82,7 +83,8 @@ class Leaps:
 
     @cached_property
     def _lost(self) -> list[Array]:
-        """What the last of these transitions is rounded by."""
+        """Low-order part of the last transition of `_doubled`, in twice the digits: a list of one matrix, or an empty
+        list."""
         return []
 
     @cached_property
@@ -102,14 +104,14 @@ class Leaps:
         """Transitions and their integrals over 1, 2, 4, ... short times, ``count`` of them, in own units."""
         while len(self._doubled) < count:
             if not self._doubled:
-                flow, lost, driven = flows(self._own * self.step)
-                driven = driven * self.step
+                flow, flow_lo, integral = flows(self._own * self.step)
+                integral = integral * self.step
             else:
-                (flow, driven), lost = self._doubled[-1], self._lost.pop()
-                driven = driven + flow @ driven
-                flow, lost = product(flow, lost, flow, lost)
-            self._doubled.append((flow, driven))
-            self._lost.append(lost)
+                (flow, integral), flow_lo = self._doubled[-1], self._lost.pop()
+                integral = integral + flow @ integral
+                flow, flow_lo = product(flow, flow_lo, flow, flow_lo)
+            self._doubled.append((flow, integral))
+            self._lost.append(flow_lo)
         return self._doubled[:count]
 
     @shaped
@@ -118,43 +120,44 @@ class Leaps:
     ) -> tuple[Float[Array, "k d"], Float[Array, "k d"]]:
         """`Exponentials.rows`."""
         count = max(1, NEAR // rows.shape[1])
-        found = np.empty((2, *rows.shape))
+        stacked = np.empty((2, *rows.shape))
         for start in range(0, len(rows), count):
-            part = slice(start, start + count)
-            found[0, part], found[1, part] = self._rows(rows[part] * self._scale, durations[part])
-        found /= self._scale
-        return found[0], found[1]
+            batch = slice(start, start + count)
+            stacked[0, batch], stacked[1, batch] = self._rows(rows[batch] * self._scale, durations[batch])
+        stacked /= self._scale
+        return stacked[0], stacked[1]
 
     def _rows(self, rows: Array, durations: Array) -> tuple[Array, Array]:
-        whole, rest = self._parted(durations)
-        flown, driven = np.array(rows, dtype=float), np.zeros(rows.shape)
-        for place, (flow, integral) in enumerate(self._over(int(whole.max(initial=0)).bit_length())):
-            far = np.flatnonzero(whole >> place & 1)
-            if far.size:
-                driven[far] += flown[far] @ integral
-                flown[far] = flown[far] @ flow
-        return self._through(flown, driven, rest)
+        steps, remainders = self._parted(durations)
+        propagated, integrals = np.array(rows, dtype=float), np.zeros(rows.shape)
+        for bit, (flow, integral) in enumerate(self._over(int(steps.max(initial=0)).bit_length())):
+            indices = np.flatnonzero(steps >> bit & 1)
+            if indices.size:
+                integrals[indices] += propagated[indices] @ integral
+                propagated[indices] = propagated[indices] @ flow
+        return self._through(propagated, integrals, remainders)
 
     def _parted(self, durations: Array) -> tuple[np.ndarray, Array]:
-        """How many short times durations ``(k,)`` have, and what is left of them."""
+        """Return the number of whole short times in each of ``durations (k,)``, and the rest of each."""
         durations = np.maximum(durations, 0.0)  # differences of times may be less by rounding
-        whole = np.floor(durations / self.step).astype(int)
-        return whole, durations - whole * self.step
+        steps = np.floor(durations / self.step).astype(int)
+        return steps, durations - steps * self.step
 
     def _through(self, flown: Array, driven: Array, rest: Array) -> tuple[Array, Array]:
-        """What ``rest (k,)`` of the durations makes of both of rows, ``(k, d)`` each."""
+        """Return rows and their integrals, ``(k, d)`` each, propagated over the last part ``rest (k,)`` of the
+        durations."""
         rest = rest[:, None]
         if self.A.shape[0] <= FEW_STATES:
-            both = ((rest / self.step) ** np.arange(TERMS) @ self._table).reshape(-1, 2, *self.A.shape)
-            moved = (flown[:, None, None] @ both)[:, :, 0]
-            return moved[:, 0], driven + moved[:, 1] * rest
-        order, left = 1, 1.0
+            matrices = ((rest / self.step) ** np.arange(TERMS) @ self._table).reshape(-1, 2, *self.A.shape)
+            propagated = (flown[:, None, None] @ matrices)[:, :, 0]
+            return propagated[:, 0], driven + propagated[:, 1] * rest
+        order, term_bound = 1, 1.0
         size = float(rest.max(initial=0.0)) / self.step  # |A r| is at most this
         term, driven = flown, driven + rest * flown
-        while left > LAST and size:
+        while term_bound > LAST and size:
             term = np.asarray(term @ self._products) * (rest / order)
             flown, driven = flown + term, driven + term * (rest / (order + 1))
-            left, order = left * size / order, order + 1
+            term_bound, order = term_bound * size / order, order + 1
         return flown, driven
 
     @shaped
@@ -162,28 +165,30 @@ class Leaps:
         self, rows: Float[Array, "r d"], durations: Float[Array, " k"]
     ) -> tuple[Float[Array, "k r d"], Float[Array, "k r d"]]:
         """`rows` where each goes over every duration: what durations begin with, in short times, is gone over once."""
-        whole, rest = self._parted(durations)
-        wholes, which = np.unique(whole, return_inverse=True)
-        flown = np.array(rows[None] * self._scale, dtype=float)
-        driven, numbers = np.zeros(flown.shape), np.zeros(1, dtype=int)
-        doubled = self._over(int(wholes.max(initial=0)).bit_length())
-        for place in range(len(doubled) - 1, -1, -1):
-            begun, numbers = numbers, np.unique(wholes >> place)
-            before, odd = np.searchsorted(begun, numbers >> 1), np.flatnonzero(numbers & 1)
-            flown, driven = flown[before], driven[before]
-            through, shape = flown[odd].reshape(-1, rows.shape[1]), (odd.size, *rows.shape)
-            driven[odd] += (through @ doubled[place][1]).reshape(shape)
-            flown[odd] = (through @ doubled[place][0]).reshape(shape)
-        found = np.empty((2, durations.size, *rows.shape))
+        steps, remainders = self._parted(durations)
+        distinct_steps, inverse = np.unique(steps, return_inverse=True)
+        propagated = np.array(rows[None] * self._scale, dtype=float)
+        integrals, prefixes = np.zeros(propagated.shape), np.zeros(1, dtype=int)
+        doubled = self._over(int(distinct_steps.max(initial=0)).bit_length())
+        for bit in range(len(doubled) - 1, -1, -1):
+            beginnings, prefixes = prefixes, np.unique(distinct_steps >> bit)
+            parents, odd = np.searchsorted(beginnings, prefixes >> 1), np.flatnonzero(prefixes & 1)
+            propagated, integrals = propagated[parents], integrals[parents]
+            odd_rows, shape = propagated[odd].reshape(-1, rows.shape[1]), (odd.size, *rows.shape)
+            integrals[odd] += (odd_rows @ doubled[bit][1]).reshape(shape)
+            propagated[odd] = (odd_rows @ doubled[bit][0]).reshape(shape)
+        stacked = np.empty((2, durations.size, *rows.shape))
         count = max(1, NEAR // rows.size)
         for start in range(0, durations.size, count):
-            part = slice(start, start + count)
-            begun, shape = which.reshape(-1)[part], (-1, rows.shape[1])
-            late = np.repeat(rest[part], len(rows))
-            both = self._through(flown[begun].reshape(shape), driven[begun].reshape(shape), late)
-            found[:, part] = np.stack(both).reshape(2, begun.size, *rows.shape)
-        found /= self._scale
-        return found[0], found[1]
+            batch = slice(start, start + count)
+            beginnings, shape = inverse.reshape(-1)[batch], (-1, rows.shape[1])
+            row_remainders = np.repeat(remainders[batch], len(rows))
+            values = self._through(
+                propagated[beginnings].reshape(shape), integrals[beginnings].reshape(shape), row_remainders
+            )
+            stacked[:, batch] = np.stack(values).reshape(2, beginnings.size, *rows.shape)
+        stacked /= self._scale
+        return stacked[0], stacked[1]
 
     @shaped
     def transitions(self, durations: Float[Array, " k"]) -> tuple[Float[Array, "k d d"], Float[Array, "k d d"]]:
@@ -205,17 +210,18 @@ class Flows:
 
     @cached_property
     def _singles(self) -> tuple[np.ndarray, Array, np.ndarray, np.ndarray]:
-        """Where the real modes are, and their rates; where rotations ``[[a, b], [-b, a]]`` begin, and ``a + ib``."""
-        alone = [part for part, single in self.decoupling.parts if single]
-        real = np.array([part.start for part in alone if part.stop == part.start + 1], dtype=int)
-        turning = np.array([part.start for part in alone if part.stop == part.start + 2], dtype=int)
+        """Indices of the real modes, and their rates; and the first indices of rotations ``[[a, b], [-b, a]]``, and
+        ``a + ib``."""
+        singles = [block for block, single in self.decoupling.parts if single]
+        real = np.array([block.start for block in singles if block.stop == block.start + 1], dtype=int)
+        turning = np.array([block.start for block in singles if block.stop == block.start + 2], dtype=int)
         return real, self.D[real, real], turning, self.D[turning, turning] + 1j * self.D[turning, turning + 1]
 
     @cached_property
     def _groups(self) -> list[tuple[slice, Leaps, Leaps]]:
-        """Every group, on rows and on columns."""
-        found = [(part, self.D[part, part]) for part, single in self.decoupling.parts if not single]
-        return [(part, Leaps(D), Leaps(np.ascontiguousarray(D.T))) for part, D in found]
+        """The groups of several blocks, each with its `Leaps` on rows and on columns."""
+        pairs = [(block, self.D[block, block]) for block, single in self.decoupling.parts if not single]
+        return [(block, Leaps(D), Leaps(np.ascontiguousarray(D.T))) for block, D in pairs]
 
     @shaped
     def rows(
@@ -229,29 +235,35 @@ class Flows:
     def columns(
         self, states: Float[Array, "k d"], drives: Float[Array, "k d"], durations: Float[Array, " k"]
     ) -> Float[Array, "k d"]:
-        """Where ``states (k, d)`` are after ``durations (k,)`` under constant ``drives (k, d)``."""
-        flown, driven = self._applied(np.stack([states, drives], axis=1), durations, transposed=True)
-        return flown[:, 0] + driven[:, 1]
+        """Return the states ``(k, d)`` after ``durations (k,)`` under constant ``drives (k, d)``, from
+        ``states (k, d)``."""
+        propagated, integrals = self._applied(np.stack([states, drives], axis=1), durations, transposed=True)
+        return propagated[:, 0] + integrals[:, 1]
 
     def _applied(self, rows: Array, durations: Array, transposed: bool) -> tuple[Array, Array]:
-        flown, driven = np.empty((2, *rows.shape))
+        propagated, integrals = np.empty((2, *rows.shape))
         real, rates, turning, spins = self._singles
         late = durations[:, None]
         if real.size:
-            grown, added = np.exp(rates * late), _integrals(rates, late)
-            flown[..., real], driven[..., real] = rows[..., real] * grown[:, None], rows[..., real] * added[:, None]
+            exponentials, exponential_integrals = np.exp(rates * late), _integrals(rates, late)
+            propagated[..., real], integrals[..., real] = (
+                rows[..., real] * exponentials[:, None],
+                rows[..., real] * exponential_integrals[:, None],
+            )
         if turning.size:
             spins = spins.conj() if transposed else spins
             points = rows[..., turning] + 1j * rows[..., turning + 1]
-            for found, factor in ((flown, np.exp(spins * late)), (driven, _integrals(spins, late))):
-                moved = points * factor[:, None]
-                found[..., turning], found[..., turning + 1] = moved.real, moved.imag
-        for part, along, across in self._groups:
-            mine = np.ascontiguousarray(rows[..., part]).reshape(-1, part.stop - part.start)
-            every = np.repeat(durations, rows.shape[1])
-            for found, moved in zip((flown, driven), (across if transposed else along).rows(mine, every), strict=True):
-                found[..., part] = moved.reshape(*rows.shape[:-1], -1)
-        return flown, driven
+            for target, factor in ((propagated, np.exp(spins * late)), (integrals, _integrals(spins, late))):
+                values = points * factor[:, None]
+                target[..., turning], target[..., turning + 1] = values.real, values.imag
+        for block, along, across in self._groups:
+            block_rows = np.ascontiguousarray(rows[..., block]).reshape(-1, block.stop - block.start)
+            row_durations = np.repeat(durations, rows.shape[1])
+            for target, values in zip(
+                (propagated, integrals), (across if transposed else along).rows(block_rows, row_durations), strict=True
+            ):
+                target[..., block] = values.reshape(*rows.shape[:-1], -1)
+        return propagated, integrals
 
 
 def _integrals(rates: np.ndarray, durations: Array) -> np.ndarray:

@@ -35,11 +35,11 @@ def exponential(matrices: Float[Array, "*k d d"]) -> Float[Array, "*k d d"]:
     blocks = COEFFICIENTS[:18].reshape(-1, 3, *(1 for _ in matrices.shape))
     group = 6 if matrices.size <= FEW else 1
     for stop in range(6, 0, -group):
-        one, first, square = blocks[stop - group : stop].swapaxes(0, 1)
-        for part in (one * identity + first * scaled + square * second)[::-1]:
-            result = result @ third + part
-    for done in range(int(squarings.max(initial=0))):
-        result = np.where((squarings > done)[..., None, None], result @ result, result)
+        constant, first, square = blocks[stop - group : stop].swapaxes(0, 1)
+        for polynomial in (constant * identity + first * scaled + square * second)[::-1]:
+            result = result @ third + polynomial
+    for squaring in range(int(squarings.max(initial=0))):
+        result = np.where((squarings > squaring)[..., None, None], result @ result, result)
     return result
 
 

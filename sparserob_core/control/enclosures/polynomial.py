@@ -63,8 +63,8 @@ def distinct_patterns(ends: Float[Array, "k r nu"]) -> tuple[Float[Array, "u nu"
     """The distinct rows of ``ends (k, r, nu)``, and which of them stands at every ``(k, r)``."""
     if not ends.shape[2]:
         return np.zeros((1, 0)), np.zeros(ends.shape[:2], dtype=int)
-    patterns, which = np.unique(ends.reshape(-1, ends.shape[2]), axis=0, return_inverse=True)
-    return patterns, which.reshape(ends.shape[:2])
+    patterns, inverse = np.unique(ends.reshape(-1, ends.shape[2]), axis=0, return_inverse=True)
+    return patterns, inverse.reshape(ends.shape[:2])
 
 
 def face_of(space: TaylorSpace, ends: Array) -> Face:
@@ -126,15 +126,15 @@ def _concave(
     fewer than two variables are inner: there, the bound variable by variable is exact.
     """
     top = np.full(gradient.shape[0], np.inf)
-    several = np.flatnonzero(inner.sum(axis=1) > 1)
-    if not several.size:
+    indices = np.flatnonzero(inner.sum(axis=1) > 1)
+    if not indices.size:
         return top
-    H, free = hessian[several], inner[several]
+    H, free = hessian[indices], inner[indices]
     values = np.linalg.eigvalsh(H)  # the other variables add zeros only
     size = np.abs(values).max(axis=1)
     lowered = np.maximum(values[:, -1], 0.0) + DEFINITE * size
     H = np.where(free[:, :, None] & free[:, None, :], H - lowered[:, None, None] * np.eye(H.shape[1]), 0.0)
-    top[several] = _highest(gradient[several], H, free, size) + lowered * free.sum(axis=1) / 2
+    top[indices] = _highest(gradient[indices], H, free, size) + lowered * free.sum(axis=1) / 2
     return top
 
 
@@ -158,23 +158,25 @@ def _highest(
     least maximum of the tangents at the points of an active set method, in which one variable at a time is held at a
     side or released from it.
     """
-    rows, free, held = np.arange(gradient.shape[0]), inner.copy(), np.zeros(gradient.shape)
+    rows, free, fixed = np.arange(gradient.shape[0]), inner.copy(), np.zeros(gradient.shape)
     filler = -np.where(size > 0, size, 1.0)[:, None, None] * np.eye(gradient.shape[1])
     top = np.full(rows.size, np.inf)
     for _ in range(ROUNDS * gradient.shape[1]):
-        pull = np.where(free, gradient + np.einsum("kij,kj->ki", hessian, held), 0.0)
-        reached = held - _solved(np.where(free[:, :, None] & free[:, None, :], hessian, filler), pull)
-        point = np.clip(np.nan_to_num(reached), -1.0, 1.0)
-        bent = np.einsum("kij,kj->ki", hessian, point)
-        slope = np.where(inner, gradient + bent, 0.0)
-        top = np.minimum(top, ((gradient + bent / 2) * point).sum(axis=1) + (np.abs(slope) - slope * point).sum(axis=1))
-        beyond = np.where(free, np.abs(reached) - 1.0, 0.0)
-        inward = np.where(free, 0.0, -slope * held)
-        worst = np.where(beyond.max(axis=1) > 0.0, beyond.argmax(axis=1), inward.argmax(axis=1))
-        changed = (beyond.max(axis=1) > 0.0) | (inward.max(axis=1) > SLOPE * size)
+        pull = np.where(free, gradient + np.einsum("kij,kj->ki", hessian, fixed), 0.0)
+        stationary = fixed - _solved(np.where(free[:, :, None] & free[:, None, :], hessian, filler), pull)
+        point = np.clip(np.nan_to_num(stationary), -1.0, 1.0)
+        hessian_product = np.einsum("kij,kj->ki", hessian, point)
+        slope = np.where(inner, gradient + hessian_product, 0.0)
+        top = np.minimum(
+            top, ((gradient + hessian_product / 2) * point).sum(axis=1) + (np.abs(slope) - slope * point).sum(axis=1)
+        )
+        excess = np.where(free, np.abs(stationary) - 1.0, 0.0)
+        inward = np.where(free, 0.0, -slope * fixed)
+        worst = np.where(excess.max(axis=1) > 0.0, excess.argmax(axis=1), inward.argmax(axis=1))
+        changed = (excess.max(axis=1) > 0.0) | (inward.max(axis=1) > SLOPE * size)
         if not changed.any():
             break
-        which = (rows[changed], worst[changed])
-        held[which] = np.where(free[which], point[which], 0.0)
-        free[which] = ~free[which]
+        changes = (rows[changed], worst[changed])
+        fixed[changes] = np.where(free[changes], point[changes], 0.0)
+        free[changes] = ~free[changes]
     return top

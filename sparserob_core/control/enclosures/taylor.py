@@ -50,16 +50,19 @@ class Face:
     sign: Array
 
     def onto(self, monomials: np.ndarray) -> tuple[np.ndarray, Array]:
-        """The monomials ``(j,)`` that are left of some ``(k,)`` with the constant, and the matrix ``(j, k)`` that
-        makes coefficients of these those of them."""
-        left, place = np.unique(self.target[monomials], return_inverse=True)
-        matrix = np.zeros((left.size, monomials.size))
-        matrix[place.reshape(-1), np.arange(monomials.size)] = self.sign[monomials]
-        return left, matrix
+        """Return the monomials ``(j,)`` of the face to which some ``monomials (k,)`` reduce, and the matrix ``(j, k)``
+        that takes coefficients of the latter to coefficients of the former.
+
+        The constant monomial is among the given ones.
+        """
+        reduced, positions = np.unique(self.target[monomials], return_inverse=True)
+        matrix = np.zeros((reduced.size, monomials.size))
+        matrix[positions.reshape(-1), np.arange(monomials.size)] = self.sign[monomials]
+        return reduced, matrix
 
     @cached_property
     def matrix(self) -> csr_array:
-        """That of all monomials, ``(M, M)``."""
+        """The matrix ``(M, M)`` that takes the coefficients of all monomials to those of a polynomial on the face."""
         from scipy.sparse import csr_array
 
         size = self.target.size
@@ -92,7 +95,7 @@ class TaylorSpace:
             for order in range(degree + 1)
             for choice in combinations_with_replacement(range(nu), order)
         ]
-        self.index: dict[tuple[int, ...], int] = {monomial: place for place, monomial in enumerate(monomials)}
+        self.index: dict[tuple[int, ...], int] = {monomial: position for position, monomial in enumerate(monomials)}
         self.exponents: npt.NDArray[np.int64] = np.array(monomials, dtype=np.int64).reshape(len(monomials), nu)
         self.degrees: npt.NDArray[np.int64] = self.exponents.sum(axis=1)
         self.even: npt.NDArray[np.bool_] = (self.exponents % 2 == 0).all(axis=1)
@@ -103,8 +106,8 @@ class TaylorSpace:
         self._codes = codes[self._order]
         target = self._order[np.searchsorted(self._codes, codes[left] + codes[right])]
         self.products = (left, right, target)
-        added = HALF * np.bincount(target)[target]
-        self.rounded: Array = added / (1.0 - added)  # what a coefficient is off by, as a share of all that it adds up
+        shares = HALF * np.bincount(target)[target]
+        self.rounded: Array = shares / (1.0 - shares)  # what a coefficient is off by, as a share of all that it adds up
         self.faces: dict[bytes, Face] = {}
 
     def places(self, exponents: npt.NDArray[np.int64]) -> npt.NDArray[np.intp]:
@@ -179,10 +182,10 @@ class TaylorModel:
 
     def bounds(self) -> tuple[float, float]:
         """An interval that holds every value; even monomials are in ``[0, 1]``, the others in ``[-1, 1]``."""
-        rest, even = self.coefficients[1:], self.space.even[1:]
-        odd = float(np.abs(rest[~even]).sum()) + self.remainder
-        low = float(self.coefficients[0] + np.minimum(rest[even], 0.0).sum()) - odd
-        high = float(self.coefficients[0] + np.maximum(rest[even], 0.0).sum()) + odd
+        nonconstant, even = self.coefficients[1:], self.space.even[1:]
+        odd = float(np.abs(nonconstant[~even]).sum()) + self.remainder
+        low = float(self.coefficients[0] + np.minimum(nonconstant[even], 0.0).sum()) - odd
+        high = float(self.coefficients[0] + np.maximum(nonconstant[even], 0.0).sum()) + odd
         return low, high
 
     def _magnitude(self) -> float:
@@ -281,10 +284,12 @@ class TaylorModel:
             result = result * y + coefficient
         low, high = y.bounds()
         reach = max(-low, high)
-        rest = bound * reach ** len(coefficients)
+        remainder = bound * reach ** len(coefficients)
         if reach > 0.0:  # the coefficients of the series are rounded too, by a few units each
-            rest += sum(rounding(4 * k) * abs(one) * reach**k for k, one in enumerate(coefficients))
-        return TaylorModel(self.space, result.coefficients, result.remainder + rest)
+            remainder += sum(
+                rounding(4 * k) * abs(coefficient) * reach**k for k, coefficient in enumerate(coefficients)
+            )
+        return TaylorModel(self.space, result.coefficients, result.remainder + remainder)
 
     def _domain(self) -> tuple[int, float, float, float]:
         return self.space.degree, float(self.coefficients[0]), *self.bounds()
@@ -319,10 +324,10 @@ class TaylorModel:
 
     def kepler(self, eccentricity: float) -> TaylorModel:
         """The ``E`` with ``E - e sin E`` equal to these values, for a number ``0 <= e < 1``."""
-        found = self._compose(kepler_series(eccentricity, *self._domain()))
+        model = self._compose(kepler_series(eccentricity, *self._domain()))
         centre = abs(float(self.coefficients[0]))  # Newton's method ends where the equation holds to its rounding
-        found.remainder += rounding(4) * (centre + 1.0) / (1.0 - eccentricity * math.cos(float(found.coefficients[0])))
-        return found
+        model.remainder += rounding(4) * (centre + 1.0) / (1.0 - eccentricity * math.cos(float(model.coefficients[0])))
+        return model
 
     def reciprocal(self) -> TaylorModel:
         """``1 / self``, for values of one sign."""
@@ -353,10 +358,10 @@ def _rounded(space: TaylorSpace, coefficients: Array, remainder: float) -> Taylo
 
 @dataclass(frozen=True, eq=False)
 class Combination:
-    """A functional whose direction varies over a cell, ``c = c_0 + sum_j eta_j c_j`` with ``|eta_j| <= 1``, beside
-    the parameters: how polynomials in ``delta`` for each of ``c_0, ..., c_J`` become one in ``(delta, eta)`` of
-    ``space``.
+    """A functional whose direction varies over a cell with the parameters, ``c = c_0 + sum_j eta_j c_j`` with
+    ``|eta_j| <= 1``.
 
+    Polynomials in ``delta`` for each of ``c_0, ..., c_J`` become one polynomial in ``(delta, eta)`` of ``space``.
     ``targets (J+1, M)``: where monomial ``a`` of functional ``j`` goes.
     """
 
@@ -364,7 +369,7 @@ class Combination:
     targets: np.ndarray
 
     def apply(self, coefficients: Array) -> Array:
-        """``(k, J+1, M, ...)`` to ``(k, 1, M', ...)``."""
+        """Return the combined coefficients ``(k, 1, M', ...)`` from those of each functional, ``(k, J+1, M, ...)``."""
         combined = np.zeros((coefficients.shape[0], 1, self.space.size, *coefficients.shape[3:]))
         for j, target in enumerate(self.targets):
             combined[:, 0, target] += coefficients[:, j]

@@ -1,8 +1,9 @@
-"""What is known of a cell's parameters beyond the cell itself, taken into the bound of a function by multipliers.
+"""Valid inequalities for the parameters of a cell, taken into the bound of a function by multipliers.
 
 Where ``q_j >= 0`` holds on the set, ``v <= v + sum_j lambda_j q_j`` there for any ``lambda >= 0`` (weak duality). The
 ``q_j`` are half-spaces of the set, products of a half-space with the side of the cell that faces it (Sherali and Adams
-1999), and the quadratic of a round set, whose best multiplier is that of a trust region (More and Sorensen 1983).
+1999), and the quadratic of a round set. The best multiplier of the quadratic is that of a trust region (More and
+Sorensen 1983).
 """
 
 from __future__ import annotations
@@ -45,12 +46,12 @@ class Cuts:
         ``(k, r, nu')``."""
         total = polynomials + rest
         additions, multipliers = self._additions(space, total)
-        found = [polynomial_bound(space, total + addition) for addition in additions]
-        spreads = [spread for _, spread in found]
+        bounds = [polynomial_bound(space, total + addition) for addition in additions]
+        spreads = [spread for _, spread in bounds]
         if self.slack.size:
             spreads[1][..., : self.bent.size] += multipliers.sum(axis=-1, keepdims=True) * self.bent
             spreads[2] = spreads[1]  # that products bend downwards is no reason to halve
-        best = np.array([heights for heights, _ in found]).argmin(axis=0)[None, ..., None]
+        best = np.array([heights for heights, _ in bounds]).argmin(axis=0)[None, ..., None]
         lowered = polynomials + np.take_along_axis(np.array(additions), best, axis=0)[0]
         return lowered, np.take_along_axis(np.array(spreads), best, axis=0)[0]
 
@@ -59,8 +60,8 @@ class Cuts:
         multipliers ``(k, r, q)``."""
         count = self.bent.size
         gradient, hessian = (
-            part.reshape(*total.shape[:2], *part.shape[1:])
-            for part in quadratic_part(space, total.reshape(-1, space.size))
+            array.reshape(*total.shape[:2], *array.shape[1:])
+            for array in quadratic_part(space, total.reshape(-1, space.size))
         )
         gradient, hessian = gradient[..., :count], hessian[..., :count, :count]
         additions, multipliers = [np.zeros_like(total)], np.zeros((*total.shape[:2], 0))
@@ -147,8 +148,8 @@ def cheapest_multipliers(slopes: Array, slack: Array, gradient: Array) -> Array:
     """
     q, nu = slopes.shape
     trials = [np.zeros((*gradient.shape[:-1], q))]
-    most = min(q, nu) if q <= TOGETHER else 1
-    for chosen in chain.from_iterable(combinations(range(q), size) for size in range(1, most + 1)):
+    largest_size = min(q, nu) if q <= TOGETHER else 1
+    for chosen in chain.from_iterable(combinations(range(q), size) for size in range(1, largest_size + 1)):
         trials.append(_placed(trials[0], chosen, gradient @ np.linalg.pinv(slopes[list(chosen)])))
     for row, coordinate in np.argwhere(slopes != 0.0):
         trials.append(_placed(trials[0], (row,), gradient[..., [coordinate]] / slopes[row, coordinate]))
@@ -170,7 +171,7 @@ def _squares(weights: Array, rows: Array) -> Array:
 
 
 def _linear(space: TaylorSpace, count: int) -> list[int]:
-    """Where the first variables of a space are among its monomials."""
+    """Return the indices of the first ``count`` variables of a space among its monomials."""
     return [space.index[tuple(unit)] for unit in np.eye(space.nu, dtype=int)[:count].tolist()]
 
 

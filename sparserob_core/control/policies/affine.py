@@ -17,10 +17,13 @@ SAME = 1e-12  # of the horizon: what is older than `memory` by less is not; ten 
 
 @final
 class AffinePolicy(Policy, Options):
-    """The state is measured at every breakpoint ``tau_j`` of the control's dictionary; the control on piece ``k`` is
-    ``u_k = v_k + sum_{j <= k} M_kj e_j`` with the innovation ``e_j``: what the state at ``tau_j`` has beyond what the
-    state one breakpoint before, the drift, every control in between and the middle of the disturbance's set predict;
-    ``e_0`` is what ``x(0)`` has beyond the middle of the set of initial states, 0 from a single one.
+    """A policy whose control is an affine function of the innovations of the measured state.
+
+    The state is measured at every breakpoint ``tau_j`` of the control's dictionary. The control on piece ``k`` is
+    ``u_k = v_k + sum_{j <= k} M_kj e_j`` with the innovations ``e_j``. An innovation is the difference of the state at
+    ``tau_j`` from its prediction by the state one breakpoint before, the drift, every control in between and the middle
+    of the disturbance's set. ``e_0`` is the difference of ``x(0)`` from the middle of the set of initial states, 0 for
+    a single initial state.
 
     The nominal control ``v (m, K)`` and the gains ``M (K, K, m, n)`` are the decision. Every set of the problem holds
     for all disturbances with the control that they cause. For a fixed disturbance everything is linear in the decision
@@ -54,7 +57,8 @@ class AffinePolicy(Policy, Options):
         return frozenset({"state"})
 
     def answers(self, breakpoints: Array) -> np.ndarray:
-        """Everything that was measured, or what is no older than ``memory``."""
+        """Return the truth values ``(K, K)`` of the answered innovations: all that are measured by then, or those no
+        older than ``memory``."""
         starts = breakpoints[:-1]
         oldest = np.inf if self.memory is None else self.memory + SAME * breakpoints[-1]
         answered: np.ndarray = np.tril(starts[:, None] - starts <= oldest)
@@ -62,5 +66,5 @@ class AffinePolicy(Policy, Options):
 
     @property
     def charge(self) -> Charge:
-        """What the options say."""
+        """The cost, the choice ``among`` policies, and the limits of the causal search, as the options give them."""
         return Charge(self.cost, self.among, self.causal_signals, self.causal_seconds)

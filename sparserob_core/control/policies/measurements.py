@@ -1,4 +1,4 @@
-"""What is measured of a state, with which noise, and when that is known."""
+"""Measurements of the state: outputs, their noise, and the time from which the control knows them."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class Measurements(Term):
 
     @property
     def outputs(self) -> int:
-        """How many numbers are measured at once, ``p``."""
+        """Number ``p`` of outputs that are measured at each breakpoint."""
         return int(np.asarray(self.C).shape[0])
 
     @property
@@ -43,8 +43,25 @@ class Measurements(Term):
         return self.noise or Box(np.zeros(self.outputs), np.zeros(self.outputs))
 
     def checked(self, states: int, horizon: float) -> Measurements:
-        """The same with ``C`` as an array, and without a noise that is a point at 0; raises `InputError` that begins
-        with the key below ``measurements``."""
+        """Return the measurements after a check, with ``C`` as an array.
+
+        Parameters
+        ----------
+        states : int
+            Number ``d`` of states.
+        horizon : float
+            Horizon, in the unit of the latency.
+
+        Returns
+        -------
+        Measurements
+            Checked measurements. A noise set that is the point 0 is replaced by ``None``.
+
+        Raises
+        ------
+        InputError
+            Where a field is not valid. The path begins with the key below ``measurements``.
+        """
         try:
             C = np.array(dense(self.C), dtype=float)
         except (TypeError, ValueError):
@@ -75,25 +92,28 @@ class Measurements(Term):
         return replace(self, C=C, noise=noise, latency=float(latency[0]))
 
     def units(self, states: Array) -> Array:
-        """What one of each output is in the user's units, ``(p,)``, where one of each state is ``states (d,)``: powers
-        of two, of the largest that a state gives to it."""
+        """Return the unit of each output in the user's units, ``(p,)``, for the units ``states (d,)`` of the states.
+
+        Each unit is a power of two, close to the largest ``|C_ij| states_j`` of its row.
+        """
         sizes = (np.abs(np.asarray(self.C)) * states).max(axis=1)
         units: Array = np.exp2(np.round(np.log2(sizes)))
         return units
 
     def in_units(self, units: Any) -> Measurements:
-        """The same with every number in these `Units`, outputs in those that `units` says."""
+        """Return the measurements with every number converted to these `Units`, and outputs to the units of `units`."""
         return super().in_units(replace(units, outputs=self.units(units.states)))
 
     def latest(self, breakpoints: Array) -> Array:
-        """When what each piece of the control knows last was measured, ``(K,)``; 0 of one that knows nothing."""
-        known = self.known(breakpoints)
-        latest: Array = np.where(known, breakpoints[:-1], 0.0).max(axis=1)
+        """Return the time of the latest measurement that each piece of the control knows, ``(K,)``; 0 where none is
+        known."""
+        is_known = self.known(breakpoints)
+        latest: Array = np.where(is_known, breakpoints[:-1], 0.0).max(axis=1)
         return latest
 
     def known(self, breakpoints: Array) -> np.ndarray:
         """Truth values ``(K, K)``: whether the control on piece ``k`` may know what was measured at breakpoint ``j``,
         of the ``breakpoints (K + 1,)`` of the control's dictionary."""
         starts, late = breakpoints[:-1], self.latency - SAME * breakpoints[-1]
-        found: np.ndarray = np.tril(starts[:, None] - starts >= late)
-        return found
+        is_known: np.ndarray = np.tril(starts[:, None] - starts >= late)
+        return is_known

@@ -1,4 +1,5 @@
-"""What the control may know and answer, what that is chosen for, and the policy that answers nothing."""
+"""Policies: the quantities that a control knows, the measurements that it answers, the cost by which a policy is
+chosen, and the open loop."""
 
 from __future__ import annotations
 
@@ -24,7 +25,7 @@ which a program has a variable each for every state."""
 @final
 @dataclass(frozen=True)
 class Charge:
-    """The cost by which a policy is chosen, and how long a bound against every causal policy is sought beside it; the
+    """The cost by which a policy is chosen, and the limits of the search for a bound against every causal policy; the
     fields are the options of `AffinePolicy`."""
 
     cost: Cost = "nominal"
@@ -34,24 +35,29 @@ class Charge:
 
 
 class Policy(ABC):
-    """How the control is decided while the system runs: which measurements every piece of it ``answers``, and which
-    cost it is chosen by, its ``charge``.
+    """A rule by which the control is decided while the system runs: the measurements that every piece ``answers``, and
+    the cost by which the policy is chosen, its ``charge``.
 
-    The state is measured at every breakpoint ``tau_j`` of the control's dictionary, and the control on piece ``k`` is
-    ``u_k = v_k + sum_j M_kj e_j`` over the innovations ``e_j`` that it answers (`AffinePolicy`). The policy that
+    The state is measured at every breakpoint ``tau_j`` of the control's dictionary. The control on piece ``k`` is
+    ``u_k = v_k + sum_j M_kj e_j`` over the innovations ``e_j`` that the piece answers (`AffinePolicy`). The policy that
     answers nothing is `OpenLoop`, where the control is a function of time alone.
     """
 
     @property
     @abstractmethod
     def knows(self) -> frozenset[Quantity]:
-        """Of which quantities the past values are known when the control is chosen at a time ``t``; a policy that
-        answers anything knows the ``state``."""
+        """The quantities whose past values are known when the control is chosen at a time ``t``.
+
+        A policy that answers anything knows the ``state``.
+        """
 
     def answers(self, breakpoints: Array) -> np.ndarray:
-        """Truth values ``(K, K)``: whether the control on piece ``k`` answers what is measured at breakpoint ``j``,
-        never for ``j > k``; of the ``breakpoints (K + 1,)`` of the control's dictionary. Nothing unless it is said; a
-        policy that knows something has to say it."""
+        """Return the truth values ``(K, K)`` of whether the control on piece ``k`` answers the measurement at
+        breakpoint ``j``.
+
+        No entry with ``j > k`` is true. The ``breakpoints (K + 1,)`` are those of the control's dictionary. By default
+        all entries are false; a policy that knows a quantity has to override this method, else `InputError` is raised.
+        """
         if self.knows:
             raise InputError(
                 path="policy.name",
@@ -62,7 +68,7 @@ class Policy(ABC):
 
     @property
     def charge(self) -> Charge:
-        """The cost by which the policy is chosen: that of the nominal control unless it is said."""
+        """The cost by which the policy is chosen: the cost of the nominal control unless a policy overrides it."""
         return Charge()
 
 
@@ -72,14 +78,14 @@ class OpenLoop(Policy, Options):
 
     @property
     def knows(self) -> frozenset[Quantity]:
-        """Nothing."""
+        """The empty set: an open-loop control knows no quantity."""
         return frozenset()
 
 
 @final
 class WrittenPolicy(Policy):
-    """A policy as a run has written it down: the truth values ``mask (K, K)`` and the cost that it is charged, without
-    the component that said them."""
+    """A policy that is read from the files of a run: the truth values ``mask (K, K)`` and the cost, without the
+    component that gave them."""
 
     def __init__(self, mask: np.ndarray, charge: Charge) -> None:
         self.mask, self._charge = mask, charge
@@ -100,10 +106,28 @@ class WrittenPolicy(Policy):
 
 
 def answers_of(policy: Policy | None, breakpoints: Array, measured: Measurements | None = None) -> np.ndarray:
-    """The truth values ``(K, K)`` of a policy, none of them of no policy, and of what is ``measured`` those of what is
-    known by then; of more than `MOST_ANSWERING` pieces an empty array where nothing is answered. Raises `InputError`
-    where they are no such array, of so many pieces, or where something is answered before it is measured, or without
-    being known."""
+    """Return the truth values ``(K, K)`` of what the control on each piece answers.
+
+    Parameters
+    ----------
+    policy : Policy or None
+        The policy; ``None`` answers nothing.
+    breakpoints : Array
+        Breakpoints ``(K + 1,)`` of the control's dictionary.
+    measured : Measurements, optional
+        The measurements; only those that are known by then are answered.
+
+    Returns
+    -------
+    ndarray
+        Truth values ``(K, K)``; an empty array for more than `MOST_ANSWERING` pieces where nothing is answered.
+
+    Raises
+    ------
+    InputError
+        Where the answers of the policy are no such array, of so many pieces, or where a state is answered before it is
+        measured or without being known.
+    """
     K = len(breakpoints) - 1
     if K > MOST_ANSWERING:
         if policy is None or isinstance(policy, OpenLoop):

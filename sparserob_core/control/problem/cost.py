@@ -137,9 +137,9 @@ class Cost(Term):
     @property
     def terms(self) -> tuple[Quadratic | None, Quadratic | None, Quadratic | None]:
         """The quadratic terms of state, control and final state, of a `checked` cost; ``None`` where one is absent."""
-        found = (self.state, self.control, self.final)
-        assert all(term is None or isinstance(term, Quadratic) for term in found)
-        return found  # type: ignore[return-value]
+        terms = (self.state, self.control, self.final)
+        assert all(term is None or isinstance(term, Quadratic) for term in terms)
+        return terms  # type: ignore[return-value]
 
     @property
     def is_quadratic(self) -> bool:
@@ -156,12 +156,12 @@ class Cost(Term):
         if self.is_linear and self.l1 == 1.0:
             return ""
         state, control, final = self.terms
-        parts = []
+        norms = []
         if self.l1 > 0.0:
             factor = "" if self.l1 == 1.0 else f"{self.l1:g} "
-            parts.append(f"{factor}{'norm of groups' if self.blocks else 'L1 norm'}")
+            norms.append(f"{factor}{'norm of groups' if self.blocks else 'L1 norm'}")
         names = (("quadratic state", state), ("quadratic control", control), ("quadratic final state", final))
-        return " + ".join(parts + [name for name, term in names if term is not None])
+        return " + ".join(norms + [name for name, term in names if term is not None])
 
 
 def nominal_point(convex: ConvexSet) -> Array:
@@ -194,8 +194,8 @@ def _groups(given: object, controls: int, weights: Array) -> tuple[tuple[int, ..
         ) from None
     channels = [channel for group in groups for channel in group]
     for channel in channels:
-        whole = isinstance(channel, int | np.integer) and not isinstance(channel, bool)
-        if not whole or not 1 <= channel <= controls:
+        is_integer = isinstance(channel, int | np.integer) and not isinstance(channel, bool)
+        if not is_integer or not 1 <= channel <= controls:
             raise InputError(path="group", expected=f"channels from 1 to {controls}", got=f"{channel!r}")
     if len(set(channels)) < len(channels) or not all(groups):
         raise InputError(
@@ -203,16 +203,16 @@ def _groups(given: object, controls: int, weights: Array) -> tuple[tuple[int, ..
             expected="every channel in one group at most, and no group empty",
             got=f"{[list(map(int, group)) for group in groups]}",
         )
-    found = tuple(tuple(int(channel) for channel in group) for group in groups)
-    for group in found:
-        own = by_time(weights)[1].T[np.array(group) - 1]
-        if (own != own[0]).any():
+    integer_groups = tuple(tuple(int(channel) for channel in group) for group in groups)
+    for group in integer_groups:
+        entries = by_time(weights)[1].T[np.array(group) - 1]
+        if (entries != entries[0]).any():
             raise InputError(
                 path="group",
                 expected="equal weights within a group",
-                got=f"{np.squeeze(own, axis=-1 if own.shape[1] == 1 else ()).tolist()} for {list(group)}",
+                got=f"{np.squeeze(entries, axis=-1 if entries.shape[1] == 1 else ()).tolist()} for {list(group)}",
             )
-    return found
+    return integer_groups
 
 
 def _term(key: str, given: object, letter: str, size: int) -> Quadratic | None:
@@ -240,19 +240,19 @@ def _term(key: str, given: object, letter: str, size: int) -> Quadratic | None:
     if isinstance(given, Quadratic):
         matrix, reference = given.Q, given.reference
     elif isinstance(given, Mapping):
-        known = {letter} if key == "control" else {letter, "reference"}
-        if letter not in given or not set(given) <= known:
-            raise InputError(path=key, expected=f"{{{', '.join(sorted(known))}}}", got=f"{sorted(map(str, given))}")
+        keys = {letter} if key == "control" else {letter, "reference"}
+        if letter not in given or not set(given) <= keys:
+            raise InputError(path=key, expected=f"{{{', '.join(sorted(keys))}}}", got=f"{sorted(map(str, given))}")
         matrix, reference = given[letter], given.get("reference")
     else:
         raise InputError(path=key, expected=f"a mapping with {letter}", got=f"{type(given).__name__}")
-    of = "control" if key == "control" else "state"
+    quantity = "control" if key == "control" else "state"
     Q = _numbers(
-        f"{key}.{letter}", matrix, (size, size), f"a {size} by {size} matrix of finite numbers, a row per {of}"
+        f"{key}.{letter}", matrix, (size, size), f"a {size} by {size} matrix of finite numbers, a row per {quantity}"
     )
     r = np.zeros(size)
     if reference is not None:
-        r = _numbers(f"{key}.reference", reference, (size,), f"{size} finite numbers, one per {of}")
+        r = _numbers(f"{key}.reference", reference, (size,), f"{size} finite numbers, one per {quantity}")
     return Quadratic(_semidefinite(f"{key}.{letter}", Q), r)
 
 
@@ -296,7 +296,7 @@ def _exactly_semidefinite(Q: Array) -> bool:
         for i in range(k + 1, len(rows)):
             if pivot and rows[i][k]:
                 factor = rows[i][k] / pivot
-                rows[i] = [entry - factor * other for entry, other in zip(rows[i], rows[k], strict=True)]
+                rows[i] = [entry - factor * pivot_entry for entry, pivot_entry in zip(rows[i], rows[k], strict=True)]
     return True
 
 

@@ -59,24 +59,24 @@ class Dictionary:
     def __init__(self, breakpoints: npt.ArrayLike, values: npt.ArrayLike | csr_array) -> None:
         times = _times(breakpoints)
         entries = _sparse(values) if hasattr(values, "tocsr") else None
-        given = _real("values", values) if entries is None else entries
-        shape: tuple[int, ...] = given.shape
+        matrix = _real("values", values) if entries is None else entries
+        shape: tuple[int, ...] = matrix.shape
         if len(shape) != 2 or shape[0] == 0 or shape[1] != times.size - 1:
             raise InputError(
-                f"values must have shape (functions, {times.size - 1}), got {given.shape}", path="dictionary"
+                f"values must have shape (functions, {times.size - 1}), got {matrix.shape}", path="dictionary"
             )
         _at_most(shape[0], shape[1])
-        owner = _owner(given) if entries is None else None
+        owner = _owner(matrix) if entries is None else None
         if owner is not None:
             self._keep(breakpoints=times, _owner=owner)
         elif entries is not None:
             self._keep(breakpoints=times, _entries=entries)
             if not _orthogonal(entries) and not _independent(self.values):
                 raise _dependent(self.values)
-        elif not _independent(given):
-            raise _dependent(given)
+        elif not _independent(matrix):
+            raise _dependent(matrix)
         else:
-            self._keep(breakpoints=times, values=given)
+            self._keep(breakpoints=times, values=matrix)
 
     @classmethod
     def indicators(cls, breakpoints: npt.ArrayLike, owner: npt.ArrayLike | None = None) -> Dictionary:
@@ -119,9 +119,9 @@ class Dictionary:
     @classmethod
     def _made(cls, breakpoints: Array, **kept: object) -> Dictionary:
         """Return a dictionary with checked fields."""
-        made = cls.__new__(cls)
-        made._keep(breakpoints=breakpoints, **kept)
-        return made
+        dictionary = cls.__new__(cls)
+        dictionary._keep(breakpoints=breakpoints, **kept)
+        return dictionary
 
     def _keep(self, **kept: object) -> None:
         """Keep fields of the frozen dictionary."""
@@ -202,8 +202,8 @@ class Dictionary:
             return self._entries
         if self._owner is None:
             return csr_array(self.values)
-        places = (self._owner, np.arange(self.pieces))
-        return csr_array((np.ones(self.pieces), places), shape=(self.functions, self.pieces))
+        coordinates = (self._owner, np.arange(self.pieces))
+        return csr_array((np.ones(self.pieces), coordinates), shape=(self.functions, self.pieces))
 
     @shaped
     def control(self, theta: Float[Array, "*n"]) -> Float[Array, "m K"]:
@@ -248,14 +248,14 @@ class Dictionary:
             return weights
         if self._owner is None and self._entries is None:
             return np.asarray(self.values @ weights)
-        first = np.moveaxis(weights, -2, 0)
+        by_piece = np.moveaxis(weights, -2, 0)
         if self._owner is not None:
-            found = np.zeros((self.functions, *first.shape[1:]))
-            np.add.at(found, self._owner, first)
+            sums = np.zeros((self.functions, *by_piece.shape[1:]))
+            np.add.at(sums, self._owner, by_piece)
         else:
             assert self._entries is not None
-            found = (self._entries @ first.reshape(self.pieces, -1)).reshape(self.functions, *first.shape[1:])
-        return np.moveaxis(found, 0, -2)
+            sums = (self._entries @ by_piece.reshape(self.pieces, -1)).reshape(self.functions, *by_piece.shape[1:])
+        return np.moveaxis(sums, 0, -2)
 
     @shaped
     def at(self, pieces: Int[np.ndarray, "*k"]) -> Float[Array, "*nk"]:

@@ -140,37 +140,37 @@ def joined(
     InputError
         If a disturbance does not fit; the error begins with ``disturbance`` and its number.
     """
-    kind, first = every[0].kind, system.phases[0]
-    for i, one in enumerate(every):
-        if one.kind not in get_args(DisturbanceClass):
+    kind, first_phase = every[0].kind, system.phases[0]
+    for i, disturbance in enumerate(every):
+        if disturbance.kind not in get_args(DisturbanceClass):
             wanted = f"one of {', '.join(get_args(DisturbanceClass))}"
-            raise InputError(path=f"disturbance.{i}.class", expected=wanted, got=f"{one.kind!r}")
-        if one.kind != kind and "l1_ball" in (one.kind, kind):
+            raise InputError(path=f"disturbance.{i}.class", expected=wanted, got=f"{disturbance.kind!r}")
+        if disturbance.kind != kind and "l1_ball" in (disturbance.kind, kind):
             raise InputError(
                 path=f"disturbance.{i}.class",
                 expected=f"{kind}, the class of the first: l1_ball is of all of a list, or of none",
-                got=one.kind,
+                got=disturbance.kind,
             )
-    windows = [_window(f"disturbance.{i}", one, horizon) for i, one in enumerate(every)]
-    own = tuple(_own(f"disturbance.{i}", one, every, horizon) for i, one in enumerate(every))
-    grids = own if any(times is not None for times in own) else None
+    windows = [_window(f"disturbance.{i}", disturbance, horizon) for i, disturbance in enumerate(every)]
+    breakpoints = tuple(_own(f"disturbance.{i}", disturbance, every, horizon) for i, disturbance in enumerate(every))
+    grids = breakpoints if any(times is not None for times in breakpoints) else None
     sets = [
-        _checked(f"disturbance.{i}.set", one.set, one.entering(f"disturbance.{i}", first))
-        for i, one in enumerate(every)
+        _checked(f"disturbance.{i}.set", disturbance.set, disturbance.entering(f"disturbance.{i}", first_phase))
+        for i, disturbance in enumerate(every)
     ]
     phases: list[Phase] = []
     for phase in legs(system, {time for window in windows for time in window}, horizon):
         columns = []
-        for i, (one, (start, stop)) in enumerate(zip(every, windows, strict=True)):
-            E = _columns(one.entering(f"disturbance.{i}", phase))
+        for i, (disturbance, (start, stop)) in enumerate(zip(every, windows, strict=True)):
+            E = _columns(disturbance.entering(f"disturbance.{i}", phase))
             acts = start < phase.until - SAME_TIME * horizon and phase.begin + SAME_TIME * horizon < stop
             columns.append(E if acts else np.zeros((phase.states, sets[i].dimension)))
         phases.append(replace(phase, E=reduce(beside, columns)))
-    kinds = tuple(one.kind for one in every)
-    together: tuple[ConvexSet, Classes] = (product(sets), kind)
+    kinds = tuple(disturbance.kind for disturbance in every)
+    set_and_classes: tuple[ConvexSet, Classes] = (product(sets), kind)
     if len(set(kinds)) > 1 or grids is not None:
-        together = Product(tuple(sets)), kinds if len(set(kinds)) > 1 else kind
-    return system.in_phases(phases), *together, grids
+        set_and_classes = Product(tuple(sets)), kinds if len(set(kinds)) > 1 else kind
+    return system.in_phases(phases), *set_and_classes, grids
 
 
 def apart(bound: ConvexSet | None, classes: Classes, kind: DisturbanceClass) -> ConvexSet | None:
@@ -193,8 +193,8 @@ def apart(bound: ConvexSet | None, classes: Classes, kind: DisturbanceClass) -> 
     """
     if bound is None or isinstance(classes, str):
         return bound if classes == kind else None
-    every = zip(bound.factors, classes, strict=True)
-    return product([part if one == kind else _nothing(part.dimension) for part, one in every])
+    pairs = zip(bound.factors, classes, strict=True)
+    return product([factor if factor_class == kind else _nothing(factor.dimension) for factor, factor_class in pairs])
 
 
 def columns_of(bound: ConvexSet, classes: Classes, kind: DisturbanceClass) -> np.ndarray:
@@ -216,22 +216,22 @@ def columns_of(bound: ConvexSet, classes: Classes, kind: DisturbanceClass) -> np
     """
     if isinstance(classes, str):
         return np.full(bound.dimension, classes == kind)
-    return np.repeat([one == kind for one in classes], [part.dimension for part in bound.factors])
+    return np.repeat([factor_class == kind for factor_class in classes], [factor.dimension for factor in bound.factors])
 
 
 def _own(where: str, one: Disturbance, every: Sequence[Disturbance], horizon: float) -> Array | None:
     """Return the own breakpoints of one of several disturbances, or ``None`` where it has none; raise `InputError`."""
     if one.breakpoints is None:
         return None
-    if {other.kind for other in every} != {"piecewise_constant"}:
+    if {disturbance.kind for disturbance in every} != {"piecewise_constant"}:
         raise InputError(
             path=f"{where}.breakpoints",
             expected="none where a disturbance of the list is not of the class piecewise_constant",
             got="some",
         )
     times = as_bound("breakpoints", one.breakpoints)
-    fit = times.ndim == 1 and times.size > 1 and times[0] == 0.0 and abs(times[-1] - horizon) <= SAME_TIME * horizon
-    if not fit or not (np.diff(times) > SAME_TIME * horizon).all():
+    fits = times.ndim == 1 and times.size > 1 and times[0] == 0.0 and abs(times[-1] - horizon) <= SAME_TIME * horizon
+    if not fits or not (np.diff(times) > SAME_TIME * horizon).all():
         raise InputError(
             path=f"{where}.breakpoints",
             expected=f"times that increase from 0 to {horizon:g} (the horizon), apart by more than rounding",

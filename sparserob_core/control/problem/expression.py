@@ -177,17 +177,17 @@ class _Parser:
 
     def kepler(self, node: ast.Call, depth: int) -> Evaluation:
         """Return the evaluation of ``kepler(M, e)``, in which ``e`` is a number."""
-        if len(node.args) != 2 or node.keywords or any(isinstance(one, ast.Starred) for one in node.args):
+        if len(node.args) != 2 or node.keywords or any(isinstance(argument, ast.Starred) for argument in node.args):
             raise self.fault("kepler takes two arguments, as in kepler(M, 0.2)")
-        seen, self.seen = self.seen, set()
-        anomaly, given = self.parse(node.args[0], depth + 1), self.seen
+        names_before, self.seen = self.seen, set()
+        anomaly, anomaly_names = self.parse(node.args[0], depth + 1), self.seen
         self.seen = set()
-        told = self.parse(node.args[1], depth + 1)
+        evaluation = self.parse(node.args[1], depth + 1)
         if self.seen:
             raise self.fault(f"the eccentricity of kepler(M, e) must be a number, it depends on {min(self.seen)}")
-        self.seen = seen | given
+        self.seen = names_before | anomaly_names
         with np.errstate(all="ignore"):
-            eccentricity = float(told({}))
+            eccentricity = float(evaluation({}))
         if not 0.0 <= eccentricity < 1.0:
             raise self.fault(f"the eccentricity of kepler(M, e) must be in [0, 1), got {eccentricity:g}")
         return lambda values: kepler(anomaly(values), eccentricity)
@@ -253,17 +253,17 @@ def parse_definitions(given: Mapping[str, str | float], names: Sequence[str]) ->
             waiting[name] = parse_expression(text, [*names, *given])
         except InputError as error:
             raise error.under("define", name) from None
-    found: list[tuple[str, Expression]] = []
+    definitions: list[tuple[str, Expression]] = []
     while waiting:
-        ready = [name for name, one in waiting.items() if not one.names & waiting.keys()]
+        ready = [name for name, expression in waiting.items() if not expression.names & waiting.keys()]
         if not ready:
             raise InputError(
                 path=f"define.{next(iter(waiting))}",
                 expected="names that are not defined by themselves",
                 got=f"a circle of {', '.join(waiting)}",
             )
-        found += [(name, waiting.pop(name)) for name in ready]
-    return tuple(found)
+        definitions += [(name, waiting.pop(name)) for name in ready]
+    return tuple(definitions)
 
 
 @dataclass(frozen=True, eq=False)
@@ -319,11 +319,11 @@ class ExpressionMatrix:
     def evaluate(self, parameters: Array) -> Array:
         """Return the matrices ``(k, rows, columns)`` at parameters ``(k, nu)``."""
         values = self._with_defined({name: parameters[:, i] for i, name in enumerate(self.names)})
-        out = np.empty((len(parameters), *self.shape))
+        matrices = np.empty((len(parameters), *self.shape))
         for i, row in enumerate(self.entries):
             for j, entry in enumerate(row):
-                out[:, i, j] = entry(values)
-        return out
+                matrices[:, i, j] = entry(values)
+        return matrices
 
 
 Entries: TypeAlias = "Array | Callable[..., object] | ExpressionMatrix"
@@ -338,7 +338,9 @@ class Joined:
 
     def __call__(self, p: Iterable[Value]) -> Value:
         """Return the matrix at one parameter vector."""
-        return np.concatenate([np.asarray(part(p) if callable(part) else part) for part in self.parts], self.axis)
+        return np.concatenate(
+            [np.asarray(matrix(p) if callable(matrix) else matrix) for matrix in self.parts], self.axis
+        )
 
 
 def beside(left: Entries, right: Entries) -> Entries:
@@ -377,8 +379,8 @@ def _joined(one: Entries, other: Entries, axis: int) -> Entries:
     """Return two matrices as one along an axis: as an array, as expressions, or as a function."""
     if isinstance(one, np.ndarray) and isinstance(other, np.ndarray):
         return np.concatenate([one, other], axis)
-    of = next((part for part in (one, other) if isinstance(part, ExpressionMatrix)), None)
-    names, defined = ((), ()) if of is None else (of.names, of.defined)
+    expressions = next((matrix for matrix in (one, other) if isinstance(matrix, ExpressionMatrix)), None)
+    names, defined = ((), ()) if expressions is None else (expressions.names, expressions.defined)
     first, second = _written(one), _written(other)
     if first is None or second is None:
         return Joined((one, other), axis)
@@ -426,7 +428,7 @@ def parse_matrix(
     InputError
         If rows differ in length, an entry cannot be read, or a constant entry is not finite.
     """
-    known = [*names, *(one for one, _ in defined)]
+    allowed_names = [*names, *(definition for definition, _ in defined)]
     if not rows or not rows[0] or len({len(row) for row in rows}) > 1:
         raise InputError(
             path=name, expected="a matrix, rows of equal length", got=f"rows of lengths {[len(row) for row in rows]}"
@@ -436,7 +438,7 @@ def parse_matrix(
         entries.append([])
         for j, entry in enumerate(row):
             try:
-                entries[i].append(_finite(parse_expression(entry, known)))
+                entries[i].append(_finite(parse_expression(entry, allowed_names)))
             except InputError as error:
                 raise error.under(name, i, j) from None
     return ExpressionMatrix(tuple(map(tuple, entries)), tuple(names), defined)

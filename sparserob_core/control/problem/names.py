@@ -69,10 +69,10 @@ class Corners:
         if not self.rows:
             return np.arange(len(directions)), directions
         d, size = self.added
-        every = np.repeat(directions[:, None], len(self.rows), axis=1)
-        every[:, :, d:size] += np.stack([directions[:, :d] @ one[:, d:] for one in self.rows], axis=1)
-        kept = [np.unique(part, axis=0) for part in every]
-        return np.repeat(np.arange(len(kept)), [len(part) for part in kept]), np.concatenate(kept)
+        at_corners = np.repeat(directions[:, None], len(self.rows), axis=1)
+        at_corners[:, :, d:size] += np.stack([directions[:, :d] @ corner[:, d:] for corner in self.rows], axis=1)
+        distinct = [np.unique(rows, axis=0) for rows in at_corners]
+        return np.repeat(np.arange(len(distinct)), [len(rows) for rows in distinct]), np.concatenate(distinct)
 
     def without(self, direction: Array) -> Array:
         """Return a direction whose components along the states that parameters add are 0."""
@@ -105,7 +105,7 @@ class Corners:
         if not self.rows:
             return states
         d, size = self.added
-        corner = min(self.rows, key=lambda one: np.abs(direction[:d] @ one[:, d:] - direction[d:size]).sum())
+        corner = min(self.rows, key=lambda matrix: np.abs(direction[:d] @ matrix[:, d:] - direction[d:size]).sum())
         return np.concatenate([corner @ states[:size], states[d:]])
 
     def at(self, direction: Array) -> str | None:
@@ -120,13 +120,17 @@ class Corners:
         if not self.rows:
             return None
         d, size = self.added
-        added, far = np.array([direction[:d] @ one[:, d:] for one in self.rows]), np.abs(direction).max()
-        mine = np.abs(added - direction[d:size]).max(axis=1, initial=0.0) <= ROUNDING * far
-        if not mine.any():
+        components, largest = np.array([direction[:d] @ corner[:, d:] for corner in self.rows]), np.abs(direction).max()
+        matches = np.abs(components - direction[d:size]).max(axis=1, initial=0.0) <= ROUNDING * largest
+        if not matches.any():
             return None
-        values = self.values[mine]
-        same = (values == values[:1]).all(axis=0) & (self.values != values[:1]).any(axis=0)
-        return ", ".join(f"{name} = {v:.6g}" for name, v, told in zip(self.names, values[0], same, strict=True) if told)
+        values = self.values[matches]
+        determined = (values == values[:1]).all(axis=0) & (self.values != values[:1]).any(axis=0)
+        return ", ".join(
+            f"{name} = {v:.6g}"
+            for name, v, is_determined in zip(self.names, values[0], determined, strict=True)
+            if is_determined
+        )
 
 
 @final
@@ -177,33 +181,35 @@ class Names:
     __repr__ = noun
 
     def __post_init__(self) -> None:
-        seen: dict[str, str] = {}
+        kind_of: dict[str, str] = {}
         for kind in KINDS:
             names = self._texts(kind)
             for name in names:
                 if not name.strip():
                     raise InputError(path=f"names.{kind}", expected="names that are not empty", got=f"{list(names)}")
-                if name in seen:
-                    also = f" and in {seen[name]}" if seen[name] != kind else ""
+                if name in kind_of:
+                    also = f" and in {kind_of[name]}" if kind_of[name] != kind else ""
                     raise InputError(f"the name {name!r} occurs twice, in {kind}{also}", path="names")
-                seen[name] = kind
+                kind_of[name] = kind
             self._texts(f"{kind[:-1]}_units")
         if not isinstance(self.time, str):
             raise InputError(path="names.units.time", expected="a text such as s", got=f"{self.time!r}")
         if plane := self._texts("plane"):
-            known = "two of the states" + (f", {', '.join(self.states)}" if self.states else ", such as x1 and x2")
-            places = [self._place(name) for name in plane]
-            if len(plane) != 2 or plane[0] == plane[1] or None in places:
-                raise InputError(path="names.plane", expected=known, got=f"{list(plane)}")
-            units = [self.state_units[place] for place in places if place is not None and place < len(self.state_units)]
+            expected = "two of the states" + (f", {', '.join(self.states)}" if self.states else ", such as x1 and x2")
+            indices = [self._place(name) for name in plane]
+            if len(plane) != 2 or plane[0] == plane[1] or None in indices:
+                raise InputError(path="names.plane", expected=expected, got=f"{list(plane)}")
+            units = [
+                self.state_units[index] for index in indices if index is not None and index < len(self.state_units)
+            ]
             if len(set(units)) > 1:
                 raise InputError(path="names.plane", expected="two states of the same unit", got=" and ".join(units))
 
     @property
     def in_plane(self) -> tuple[int, int] | None:
         """The indices of the two states that are a position in the plane; ``None`` where none are given."""
-        across, up = [self._place(name) for name in self.plane] or [None, None]
-        return None if across is None or up is None else (across, up)
+        horizontal, vertical = [self._place(name) for name in self.plane] or [None, None]
+        return None if horizontal is None or vertical is None else (horizontal, vertical)
 
     def _place(self, name: str) -> int | None:
         """Return the index of the state with a name, or ``None`` where no state has it."""
@@ -225,14 +231,14 @@ class Names:
             If the number of names or units of a kind is another one.
         """
         for kind, count in (("states", states), ("controls", controls), ("disturbances", disturbances)):
-            for key, given in ((kind, getattr(self, kind)), (f"units.{kind}", getattr(self, f"{kind[:-1]}_units"))):
-                if given and len(given) != count:
+            for key, texts in ((kind, getattr(self, kind)), (f"units.{kind}", getattr(self, f"{kind[:-1]}_units"))):
+                if texts and len(texts) != count:
                     raise InputError(
                         path=f"names.{key}",
                         expected=f"{count}, one for each of the {kind}",
-                        got=f"{len(given)}: {', '.join(given)}",
+                        got=f"{len(texts)}: {', '.join(texts)}",
                     )
-        if (places := self.in_plane) is not None and max(places) >= states:
+        if (indices := self.in_plane) is not None and max(indices) >= states:
             raise InputError(path="names.plane", expected=f"two of {states} states", got=f"{list(self.plane)}")
         return self
 
@@ -257,18 +263,18 @@ class Names:
         unit = next(iter(self.control_units), "")
         if not unit or not self.time or set(self.control_units) != {unit}:
             return ""
-        for rate, left in ((f"/{self.time}^2", f"/{self.time}"), (f"/{self.time}", "")):
+        for rate, suffix in ((f"/{self.time}^2", f"/{self.time}"), (f"/{self.time}", "")):
             if unit.endswith(rate) and len(unit) > len(rate):
-                return unit.removesuffix(rate) + left
+                return unit.removesuffix(rate) + suffix
         return f"{unit} {self.time}"
 
     def _texts(self, field: str) -> tuple[str, ...]:
         """Return a field as a tuple of texts, which is kept; raise `InputError` for anything else."""
-        given = getattr(self, field)
-        if isinstance(given, str) or not all(isinstance(text, str) for text in given):
-            raise InputError(path=f"names.{field}", expected="a list of texts", got=f"{given!r}")
-        object.__setattr__(self, field, tuple(given))
-        return tuple(given)
+        texts = getattr(self, field)
+        if isinstance(texts, str) or not all(isinstance(text, str) for text in texts):
+            raise InputError(path=f"names.{field}", expected="a list of texts", got=f"{texts!r}")
+        object.__setattr__(self, field, tuple(texts))
+        return tuple(texts)
 
 
 UNNAMED = Names()
@@ -328,5 +334,5 @@ def joined(units: Iterable[str]) -> str:
     The result is ``m`` where all rows have this unit, ``m or m/s`` where rows differ, and empty where a unit is not
     known.
     """
-    known = list(dict.fromkeys(units))
-    return f" {' or '.join(known)}" if known and all(known) else ""
+    distinct = list(dict.fromkeys(units))
+    return f" {' or '.join(distinct)}" if distinct and all(distinct) else ""

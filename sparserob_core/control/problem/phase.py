@@ -191,7 +191,7 @@ class Phase:
     def at(self, parameter: Array) -> Phase:
         """Return the known phase at one value ``(nu,)`` of the uncertain parameter."""
         if not self.timed:
-            A, B, E = (part[0] for part in self.matrices(parameter[None]))
+            A, B, E = (matrix[0] for matrix in self.matrices(parameter[None]))
             drift = None if self.c is None else self._values("c", parameter[None])[0]
             return Phase(A, B, E, c=drift, begin=self.begin, until=self.until)
         domain = and_time(self.begin, self.until, None)
@@ -267,12 +267,12 @@ class Phase:
             The phase with ``d + k`` states, the last ``k`` of which are integrals of state and control.
         """
         k, d = rows.shape
-        below = {"B": inputs, "E": np.zeros((k, self.disturbances)), "c": np.zeros((k, 1))}
-        known = {
-            name: above(self._entry(name), part) for name, part in below.items() if name != "c" or self.c is not None
+        blocks = {"B": inputs, "E": np.zeros((k, self.disturbances)), "c": np.zeros((k, 1))}
+        extended = {
+            name: above(self._entry(name), block) for name, block in blocks.items() if name != "c" or self.c is not None
         }
         A = above(beside(self._entry("A"), np.zeros((d, k))), np.hstack([rows, np.zeros((k, k))]))
-        return replace(self, A=A, B=known["B"], E=known["E"], c=known.get("c"))
+        return replace(self, A=A, B=extended["B"], E=extended["E"], c=extended.get("c"))
 
     @shaped
     def matrices(
@@ -414,12 +414,12 @@ class Phase:
 
     def _check_domain(self) -> None:
         """Keep the names of the arguments; raise `InputError` where the domain or the names are unsuitable."""
-        given: object = self.domain
-        if not isinstance(given, ConvexSet | None):
+        domain: object = self.domain
+        if not isinstance(domain, ConvexSet | None):
             raise InputError(
                 path="system.parameters",
                 expected="a convex set, such as Box([-0.1], [0.1]), or None; C and D of a plant have no place here",
-                got=f"{type(given).__name__}",
+                got=f"{type(domain).__name__}",
             )
         if self.domain is not None and not self.domain.is_bounded:
             raise InputError("the set of parameters must be bounded", path="system")
@@ -433,16 +433,16 @@ class Phase:
 
     def _check_drift(self, d: int) -> None:
         """Keep the drift as a matrix of one column; raise `InputError` where it does not fit ``d`` states."""
-        given = self.c
-        if callable(given) and not isinstance(given, ExpressionMatrix | _AsColumn):
-            given = _AsColumn(given)
-        elif not callable(given):
-            given = dense(given)
-            array = np.asarray(given, dtype=object)
+        drift = self.c
+        if callable(drift) and not isinstance(drift, ExpressionMatrix | _AsColumn):
+            drift = _AsColumn(drift)
+        elif not callable(drift):
+            drift = dense(drift)
+            array = np.asarray(drift, dtype=object)
             if array.ndim == 0:
-                raise InputError(path="system.c", expected=f"{d} numbers, one per state", got=f"{given!r}")
-            given = array[:, None].tolist() if array.ndim == 1 else given
-        object.__setattr__(self, "c", self._matrix("c", given))
+                raise InputError(path="system.c", expected=f"{d} numbers, one per state", got=f"{drift!r}")
+            drift = array[:, None].tolist() if array.ndim == 1 else drift
+        object.__setattr__(self, "c", self._matrix("c", drift))
         if self._shape("c") != (d, 1):
             rows, columns = self._shape("c")
             got = f"{rows}" if columns == 1 else f"shape {(rows, columns)}"
@@ -535,9 +535,11 @@ class Phase:
             values = entry.evaluate(points)
         else:
             rows = [self._called(name, point) for point in points]
-            other = next((row.shape for row in rows if row.shape != shape), None)
-            if other is not None:
-                raise InputError(f"the function {name} must always return shape {shape}, got {other}", path="system")
+            other_shape = next((row.shape for row in rows if row.shape != shape), None)
+            if other_shape is not None:
+                raise InputError(
+                    f"the function {name} must always return shape {shape}, got {other_shape}", path="system"
+                )
             values = np.array(rows).reshape(len(points), *shape)
         finite = np.isfinite(values).all(axis=(1, 2))
         if not finite.all():
@@ -566,20 +568,20 @@ class Phase:
             raise NotEnclosable(
                 f"system: the function {name} returns shape {shape} for numbers, but {models.shape} for Taylor models"
             )
-        every, left = coefficients.reshape(space.size, -1), remainder.reshape(-1)
-        for place, model in enumerate(models.ravel().tolist()):
+        flat_coefficients, flat_remainder = coefficients.reshape(space.size, -1), remainder.reshape(-1)
+        for index, model in enumerate(models.ravel().tolist()):
             if type(model) is int and not model:  # most entries, where the states are coefficients of an expansion
                 continue
             if isinstance(model, TaylorModel):
-                every[:, place], left[place] = model.coefficients, model.remainder
+                flat_coefficients[:, index], flat_remainder[index] = model.coefficients, model.remainder
             elif isinstance(model, int | float | np.integer | np.floating):
-                every[0, place] = model
+                flat_coefficients[0, index] = model
             else:
                 raise NotEnclosable(
                     f"system: the function {name} returned {type(model).__name__} for an entry, expected a number"
                 )
         if not isinstance(entry, ExpressionMatrix):
-            self._require_same(name, np.array([one.coefficients[0] for one in p]), coefficients[0], remainder)
+            self._require_same(name, np.array([argument.coefficients[0] for argument in p]), coefficients[0], remainder)
         return coefficients, remainder
 
     def _require_same(self, name: str, centre: Array, value: Array, remainder: Array) -> None:
@@ -597,14 +599,14 @@ class Phase:
         value, remainder : arrays of the shape of the matrix
             The constant coefficients of the Taylor models, and the bounds of their remainders.
         """
-        given = self._called(name, centre)
-        apart = np.abs(given - value) - remainder
-        if not (apart <= SAME * np.abs(given).max()).all():
-            row, column = (int(i) for i in np.unravel_index(int(apart.argmax()), apart.shape))
+        numeric = self._called(name, centre)
+        excess = np.abs(numeric - value) - remainder
+        if not (excess <= SAME * np.abs(numeric).max()).all():
+            i, j = (int(i) for i in np.unravel_index(int(excess.argmax()), excess.shape))
             raise InputError(
                 path=f"system.{name}",
                 expected="a function that depends on its argument alone, by arithmetic",
-                got=f"{given[row, column]:.9g} and then {value[row, column]:.9g} in row {row + 1}, column {column + 1},"
+                got=f"{numeric[i, j]:.9g} and then {value[i, j]:.9g} in row {i + 1}, column {j + 1},"
                 f" at {self.describe(centre)}",
             )
 
@@ -643,8 +645,8 @@ class Through:
 
     def __call__(self, p: _Arguments) -> object:
         """Return the matrix at other arguments ``(n,)``."""
-        found = self.entry(self.arguments(p))
-        return found if self.factor is None else np.asarray(found, dtype=object) * self.factor
+        matrix = self.entry(self.arguments(p))
+        return matrix if self.factor is None else np.asarray(matrix, dtype=object) * self.factor
 
 
 def through(entry: _Entry | None, arguments: Callable[[_Arguments], _Arguments]) -> _Entry | None:
@@ -662,25 +664,25 @@ def through(entry: _Entry | None, arguments: Callable[[_Arguments], _Arguments])
 
 def _moved(later: float, p: _Arguments) -> _Arguments:
     """Return the arguments ``p``, with ``later`` added to the time, which is the first of them."""
-    moved = p.copy()
-    moved[0] = p[0] + later
-    return moved
+    shifted = p.copy()
+    shifted[0] = p[0] + later
+    return shifted
 
 
 def _with_parameter(parameter: Array, p: _Arguments) -> _Arguments:
     """Return the time, followed by one parameter ``(nu,)``."""
-    whole = np.empty(1 + parameter.size, dtype=object)
-    whole[0], nothing = p[0], 0.0 * p[0]
+    arguments = np.empty(1 + parameter.size, dtype=object)
+    arguments[0], zero = p[0], 0.0 * p[0]
     for i, value in enumerate(parameter.tolist()):
-        whole[1 + i] = nothing + value
-    return whole
+        arguments[1 + i] = zero + value
+    return arguments
 
 
 def _at_time(time: float, p: _Arguments) -> _Arguments:
     """Return the parameters ``p``, after one time."""
-    whole = np.empty(1 + len(p), dtype=object)
-    whole[0], whole[1:] = time, p
-    return whole
+    arguments = np.empty(1 + len(p), dtype=object)
+    arguments[0], arguments[1:] = time, p
+    return arguments
 
 
 def _without_time(p: _Arguments) -> _Arguments:
@@ -775,12 +777,12 @@ class PhaseInUnits(Phase):
         return self if self.c is not None else replace(self, c=base.c, base=base)
 
     def within(self, parameters: ConvexSet | None, names: Sequence[str]) -> Phase:
-        found = super().within(parameters, names)
-        if found is self or parameters is None:
-            return found
+        phase = super().within(parameters, names)
+        if phase is self or parameters is None:
+            return phase
         base = self.base.within(parameters.in_units(1.0 / self.units[int(self.timed) :]), names)
-        assert isinstance(found, PhaseInUnits)
-        return replace(found, base=base)
+        assert isinstance(phase, PhaseInUnits)
+        return replace(phase, base=base)
 
     @shaped
     def describe(self, arguments: Float[Array, " n"]) -> str:
@@ -796,8 +798,10 @@ class PhaseInUnits(Phase):
         c: Float[Array, "d 1"] | float = 1.0,
         time: float = 1.0,
     ) -> Phase:
-        mine, units = self.factors, arguments * self.units
-        return self.base.in_units(A * mine["A"], B * mine["B"], E * mine["E"], units, c * mine["c"], time * self.clock)
+        factors, units = self.factors, arguments * self.units
+        return self.base.in_units(
+            A * factors["A"], B * factors["B"], E * factors["E"], units, c * factors["c"], time * self.clock
+        )
 
     def entry(self, name: str) -> _Entry | None:
         entry = self.base.entry(name)
@@ -824,9 +828,9 @@ class PhaseInUnits(Phase):
         Float[Array, "M d mw"],
         Float[Array, "d mw"],
     ]:
-        found = self.base.taylor(space, centre * self.units, radius * self.units)
-        every = [part * self.factors[name] for name, part in zip("AABBEE", found, strict=True)]
-        return every[0], every[1], every[2], every[3], every[4], every[5]
+        arrays = self.base.taylor(space, centre * self.units, radius * self.units)
+        scaled = [array * self.factors[name] for name, array in zip("AABBEE", arrays, strict=True)]
+        return scaled[0], scaled[1], scaled[2], scaled[3], scaled[4], scaled[5]
 
 
 def _still(view: Array) -> Array:

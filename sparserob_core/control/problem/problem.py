@@ -238,9 +238,9 @@ class OptimalControlProblem(Term):
             )
         self._set("measurements", self._measured())
         self._check_names()
-        for one in fields(self):
-            if KIND in one.metadata:
-                self._set(one.name, tuple(self._constraints(one.name, one.metadata[KIND])))
+        for attribute in fields(self):
+            if KIND in attribute.metadata:
+                self._set(attribute.name, tuple(self._constraints(attribute.name, attribute.metadata[KIND])))
         self._set("terminal", tuple(self._terminal()))
         if self.repeat is not Repeating.IMPOSED:
             self._return()
@@ -264,7 +264,9 @@ class OptimalControlProblem(Term):
     @property
     def lists(self) -> dict[str, tuple[Window, ...]]:
         """The constraints of the fields that are lists of terms, by the name of the field."""
-        return {one.name: getattr(self, one.name) for one in fields(self) if KIND in one.metadata}
+        return {
+            attribute.name: getattr(self, attribute.name) for attribute in fields(self) if KIND in attribute.metadata
+        }
 
     @property
     def sums(self) -> dict[str, tuple[Window, ...]]:
@@ -277,8 +279,8 @@ class OptimalControlProblem(Term):
         A constraint without a name is called by the name of the list, with its position where the user gave several.
         """
         entries = self.lists[name]
-        several = sum(entry.stated for entry in entries) > 1
-        return [entry.name or (f"{name}[{i}]" if several else name) for i, entry in enumerate(entries)]
+        is_numbered = sum(entry.stated for entry in entries) > 1
+        return [entry.name or (f"{name}[{i}]" if is_numbered else name) for i, entry in enumerate(entries)]
 
     @property
     def windows(self) -> list[PathConstraint | MixedConstraint]:
@@ -364,7 +366,7 @@ class OptimalControlProblem(Term):
             )
         if not shares.any():
             return None
-        sets = [one if isinstance(one, ConvexSet) else one.set for one in (*self.path, *self.terminal_sets)]
+        sets = [entry if isinstance(entry, ConvexSet) else entry.set for entry in (*self.path, *self.terminal_sets)]
         timed = self._in_time()
         refused = {
             "fixed final values, which an error of execution misses: a terminal set such as box": bool(
@@ -372,16 +374,16 @@ class OptimalControlProblem(Term):
             ),
             "parameters in another set than a box": timed is None,
             "measurable disturbances in a curved set where the system has pieces, a delay or parameters": any(
-                one.halfspaces() is None for one in filter(None, [self.measurable])
+                bound.halfspaces() is None for bound in filter(None, [self.measurable])
             )
             and (bool(self.system.switches) or self.system.delay > 0.0 or self.system.parameter_count > 0),
             "curved sets of states with parameters that the state does not depend on affinely": timed is not None
             and timed.powers is not None
-            and any(one.halfspaces() is None for one in sets),
+            and any(bound.halfspaces() is None for bound in sets),
         }
-        for beside, given in refused.items():
-            if given:
-                raise InputError(path="execution", expected=f"none beside {beside}", got=f"{shares.tolist()}")
+        for combination, is_present in refused.items():
+            if is_present:
+                raise InputError(path="execution", expected=f"none beside {combination}", got=f"{shares.tolist()}")
         return shares
 
     def _in_time(self) -> System | None:
@@ -439,8 +441,8 @@ class OptimalControlProblem(Term):
         another unit, which no name states.
         """
         weights = np.asarray(self.weights)
-        priced = weights.ndim == 2 or bool((weights != 1.0).any())
-        return "" if priced or self.cost.is_quadratic else self.names.effort
+        is_weighted = weights.ndim == 2 or bool((weights != 1.0).any())
+        return "" if is_weighted or self.cost.is_quadratic else self.names.effort
 
     def _measured(self) -> Measurements | None:
         """Return the checked measurements, or ``None`` where there are none; raise `InputError`."""
@@ -449,11 +451,11 @@ class OptimalControlProblem(Term):
         if not isinstance(self.measurements, Measurements):
             raise InputError(path="measurements", expected="Measurements", got=type(self.measurements).__name__)
         try:
-            measured = self.measurements.checked(self.system.states, self.horizon)
-            require_consistent("noise", measured.noise)
+            measurements = self.measurements.checked(self.system.states, self.horizon)
+            require_consistent("noise", measurements.noise)
         except InputError as error:
             raise error.under("measurements") from None
-        return measured
+        return measurements
 
     def _costs(self) -> Cost:
         """Return the checked cost; raise `InputError`."""
@@ -480,21 +482,21 @@ class OptimalControlProblem(Term):
         """Raise `InputError` where the disturbance, its class, its breakpoints and the system do not fit."""
         kinds, bound = self.disturbance_class, self.disturbance
         if isinstance(kinds, tuple) and isinstance(bound, Product) and len(bound.parts) == len(kinds):
-            known = set(kinds) == {"piecewise_constant", "measurable"}
+            is_known = set(kinds) == {"piecewise_constant", "measurable"}
         else:
-            known = isinstance(kinds, str) and kinds in get_args(DisturbanceClass)
-        if not known:
+            is_known = isinstance(kinds, str) and kinds in get_args(DisturbanceClass)
+        if not is_known:
             raise InputError(
                 path="disturbance_class",
                 expected=f"one of {', '.join(get_args(DisturbanceClass))}",
                 got=f"{self.disturbance_class!r}",
             )
-        own, parts = self.disturbance_breakpoints, bound.parts if isinstance(bound, Product) else ()
-        if own is not None and (len(own) != len(parts) or kinds != "piecewise_constant"):
+        breakpoints, factors = self.disturbance_breakpoints, bound.parts if isinstance(bound, Product) else ()
+        if breakpoints is not None and (len(breakpoints) != len(factors) or kinds != "piecewise_constant"):
             raise InputError(
                 path="disturbance_breakpoints",
                 expected="those of every part of a product of piecewise constant disturbances, made by disturbances",
-                got=f"{len(own)} for {len(parts)} parts",
+                got=f"{len(breakpoints)} for {len(factors)} parts",
             )
         if self.disturbance is None:
             return
@@ -508,18 +510,20 @@ class OptimalControlProblem(Term):
 
     def _join_disturbances(self) -> None:
         """Replace the list of disturbances by the single disturbance that holds all of them."""
-        every: object = self.disturbances
-        if not isinstance(every, Sequence) or not all(isinstance(one, Disturbance) for one in every):
-            raise InputError(path="disturbance", expected="a list of Disturbance", got=f"{type(every).__name__}")
-        if not every:
+        disturbances: object = self.disturbances
+        if not isinstance(disturbances, Sequence) or not all(
+            isinstance(disturbance, Disturbance) for disturbance in disturbances
+        ):
+            raise InputError(path="disturbance", expected="a list of Disturbance", got=f"{type(disturbances).__name__}")
+        if not disturbances:
             return
-        if self.disturbance is not None or self.disturbance_class not in ("piecewise_constant", every[0].kind):
+        if self.disturbance is not None or self.disturbance_class not in ("piecewise_constant", disturbances[0].kind):
             raise InputError(
                 path="disturbance_class" if self.disturbance is None else "disturbance",
                 expected="none beside a list of disturbances, each of which has its own",
                 got=f"{self.disturbance_class}" if self.disturbance is None else self.disturbance.kind,
             )
-        system, bound, kind, breakpoints = joined(self.system, every, self.horizon)
+        system, bound, kind, breakpoints = joined(self.system, disturbances, self.horizon)
         self._set("system", system)
         self._set("disturbance", bound)
         self._set("disturbance_class", kind)
@@ -534,12 +538,12 @@ class OptimalControlProblem(Term):
 
     def _constraints(self, name: str, kind: type[Window]) -> Iterator[Window]:
         """Yield the checked constraints of the field ``name`` that exclude anything, as terms of one ``kind``."""
-        of = "sets" if kind is PathConstraint else kind.__name__
+        noun = "sets" if kind is PathConstraint else kind.__name__
         setting = Setting(self.system.states, self.system.controls, self.system.delay, self.horizon)
-        for i, entry in enumerate(_listed(name, getattr(self, name), of)):
-            found = kind.of(f"{name}.{i}", entry).checked(f"{name}.{i}", setting)
-            if found.restricts:
-                yield found
+        for i, entry in enumerate(_listed(name, getattr(self, name), noun)):
+            constraint = kind.of(f"{name}.{i}", entry).checked(f"{name}.{i}", setting)
+            if constraint.restricts:
+                yield constraint
 
     def _return(self) -> None:
         """Require that every final state is one of the initial states, where the plan repeats."""

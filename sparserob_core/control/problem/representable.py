@@ -47,14 +47,14 @@ def require_representable(problem: OptimalControlProblem) -> None:
     last = 0.0
     for i, mode in enumerate(problem.system.modes):
         until = (*problem.system.switches, problem.horizon)[i]
-        place: Path = ("system", "pieces", i) if problem.system.switches else ("system",)
+        prefix: Path = ("system", "pieces", i) if problem.system.switches else ("system",)
         for name, values in zip("ABE", mode.forced.matrices(mode.probes), strict=True):
-            _require_small((*place, name), values)
+            _require_small((*prefix, name), values)
         A = mode.matrices(mode.probes)[0]
         rate = float(np.linalg.eigvals(A).real.max())
         if rate * (until - last) > np.log(LARGEST):
             raise InputError(
-                path=(*place, "A"),
+                path=(*prefix, "A"),
                 expected=f"a state that grows by at most {LARGEST:g} until the horizon",
                 got=f"e^({rate:.4g} * {until - last:.4g}), of an eigenvalue with the real part {rate:.4g}",
             )
@@ -63,13 +63,13 @@ def require_representable(problem: OptimalControlProblem) -> None:
 
 def _keyed(problem: OptimalControlProblem) -> Iterator[tuple[Path, np.ndarray]]:
     """Yield every array and number of a problem, with the keys of a config that lead to it."""
-    several = len(problem.system.phases) > 1
+    is_switched = len(problem.system.phases) > 1
     for path, value in _numbers(problem, ()):
         if path[:2] != ("system", "phases"):
             yield path, value
         elif path[3] == "domain":  # parameters and times, which are fields of the system and of the phase too
             continue
-        elif several:
+        elif is_switched:
             yield ("system", "pieces", *path[2:]), value
         else:
             yield ("horizon",) if path[3] == "until" else ("system", *path[3:]), value

@@ -27,8 +27,8 @@ def matrices_of(plant: object) -> tuple[Any, Any]:
     InputError
         If the model has no such attributes, or is in discrete time.
     """
-    given = {name: getattr(plant, name, getattr(plant, name.lower(), None)) for name in ("A", "B")}
-    missing = [name for name, matrix in given.items() if matrix is None]
+    matrices = {name: getattr(plant, name, getattr(plant, name.lower(), None)) for name in ("A", "B")}
+    missing = [name for name, matrix in matrices.items() if matrix is None]
     if missing:
         raise InputError(
             path="plant",
@@ -44,7 +44,7 @@ def matrices_of(plant: object) -> tuple[Any, Any]:
             " model knows nothing of",
             got=f"a sampled one, its step {step}",
         )
-    return given["A"], given["B"]
+    return matrices["A"], matrices["B"]
 
 
 def _step(plant: object) -> str | None:

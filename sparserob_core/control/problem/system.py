@@ -74,14 +74,14 @@ class System:
         object.__setattr__(self, "delay", _duration(self.delay))
         if not self.phases:
             raise InputError(path="system.pieces", expected="at least one", got="none")
-        first, *others = self.phases
-        for i, phase in enumerate(others, 1):
-            for what in ("states", "controls", "disturbances"):
-                if getattr(phase, what) != getattr(first, what):
+        first, *later = self.phases
+        for i, phase in enumerate(later, 1):
+            for dimension in ("states", "controls", "disturbances"):
+                if getattr(phase, dimension) != getattr(first, dimension):
                     raise InputError(
                         path=f"system.pieces.{i}",
-                        expected=f"{getattr(first, what)} {what}, as the other pieces",
-                        got=f"{getattr(phase, what)}",
+                        expected=f"{getattr(first, dimension)} {dimension}, as the other pieces",
+                        got=f"{getattr(phase, dimension)}",
                     )
         if len({phase.c is None for phase in self.phases}) > 1:
             object.__setattr__(self, "phases", tuple(phase.drifting() for phase in self.phases))
@@ -92,9 +92,9 @@ class System:
     @property
     def noun_of(self) -> tuple[str, list[tuple[str, object]]]:
         """The name and the fields by which the system is shown in messages."""
-        every, own = {**vars(self.phases[0]), **vars(self)}, ("phases", "parameters", "delay")
-        names = ("A", "B", "E", "parameters", "names", "c", "delay") if self.kind == "LinearSystem" else own
-        return self.kind, [(name, every[name]) for name in names]
+        attributes, own_names = {**vars(self.phases[0]), **vars(self)}, ("phases", "parameters", "delay")
+        names = ("A", "B", "E", "parameters", "names", "c", "delay") if self.kind == "LinearSystem" else own_names
+        return self.kind, [(name, attributes[name]) for name in names]
 
     @property
     def kind(self) -> str:
@@ -132,8 +132,8 @@ class System:
     @property
     def names(self) -> Sequence[str]:
         """The names of the parameters, without the time."""
-        every = self.phases[0].names
-        return every[len(every) - self.parameter_count :]
+        argument_names = self.phases[0].names
+        return argument_names[len(argument_names) - self.parameter_count :]
 
     @property
     def drifts(self) -> bool:
@@ -184,19 +184,19 @@ class System:
         """
         if not self.varies:
             return self.phases
-        found = list[Phase]()
+        modes = list[Phase]()
         # Chebyshev points lie closer to the ends: an entry with zeros at evenly spaced times is not taken for 0
         shares = (1.0 - np.cos(np.linspace(0.0, np.pi, LOOKS))[:, None]) / 2.0
         for phase in self.phases:
             times = phase.begin + (phase.until - phase.begin) * shares
             if self.powers is not None:
-                found += [phase.during(time, self.parameters) for time in times[:, 0].tolist()]
+                modes += [phase.during(time, self.parameters) for time in times[:, 0].tolist()]
                 continue
             arguments = self._arguments(times)
             A, B, E = phase.matrices(arguments)
             drifts = list(phase.forced.matrices(arguments)[1][:, :, -1:]) if self.drifts else [None] * LOOKS
-            found += [Phase(a, b, e, c=drift) for a, b, e, drift in zip(A, B, E, drifts, strict=True)]
-        return tuple(found)
+            modes += [Phase(a, b, e, c=drift) for a, b, e, drift in zip(A, B, E, drifts, strict=True)]
+        return tuple(modes)
 
     def _arguments(self, times: Array) -> Array:
         """Return times ``(k, 1)`` as arguments of a phase, with the parameters in the middle of their box."""
@@ -242,14 +242,14 @@ class System:
         """
         if self.horizon == np.inf:
             return self
-        left = [
+        overlapping = [
             phase
             for phase in self.phases
             if not over(phase.until, begin, horizon) and not over(begin + horizon, phase.begin)
         ]
-        switches = [phase.begin - begin for phase in left[1:]]
-        times = [0.0, *switches, horizon if self.varies or len(left) > 1 else np.inf]
-        phases = tuple(phase.later(*during, begin) for phase, during in zip(left, pairwise(times), strict=True))
+        switches = [phase.begin - begin for phase in overlapping[1:]]
+        times = [0.0, *switches, horizon if self.varies or len(overlapping) > 1 else np.inf]
+        phases = tuple(phase.later(*during, begin) for phase, during in zip(overlapping, pairwise(times), strict=True))
         return System(phases, self.parameters, self.delay)
 
     def in_time(self, horizon: float) -> System:
@@ -278,8 +278,8 @@ class System:
         """
         if not self.varies or len(self.phases) > 1:
             return
-        every = [[part[0] for part in mode.forced.matrices(mode.probes[:1])] for mode in self.modes]
-        sizes = [np.abs(parts).max(axis=0) for parts in zip(*every, strict=True)]
+        matrices = [[matrix[0] for matrix in mode.forced.matrices(mode.probes[:1])] for mode in self.modes]
+        sizes = [np.abs(values).max(axis=0) for values in zip(*matrices, strict=True)]
         ends = self.phases[0].forced.matrices(self._arguments(np.array([[0.0], [self.horizon]])))
         for name, size, (first, last) in zip("ABE", sizes, ends, strict=True):
             for i, j in np.argwhere(np.abs(last - first) > PERIODIC * size):
@@ -339,11 +339,11 @@ class System:
         """
         phases = []
         for phase in self.phases:
-            parts = {name: phase.entry(name) for name in PARTS}
-            made = {name: Superposed(name, part, depends) for name, part in parts.items() if part is not None}
+            entries = {name: phase.entry(name) for name in PARTS}
+            expanded = {name: Superposed(name, entry, depends) for name, entry in entries.items() if entry is not None}
             times = Box([phase.begin], [phase.until])
-            every = made["A"], made["B"], made["E"], times, (TIME,), made.get("c")
-            phases.append(Phase(*every, phase.begin, phase.until, timed=True))
+            arguments = expanded["A"], expanded["B"], expanded["E"], times, (TIME,), expanded.get("c")
+            phases.append(Phase(*arguments, phase.begin, phase.until, timed=True))
         return System(tuple(phases), None, self.delay)
 
     def at(self, parameter: Array) -> System:
@@ -528,22 +528,24 @@ class SwitchedSystem(System):
     """
 
     def __init__(self, pieces: Sequence[tuple[float, System]], delay: float = 0.0) -> None:
-        given = list(pieces)
-        if not given:
+        pairs = list(pieces)
+        if not pairs:
             raise InputError(path="system.pieces", expected="pairs of a time and a LinearSystem", got="none")
-        for i, pair in enumerate(given):
-            _check_piece(i, pair, given[i - 1][0] if i else 0.0)
-        ends = [0.0, *(float(until) for until, _ in given)]
-        first = next((one for _, one in given if one.parameters is not None), given[0][1])
-        for i, (_, one) in enumerate(given):
-            other = one.parameters
-            if other is not None and (not other.is_same(first.parameters) or one.names != first.names):
+        for i, pair in enumerate(pairs):
+            _check_piece(i, pair, pairs[i - 1][0] if i else 0.0)
+        ends = [0.0, *(float(until) for until, _ in pairs)]
+        reference = next((system for _, system in pairs if system.parameters is not None), pairs[0][1])
+        for i, (_, system) in enumerate(pairs):
+            parameters = system.parameters
+            if parameters is not None and (
+                not parameters.is_same(reference.parameters) or system.names != reference.names
+            ):
                 raise InputError(path=f"system.pieces.{i}", expected="the parameters of the other pieces", got="others")
         phases = tuple(
-            one.phases[0].within(first.parameters, first.names).between(begin, until)
-            for (_, one), (begin, until) in zip(given, pairwise(ends), strict=True)
+            system.phases[0].within(reference.parameters, reference.names).between(begin, until)
+            for (_, system), (begin, until) in zip(pairs, pairwise(ends), strict=True)
         )
-        super().__init__(phases, first.parameters, delay)
+        super().__init__(phases, reference.parameters, delay)
 
 
 @final
@@ -581,8 +583,8 @@ class VaryingSystem(System):
         later: Sequence[tuple[float, System]] = (),
         parameters: Box | None = None,
     ) -> None:
-        every, count = [law, *(one for _, one in later)], 0 if parameters is None else parameters.dimension
-        if any(one.parameter_count != 1 + count or one.delay or len(one.phases) > 1 for one in every):
+        laws, count = [law, *(piece for _, piece in later)], 0 if parameters is None else parameters.dimension
+        if any(piece.parameter_count != 1 + count or piece.delay or len(piece.phases) > 1 for piece in laws):
             expected = "a law whose first parameter is the time, before those of the system, without a delay of its own"
             raise InputError(path="system", expected=expected, got="another")
         times = [0.0, *(begin for begin, _ in later), horizon]
@@ -591,8 +593,8 @@ class VaryingSystem(System):
                 where = f"system.pieces.{i}.until" if later else "system.until"
                 raise InputError(path=where, expected=f"a time after {begin:g}", got=f"{until:g}")
         phases = tuple(
-            replace(one.phases[0], begin=begin, until=until, timed=True)
-            for one, (begin, until) in zip(every, pairwise(times), strict=True)
+            replace(piece.phases[0], begin=begin, until=until, timed=True)
+            for piece, (begin, until) in zip(laws, pairwise(times), strict=True)
         )
         super().__init__(phases, parameters, delay)
 
@@ -648,8 +650,8 @@ class VaryingSystem(System):
         >>> sr.VaryingSystem.of([["-(1 + 0.4 * cos(2 * t))"]], [[1]], 5.0).varies
         True
         """
-        known = _Uncertain.of(parameters, names)
-        return System((_phase("system", (A, B, E, c), (0.0, horizon), define, known),), known.box, delay)
+        uncertain = _Uncertain.of(parameters, names)
+        return System((_phase("system", (A, B, E, c), (0.0, horizon), define, uncertain),), uncertain.box, delay)
 
     @staticmethod
     def taking_turns(
@@ -681,12 +683,12 @@ class VaryingSystem(System):
         InputError
             If an entry cannot be read, the times do not increase, or the shapes disagree.
         """
-        ends, known = [0.0, *(float(until) for until, _ in pieces)], _Uncertain.of(parameters, names)
+        ends, uncertain = [0.0, *(float(until) for until, _ in pieces)], _Uncertain.of(parameters, names)
         phases = tuple(
-            _phase(f"system.pieces.{i}", given, during, define, known)
-            for i, (during, (_, given)) in enumerate(zip(pairwise(ends), pieces, strict=True))
+            _phase(f"system.pieces.{i}", matrices, during, define, uncertain)
+            for i, (during, (_, matrices)) in enumerate(zip(pairwise(ends), pieces, strict=True))
         )
-        return System(phases, known.box, delay)
+        return System(phases, uncertain.box, delay)
 
 
 def _duration(value: object) -> float:
@@ -699,8 +701,8 @@ def _duration(value: object) -> float:
 
 def _difference(low: float, high: float) -> float:
     """Return ``high - low`` as a double, rounded upwards."""
-    exact, found = Fraction(float(high)) - Fraction(float(low)), float(high) - float(low)
-    return found if Fraction(found) >= exact else float(np.nextafter(found, np.inf))
+    exact, difference = Fraction(float(high)) - Fraction(float(low)), float(high) - float(low)
+    return difference if Fraction(difference) >= exact else float(np.nextafter(difference, np.inf))
 
 
 def _check_ends(ends: Sequence[float], horizon: float, whole: bool) -> None:
@@ -741,8 +743,8 @@ def _check_piece(i: int, pair: object, before: float) -> None:
         raise InputError(path=f"system.pieces.{i}.until", expected=f"a time after {before:g}", got=f"{until:g}")
     kind = system.kind if isinstance(system, System) else type(system).__name__
     if kind != "LinearSystem" or system.delay:
-        said = "a delay of its own" if kind == "LinearSystem" else kind
-        raise InputError(path=f"system.pieces.{i}", expected="a LinearSystem without delay", got=said)
+        got = "a delay of its own" if kind == "LinearSystem" else kind
+        raise InputError(path=f"system.pieces.{i}", expected="a LinearSystem without delay", got=got)
 
 
 @final
@@ -758,11 +760,11 @@ class _Uncertain:
         """Return the box and the names; raise `InputError` for another set or for unsuitable names."""
         box = None if parameters is None else boxed(parameters)
         count = 0 if box is None else box.dimension
-        given = tuple(names) or tuple(f"p{i + 1}" for i in range(count))
-        if len(given) != count or TIME in given:
+        parameter_names = tuple(names) or tuple(f"p{i + 1}" for i in range(count))
+        if len(parameter_names) != count or TIME in parameter_names:
             expected = f"{count} names, none of them {TIME}, which is the time"
-            raise InputError(path="system.parameters", expected=expected, got=", ".join(given))
-        return _Uncertain(box, (TIME, *given))
+            raise InputError(path="system.parameters", expected=expected, got=", ".join(parameter_names))
+        return _Uncertain(box, (TIME, *parameter_names))
 
 
 def _phase(

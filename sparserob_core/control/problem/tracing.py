@@ -109,7 +109,7 @@ def traced(name: str, function: Callable[..., object], names: Sequence[str], pro
         If the function is more than arithmetic with numpy functions, or if an expression is too long for a config.
     """
     p = np.empty(len(names), dtype=object)
-    p[:] = [Symbol(one) for one in names]
+    p[:] = [Symbol(parameter) for parameter in names]
     try:
         matrix = np.atleast_2d(np.asarray(function(p), dtype=object))
         rows = [[_entry(value) for value in row] for row in matrix]
@@ -126,8 +126,8 @@ def traced(name: str, function: Callable[..., object], names: Sequence[str], pro
 
 def _agree(written: ExpressionMatrix, function: Callable[..., object], point: Array) -> bool:
     """Return True where a matrix of expressions agrees with the function at one point ``(nu,)``, up to `SAME`."""
-    given, found = np.asarray(function(point), dtype=float), np.asarray(written(point), dtype=float)
-    return given.shape == found.shape and bool(np.allclose(given, found, rtol=SAME, atol=0.0))
+    expected, actual = np.asarray(function(point), dtype=float), np.asarray(written(point), dtype=float)
+    return expected.shape == actual.shape and bool(np.allclose(expected, actual, rtol=SAME, atol=0.0))
 
 
 def _refused(name: str, why: str) -> str:

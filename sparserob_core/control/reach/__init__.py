@@ -1,1 +1,2 @@
-"""How far what is uncertain pushes functionals of the state, enclosed over cells of time, parameters and directions."""
+"""Enclosures of the effect of uncertainty on functionals of the state, over cells of time, parameters and
+directions."""

@@ -1,4 +1,4 @@
-"""How far the worst disturbance pushes a functional of the state, enclosed over a cell of parameters."""
+"""Support function of the disturbance on functionals of the state, enclosed over a cell of parameters."""
 
 from __future__ import annotations
 
@@ -37,8 +37,8 @@ class DisturbanceSupport:
     combination: Combination | None = None
 
     def steepness(self, times: Array) -> Array:
-        """How steep the support function of *any* one disturbance can be in each parameter over the cell:
-        ``(k, r, nu)``."""
+        """Return bounds ``(k, r, nu)`` of the slope of the functionals in each parameter over the cell, under *any* one
+        disturbance."""
         if self._repeats:
             return np.asarray(self._gathered(times, self._reaches) @ self._space.exponents[self._monomials])
         self._asked["blocks"] = times, (blocks := self._side_by_side(self.blocks(times)))
@@ -52,15 +52,15 @@ class DisturbanceSupport:
         face they leave.
         """
         if not self._repeats:  # and `steepness` has just been asked for these times, where there are parameters
-            asked, blocks = self._asked.pop("blocks", (None, None))
-            if blocks is None or asked is not times:
+            last_times, blocks = self._asked.pop("blocks", (None, None))
+            if blocks is None or last_times is not times:
                 blocks = self._side_by_side(self.blocks(times))
-            return over_faces(self._space, ends, lambda here, face: self._summed(blocks[here], face).sum(axis=2))
+            return over_faces(self._space, ends, lambda index, face: self._summed(blocks[index], face).sum(axis=2))
         return over_faces(
             self._space,
             ends,
-            lambda here, face: self._gathered(
-                times[here], partial(self._summed, face=face), kept="worst" if face is None else ""
+            lambda index, face: self._gathered(
+                times[index], partial(self._summed, face=face), kept="worst" if face is None else ""
             ),
         )
 
@@ -68,71 +68,79 @@ class DisturbanceSupport:
         return summed(self.disturbance.set, blocks, face, self._monomials, self._space.size)
 
     def deviation(self, start: Array, widths: Array) -> Array:
-        """Bounds ``(k, r)``, for times in ``[start, start + width]`` inside one piece, of how far what the blocks
-        receive is from its chord, summed over blocks and Taylor coefficients.
+        """Return bounds ``(k, r)`` of the distance of the weights on the blocks from their chords, for times in
+        ``[start, start + width]`` inside one piece.
 
-        A block that has ended receives ``y(r) = c e^{A r} z``, the one that lasts ``y' = c e^{A r} W``. The chord is
-        missed by at most ``width^2 / 8`` of the largest second derivative, and mode by mode by at most twice what it
-        moves: that bound serves fast modes, which have died away long before a cell is as short as they are.
+        The distances are summed over blocks and Taylor coefficients. A block that has ended has ``y(r) = c e^{A r} z``,
+        the one that lasts ``y' = c e^{A r} W``. The distance is at most ``width^2 / 8`` of the largest second
+        derivative, and mode by mode at most twice the total change. The latter bound serves fast modes, which have died
+        away long before a cell is as short as they are.
         """
         grid, comparison = self.lifted.grid, self.lifted.comparison
-        bent, once, twice, norms, squared = self._bending
-        sizes = self._gathered(start, self._reaches, bent, plain=True, kept="bent").sum(axis=2)
+        curvature_rows, slope_norms, curvature_norms, norms, squared = self._bending
+        sizes = self._gathered(start, self._reaches, curvature_rows, plain=True, kept="bent").sum(axis=2)
         pieces = np.minimum(np.maximum(grid.breakpoints.searchsorted(start, side="right") - 1, 0), grid.pieces - 1)
-        moved = comparison.over(start - grid.breakpoints[pieces], cells=True).flow
+        flow = comparison.over(start - grid.breakpoints[pieces], cells=True).flow
         reach = comparison.over(widths, cells=True)
-        young = moved.on(np.broadcast_to(self._drive, (start.size, self._drive.size)))
-        old = moved.on(self._gains[pieces])
+        lasting_sizes = flow.on(np.broadcast_to(self._drive, (start.size, self._drive.size)))
+        ended_sizes = flow.on(self._gains[pieces])
         square = (widths**2 / 8)[:, None]
-        exact = square * (sizes + product(twice, reach.departure.on(old).T).T + product(once, reach.peak.on(young).T).T)
+        exact = square * (
+            sizes
+            + product(curvature_norms, reach.departure.on(ended_sizes).T).T
+            + product(slope_norms, reach.peak.on(lasting_sizes).T).T
+        )
         ended = np.minimum(
-            square * product(reach.peak.on(old), squared.T),
-            2.0 * product(reach.integral.on(old), comparison.sizes.T),
+            square * product(reach.peak.on(ended_sizes), squared.T),
+            2.0 * product(reach.integral.on(ended_sizes), comparison.sizes.T),
         )
         lasting = np.minimum(
-            square * product(reach.peak.on(young), comparison.sizes.T),
-            2.0 * reach.integral.on(young),
+            square * product(reach.peak.on(lasting_sizes), comparison.sizes.T),
+            2.0 * reach.integral.on(lasting_sizes),
         )
         by_mode = product(norms, (ended + lasting).T).T
         return np.asarray(np.minimum(exact, by_mode))
 
     @cached_property
     def _bending(self) -> tuple[Array, Array, Array, Array, Array]:
-        """What `deviation` needs at all times: the lifted functionals times the square of the matrix, the block norms
-        ``(r, q)`` of these and of their first derivative (before them), those of the functionals, and the square of the
-        comparison's sizes."""
+        """Quantities of `deviation` that do not depend on time: the lifted functionals times the square of the matrix;
+        the block norms ``(r, q)`` of their first derivative, of their second derivative, and of the functionals
+        themselves; and the square of the block sizes."""
         lifted, rows = self.lifted, self._lifted_rows
-        sloping, bent = rows @ lifted.row_matrix, rows @ lifted.row_matrix @ lifted.row_matrix
-        once, twice = (
-            block_norms(part.reshape(*part.shape[:-1], -1, lifted.states), lifted.starts).sum(axis=-2)
-            for part in (sloping, bent)
+        slope_rows, curvature_rows = rows @ lifted.row_matrix, rows @ lifted.row_matrix @ lifted.row_matrix
+        slope_norms, curvature_norms = (
+            block_norms(derivative.reshape(*derivative.shape[:-1], -1, lifted.states), lifted.starts).sum(axis=-2)
+            for derivative in (slope_rows, curvature_rows)
         )
         sizes = lifted.comparison.sizes
-        return bent, once, twice, block_norms(self.rows, lifted.starts), sizes @ sizes
+        return curvature_rows, slope_norms, curvature_norms, block_norms(self.rows, lifted.starts), sizes @ sizes
 
     @cached_property
     def neglected(self) -> Array:
-        """What the Taylor models leave out, at most, on every piece: ``(r, L)``.
+        """Bounds ``(r, L)`` of the remainder of the Taylor models on every piece.
 
-        Of what a disturbance had made of the state before this leg, the product with a row leaves out what the row
-        does, what is left out of the state already, and the terms of too high a degree.
+        The effect of a disturbance before this phase of a switched system adds three parts to the remainder of its
+        product with a row: the remainder of the row, the remainder of the effect itself, and the terms of too high a
+        degree.
         """
         lifted, radius = self.lifted, self.disturbance.radius
         sizes, remainder = lifted.row_bounds(self.rows, self._repeats)
-        spilt = lifted.spilt(_row_norms(lifted.W, lifted.starts)) + np.linalg.norm(lifted.slack_W, axis=1)
-        pushed = remainder @ self._drive + radius * np.einsum("rlaj,aj->rl", sizes, spilt)
-        within = np.cumsum(pushed[:, lifted.span] * lifted.fine.lengths, axis=1)[:, lifted.ends[1:] - 1]
-        before = self._carried
-        if before is None:
+        truncation = lifted.spilt(_row_norms(lifted.W, lifted.starts)) + np.linalg.norm(lifted.slack_W, axis=1)
+        rates = remainder @ self._drive + radius * np.einsum("rlaj,aj->rl", sizes, truncation)
+        within = np.cumsum(rates[:, lifted.span] * lifted.fine.lengths, axis=1)[:, lifted.ends[1:] - 1]
+        earlier_effect = self._carried
+        if earlier_effect is None:
             return np.asarray(within)
-        missed = remainder @ (before.reached + before.left_out) + sizes.sum(axis=2) @ before.left_out
-        missed = missed + np.einsum("rlaj,aj->rl", sizes, lifted.spilt(before.sizes))
-        return np.asarray(within + np.maximum.reduceat(missed[:, lifted.span], lifted.ends[:-1], axis=1))
+        earlier_errors = (
+            remainder @ (earlier_effect.reached + earlier_effect.left_out) + sizes.sum(axis=2) @ earlier_effect.left_out
+        )
+        earlier_errors = earlier_errors + np.einsum("rlaj,aj->rl", sizes, lifted.spilt(earlier_effect.sizes))
+        return np.asarray(within + np.maximum.reduceat(earlier_errors[:, lifted.span], lifted.ends[:-1], axis=1))
 
     @property
     def reached(self) -> Array:
-        """What any disturbance can have made of every block of the coordinates until the end of every piece,
-        ``(L, q)``."""
+        """Norm bounds ``(L, q)`` of the effect of any disturbance on every block of the coordinates until the end of
+        every piece."""
         return self._gains[1:]
 
     @property
@@ -141,8 +149,8 @@ class DisturbanceSupport:
 
     @property
     def _repeats(self) -> bool:
-        """Whether the blocks are the pieces of a uniform grid: what they receive then depends on their age ``t - s``
-        only."""
+        """True where the blocks are the pieces of a uniform grid, so that what a block receives depends only on its age
+        ``t - s``."""
         alone = self.lifted.grid.pieces == self.disturbance.grid.pieces  # not one leg of several
         return alone and self.lifted.backward.uniform and self.disturbance.by_piece
 
@@ -166,32 +174,32 @@ class DisturbanceSupport:
             return np.asarray(of_blocks(combined(self._blocks(times, start))).sum(axis=2))
         grid = self.lifted.grid
         pieces = grid.locate(times)
-        within, which = grid.distinct(times - grid.breakpoints[pieces])
+        within, duration_indices = grid.distinct(times - grid.breakpoints[pieces])
         if within.size == 1 and kept and self._whole(float(within[0])):
             key = (kept, float(within[0]))
             if key not in self._sums:
                 sums = self._by_age(within, grid.pieces - 1, start, lambda blocks: of_blocks(combined(blocks)))
                 if sums.size > KEPT:
-                    return np.asarray(sums[which, :, pieces])
+                    return np.asarray(sums[duration_indices, :, pieces])
                 self._sums[key] = sums
-            return np.asarray(self._sums[key][which, :, pieces])
+            return np.asarray(self._sums[key][duration_indices, :, pieces])
         count = int(pieces.max(initial=0))
-        share = max(1, AT_ONCE // max(1, start.shape[0] * count * self._impulses.columns.shape[1]))
+        chunk_size = max(1, AT_ONCE // max(1, start.shape[0] * count * self._impulses.columns.shape[1]))
         answer = None
-        for begin in range(0, within.size, share):
-            part = slice(begin, begin + share)
-            found = self._by_age(within[part], count, start, lambda blocks: of_blocks(combined(blocks)))
-            if share >= within.size:
-                return np.asarray(found[which, :, pieces])
-            mine = np.flatnonzero((which >= part.start) & (which < part.stop))
+        for begin in range(0, within.size, chunk_size):
+            chunk = slice(begin, begin + chunk_size)
+            chunk_sums = self._by_age(within[chunk], count, start, lambda blocks: of_blocks(combined(blocks)))
+            if chunk_size >= within.size:
+                return np.asarray(chunk_sums[duration_indices, :, pieces])
+            members = np.flatnonzero((duration_indices >= chunk.start) & (duration_indices < chunk.stop))
             if answer is None:
-                answer = np.empty((times.size, found.shape[1], found.shape[3]))
-            answer[mine] = found[which[mine] - begin, :, pieces[mine]]
+                answer = np.empty((times.size, chunk_sums.shape[1], chunk_sums.shape[3]))
+            answer[members] = chunk_sums[duration_indices[members] - begin, :, pieces[members]]
         assert answer is not None
         return answer
 
     def _whole(self, within: float) -> bool:
-        """Whether a time within a piece is its beginning or its end."""
+        """Return whether a time within a piece is its beginning or, up to rounding, its end."""
         length = float(self.lifted.backward.propagator.lengths[0])
         return within == 0.0 or abs(within - length) <= SAME * length
 
@@ -207,31 +215,35 @@ class DisturbanceSupport:
     def _by_age(self, within: Array, count: int, start: Array, of_blocks: Callable[[Array], Array]) -> Array:
         """The sums of `_gathered` at such times ``within (q,)`` of the pieces ``0, ..., count``, ``(q, r, count + 1,
         j)``, since what a block receives depends on its age."""
-        flown, driven = self.lifted.flown(np.broadcast_to(start, (within.size, *start.shape)), within)
-        young = self._weights(driven)[..., None, :]
-        old = self._impulses.of(flown, count)
-        old = old.reshape(*old.shape[:-1], young.shape[2], young.shape[4]).swapaxes(-2, -3)
-        return np.asarray(np.concatenate([of_blocks(young), of_blocks(old)], axis=2).cumsum(axis=2))
+        propagated_rows, gains = self.lifted.flown(np.broadcast_to(start, (within.size, *start.shape)), within)
+        lasting_weights = self._weights(gains)[..., None, :]
+        ended_weights = self._impulses.of(propagated_rows, count)
+        ended_weights = ended_weights.reshape(
+            *ended_weights.shape[:-1], lasting_weights.shape[2], lasting_weights.shape[4]
+        ).swapaxes(-2, -3)
+        return np.asarray(np.concatenate([of_blocks(lasting_weights), of_blocks(ended_weights)], axis=2).cumsum(axis=2))
 
     @cached_property
     def _impulses(self) -> Impulses:
-        """What the disturbance on a piece gives to the Taylor coefficients of a functional, by the piece's age."""
-        whole = self._weights(np.eye(self.lifted.row_matrix.shape[0]))
-        return Impulses(self.lifted.backward.propagator, whole.reshape(whole.shape[0], -1))
+        """Contributions of the disturbance on a piece to the Taylor coefficients of a functional, by the age of the
+        piece."""
+        weights = self._weights(np.eye(self.lifted.row_matrix.shape[0]))
+        return Impulses(self.lifted.backward.propagator, weights.reshape(weights.shape[0], -1))
 
     def _side_by_side(self, blocks: Array) -> Array:
         """Coefficients ``(k, r, M, nb, q)`` as those of the polynomials whose sums are taken: of the one of a direction
         that varies, ``(k, 1, r M, nb, q)``, whose other coefficients are 0."""
-        k, r, size, *each = blocks.shape
-        return blocks if self.combination is None else blocks.reshape(k, 1, r * size, *each)
+        k, r, size, *block_shape = blocks.shape
+        return blocks if self.combination is None else blocks.reshape(k, 1, r * size, *block_shape)
 
     @cached_property
     def _monomials(self) -> np.ndarray:
-        """Of which monomials of the space `_side_by_side` has the coefficients, that of the centre first."""
+        """Indices, in the space, of the monomials of the coefficients of `_side_by_side`, the constant one first."""
         return np.arange(self._space.size) if self.combination is None else self.combination.targets.reshape(-1)
 
     def _reaches(self, blocks: Array) -> Array:
-        """How much any one disturbance can make of every Taylor coefficient of every block, ``(k, r, nb, M)``."""
+        """Return bounds ``(k, r, nb, M)`` of the absolute value of every Taylor coefficient of every block under any
+        one disturbance."""
         return self.disturbance.set.reach(blocks).swapaxes(2, 3)
 
     def blocks(self, times: Array) -> Array:
@@ -251,45 +263,47 @@ class DisturbanceSupport:
             np.repeat(times, r), np.tile(rows, (k, 1)), np.zeros((k * r, 0))
         )
         weights = self._weights(gains.reshape(k, r, gains.shape[1], -1))
-        first, whole = self.lifted.first, self.disturbance.grid.pieces
-        if whole == weights.shape[2]:
+        first, piece_count = self.lifted.first, self.disturbance.grid.pieces
+        if piece_count == weights.shape[2]:
             return weights
-        every = np.zeros((k, r, whole, *weights.shape[3:]))
-        every[:, :, first : first + weights.shape[2]] = weights
+        all_weights = np.zeros((k, r, piece_count, *weights.shape[3:]))
+        all_weights[:, :, first : first + weights.shape[2]] = weights
         if self._carried is not None:
             space, effect = self.lifted.space, self._carried.effect
-            along = free.reshape(k, r, space.size, -1)
+            row_coefficients = free.reshape(k, r, space.size, -1)
             for left, right, target in zip(*space.products, strict=True):
-                every[:, :, :first, target] += np.einsum("krd,dlw->krlw", along[:, :, right], effect[left])
-        return every
+                all_weights[:, :, :first, target] += np.einsum(
+                    "krd,dlw->krlw", row_coefficients[:, :, right], effect[left]
+                )
+        return all_weights
 
     @property
     def _carried(self) -> Carried | None:
         past = self.lifted.past
         if past is None:
             return None
-        known = past.carried.get(id(self.disturbance))
-        if not isinstance(known, Carried):
-            known = past.carried[id(self.disturbance)] = _carry(past, self.disturbance)
-        return known
+        earlier_effect = past.carried.get(id(self.disturbance))
+        if not isinstance(earlier_effect, Carried):
+            earlier_effect = past.carried[id(self.disturbance)] = _carry(past, self.disturbance)
+        return earlier_effect
 
     def _weights(self, gains: Array) -> Array:
         """Gains ``(..., M d)`` on the state's drive, as Taylor coefficients ``(..., M, mw)`` of the weights on the
         disturbance."""
         space = self.lifted.space
-        parts = gains.reshape(*gains.shape[:-1], space.size, self.lifted.states)
+        coefficients = gains.reshape(*gains.shape[:-1], space.size, self.lifted.states)
         if space.size == 1:
-            return np.asarray(parts @ self.lifted.W[0])
-        weights = np.zeros((*parts.shape[:-1], self.lifted.W.shape[2]))
-        used = [part.any() for part in self.lifted.W]
+            return np.asarray(coefficients @ self.lifted.W[0])
+        weights = np.zeros((*coefficients.shape[:-1], self.lifted.W.shape[2]))
+        is_used = [matrix.any() for matrix in self.lifted.W]
         for left, right, target in zip(*space.products, strict=True):
-            if used[left]:
-                weights[..., target, :] += parts[..., right, :] @ self.lifted.W[left]
+            if is_used[left]:
+                weights[..., target, :] += coefficients[..., right, :] @ self.lifted.W[left]
         return weights
 
     @cached_property
     def before(self) -> Array:
-        """What any disturbance can have made of every block of the coordinates before time 0, ``(q,)``."""
+        """Norm bounds ``(q,)`` of the effect of any disturbance before time 0 on every block of the coordinates."""
         return np.zeros(self.lifted.starts.size) if self._carried is None else self._carried.reached
 
     @cached_property
@@ -300,27 +314,29 @@ class DisturbanceSupport:
 
     @cached_property
     def _drive(self) -> Array:
-        """How much of every block of the coordinates any admissible disturbance drives, at most, ``(q,)``."""
+        """Norm bounds ``(q,)`` of the rate at which any admissible disturbance drives every block of the
+        coordinates."""
         norms = _row_norms(self.lifted.W, self.lifted.starts).sum(axis=0)
         return np.asarray(self.disturbance.radius * (norms + np.linalg.norm(self.lifted.slack_W, axis=1)))
 
     @cached_property
     def _gains(self) -> Array:
-        """``int_0^t e^{M s} |W| ds`` for the comparison system at the breakpoints, ``(L+1, q)``: what any disturbance
-        until then can have made of every block."""
+        """``int_0^t e^{M s} |W| ds`` for the comparison system at the breakpoints, ``(L+1, q)``: norm bounds of the
+        effect of any disturbance until then on every block."""
         grid = self.lifted.grid
         reach = self.lifted.comparison.over(grid.lengths)
-        driven = reach.integral.on(np.broadcast_to(self._drive, (grid.pieces, self._drive.size)))
-        return reach.flow.summed(self.before, driven)
+        drive_effects = reach.integral.on(np.broadcast_to(self._drive, (grid.pieces, self._drive.size)))
+        return reach.flow.summed(self.before, drive_effects)
 
 
 @dataclass(frozen=True, eq=False)
 class Carried:
-    """What a part of the uncertainty made of the state before a leg begins: its ``effect (M, d, ...)`` per unit, Taylor
-    coefficients in the leg's coordinates.
+    """The effect of a part of the uncertainty on the state before a phase of a switched system begins.
 
-    Whatever is admissible, block by block: the norms of the coefficients ``sizes (M, q)``, all that it can be,
-    ``reached (q,)``, and what the coefficients leave out, ``left_out (q,)``. ``of``: whose it is.
+    ``effect (M, d, ...)`` are Taylor coefficients of the effect per unit, in the coordinates of the phase. The bounds
+    hold block by block for all admissible values: ``sizes (M, q)`` of the norms of the coefficients, ``reached (q,)``
+    of the whole effect, and ``left_out (q,)`` of the remainder of the coefficients. ``of`` is the part of the
+    uncertainty.
     """
 
     of: object
@@ -331,61 +347,117 @@ class Carried:
 
 
 def carried(past: Past, of: object, old: Array, entries: Array, reached: Array, neglected: Array) -> Carried:
-    """`Carried` from what is known at the end of the leg before: the effect ``old (d, M, ...)`` in its coordinates, how
-    large its coefficients can be, ``entries (d, M)``, block norms ``reached (q',)``, and ``neglected (d,)`` of every
-    coordinate."""
+    """Return the effect of a part of the uncertainty at the beginning of a phase, from bounds at the end of the phase
+    before.
+
+    Parameters
+    ----------
+    past : Past
+        The phase before, and the change of coordinates.
+    of : object
+        The part of the uncertainty.
+    old : Array
+        Effect ``(d, M, ...)`` per unit, in the coordinates of the phase before.
+    entries : Array
+        Bounds ``(d, M)`` of the coefficients of the effect.
+    reached : Array
+        Norm bounds ``(q',)`` of the whole effect, block by block.
+    neglected : Array
+        Bounds ``(d,)`` of the remainder of every coordinate.
+
+    Returns
+    -------
+    Carried
+        The effect in the coordinates of the phase that begins.
+    """
     effect = np.moveaxis(np.tensordot(past.turn, old, axes=1), 1, 0)
     terms = rounding(2 * past.turn.shape[0] + old[0].size)
     sizes = (1.0 + terms) * block_norms((np.abs(past.turn) @ entries).T, past.starts)
-    moved = product(past.blocks, reached[:, None])[:, 0]
-    missed = block_norms(np.abs(past.turn) @ neglected, past.starts) * (1.0 + terms)
-    return Carried(of, effect, sizes, moved, missed + past.rounded(entries.sum(axis=1)) + terms * moved)
+    bounds = product(past.blocks, reached[:, None])[:, 0]
+    error_bounds = block_norms(np.abs(past.turn) @ neglected, past.starts) * (1.0 + terms)
+    return Carried(of, effect, sizes, bounds, error_bounds + past.rounded(entries.sum(axis=1)) + terms * bounds)
 
 
 def _carry(past: Past, disturbance: DisturbanceModel) -> Carried:
     lifted, d = past.lifted, past.turn.shape[0]
-    ended, rows = DisturbanceSupport(lifted, disturbance, np.eye(d)), np.eye(d, lifted.row_matrix.shape[0])
+    earlier_support, rows = DisturbanceSupport(lifted, disturbance, np.eye(d)), np.eye(d, lifted.row_matrix.shape[0])
     first = lifted.first + lifted.grid.pieces
-    old = ended.on_pieces(lifted.grid.breakpoints[-1:], rows)[0, :, :first]  # (d, L, M, mw)
-    entries = disturbance.radius * np.linalg.norm(old, axis=3).sum(axis=1)
-    return carried(past, disturbance, old.swapaxes(1, 2), entries, ended.reached[-1], ended.neglected[:, -1])
+    effect = earlier_support.on_pieces(lifted.grid.breakpoints[-1:], rows)[0, :, :first]  # (d, L, M, mw)
+    entries = disturbance.radius * np.linalg.norm(effect, axis=3).sum(axis=1)
+    return carried(
+        past, disturbance, effect.swapaxes(1, 2), entries, earlier_support.reached[-1], earlier_support.neglected[:, -1]
+    )
 
 
 def over_faces(
     space: TaylorSpace, ends: Array, parts: Callable[[np.ndarray, Face | None], Array]
 ) -> tuple[Array, Array]:
-    """Coefficients ``(k, r, M)`` and excess ``(k, r)`` where every functional has its own pattern of ``ends (k, r,
-    nu)``; ``parts(here, face)`` gives both as ``(k', r, M + 1)`` for the times ``here`` on one face of the cell."""
+    """Return coefficients ``(k, r, M)`` and excess ``(k, r)`` where every functional has its own pattern of ``ends``.
+
+    Parameters
+    ----------
+    space : TaylorSpace
+        The polynomials, of ``M`` coefficients.
+    ends : Array
+        Patterns ``(k, r, nu)``: -1 or 1 for a parameter at an end of the cell, else 0.
+    parts : Callable
+        ``parts(index, face)`` gives coefficients and excess as ``(k', r, M + 1)`` for the times at ``index`` on one
+        face of the cell.
+
+    Returns
+    -------
+    Array, Array
+        The coefficients and the excess.
+    """
     if not space.nu:
-        found = parts(np.arange(ends.shape[0]), None)
-        return found[..., :-1], found[..., -1]
+        values = parts(np.arange(ends.shape[0]), None)
+        return values[..., :-1], values[..., -1]
     k, r, _ = ends.shape
-    patterns, which = distinct_patterns(ends)
+    patterns, pattern_indices = distinct_patterns(ends)
     coefficients, excess = np.empty((k, r, space.size)), np.empty((k, r))
     for position, pattern in enumerate(patterns):
         face = face_of(space, pattern) if pattern.any() else None
-        here = (which == position).any(axis=1)
-        found = parts(here, face)
-        mine = which[here] == position
-        coefficients[which == position], excess[which == position] = found[mine][:, :-1], found[mine][:, -1]
+        index = (pattern_indices == position).any(axis=1)
+        values = parts(index, face)
+        is_on_face = pattern_indices[index] == position
+        coefficients[pattern_indices == position], excess[pattern_indices == position] = (
+            values[is_on_face][:, :-1],
+            values[is_on_face][:, -1],
+        )
     return coefficients, excess
 
 
 def summed(
     bound: ConvexSet, blocks: Array, face: Face | None, monomials: np.ndarray | None = None, size: int = 0
 ) -> Array:
-    """Per block in ``bound``: the polynomial under the centre's worst point, and the excess as one more entry; from
-    Taylor coefficients ``(k, r, M, nb, q)``.
+    """Return the polynomial of each block at the worst point of a set for the centre, with the excess as one more
+    entry.
 
-    ``monomials (M,)``: whose they are where these are not all ``size`` of a space; the others are 0, in many
-    dimensions most of them. On a ``face`` only monomials of the variables that it leaves are looked at.
+    Parameters
+    ----------
+    bound : ConvexSet
+        The set in which each block is.
+    blocks : Array
+        Taylor coefficients ``(k, r, M, nb, q)``.
+    face : Face, optional
+        A face of the cell; only monomials of the variables that it leaves free are then looked at.
+    monomials : array, optional
+        Indices ``(M,)`` of the monomials, where the coefficients are not all of a space. The others are 0, in many
+        dimensions most of them.
+    size : int
+        Number of monomials of the space, where ``monomials`` are given.
+
+    Returns
+    -------
+    Array
+        Coefficients and excess, ``(k, r, nb, size + 1)``, where ``size`` is ``M`` without ``monomials``.
     """
-    k, r, given, count, width = blocks.shape
-    kept = np.arange(given) if monomials is None else monomials
+    k, r, monomial_count, count, width = blocks.shape
+    kept = np.arange(monomial_count) if monomials is None else monomials
     if face is not None:
         kept, onto = face.onto(kept)
-        blocks = (onto @ blocks.reshape(k, r, given, count * width)).reshape(k, r, kept.size, count, width)
-    size = given if monomials is None else size
+        blocks = (onto @ blocks.reshape(k, r, monomial_count, count * width)).reshape(k, r, kept.size, count, width)
+    size = monomial_count if monomials is None else size
     polynomials = np.zeros((k, r, count, size + 1))
     if kept.size > 1:
         point, polynomials[..., -1] = bound.support_majorant(blocks[:, :, 0], np.moveaxis(blocks[:, :, 1:], 2, 3))

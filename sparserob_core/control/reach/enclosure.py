@@ -1,10 +1,10 @@
 """Proven upper bounds of the worst-case violation on cells of times and parameters.
 
 On a cell ``[a, b]`` of times inside one piece of the grid, every Taylor coefficient of the state lies within
-``(b - a)^2 / 8 max |second derivative|`` of its chord, and within twice of what it moves; and a support function of a
+``(b - a)^2 / 8 max |second derivative|`` of its chord, and within twice its total change. The support function of a
 chord lies below the chord of the support functions. So the violation is at most the larger of its bounds at ``a`` and
-at ``b``, plus that deviation, plus what the Taylor models leave out. The way to ``a`` is exact: only the length of the
-cell counts, not that of the piece.
+at ``b``, plus that deviation, plus the remainder of the Taylor models. The propagation to ``a`` is exact: only the
+length of the cell counts, not the length of the piece.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ class Motion(Protocol):
 
     @property
     def grid(self) -> TimeGrid:
-        """The pieces, in times from where the leg begins."""
+        """The pieces, in times from the beginning of the phase."""
 
     @property
     def space(self) -> TaylorSpace:
@@ -64,7 +64,7 @@ class Motion(Protocol):
 
     @property
     def starts(self) -> np.ndarray:
-        """Where the blocks of the coordinates begin, ``(q,)``."""
+        """Indices ``(q,)`` at which the blocks of the coordinates begin."""
 
     @property
     def states(self) -> int:
@@ -72,11 +72,11 @@ class Motion(Protocol):
 
     @property
     def norm(self) -> float:
-        """About how fast it moves: cells of a time shorter than its reciprocal are short."""
+        """An estimate of how fast the system moves: cells of a time shorter than its reciprocal are short."""
 
     @property
     def influence(self) -> Array:
-        """How much every parameter has to do with what is left out, ``(nu,)``; it only guides the halving."""
+        """Influence of every parameter on the remainder of the models, ``(nu,)``, which only guides the halving."""
 
     def nodes(self, control: Array) -> Array:
         """Taylor coefficients ``(L+1, M, d)`` of the state at the breakpoints, under ``control (m, K)``."""
@@ -88,12 +88,31 @@ class Motion(Protocol):
     def deviation(
         self, rows: Array, start: Array, width: Array, pieces: np.ndarray, states: Array, inputs: Array
     ) -> Array:
-        """How far ``rows (r, d)`` of the state are from their chords on ``[start, start + width]``, each on one piece,
-        from its ``states (k, M, d)`` at ``start``, summed over the coefficients, ``(k, r)``."""
+        """Return bounds ``(k, r)`` of the distance of rows of the state from their chords on
+        ``[start, start + width]``.
+
+        The distances are summed over the Taylor coefficients.
+
+        Parameters
+        ----------
+        rows : Array
+            Rows ``(r, d)`` in the coordinates ``z``.
+        start, width : Array
+            Cells of time ``(k,)``, each on one piece.
+        pieces : array
+            The piece ``(k,)`` of each cell.
+        states : Array
+            Taylor coefficients ``(k, M, d)`` of the state at ``start``.
+        inputs : Array
+            Inputs ``(k, m)`` on the pieces.
+        """
 
     def along(self, control: Array, rows: Array, others: Array) -> Array:
-        """What the models leave out of the state, block by block, by the product with ``rows (r, q)``, and how large
-        they are by that with ``others (r, q)``, added up: ``(r, L)``."""
+        """Return sums ``(r, L)`` of bounds of the state under ``control (m, K)``, weighted block by block.
+
+        ``rows (r, q)`` are the weights on the remainder of the Taylor models, and ``others (r, q)`` the weights on the
+        size of the state.
+        """
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,11 +121,12 @@ class CellEnclosure:
     ``combination``.
 
     ``H (r, d)``; ``rhs (r', M')``, polynomials over the cell; ``control (m, K)`` on the pieces of the control's
-    dictionary. Without a combination every row of ``H`` is a constraint (``r' = r``, ``M' = M``); with one they are the
-    parts of a single constraint. ``looseness (nu',)``: how far ``rhs`` may be below the truth at the ends of every
-    coordinate, and ``lengthening (nu',)``, by which share longer than the shortest direction of the cell, whose length
-    a violation is told in, those there are; they only guide the halving. ``cuts``: beyond them the cell holds no
-    parameters. ``moving``, ``direct``: what is added to the rows, linear in time or constant on every cell of times.
+    dictionary. Without a combination every row of ``H`` is a constraint (``r' = r``, ``M' = M``); with one the rows are
+    the parts of a single constraint. ``looseness (nu',)``: how far ``rhs`` may be below the truth at the ends of every
+    coordinate. ``lengthening (nu',)``: the share by which directions there are longer than the shortest direction of
+    the cell, in whose length a violation is reported. Both only guide the halving. ``cuts``: inequalities that hold for
+    all parameters in the cell. ``moving``, ``direct``: terms that are added to the rows, linear in time or constant on
+    every cell of times.
     """
 
     lifted: Motion
@@ -122,34 +142,45 @@ class CellEnclosure:
     direct: Direct | None = None
 
     def bounds(self, start: Array, stop: Array) -> tuple[Array, Array, Array]:
-        """For time cells ``[start, stop]`` (``(k,)``, each inside one piece): upper bounds ``(k,)``, the part of them
-        that halving the times would reduce, and the parts ``(k, nu)`` that halving each parameter would."""
+        """Return upper bounds of the violation on cells of time, and how much of them halving would reduce.
+
+        Parameters
+        ----------
+        start, stop : Array
+            Ends ``(k,)`` of the cells, each inside one piece.
+
+        Returns
+        -------
+        Array, Array, Array
+            Upper bounds ``(k,)``; the part of them that halving the times would reduce, ``(k,)``; and the parts
+            ``(k, nu')`` that halving each parameter, or direction, would reduce.
+        """
         with np.errstate(over="ignore", invalid="ignore"):  # a bound that overflows is no bound, and is told as such
             return self._bounds(start, stop)
 
     def _bounds(self, start: Array, stop: Array) -> tuple[Array, Array, Array]:
         pieces = self.lifted.grid.locate(stop)
-        ends, which = _ends(start, stop, pieces, self.lifted.grid.breakpoints)
+        ends, end_indices = _ends(start, stop, pieces, self.lifted.grid.breakpoints)
         bounds, spreads = self._at(*ends)
-        left, right = bounds[which[: start.size]], bounds[which[start.size :]]
+        start_bounds, stop_bounds = bounds[end_indices[: start.size]], bounds[end_indices[start.size :]]
         bend = self._deviation(start, stop, pieces)
         neglected = self._neglected[:, pieces].T
         if self.combination is not None:  # the parts of one constraint, each with a factor of at most 1
             bend, neglected = bend.sum(axis=1, keepdims=True), neglected.sum(axis=1, keepdims=True)
         if self.direct is not None:
             elapsed = self.lifted.grid.elapsed
-            added = self.direct.on(start + elapsed, stop + elapsed)
-            left, right = left + added, right + added
-        total = np.maximum(left, right) + bend + neglected
+            direct_terms = self.direct.on(start + elapsed, stop + elapsed)
+            start_bounds, stop_bounds = start_bounds + direct_terms, stop_bounds + direct_terms
+        total = np.maximum(start_bounds, stop_bounds) + bend + neglected
         worst = total.argmax(axis=1)
         pick = (np.arange(worst.size), worst)
         spread = (
-            np.maximum(spreads[which[: start.size]][pick], spreads[which[start.size :]][pick])
+            np.maximum(spreads[end_indices[: start.size]][pick], spreads[end_indices[start.size :]][pick])
             + self._shares * neglected[pick][:, None]
         )
         # A short cell that bends beyond all measure has models that are good for narrower parameters only.
         short = self.lifted.norm * (stop - start) < 1.0
-        wild = short & ~(bend[pick] <= WILD * (1.0 + np.abs(left[pick]) + np.abs(right[pick])))
+        wild = short & ~(bend[pick] <= WILD * (1.0 + np.abs(start_bounds[pick]) + np.abs(stop_bounds[pick])))
         gain = np.where(wild, 0.0, bend[pick]) if spread.shape[1] else bend[pick]
         return total[pick], gain, spread
 
@@ -172,8 +203,8 @@ class CellEnclosure:
         ends = self._better_ends(space, coefficients, steepness)
         coefficients, excess = _on_faces(space, coefficients, ends), np.zeros(coefficients.shape[:2])
         if self.sigma is not None:
-            pushed, excess = self.sigma.at(times, ends)
-            coefficients = coefficients + pushed
+            support, excess = self.sigma.at(times, ends)
+            coefficients = coefficients + support
         bound, spread = polynomial_bound(space, coefficients)
         blame = np.where(ends == 0, steepness, 0.0) + np.finfo(float).tiny
         spread = spread if gain is None else gain
@@ -184,28 +215,30 @@ class CellEnclosure:
     def _of_directions(
         self, space: TaylorSpace, coefficients: Array, ends: Array, spread: Array, violated: Array
     ) -> Array:
-        """The ``spread (k, r, nu')`` with what halving each direction would gain: a polynomial that bends downwards is
-        bounded exactly, however wide the cell, so that only what is lost where it is highest counts: what ``rhs`` is
-        below the truth there, and the length in which what is ``violated (k, r)`` is told; beside products with other
-        variables."""
+        """Return the ``spread (k, r, nu')`` with the gain from halving each direction.
+
+        A polynomial that bends downwards is bounded exactly, however wide the cell. So only the loss at its highest
+        point counts: how far ``rhs`` is below the truth there, and the length in which what is ``violated (k, r)`` is
+        reported. The products with other variables are added.
+        """
         nu = self.lifted.space.nu
         gradient, hessian = (
-            part.reshape(*ends.shape, *part.shape[2:])
-            for part in quadratic_part(space, coefficients.reshape(-1, space.size))
+            derivative.reshape(*ends.shape, *derivative.shape[2:])
+            for derivative in quadratic_part(space, coefficients.reshape(-1, space.size))
         )
         own = np.einsum("...ii->...i", hessian)
         highest = np.where(ends == 0, np.clip(gradient / np.maximum(-own, TINIEST), -1.0, 1.0), ends)
-        lost = self.looseness + violated[..., None] * self.lengthening
-        found = np.abs(hessian).sum(axis=3) - np.abs(own) + lost * highest**2
-        return np.concatenate([spread[..., :nu], found[..., nu:]], axis=2)
+        loss = self.looseness + violated[..., None] * self.lengthening
+        gain = np.abs(hessian).sum(axis=3) - np.abs(own) + loss * highest**2
+        return np.concatenate([spread[..., :nu], gain[..., nu:]], axis=2)
 
     def _cut_off(self, space: TaylorSpace, coefficients: Array, times: Array) -> tuple[Array, Array | None]:
         """Polynomials above ``coefficients (k, r, M)`` where the parameters are, and what halving the cell would gain
         with them."""
         if self.cuts is None:
             return coefficients, None
-        pushed = 0.0 if self.sigma is None else self.sigma.at(times, np.zeros((*coefficients.shape[:2], space.nu)))[0]
-        return self.cuts.lowered(space, coefficients, pushed)
+        support = 0.0 if self.sigma is None else self.sigma.at(times, np.zeros((*coefficients.shape[:2], space.nu)))[0]
+        return self.cuts.lowered(space, coefficients, support)
 
     @staticmethod
     def _better_ends(space: TaylorSpace, coefficients: Array, steepness: Array) -> Array:
@@ -227,8 +260,8 @@ class CellEnclosure:
         return self.lifted.moved(within, pieces, start, self._inputs[pieces])
 
     def _deviation(self, start: Array, stop: Array, pieces: np.ndarray) -> Array:
-        """How far the state and the support function are from their chords on the cells, summed over the Taylor
-        coefficients, ``(k, r)``."""
+        """Return bounds ``(k, r)`` of the distance of the state and of the support function from their chords on the
+        cells, summed over the Taylor coefficients."""
         width, states = stop - start, self._states(start, pieces)
         total = self.lifted.deviation(self._rows, start, width, pieces, states, self._inputs[pieces])
         return np.asarray(total if self.sigma is None else total + self.sigma.deviation(start, width))
@@ -251,14 +284,14 @@ class CellEnclosure:
 
     @cached_property
     def _shares(self) -> Array:
-        """How what the models neglect is blamed on the parameters (and directions), ``(nu,)``."""
+        """Shares ``(nu',)`` of the parameters (and directions) in the remainder of the models, of sum 1."""
         directions = (self.combination.space.nu - self.lifted.space.nu) if self.combination is not None else 0
         total = np.append(self.lifted.influence, np.zeros(directions)) + SMALL_SHARE
         return np.asarray(total / total.sum())
 
     @cached_property
     def _neglected(self) -> Array:
-        """What the Taylor models leave out, and what the last products and sums may round, ``(r, L)``."""
+        """Bounds ``(r, L)`` of the remainder of the Taylor models and of the rounding of the last products and sums."""
         lifted = self.lifted
         widest = block_norms(np.abs(self.H) @ np.abs(lifted.transform), lifted.starts)  # with what cancels in H T
         terms = rounding(2 * lifted.states + self.rhs.shape[1])
@@ -266,28 +299,29 @@ class CellEnclosure:
         if self.sigma is not None:
             total = total + self.sigma.neglected + terms * product(widest, self.sigma.reached.T)
         sides = np.abs(self.rhs).sum(axis=1, keepdims=True)  # of every row, or of the one that a combination makes
-        for part in (self.moving, self.direct):
-            sides = sides if part is None else sides + part.size[:, None]
+        for term in (self.moving, self.direct):
+            sides = sides if term is None else sides + term.size[:, None]
         return np.asarray(total + terms * sides)
 
 
 @dataclass(frozen=True, eq=False)
 class LegsEnclosure:
-    """`CellEnclosure` of a system that changes: one for every leg, in times from where it begins, ``begin (J,)``."""
+    """The `CellEnclosure` of every phase of a switched system, in times from the beginning of the phase,
+    ``begin (J,)``."""
 
     legs: Sequence[CellEnclosure]
     begin: Array
 
     def bounds(self, start: Array, stop: Array) -> tuple[Array, Array, Array]:
-        """As `CellEnclosure.bounds`, of cells that lie within one leg each."""
-        which = np.maximum(np.searchsorted(self.begin, stop, side="left") - 1, 0)
-        found: list[tuple[np.ndarray, tuple[Array, Array, Array]]] = []
-        for number in np.unique(which):
-            mine, begin = np.flatnonzero(which == number), self.begin[number]
-            times = np.maximum(start[mine] - begin, 0.0), np.maximum(stop[mine] - begin, 0.0)
-            found.append((mine, self.legs[number].bounds(*times)))
-        order = np.argsort(np.concatenate([mine for mine, _ in found]))
-        bounds, bend, spread = (np.concatenate([parts[i] for _, parts in found])[order] for i in range(3))
+        """Return the bounds of `CellEnclosure.bounds` for cells ``[start, stop]`` that lie within one phase each."""
+        leg_indices = np.maximum(np.searchsorted(self.begin, stop, side="left") - 1, 0)
+        leg_bounds: list[tuple[np.ndarray, tuple[Array, Array, Array]]] = []
+        for number in np.unique(leg_indices):
+            members, begin = np.flatnonzero(leg_indices == number), self.begin[number]
+            times = np.maximum(start[members] - begin, 0.0), np.maximum(stop[members] - begin, 0.0)
+            leg_bounds.append((members, self.legs[number].bounds(*times)))
+        order = np.argsort(np.concatenate([members for members, _ in leg_bounds]))
+        bounds, bend, spread = (np.concatenate([triple[i] for _, triple in leg_bounds])[order] for i in range(3))
         return bounds, bend, spread
 
 
@@ -296,12 +330,12 @@ Bounded: TypeAlias = CellEnclosure | LegsEnclosure
 
 
 def kept(control: Array) -> int:
-    """How many enclosures for such controls are remembered."""
+    """Return the number of enclosures to remember for controls of this size, from 2 to `CELLS_KEPT`."""
     return max(2, min(CELLS_KEPT, CELLS_SIZE // control.size))
 
 
 def over_legs(legs: Sequence[AnyMotion], cell: Callable[[AnyMotion], CellEnclosure]) -> Bounded:
-    """The enclosure that ``cell`` makes of a motion, for every leg of it."""
+    """Return the enclosure that ``cell`` makes of a motion, for every phase of a switched system."""
     if len(legs) == 1:
         return cell(legs[0])
     return LegsEnclosure([cell(leg) for leg in legs], np.array([leg.grid.elapsed for leg in legs]))
@@ -311,12 +345,12 @@ def _on_faces(space: TaylorSpace, coefficients: Array, ends: Array) -> Array:
     """Polynomials ``(k, r, M)`` with the variables that have an end in ``ends (k, r, nu)`` set to it."""
     if not ends.any():
         return coefficients
-    patterns, which = distinct_patterns(ends)
+    patterns, pattern_indices = distinct_patterns(ends)
     on_faces = coefficients.copy()
     for position, pattern in enumerate(patterns):
         if pattern.any():
-            here = which == position
-            on_faces[here] = (face_of(space, pattern).matrix @ coefficients[here].T).T
+            mask = pattern_indices == position
+            on_faces[mask] = (face_of(space, pattern).matrix @ coefficients[mask].T).T
     return on_faces
 
 
@@ -328,14 +362,14 @@ def _ends(
     next one begins."""
     count, ended = start.size, pieces + (stop == breakpoints[pieces + 1])
     if count <= FEW_CELLS or (pieces[1:] > pieces[:-1]).all():
-        met = np.append((stop[:-1] == start[1:]) & (ended[:-1] == pieces[1:]), False)
-        which, apart = np.arange(1, count + 1), np.flatnonzero(~met)
-        which[apart] = count + np.arange(apart.size)
-        points = np.concatenate([start, stop[apart]]), np.concatenate([pieces, ended[apart]])
-        return points, np.concatenate([np.arange(count), which])
-    both = np.stack([np.concatenate([start, stop]), np.concatenate([pieces, ended])])
-    unique, which = np.unique(both, axis=1, return_inverse=True)
-    return (unique[0], unique[1].astype(int)), which.reshape(-1)
+        is_shared = np.append((stop[:-1] == start[1:]) & (ended[:-1] == pieces[1:]), False)
+        end_indices, unshared = np.arange(1, count + 1), np.flatnonzero(~is_shared)
+        end_indices[unshared] = count + np.arange(unshared.size)
+        points = np.concatenate([start, stop[unshared]]), np.concatenate([pieces, ended[unshared]])
+        return points, np.concatenate([np.arange(count), end_indices])
+    pairs = np.stack([np.concatenate([start, stop]), np.concatenate([pieces, ended])])
+    unique, end_indices = np.unique(pairs, axis=1, return_inverse=True)
+    return (unique[0], unique[1].astype(int)), end_indices.reshape(-1)
 
 
 def enclose(
@@ -370,20 +404,28 @@ def enclose(
 
 def _groups(keys: Array, touched: np.ndarray) -> list[np.ndarray]:
     """Positions of the touched rows of ``keys``, those with the same row together."""
-    places = np.flatnonzero(touched)
-    if not places.size or not keys.shape[1]:
-        return [places] if places.size else []
-    _, which = np.unique(keys[places], axis=0, return_inverse=True)
-    order = np.argsort(which.reshape(-1), kind="stable")
-    return np.split(places[order], np.flatnonzero(np.diff(which.reshape(-1)[order])) + 1)
+    touched_rows = np.flatnonzero(touched)
+    if not touched_rows.size or not keys.shape[1]:
+        return [touched_rows] if touched_rows.size else []
+    _, key_indices = np.unique(keys[touched_rows], axis=0, return_inverse=True)
+    order = np.argsort(key_indices.reshape(-1), kind="stable")
+    return np.split(touched_rows[order], np.flatnonzero(np.diff(key_indices.reshape(-1)[order])) + 1)
 
 
 def where_to_halve(bend: Array, spread: Array, bounds: Array) -> np.ndarray:
-    """Halve the times where they matter most, else one other coordinate, the same for the whole group so that its cells
-    stay shared.
+    """Return the coordinate to halve of every cell, ``(k,)``: 0 for the times where they matter most, else one other
+    coordinate.
 
-    ``bend (k,)``: what halving the times of a cell would gain; ``spread (k, j)``: what halving each other coordinate
-    would.
+    The other coordinate is the same for the whole group, so that its cells stay shared.
+
+    Parameters
+    ----------
+    bend : Array
+        Gain ``(k,)`` from halving the times of a cell.
+    spread : Array
+        Gain ``(k, j)`` from halving each other coordinate.
+    bounds : Array
+        Upper bounds ``(k,)`` of the violation; where some are positive, only their cells decide on the coordinate.
     """
     if not spread.shape[1]:
         return np.zeros(bend.size, dtype=int)

@@ -1,8 +1,8 @@
-"""What errors of execution make of the reachable set.
+"""Effect of errors of execution on the reachable set.
 
-What is delivered of a control differs from the command by at most a share of it, any function of time. What the worst
-such error adds to ``c'x(t)`` is ``sum_jk share_j |u_jk| int |c'e^{A(t-s)} B_j| ds``, the integral over piece ``k`` up
-to ``t``: convex in the command, and 0 where that is 0.
+The delivered control differs from the command by at most a share of it, any function of time. The worst such error adds
+``sum_jk share_j |u_jk| int |c'e^{A(t-s)} B_j| ds`` to ``c'x(t)``, with the integral over piece ``k`` up to ``t``. The
+sum is convex in the command, and 0 where the command is 0.
 """
 
 from __future__ import annotations
@@ -35,9 +35,11 @@ ALIKE = 1e-14
 
 @dataclass(frozen=True, eq=False)
 class Execution:
-    """The ``shares (m,)`` of the commanded control by which what is delivered may differ; ``breakpoints (K + 1,)`` are
-    the command's, ``response`` is that of a known system. ``felt (d,)``: 0 of states that add up what is commanded,
-    and do nothing else, 1 of others."""
+    """Errors of execution: the delivered control may differ from the commanded one by ``shares (m,)`` of it.
+
+    ``breakpoints (K + 1,)`` are those of the command, and ``response`` is the response of a known system. ``felt (d,)``
+    is 0 for states that add up what is commanded, and do nothing else, and 1 for others.
+    """
 
     response: Response
     breakpoints: Array
@@ -45,7 +47,8 @@ class Execution:
     felt: Array
 
     def seen(self, directions: Array, parameters: Array) -> Array:
-        """Directions ``(k, d)`` at parameters ``(k, nu)`` as those on the states that errors are followed in."""
+        """Return directions ``(k, d)`` at parameters ``(k, nu)`` as directions on the states along which errors are
+        followed."""
         return directions
 
     def over(
@@ -55,26 +58,44 @@ class Execution:
         leg: LiftedSystem | VaryingMotion | SpreadMotion,
         joined: Combination | None = None,
     ) -> Support:
-        """What the worst errors of a ``control (m, K)`` add to functionals ``rows (r, d)`` over cells of time; with
-        ``joined`` to that of a direction that is made of them."""
+        """Return the support of the worst errors of a control on functionals over cells of time.
+
+        Parameters
+        ----------
+        control : Array
+            Command ``(m, K)``.
+        rows : Array
+            Functionals ``(r, d)``.
+        leg : LiftedSystem, VaryingMotion or SpreadMotion
+            The system, or a phase of a switched system.
+        joined : Combination, optional
+            How the rows make up one direction that varies over a cell; without it each row is a functional.
+
+        Returns
+        -------
+        Support
+            Support of the errors.
+        """
         assert isinstance(leg, LiftedSystem)
-        return over_directions(lambda every: ExecutionCellSupport(self, control, every, leg), rows, leg, joined)
+        return over_directions(
+            lambda functionals: ExecutionCellSupport(self, control, functionals, leg), rows, leg, joined
+        )
 
     def sampled(self, control: Array, times: Array, directions: Array) -> Array:
         """`added` at times and directions that are asked for again and again."""
         return self.added(control, times, directions)
 
     def none(self) -> Execution:
-        """The same of a control that is delivered as it is commanded."""
+        """Return the execution without errors: the control is delivered as it is commanded."""
         return replace(self, shares=np.zeros(self.shares.size))
 
     def given(self, times: Array, directions: Array) -> Array:
-        """What errors of what was commanded before the first piece add to ``c'x(t)``, ``(k,)``: nothing."""
+        """Return the contribution ``(k,)`` to ``c'x(t)`` of errors of commands before the first piece: 0."""
         return np.zeros(times.size)
 
     @property
     def size(self) -> int:
-        """How many absolute values there are, one for every channel and piece."""
+        """Number ``m K`` of absolute values, one for every channel and piece."""
         return int(self.shares.size * (self.breakpoints.size - 1))
 
     @cached_property
@@ -88,89 +109,101 @@ class Execution:
         """``int_0^t |c'e^{A s} B_j| ds`` of every channel, ``None`` where it is delivered as it is commanded."""
         A, B = self.matrices
         unit, grid, start = Box([-1.0], [1.0]), self.response.grid, self.response.initial_state
-        made = [Response(LinearSystem(A, B, B[:, [j]]), grid, start) for j in range(self.shares.size)]
-        return [MeasurableSupport(one, unit) if s > 0.0 else None for one, s in zip(made, self.shares, strict=True)]
+        responses = [Response(LinearSystem(A, B, B[:, [j]]), grid, start) for j in range(self.shares.size)]
+        return [
+            MeasurableSupport(response, unit) if s > 0.0 else None
+            for response, s in zip(responses, self.shares, strict=True)
+        ]
 
     @shaped
     def lengths(self, times: Float[Array, " k"], directions: Float[Array, "k d"]) -> Float[Array, "k n"]:
-        """What a command of size 1 on every piece of every channel adds at most, ``(k, m K)``, channel by channel."""
+        """Return the largest contribution of errors to ``c'x(t)`` for a command of size 1, on every piece of every
+        channel.
+
+        The result ``(k, m K)`` is ordered channel by channel.
+        """
         ages = np.clip(times[:, None] - self.breakpoints, 0.0, None)
-        found = np.zeros((times.size, self.shares.size, self.breakpoints.size - 1))
+        contributions = np.zeros((times.size, self.shares.size, self.breakpoints.size - 1))
         for j, integral in enumerate(self._integrals(ages, directions)):
-            found[:, j] = self.shares[j] * np.maximum(integral[:, :-1] - integral[:, 1:], 0.0)
-        return found.reshape(times.size, self.shares.size * (self.breakpoints.size - 1))
+            contributions[:, j] = self.shares[j] * np.maximum(integral[:, :-1] - integral[:, 1:], 0.0)
+        return contributions.reshape(times.size, self.shares.size * (self.breakpoints.size - 1))
 
     @shaped
     def added(
         self, control: Float[Array, "m K"], times: Float[Array, " k"], directions: Float[Array, "k d"]
     ) -> Float[Array, " k"]:
-        """What the worst errors of a command add to ``c'x(t)``, ``(k,)``."""
-        which, jumps = self.jumps(control)
-        if not which.size:
+        """Return the largest contribution ``(k,)`` of errors of a command to ``c'x(t)``, at ``times (k,)`` in
+        ``directions (k, d)``."""
+        pieces, jumps = self.jumps(control)
+        if not pieces.size:
             return np.zeros(times.size)
-        ages = np.clip(times[:, None] - self.breakpoints[which], 0.0, None)
-        every = zip(self._integrals(ages, directions), jumps, strict=True)
-        return np.asarray(sum(integral @ change for integral, change in every))
+        ages = np.clip(times[:, None] - self.breakpoints[pieces], 0.0, None)
+        pairs = zip(self._integrals(ages, directions), jumps, strict=True)
+        return np.asarray(sum(integral @ change for integral, change in pairs))
 
     @shaped
     def slope(
         self, control: Float[Array, "m K"], times: Float[Array, " k"], directions: Float[Array, "k d"]
     ) -> Float[Array, " k"]:
         """The derivative ``(k,)`` of `added` in the time, from the left where that jumps."""
-        (A, B), (which, jumps) = self.matrices, self.jumps(control)
-        ages = times[:, None] - self.breakpoints[which]
-        at = _moved(A, directions, ages) @ B
-        return np.asarray(np.einsum("kqm,mq,kq->k", np.abs(at), jumps, ages > 0.0))
+        (A, B), (pieces, jumps) = self.matrices, self.jumps(control)
+        ages = times[:, None] - self.breakpoints[pieces]
+        impulse_responses = _moved(A, directions, ages) @ B
+        return np.asarray(np.einsum("kqm,mq,kq->k", np.abs(impulse_responses), jumps, ages > 0.0))
 
     @shaped
     def jumps(self, control: Float[Array, "m K"]) -> tuple[np.ndarray, Float[Array, "m q"]]:
         """The pieces ``(q,)`` with which the size of the largest error changes, and by how much, ``(m, q)``: by parts,
         ``sum_k r_k int_k = sum_k (r_k - r_{k-1}) int_{t_k}^t``, of which a sparse control needs few."""
         jumps = np.diff(self.shares[:, None] * np.abs(control), axis=1, prepend=0.0)
-        which = np.flatnonzero(jumps.any(axis=0))
-        return which, jumps[:, which]
+        pieces = np.flatnonzero(jumps.any(axis=0))
+        return pieces, jumps[:, pieces]
 
     def _integrals(self, ages: Array, directions: Array) -> list[Array]:
         """``int_0^age |c'e^{A s} B_j| ds`` for ages ``(k, q)`` of directions ``(k, d)``, of every channel; of ages that
         are alike once."""
-        alike = ALIKE * float(self.breakpoints[-1])
+        tolerance = ALIKE * float(self.breakpoints[-1])
         c, owner = unique_rows(directions)
-        keys = np.stack([np.repeat(owner.reshape(-1), ages.shape[1]), np.rint(ages.ravel() / alike)])
-        (who, _), first, which = np.unique(keys, axis=1, return_index=True, return_inverse=True)
-        times, rows = ages.ravel()[first], c[who.astype(int)]
-        none = np.zeros((times.size, 0))
+        keys = np.stack([np.repeat(owner.reshape(-1), ages.shape[1]), np.rint(ages.ravel() / tolerance)])
+        (direction_indices, _), first, pair_indices = np.unique(keys, axis=1, return_index=True, return_inverse=True)
+        times, rows = ages.ravel()[first], c[direction_indices.astype(int)]
+        no_parameters = np.zeros((times.size, 0))
         return [
-            np.zeros(ages.shape) if one is None else one(times, rows, none)[which.reshape(-1)].reshape(ages.shape)
-            for one in self._supports
+            np.zeros(ages.shape)
+            if support is None
+            else support(times, rows, no_parameters)[pair_indices.reshape(-1)].reshape(ages.shape)
+            for support in self._supports
         ]
 
     @shaped
     def enclosed(
         self, control: Float[Array, "m K"], times: Float[Array, " k"], directions: Float[Array, "k d"]
     ) -> Float[Array, "k 2"]:
-        """What `added` is at least and at most, ``(k, 2)``."""
-        which, jumps = self.jumps(control)
+        """Return lower and upper bounds of `added`, ``(k, 2)``."""
+        pieces, jumps = self.jumps(control)
         total, size = np.zeros((times.size, 2)), np.zeros(times.size)
-        ages = np.clip(times[:, None] - self.breakpoints[which], 0.0, None).ravel()
+        ages = np.clip(times[:, None] - self.breakpoints[pieces], 0.0, None).ravel()
         # a difference of times is rounded, and an integral grows with its length
-        last, rows = float(self.breakpoints[-1]), np.repeat(directions, which.size, axis=0)
-        around = np.nextafter(ages, 0.0), np.minimum(np.nextafter(ages, np.inf), last)
-        for one, change in zip(self._supports, jumps, strict=True):
-            if one is None or not change.any():
+        last, rows = float(self.breakpoints[-1]), np.repeat(directions, pieces.size, axis=0)
+        age_bounds = np.nextafter(ages, 0.0), np.minimum(np.nextafter(ages, np.inf), last)
+        for support, change in zip(self._supports, jumps, strict=True):
+            if support is None or not change.any():
                 continue
-            low, high = (one.enclosed(at, rows)[:, side] for side, at in enumerate(around))
-            ends = np.stack([low, high], axis=1).reshape(times.size, which.size, 2)
+            low, high = (support.enclosed(age_bound, rows)[:, side] for side, age_bound in enumerate(age_bounds))
+            ends = np.stack([low, high], axis=1).reshape(times.size, pieces.size, 2)
             total += np.einsum("kqe,q->ke", ends, np.maximum(change, 0.0))
             total += np.einsum("kqe,q->ke", ends[..., ::-1], np.minimum(change, 0.0))
             size += np.abs(ends).max(axis=2) @ np.abs(change)
-        return np.asarray(total + (rounding(4 * which.size + 8) * size)[:, None] * [-1.0, 1.0])
+        return np.asarray(total + (rounding(4 * pieces.size + 8) * size)[:, None] * [-1.0, 1.0])
 
 
 @final
 @dataclass(frozen=True, eq=False)
 class ExecutionCellSupport(KnownCellSupport):
-    """What errors of execution of a ``control (m, K)`` add to functionals ``rows (r, d)`` over cells of time, in the
-    form of `MeasurableCellSupport`; ``lifted`` is the known system."""
+    """The support of errors of execution of a ``control (m, K)`` on functionals ``rows (r, d)`` over cells of time.
+
+    The form is that of `MeasurableCellSupport`; ``lifted`` is the known system.
+    """
 
     execution: Execution
     control: Array
@@ -181,41 +214,50 @@ class ExecutionCellSupport(KnownCellSupport):
     def at(
         self, times: Float[Array, " k"], ends: Float[Array, "k r 0"]
     ) -> tuple[Float[Array, "k r 1"], Float[Array, "k r"]]:
-        """What is added ``(k, r, 1)`` and how far it may be from that, ``(k, r)``; ``ends (k, r, 0)``."""
+        """Return support values ``(k, r, 1)`` and their error bounds ``(k, r)``; ``ends (k, r, 0)`` is empty."""
         return self.between(self.execution.enclosed(self.control, *self.repeated(times)))
 
     @shaped
     def deviation(self, start: Float[Array, " k"], widths: Float[Array, " k"]) -> Float[Array, "k r"]:
-        """Bounds ``(k, r)`` of how far it is from its chord on ``[start, start + width]``, each inside one piece: its
-        slope is a sum of ``|c'e^{A s} B_j|`` at the ages of the jumps, of which each changes no faster than
-        ``|c'e^{A s} A B_j|``."""
-        which, jumps = self.execution.jumps(self.control)
-        if not which.size:
+        """Return bounds ``(k, r)`` of the distance of the support function from its chord on
+        ``[start, start + width]``.
+
+        Each interval is inside one piece. The slope is a sum of ``|c'e^{A s} B_j|`` at the ages of the jumps, each of
+        which changes no faster than ``|c'e^{A s} A B_j|``.
+        """
+        pieces, jumps = self.execution.jumps(self.control)
+        if not pieces.size:
             return np.zeros((start.size, self.rows.shape[0]))
         comparison, lifted = self.lifted.comparison, self.lifted
-        ages = start[:, None] - self.execution.breakpoints[which]
-        begun = ages + widths[:, None] > 0.0  # the others begin after the cell
-        ages, width = np.where(begun, np.maximum(ages, 0.0), 0.0).ravel(), np.repeat(widths, which.size)
+        ages = start[:, None] - self.execution.breakpoints[pieces]
+        is_active = ages + widths[:, None] > 0.0  # the others begin after the cell
+        ages, width = np.where(is_active, np.maximum(ages, 0.0), 0.0).ravel(), np.repeat(widths, pieces.size)
         rows, drive = self.rows @ lifted.transform, lifted.B[0][:, : jumps.shape[0]]
         slopes = lifted.flown(np.broadcast_to(rows, (ages.size, *rows.shape)), ages)[0] @ lifted.A[0]  # (k q, r, d)
         departure = comparison.over(width).departure
-        bent = np.abs(slopes @ drive)  # (k q, r, m)
+        curvatures = np.abs(slopes @ drive)  # (k q, r, m)
         norms = block_norms(slopes, lifted.starts)
         for j in range(drive.shape[1]):
-            pushed = np.broadcast_to(block_norms(np.abs(drive[:, j]), lifted.starts), (width.size, norms.shape[2]))
-            bent[..., j] += np.einsum("nrq,nq->nr", norms, departure.on(pushed))
-        total = np.einsum("kqrj,jq,kq->kr", bent.reshape(start.size, which.size, *bent.shape[1:]), np.abs(jumps), begun)
-        return np.asarray((widths**2 / 8)[:, None] * total * (1.0 + rounding(16 * (lifted.states + which.size))))
+            drive_norms = np.broadcast_to(block_norms(np.abs(drive[:, j]), lifted.starts), (width.size, norms.shape[2]))
+            curvatures[..., j] += np.einsum("nrq,nq->nr", norms, departure.on(drive_norms))
+        total = np.einsum(
+            "kqrj,jq,kq->kr",
+            curvatures.reshape(start.size, pieces.size, *curvatures.shape[1:]),
+            np.abs(jumps),
+            is_active,
+        )
+        return np.asarray((widths**2 / 8)[:, None] * total * (1.0 + rounding(16 * (lifted.states + pieces.size))))
 
     @property
     def neglected(self) -> Array:
-        """Nothing beside what `at` says, ``(r, L)``."""
+        """Zeros ``(r, L)``, since the error bounds of `at` contain all errors."""
         return np.zeros((self.rows.shape[0], self.lifted.grid.pieces))
 
     @property
     def reached(self) -> Array:
-        """As in `DisturbanceSupport`, ``(L, q)``."""
-        far = self.execution.shares * np.abs(self.control).max(axis=1)
-        norms = block_norms(np.abs(self.lifted.B[0][:, : far.size]) @ far, self.lifted.starts)
+        """Norm bounds ``(L, q)`` of the effect of the errors on every block of the coordinates until the end of every
+        piece."""
+        error_sizes = self.execution.shares * np.abs(self.control).max(axis=1)
+        norms = block_norms(np.abs(self.lifted.B[0][:, : error_sizes.size]) @ error_sizes, self.lifted.starts)
         reach = self.lifted.comparison.over(self.lifted.grid.breakpoints[1:])
         return reach.integral.on(np.broadcast_to(norms, (self.lifted.grid.pieces, norms.size)))

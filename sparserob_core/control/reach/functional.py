@@ -1,5 +1,5 @@
 """Worst-case functionals of the state: the largest ``c'x(t; theta, w, p)`` over disturbances ``w`` and initial states,
-split into what the control does and what it cannot help."""
+split into the contribution of the control and the rest, which the control cannot change."""
 
 from __future__ import annotations
 
@@ -51,10 +51,13 @@ NEAR = 250_000
 
 @dataclass(frozen=True, eq=False)
 class Parts:
-    """What the largest ``c'x(t)`` at one index is made of, beside the control: what the centre of the initial states
-    gives (``free``), what the worst disturbance and the worst initial state add together (``sigma``, of which ``begun``
-    is the initial state's), and these: ``disturbance (mw, L)`` on the pieces of the merged grid, and ``deviation (d,)``
-    from the centre; ``None`` where there is none."""
+    """Contributions to the largest ``c'x(t)`` at one index, without the contribution of the control.
+
+    ``free`` is the contribution of the centre of the initial states and of inputs that are not decided. ``sigma`` is
+    the support value of the worst disturbance and the worst initial state together, and ``begun`` the part of it that
+    comes from the initial state. ``disturbance (mw, L)`` is a worst disturbance on the pieces of the merged grid, and
+    ``deviation (d,)`` a worst deviation from the centre; each is ``None`` where there is none.
+    """
 
     free: float
     sigma: float
@@ -67,12 +70,12 @@ class Parts:
 class WorstCase:
     """The functionals ``c'x(t)`` of one system under its worst disturbance, from the worst initial state.
 
-    The initial states are that of the response plus ``initial``, a set of deviations; what the worst of them adds is
-    the set's support function of ``e^{A't} c``.
+    The initial states are that of the response plus ``initial``, a set of deviations. The worst of them adds the
+    support function of the set, at ``e^{A't} c``.
 
     Indices are given as ``times (k,)``, ``directions (k, d)``, ``parameters (k, nu)``; the decision is ``theta``
-    raveled, ``(m N,)``. ``names``: what the states are called where a functional is explained. ``execution``: the
-    errors with which the control is delivered; the decision then goes on with a bound of the absolute value of every
+    raveled, ``(m N,)``. ``names``: the names of the states where a functional is explained. ``execution``: the errors
+    with which the control is delivered. The decision then has further entries, a bound of the absolute value of every
     channel on every piece, ``(m K,)``, in which rows are linear.
     """
 
@@ -96,7 +99,7 @@ class WorstCase:
 
     @property
     def disturbed(self) -> bool:
-        """Whether there is a disturbance, or more than one initial state."""
+        """True where there is a disturbance, or more than one initial state."""
         return self.disturbance is not None or self.initial is not None
 
     @cached_property
@@ -123,8 +126,8 @@ class WorstCase:
 
     @cached_property
     def known(self) -> Array:
-        """What acts through the columns of ``B`` where nothing is decided, ``(m + constants, L)``: a drift, and the
-        control before the first one acts; 0 elsewhere."""
+        """Inputs through the columns of ``B`` that are not decided, ``(m + constants, L)``: a drift, and the control
+        before the first decided one acts; 0 elsewhere."""
         return self.response.grid.inputs(np.zeros((self.channels, self.dictionary.pieces)))
 
     def central(self) -> WorstCase:
@@ -133,8 +136,10 @@ class WorstCase:
         response, model = self.response, self.disturbance
         if self.initial is not None:
             response = response.from_state(response.initial_state + nominal_point(self.initial))
-        held = None if model is None else model.held(nominal_point(model.bound))
-        return replace(self, response=response, disturbance=held, shared=None, initial=None, execution=self._exactly)
+        disturbance = None if model is None else model.held(nominal_point(model.bound))
+        return replace(
+            self, response=response, disturbance=disturbance, shared=None, initial=None, execution=self._exactly
+        )
 
     def nominal(self) -> WorstCase:
         """The functionals of the system at an interior point of its parameters, from the centre of the initial states,
@@ -156,22 +161,26 @@ class WorstCase:
 
     @property
     def _exactly(self) -> Execution | None:
-        """The same decisions, of a control that is delivered as it is commanded."""
+        """The execution of the same decisions without errors, where the control is delivered as it is commanded;
+        ``None`` where there is no execution."""
         return None if self.execution is None else self.execution.none()
 
     def coarser(self, pieces: int) -> WorstCase:
-        """The same functionals where about so many equal pieces are the whole horizon, of a known system on many equal
-        ones on each of which every input may act: what they can bring to the state is almost the same. Else these."""
+        """Return the same functionals on about ``pieces`` equal pieces over the whole horizon, or unchanged.
+
+        The grid changes only for a known system on many equal pieces, on each of which every input may act: the effect
+        of the inputs on the state then is almost the same.
+        """
         response, model = self.response, self.disturbance
-        grid, share = response.grid, response.grid.pieces // pieces
-        bound = grid.before is not None or (model is not None and not model.by_piece)
-        if share < 2 or bound or not response.propagator.aged(response.system.parameters is not None):
+        grid, group_size = response.grid, response.grid.pieces // pieces
+        is_fixed = grid.before is not None or (model is not None and not model.by_piece)
+        if group_size < 2 or is_fixed or not response.propagator.aged(response.system.parameters is not None):
             return self
-        ends = np.linspace(0.0, float(grid.breakpoints[-1]), grid.pieces // share + 1)
-        which = np.arange(ends.size - 1)
-        coarse = TimeGrid(ends, which, which, constants=grid.constants)
+        ends = np.linspace(0.0, float(grid.breakpoints[-1]), grid.pieces // group_size + 1)
+        piece_indices = np.arange(ends.size - 1)
+        coarse = TimeGrid(ends, piece_indices, piece_indices, constants=grid.constants)
         if model is not None:
-            model = replace(model, grid=coarse, starts=which)
+            model = replace(model, grid=coarse, starts=piece_indices)
         return replace(self, response=Response(response.system, coarse, response.initial_state), disturbance=model)
 
     @shaped
@@ -183,7 +192,7 @@ class WorstCase:
             times,
             directions,
             parameters,
-            lambda part, known: self._support(known, times[part], directions[part], parameters[part]),
+            lambda chunk, weights: self._support(weights, times[chunk], directions[chunk], parameters[chunk]),
         )
 
     @shaped
@@ -201,11 +210,11 @@ class WorstCase:
 
         def pushed(part: slice, known: Weights) -> Array:
             free = known.free
-            begun = self._begun(free) if deviations is None else (free * deviations[part]).sum(axis=1)
+            initial_effect = self._begun(free) if deviations is None else (free * deviations[part]).sum(axis=1)
             return (
-                begun
+                initial_effect
                 if disturbances is None
-                else begun + np.einsum("kli,kil->k", known.disturbance, disturbances[part])
+                else initial_effect + np.einsum("kli,kil->k", known.disturbance, disturbances[part])
             )
 
         return self._rows(times, directions, parameters, pushed)
@@ -221,15 +230,17 @@ class WorstCase:
         """Rows and offsets; ``pushed(part, weights)`` is what the uncertainty adds to the offsets of a part of the
         indices."""
         G, offset = np.empty((times.size, self.variables)), np.empty(times.size)
-        for part in self._chunks(parameters):
-            known = self.response.weights(times[part], directions[part], parameters[part])
-            G[part, : self.coefficients] = self.on_decision(known.control)
+        for chunk in self._chunks(parameters):
+            weights = self.response.weights(times[chunk], directions[chunk], parameters[chunk])
+            G[chunk, : self.coefficients] = self.on_decision(weights.control)
             if self.execution is not None:
-                along = self.execution.seen(directions[part], parameters[part])
-                G[part, self.coefficients :] = self.execution.lengths(times[part], along)
-            offset[part] = known.free @ self.response.initial_state + self.given(known.control) + pushed(part, known)
+                error_directions = self.execution.seen(directions[chunk], parameters[chunk])
+                G[chunk, self.coefficients :] = self.execution.lengths(times[chunk], error_directions)
+            offset[chunk] = (
+                weights.free @ self.response.initial_state + self.given(weights.control) + pushed(chunk, weights)
+            )
             if self.execution is not None:
-                offset[part] += self.execution.given(times[part], along)
+                offset[chunk] += self.execution.given(times[chunk], error_directions)
         return G, offset
 
     @shaped
@@ -254,18 +265,18 @@ class WorstCase:
         and each is asked for once: with measurable disturbances and errors as in `turning`."""
         control = self.on_grid(theta)
         result = np.empty(times.size)
-        for part in self._chunks(parameters):
-            known = self.response.weights(times[part], directions[part], parameters[part])
-            driven = np.einsum("klm,ml->k", known.control, control)
-            support = self._support(known, times[part], directions[part], parameters[part], roughly)
-            result[part] = known.free @ self.response.initial_state + driven + support
+        for chunk in self._chunks(parameters):
+            weights = self.response.weights(times[chunk], directions[chunk], parameters[chunk])
+            control_effect = np.einsum("klm,ml->k", weights.control, control)
+            support = self._support(weights, times[chunk], directions[chunk], parameters[chunk], roughly)
+            result[chunk] = weights.free @ self.response.initial_state + control_effect + support
             if roughly:
-                result[part] += np.einsum(
-                    "klm,ml->k", np.abs(known.control[..., : self.channels]), self._missed(control)
+                result[chunk] += np.einsum(
+                    "klm,ml->k", np.abs(weights.control[..., : self.channels]), self._missed(control)
                 )
             elif self.execution is not None:
-                along = self.execution.seen(directions[part], parameters[part])
-                result[part] += self.execution.added(self.control(theta), times[part], along)
+                error_directions = self.execution.seen(directions[chunk], parameters[chunk])
+                result[chunk] += self.execution.added(self.control(theta), times[chunk], error_directions)
         return result
 
     def turning(self, theta: Array, times: Array, parameters: Array) -> Callable[[Array, np.ndarray], Array]:
@@ -273,35 +284,38 @@ class WorstCase:
         nu)``: of directions ``(j, d)`` and the places ``(j,)`` that they are at, as many at each, ``(j,)``. Weights are
         linear in the direction, so that those of the axes are computed once. What measurable disturbances and errors of
         execution add is not, and is only about right: of errors it is what those do that are constant on pieces."""
-        known, model, control = self._axes(times, parameters), self.disturbance, self.on_grid(theta)
-        states = known.free @ self.response.initial_state + np.einsum("kdlm,ml->kd", known.control, control)
+        weights, model, control = self._axes(times, parameters), self.disturbance, self.on_grid(theta)
+        states = weights.free @ self.response.initial_state + np.einsum("kdlm,ml->kd", weights.control, control)
         by_block, measurable = None if model is None else model.on_blocks, self.measurable
-        blocks = np.zeros((*states.shape, 0, 0)) if by_block is None else by_block.blocks(known.disturbance)
-        missed = self._missed(control)
-        missing = np.flatnonzero(missed.any(axis=0))
-        errors = (known.control[:, :, missing, : self.channels] * missed[:, missing].T).reshape(*states.shape, -1)
+        blocks = np.zeros((*states.shape, 0, 0)) if by_block is None else by_block.blocks(weights.disturbance)
+        error_sizes = self._missed(control)
+        error_pieces = np.flatnonzero(error_sizes.any(axis=0))
+        error_weights = (weights.control[:, :, error_pieces, : self.channels] * error_sizes[:, error_pieces].T).reshape(
+            *states.shape, -1
+        )
 
         def along(directions: Array, which: np.ndarray) -> Array:
             places = which[np.flatnonzero(np.diff(which, prepend=-1))]
             c = directions.reshape(places.size, -1, directions.shape[1])
-            found: Array = (c * states[places, None]).sum(axis=2)
-            for part in _parts(places.size, max(1, NEAR // max(1, c[:1, :, 0].size * blocks[:1, 0].size))):
-                at, turned = places[part], c[part]
-                free = turned @ known.free[at]
-                found[part] += self._begun(free.reshape(-1, free.shape[2])).reshape(free.shape[:2])
+            values: Array = (c * states[places, None]).sum(axis=2)
+            for chunk in _parts(places.size, max(1, NEAR // max(1, c[:1, :, 0].size * blocks[:1, 0].size))):
+                indices, chunk_directions = places[chunk], c[chunk]
+                free = chunk_directions @ weights.free[indices]
+                values[chunk] += self._begun(free.reshape(-1, free.shape[2])).reshape(free.shape[:2])
                 if by_block is not None:
-                    on_blocks = turned @ blocks[at].reshape(*blocks[at].shape[:2], -1)
-                    found[part] += by_block.pushed(on_blocks.reshape(*free.shape[:2], *blocks.shape[2:]))
-                if errors.shape[2]:
-                    found[part] += np.abs(turned @ errors[at]).sum(axis=2)
+                    on_blocks = chunk_directions @ blocks[indices].reshape(*blocks[indices].shape[:2], -1)
+                    values[chunk] += by_block.pushed(on_blocks.reshape(*free.shape[:2], *blocks.shape[2:]))
+                if error_weights.shape[2]:
+                    values[chunk] += np.abs(chunk_directions @ error_weights[indices]).sum(axis=2)
             if measurable is not None:
-                found += measurable.roughly(times[which], directions, parameters[which]).reshape(found.shape)
-            return found.reshape(-1)
+                values += measurable.roughly(times[which], directions, parameters[which]).reshape(values.shape)
+            return values.reshape(-1)
 
         return along
 
     def _missed(self, control: Array) -> Array:
-        """By how much every channel of a control on the pieces of the merged grid may be missed, ``(m, L)``."""
+        """Return the largest error of execution of every channel of a control on the pieces of the merged grid,
+        ``(m, L)``."""
         commanded = np.abs(control[: self.channels])
         return 0.0 * commanded if self.execution is None else self.execution.shares[:, None] * commanded
 
@@ -318,58 +332,87 @@ class WorstCase:
         if (changes or not aged) and r > directions.shape[1] and measurable is None:
             return self._profile_by_axes(times, directions, parameter)
         if changes or not aged:
-            every = np.broadcast_to(parameter, (k * r, parameter.size))
-            return self.offsets(np.repeat(times, r), np.tile(directions, (k, 1)), every).reshape(k, r)
-        sigma, several = np.zeros((k, r)), max(1, CHUNK // (r * directions.shape[1]))
+            repeated = np.broadcast_to(parameter, (k * r, parameter.size))
+            return self.offsets(np.repeat(times, r), np.tile(directions, (k, 1)), repeated).reshape(k, r)
+        sigma, chunk_size = np.zeros((k, r)), max(1, CHUNK // (r * directions.shape[1]))
         if by_block is not None:
-            known = self._frozen.get(parameter.tobytes())
-            if known is None:
-                fixed = (self.response.system.modes[0], self.response.grid, self.response.initial_state, parameter)
-                known = remember(self._frozen, parameter.tobytes(), frozen(*fixed), LEGS_KEPT)
-            sigma = DisturbanceSupport(known, by_block, directions).at(times, np.zeros((k, r, 0)))[0][:, :, 0]
+            lifted = self._frozen.get(parameter.tobytes())
+            if lifted is None:
+                arguments = (self.response.system.modes[0], self.response.grid, self.response.initial_state, parameter)
+                lifted = remember(self._frozen, parameter.tobytes(), frozen(*arguments), LEGS_KEPT)
+            sigma = DisturbanceSupport(lifted, by_block, directions).at(times, np.zeros((k, r, 0)))[0][:, :, 0]
         if measurable is not None:
-            for part in _parts(k, several):
-                at = np.repeat(times[part], r), np.tile(directions, (times[part].size, 1))
-                sigma[part] += measurable(*at, np.broadcast_to(parameter, (at[0].size, parameter.size))).reshape(-1, r)
+            for chunk in _parts(k, chunk_size):
+                pairs = np.repeat(times[chunk], r), np.tile(directions, (times[chunk].size, 1))
+                sigma[chunk] += measurable(*pairs, np.broadcast_to(parameter, (pairs[0].size, parameter.size))).reshape(
+                    -1, r
+                )
         if self.initial is not None:
-            for part in _parts(k, several):
-                rows = self.response.propagator.backwards(times[part], directions, parameter)
-                sigma[part] += self.initial.support(rows)
+            for chunk in _parts(k, chunk_size):
+                rows = self.response.propagator.backwards(times[chunk], directions, parameter)
+                sigma[chunk] += self.initial.support(rows)
         return sigma
 
     def _profile_by_axes(self, times: Array, directions: Array, parameter: Array) -> Array:
         """`profile` of more directions than there are axes: what the axes give to the blocks of the disturbance does
         for all directions, in which it is linear."""
         (r, d), sigma, model = directions.shape, np.zeros((times.size, directions.shape[0])), self.disturbance
-        several = max(1, CHUNK // (d * self.response.numbers(parameter.size)))
-        for part in _parts(times.size if self.disturbed else 0, several):
-            known = self._axes(times[part], np.broadcast_to(parameter, (times[part].size, parameter.size)))
-            k = known.free.shape[0]
-            sigma[part] = self._begun((directions @ known.free).reshape(k * r, d)).reshape(k, r)
+        chunk_size = max(1, CHUNK // (d * self.response.numbers(parameter.size)))
+        for chunk in _parts(times.size if self.disturbed else 0, chunk_size):
+            weights = self._axes(times[chunk], np.broadcast_to(parameter, (times[chunk].size, parameter.size)))
+            k = weights.free.shape[0]
+            sigma[chunk] = self._begun((directions @ weights.free).reshape(k * r, d)).reshape(k, r)
             if model is None:
                 continue
-            blocks = model.blocks(known.disturbance)
-            for near in _parts(k, max(1, NEAR // (r * blocks[0, 0].size))):
-                begun = blocks[near][:, :, blocks[near].any(axis=(0, 1, 3))]
-                turned = directions @ begun.reshape(begun.shape[0], d, begun[0, 0].size)
-                sigma[part][near] += model.pushed(turned.reshape(begun.shape[0], r, *begun.shape[2:]))
+            blocks = model.blocks(weights.disturbance)
+            for inner_chunk in _parts(k, max(1, NEAR // (r * blocks[0, 0].size))):
+                active_blocks = blocks[inner_chunk][:, :, blocks[inner_chunk].any(axis=(0, 1, 3))]
+                projected = directions @ active_blocks.reshape(active_blocks.shape[0], d, active_blocks[0, 0].size)
+                sigma[chunk][inner_chunk] += model.pushed(
+                    projected.reshape(active_blocks.shape[0], r, *active_blocks.shape[2:])
+                )
         return sigma
 
     def _axes(self, times: Array, parameters: Array) -> Weights:
         """The weights of the functionals along the axes at times ``(k,)``, with one dimension ``(k, d, ...)`` more."""
         d = self.response.initial_state.size
         axes = np.tile(np.eye(d), (times.size, 1))
-        every = [np.repeat(one, d, axis=0) for one in (times, parameters)]
-        parts = [self.response.weights(every[0][part], axes[part], every[1][part]) for part in self._chunks(every[1])]
-        known = [np.concatenate([getattr(part, name) for part in parts]) for name in ("free", "control", "disturbance")]
-        return Weights(*(one.reshape(times.size, d, *one.shape[1:]) for one in known))
+        repeated = [np.repeat(values, d, axis=0) for values in (times, parameters)]
+        chunks = [
+            self.response.weights(repeated[0][chunk], axes[chunk], repeated[1][chunk])
+            for chunk in self._chunks(repeated[1])
+        ]
+        arrays = [
+            np.concatenate([getattr(weights, name) for weights in chunks])
+            for name in ("free", "control", "disturbance")
+        ]
+        return Weights(*(array.reshape(times.size, d, *array.shape[1:]) for array in arrays))
 
     @shaped
     def support_over(self, lifted: Leg, H: Float[Array, "r d"], joined: Combination | None = None) -> Supports | None:
-        """What the worst disturbance and the worst initial state add to functionals ``H (r, d)`` over a cell, ``None``
-        where there is neither; raises `NotEnclosable` where no bound of it is proven."""
+        """Return the support of the worst disturbance and of the worst initial state on functionals over a cell.
+
+        Parameters
+        ----------
+        lifted : LiftedSystem, VaryingMotion or SpreadMotion
+            The system over the cell, or a phase of it.
+        H : Array
+            Functionals ``(r, d)``.
+        joined : Combination, optional
+            How the functionals make up one direction that varies over the cell.
+
+        Returns
+        -------
+        Supports or None
+            The support, ``None`` where there is neither a disturbance nor a set of initial states.
+
+        Raises
+        ------
+        NotEnclosable
+            Where no bound of the support is proven.
+        """
         rows = H @ lifted.transform
-        found: list[Support] = []
+        supports: list[Support] = []
         model, measurable = self.disturbance, self.measurable
         by_block = None if model is None else model.on_blocks
         if measurable is not None:
@@ -377,23 +420,37 @@ class WorstCase:
                 lifted.space.nu and isinstance(lifted, LiftedSystem)
             ):
                 raise NotEnclosable(f"{WITHOUT_PROOF}; with disturbance_class piecewise_constant there is one")
-            found += measurable.over(H, lifted, joined)
+            supports += measurable.over(H, lifted, joined)
         if isinstance(lifted, SpreadMotion):
-            found += [] if by_block is None else [SpreadSupport.of_disturbance(lifted, by_block, rows, joined)]
-            found += [] if self.initial is None else [SpreadSupport.of_initial(lifted, self.initial, rows, joined)]
+            supports += [] if by_block is None else [SpreadSupport.of_disturbance(lifted, by_block, rows, joined)]
+            supports += [] if self.initial is None else [SpreadSupport.of_initial(lifted, self.initial, rows, joined)]
         elif isinstance(lifted, VaryingMotion):
-            found += [] if by_block is None else [VaryingSupport.of_disturbance(lifted, by_block, rows, joined)]
-            found += [] if self.initial is None else [VaryingSupport.of_initial(lifted, self.initial, rows, joined)]
+            supports += [] if by_block is None else [VaryingSupport.of_disturbance(lifted, by_block, rows, joined)]
+            supports += [] if self.initial is None else [VaryingSupport.of_initial(lifted, self.initial, rows, joined)]
         else:
-            found += [] if by_block is None else [DisturbanceSupport(lifted, by_block, rows, joined)]
-            found += [] if self.initial is None else [InitialSupport(lifted, self.initial, rows, joined)]
-        return Supports(tuple(found)) if found else None
+            supports += [] if by_block is None else [DisturbanceSupport(lifted, by_block, rows, joined)]
+            supports += [] if self.initial is None else [InitialSupport(lifted, self.initial, rows, joined)]
+        return Supports(tuple(supports)) if supports else None
 
     def delivered_over(
         self, known: Supports | None, theta: Array, H: Array, leg: Leg, joined: Combination | None = None
     ) -> Supports | None:
-        """What is ``known`` of the uncertainty over a cell (`support_over`), with what errors of execution of a
-        decision add."""
+        """Return a ``known`` support over a cell (`support_over`), with the errors of execution of a decision.
+
+        Parameters
+        ----------
+        known : Supports or None
+            The support of the uncertainty.
+        theta : Array
+            The decision ``(n,)``.
+        H, leg, joined
+            Functionals, system and combination, as in `support_over`.
+
+        Returns
+        -------
+        Supports or None
+            The support with errors; ``known`` itself where there is no execution.
+        """
         if self.execution is None:
             return known
         errors = self.execution.over(self.control(theta), H, leg, joined)
@@ -403,13 +460,14 @@ class WorstCase:
     def offsets(
         self, times: Float[Array, " k"], directions: Float[Array, "k d"], parameters: Float[Array, "k nu"]
     ) -> Float[Array, " k"]:
-        """``sigma (k,)``: how far the worst disturbance and the worst initial state alone push ``c'x(t)``."""
+        """Return ``sigma (k,)``, the support value of the worst disturbance and the worst initial state on
+        ``c'x(t)``."""
         if not self.disturbed:
             return np.zeros(times.size)
         result = np.empty(times.size)
-        for part in self._chunks(parameters):
-            known = self.response.weights(times[part], directions[part], parameters[part])
-            result[part] = self._support(known, times[part], directions[part], parameters[part])
+        for chunk in self._chunks(parameters):
+            weights = self.response.weights(times[chunk], directions[chunk], parameters[chunk])
+            result[chunk] = self._support(weights, times[chunk], directions[chunk], parameters[chunk])
         return result
 
     @shaped
@@ -421,15 +479,15 @@ class WorstCase:
 
     @shaped
     def parts(self, time: float, direction: Float[Array, " d"], parameter: Float[Array, " nu"]) -> Parts:
-        """What the largest ``c'x(t)`` is made of at one index, beside the control."""
-        at = (np.array([time]), direction[None], parameter[None])
-        known = self.response.weights(*at)
+        """Return the contributions to the largest ``c'x(t)`` at one index, without the contribution of the control."""
+        index = (np.array([time]), direction[None], parameter[None])
+        weights = self.response.weights(*index)
         return Parts(
-            float(known.free[0] @ self.response.initial_state + self.given(known.control)[0]),
-            float(self._support(known, *at)[0]),
-            float(self._begun(known.free)[0]),
-            None if self.disturbance is None else self.disturbance.worst(known.disturbance)[0],
-            None if self.initial is None else self.initial.support_point(known.free)[0],
+            float(weights.free[0] @ self.response.initial_state + self.given(weights.control)[0]),
+            float(self._support(weights, *index)[0]),
+            float(self._begun(weights.free)[0]),
+            None if self.disturbance is None else self.disturbance.worst(weights.disturbance)[0],
+            None if self.initial is None else self.initial.support_point(weights.free)[0],
         )
 
     @shaped
@@ -445,23 +503,28 @@ class WorstCase:
     def measurable(self) -> MeasurableSupport | VaryingMeasurable | None:
         """The support of measurable disturbances, ``None`` where there are none; the ``shared`` one where it is of this
         system and set."""
-        bound, given = None if self.disturbance is None else self.disturbance.measurable, self.shared
+        bound, shared = None if self.disturbance is None else self.disturbance.measurable, self.shared
         if bound is None:
             return None
-        if given and given.response.propagator is self.response.propagator and given.bound is bound:
-            return given
+        if shared and shared.response.propagator is self.response.propagator and shared.bound is bound:
+            return shared
         from sparserob_core.control.reach.varying_measurable import measurable_support
 
         return measurable_support(self.response, bound)
 
     @shaped
     def given(self, weights: Float[Array, "k L mc"]) -> Float[Array, " k"]:
-        """What weights ``(k, L, m + constants)`` on the columns of ``B`` make of all that is not decided, ``(k,)``."""
+        """Return the contribution ``(k,)`` of all inputs that are not decided, from weights ``(k, L, m + constants)``
+        on the columns of ``B``."""
         return np.einsum("klm,ml->k", weights, self.known) if self._gives else np.zeros(weights.shape[0])
 
     @shaped
     def decided(self, weights: Float[Array, "k L mc"]) -> Float[Array, "k J m"]:
-        """Of weights on the columns of ``B``, those on the control, on the grid pieces on which one acts."""
+        """Return the weights ``(k, J, m)`` on the control from weights ``(k, L, m + constants)`` on the columns of
+        ``B``.
+
+        The ``J`` grid pieces are those on which a piece of the control acts.
+        """
         grid = self.response.grid
         return weights[:, grid.decided, : self.channels] if self._gives or grid.before is not None else weights
 
@@ -474,9 +537,9 @@ class WorstCase:
         if starts.size < on_pieces.shape[1]:
             on_pieces = np.add.reduceat(on_pieces, starts, axis=1)
         if starts.size < self.dictionary.pieces:  # the last ones act after the horizon
-            every = np.zeros((weights.shape[0], self.dictionary.pieces, self.channels))
-            every[:, acting] = on_pieces
-            on_pieces = every
+            all_weights = np.zeros((weights.shape[0], self.dictionary.pieces, self.channels))
+            all_weights[:, acting] = on_pieces
+            on_pieces = all_weights
         return self.dictionary.gathered(on_pieces).swapaxes(1, 2).reshape(-1, self.coefficients)
 
     @cached_property
@@ -488,8 +551,11 @@ class WorstCase:
 
     @shaped
     def legs(self, low: Float[Array, " nu"], high: Float[Array, " nu"]) -> tuple[Leg, ...]:
-        """The lifted system over a cell of parameters, leg by leg, or the motion of one that changes with time;
-        remembered, for all constraints."""
+        """Return the lifted system over a cell of parameters, phase by phase, or the motion of a system that changes
+        with time.
+
+        The result is remembered, for all constraints.
+        """
         key, response = low.tobytes() + high.tobytes(), self.response
         if key not in self._legs:
             cell = (low + high) / 2, (high - low) / 2
@@ -504,16 +570,18 @@ class WorstCase:
         return self._legs[key]
 
     def _on_cell(self, low: Array, high: Array) -> SpreadMotion:
-        """The motion over a cell of parameters; how far states grow on the smallest cell around it is not asked
-        again."""
-        propagator, begun = self.response.propagator, self.response.initial_state
+        """Return the motion over a cell of parameters; its growth bound is the least known one of the cells around it,
+        if there is any."""
+        propagator, initial_state = self.response.propagator, self.response.initial_state
         assert propagator.laws is not None
-        part = propagator.laws.holding(low, high)  # of which units are
-        around = [growth for own, a, b, growth in self._grown if own == part and (a <= low).all() and (high <= b).all()]
-        known = min(around, default=None)
-        leg = SpreadMotion.of(propagator.on_cell(low, high), begun, known)
-        if known is None:
-            self._grown.append((part, low, high, leg.truncation.growth))
+        part_index = propagator.laws.holding(low, high)  # of which units are
+        around = [
+            growth for own, a, b, growth in self._grown if own == part_index and (a <= low).all() and (high <= b).all()
+        ]
+        least_growth = min(around, default=None)
+        leg = SpreadMotion.of(propagator.on_cell(low, high), initial_state, least_growth)
+        if least_growth is None:
+            self._grown.append((part_index, low, high, leg.truncation.growth))
         return leg
 
     @cached_property
@@ -521,7 +589,8 @@ class WorstCase:
         return []
 
     def _growth(self, low: Array, high: Array, halvings: int) -> float:
-        """The norm of the transitions at any parameter of a cell, at most; ``inf`` where smaller cells have none."""
+        """Return a bound of the norm of the transitions at any parameter of a cell; ``inf`` where smaller cells have
+        none."""
         try:
             return self._on_cell(low, high).truncation.growth
         except NotEnclosable as error:
@@ -533,32 +602,36 @@ class WorstCase:
             return max(self._growth(low, ends[1], halvings - 1), self._growth(ends[0], high, halvings - 1))
 
     def beyond(self, far: Array) -> Array:
-        """What a law leaves out of its series in the parameters, of any state, ``(d,)``, under a control that goes as
-        ``far (m,)`` as it may; nothing where entries are polynomials."""
-        laws, found = self.response.propagator.laws, np.zeros(self.response.initial_state.size)
-        if laws is None or all(how.left is None for how, _ in laws.every):
-            return found
-        begun, inputs = self._largest(far)
-        for part, (how, _) in enumerate(laws.every):
-            if how.left is not None:
-                growth = self._growth(*laws.ends(part), HALVINGS)
-                off = laws.left_out(part, begun, inputs, growth)
-                found = np.maximum(found, off)
-        return found
+        """Return bounds ``(d,)`` of the truncation error of any state, from the series of the law in the parameters.
+
+        ``far (m,)`` bounds the absolute value of the control. The error is 0 where the entries of the law are
+        polynomials.
+        """
+        laws, bounds = self.response.propagator.laws, np.zeros(self.response.initial_state.size)
+        if laws is None or all(spread.left is None for spread, _ in laws.every):
+            return bounds
+        initial_sizes, inputs = self._largest(far)
+        for part_index, (spread, _) in enumerate(laws.every):
+            if spread.left is not None:
+                growth = self._growth(*laws.ends(part_index), HALVINGS)
+                error_bounds = laws.left_out(part_index, initial_sizes, inputs, growth)
+                bounds = np.maximum(bounds, error_bounds)
+        return bounds
 
     def _largest(self, far: Array) -> tuple[Array, Array]:
-        """How large the initial state ``(d,)`` and all inputs ``(m + constants + mw,)`` may be under such a control."""
-        begun, model = np.abs(self.response.initial_state), self.disturbance
+        """Return bounds of the initial state, ``(d,)``, and of all inputs, ``(m + constants + mw,)``, for a control of
+        at most ``far (m,)``."""
+        initial_sizes, model = np.abs(self.response.initial_state), self.disturbance
         if self.initial is not None:
-            begun = begun + self.initial.reach(np.eye(begun.size))
-        pushed = np.zeros(self.response.system.disturbances)
+            initial_sizes = initial_sizes + self.initial.reach(np.eye(initial_sizes.size))
+        disturbance_sizes = np.zeros(self.response.system.disturbances)
         if model is not None:
-            pushed = model.bound.reach(np.eye(model.channels))
-        known = np.abs(self.known).max(axis=1)
-        delivered = np.maximum(far, known[: far.size])
+            disturbance_sizes = model.bound.reach(np.eye(model.channels))
+        input_sizes = np.abs(self.known).max(axis=1)
+        delivered = np.maximum(far, input_sizes[: far.size])
         if self.execution is not None:  # of what is missed as much is left out as of what is commanded
             delivered = (1.0 + self.execution.shares) * delivered
-        return begun, np.concatenate([delivered, known[far.size :], pushed])
+        return initial_sizes, np.concatenate([delivered, input_sizes[far.size :], disturbance_sizes])
 
     @cached_property
     def _frozen(self) -> dict[bytes, LiftedSystem]:
@@ -570,8 +643,8 @@ class WorstCase:
 
     @shaped
     def on_grid(self, theta: Float[Array, " n"]) -> Float[Array, "mc L"]:
-        """What acts through the columns of ``B`` on the pieces of the merged grid, ``(m + constants, L)``: the control,
-        and all that is not decided."""
+        """Return the inputs through the columns of ``B`` on the pieces of the merged grid, ``(m + constants, L)``: the
+        control of a decision, and all inputs that are not decided."""
         return self.response.grid.inputs(self.control(theta))
 
     @shaped
@@ -583,17 +656,18 @@ class WorstCase:
         parameters: Float[Array, "k nu"],
         roughly: bool = False,
     ) -> Float[Array, " k"]:
-        found, by_block = self._begun(known.free), None if self.disturbance is None else self.disturbance.on_blocks
+        total, by_block = self._begun(known.free), None if self.disturbance is None else self.disturbance.on_blocks
         if by_block is not None:
-            found = found + by_block.support(known.disturbance)
+            total = total + by_block.support(known.disturbance)
         if self.measurable is None:
-            return found
-        added = self.measurable.roughly if roughly else self.measurable
-        return found + np.asarray(added(times, directions, parameters))
+            return total
+        evaluate = self.measurable.roughly if roughly else self.measurable
+        return total + np.asarray(evaluate(times, directions, parameters))
 
     @shaped
     def _begun(self, free: Float[Array, "k d"]) -> Float[Array, " k"]:
-        """What the worst initial state adds to functionals with the weights ``free (k, d)`` on it."""
+        """Return the support value ``(k,)`` of the deviations of the initial state, for weights ``free (k, d)`` on
+        it."""
         return np.zeros(free.shape[0]) if self.initial is None else self.initial.support(free)
 
     @cached_property
@@ -609,5 +683,5 @@ class WorstCase:
 
 
 def _parts(count: int, several: int) -> list[slice]:
-    """``count`` numbers, ``several`` at a time."""
+    """Return slices that divide ``count`` numbers into parts of at most ``several``."""
     return [slice(first, first + several) for first in range(0, count, several)]

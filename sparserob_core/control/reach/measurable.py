@@ -1,8 +1,9 @@
 """Support of the reachable set when the disturbance may be any measurable function with values in a set.
 
-``sigma(t) = int_0^t h_W(E' e^{A' s} c) ds``: the integral and the maximum commute (Aumann 1965). Of systems that take
-turns it is that of the one that acts, from where it begins to act, and ``sigma`` at that time of the row ``e^{A' s} c``
-that the way from there to ``t`` makes of ``c``: the support function of a set of states in which its turn begins.
+``sigma(t) = int_0^t h_W(E' e^{A' s} c) ds``: the integral and the maximum commute (Aumann 1965). In a switched system
+the integral is that of the mode that acts at ``t``, from the beginning of its phase. Added is ``sigma`` at that
+beginning, of the row ``e^{A' s} c`` to which the transition from there to ``t`` takes ``c``: the support function of
+the set of states in which the phase begins.
 """
 
 from __future__ import annotations
@@ -52,10 +53,13 @@ GUESSED = 8
 
 @dataclass(frozen=True, eq=False)
 class _Table:
-    """What is known of one direction between the times ``starts (n + 1,)``: the integral up to each of them, or its
-    lower and upper bound, ``sums (n + 1, c)``, and of what follows it ``rows (n + 1, d)``, or polynomials with ``terms
-    (n, ORDER + 1, mw)``, what is ``lost (n,)`` by them, and what an integral may be off by, as a goal (``accuracy``)
-    and by the rounding of a time (``late``)."""
+    """Integrals along one direction, between the times ``starts (n + 1,)``.
+
+    ``sums (n + 1, c)`` are the integrals up to each time, or their lower and upper bounds. For the interval after each
+    time there are either ``rows (n + 1, d)``, or polynomials with ``terms (n, ORDER + 1, mw)`` and error bounds
+    ``lost (n,)``. ``accuracy`` is the goal for the error of an integral, and ``late`` the error from the rounding of a
+    time.
+    """
 
     starts: Array
     sums: Array
@@ -68,8 +72,10 @@ class _Table:
 
 @dataclass(frozen=True, eq=False)
 class _Balanced:
-    """``A (d, d)`` in ``units (d,)`` of the states in which it is small, powers of two: what is left of an expansion is
-    bounded by its norm there, the ``speed``."""
+    """A matrix ``A (d, d)`` in ``units (d,)`` of the states in which it is small, powers of two.
+
+    The remainder of an expansion is bounded by the norm of ``A`` in these units, the ``speed``.
+    """
 
     A: Array
     units: Array
@@ -85,8 +91,11 @@ class _Balanced:
 
     @cached_property
     def fastest(self) -> float:
-        """How fast rows move: not by the norm alone, which of a matrix far from normal is much larger than what its
-        flow does."""
+        """Estimate of how fast rows move: four times the largest absolute eigenvalue, kept between ``speed / 16`` and
+        ``speed``.
+
+        The norm alone would not do, since that of a matrix far from normal is much larger than the growth of its flow.
+        """
         return min(self.speed, max(4.0 * float(np.abs(np.linalg.eigvals(self.A)).max()), self.speed / 16.0))
 
     @cached_property
@@ -110,34 +119,37 @@ class MeasurableSupport:
         self, times: Float[Array, " k"], directions: Float[Array, "k d"], parameters: Float[Array, "k nu"]
     ) -> Float[Array, " k"]:
         """``sigma (k,)`` at ``times (k,)``, ``directions (k, d)``, ``parameters (k, nu)``."""
-        unique, which = np.unique(parameters, axis=0, return_inverse=True)
+        unique, parameter_indices = np.unique(parameters, axis=0, return_inverse=True)
         result = np.empty(times.size)
         for position, parameter in enumerate(unique):
-            here = np.flatnonzero(which.reshape(-1) == position)
-            result[here] = self._at(times[here], directions[here], parameter, self.is_enclosed).mean(axis=1)
+            members = np.flatnonzero(parameter_indices.reshape(-1) == position)
+            result[members] = self._at(times[members], directions[members], parameter, self.is_enclosed).mean(axis=1)
         return result
 
     @shaped
     def roughly(
         self, times: Float[Array, " k"], directions: Float[Array, "k d"], parameters: Float[Array, "k nu"]
     ) -> Float[Array, " k"]:
-        """About ``sigma (k,)``, where directions are many and each is asked for once: of a known system that stays as
-        it is by the midpoint rule, whose nodes all of them share."""
+        """Return an approximation of ``sigma (k,)``, for many directions each of which is asked for once.
+
+        For a known system with one mode the approximation is the midpoint rule, whose nodes all directions share. For
+        other systems the result is that of `__call__`.
+        """
         if parameters.shape[1] or self.response.grid.mode is not None:
             return self(times, directions, parameters)
         starts, lengths, columns = self._nodes
-        found, several = np.empty(times.size), max(1, AT_ONCE // (starts.size * columns.shape[2]))
-        for first in range(0, times.size, several):
-            part = slice(first, first + several)
-            spent = np.clip(times[part, None] - starts, 0.0, lengths)
-            found[part] = (spent * self.bound.support(np.tensordot(directions[part], columns, 1))).sum(axis=1)
-        return found
+        values, chunk_size = np.empty(times.size), max(1, AT_ONCE // (starts.size * columns.shape[2]))
+        for first in range(0, times.size, chunk_size):
+            chunk = slice(first, first + chunk_size)
+            durations = np.clip(times[chunk, None] - starts, 0.0, lengths)
+            values[chunk] = (durations * self.bound.support(np.tensordot(directions[chunk], columns, 1))).sum(axis=1)
+        return values
 
     @cached_property
     def _nodes(self) -> tuple[Array, Array, Array]:
-        """Where short intervals of ages begin ``(q,)``, their lengths ``(q,)``, and ``e^{As} E`` in the middle of each,
+        """Beginnings ``(q,)`` and lengths ``(q,)`` of short intervals of ages, and ``e^{As} E`` in the middle of each,
         ``(d, q, mw)``."""
-        A, E = (part[0] for part in self.response.system.modes[0].matrices(np.zeros((1, 0)))[::2])
+        A, E = (matrix[0] for matrix in self.response.system.modes[0].matrices(np.zeros((1, 0)))[::2])
         ages = self.response.grid.breakpoints
         lengths = np.repeat(np.diff(ages) / GUESSED, GUESSED)
         starts = np.repeat(ages[:-1], GUESSED) + lengths * np.tile(np.arange(GUESSED), ages.size - 1)
@@ -147,46 +159,68 @@ class MeasurableSupport:
     def over(
         self, rows: Array, leg: LiftedSystem | VaryingMotion | SpreadMotion, joined: Combination | None = None
     ) -> list[Support]:
-        """What it adds to functionals ``rows (r, d)`` over cells of time, in parts that add up; with ``joined`` to that
-        of a direction that is made of them."""
+        """Return the parts of the support of measurable disturbances on functionals over cells of time; the parts add
+        up.
+
+        Parameters
+        ----------
+        rows : Array
+            Functionals ``(r, d)``.
+        leg : LiftedSystem, VaryingMotion or SpreadMotion
+            The system, or a phase of a switched system.
+        joined : Combination, optional
+            How the rows make up one direction that varies over a cell; without it each row is a functional.
+
+        Returns
+        -------
+        list of Support
+            The parts.
+        """
         assert isinstance(leg, LiftedSystem)
-        return [over_directions(lambda every: MeasurableCellSupport(self, every, leg), rows, leg, joined)]
+        return [over_directions(lambda functionals: MeasurableCellSupport(self, functionals, leg), rows, leg, joined)]
 
     def integrated_sizes(self, times: Array, directions: Array, parameters: Array) -> Array:
-        """The numbers ``(k,)`` that are added up to integrals beside what enters by pieces: none."""
+        """Return the sum ``(k,)`` of the integrals of absolute values that are added up at each index: 0 for this
+        class."""
         return np.zeros(times.size)
 
     @property
     def is_enclosed(self) -> bool:
-        """Whether `enclosed` is close: the set is flat, or its support function is known to be analytic."""
+        """True where the bounds of `enclosed` are close: the set is flat, or its support function is known to be
+        analytic."""
         return enclosed(self.bound)
 
     @shaped
     def enclosed(
         self, times: Float[Array, " k"], directions: Float[Array, "k d"], leg: int | None = None
     ) -> Float[Array, "k 2"]:
-        """What ``sigma`` of a known system is at least and at most, ``(k, 2)``; ``times`` in a ``leg`` of systems that
-        take turns, where one is given, are counted from where it begins."""
+        """Return lower and upper bounds ``(k, 2)`` of ``sigma`` of a known system.
+
+        With a phase ``leg`` of a switched system, ``times`` are counted from the beginning of that phase.
+        """
         bounds = self._at(times, directions, np.zeros(0), enclosed=True, leg=leg)
-        lost = rounding(self.response.grid.pieces) * np.abs(bounds).max(axis=1, initial=0.0)
-        return np.asarray(bounds + lost[:, None] * [-1.0, 1.0])
+        rounding_errors = rounding(self.response.grid.pieces) * np.abs(bounds).max(axis=1, initial=0.0)
+        return np.asarray(bounds + rounding_errors[:, None] * [-1.0, 1.0])
 
     @cached_property
     def _legs(self) -> list[TimeGrid]:
-        """The pieces of every system that takes its turn, in times from where it begins."""
+        """The pieces of every phase of a switched system, in times from the beginning of the phase."""
         grid = self.response.grid
         return [grid] if grid.mode is None else [grid.leg(number) for number in range(len(grid.turns))]
 
     @cached_property
     def _differing(self) -> np.ndarray | None:
-        """The states ``(k,)`` by whose equations alone known systems that take turns differ, if no others depend on
-        them, as of integrals in windows: rows without these see one system all along. ``None`` elsewhere."""
+        """The states ``(k,)`` by whose equations alone the modes of a known switched system differ, if no other states
+        depend on them, as with integrals in windows.
+
+        Rows without these states see one system all along. ``None`` elsewhere.
+        """
         system = self.response.system
         if self.response.grid.mode is None or system.parameter_count:
             return None
-        every = [np.concatenate(one.matrices(np.zeros((1, 0)))[::2], axis=2)[0] for one in system.modes]
-        A, differ = every[0][:, : system.states], np.ptp(every, axis=0).any(axis=1)
-        return None if A[~differ][:, differ].any() else np.flatnonzero(differ)
+        matrices = [np.concatenate(mode.matrices(np.zeros((1, 0)))[::2], axis=2)[0] for mode in system.modes]
+        A, is_different = matrices[0][:, : system.states], np.ptp(matrices, axis=0).any(axis=1)
+        return None if A[~is_different][:, is_different].any() else np.flatnonzero(is_different)
 
     @shaped
     def _at(
@@ -197,12 +231,15 @@ class MeasurableSupport:
         enclosed: bool = False,
         leg: int | None = None,
     ) -> Float[Array, "k n"]:
-        """The integrals, or with ``enclosed`` their lower and upper bounds, as columns: those of the last system from
-        where it begins, and what each before it adds for the rows that the way from its end makes of the directions."""
-        begins = np.array([one.elapsed for one in self._legs])
+        """Return the integrals ``(k, 1)``, or with ``enclosed`` their lower and upper bounds ``(k, 2)``.
+
+        The mode that acts last contributes from the beginning of its phase. Each phase before it contributes for the
+        rows to which the transitions from its end take the directions.
+        """
+        begins = np.array([grid.elapsed for grid in self._legs])
         total = np.zeros((times.size, 2 if enclosed else 1))
         if self._differing is not None and not directions[:, self._differing].any():
-            A, E = (part[0] for part in self.response.system.modes[0].matrices(parameter[None])[::2])
+            A, E = (matrix[0] for matrix in self.response.system.modes[0].matrices(parameter[None])[::2])
             since, key = (0.0 if leg is None else begins[leg]), parameter.tobytes() + b"all" + bytes([enclosed])
             return total + self._until(A, E, self.response.grid.breakpoints, times + since, directions, key)
         if leg is None:
@@ -212,7 +249,7 @@ class MeasurableSupport:
             legs = np.full(times.size, leg)
         rows = directions
         for number in range(int(legs.max(initial=0)), -1, -1):
-            A, E = (part[0] for part in self.response.system.modes[number].matrices(parameter[None])[::2])
+            A, E = (matrix[0] for matrix in self.response.system.modes[number].matrices(parameter[None])[::2])
             ages, length = self._legs[number].breakpoints, float(self._legs[number].breakpoints[-1])
             last, through = np.flatnonzero(legs == number), np.flatnonzero(legs > number)
             key = parameter.tobytes() + number.to_bytes(4) + bytes([enclosed])
@@ -220,99 +257,105 @@ class MeasurableSupport:
             if through.size:
                 total[through] += self._through(A, E, length, rows[through], enclosed)
             if number:
-                mine = np.flatnonzero(legs >= number)
-                spent = np.where(legs[mine] == number, times[mine], length)
+                members = np.flatnonzero(legs >= number)
+                durations = np.where(legs[members] == number, times[members], length)
                 rows = rows.copy()
-                rows[mine] = _moved(A, rows[mine], spent[:, None])[:, 0]
+                rows[members] = _moved(A, rows[members], durations[:, None])[:, 0]
         return total
 
     def _until(self, A: Array, E: Array, ages: Array, times: Array, directions: Array, key: bytes) -> Array:
-        """What one system adds until ``times (k,)`` from where it begins, ``(k, 1)`` or ``(k, 2)``; integrals up to
-        ``ages (L + 1,)`` are remembered, of the parameter and the system that the ``key`` names, which ends with
-        whether they are enclosed."""
+        """Return the contribution of one mode until ``times (k,)`` from the beginning of its phase, ``(k, 1)``, or its
+        lower and upper bounds, ``(k, 2)``.
+
+        Integrals up to ``ages (L + 1,)`` are remembered for the parameter and the mode that ``key`` names. The last
+        byte of ``key`` says whether the integrals are enclosed.
+        """
         if not times.size:
             return np.zeros((0, 1))
-        unique, which = unique_rows(directions)
+        unique, table_indices = unique_rows(directions)
         tables = self._known(A, E, ages, unique, key)
         starts = tables[0].starts
-        parts = np.clip(np.searchsorted(starts, times, side="right") - 1, 0, starts.size - 2)
-        within = np.clip(times - starts[parts], 0.0, None)
-        before, found = np.array([tables[one].sums[part] for one, part in zip(which, parts, strict=True)]), None
+        intervals = np.clip(np.searchsorted(starts, times, side="right") - 1, 0, starts.size - 2)
+        within = np.clip(times - starts[intervals], 0.0, None)
+        before, partial = np.array([tables[i].sums[j] for i, j in zip(table_indices, intervals, strict=True)]), None
         if key[-1]:
-            terms = np.array([tables[one].terms[part] for one, part in zip(which, parts, strict=True)])
-            lost = np.array([tables[one].lost[part] for one, part in zip(which, parts, strict=True)])
-            accuracy = np.array([table.accuracy for table in tables])[which]
-            shares = within / np.diff(starts)[parts]
+            terms = np.array([tables[i].terms[j] for i, j in zip(table_indices, intervals, strict=True)])
+            errors = np.array([tables[i].lost[j] for i, j in zip(table_indices, intervals, strict=True)])
+            accuracy = np.array([table.accuracy for table in tables])[table_indices]
+            shares = within / np.diff(starts)[intervals]
             terms = terms * (shares[:, None] ** np.arange(ORDER + 1))[..., None]
-            late = np.where(times > 0.0, np.array([table.late for table in tables])[which], 0.0)
-            found = integrated(self.bound, terms, within, accuracy) + (shares * lost + late)[:, None] * [-1.0, 1.0]
+            late = np.where(times > 0.0, np.array([table.late for table in tables])[table_indices], 0.0)
+            partial = integrated(self.bound, terms, within, accuracy) + (shares * errors + late)[:, None] * [-1.0, 1.0]
         else:
-            rows = np.stack([tables[one].rows[part] for one, part in zip(which, parts, strict=True)])
-            found = self._integrals(A, E, rows, within, which)[:, None]
-        return np.asarray(before + found)
+            rows = np.stack([tables[i].rows[j] for i, j in zip(table_indices, intervals, strict=True)])
+            partial = self._integrals(A, E, rows, within, table_indices)[:, None]
+        return np.asarray(before + partial)
 
     def _through(self, A: Array, E: Array, length: float, directions: Array, enclosed: bool) -> Array:
-        """What one system adds over all of its turn of this ``length`` for rows ``directions (k, d)`` at its end, which
-        are others at every time: nothing is remembered of them."""
+        """Return the contribution of one mode over a whole phase of this ``length``, for rows ``directions (k, d)`` at
+        its end.
+
+        Nothing is remembered, since the rows are different at every time.
+        """
         if not enclosed:
-            lengths, alone = np.full(len(directions), length), np.arange(len(directions))
-            return self._integrals(A, E, directions, lengths, alone)[:, None]
+            lengths, owners = np.full(len(directions), length), np.arange(len(directions))
+            return self._integrals(A, E, directions, lengths, owners)[:, None]
         starts = self._short(A, np.array([0.0, length]))
-        lengths, found = np.diff(starts), np.empty((len(directions), 2))
-        several = max(1, AT_ONCE // (lengths.size * (ORDER + 1) * max(E.shape)))
-        for first in range(0, len(directions), several):
-            part = slice(first, first + several)
-            terms, lost, tallest = self._expanded(A, E, directions[part], starts)
+        lengths, values = np.diff(starts), np.empty((len(directions), 2))
+        chunk_size = max(1, AT_ONCE // (lengths.size * (ORDER + 1) * max(E.shape)))
+        for first in range(0, len(directions), chunk_size):
+            chunk = slice(first, first + chunk_size)
+            terms, errors, tallest = self._expanded(A, E, directions[chunk], starts)
             accuracy = ACCURACY * np.maximum(tallest * length, TINY)
-            every = np.tile(lengths, len(terms)), np.repeat(accuracy, lengths.size)
-            bounds = integrated(self.bound, terms.reshape(-1, *terms.shape[2:]), *every)
-            size = rounding(lengths.size) * np.abs(bounds).max(axis=1).reshape(lost.shape).sum(axis=1)
-            lost = lost.sum(axis=1) * (1.0 + rounding(lengths.size)) + size
+            intervals = np.tile(lengths, len(terms)), np.repeat(accuracy, lengths.size)
+            bounds = integrated(self.bound, terms.reshape(-1, *terms.shape[2:]), *intervals)
+            size = rounding(lengths.size) * np.abs(bounds).max(axis=1).reshape(errors.shape).sum(axis=1)
+            errors = errors.sum(axis=1) * (1.0 + rounding(lengths.size)) + size
             late = rounding(8) * float(self.response.grid.breakpoints[-1]) * tallest
-            found[part] = bounds.reshape(*lost.shape, -1, 2).sum(axis=1) + (lost + late)[:, None] * [-1.0, 1.0]
-        return found
+            values[chunk] = bounds.reshape(*errors.shape, -1, 2).sum(axis=1) + (errors + late)[:, None] * [-1.0, 1.0]
+        return values
 
     def _known(self, A: Array, E: Array, ages: Array, directions: Array, key: bytes) -> list[_Table]:
-        """What is remembered of each of ``directions (k, d)``."""
+        """Return the table of each of ``directions (k, d)``, made where none is remembered."""
         keys = [direction.tobytes() + key for direction in directions]
-        found = {one: self._tables[one] for one in keys if one in self._tables}
-        new = np.array([number for number, one in enumerate(keys) if one not in found], dtype=int)
+        tables = {table_key: self._tables[table_key] for table_key in keys if table_key in self._tables}
+        missing = np.array([number for number, table_key in enumerate(keys) if table_key not in tables], dtype=int)
         make = self._enclosing if key[-1] else self._measuring
-        for number, table in zip(new.tolist(), make(A, E, ages, directions[new]), strict=True):
-            found[keys[number]] = remember(self._tables, keys[number], table, TABLES_KEPT)
-        return [found[one] for one in keys]
+        for number, table in zip(missing.tolist(), make(A, E, ages, directions[missing]), strict=True):
+            tables[keys[number]] = remember(self._tables, keys[number], table, TABLES_KEPT)
+        return [tables[table_key] for table_key in keys]
 
     def _measuring(self, A: Array, E: Array, ages: Array, directions: Array) -> Iterator[_Table]:
-        """By quadrature, from one of ``ages (L + 1,)`` to the next, of each of ``directions (k, d)``."""
+        """Yield the table of each of ``directions (k, d)``, with integrals by quadrature from one of ``ages (L + 1,)``
+        to the next."""
         for direction in directions:
             rows = _moved(A, direction[None], ages[None])[0]
-            lengths, alike = np.diff(ages), np.zeros(ages.size - 1, dtype=int)
-            sums = np.append(0.0, np.cumsum(self._integrals(A, E, rows[:-1], lengths, alike)))
+            lengths, owners = np.diff(ages), np.zeros(ages.size - 1, dtype=int)
+            sums = np.append(0.0, np.cumsum(self._integrals(A, E, rows[:-1], lengths, owners)))
             yield _Table(ages, sums[:, None], rows=rows)
 
     def _enclosing(self, A: Array, E: Array, ages: Array, directions: Array) -> Iterator[_Table]:
-        """Lower and upper bounds, from the end of one short interval to that of the next, of each of ``directions (k,
-        d)``.
+        """Yield the table of each of ``directions (k, d)``, with lower and upper bounds at the ends of short intervals.
 
-        On short intervals a row is a polynomial ``f`` with a rest. In Bernstein's form ``f`` is a convex combination of
-        its coefficients ``b_k`` with weights of equal integrals, and ``h`` is convex; so the integral is at most the
-        length times the mean of ``h(b_k)``, and at least that of ``w'b_k`` for any point ``w`` of the set. Both are
-        equal where one corner of the set is best for all; an interval where another takes over is halved.
+        On short intervals a row is a polynomial ``f`` with a remainder. In Bernstein's form ``f`` is a convex
+        combination of its coefficients ``b_k`` with weights of equal integrals, and ``h`` is convex. So the integral is
+        at most the length times the mean of ``h(b_k)``, and at least that of ``w'b_k`` for any point ``w`` of the set.
+        Both are equal where one corner of the set is best for all; an interval where another takes over is halved.
         """
         starts = self._short(A, ages)
         lengths, horizon = np.diff(starts), float(self.response.grid.breakpoints[-1])
-        several = max(1, AT_ONCE // (lengths.size * (ORDER + 1) * max(E.shape)))
-        for first in range(0, len(directions), several):
-            terms, lost, tallest = self._expanded(A, E, directions[first : first + several], starts)
+        chunk_size = max(1, AT_ONCE // (lengths.size * (ORDER + 1) * max(E.shape)))
+        for first in range(0, len(directions), chunk_size):
+            terms, errors, tallest = self._expanded(A, E, directions[first : first + chunk_size], starts)
             accuracy = ACCURACY * np.maximum(tallest * horizon, TINY)
-            every = np.tile(lengths, len(terms)), np.repeat(accuracy, lengths.size)
-            bounds = integrated(self.bound, terms.reshape(-1, *terms.shape[2:]), *every).reshape(*lost.shape, 2)
-            bounds = bounds + lost[..., None] * [-1.0, 1.0]
+            intervals = np.tile(lengths, len(terms)), np.repeat(accuracy, lengths.size)
+            bounds = integrated(self.bound, terms.reshape(-1, *terms.shape[2:]), *intervals).reshape(*errors.shape, 2)
+            bounds = bounds + errors[..., None] * [-1.0, 1.0]
             late = rounding(8) * horizon * tallest
-            for number, found in enumerate(bounds):
-                sums = np.vstack([np.zeros(2), np.cumsum(found, axis=0)])
+            for number, interval_bounds in enumerate(bounds):
+                sums = np.vstack([np.zeros(2), np.cumsum(interval_bounds, axis=0)])
                 own = float(accuracy[number]), float(late[number])
-                yield _Table(starts, sums, terms=terms[number], lost=lost[number], accuracy=own[0], late=own[1])
+                yield _Table(starts, sums, terms=terms[number], lost=errors[number], accuracy=own[0], late=own[1])
 
     def _short(self, A: Array, ages: Array) -> Array:
         """The ends ``(n + 1,)`` of short intervals, as many between all neighbours of ``ages (L + 1,)``."""
@@ -321,32 +364,48 @@ class MeasurableSupport:
         return np.append((ages[:-1, None] + np.outer(pieces, np.arange(count) / count)).ravel(), ages[-1])
 
     def _in_balance(self, A: Array) -> _Balanced:
-        """What is remembered of the matrix of a system."""
+        """Return the balanced form of the matrix ``A (d, d)`` of a system; the last ones are remembered."""
         key = A.tobytes()
         return self._balanced.get(key) or remember(self._balanced, key, _Balanced.of(A), KEPT)
 
     def _expanded(self, A: Array, E: Array, directions: Array, starts: Array) -> tuple[Array, Array, Array]:
-        """Of every row ``directions (k, d)`` on every interval between ``starts (n + 1,)``: polynomials ``(k, n,
-        ORDER + 1, mw)`` in the share of it that has passed, what the integral over it may be off by with them, ``(k,
-        n)``, and the largest integrand, ``(k,)``."""
-        known = self._in_balance(A)
-        A, units, speed, E = known.A, known.units, known.speed, E / known.units[:, None]
-        lengths, far, count = np.tile(np.diff(starts), len(directions)), self.bound.radius_bound, len(directions)
-        once, sized = known.products
-        row = known.leaps.orbits(directions * units, starts[:-1])[0].swapaxes(0, 1).reshape(-1, A.shape[0])
+        """Return polynomials of every row on every interval, with error bounds.
+
+        Parameters
+        ----------
+        A, E : Array
+            Matrices ``(d, d)`` and ``(d, mw)`` of the system.
+        directions : Array
+            Rows ``(k, d)``.
+        starts : Array
+            Ends ``(n + 1,)`` of the intervals.
+
+        Returns
+        -------
+        Array, Array, Array
+            Polynomials ``(k, n, ORDER + 1, mw)`` in the share of the interval that has passed; bounds ``(k, n)`` of the
+            error of the integral over the interval with them; and bounds ``(k,)`` of the integrand.
+        """
+        balanced = self._in_balance(A)
+        A, units, speed, E = balanced.A, balanced.units, balanced.speed, E / balanced.units[:, None]
+        lengths, radius, count = np.tile(np.diff(starts), len(directions)), self.bound.radius_bound, len(directions)
+        matrix, absolute_matrix = balanced.products
+        row = balanced.leaps.orbits(directions * units, starts[:-1])[0].swapaxes(0, 1).reshape(-1, A.shape[0])
         terms, sizes, size = [row @ E], np.abs(row) @ np.abs(E), np.abs(row)
         for order in range(1, ORDER + 1):
             step = (lengths / order)[:, None]
-            row, size = step * np.asarray(row @ once), step * np.asarray(size @ sized)
+            row, size = step * np.asarray(row @ matrix), step * np.asarray(size @ absolute_matrix)
             terms.append(row @ E)
             sizes = sizes + size @ np.abs(E)
         with np.errstate(over="ignore"):
             growth = np.exp(speed * lengths) * lengths / (ORDER + 1)
         operations = ORDER * (A.shape[0] + 4) + A.shape[0] + 4 * E.shape[1] + HALVINGS
-        lost = far * (np.linalg.norm(np.asarray(row @ once), axis=1) * growth * np.linalg.norm(E, 2))
-        lost = lengths * (lost + far * rounding(operations) * np.linalg.norm(sizes, axis=1)) * (1.0 + rounding(8))
-        tallest = far * np.linalg.norm(sizes, axis=1).reshape(count, -1).max(axis=1, initial=0.0)
-        return np.stack(terms, axis=1).reshape(count, -1, ORDER + 1, E.shape[1]), lost.reshape(count, -1), tallest
+        errors = radius * (np.linalg.norm(np.asarray(row @ matrix), axis=1) * growth * np.linalg.norm(E, 2))
+        errors = (
+            lengths * (errors + radius * rounding(operations) * np.linalg.norm(sizes, axis=1)) * (1.0 + rounding(8))
+        )
+        tallest = radius * np.linalg.norm(sizes, axis=1).reshape(count, -1).max(axis=1, initial=0.0)
+        return np.stack(terms, axis=1).reshape(count, -1, ORDER + 1, E.shape[1]), errors.reshape(count, -1), tallest
 
     @shaped
     def _integrals(
@@ -367,23 +426,23 @@ class MeasurableSupport:
         offsets = np.outer(lengths, np.arange(count) / count)
         starts = _moved(A, starts, offsets).reshape(-1, A.shape[0])
         lengths = lengths[owner] / count
-        whole, size = self._quadrature(A, E, starts, lengths)
+        estimate, size = self._quadrature(A, E, starts, lengths)
         largest = np.zeros(int(member.max(initial=0)) + 1)
         np.maximum.at(largest, member[owner], size)
         accuracy = ACCURACY * np.maximum(largest[member] * float(self.response.grid.breakpoints[-1]), TINY)
         for _ in range(HALVINGS):
             middles = _moved(A, starts, lengths[:, None] / 2)[:, 0]
-            left, right = (
+            first_half, second_half = (
                 self._quadrature(A, E, starts, lengths / 2)[0],
                 self._quadrature(A, E, middles, lengths / 2)[0],
             )
-            open_ = np.abs(left + right - whole) > accuracy[owner]
-            np.add.at(total, owner[~open_], (left + right)[~open_])
+            open_ = np.abs(first_half + second_half - estimate) > accuracy[owner]
+            np.add.at(total, owner[~open_], (first_half + second_half)[~open_])
             starts, lengths = np.vstack([starts[open_], middles[open_]]), np.tile(lengths[open_] / 2, 2)
-            whole, owner = np.concatenate([left[open_], right[open_]]), np.tile(owner[open_], 2)
+            estimate, owner = np.concatenate([first_half[open_], second_half[open_]]), np.tile(owner[open_], 2)
             if not owner.size:
                 return total
-        np.add.at(total, owner, whole)
+        np.add.at(total, owner, estimate)
         return total
 
     @shaped
@@ -396,18 +455,18 @@ class MeasurableSupport:
 
 def _moved(A: Array, rows: Array, durations: Array) -> Array:
     """``c'e^{A r} (k, q, d)`` of ``rows (k, d)`` over ``durations (k, q)`` of their own."""
-    every = np.repeat(rows, durations.shape[1], axis=0)
-    return Leaps(A).rows(every, durations.ravel())[0].reshape(*durations.shape, -1)
+    repeated = np.repeat(rows, durations.shape[1], axis=0)
+    return Leaps(A).rows(repeated, durations.ravel())[0].reshape(*durations.shape, -1)
 
 
 @dataclass(frozen=True, eq=False)
 class MeasurableCellSupport(KnownCellSupport):
     """The support function of measurable disturbances on functionals ``rows (r, d)`` of a *known* system, in the form
-    of `DisturbanceSupport`; ``lifted`` is that system, or one of those that take turns.
+    of `DisturbanceSupport`; ``lifted`` is that system, or a phase of a switched system.
 
     ``sigma`` is an integral with a Lipschitz integrand, so its second derivative is bounded by that of the integrand's
-    argument. What earlier systems did is the support function of a set in which the turn of this one begins: it bends,
-    and is rounded, no more than that of a box around this set.
+    argument. The effect of earlier phases is the support function of a set in which this phase begins. Its curvature
+    and its rounding are no more than those of a box around this set.
     """
 
     support: MeasurableSupport
@@ -418,12 +477,12 @@ class MeasurableCellSupport(KnownCellSupport):
     def at(
         self, times: Float[Array, " k"], ends: Float[Array, "k r 0"]
     ) -> tuple[Float[Array, "k r 1"], Float[Array, "k r"]]:
-        """The support function ``(k, r, 1)`` and how far it may be from that, ``(k, r)``; ``ends (k, r, 0)``."""
-        every = self.repeated(times)
+        """Return support values ``(k, r, 1)`` and their error bounds ``(k, r)``; ``ends (k, r, 0)`` is empty."""
+        pairs = self.repeated(times)
         if self.support.is_enclosed:
-            return self.between(self.support.enclosed(*every, leg=self.lifted.turn))
+            return self.between(self.support.enclosed(*pairs, leg=self.lifted.turn))
         k, r = times.size, self.rows.shape[0]
-        sigma = self.support(every[0] + self.lifted.grid.elapsed, every[1], np.zeros((k * r, 0))).reshape(k, r)
+        sigma = self.support(pairs[0] + self.lifted.grid.elapsed, pairs[1], np.zeros((k * r, 0))).reshape(k, r)
         return sigma[..., None], MISSED * np.abs(sigma)
 
     @shaped
@@ -436,57 +495,61 @@ class MeasurableCellSupport(KnownCellSupport):
         reach = comparison.over(widths)
         drive = np.broadcast_to(self._drive, (start.size, self._drive.size))
         square = (widths**2 / 8)[:, None]
-        moved = product(block_norms(slopes, lifted.starts), reach.departure.on(drive)[..., None])[..., 0]
-        exact = square * (bound.reach(slopes @ W) + moved)
-        now = comparison.over(start).flow.on(drive)
+        change = product(block_norms(slopes, lifted.starts), reach.departure.on(drive)[..., None])[..., 0]
+        exact = square * (bound.reach(slopes @ W) + change)
+        current_drive = comparison.over(start).flow.on(drive)
         by_mode = np.minimum(
-            square * product(reach.peak.on(now), comparison.sizes.T),
-            2.0 * reach.integral.on(now),
+            square * product(reach.peak.on(current_drive), comparison.sizes.T),
+            2.0 * reach.integral.on(current_drive),
         )
-        found = np.minimum(exact, product(block_norms(rows, lifted.starts), by_mode.T).T)
-        return np.asarray(found if self._earlier is None else found + self._earlier.deviation(start, widths))
+        bounds = np.minimum(exact, product(block_norms(rows, lifted.starts), by_mode.T).T)
+        return np.asarray(bounds if self._earlier is None else bounds + self._earlier.deviation(start, widths))
 
     @cached_property
     def neglected(self) -> Array:
-        """What rounding may change of ``e^{A' s} c``, times the disturbance, at most, ``(r, L)``."""
-        found = self._rounded(self.rows @ self.lifted.transform)
-        return found if self._earlier is None else found + self._earlier.neglected
+        """Bounds ``(r, L)`` of the rounding error of ``e^{A' s} c``, times the disturbance."""
+        error_bounds = self._rounded(self.rows @ self.lifted.transform)
+        return error_bounds if self._earlier is None else error_bounds + self._earlier.neglected
 
     def _rounded(self, rows: Array) -> Array:
-        """The same of ``rows (r, d)`` in the coordinates of the lifted system, without what was before its turn."""
+        """Return `neglected` for ``rows (r, d)`` in the coordinates of the lifted system, without the effect of earlier
+        phases."""
         lifted = self.lifted
         _, remainder = lifted.row_bounds(rows)
-        pushed = np.cumsum((remainder @ self._drive)[:, lifted.span] * lifted.fine.lengths, axis=1)
-        return np.asarray(pushed[:, lifted.ends[1:] - 1])
+        errors = np.cumsum((remainder @ self._drive)[:, lifted.span] * lifted.fine.lengths, axis=1)
+        return np.asarray(errors[:, lifted.ends[1:] - 1])
 
     @cached_property
     def reached(self) -> Array:
-        """As in `DisturbanceSupport`, ``(L, q)``."""
+        """Norm bounds ``(L, q)`` of the effect of any disturbance on every block of the coordinates until the end of
+        every piece."""
         reach = self.lifted.comparison.over(self.lifted.grid.breakpoints[1:])
-        found = reach.integral.on(np.broadcast_to(self._drive, (self.lifted.grid.pieces, self._drive.size)))
-        return found if self._earlier is None else found + self._earlier.reached
+        bounds = reach.integral.on(np.broadcast_to(self._drive, (self.lifted.grid.pieces, self._drive.size)))
+        return bounds if self._earlier is None else bounds + self._earlier.reached
 
     @cached_property
     def _earlier(self) -> InitialSupport | None:
-        """What disturbances made of the state before the turn of this system begins, as a box of states around it; of
-        the first ``None``."""
+        """The effect of disturbances before this phase on the state, as the support of a box of states at its
+        beginning; ``None`` in the first phase."""
         past = self.lifted.past
         if past is None:
             return None
-        known = past.carried.get(id(self.support))
-        if not isinstance(known, Carried):
+        earlier_effect = past.carried.get(id(self.support))
+        if not isinstance(earlier_effect, Carried):
             axes = np.eye(past.lifted.states)
-            ended = MeasurableCellSupport(self.support, self.rows, past.lifted)
-            left_out = ended._rounded(axes)[:, -1]
-            if ended._earlier is not None:
-                left_out = left_out + replace(ended._earlier, rows=axes).neglected[:, -1]
-            far = np.repeat(ended.reached[-1], np.diff(past.lifted.starts, append=past.lifted.states))
-            around = Box(-far, far)
-            known = carried(past, (self.support, around), axes[:, None], far[:, None], ended.reached[-1], left_out)
-            past.carried.update({id(self.support): known, id(around): known})
-        assert isinstance(known.of, tuple)
-        _, around = known.of
-        return InitialSupport(self.lifted, around, self.rows @ self.lifted.transform)
+            earlier_support = MeasurableCellSupport(self.support, self.rows, past.lifted)
+            left_out = earlier_support._rounded(axes)[:, -1]
+            if earlier_support._earlier is not None:
+                left_out = left_out + replace(earlier_support._earlier, rows=axes).neglected[:, -1]
+            radii = np.repeat(earlier_support.reached[-1], np.diff(past.lifted.starts, append=past.lifted.states))
+            box = Box(-radii, radii)
+            earlier_effect = carried(
+                past, (self.support, box), axes[:, None], radii[:, None], earlier_support.reached[-1], left_out
+            )
+            past.carried.update({id(self.support): earlier_effect, id(box): earlier_effect})
+        assert isinstance(earlier_effect.of, tuple)
+        _, box = earlier_effect.of
+        return InitialSupport(self.lifted, box, self.rows @ self.lifted.transform)
 
     @property
     def _drive(self) -> Array:

@@ -73,8 +73,8 @@ def nominal_sizes(functionals: WorstCase, x: Array, H: Array, G: Array | None = 
     chosen = np.linspace(0, breakpoints.size - 1, min(breakpoints.size, LOOKED_AT)).round().astype(int)
     times = breakpoints[np.unique(chosen)]
     rows, point = np.tile(H, (times.size, 1)), np.zeros(0) if parameters is None else nominal_point(parameters)
-    found = nominal.values(x, np.repeat(times, len(H)), rows, np.tile(point, (len(rows), 1)))
-    values = found.reshape(times.size, len(H))
+    flat_values = nominal.values(x, np.repeat(times, len(H)), rows, np.tile(point, (len(rows), 1)))
+    values = flat_values.reshape(times.size, len(H))
     if G is not None:
         starts = nominal.dictionary.breakpoints[:-1]
         pieces = np.clip(np.searchsorted(starts, times, side="right") - 1, 0, starts.size - 1)

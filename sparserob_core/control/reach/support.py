@@ -1,6 +1,8 @@
-"""Parts of the uncertainty, enclosed over cells of time, parameters and directions, and what several of them add up to:
-how far the worst initial state of a set pushes a functional of the state, and what is asked along single directions, as
-over a cell of these."""
+"""Parts of the uncertainty, enclosed over cells of time, parameters and directions, and the sum of several parts.
+
+The module holds the support function of the deviations of the initial state, and the support over a cell of directions
+from the support along single directions.
+"""
 
 from __future__ import annotations
 
@@ -24,24 +26,25 @@ from sparserob_core.sip.convex_set import Array, ConvexSet
 
 
 class Support(Protocol):
-    """A part of the uncertainty on functionals ``(r, d)`` over one cell, as `DisturbanceSupport` says it."""
+    """A part of the uncertainty on functionals ``(r, d)`` over one cell, in the form of `DisturbanceSupport`."""
 
     def steepness(self, times: Array) -> Array:
-        """How steep it can be in each parameter, ``(k, r, nu)``."""
+        """Return bounds ``(k, r, nu)`` of the slope in each parameter."""
 
     def at(self, times: Array, ends: Array) -> tuple[Array, Array]:
         """Taylor coefficients ``(k, r, M)`` and excess ``(k, r)``."""
 
     def deviation(self, start: Array, widths: Array) -> Array:
-        """How far it is from its chord on time cells, ``(k, r)``."""
+        """Return bounds ``(k, r)`` of the distance of the support function from its chord on cells of time
+        ``[start, start + width]``."""
 
     @property
     def neglected(self) -> Array:
-        """What the Taylor models leave out on every piece, ``(r, L)``."""
+        """Bounds ``(r, L)`` of the remainder of the Taylor models on every piece."""
 
     @property
     def reached(self) -> Array:
-        """How large what it makes of the state may be on every piece, block by block, ``(L, q)``."""
+        """Norm bounds ``(L, q)`` of the effect on the state on every piece, block by block."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,35 +55,35 @@ class Supports:
 
     def steepness(self, times: Array) -> Array:
         """`Support.steepness` of all parts."""
-        return np.asarray(sum(part.steepness(times) for part in self.parts))
+        return np.asarray(sum(support.steepness(times) for support in self.parts))
 
     def at(self, times: Array, ends: Array) -> tuple[Array, Array]:
         """`Support.at` of all parts."""
-        found = [part.at(times, ends) for part in self.parts]
-        return np.asarray(sum(one for one, _ in found)), np.asarray(sum(excess for _, excess in found))
+        pairs = [support.at(times, ends) for support in self.parts]
+        return np.asarray(sum(polynomial for polynomial, _ in pairs)), np.asarray(sum(excess for _, excess in pairs))
 
     def deviation(self, start: Array, widths: Array) -> Array:
         """`Support.deviation` of all parts."""
-        return np.asarray(sum(part.deviation(start, widths) for part in self.parts))
+        return np.asarray(sum(support.deviation(start, widths) for support in self.parts))
 
     @cached_property
     def neglected(self) -> Array:
         """`Support.neglected` of all parts."""
-        return np.asarray(sum(part.neglected for part in self.parts))
+        return np.asarray(sum(support.neglected for support in self.parts))
 
     @cached_property
     def reached(self) -> Array:
         """`Support.reached` of all parts."""
-        return np.asarray(sum(part.reached for part in self.parts))
+        return np.asarray(sum(support.reached for support in self.parts))
 
 
 @dataclass(frozen=True, eq=False)
 class InitialSupport:
-    """The support function ``h(e^{A't} c)`` of a set of deviations from the initial state, for functionals ``rows (r,
-    d)`` (in the lifted system's coordinates) over one cell.
+    """The support function ``h(e^{A't} c)`` of a set of deviations from the initial state, for functionals
+    ``rows (r, d)`` (in the lifted system's coordinates) over one cell.
 
-    The deviation is one block that received all it ever will at time 0: what `DisturbanceSupport` says of a block that
-    has ended holds of it.
+    The deviation is one block that acts at time 0 and never again: the bounds of `DisturbanceSupport` for a block that
+    has ended hold for it.
     """
 
     lifted: LiftedSystem
@@ -89,7 +92,8 @@ class InitialSupport:
     combination: Combination | None = None
 
     def steepness(self, times: Array) -> Array:
-        """How steep the functional of *any* one deviation can be in each parameter over the cell: ``(k, r, nu)``."""
+        """Return bounds ``(k, r, nu)`` of the slope of the functional in each parameter over the cell, under *any* one
+        deviation."""
         return np.asarray(self._reaches(self._combined(self.blocks(times))) @ self._space.exponents)
 
     def at(self, times: Array, ends: Array) -> tuple[Array, Array]:
@@ -98,44 +102,52 @@ class InitialSupport:
         return over_faces(
             self._space,
             ends,
-            lambda here, face: summed(self.set, self._combined(self.blocks(times[here]))[:, :, :, None], face)[:, :, 0],
+            lambda index, face: summed(self.set, self._combined(self.blocks(times[index]))[:, :, :, None], face)[
+                :, :, 0
+            ],
         )
 
     def deviation(self, start: Array, widths: Array) -> Array:
-        """Bounds ``(k, r)`` of how far it is from its chord on ``[start, start + width]``, each inside one piece,
-        summed over the Taylor coefficients: as in `DisturbanceSupport.deviation`."""
+        """Return bounds ``(k, r)`` of the distance of the support function from its chord on
+        ``[start, start + width]``.
+
+        Each interval is inside one piece. The distances are summed over the Taylor coefficients, as in
+        `DisturbanceSupport.deviation`.
+        """
         lifted, grid = self.lifted, self.lifted.grid
         comparison, starts = lifted.comparison, lifted.starts
         pieces = np.clip(np.searchsorted(grid.breakpoints, start, side="right") - 1, 0, grid.pieces - 1)
-        moved = comparison.over(start - grid.breakpoints[pieces], cells=True).flow
-        old, reach = moved.on(self._gains[pieces]), comparison.over(widths, cells=True)
-        bent = self._lifted_rows(start) @ lifted.row_matrix @ lifted.row_matrix
-        sizes = self._reaches(self._parts(bent)).sum(axis=2)
+        flow = comparison.over(start - grid.breakpoints[pieces], cells=True).flow
+        ended_sizes, reach = flow.on(self._gains[pieces]), comparison.over(widths, cells=True)
+        curvature_rows = self._lifted_rows(start) @ lifted.row_matrix @ lifted.row_matrix
+        sizes = self._reaches(self._parts(curvature_rows)).sum(axis=2)
         square = (widths**2 / 8)[:, None]
-        first = np.zeros((self.rows.shape[0], lifted.row_matrix.shape[0]))
-        first[:, : lifted.states] = self.rows
-        twice = first @ lifted.row_matrix @ lifted.row_matrix
-        norms = block_norms(twice.reshape(*twice.shape[:-1], -1, lifted.states), starts).sum(axis=-2)
-        exact = square * (sizes + product(norms, reach.departure.on(old).T).T)
+        lifted_rows = np.zeros((self.rows.shape[0], lifted.row_matrix.shape[0]))
+        lifted_rows[:, : lifted.states] = self.rows
+        initial_curvature = lifted_rows @ lifted.row_matrix @ lifted.row_matrix
+        norms = block_norms(initial_curvature.reshape(*initial_curvature.shape[:-1], -1, lifted.states), starts).sum(
+            axis=-2
+        )
+        exact = square * (sizes + product(norms, reach.departure.on(ended_sizes).T).T)
         ended = np.minimum(
-            square * product(reach.peak.on(old), (comparison.sizes @ comparison.sizes).T),
-            2.0 * product(reach.integral.on(old), comparison.sizes.T),
+            square * product(reach.peak.on(ended_sizes), (comparison.sizes @ comparison.sizes).T),
+            2.0 * product(reach.integral.on(ended_sizes), comparison.sizes.T),
         )
         return np.asarray(np.minimum(exact, product(block_norms(self.rows, starts), ended.T).T))
 
     @cached_property
     def neglected(self) -> Array:
-        """What the Taylor models leave out, at most, on every piece: ``(r, L)``."""
+        """Bounds ``(r, L)`` of the remainder of the Taylor models on every piece."""
         lifted = self.lifted
         sizes, remainder = lifted.row_bounds(self.rows)
-        pushed = remainder @ self._sizes + sizes.sum(axis=2) @ self._slack
+        remainders = remainder @ self._sizes + sizes.sum(axis=2) @ self._slack
         if self._carried is not None:
-            pushed = pushed + np.einsum("rlaj,aj->rl", sizes, lifted.spilt(self._carried.sizes))
-        return np.asarray(np.maximum.reduceat(pushed[:, lifted.span], lifted.ends[:-1], axis=1))
+            remainders = remainders + np.einsum("rlaj,aj->rl", sizes, lifted.spilt(self._carried.sizes))
+        return np.asarray(np.maximum.reduceat(remainders[:, lifted.span], lifted.ends[:-1], axis=1))
 
     @cached_property
     def reached(self) -> Array:
-        """What any deviation can have made of every block of the coordinates on every piece, ``(L, q)``."""
+        """Norm bounds ``(L, q)`` of the effect of any deviation on every block of the coordinates on every piece."""
         peak = self.lifted.comparison.over(self.lifted.grid.lengths).peak
         return peak.on(self._gains[:-1])
 
@@ -147,7 +159,8 @@ class InitialSupport:
         return blocks if self.combination is None else self.combination.apply(blocks)
 
     def _reaches(self, blocks: Array) -> Array:
-        """How much any one deviation can make of every Taylor coefficient ``(k, r, M, d)``: ``(k, r, M)``."""
+        """Return bounds ``(k, r, M)`` of the absolute value of every Taylor coefficient under any one deviation, from
+        weights ``(k, r, M, d)``."""
         return np.asarray(self.set.reach(blocks))
 
     def blocks(self, times: Array) -> Array:
@@ -157,30 +170,36 @@ class InitialSupport:
     def _parts(self, rows: Array) -> Array:
         """Lifted rows ``(k, r, M d)`` as Taylor coefficients of weights on the deviation ``(k, r, M, d)``."""
         space = self.lifted.space
-        parts = rows.reshape(*rows.shape[:2], space.size, self.lifted.states)
+        coefficients = rows.reshape(*rows.shape[:2], space.size, self.lifted.states)
         if self._carried is None:
-            return np.asarray(parts @ self.lifted.decoupling.inverse.astype(float))
-        found, effect = np.zeros((*parts.shape[:-1], self.set.dimension)), self._carried.effect
+            return np.asarray(coefficients @ self.lifted.decoupling.inverse.astype(float))
+        weights, effect = np.zeros((*coefficients.shape[:-1], self.set.dimension)), self._carried.effect
         for left, right, target in zip(*space.products, strict=True):
-            found[..., target, :] += parts[..., right, :] @ effect[left]
-        return found
+            weights[..., target, :] += coefficients[..., right, :] @ effect[left]
+        return weights
 
     @property
     def _carried(self) -> Carried | None:
-        """What a deviation made of the state before a later leg begins, ``effect (M, d, d)``."""
+        """The effect of a deviation on the state before a later phase begins, ``effect (M, d, d)``; ``None`` in the
+        first phase."""
         past = self.lifted.past
         if past is None:
             return None
-        known = past.carried.get(id(self.set))
-        if not isinstance(known, Carried):
+        earlier_effect = past.carried.get(id(self.set))
+        if not isinstance(earlier_effect, Carried):
             d = past.turn.shape[0]
-            ended = InitialSupport(past.lifted, self.set, np.eye(d))
-            far = self.set.reach(np.eye(self.set.dimension))
-            old = ended.blocks(past.lifted.grid.breakpoints[-1:])[0]  # (d, M, d)
-            known = past.carried[id(self.set)] = carried(
-                past, self.set, old, np.abs(old) @ far, ended._gains[-1], ended.neglected[:, -1]
+            earlier_support = InitialSupport(past.lifted, self.set, np.eye(d))
+            radii = self.set.reach(np.eye(self.set.dimension))
+            effect = earlier_support.blocks(past.lifted.grid.breakpoints[-1:])[0]  # (d, M, d)
+            earlier_effect = past.carried[id(self.set)] = carried(
+                past,
+                self.set,
+                effect,
+                np.abs(effect) @ radii,
+                earlier_support._gains[-1],
+                earlier_support.neglected[:, -1],
             )
-        return known
+        return earlier_effect
 
     def _lifted_rows(self, times: Array) -> Array:
         """The lifted functionals that ``c'x(t)`` are of the state at time 0, ``(k, r, M d)``."""
@@ -204,27 +223,29 @@ class InitialSupport:
         """Norms of every block of the coordinates of any deviation, at most, ``(q,)``."""
         if self._carried is not None:
             return self._carried.reached
-        far = self.set.reach(np.eye(self.set.dimension))
-        return block_norms(np.abs(self.lifted.decoupling.inverse).astype(float) @ far, self.lifted.starts) + self._slack
+        radii = self.set.reach(np.eye(self.set.dimension))
+        return (
+            block_norms(np.abs(self.lifted.decoupling.inverse).astype(float) @ radii, self.lifted.starts) + self._slack
+        )
 
     @cached_property
     def _slack(self) -> Array:
-        """What the rounding of the coordinates may change of every block of a deviation, at most, ``(q,)``; at the
-        beginning of a later leg what the Taylor models leave out."""
+        """Norm bounds ``(q,)`` of the rounding error of every block of a deviation, from the coordinates; in a later
+        phase, of the remainder of the Taylor models at its beginning."""
         if self._carried is not None:
             return self._carried.left_out
-        inverse = self.lifted.decoupling
-        far = self.set.reach(np.eye(self.set.dimension))
-        if inverse.is_identity:
+        decoupling = self.lifted.decoupling
+        radii = self.set.reach(np.eye(self.set.dimension))
+        if decoupling.is_identity:
             return np.zeros(self.lifted.starts.size)
         # of V rounded to double precision, and of the defect of V: entry by entry, however a deviation points
-        size = np.abs(inverse.inverse).astype(float) @ far
-        lost = np.finfo(float).eps * size + inverse.defect.astype(float) @ size
-        return block_norms(1.001 * lost, self.lifted.starts)
+        size = np.abs(decoupling.inverse).astype(float) @ radii
+        errors = np.finfo(float).eps * size + decoupling.defect.astype(float) @ size
+        return block_norms(1.001 * errors, self.lifted.starts)
 
     @cached_property
     def _gains(self) -> Array:
-        """What any deviation can have made of every block at the breakpoints, ``(L + 1, q)``."""
+        """Norm bounds ``(L + 1, q)`` of the effect of any deviation on every block at the breakpoints."""
         grid = self.lifted.grid
         flow = self.lifted.comparison.over(grid.lengths).flow
         return flow.summed(self._sizes, np.zeros((grid.pieces, self._sizes.size)))
@@ -237,15 +258,15 @@ class KnownCellSupport:
 
     @shaped
     def steepness(self, times: Float[Array, " k"]) -> Float[Array, "k r 0"]:
-        """No parameters, no steepness: ``(k, r, 0)``."""
+        """Return the slopes in the parameters, an empty array ``(k, r, 0)``, since a known system has none."""
         return np.zeros((times.size, self.rows.shape[0], 0))
 
     def repeated(self, times: Array) -> tuple[Array, Array]:
-        """Every time with every row: ``(k r,)``, ``(k r, d)``."""
+        """Return all pairs of a time and a row: the times ``(k r,)`` and the rows ``(k r, d)``."""
         return np.repeat(times, self.rows.shape[0]), np.tile(self.rows, (times.size, 1))
 
     def between(self, bounds: Array) -> tuple[Array, Array]:
-        """The middle ``(k, r, 1)`` of bounds ``(k r, 2)``, and how far they are from it, ``(k, r)``."""
+        """Return the middle ``(k, r, 1)`` of bounds ``(k r, 2)``, and their distance from it, ``(k, r)``."""
         bounds = bounds.reshape(-1, self.rows.shape[0], 2)
         return bounds.mean(axis=2)[..., None], (bounds[..., 1] - bounds[..., 0]) / 2 * (1.0 + rounding(4))
 
@@ -253,14 +274,17 @@ class KnownCellSupport:
 @final
 @dataclass(frozen=True, eq=False)
 class DirectionsCellSupport:
-    """A part of the uncertainty of a *known* system on one functional over a cell of directions ``c = rows[0] + sum_j
-    eta_j rows[j]``, ``|eta_j| <= 1``, in the form of `Support`; ``made`` is what it is on given ``rows (r, d)``, and
-    ``joined`` says which monomials there are.
+    """A part of the uncertainty of a *known* system on one functional over a cell of directions, in the form of
+    `Support`.
 
-    It is a support function, or a sum of such with factors that are not negative: sublinear in ``c``. So it is, one
-    coordinate after another, at most what is linear in each between the corners. How far it leaves its chord in time is
-    a mean of differences ``h(y(s)) - h(y(r))`` with ``y`` linear in ``c``, each at most the sum of those of the rows:
-    so bounds of these, and of what is left out, add up.
+    The directions are ``c = rows[0] + sum_j eta_j rows[j]`` with ``|eta_j| <= 1``. ``made`` gives the part on rows
+    ``(r, d)``, and ``joined`` the monomials.
+
+    The part is a support function, or a sum of support functions with factors that are not negative: sublinear in
+    ``c``. So, in one coordinate after another, the part is at most the linear interpolation of its values at the
+    corners. Its distance from its chord in time is a mean of differences ``h(y(s)) - h(y(r))`` with ``y`` linear in
+    ``c``, each at most the sum of the differences of the rows. So the bounds of the distance, and of the remainder, add
+    up.
     """
 
     made: Callable[[Array], Support]
@@ -270,33 +294,40 @@ class DirectionsCellSupport:
 
     @shaped
     def steepness(self, times: Float[Array, " k"]) -> Float[Array, "k 1 nu"]:
-        """`Support.steepness`: what is added along a row, or against it, at most."""
+        """Return the bounds of `Support.steepness`: the largest support value along a row, or against it, and at least
+        0."""
         axes = self.rows[1:]
         # powers of two of one row are asked for again in every smaller cell
         sizes = np.exp2(np.frexp(np.abs(axes).max(axis=1, initial=0.0))[1])
         axes = axes / sizes[:, None]
-        along, off = self._at(times, np.vstack([axes, -axes]))
-        most = np.maximum(along + off, 0.0).reshape(times.size, 2, len(axes)).max(axis=1)
-        return np.asarray((most * sizes * OUTWARD)[:, None])
+        values, error_bounds = self._at(times, np.vstack([axes, -axes]))
+        largest = np.maximum(values + error_bounds, 0.0).reshape(times.size, 2, len(axes)).max(axis=1)
+        return np.asarray((largest * sizes * OUTWARD)[:, None])
 
     @shaped
     def at(
         self, times: Float[Array, " k"], ends: Float[Array, "k 1 nu"]
     ) -> tuple[Float[Array, "k 1 M"], Float[Array, "k 1"]]:
-        """`Support.at`. What is lost in the middle of the cell is a part of the excess, since smaller cells lose
-        less."""
+        """Return the coefficients and the excess of `Support.at`.
+
+        The loss in the middle of the cell is a part of the excess, since smaller cells lose less.
+        """
         coefficients, excess = np.zeros((times.size, 1, self.joined.space.size)), np.zeros((times.size, 1))
-        patterns, which = distinct_patterns(ends)
+        patterns, pattern_indices = distinct_patterns(ends)
         for position, pattern in enumerate(patterns):
-            here = np.flatnonzero(which[:, 0] == position)
+            members = np.flatnonzero(pattern_indices[:, 0] == position)
             corners = _corners(pattern)
-            along, off = self._at(times[here], self.rows[0] + np.vstack([pattern, corners]) @ self.rows[1:])
-            found, beyond = between_corners(self.joined.space, pattern, along[:, 1:])
-            lost = np.maximum(along[:, 1:].mean(axis=1) - along[:, 0], 0.0)
-            size = rounding(len(corners) + 4) * np.abs(along).max(axis=1)
-            found[:, 0] -= lost
-            coefficients[here, 0] = found
-            excess[here, 0] = (off[:, 1:].max(axis=1) + beyond + lost + size) * OUTWARD
+            values, error_bounds = self._at(
+                times[members], self.rows[0] + np.vstack([pattern, corners]) @ self.rows[1:]
+            )
+            interpolation, truncation = between_corners(self.joined.space, pattern, values[:, 1:])
+            middle_loss = np.maximum(values[:, 1:].mean(axis=1) - values[:, 0], 0.0)
+            rounding_errors = rounding(len(corners) + 4) * np.abs(values).max(axis=1)
+            interpolation[:, 0] -= middle_loss
+            coefficients[members, 0] = interpolation
+            excess[members, 0] = (
+                error_bounds[:, 1:].max(axis=1) + truncation + middle_loss + rounding_errors
+            ) * OUTWARD
         return coefficients, excess
 
     @shaped
@@ -320,15 +351,32 @@ class DirectionsCellSupport:
         return self.made(self.rows)
 
     def _at(self, times: Array, rows: Array) -> tuple[Array, Array]:
-        """What is added along ``rows (r, d)``, and how far it may be from that, ``(k, r)`` each."""
-        found, off = self.made(rows).at(times, np.zeros((times.size, len(rows), 0)))
-        return found[..., 0], off
+        """Return the support values along ``rows (r, d)``, and their error bounds, ``(k, r)`` each."""
+        coefficients, error_bounds = self.made(rows).at(times, np.zeros((times.size, len(rows), 0)))
+        return coefficients[..., 0], error_bounds
 
 
 def over_directions(
     made: Callable[[Array], Support], rows: Array, leg: LiftedSystem | VaryingMotion, joined: Combination | None
 ) -> Support:
-    """What is ``made`` of functionals ``rows (r, d)``, or of the direction that they make where they are ``joined``."""
+    """Return the support on functionals, or on the direction that they make up where they are ``joined``.
+
+    Parameters
+    ----------
+    made : Callable
+        The support as a function of functionals ``(r, d)``.
+    rows : Array
+        Functionals ``(r, d)``.
+    leg : LiftedSystem or VaryingMotion
+        The system, or a phase of a switched system.
+    joined : Combination or None
+        How the rows make up one direction that varies over a cell.
+
+    Returns
+    -------
+    Support
+        The support.
+    """
     return made(rows) if joined is None else DirectionsCellSupport(made, rows, leg, joined)
 
 
@@ -343,18 +391,33 @@ def _corners(pattern: Array) -> Array:
 
 
 def between_corners(space: TaylorSpace, pattern: Array, values: Array) -> tuple[Array, Array]:
-    """What is linear in every coordinate between ``values (q, n)`` at the `_corners` of a face: coefficients ``(q,
-    M)``, and how far it may be above these, ``(q,)``: of products that the space has not, and by rounding."""
+    """Return the interpolation of values at the corners of a face that is linear in every coordinate.
+
+    Parameters
+    ----------
+    space : TaylorSpace
+        The polynomials, of ``M`` coefficients.
+    pattern : Array
+        The face ``(nu,)``: -1 or 1 for a coordinate at an end, else 0.
+    values : Array
+        Values ``(q, n)`` at the `_corners` of the face.
+
+    Returns
+    -------
+    Array, Array
+        Coefficients ``(q, M)``; and bounds ``(q,)`` of how far the interpolation is above them, by products that are
+        not in the space and by rounding.
+    """
     corners, free = _corners(pattern), np.flatnonzero(pattern == 0.0)
     coefficients = np.zeros((len(values), space.size))
-    beyond = len(corners) * rounding(2 * len(corners) + 8) * np.abs(values).max(axis=1)
+    truncation = len(corners) * rounding(2 * len(corners) + 8) * np.abs(values).max(axis=1)
     for chosen in every_choice((0, 1), repeat=free.size):
-        found = values @ corners[:, free[np.flatnonzero(chosen)]].prod(axis=1) / len(corners)
+        coefficient = values @ corners[:, free[np.flatnonzero(chosen)]].prod(axis=1) / len(corners)
         exponents = np.zeros(space.nu, dtype=int)
         exponents[free] = chosen
-        place = space.index.get(tuple(exponents.tolist()))
-        if place is None:  # of more coordinates than there are degrees
-            beyond = beyond + np.abs(found)
+        index = space.index.get(tuple(exponents.tolist()))
+        if index is None:  # of more coordinates than there are degrees
+            truncation = truncation + np.abs(coefficient)
         else:
-            coefficients[:, place] = found
-    return coefficients, beyond
+            coefficients[:, index] = coefficient
+    return coefficients, truncation

@@ -1,8 +1,8 @@
 """`Execution` of systems that change with time: ``c'Phi(t, s) B_j(s)`` takes the place of ``c'e^{A(t-s)} B_j``.
 
-On every piece between two marks ``Phi(end, s) B(s)`` is a polynomial but for a remainder (`Expansion.kernel`), and what
-the time after it makes of its end is a row. In the time ``t`` each integrand obeys the equation of the state, so that
-the sum is nowhere further above its chord than that says.
+On every piece between two marks ``Phi(end, s) B(s)`` is a polynomial with a remainder (`Expansion.kernel`), and the
+propagation from its end to ``t`` enters as the row ``c'Phi(t, end)``. In the time ``t`` each integrand obeys the
+equation of the state. This bounds how far the sum is above its chord.
 """
 
 from __future__ import annotations
@@ -48,10 +48,13 @@ STEP = 1e-6  # of the horizon, over which a slope is a difference: a tenth of it
 @final
 @dataclass(frozen=True, eq=False)
 class VaryingExecution(Execution):
-    """`Execution` of a system that changes with time; ``disturbing``: what is commanded enters through ``E``, all of
-    it on every piece between ``breakpoints``, as the disturbances of a `VaryingMeasurable` do. ``bound``: a set of
-    what enters by the columns ``through (m,)`` of ``E`` at once, in the place of channels of their own; there is one
-    share of 1 then, and integrals are those of its support function."""
+    """`Execution` of a system that changes with time.
+
+    ``disturbing``: the command enters through ``E``, all of it on every piece between ``breakpoints``, as the
+    disturbances of a `VaryingMeasurable` do. ``bound``: a set of the inputs through the columns ``through (m,)`` of
+    ``E`` together, in the place of separate channels. Then there is one share of 1, and integrals are those of the
+    support function of the set.
+    """
 
     disturbing: bool = False
     bound: ConvexSet | None = None
@@ -61,7 +64,7 @@ class VaryingExecution(Execution):
     _reaching: dict[bytes, VaryingExecutionCellSupport] = field(default_factory=dict, repr=False)
 
     def none(self) -> VaryingExecution:
-        """`Execution.none`; what is remembered is of these shares."""
+        """Return the execution without errors; remembered results that depend on the shares are dropped."""
         return replace(self, shares=np.zeros(self.shares.size), _lengths={}, _reaching={})
 
     def following(self, propagator: Propagator, initial_state: Array) -> VaryingExecution:
@@ -79,19 +82,24 @@ class VaryingExecution(Execution):
     ) -> Support:
         """`Execution.over`."""
         assert isinstance(leg, VaryingMotion)
-        return over_directions(lambda every: VaryingExecutionCellSupport(self, control, every, leg), rows, leg, joined)
+        return over_directions(
+            lambda functionals: VaryingExecutionCellSupport(self, control, functionals, leg), rows, leg, joined
+        )
 
     def reaching(self, control: Array) -> VaryingExecutionCellSupport:
-        """What errors of a control can have made of all coefficients, whatever the functional; remembered."""
+        """Return the support of the errors of a ``control (m, K)`` without functionals, for the bounds of the states.
+
+        The bounds hold for all coefficients of the state, whatever the functional. The result is remembered.
+        """
         key = control.tobytes()
         if key not in self._reaching:
-            found = VaryingExecutionCellSupport(self, control, np.zeros((0, self.motion.states)), self.motion)
-            remember(self._reaching, key, found, KEPT)
+            support = VaryingExecutionCellSupport(self, control, np.zeros((0, self.motion.states)), self.motion)
+            remember(self._reaching, key, support, KEPT)
         return self._reaching[key]
 
     @cached_property
     def motion(self) -> VaryingMotion:
-        """That of the response."""
+        """The motion of the response, over all times from its initial state."""
         return VaryingMotion(self.response.propagator, self.response.initial_state)
 
     @cached_property
@@ -102,7 +110,7 @@ class VaryingExecution(Execution):
 
     @cached_property
     def far(self) -> Array:
-        """How far from 0 at most what enters by each column is, ``(m,)``, where the command is 1."""
+        """Bounds ``(m,)`` of the absolute value of the error through each column, where the command is 1."""
         if self.bound is None:
             return self.shares
         box = self.bound.bounding_box()
@@ -117,8 +125,10 @@ class VaryingExecution(Execution):
 
     @cached_property
     def acting(self) -> np.ndarray:
-        """What acts between marks, ``(L,)``: a piece of the command, after what did before the first of them where
-        they act late (`acts`)."""
+        """The column of `acts` that acts on every piece between marks, ``(L,)``.
+
+        With a delay, column 0 is the control before the first piece of the command; the pieces of the command follow.
+        """
         grid = self.motion.grid
         if not self.disturbing:
             return np.asarray(grid.control_piece + self.late)
@@ -127,25 +137,25 @@ class VaryingExecution(Execution):
 
     @property
     def late(self) -> int:
-        """How much acts before the first piece of the command: 1, or 0 where that acts at once."""
+        """Number of inputs before the first piece of the command: 1 where commands act with a delay, else 0."""
         return int(self.motion.grid.before is not None and not self.disturbing)
 
     def acts(self, control: Array) -> Array:
-        """The size of all that acts, ``(m, late + K)``, from a command ``(m, K)``."""
+        """Return the absolute value of all that acts, ``(m, late + K)``, for a command ``(m, K)``."""
         size, before = np.abs(control), self.motion.grid.before
         return size if before is None or not self.late else np.column_stack([np.abs(before), size])
 
     @cached_property
     def kernel(self) -> Kernel:
-        """Of the pieces between all marks."""
+        """Kernel of the pieces between all marks."""
         marks = self.motion.grid.breakpoints
         return self.motion.expansion.kernel(marks[:-1], marks[1:])
 
     @shaped
     def lengths(self, times: Float[Array, " k"], directions: Float[Array, "k d"]) -> Float[Array, "k n"]:
         """`Execution.lengths`."""
-        found = self._of_each(times, directions)[:, :, self.late :]
-        return found.reshape(times.size, self.shares.size * (self.breakpoints.size - 1))
+        lengths = self._of_each(times, directions)[:, :, self.late :]
+        return lengths.reshape(times.size, self.shares.size * (self.breakpoints.size - 1))
 
     @shaped
     def given(self, times: Float[Array, " k"], directions: Float[Array, "k d"]) -> Float[Array, " k"]:
@@ -155,9 +165,9 @@ class VaryingExecution(Execution):
         return self.added(np.zeros((self.shares.size, self.breakpoints.size - 1)), times, directions)
 
     def _of_each(self, times: Array, directions: Array) -> Array:
-        """What each size of 1 of all that acts adds, ``(k, m, late + K)``."""
-        every = np.ones((self.shares.size, self.late + self.breakpoints.size - 1), dtype=bool)
-        return np.asarray(self._over_pieces(times, directions, every).mean(axis=3))
+        """Return the contribution of errors for size 1 of each entry of `acts`, ``(k, m, late + K)``."""
+        wanted = np.ones((self.shares.size, self.late + self.breakpoints.size - 1), dtype=bool)
+        return np.asarray(self._over_pieces(times, directions, wanted).mean(axis=3))
 
     @shaped
     def added(
@@ -172,8 +182,8 @@ class VaryingExecution(Execution):
             return self.added(control, times, directions)
         key = times.tobytes() + directions.tobytes()
         if key not in self._lengths:
-            found = self._of_each(times, directions)
-            remember(self._lengths, key, found.reshape(times.size, found.shape[1] * found.shape[2]), KEPT)
+            lengths = self._of_each(times, directions)
+            remember(self._lengths, key, lengths.reshape(times.size, lengths.shape[1] * lengths.shape[2]), KEPT)
         return np.asarray(self._lengths[key] @ self.acts(control).ravel())
 
     @shaped
@@ -189,107 +199,128 @@ class VaryingExecution(Execution):
     def enclosed(
         self, control: Float[Array, "m K"], times: Float[Array, " k"], directions: Float[Array, "k d"]
     ) -> Float[Array, "k 2"]:
-        """`Execution.enclosed`, but for what transitions are off by."""
+        """Return `Execution.enclosed`, without the error of the transitions."""
         bounds = self._summed(control, times, directions)
-        lost = rounding(self.size + 8) * np.abs(bounds).max(axis=1)
-        return np.asarray(bounds + lost[:, None] * [-1.0, 1.0])
+        rounding_errors = rounding(self.size + 8) * np.abs(bounds).max(axis=1)
+        return np.asarray(bounds + rounding_errors[:, None] * [-1.0, 1.0])
 
     def _summed(self, control: Array, times: Array, directions: Array) -> Array:
-        """What errors of a control add, between two bounds, ``(k, 2)``."""
+        """Return lower and upper bounds of the contribution of errors of a control, ``(k, 2)``."""
         size = self.acts(control)
         bounds: Array = self._over_pieces(times, directions, np.asarray(size > 0.0))
         return np.asarray(np.einsum("kjpe,jp->ke", bounds, size))
 
     def _over_pieces(self, times: Array, directions: Array, wanted: np.ndarray) -> Array:
-        """Bounds of ``share_j int |c'Phi(t, s) B_j(s)| ds`` over all that acts, ``(k, m, late + K, 2)``; 0 for what is
-        not ``wanted (m, late + K)``."""
-        found = np.zeros((times.size, *wanted.shape, 2))
-        asked = np.logical_and(wanted, self.shares[:, None] > 0.0)
+        """Return bounds of ``share_j int |c'Phi(t, s) B_j(s)| ds`` for each entry of `acts`, ``(k, m, late + K, 2)``.
+
+        Entries that are not ``wanted (m, late + K)`` have 0.
+        """
+        contributions = np.zeros((times.size, *wanted.shape, 2))
+        is_active = np.logical_and(wanted, self.shares[:, None] > 0.0)
         acting = self.acting
-        pieces = np.flatnonzero(asked[:, acting].any(axis=0))
+        pieces = np.flatnonzero(is_active[:, acting].any(axis=0))
         if not pieces.size or not times.size:
-            return found
+            return contributions
         directions = directions * self.felt
-        each = max(1, AT_ONCE // (pieces.size * self.kernel.terms[0].size + acting.size * directions.shape[1]))
-        for begin in range(0, times.size, each):
-            part = slice(begin, begin + each)
-            for who, piece, bounds in self._bounds(times[part], directions[part], pieces, asked):
-                np.add.at(found.swapaxes(1, 2), (begin + who, acting[piece]), bounds)
-        return found
+        chunk_size = max(1, AT_ONCE // (pieces.size * self.kernel.terms[0].size + acting.size * directions.shape[1]))
+        for begin in range(0, times.size, chunk_size):
+            chunk = slice(begin, begin + chunk_size)
+            for time_indices, piece, bounds in self._bounds(times[chunk], directions[chunk], pieces, is_active):
+                np.add.at(contributions.swapaxes(1, 2), (begin + time_indices, acting[piece]), bounds)
+        return contributions
 
     def _bounds(
         self, times: Array, directions: Array, pieces: np.ndarray, asked: np.ndarray
     ) -> Iterator[tuple[np.ndarray, np.ndarray, Array]]:
-        """Of ``times (k,)`` and ``pieces`` between marks that begin before them: the numbers of both, ``(q,)``, and the
-        bounds ``(q, m, 2)``; of pieces that are over by then, and of those that are not."""
+        """Yield bounds of the errors on ``pieces`` between marks, for every one of ``times (k,)`` after their
+        beginning.
+
+        Each item has the indices ``(q,)`` of the times, the pieces ``(q,)``, and the bounds ``(q, m, 2)``. The first
+        item is for pieces that have ended at their time, the second for pieces that have not.
+        """
         motion, grid = self.motion, self.motion.grid
         steps = motion.flow.state
-        place = np.clip(np.searchsorted(grid.breakpoints, times, side="left") - 1, 0, grid.pieces - 1)
-        distinct, where = np.unique(np.stack([times, grid.breakpoints[place]]), axis=1, return_inverse=True)
-        where = where.reshape(-1)
-        begun, kernel = self._begun(distinct)
+        last_pieces = np.clip(np.searchsorted(grid.breakpoints, times, side="left") - 1, 0, grid.pieces - 1)
+        distinct, distinct_indices = np.unique(
+            np.stack([times, grid.breakpoints[last_pieces]]), axis=1, return_inverse=True
+        )
+        distinct_indices = distinct_indices.reshape(-1)
+        transitions, kernel = self._begun(distinct)
         row, rows = np.zeros(directions.shape), np.empty((times.size, *directions.shape[1:], grid.pieces))
-        first = np.einsum("ki,kij->kj", directions, begun[where])
-        for k in range(int(place.max()) - 1, int(pieces[0]) - 1, -1):  # rows on the end of every piece
-            row = np.where((place == k + 1)[:, None], first, row)
+        first = np.einsum("ki,kij->kj", directions, transitions[distinct_indices])
+        for k in range(int(last_pieces.max()) - 1, int(pieces[0]) - 1, -1):  # rows on the end of every piece
+            row = np.where((last_pieces == k + 1)[:, None], first, row)
             rows[:, :, k] = row
             row = row @ steps[k]
-        who, which = np.nonzero(pieces < place[:, None])
-        piece = pieces[which]
-        yield who, piece, self._along(self.kernel, piece, rows[who, :, piece], asked[:, self.acting[piece]])
-        here = np.flatnonzero(np.isin(place, pieces) & np.greater(times, grid.breakpoints[place]))
-        piece = place[here]
-        yield here, piece, self._along(kernel, where[here], directions[here], asked[:, self.acting[piece]])
+        indices, piece_positions = np.nonzero(pieces < last_pieces[:, None])
+        piece = pieces[piece_positions]
+        yield indices, piece, self._along(self.kernel, piece, rows[indices, :, piece], asked[:, self.acting[piece]])
+        inside = np.flatnonzero(np.isin(last_pieces, pieces) & np.greater(times, grid.breakpoints[last_pieces]))
+        piece = last_pieces[inside]
+        yield (
+            inside,
+            piece,
+            self._along(kernel, distinct_indices[inside], directions[inside], asked[:, self.acting[piece]]),
+        )
 
     def _begun(self, distinct: Array) -> tuple[Array, Kernel]:
-        """Of times, and the breakpoints before them, ``(2, k)``: the transitions from these, ``(k, d, d)``, and the
-        kernel on the way; remembered, since the same times are asked for in many directions."""
+        """Return the transitions ``(k, d, d)`` from the breakpoint before each time to the time, and the kernel between
+        them.
+
+        ``distinct (2, k)`` holds the times and the breakpoints before them. The result is remembered, since the same
+        times are asked for in many directions.
+        """
         key = distinct.tobytes()
         if key not in self._ways:
             until, expansion = np.maximum(*distinct), self.motion.expansion
-            found = expansion.flow(distinct[1], until).state, expansion.kernel(distinct[1], until)
-            remember(self._ways, key, found, max(1, AT_ONCE // (found[0].size + found[1].terms.size)))
+            entry = expansion.flow(distinct[1], until).state, expansion.kernel(distinct[1], until)
+            remember(self._ways, key, entry, max(1, AT_ONCE // (entry[0].size + entry[1].terms.size)))
         return self._ways[key]
 
     def _along(self, kernel: Kernel, which: np.ndarray, rows: Array, asked: np.ndarray) -> Array:
-        """Bounds ``(q, m, 2)`` of what intervals ``which (q,)`` of a kernel make of ``rows (q, d)`` on their ends, of
-        channels that are ``asked (m, q)``."""
+        """Return lower and upper bounds ``(q, m, 2)`` of the errors on intervals ``which (q,)`` of a kernel.
+
+        ``rows (q, d)`` are the functionals at the ends of the intervals. Channels that are not ``asked (m, q)`` have 0.
+        """
         m, units, columns = self.shares.size, self.motion.expansion.units, self.columns
         if self.bound is not None:
             return self._together(self.bound, kernel, which, rows)
         sizes = np.einsum("qd,qdm->qm", np.abs(rows), np.abs(kernel.terms[..., columns]).sum(axis=1)[which])
-        lost = np.einsum("qd,qdm->qm", np.abs(rows) * units, kernel.sizes[which][..., columns])
-        lost = lost * kernel.error[which, None]
+        errors = np.einsum("qd,qdm->qm", np.abs(rows) * units, kernel.sizes[which][..., columns])
+        errors = errors * kernel.error[which, None]
         # a cut rounds every coefficient four times for every order; halves, of half the length each, twice in all
-        lost = lost + rounding(rows.shape[1] + (2 + 4 * CUTS) * kernel.terms.shape[1] + HALVINGS) * sizes
+        errors = errors + rounding(rows.shape[1] + (2 + 4 * CUTS) * kernel.terms.shape[1] + HALVINGS) * sizes
         bounds = np.zeros((which.size, m, 2))
         for j, share in enumerate(self.shares):
-            mine = np.flatnonzero(asked[j])
-            terms = np.einsum("qd,qpd->qp", rows[mine], kernel.terms[which[mine], :, :, columns[j]])
-            accuracy = np.maximum(ACCURACY * self.motion.grid.pieces * sizes[mine, j], TINY)
-            found = absolute(terms, accuracy)
-            found = found + lost[mine, j, None] * [-1.0, 1.0]
-            bounds[mine, j] = share * np.maximum(found, 0.0) * [1.0 / OUTWARD, OUTWARD]
+            members = np.flatnonzero(asked[j])
+            terms = np.einsum("qd,qpd->qp", rows[members], kernel.terms[which[members], :, :, columns[j]])
+            accuracy = np.maximum(ACCURACY * self.motion.grid.pieces * sizes[members, j], TINY)
+            integrals = absolute(terms, accuracy)
+            integrals = integrals + errors[members, j, None] * [-1.0, 1.0]
+            bounds[members, j] = share * np.maximum(integrals, 0.0) * [1.0 / OUTWARD, OUTWARD]
         return bounds
 
     def _together(self, bound: ConvexSet, kernel: Kernel, which: np.ndarray, rows: Array) -> Array:
-        """`_along` of a set of what enters by all columns, ``(q, 1, 2)``."""
-        columns, far = self.columns, self.far
-        sizes = np.einsum("qd,qdm->qm", np.abs(rows), np.abs(kernel.terms[..., columns]).sum(axis=1)[which]) @ far
+        """Return `_along` for a set of inputs through all columns together, ``(q, 1, 2)``."""
+        columns, radii = self.columns, self.far
+        sizes = np.einsum("qd,qdm->qm", np.abs(rows), np.abs(kernel.terms[..., columns]).sum(axis=1)[which]) @ radii
         units = np.abs(rows) * self.motion.expansion.units
-        lost = np.einsum("qd,qdm->qm", units, kernel.sizes[which][..., columns]) @ far * kernel.error[which]
-        lost = lost + rounding(rows.shape[1] + 2 * kernel.terms.shape[1] + HALVINGS + 2 * far.size) * sizes
+        errors = np.einsum("qd,qdm->qm", units, kernel.sizes[which][..., columns]) @ radii * kernel.error[which]
+        errors = errors + rounding(rows.shape[1] + 2 * kernel.terms.shape[1] + HALVINGS + 2 * radii.size) * sizes
         terms = np.einsum("qd,qpdm->qpm", rows, kernel.terms[which][..., columns])
         accuracy = np.maximum(ACCURACY * self.motion.grid.pieces * sizes, TINY)
-        found = integrated(bound, terms, np.ones(which.size), accuracy)
-        return np.asarray(found + OUTWARD * lost[:, None] * [-1.0, 1.0])[:, None]
+        integrals = integrated(bound, terms, np.ones(which.size), accuracy)
+        return np.asarray(integrals + OUTWARD * errors[:, None] * [-1.0, 1.0])[:, None]
 
 
 @final
 @dataclass(frozen=True, eq=False)
 class UncertainExecution(Execution):
-    """`Execution` of a system that changes with time and has parameters: ``known`` is that of a known one, to be made
-    for each parameter and on each cell. Directions are followed by their parameters (`seen`)."""
+    """`Execution` of a system that changes with time and has parameters.
+
+    ``known`` is the execution of a known system; an execution is made from it for each parameter and on each cell.
+    Directions are followed by their parameters (`seen`).
+    """
 
     known: VaryingExecution
     _at: dict[bytes, VaryingExecution] = field(default_factory=dict, repr=False)
@@ -306,7 +337,7 @@ class UncertainExecution(Execution):
         return self if around is self.known else replace(self, shares=around.shares, known=around, _at={}, _on={})
 
     def seen(self, directions: Array, parameters: Array) -> Array:
-        """`Execution.seen`: with the parameters behind them."""
+        """Return directions with the parameters as further columns, ``(k, d + nu)``."""
         return np.hstack([directions, parameters])
 
     def at(self, parameter: Array) -> VaryingExecution:
@@ -315,8 +346,8 @@ class UncertainExecution(Execution):
             return self.known
         key = parameter.tobytes()
         if key not in self._at:
-            found = self.known.following(self.response.propagator.at_point(parameter), self.response.initial_state)
-            remember(self._at, key, found, POINTS_KEPT)
+            execution = self.known.following(self.response.propagator.at_point(parameter), self.response.initial_state)
+            remember(self._at, key, execution, POINTS_KEPT)
         return self._at[key]
 
     def over(
@@ -331,56 +362,62 @@ class UncertainExecution(Execution):
         assert joined is None  # refused beside curved sets
         key = id(leg).to_bytes(8)  # of a leg that is kept beside
         if key not in self._on:
-            every = self.known.following(leg.motion.propagator, leg.motion.initial_state)
-            remember(self._on, key, (leg, every), CELLS_KEPT)
+            execution = self.known.following(leg.motion.propagator, leg.motion.initial_state)
+            remember(self._on, key, (leg, execution), CELLS_KEPT)
         return SpreadExecutionSupport(self._on[key][1].reaching(control), rows, leg)
 
     def _each(
         self, directions: Array, found: Array, of: Callable[[VaryingExecution, np.ndarray, Array], Array]
     ) -> Array:
-        """Fill what is ``found (k, ...)`` with what it is ``of`` the errors at every parameter."""
+        """Fill ``found (k, ...)`` with the values of a function ``of`` the errors at every parameter, and return it."""
         d = self.felt.size
-        unique, which = unique_rows(directions[:, d:])
+        unique, parameter_indices = unique_rows(directions[:, d:])
         for number, parameter in enumerate(unique):
-            here = np.flatnonzero(which == number)
-            found[here] = of(self.at(parameter), here, directions[here, :d])
+            indices = np.flatnonzero(parameter_indices == number)
+            found[indices] = of(self.at(parameter), indices, directions[indices, :d])
         return found
 
     @shaped
     def lengths(self, times: Float[Array, " k"], directions: Float[Array, "k d"]) -> Float[Array, "k n"]:
         """`Execution.lengths`."""
-        found = np.empty((times.size, self.size))
-        return self._each(directions, found, lambda one, here, c: one.lengths(times[here], c))
+        values = np.empty((times.size, self.size))
+        return self._each(directions, values, lambda errors, indices, c: errors.lengths(times[indices], c))
 
     def given(self, times: Array, directions: Array) -> Array:
         """`Execution.given`."""
-        return self._each(directions, np.empty(times.size), lambda one, here, c: one.given(times[here], c))
+        return self._each(directions, np.empty(times.size), lambda errors, indices, c: errors.given(times[indices], c))
 
     @shaped
     def added(
         self, control: Float[Array, "m K"], times: Float[Array, " k"], directions: Float[Array, "k d"]
     ) -> Float[Array, " k"]:
         """`Execution.added`."""
-        return self._each(directions, np.empty(times.size), lambda one, here, c: one.added(control, times[here], c))
+        return self._each(
+            directions, np.empty(times.size), lambda errors, indices, c: errors.added(control, times[indices], c)
+        )
 
     def sampled(self, control: Array, times: Array, directions: Array) -> Array:
         """`Execution.sampled`."""
-        return self._each(directions, np.empty(times.size), lambda one, here, c: one.sampled(control, times[here], c))
+        return self._each(
+            directions, np.empty(times.size), lambda errors, indices, c: errors.sampled(control, times[indices], c)
+        )
 
     @shaped
     def slope(
         self, control: Float[Array, "m K"], times: Float[Array, " k"], directions: Float[Array, "k d"]
     ) -> Float[Array, " k"]:
         """`Execution.slope`."""
-        return self._each(directions, np.empty(times.size), lambda one, here, c: one.slope(control, times[here], c))
+        return self._each(
+            directions, np.empty(times.size), lambda errors, indices, c: errors.slope(control, times[indices], c)
+        )
 
     @shaped
     def enclosed(
         self, control: Float[Array, "m K"], times: Float[Array, " k"], directions: Float[Array, "k d"]
     ) -> Float[Array, "k 2"]:
         """`Execution.enclosed`."""
-        found = np.empty((times.size, 2))
-        return self._each(directions, found, lambda one, here, c: one.enclosed(control, times[here], c))
+        bounds = np.empty((times.size, 2))
+        return self._each(directions, bounds, lambda errors, indices, c: errors.enclosed(control, times[indices], c))
 
 
 def followed(errors: VaryingExecution) -> VaryingExecution | UncertainExecution:
@@ -393,7 +430,7 @@ def followed(errors: VaryingExecution) -> VaryingExecution | UncertainExecution:
 @final
 @dataclass(frozen=True, eq=False)
 class VaryingExecutionCellSupport(KnownCellSupport):
-    """`ExecutionCellSupport` of a system that changes with time; ``motion`` is its."""
+    """`ExecutionCellSupport` of a system that changes with time; ``motion`` is the motion of that system."""
 
     execution: VaryingExecution
     control: Array
@@ -404,89 +441,101 @@ class VaryingExecutionCellSupport(KnownCellSupport):
     def at(
         self, times: Float[Array, " k"], ends: Float[Array, "k r 0"]
     ) -> tuple[Float[Array, "k r 1"], Float[Array, "k r"]]:
-        """What is added ``(k, r, 1)`` and how far it may be from that, ``(k, r)``; ``ends (k, r, 0)``."""
+        """Return support values ``(k, r, 1)`` and their error bounds ``(k, r)``; ``ends (k, r, 0)`` is empty."""
         return self.between(self.execution.enclosed(self.control, *self.repeated(times)))
 
     @shaped
     def deviation(self, start: Float[Array, " k"], widths: Float[Array, " k"]) -> Float[Array, "k r"]:
-        """Bounds ``(k, r)`` of how far it is above its chord on ``[start, start + width]``, each inside one piece.
+        """Return bounds ``(k, r)`` of the height of the support function above its chord on ``[start, start + width]``.
 
-        With ``g(t, s) = c'Phi(t, s) B(s)`` the second derivative of the integral of ``|g|`` up to ``t`` is at least
-        ``-|c'B'| - |c'A B| - int |g_tt| ds``, and ``g_tt = c'(A' + A^2) Phi B``: where ``g`` changes its sign the slope
-        jumps upwards only. All of it is bounded at the start, and how much it changes within the cell.
+        Each interval is inside one piece. With ``g(t, s) = c'Phi(t, s) B(s)`` the second derivative of the integral of
+        ``|g|`` up to ``t`` is at least ``-|c'B'| - |c'A B| - int |g_tt| ds``, and ``g_tt = c'(A' + A^2) Phi B``: where
+        ``g`` changes its sign the slope jumps upwards only. All terms are bounded at the start, and their change within
+        the cell is added.
         """
         motion, d, columns = self.motion, self.motion.states, self.execution.columns
         pieces = np.minimum(motion.place(start), motion.origin.size - 1)
         (law, slope), width = motion.law(start, pieces), widths[:, None]
-        entering = np.append(np.arange(d), d + columns)
-        law, slope = law[:, :, entering], slope[:, :, entering]
-        most, second, third = (one[pieces][:, :, entering] for one in (motion.most, motion.second, motion.third))
-        begun, pushed = self._sizes(start), self.sizing[pieces]
-        exact = np.abs(self.rows @ (slope[:, :, :d] + law[:, :, :d] @ law[:, :, :d]))
-        now = np.abs(self.rows @ slope[:, :, d:]) + np.abs(self.rows @ law[:, :, :d] @ law[:, :, d:])
-        entered = width * np.einsum("kim,km->ki", most[:, :, d:], pushed)
-        grown = motion.grown(pieces, widths, begun + entered)
-        turned = np.einsum("kij,kj->ki", third[:, :, :d], grown) + np.einsum("kim,km->ki", third[:, :, d:], pushed)
-        turned = width * turned + np.einsum("kij,kj->ki", second[:, :, :d], entered)
-        rounded = np.einsum("kij,kj->ki", second[:, :, :d], begun) + np.einsum("kim,km->ki", second[:, :, d:], pushed)
-        turned = turned + rounding(2 * motion.terms) * rounded
-        along = np.einsum("krj,kj->kr", exact, begun) + np.einsum("krm,km->kr", now, pushed)
-        return np.asarray(width**2 / 8 * (along + turned @ np.abs(self.rows).T) * OUTWARD)
+        used_columns = np.append(np.arange(d), d + columns)
+        law, slope = law[:, :, used_columns], slope[:, :, used_columns]
+        law_bounds, second, third = (
+            bounds[pieces][:, :, used_columns] for bounds in (motion.most, motion.second, motion.third)
+        )
+        start_sizes, input_sizes = self._sizes(start), self.sizing[pieces]
+        state_curvature = np.abs(self.rows @ (slope[:, :, :d] + law[:, :, :d] @ law[:, :, :d]))
+        input_curvature = np.abs(self.rows @ slope[:, :, d:]) + np.abs(self.rows @ law[:, :, :d] @ law[:, :, d:])
+        input_effects = width * np.einsum("kim,km->ki", law_bounds[:, :, d:], input_sizes)
+        state_bounds = motion.grown(pieces, widths, start_sizes + input_effects)
+        change = np.einsum("kij,kj->ki", third[:, :, :d], state_bounds) + np.einsum(
+            "kim,km->ki", third[:, :, d:], input_sizes
+        )
+        change = width * change + np.einsum("kij,kj->ki", second[:, :, :d], input_effects)
+        magnitudes = np.einsum("kij,kj->ki", second[:, :, :d], start_sizes) + np.einsum(
+            "kim,km->ki", second[:, :, d:], input_sizes
+        )
+        change = change + rounding(2 * motion.terms) * magnitudes
+        row_curvature = np.einsum("krj,kj->kr", state_curvature, start_sizes) + np.einsum(
+            "krm,km->kr", input_curvature, input_sizes
+        )
+        return np.asarray(width**2 / 8 * (row_curvature + change @ np.abs(self.rows).T) * OUTWARD)
 
     @cached_property
     def neglected(self) -> Array:
-        """What is off in the transitions, on every piece: ``(r, K)``."""
+        """Bounds ``(r, K)`` of the error of the functionals on every piece, from the error of the transitions."""
         return product(np.abs(self.rows), self.missed.T)
 
     @cached_property
     def missed(self) -> Array:
-        """What states are off by, on every piece, ``(K, d)``."""
-        pushed = self.motion.flow.sizes[..., self.execution.columns] * self.sizing[:, None]
-        return self.motion.left_out(self.at_marks[:-1], pushed)
+        """Bounds ``(K, d)`` of the error of the states on every piece, from the error of the transitions."""
+        forcing = self.motion.flow.sizes[..., self.execution.columns] * self.sizing[:, None]
+        return self.motion.left_out(self.at_marks[:-1], forcing)
 
     @cached_property
     def reached(self) -> Array:
-        """As in `VaryingSupport`, ``(K, d)``."""
+        """Bounds ``(K, d)`` of the effect of the errors of execution on every state on every piece."""
         motion, lengths = self.motion, self.motion.grid.lengths
         columns = motion.states + self.execution.columns
-        entered = np.einsum("kim,km->ki", motion.most[:, :, columns], self.sizing)
-        return motion.grown(motion.every, lengths, self.at_marks[:-1] + lengths[:, None] * entered)
+        rates = np.einsum("kim,km->ki", motion.most[:, :, columns], self.sizing)
+        return motion.grown(motion.every, lengths, self.at_marks[:-1] + lengths[:, None] * rates)
 
     @cached_property
     def sizing(self) -> Array:
-        """How large errors may be on every piece between marks, ``(K, m)``."""
+        """Bounds ``(K, m)`` of the errors of execution on every piece between marks."""
         size = self.execution.far[:, None] * self.execution.acts(self.control)
         return np.asarray(size[:, self.execution.acting].T * OUTWARD)
 
     @cached_property
     def at_marks(self) -> Array:
-        """What errors can have made of every state at the marks, ``(K + 1, d)``, at most."""
+        """Bounds ``(K + 1, d)`` of the effect of the errors of execution on every state at the marks."""
         return self._sizes(self.motion.grid.breakpoints)
 
     def _sizes(self, times: Array) -> Array:
-        """What errors can have made of every state, ``(k, d)``, at most; of a set of what enters by several columns at
-        once those of the box around it, whose integrals are of absolute values."""
+        """Return bounds ``(k, d)`` of the effect of the errors of execution on every state.
+
+        For a set of inputs through several columns together the bounds are those of the box around it, whose integrals
+        are of absolute values.
+        """
         around, d = self.execution.around, self.motion.states
         control = np.repeat(self.control, around.shares.size // self.execution.shares.size, axis=0)
-        found = around.enclosed(control, *self._each(times, np.eye(d)))[:, 1]
-        return np.asarray(np.maximum(found, 0.0).reshape(-1, d) * OUTWARD)
+        upper_bounds = around.enclosed(control, *self._each(times, np.eye(d)))[:, 1]
+        return np.asarray(np.maximum(upper_bounds, 0.0).reshape(-1, d) * OUTWARD)
 
     @staticmethod
     def _each(times: Array, rows: Array) -> tuple[Array, Array]:
-        """Every time with every row."""
+        """Return all pairs of a time and a row: the times ``(k r,)`` and the rows ``(k r, d)``."""
         return np.repeat(times, len(rows)), np.tile(rows, (times.size, 1))
 
 
 @final
 @dataclass(frozen=True, eq=False)
 class SpreadExecutionSupport:
-    """What errors of execution add to functionals ``rows (r, d)`` over a cell of parameters, in the form of `Support`;
-    ``every`` is what they make of all coefficients.
+    """The support of errors of execution on functionals ``rows (r, d)`` over a cell of parameters, in the form of
+    `Support`.
 
-    Of one parameter alone a polynomial ``f`` is nowhere further from its chord than half the largest ``f''`` on
-    ``[-1, 1]``, and the absolute value of the chord is not above the chord of the absolute values. So the integrals
-    of ``|f|`` are, one parameter after another, at most what is linear in each between those at the corners, and half
-    of those of the second derivatives more.
+    ``every`` is the support of the errors on all coefficients of the state. A polynomial ``f`` of one parameter is
+    nowhere further from its chord than half the largest ``|f''|`` on ``[-1, 1]``, and the absolute value of the chord
+    is not above the chord of the absolute values. So, in one parameter after another, the integrals of ``|f|`` are at
+    most the linear interpolation of those at the corners, plus half of the integrals of ``|f''|``.
     """
 
     every: VaryingExecutionCellSupport
@@ -503,36 +552,43 @@ class SpreadExecutionSupport:
         self, times: Float[Array, " k"], ends: Float[Array, "k r nu"]
     ) -> tuple[Float[Array, "k r M"], Float[Array, "k r"]]:
         """`Support.at`."""
-        space, sizes, of = self.motion.space, self._sizes(times), self.every
+        space, sizes, support = self.motion.space, self._sizes(times), self.every
         coefficients, excess = np.zeros((*ends.shape[:2], space.size)), np.zeros(ends.shape[:2])
-        patterns, which = distinct_patterns(ends)
+        patterns, pattern_indices = distinct_patterns(ends)
         for position, pattern in enumerate(patterns):
-            here, row = np.nonzero(which == position)
+            time_indices, row_indices = np.nonzero(pattern_indices == position)
             free, corners = np.flatnonzero(pattern == 0.0), _corners(pattern)
             powers = space.monomials(corners)
-            directions = (powers[:, :, None] * self.rows[row][:, None, None, :]).reshape(len(row) * len(corners), -1)
-            bounds = of.execution.enclosed(of.control, np.repeat(times[here], len(corners)), directions)
-            bounds = bounds.reshape(len(row), len(corners), 2)
-            off = (bounds[..., 1] - bounds[..., 0]).max(axis=1) / 2
-            bent = sizes[here, row] @ (space.exponents[:, free] * (space.exponents[:, free] - 1)).sum(axis=1)
-            coefficients[here, row], beyond = between_corners(space, pattern, bounds.mean(axis=2))
-            excess[here, row] = (off + bent / 2 + beyond) * OUTWARD
+            directions = (powers[:, :, None] * self.rows[row_indices][:, None, None, :]).reshape(
+                len(row_indices) * len(corners), -1
+            )
+            bounds = support.execution.enclosed(
+                support.control, np.repeat(times[time_indices], len(corners)), directions
+            )
+            bounds = bounds.reshape(len(row_indices), len(corners), 2)
+            error_bounds = (bounds[..., 1] - bounds[..., 0]).max(axis=1) / 2
+            curvature = sizes[time_indices, row_indices] @ (
+                space.exponents[:, free] * (space.exponents[:, free] - 1)
+            ).sum(axis=1)
+            coefficients[time_indices, row_indices], truncation = between_corners(space, pattern, bounds.mean(axis=2))
+            excess[time_indices, row_indices] = (error_bounds + curvature / 2 + truncation) * OUTWARD
         return coefficients, excess
 
     @shaped
     def deviation(self, start: Float[Array, " k"], widths: Float[Array, " k"]) -> Float[Array, "k r"]:
         """`VaryingExecutionCellSupport.deviation`, by the largest numbers on every piece."""
-        bent = self._bent[self._pieces(start)] @ self.motion.sizes(np.abs(self.rows)).T
-        return np.asarray((widths**2 / 8)[:, None] * bent * OUTWARD)
+        row_curvature = self._bent[self._pieces(start)] @ self.motion.sizes(np.abs(self.rows)).T
+        return np.asarray((widths**2 / 8)[:, None] * row_curvature * OUTWARD)
 
     @cached_property
     def neglected(self) -> Array:
-        """What is off in the transitions, with what is beyond the degree, on every piece: ``(r, K)``."""
-        of, motion, rows = self.every, self.motion, np.abs(self.rows)
-        inputs = np.zeros((len(of.sizing), of.motion.most.shape[2] - of.motion.states))
-        inputs[:, of.execution.columns] = of.sizing
-        lost = motion.truncation.lost(of.at_marks[:-1] + of.missed, inputs)
-        return np.asarray((motion.sizes(rows) @ of.missed.T + rows @ lost.T) * OUTWARD)
+        """Bounds ``(r, K)`` of the error of the functionals on every piece, from the error of the transitions and from
+        the terms beyond the degree."""
+        support, motion, rows = self.every, self.motion, np.abs(self.rows)
+        inputs = np.zeros((len(support.sizing), support.motion.most.shape[2] - support.motion.states))
+        inputs[:, support.execution.columns] = support.sizing
+        truncation = motion.truncation.lost(support.at_marks[:-1] + support.missed, inputs)
+        return np.asarray((motion.sizes(rows) @ support.missed.T + rows @ truncation.T) * OUTWARD)
 
     @cached_property
     def reached(self) -> Array:
@@ -542,17 +598,19 @@ class SpreadExecutionSupport:
     @cached_property
     def _bent(self) -> Array:
         """The second derivative in time of every coefficient, at most, on every piece, ``(K, states)``."""
-        of, d = self.every, self.every.motion.states
-        second = of.motion.second
-        pushed = second[:, :, d + of.execution.columns]
-        found = np.einsum("kij,kj->ki", second[:, :, :d], of.reached) + np.einsum("kim,km->ki", pushed, of.sizing)
-        return np.asarray(found * OUTWARD)
+        support, d = self.every, self.every.motion.states
+        second = support.motion.second
+        input_matrix = second[:, :, d + support.execution.columns]
+        curvatures = np.einsum("kij,kj->ki", second[:, :, :d], support.reached) + np.einsum(
+            "kim,km->ki", input_matrix, support.sizing
+        )
+        return np.asarray(curvatures * OUTWARD)
 
     def _sizes(self, times: Array) -> Array:
-        """What errors add along every coefficient on the cell, at most, ``(k, r, M)``."""
-        reached = self.every.reached[self._pieces(times)].reshape(times.size, self.motion.space.size, -1)
-        along = np.einsum("rd,kad->kra", np.abs(self.rows), reached)
-        return np.asarray(along * OUTWARD)
+        """Return bounds ``(k, r, M)`` of the effect of the errors of execution along every coefficient on the cell."""
+        bounds = self.every.reached[self._pieces(times)].reshape(times.size, self.motion.space.size, -1)
+        sizes = np.einsum("rd,kad->kra", np.abs(self.rows), bounds)
+        return np.asarray(sizes * OUTWARD)
 
     def _pieces(self, times: Array) -> np.ndarray:
         return np.asarray(np.minimum(self.every.motion.place(times), self.every.motion.origin.size - 1))

@@ -1,4 +1,4 @@
-"""Measurable disturbances of systems that change with time: errors of execution of a command that nobody gives."""
+"""Measurable disturbances of systems that change with time, as errors of execution of a constant command of 1."""
 
 from __future__ import annotations
 
@@ -29,10 +29,13 @@ from sparserob_core.sip.convex_set import Array, Box, ConvexSet
 @final
 @dataclass(frozen=True, eq=False)
 class VaryingMeasurable:
-    """`MeasurableSupport` of a system that changes with time. Of a box: what stays in the middle of the box, and the
-    errors, through the columns of ``E``, of a command that is 1 and may be missed by half the widths. Of another set
-    what all of it does at once takes the place of such errors, and the middle is 0. Where the state is expanded in
-    parameters, the errors are those of all coefficients, on each of the parts of their box."""
+    """`MeasurableSupport` of a system that changes with time.
+
+    A disturbance in a box is the middle of the box, at all times, plus errors of execution through the columns of
+    ``E``: those of a command of 1 with half the widths of the box as shares. For another set the middle is 0, and the
+    whole set takes the place of the errors. Where the state is expanded in parameters, the errors are those of all
+    coefficients, on each part of the box of the parameters.
+    """
 
     response: Response
     bound: ConvexSet
@@ -42,25 +45,25 @@ class VaryingMeasurable:
         self, times: Float[Array, " k"], directions: Float[Array, "k d"], parameters: Float[Array, "k nu"]
     ) -> Float[Array, " k"]:
         """``sigma (k,)`` at ``times (k,)``, ``directions (k, d)``, ``parameters (k, nu)``."""
-        along = self.errors.seen(directions, parameters)
-        found = np.array(self.errors.sampled(self.command, times, along))
+        error_directions = self.errors.seen(directions, parameters)
+        values = np.array(self.errors.sampled(self.command, times, error_directions))
         resting = self.resting
         if resting is None:
-            return found
-        several = max(1, AT_ONCE // self.response.numbers(0))
-        for first in range(0, times.size, several):
-            part = slice(first, first + several)
-            weights = self.response.weights(times[part], directions[part], parameters[part])
-            found[part] += resting.support(weights.disturbance)
-        return found
+            return values
+        chunk_size = max(1, AT_ONCE // self.response.numbers(0))
+        for first in range(0, times.size, chunk_size):
+            chunk = slice(first, first + chunk_size)
+            weights = self.response.weights(times[chunk], directions[chunk], parameters[chunk])
+            values[chunk] += resting.support(weights.disturbance)
+        return values
 
     def roughly(self, times: Array, directions: Array, parameters: Array) -> Array:
-        """The same, in no other way."""
+        """Return ``sigma (k,)`` as `__call__` does, without a rougher approximation."""
         return self(times, directions, parameters)
 
     @cached_property
     def middle(self) -> Array:
-        """That of the box, ``(mw,)``; 0 of another set."""
+        """The middle of the box, ``(mw,)``; 0 for another set."""
         if not self.bound.is_box:
             return np.zeros(self.bound.dimension)
         box = self.bound.bounding_box()
@@ -68,26 +71,30 @@ class VaryingMeasurable:
 
     @cached_property
     def errors(self) -> VaryingExecution | UncertainExecution:
-        """How far disturbances may be from the middle: rounded outwards where that is not 0."""
+        """Deviations of the disturbances from the middle, as errors of execution; the half widths are rounded outwards
+        where the middle is not 0."""
         shares, bound, through = np.ones(1), None, None
         if self.bound.is_box:
             box = self.bound.bounding_box()
-            far = np.maximum(box.upper - self.middle, self.middle - box.lower)
-            shares = np.where(self.middle == 0.0, far, np.where(box.upper > box.lower, np.nextafter(far, np.inf), 0.0))
+            half_widths = np.maximum(box.upper - self.middle, self.middle - box.lower)
+            shares = np.where(
+                self.middle == 0.0, half_widths, np.where(box.upper > box.lower, np.nextafter(half_widths, np.inf), 0.0)
+            )
         else:
             bound, through = _moving(self.bound)
         ends, felt = self.response.grid.breakpoints[[0, -1]], np.ones(self.response.system.states)
-        one = VaryingExecution(self.response, ends, shares, felt, disturbing=True, bound=bound, through=through)
-        return followed(one)
+        execution = VaryingExecution(self.response, ends, shares, felt, disturbing=True, bound=bound, through=through)
+        return followed(execution)
 
     @property
     def command(self) -> Array:
-        """The 1 that is missed, ``(mw, 1)``, of sets of all channels at once ``(1, 1)``."""
+        """The command of 1 whose errors are the disturbances, ``(mw, 1)``; ``(1, 1)`` for a set of all channels
+        together."""
         return np.ones((self.errors.shares.size, 1))
 
     @cached_property
     def resting(self) -> DisturbanceModel | None:
-        """The disturbance that stays in the middle, ``None`` where that is 0."""
+        """The disturbance that stays in the middle; ``None`` where the middle is 0."""
         if not self.middle.any():
             return None
         point, pieces = Box(self.middle, self.middle), np.arange(self.response.grid.pieces)
@@ -98,22 +105,24 @@ class VaryingMeasurable:
     ) -> list[Support]:
         """`MeasurableSupport.over`, over a cell of parameters too."""
         assert not isinstance(leg, LiftedSystem)
-        found = [self.errors.over(self.command, rows, leg, joined)]
+        supports = [self.errors.over(self.command, rows, leg, joined)]
         if self.resting is not None and isinstance(leg, SpreadMotion):
-            found.append(SpreadSupport.of_disturbance(leg, self.resting, rows, joined))
+            supports.append(SpreadSupport.of_disturbance(leg, self.resting, rows, joined))
         elif self.resting is not None and isinstance(leg, VaryingMotion):
-            found.append(VaryingSupport.of_disturbance(leg, self.resting, rows, joined))
-        return found
+            supports.append(VaryingSupport.of_disturbance(leg, self.resting, rows, joined))
+        return supports
 
     def integrated_sizes(self, times: Array, directions: Array, parameters: Array) -> Array:
-        """`MeasurableSupport.integrated_sizes`: integrals of absolute values."""
-        along = self.errors.seen(directions, parameters)
-        return np.asarray(self.errors.around.lengths(times, along).sum(axis=1))
+        """Return the sum ``(k,)`` of the integrals of absolute values that are added up at each index."""
+        error_directions = self.errors.seen(directions, parameters)
+        return np.asarray(self.errors.around.lengths(times, error_directions).sum(axis=1))
 
 
 def _moving(bound: ConvexSet) -> tuple[ConvexSet, np.ndarray]:
-    """A flat set without the entries that are 0 in all of it, as those of another class are, and which the others
-    are."""
+    """Return a flat set without the coordinates that are 0 in all of it, and the indices of the others.
+
+    Coordinates are 0 where the disturbances in them are of another class.
+    """
     box, flat = bound.bounding_box(), bound.halfspaces()
     moving = np.flatnonzero((box.lower != 0.0) | (box.upper != 0.0))
     if moving.size in (0, bound.dimension) or flat is None:

@@ -1,18 +1,19 @@
 """A known system that changes with time, between the breakpoints, as bounds over cells of time see it.
 
-Between two *marks*, breakpoints and ends of segments of the expansion, the system is one polynomial of the time but
-for a remainder. There ``y'' = Q y + R v`` with ``Q = A' + A^2`` and ``R = F' + A F`` for the state, and for what any
-block of an uncertainty makes of it, under inputs ``v`` through ``F = [B E]``; and what ``y''`` moves by within a cell
-is bounded entry by entry by its own derivative. What is computed may be off by what every step was off by, carried on:
-the products of transitions that carry it are at most what is computed of them, and a little.
+Between two *marks*, breakpoints and ends of segments of the expansion, the system is one polynomial of the time with a
+remainder. There ``y'' = Q y + R v`` with ``Q = A' + A^2`` and ``R = F' + A F``, for the state and for the effect of any
+block of an uncertainty on it, under inputs ``v`` through ``F = [B E]``. The change of ``y''`` within a cell is bounded
+entry by entry by its own derivative. The error of the computed states is the propagated error of all steps: the
+products of transitions that propagate it are at most the computed ones, and a little more.
 
-Of a system with parameters that its state is no affine function of, it is the motion of all coefficients of an
-expansion in them. With ``x = sum_a delta^a x_a + R`` (`Spread`), what is beyond the degree ``D`` obeys ``R' = A(t, p)
-R`` plus the products of coefficients of ``A`` and of the state whose degrees add up to more than ``D``. So it is at
-most the transitions' norm times the integral of ``sum_j n_j sum_(b > D - j) a_b``, with ``a_b`` and ``n_j`` the norms
-of all coefficients of ``A`` and of the state of a degree; and the transitions themselves are such an expansion, whose
-norm is bounded by what it is of its own coefficients. Of entries that are no polynomials what their own power series
-leave (`Left`) is there too: that of ``A`` times all coefficients of the state, and that of ``[B E]`` times inputs.
+For a system with parameters whose state is not affine in them, the motion is that of all coefficients of an expansion
+in the parameters. With ``x = sum_a delta^a x_a + R`` (`Spread`), the remainder beyond the degree ``D`` obeys
+``R' = A(t, p) R`` plus the products of coefficients of ``A`` and of the state whose degrees add up to more than ``D``.
+So the remainder is at most the norm of the transitions times the integral of ``sum_j n_j sum_(b > D - j) a_b``, with
+``a_b`` and ``n_j`` the norms of all coefficients of ``A`` and of the state of a degree. The transitions are such an
+expansion themselves, and their norm is bounded from the norms of their own coefficients. For entries that are no
+polynomials the remainder of their power series (`Left`) is added: that of ``A`` times all coefficients of the state,
+and that of ``[B E]`` times inputs.
 """
 
 from __future__ import annotations
@@ -61,11 +62,13 @@ class VaryingMotion:
     @cached_property
     def grid(self) -> TimeGrid:
         """The pieces between all marks, ``K`` of them."""
-        whole, origin = self.propagator.grid, self.origin
-        acting, pushing = whole.control_piece[origin], whole.disturbance_piece[origin]
-        numbers = np.arange(origin.size)
+        grid, origin = self.propagator.grid, self.origin
+        control_pieces, disturbance_pieces = grid.control_piece[origin], grid.disturbance_piece[origin]
+        modes = np.arange(origin.size)
         marks = self.propagator.marks
-        return TimeGrid(marks, acting, pushing, whole.before, whole.constants, mode=numbers, varying=True)
+        return TimeGrid(
+            marks, control_pieces, disturbance_pieces, grid.before, grid.constants, mode=modes, varying=True
+        )
 
     @cached_property
     def origin(self) -> np.ndarray:
@@ -75,7 +78,7 @@ class VaryingMotion:
 
     @property
     def space(self) -> TaylorSpace:
-        """Nothing depends on parameters."""
+        """The polynomials in no parameter, with one coefficient."""
         return KNOWN
 
     @property
@@ -90,12 +93,12 @@ class VaryingMotion:
 
     @cached_property
     def starts(self) -> np.ndarray:
-        """Every state is a block."""
+        """Indices ``(d,)`` at which the blocks begin: every state is a block of its own."""
         return np.arange(self.states)
 
     @property
     def influence(self) -> Array:
-        """There are no parameters."""
+        """An empty array ``(0,)``, since the system has no parameters."""
         return np.zeros(0)
 
     @cached_property
@@ -105,7 +108,7 @@ class VaryingMotion:
 
     @property
     def terms(self) -> int:
-        """How many numbers are added up to an entry of `bends` times a state."""
+        """Number of terms that are added up in an entry of `bends` times a state."""
         return 2 * int(self.expansion.coefficients.shape[1]) + 4 * self.states
 
     @cached_property
@@ -117,24 +120,25 @@ class VaryingMotion:
 
     @cached_property
     def flow(self) -> Flow:
-        """What the pieces make of states and inputs."""
+        """Effect of the state at the beginning of every piece, and of inputs, on the state at its end."""
         marks = self.propagator.marks
         return self.expansion.flow(marks[:-1], marks[1:])
 
     @cached_property
     def inputs(self) -> Array:
-        """What the pieces make of inputs, those of the disturbance after the others, ``(K, d, m + mw)``."""
+        """Effect of constant inputs on every piece on the state at its end, those of the disturbance after the others,
+        ``(K, d, m + mw)``."""
         return np.concatenate([self.flow.control, self.flow.disturbance], axis=2)
 
     def nodes(self, control: Array) -> Array:
         """States ``(K + 1, 1, d)`` at the marks."""
         key = control.tobytes()
         if key not in self._paths:
-            pushed = np.einsum("kdm,mk->kd", self.flow.control, self.grid.inputs(control))
-            path = np.empty((pushed.shape[0] + 1, self.states))
+            forcings = np.einsum("kdm,mk->kd", self.flow.control, self.grid.inputs(control))
+            path = np.empty((forcings.shape[0] + 1, self.states))
             path[0] = self.initial_state
-            for k, (step, push) in enumerate(zip(self.flow.state, pushed, strict=True)):
-                path[k + 1] = step @ path[k] + push
+            for k, (step, forcing) in enumerate(zip(self.flow.state, forcings, strict=True)):
+                path[k + 1] = step @ path[k] + forcing
             remember(self._paths, key, path[:, None], PATHS_KEPT)
         return self._paths[key]
 
@@ -145,12 +149,14 @@ class VaryingMotion:
     def moved(self, within: Array, pieces: np.ndarray, begun: Array, inputs: Array) -> Array:
         """`Motion.moved`."""
         flow = self.over(within, pieces)
-        found = np.einsum("kij,kj->ki", flow.state, begun[:, 0]) + np.einsum("kim,km->ki", flow.control, inputs)
-        return np.asarray(found[:, None])
+        states = np.einsum("kij,kj->ki", flow.state, begun[:, 0]) + np.einsum("kim,km->ki", flow.control, inputs)
+        return np.asarray(states[:, None])
 
     def over(self, within: Array, pieces: np.ndarray) -> Flow:
-        """What the first times ``within (k,)`` pieces make of states and inputs; remembered, since a state and all that
-        is uncertain of it are looked at together."""
+        """Return the effect of states and inputs over the first times ``within (k,)`` of ``pieces (k,)``.
+
+        The result is remembered, since a state and its uncertainty are looked at together.
+        """
         pieces = np.minimum(pieces, self.origin.size - 1)  # beyond the last there is no time
         key = within.tobytes() + pieces.tobytes()
         if key not in self._ways:
@@ -178,40 +184,61 @@ class VaryingMotion:
         inputs: Array,
         sizes: Array,
     ) -> Array:
-        """How far ``rows (r, d)``, or ``(k, r, d)``, of several states are from their chords on ``[start, start +
-        width]``, ``(k, r)``: of any sum of ``states (k, d, n)`` at ``start``, driven by the first of the ``inputs (k,
-        i, n)``, each times a factor of at most its size, ``sizes (n,)``. By the second time derivative at the start,
-        and how far the third may move it."""
+        """Return bounds ``(k, r)`` of the distance of rows of states from their chords on ``[start, start + width]``.
+
+        The bounds are from the second time derivative at the start, and from its change by the third.
+
+        Parameters
+        ----------
+        rows : Array
+            Rows ``(r, d)``, or ``(k, r, d)``.
+        start, width : Array
+            Cells of time ``(k,)``.
+        pieces : array
+            The piece ``(k,)`` of each cell.
+        states, inputs : Array
+            States ``(k, d, n)`` at ``start``, and their inputs ``(k, i, n)``, the first ``i`` of all.
+        sizes : Array
+            Bounds ``(n,)``: the bounds hold for any sum of the states, each times a factor of at most its size.
+
+        Returns
+        -------
+        Array
+            The bounds ``(k, r)``.
+        """
         d, last = self.states, self.states + inputs.shape[1]
-        at = self.bends(start, pieces)[:, :, :last]
-        bent = at[:, :, :d] @ states + at[:, :, d:] @ inputs
-        begun, pushes = np.abs(states) @ sizes, np.abs(inputs) @ sizes
-        most, third = self.most[pieces], self.third[pieces]
-        reached = begun + width[:, None] * np.einsum("kim,km->ki", most[:, :, d:last], pushes)
-        turned = np.einsum("kij,kj->ki", third[:, :, :d], self.grown(pieces, width, reached))
-        turned = turned + np.einsum("kim,km->ki", third[:, :, d:last], pushes)
-        added = np.einsum("kij,kj->ki", np.abs(at), np.concatenate([begun, pushes], axis=1))
-        turned = width[:, None] * turned + rounding(self.terms + inputs.shape[1]) * added
-        along = np.abs(rows @ bent) @ sizes + (np.abs(rows) @ turned[:, :, None])[:, :, 0]
-        return np.asarray((width**2 / 8)[:, None] * along * OUTWARD)
+        matrices = self.bends(start, pieces)[:, :, :last]
+        curvatures = matrices[:, :, :d] @ states + matrices[:, :, d:] @ inputs
+        start_sizes, input_sizes = np.abs(states) @ sizes, np.abs(inputs) @ sizes
+        law_bounds, third = self.most[pieces], self.third[pieces]
+        driven_sizes = start_sizes + width[:, None] * np.einsum("kim,km->ki", law_bounds[:, :, d:last], input_sizes)
+        change = np.einsum("kij,kj->ki", third[:, :, :d], self.grown(pieces, width, driven_sizes))
+        change = change + np.einsum("kim,km->ki", third[:, :, d:last], input_sizes)
+        magnitudes = np.einsum("kij,kj->ki", np.abs(matrices), np.concatenate([start_sizes, input_sizes], axis=1))
+        change = width[:, None] * change + rounding(self.terms + inputs.shape[1]) * magnitudes
+        row_curvature = np.abs(rows @ curvatures) @ sizes + (np.abs(rows) @ change[:, :, None])[:, :, 0]
+        return np.asarray((width**2 / 8)[:, None] * row_curvature * OUTWARD)
 
     def along(self, control: Array, rows: Array, others: Array) -> Array:
         """`Motion.along`."""
-        left_out, sizes = self.under(control)
-        return np.asarray(product(rows, left_out.T) + product(others, sizes.T))
+        error_bounds, sizes = self.under(control)
+        return np.asarray(product(rows, error_bounds.T) + product(others, sizes.T))
 
     def under(self, control: Array) -> tuple[Array, Array]:
-        """What states under a control may be off by on every piece, and how large they are at most, ``(K, d)`` each;
-        remembered, since it is the same for all rows."""
+        """Return bounds of the error of the states under a control on every piece, and bounds of the states, ``(K, d)``
+        each.
+
+        The result is remembered, since it is the same for all rows.
+        """
         key = control.tobytes()
         if key not in self._under:
-            inputs, path = np.abs(self.grid.inputs(control)), np.abs(self.nodes(control)[:-1, 0])
-            m = inputs.shape[0]
-            left_out = self.left_out(path, self.flow.sizes[:, :, :m] * inputs.T[:, None])
-            pushed = np.einsum("kim,mk->ki", self.most[:, :, self._columns(m)], inputs)
-            begun = path + self.grid.lengths[:, None] * pushed
-            found = left_out, self.grown(self.every, self.grid.lengths, begun)
-            remember(self._under, key, found, PATHS_KEPT)
+            input_sizes, start_sizes = np.abs(self.grid.inputs(control)), np.abs(self.nodes(control)[:-1, 0])
+            m = input_sizes.shape[0]
+            error_bounds = self.left_out(start_sizes, self.flow.sizes[:, :, :m] * input_sizes.T[:, None])
+            forcing = np.einsum("kim,mk->ki", self.most[:, :, self._columns(m)], input_sizes)
+            driven_sizes = start_sizes + self.grid.lengths[:, None] * forcing
+            bounds = error_bounds, self.grown(self.every, self.grid.lengths, driven_sizes)
+            remember(self._under, key, bounds, PATHS_KEPT)
         return self._under[key]
 
     @cached_property
@@ -219,41 +246,64 @@ class VaryingMotion:
         return {}
 
     def left_out(self, sizes: Array, pushed: Array) -> Array:
-        """What states that are at most ``sizes (K, d)`` at the beginning of every piece, and are driven by at most
-        ``pushed (K, d, ...)`` in the norm of the units of what is coupled with each, may be off by on it, entry by
-        entry, ``(K, d)``: twice, since both a chord and the state itself are looked at; and what that makes of the
-        second and third derivative."""
-        lost, lengths, d = self._lost(sizes, pushed.sum(axis=2)), self.grid.lengths[:, None], self.states
-        second = np.einsum("kij,kj->ki", self.second[:, :, :d], lost)
-        third = np.einsum("kij,kj->ki", self.third[:, :, :d], self.grown(self.every, lengths[:, 0], lost))
-        return np.asarray((2.0 * lost + lengths**2 / 8 * (second + lengths * third)) * OUTWARD)
+        """Return bounds of the error of states on every piece, entry by entry, ``(K, d)``.
+
+        The error counts twice, since both a chord and the state itself are looked at. Its effect on the second and on
+        the third derivative is added.
+
+        Parameters
+        ----------
+        sizes : Array
+            Bounds ``(K, d)`` of the states at the beginning of every piece.
+        pushed : Array
+            Bounds ``(K, d, ...)`` of the inputs to the states that are coupled with each state, in the norm of their
+            units.
+
+        Returns
+        -------
+        Array
+            Bounds ``(K, d)``.
+        """
+        step_errors, lengths, d = self._lost(sizes, pushed.sum(axis=2)), self.grid.lengths[:, None], self.states
+        second = np.einsum("kij,kj->ki", self.second[:, :, :d], step_errors)
+        third = np.einsum("kij,kj->ki", self.third[:, :, :d], self.grown(self.every, lengths[:, 0], step_errors))
+        return np.asarray((2.0 * step_errors + lengths**2 / 8 * (second + lengths * third)) * OUTWARD)
 
     def _lost(self, sizes: Array, pushed: Array) -> Array:
-        """Every step misses a share of what it begins with, and of what drives it, of states that are coupled with one
-        another, in the units of its segment; that is carried on by the transitions from there, and within the piece."""
-        units, off = self._steps_off
-        begun = self.expansion.over_parts((sizes / units)[:, :, None])[:, :, 0]
-        here = np.maximum(off[:, None] * (begun + pushed), TINY)  # not 0, which times no bound is no number
+        """Return bounds ``(K, d)`` of the propagated error of all steps, on every piece.
+
+        Every step has an error in proportion to the states at its beginning, and to their inputs, of all states that
+        are coupled with one another, in the units of its segment. The transitions from there, and within the piece,
+        propagate it.
+        """
+        units, step_errors = self._steps_off
+        start_norms = self.expansion.over_parts((sizes / units)[:, :, None])[:, :, 0]
+        # not 0, which times no bound is no number
+        local_errors = np.maximum(step_errors[:, None] * (start_norms + pushed), TINY)
         stretch, first = self._stretches
-        so_far, whole = np.empty_like(here), np.add.reduceat(here, first, axis=0)
-        for begin, end in zip(first, [*first[1:], len(here)], strict=True):
-            so_far[begin:end] = np.cumsum(here[begin:end], axis=0)
-        carried, all_before = np.zeros_like(here), np.arange(first.size) < stretch[:-1, None]
-        carried[1:] = np.einsum("kb,kbi,bi->ki", all_before, self.carries[1:-1], whole)
-        carried[1:] += self.carries[np.arange(1, len(here)), stretch[:-1]] * so_far[:-1]
-        return np.asarray((self.grown(self.every, self.grid.lengths, carried) + units * here) * OUTWARD)
+        sums_within, stretch_totals = np.empty_like(local_errors), np.add.reduceat(local_errors, first, axis=0)
+        for begin, end in zip(first, [*first[1:], len(local_errors)], strict=True):
+            sums_within[begin:end] = np.cumsum(local_errors[begin:end], axis=0)
+        propagated, is_earlier = np.zeros_like(local_errors), np.arange(first.size) < stretch[:-1, None]
+        propagated[1:] = np.einsum("kb,kbi,bi->ki", is_earlier, self.carries[1:-1], stretch_totals)
+        propagated[1:] += self.carries[np.arange(1, len(local_errors)), stretch[:-1]] * sums_within[:-1]
+        return np.asarray((self.grown(self.every, self.grid.lengths, propagated) + units * local_errors) * OUTWARD)
 
     @cached_property
     def _steps_off(self) -> tuple[Array, Array]:
-        """The units ``(K, d)`` of the segment that a piece is in, or of all where it is in several, and what its step
-        is off by in the norm of largest row sums in them, what a product with it rounds included, ``(K,)``."""
+        """Units and errors of the steps over all pieces.
+
+        The units ``(K, d)`` are those of the segment that a piece is in, or of all where it is in several. The error
+        ``(K,)`` of a step is in the norm of largest row sums in these units, with the rounding of a product with the
+        step.
+        """
         expansion, marks, flow = self.expansion, self.propagator.marks, self.flow
-        apart = np.searchsorted(expansion.ends, marks[1:], side="left") - 1 > expansion.segment_of(marks[:-1])
-        ratios = np.where(apart[:, None], 1.0, expansion.ratios[self._segments])
+        spans_segments = np.searchsorted(expansion.ends, marks[1:], side="left") - 1 > expansion.segment_of(marks[:-1])
+        ratios = np.where(spans_segments[:, None], 1.0, expansion.ratios[self._segments])
         units = expansion.units * ratios
-        off = flow.error / ratios.max(axis=1)
-        ahead = (np.abs(flow.state) / units[:, :, None] * units[:, None]).sum(axis=2).max(axis=1)
-        return units, off + rounding(self.states + self.inputs.shape[2]) * (ahead + off)
+        errors = flow.error / ratios.max(axis=1)
+        transition_norms = (np.abs(flow.state) / units[:, :, None] * units[:, None]).sum(axis=2).max(axis=1)
+        return units, errors + rounding(self.states + self.inputs.shape[2]) * (transition_norms + errors)
 
     @cached_property
     def _stretches(self) -> tuple[np.ndarray, np.ndarray]:
@@ -263,48 +313,58 @@ class VaryingMotion:
 
     @cached_property
     def carries(self) -> Array:
-        """What the transitions to every mark from the ends of the pieces of a stretch before it make of a step that
-        is off by 1 in the units of its piece, state by state, at most: ``(K + 1, stretches, d)``. That of the computed
-        ones, and with ``P`` the largest norm of them, each in the units of the pieces that end at both marks, and ``e``
-        the sum of what all steps are off by in these, ``P^2 e / (1 - P e)`` more."""
-        (units, off), first = self._steps_off, self._stretches[1]
-        found = np.zeros((len(units) + 1, first.size, self.states))
+        """Bounds ``(K + 1, stretches, d)`` of the effect on every mark of a step with error 1 in an earlier stretch,
+        state by state.
+
+        The error is 1 in the units of the piece of the step. The bound is that of the computed transitions to the mark
+        from the ends of the pieces of the stretch, and ``P^2 e / (1 - P e)`` more. Here ``P`` is the largest norm of
+        these transitions, each in the units of the pieces that end at both marks, and ``e`` the sum of the errors of
+        all steps in these units.
+        """
+        (units, step_errors), first = self._steps_off, self._stretches[1]
+        bounds = np.zeros((len(units) + 1, first.size, self.states))
         for mark, sums in enumerate(self.sums()):
-            begun = first[first < mark]
+            earlier = first[first < mark]
             if mark:
-                found[mark, : begun.size] = np.maximum.reduceat(sums[1:], begun, axis=0)
-        found = self.expansion.of_all(found)
-        before = np.concatenate([units[:1], units[:-1]])
-        ends = np.concatenate([units[:1], units])
-        largest = max(1.0, float((found / ends[:, None]).max()))
-        share = largest * float((off * (before / units).max(axis=1)).sum())
-        more = largest * share / (1.0 - share) if share < 0.5 else np.inf
-        return found + np.where(found > 0.0, more * ends[:, None], 0.0)
+                bounds[mark, : earlier.size] = np.maximum.reduceat(sums[1:], earlier, axis=0)
+        bounds = self.expansion.of_all(bounds)
+        start_units = np.concatenate([units[:1], units[:-1]])
+        mark_units = np.concatenate([units[:1], units])
+        largest = max(1.0, float((bounds / mark_units[:, None]).max()))
+        share = largest * float((step_errors * (start_units / units).max(axis=1)).sum())
+        surplus = largest * share / (1.0 - share) if share < 0.5 else np.inf
+        return bounds + np.where(bounds > 0.0, surplus * mark_units[:, None], 0.0)
 
     def sums(self) -> Iterator[Array]:
-        """Yield, mark after mark, what the transitions to it from every mark up to it make of states that are at most 1
-        in the units of the piece before, ``(marks, d)``; of coefficients of polynomials, of the constant ones."""
+        """Yield, mark after mark, the effect on it of states of at most 1 at every mark up to it, ``(marks, d)``.
+
+        States are in the units of the piece before their mark. For coefficients of polynomials, the states are those of
+        the constant coefficient.
+        """
         units, own = self._steps_off[0], self.expansion.own
-        every = np.empty((len(units) + 1, self.states, own))
-        for mark in range(len(every)):
+        effects = np.empty((len(units) + 1, self.states, own))
+        for mark in range(len(effects)):
             if mark:
-                every[:mark] = self.flow.state[mark - 1] @ every[:mark]
-            every[mark] = np.diag(units[max(mark - 1, 0)])[:, :own]
-            yield np.abs(every[: mark + 1]).sum(axis=2)
+                effects[:mark] = self.flow.state[mark - 1] @ effects[:mark]
+            effects[mark] = np.diag(units[max(mark - 1, 0)])[:, :own]
+            yield np.abs(effects[: mark + 1]).sum(axis=2)
 
     def grown(self, pieces: np.ndarray, width: Array, sizes: Array) -> Array:
-        """What states of at most ``sizes (k, d)`` may become within a ``width (k,)`` of a piece, ``(k, d)``: by the
-        exponential of the largest entries of ``A`` there."""
-        most, pace = self.most[pieces][:, :, : self.states], self.paces[pieces] * width
+        """Return bounds ``(k, d)`` of states of at most ``sizes (k, d)`` after up to a time ``width (k,)`` within a
+        piece.
+
+        The bounds are from the exponential of the largest entries of ``A`` on the piece.
+        """
+        matrix_bounds, pace = self.most[pieces][:, :, : self.states], self.paces[pieces] * width
         units = self.expansion.units * self.expansion.ratios[self._segments[pieces]]
         total, term = sizes.astype(float), sizes.astype(float)
         for n in range(1, GROWN):
-            term = np.einsum("kij,kj->ki", most, term) * (width / n)[:, None]
+            term = np.einsum("kij,kj->ki", matrix_bounds, term) * (width / n)[:, None]
             total = total + term
-        shares = (pace / GROWN) / np.maximum(1.0 - pace / (GROWN + 1), 0.1)
-        rest = self.expansion.over_parts((term / units)[:, :, None])[:, :, 0] * shares[:, None]
-        rest = np.where(pace[:, None] < 0.8 * GROWN, rest, np.inf)
-        return np.asarray((total + units * rest) * OUTWARD)
+        tail_factors = (pace / GROWN) / np.maximum(1.0 - pace / (GROWN + 1), 0.1)
+        tail = self.expansion.over_parts((term / units)[:, :, None])[:, :, 0] * tail_factors[:, None]
+        tail = np.where(pace[:, None] < 0.8 * GROWN, tail, np.inf)
+        return np.asarray((total + units * tail) * OUTWARD)
 
     def place(self, times: Array) -> np.ndarray:
         """The mark at or before each time."""
@@ -320,8 +380,8 @@ class VaryingMotion:
         size = max(1, AT_ONCE // self.expansion.coefficients[0].size)
         if times.size > size:
             every = [slice(begin, begin + size) for begin in range(0, times.size, size)]
-            parts = [self.law(times[part], pieces[part]) for part in every]
-            return np.concatenate([one for one, _ in parts]), np.concatenate([one for _, one in parts])
+            pairs = [self.law(times[chunk], pieces[chunk]) for chunk in every]
+            return np.concatenate([law for law, _ in pairs]), np.concatenate([slope for _, slope in pairs])
         segments = self._segments[pieces]
         begin, end = self.expansion.ends[segments], self.expansion.ends[segments + 1]
         every = self.expansion.coefficients[segments]
@@ -347,20 +407,22 @@ class VaryingMotion:
 
     @cached_property
     def _bounds(self) -> tuple[Array, Array, Array, Array]:
-        """Of ``[A F]`` on every piece, entry by entry: the largest absolute values, those of the second and third
-        derivative of a solution by what multiplies it and its inputs, ``(K, d, d + m + mw)`` each; and the norm of
-        ``A`` in own units, ``(K,)``."""
+        """Bounds on every segment of the expansion, entry by entry.
+
+        Of ``[A F]``, and of the matrices that give the second and the third derivative of a solution from the state and
+        its inputs, ``(s, d, d + m + mw)`` each; and the norm of ``A`` in own units, ``(s,)``.
+        """
         expansion, d, sizes = self.expansion, self.states, np.abs(self.expansion.coefficients)
         radius, orders = (np.diff(expansion.ends) / 2)[:, None, None], np.arange(float(sizes.shape[1]))
-        most = sizes.sum(axis=1) + expansion.remainder
-        once = np.einsum("n,snij->sij", orders, sizes) / radius
-        twice = np.einsum("n,snij->sij", orders * (orders - 1.0), sizes) / radius**2
-        A, slope = most[:, :, :d], once[:, :, :d]
-        second = once + A @ most
-        third = twice + slope @ most + A @ once + second[:, :, :d] @ most
+        law_bounds = sizes.sum(axis=1) + expansion.remainder
+        law_slopes = np.einsum("n,snij->sij", orders, sizes) / radius
+        law_curvatures = np.einsum("n,snij->sij", orders * (orders - 1.0), sizes) / radius**2
+        A, slope = law_bounds[:, :, :d], law_slopes[:, :, :d]
+        second = law_slopes + A @ law_bounds
+        third = law_curvatures + slope @ law_bounds + A @ law_slopes + second[:, :, :d] @ law_bounds
         units = expansion.units * expansion.ratios
         pace = (A / units[:, :, None] * units[:, None]).sum(axis=2).max(axis=1)
-        return most * OUTWARD, second * OUTWARD, third * OUTWARD, pace * OUTWARD
+        return law_bounds * OUTWARD, second * OUTWARD, third * OUTWARD, pace * OUTWARD
 
     @cached_property
     def most(self) -> Array:
@@ -369,12 +431,14 @@ class VaryingMotion:
 
     @cached_property
     def second(self) -> Array:
-        """Those of what makes the second derivative, ``(K, d, d + m + mw)``."""
+        """Bounds of the matrix that gives the second derivative of a solution from the state and its inputs, on every
+        piece, ``(K, d, d + m + mw)``."""
         return np.asarray(self._bounds[1][self._segments])
 
     @cached_property
     def third(self) -> Array:
-        """Those of what makes the third derivative, ``(K, d, d + m + mw)``."""
+        """Bounds of the matrix that gives the third derivative of a solution from the state and its inputs, on every
+        piece, ``(K, d, d + m + mw)``."""
         return np.asarray(self._bounds[2][self._segments])
 
     @cached_property
@@ -384,33 +448,34 @@ class VaryingMotion:
 
     @cached_property
     def of_initial(self) -> Array:
-        """What a deviation of the initial state makes of the states at the marks, ``(K + 1, d, 1, d)``."""
-        found = np.empty((self.origin.size + 1, self.states, self.states))
-        found[0] = np.eye(self.states)
+        """Effect of a deviation of the initial state on the states at the marks, ``(K + 1, d, 1, d)``."""
+        effects = np.empty((self.origin.size + 1, self.states, self.states))
+        effects[0] = np.eye(self.states)
         for k, step in enumerate(self.flow.state):
-            found[k + 1] = step @ found[k]
-        return found[:, :, None]
+            effects[k + 1] = step @ effects[k]
+        return effects[:, :, None]
 
     @cached_property
     def of_disturbance(self) -> Array:
-        """What the disturbance on every piece of the propagator's grid makes of the states at the marks, ``(K + 1, d,
-        L, mw)``."""
-        pushes = self.flow.disturbance
-        found = np.zeros((self.origin.size + 1, self.states, self.propagator.grid.pieces, pushes.shape[2]))
+        """Effect of the disturbance on every piece of the propagator's grid on the states at the marks,
+        ``(K + 1, d, L, mw)``."""
+        input_effects = self.flow.disturbance
+        effects = np.zeros((self.origin.size + 1, self.states, self.propagator.grid.pieces, input_effects.shape[2]))
         for k, (step, piece) in enumerate(zip(self.flow.state, self.origin.tolist(), strict=True)):
-            found[k + 1, :, : piece + 1] = np.einsum("ij,jlw->ilw", step, found[k, :, : piece + 1])
-            found[k + 1, :, piece] += pushes[k]
-        return found
+            effects[k + 1, :, : piece + 1] = np.einsum("ij,jlw->ilw", step, effects[k, :, : piece + 1])
+            effects[k + 1, :, piece] += input_effects[k]
+        return effects
 
 
 @dataclass(frozen=True, eq=False)
 class VaryingSupport:
     """The support function of a part of the uncertainty on functionals ``rows (r, d)`` of a system that changes with
-    time: as `DisturbanceSupport`, for one that is known.
+    time, in the form of `DisturbanceSupport` for a known system.
 
-    ``effect (K + 1, d, P, w)``: what its ``P`` parts made of the state until every mark; ``blocks``: from weights
-    ``(..., P, w)`` on these to those on its blocks ``(..., nb, q)``, each of which is in ``set``; ``far (w,)``: how
-    far a part goes. ``lasts``: it acts all the time, on the piece of the grid as it is its turn, through ``E``.
+    ``effect (K + 1, d, P, w)`` is the effect of its ``P`` components on the state until every mark. ``blocks`` takes
+    weights ``(..., P, w)`` on the components to weights ``(..., nb, q)`` on the blocks, each of which is in ``set``.
+    ``far (w,)`` bounds the entries of a component. ``lasts``: the components act one after another, each on its piece
+    of the propagator's grid, through ``E``.
     """
 
     motion: VaryingMotion
@@ -426,17 +491,22 @@ class VaryingSupport:
     def of_disturbance(
         motion: VaryingMotion, model: DisturbanceModel, rows: Array, combination: Combination | None
     ) -> VaryingSupport:
-        """That of the worst disturbance."""
-        far = model.bound.reach(np.eye(model.channels))
-        return VaryingSupport(motion, model.set, motion.of_disturbance, model.blocks, far, True, rows, combination)
+        """Return the support of the worst disturbance on functionals ``rows (r, d)``."""
+        radii = model.bound.reach(np.eye(model.channels))
+        return VaryingSupport(motion, model.set, motion.of_disturbance, model.blocks, radii, True, rows, combination)
 
     @staticmethod
     def of_initial(
         motion: VaryingMotion, bound: ConvexSet, rows: Array, combination: Combination | None
     ) -> VaryingSupport:
-        """That of the worst deviation of the initial state, one block that acts at time 0."""
-        far = bound.reach(np.eye(bound.dimension))
-        return VaryingSupport(motion, bound, motion.of_initial, lambda one: one, far, False, rows, combination)
+        """Return the support of the worst deviation of the initial state on functionals ``rows (r, d)``.
+
+        The deviation is one block that acts at time 0.
+        """
+        radii = bound.reach(np.eye(bound.dimension))
+        return VaryingSupport(
+            motion, bound, motion.of_initial, lambda weights: weights, radii, False, rows, combination
+        )
 
     def steepness(self, times: Array) -> Array:
         """`Support.steepness`."""
@@ -446,51 +516,52 @@ class VaryingSupport:
     def at(self, times: Array, ends: Array) -> tuple[Array, Array]:
         """`Support.at`."""
         return over_faces(
-            self._space, ends, lambda here, face: summed(self.set, self._seen(times[here]), face).sum(axis=2)
+            self._space, ends, lambda index, face: summed(self.set, self._seen(times[index]), face).sum(axis=2)
         )
 
     def deviation(self, start: Array, widths: Array) -> Array:
         """`Support.deviation`: as `VaryingMotion.deviation`, for every block."""
         motion, d = self.motion, self.motion.states
         pieces = np.minimum(motion.place(start), motion.origin.size - 1)
-        at = motion.bends(start, pieces)
-        bent = self.weights(start, self.rows @ at[:, :, :d])
+        matrices = motion.bends(start, pieces)
+        curvatures = self.weights(start, self.rows @ matrices[:, :, :d])
         third = motion.third[pieces]
-        turned = np.einsum("kij,kj->ki", third[:, :, :d], self.reached[pieces])
+        change = np.einsum("kij,kj->ki", third[:, :, :d], self.reached[pieces])
         if self.lasts:
-            pushes = slice(at.shape[2] - self.far.size, None)
-            bent[np.arange(start.size), :, motion.origin[pieces]] += self.rows @ at[:, :, pushes]
-            turned = turned + third[:, :, pushes] @ self.far
-        exact = self.set.reach(self.blocks(bent)).sum(axis=2)
-        turned = widths[:, None] * turned
-        turned = turned + rounding(motion.terms + bent[0, 0].size) * np.einsum(
+            columns = slice(matrices.shape[2] - self.far.size, None)
+            curvatures[np.arange(start.size), :, motion.origin[pieces]] += self.rows @ matrices[:, :, columns]
+            change = change + third[:, :, columns] @ self.far
+        exact = self.set.reach(self.blocks(curvatures)).sum(axis=2)
+        change = widths[:, None] * change
+        change = change + rounding(motion.terms + curvatures[0, 0].size) * np.einsum(
             "kij,kj->ki", motion.second[pieces][:, :, :d], self.reached[pieces]
         )
-        along = exact + turned @ np.abs(self.rows).T
-        return np.asarray((widths**2 / 8)[:, None] * along * OUTWARD)
+        row_curvature = exact + change @ np.abs(self.rows).T
+        return np.asarray((widths**2 / 8)[:, None] * row_curvature * OUTWARD)
 
     @cached_property
     def neglected(self) -> Array:
-        """What is off in the transitions, and rounded in the sums over the blocks, on every piece: ``(r, K)``."""
-        motion, sums = self.motion, self.sizes
-        pushed = np.zeros((sums.shape[0] - 1, 1, 1))
+        """Bounds ``(r, K)`` of the error of the functionals on every piece, from the error of the transitions and the
+        rounding of the sums over the blocks."""
+        motion, sizes = self.motion, self.sizes
+        forcing = np.zeros((sizes.shape[0] - 1, 1, 1))
         if self.lasts:
-            pushed = motion.flow.sizes[..., -self.far.size :] * self.far
-        total = motion.left_out(sums[:-1], pushed) + rounding(self.effect[0, 0].size) * self.reached
+            forcing = motion.flow.sizes[..., -self.far.size :] * self.far
+        total = motion.left_out(sizes[:-1], forcing) + rounding(self.effect[0, 0].size) * self.reached
         return product(np.abs(self.rows), total.T)
 
     @cached_property
     def reached(self) -> Array:
-        """What any of it can have made of every state on every piece, ``(K, d)``."""
-        motion, begun = self.motion, self.sizes[:-1]
+        """Bounds ``(K, d)`` of the effect of this part of the uncertainty on every state on every piece."""
+        motion, sizes = self.motion, self.sizes[:-1]
         lengths = motion.grid.lengths
         if self.lasts:
-            begun = begun + lengths[:, None] * (motion.most[:, :, -self.far.size :] @ self.far)
-        return motion.grown(motion.every, lengths, begun)
+            sizes = sizes + lengths[:, None] * (motion.most[:, :, -self.far.size :] @ self.far)
+        return motion.grown(motion.every, lengths, sizes)
 
     @cached_property
     def sizes(self) -> Array:
-        """The same at the marks, ``(K + 1, d)``."""
+        """Bounds ``(K + 1, d)`` of the effect of this part of the uncertainty on every state at the marks."""
         return np.asarray(np.einsum("kdpw,w->kd", np.abs(self.effect), self.far) * OUTWARD)
 
     @property
@@ -500,31 +571,35 @@ class VaryingSupport:
     def _seen(self, times: Array) -> Array:
         """Taylor coefficients ``(k, r, M, nb, q)`` of what the functionals give to every block."""
         rows = np.broadcast_to(self.rows, (times.size, *self.rows.shape))
-        found = self.blocks(self.weights(times, rows))[:, :, None]
-        return found if self.combination is None else self.combination.apply(found)
+        coefficients = self.blocks(self.weights(times, rows))[:, :, None]
+        return coefficients if self.combination is None else self.combination.apply(coefficients)
 
     def weights(self, times: Array, rows: Array) -> Array:
-        """What rows ``(k, r, d)`` at times ``(k,)`` give to every part, ``(k, r, P, w)``."""
-        motion, place = self.motion, self.motion.place(times)
-        parts = self.effect.shape[2:]
-        flow = motion.over(times - motion.grid.breakpoints[place], place)
-        carried = rows @ flow.state
-        found = np.empty((*rows.shape[:2], *parts))
-        size = max(1, AT_ONCE // max(1, motion.states * parts[0] * parts[1]))
+        """Return the weights ``(k, r, P, w)`` of rows ``(k, r, d)`` at times ``(k,)`` on every component of the
+        uncertainty."""
+        motion, mark_indices = self.motion, self.motion.place(times)
+        shape = self.effect.shape[2:]
+        flow = motion.over(times - motion.grid.breakpoints[mark_indices], mark_indices)
+        propagated_rows = rows @ flow.state
+        weights = np.empty((*rows.shape[:2], *shape))
+        size = max(1, AT_ONCE // max(1, motion.states * shape[0] * shape[1]))
         for begin in range(0, times.size, size):
-            part = slice(begin, begin + size)
-            table = self.effect[place[part]].reshape(-1, motion.states, parts[0] * parts[1])
-            found[part] = (carried[part] @ table).reshape(-1, rows.shape[1], *parts)
+            chunk = slice(begin, begin + size)
+            table = self.effect[mark_indices[chunk]].reshape(-1, motion.states, shape[0] * shape[1])
+            weights[chunk] = (propagated_rows[chunk] @ table).reshape(-1, rows.shape[1], *shape)
         if self.lasts:
-            pieces = motion.origin[np.minimum(place, motion.origin.size - 1)]
-            found[np.arange(times.size), :, pieces] += rows @ flow.disturbance
-        return found
+            pieces = motion.origin[np.minimum(mark_indices, motion.origin.size - 1)]
+            weights[np.arange(times.size), :, pieces] += rows @ flow.disturbance
+        return weights
 
 
 @dataclass(frozen=True, eq=False)
 class Truncation:
-    """What an expansion leaves out of states that a ``motion`` of all coefficients tells of; in the norm of the units
-    of the first block of these. ``known``: the `growth` on a cell around this one, where that is known."""
+    """Truncation error of an expansion in parameters, of states whose coefficients all are in one ``motion``.
+
+    Norms are in the units of the first block of the coefficients. ``known`` is the `growth` on a cell around this one,
+    where that is known.
+    """
 
     motion: VaryingMotion
     spread: Spread
@@ -539,8 +614,10 @@ class Truncation:
         """The summed norms of the coefficients of every degree, ``(..., D + 1)``, of states that are at most ``sizes
         (..., states)``."""
         space = self.spread.space
-        apart = (sizes.reshape(*sizes.shape[:-1], space.size, self.spread.d) / self.units).max(axis=-1)
-        return np.stack([apart[..., space.degrees == j].sum(axis=-1) for j in range(space.degree + 1)], axis=-1)
+        coefficient_norms = (sizes.reshape(*sizes.shape[:-1], space.size, self.spread.d) / self.units).max(axis=-1)
+        return np.stack(
+            [coefficient_norms[..., space.degrees == j].sum(axis=-1) for j in range(space.degree + 1)], axis=-1
+        )
 
     def driven(self, inputs: Array) -> Array:
         """The rates at which inputs that are at most ``inputs (K, m + mw)`` drive the coefficients of every degree,
@@ -558,17 +635,17 @@ class Truncation:
 
     @property
     def influence(self) -> Array:
-        """How far every parameter moves the law over the horizon, ``(nu,)``."""
+        """Size of the change of the law with every parameter, over the horizon, ``(nu,)``."""
         d, space, lengths = self.motion.states, self.spread.space, self.motion.grid.lengths
         inputs = self.motion.most[:, :, d:].reshape(lengths.size, space.size, self.spread.d, -1)
-        pushed = (inputs / self.units[:, None]).max(axis=(2, 3), initial=0.0)
-        return np.asarray(lengths @ (self._norms + pushed) @ space.exponents)
+        input_norms = (inputs / self.units[:, None]).max(axis=(2, 3), initial=0.0)
+        return np.asarray(lengths @ (self._norms + input_norms) @ space.exponents)
 
     @property
     def growing(self) -> int:
         """The parameter that moves ``A`` most, which alone decides how far states grow."""
-        moved = self.motion.grid.lengths @ self._norms @ self.spread.space.exponents
-        return int(moved.argmax())
+        changes = self.motion.grid.lengths @ self._norms @ self.spread.space.exponents
+        return int(changes.argmax())
 
     @cached_property
     def _sizes(self) -> Array:
@@ -578,8 +655,8 @@ class Truncation:
 
     @cached_property
     def _off(self) -> tuple[Array, Array]:
-        """What the entries themselves leave out on every piece: the norm of ``A``, ``(K,)``, and how fast it drives
-        states, ``(K, m + mw)``."""
+        """Bounds of the remainder of the entries of the law on every piece: the norm of that of ``A``, ``(K,)``, and
+        the rate at which that of ``[B E]`` drives states per unit of each input, ``(K, m + mw)``."""
         d, K = self.spread.d, self.motion.grid.pieces
         if self.spread.left is None:
             return np.zeros(K), np.zeros((K, self.motion.most.shape[2] - self.motion.states))
@@ -588,7 +665,8 @@ class Truncation:
 
     @cached_property
     def _within(self) -> Array:
-        """What a piece makes of norms at most, anywhere on it, ``(K, D + 1, D + 1)``."""
+        """Bounds ``(K, D + 1, D + 1)`` of the growth of the norms of the coefficients of every degree, anywhere on a
+        piece."""
         size, count = self.spread.space.degree + 1, self._sizes.shape[0]
         rate = np.zeros((count, size, size))
         for j in range(size):
@@ -603,65 +681,85 @@ class Truncation:
 
     @cached_property
     def _beyond(self) -> Array:
-        """What coefficients of every degree are multiplied by in the products beyond, ``(K, D + 1)``."""
-        found = np.cumsum(self._sizes[:, ::-1], axis=1)  # of the degrees D, D and D - 1, ...: for j = 0, 1, ...
-        above = np.concatenate([np.zeros((found.shape[0], 1)), found[:, :-1]], axis=1)
+        """Factors ``(K, D + 1)`` of the coefficients of every degree in the products beyond the degree ``D``, with the
+        remainder of ``A``."""
+        sums = np.cumsum(self._sizes[:, ::-1], axis=1)  # of the degrees D, D and D - 1, ...: for j = 0, 1, ...
+        above = np.concatenate([np.zeros((sums.shape[0], 1)), sums[:, :-1]], axis=1)
         return np.asarray((above + self._off[0][:, None]) * OUTWARD)
 
     def _added(self, begun: Array, driven: Array, off: Array) -> Array:
-        """The integral over every piece of what is beyond the degree, ``(K,)``, of states whose norms are ``begun (K, D
-        + 1)`` at its beginning and that are driven so fast, ``(K, D + 1)``, and ``off (K,)`` by what entries leave."""
+        """Return the integral of the terms beyond the degree over every piece, ``(K,)``.
+
+        ``begun (K, D + 1)`` are the norms of the states at the beginning of the piece, ``driven (K, D + 1)`` the rates
+        of their inputs, and ``off (K,)`` the rate from the remainder of the entries.
+        """
         lengths = self.motion.grid.lengths[:, None]
-        most = np.einsum("kij,kj->ki", self._within, begun + lengths * driven)
-        return np.asarray(((most * self._beyond).sum(axis=1) + off) * lengths[:, 0] * OUTWARD)
+        state_norms = np.einsum("kij,kj->ki", self._within, begun + lengths * driven)
+        return np.asarray(((state_norms * self._beyond).sum(axis=1) + off) * lengths[:, 0] * OUTWARD)
 
     @cached_property
     def _carried(self) -> Array:
-        """The norms of the coefficients of every degree of the transitions from any mark to each one, ``(K + 1, D +
-        1)``: what the constant coefficient there makes of all of them, as computed, and what steps are off by, carried
-        on as in `VaryingMotion.carries`; in each of several norms, in which a degree ``j`` counts ``ratio^j``, so that
-        it is off by that over this."""
+        """Norms ``(K + 1, D + 1)`` of the coefficients of every degree of the transitions from any mark to each one.
+
+        The norms are those of the computed effect of the constant coefficient on all coefficients, plus the error of
+        the steps, propagated as in `VaryingMotion.carries`. The error is bounded in each of several norms, in which a
+        degree ``j`` counts ``ratio^j``, so that the error of that degree is the bound divided by ``ratio^j``.
+        """
         motion, space, d = self.motion, self.spread.space, self.spread.d
         marks = motion.grid.breakpoints
-        counted = np.array(RATIOS)[:, None] ** np.arange(space.degree + 1)
-        found, largest = np.empty((marks.size, space.degree + 1)), np.ones(counted.shape[0])
+        degree_weights = np.array(RATIOS)[:, None] ** np.arange(space.degree + 1)
+        degree_norms, largest = np.empty((marks.size, space.degree + 1)), np.ones(degree_weights.shape[0])
         for mark, sums in enumerate(motion.sums()):
             norms = self.norms(sums)
-            found[mark], largest = norms.max(axis=0), np.maximum(largest, (norms @ counted.T).max(axis=0))
-        ahead = counted @ self.norms((np.abs(motion.flow.state[:, :, :d]) * self.units).sum(axis=2)).T
+            degree_norms[mark], largest = norms.max(axis=0), np.maximum(largest, (norms @ degree_weights.T).max(axis=0))
+        step_norms = degree_weights @ self.norms((np.abs(motion.flow.state[:, :, :d]) * self.units).sum(axis=2)).T
         error = motion.expansion.off(marks[:-1], marks[1:], RATIOS)
-        share = largest * (error + rounding(motion.states) * (ahead + error)).sum(axis=1) * OUTWARD
-        near = np.where(share < 0.5, largest * share / np.where(share < 0.5, 1.0 - share, 1.0), np.inf)
-        return np.asarray((found + (near[:, None] / counted).min(axis=0)) * OUTWARD)
+        share = largest * (error + rounding(motion.states) * (step_norms + error)).sum(axis=1) * OUTWARD
+        error_bounds = np.where(share < 0.5, largest * share / np.where(share < 0.5, 1.0 - share, 1.0), np.inf)
+        return np.asarray((degree_norms + (error_bounds[:, None] / degree_weights).min(axis=0)) * OUTWARD)
 
     @cached_property
     def growth(self) -> float:
-        """The norm of the transitions from any time to any later one, at any parameter; at most this."""
+        """An upper bound of the norm of the transitions from any time to any later one, at any parameter."""
         if self.known is not None:
             return self.known
         sizes = self._sizes.sum(axis=1) + self._off[0]
-        ends = float(np.exp((sizes * self.motion.grid.lengths).max()) * OUTWARD)
-        marks = self._carried[:-1]
-        share = ends * float(self._added(marks, np.zeros(marks.shape), np.zeros(len(marks))).sum())
+        piece_growth = float(np.exp((sizes * self.motion.grid.lengths).max()) * OUTWARD)
+        mark_norms = self._carried[:-1]
+        share = piece_growth * float(
+            self._added(mark_norms, np.zeros(mark_norms.shape), np.zeros(len(mark_norms))).sum()
+        )
         largest = float(self._carried.sum(axis=1).max())
-        return ends * ends * largest / (1.0 - share) * OUTWARD if share < 0.5 else np.inf
+        return piece_growth * piece_growth * largest / (1.0 - share) * OUTWARD if share < 0.5 else np.inf
 
     def lost(self, sizes: Array, inputs: Array) -> Array:
-        """What is beyond the degree of states that are at most ``sizes (K, states)`` at the beginning of every piece
-        and are driven by at most ``inputs (K, m + mw)``: state by state, ``(K, d)``."""
-        off = (self._off[1] * inputs).sum(axis=1)
-        added = np.cumsum(self._added(self.norms(sizes), self.driven(inputs), off))
-        return np.asarray(self.growth * added[:, None] * self.units * OUTWARD)
+        """Return bounds ``(K, d)`` of the truncation error of states, state by state.
+
+        Parameters
+        ----------
+        sizes : Array
+            Bounds ``(K, states)`` of the coefficients at the beginning of every piece.
+        inputs : Array
+            Bounds ``(K, m + mw)`` of the inputs.
+
+        Returns
+        -------
+        Array
+            Bounds ``(K, d)``.
+        """
+        remainder_rates = (self._off[1] * inputs).sum(axis=1)
+        accumulated = np.cumsum(self._added(self.norms(sizes), self.driven(inputs), remainder_rates))
+        return np.asarray(self.growth * accumulated[:, None] * self.units * OUTWARD)
 
     def under(self, control: Array) -> Array:
-        """The same of the states under a control, ``(K, d)``; remembered."""
+        """Return bounds ``(K, d)`` of the truncation error of the states under a control; remembered."""
         key = control.tobytes()
         if key not in self._under:
             motion, inputs = self.motion, np.abs(self.motion.grid.inputs(control)).T
-            every = np.zeros((len(inputs), motion.most.shape[2] - motion.states))
-            every[:, : inputs.shape[1]] = inputs
-            begun = np.abs(motion.nodes(control)[:-1, 0]) + motion.under(control)[0]
-            remember(self._under, key, self.lost(begun, every), PATHS_KEPT)
+            all_inputs = np.zeros((len(inputs), motion.most.shape[2] - motion.states))
+            all_inputs[:, : inputs.shape[1]] = inputs
+            start_sizes = np.abs(motion.nodes(control)[:-1, 0]) + motion.under(control)[0]
+            remember(self._under, key, self.lost(start_sizes, all_inputs), PATHS_KEPT)
         return self._under[key]
 
     @cached_property
@@ -671,23 +769,23 @@ class Truncation:
 
 @dataclass(frozen=True, eq=False)
 class SpreadMotion:
-    """The `Motion` over a cell of parameters, by that of all coefficients on it, and what is beyond their degree, in a
-    ``truncation``."""
+    """The `Motion` of a system over a cell of parameters: the motion of all coefficients on the cell, and a
+    ``truncation`` for the terms beyond their degree."""
 
     truncation: Truncation
 
     @staticmethod
     def of(propagator: Propagator, initial_state: Array, growth: float | None) -> SpreadMotion:
-        """Return the motion of a system over the cell that its coefficients are expanded on.
+        """Return the motion of a system over the cell on which its coefficients are expanded.
 
-        ``growth`` is that of a cell around this one, where it is known. Raises `NotEnclosable` where the cell is so
-        wide that what is beyond the degree grows without a bound.
+        ``growth`` is the `Truncation.growth` on a cell around this one, where it is known. Raises `NotEnclosable` where
+        the cell is so wide that the terms beyond the degree grow without a bound.
         """
         assert propagator.expansion is not None
         spread = propagator.expansion.spread
         assert spread is not None
-        begun = np.append(initial_state, np.zeros(spread.states - spread.d))
-        truncation = Truncation(VaryingMotion(propagator, begun), spread, growth)
+        coefficients = np.append(initial_state, np.zeros(spread.states - spread.d))
+        truncation = Truncation(VaryingMotion(propagator, coefficients), spread, growth)
         with np.errstate(over="ignore", invalid="ignore"):  # of a cell that is too wide
             bounded = np.isfinite(truncation.growth)
         if not bounded:
@@ -697,12 +795,12 @@ class SpreadMotion:
 
     @property
     def motion(self) -> VaryingMotion:
-        """That of all coefficients."""
+        """The motion of all coefficients."""
         return self.truncation.motion
 
     @property
     def spread(self) -> Spread:
-        """How the state is expanded."""
+        """The parametric expansion of the state."""
         return self.truncation.spread
 
     @property
@@ -727,7 +825,7 @@ class SpreadMotion:
 
     @cached_property
     def starts(self) -> np.ndarray:
-        """Every state is a block."""
+        """Indices ``(d,)`` at which the blocks begin: every state is a block of its own."""
         return np.arange(self.states)
 
     @property
@@ -737,7 +835,7 @@ class SpreadMotion:
 
     @property
     def norm(self) -> float:
-        """That of all coefficients."""
+        """The largest norm of ``A`` for all coefficients together, in own units."""
         return self.motion.norm
 
     def nodes(self, control: Array) -> Array:
@@ -752,27 +850,27 @@ class SpreadMotion:
         self, rows: Array, start: Array, width: Array, pieces: np.ndarray, states: Array, inputs: Array
     ) -> Array:
         """`Motion.deviation`, of every coefficient on the cell."""
-        found = self.motion.deviation(
+        bounds = self.motion.deviation(
             self.along_cell(rows), start, width, pieces, states.reshape(len(states), 1, -1), inputs
         )
-        return np.asarray(found.reshape(start.size, len(rows), -1).sum(axis=2) * OUTWARD)
+        return np.asarray(bounds.reshape(start.size, len(rows), -1).sum(axis=2) * OUTWARD)
 
     def along(self, control: Array, rows: Array, others: Array) -> Array:
         """`Motion.along`; what coefficients are multiplied by and added up is rounded too."""
-        found = self.motion.along(control, self.sizes(rows), (1.0 + self.space.size) * self.sizes(others))
-        return np.asarray(found + rows @ self.truncation.under(control).T * OUTWARD)
+        bounds = self.motion.along(control, self.sizes(rows), (1.0 + self.space.size) * self.sizes(others))
+        return np.asarray(bounds + rows @ self.truncation.under(control).T * OUTWARD)
 
     def along_cell(self, rows: Array) -> Array:
         """Rows ``(r, d)`` as those of every coefficient, on all coefficients, ``(r M, states)``."""
-        found = np.eye(self.space.size)[None, :, :, None] * rows[:, None, None, :]
-        return np.asarray(found.reshape(len(rows) * self.space.size, -1))
+        coefficient_rows = np.eye(self.space.size)[None, :, :, None] * rows[:, None, None, :]
+        return np.asarray(coefficient_rows.reshape(len(rows) * self.space.size, -1))
 
     def sizes(self, rows: Array) -> Array:
         """Rows ``(r, d)`` on sizes of states as such on sizes of all coefficients, ``(r, states)``."""
         return np.tile(rows, self.space.size)
 
     def folded(self, sizes: Array) -> Array:
-        """What sizes ``(K, states)`` of all coefficients add up to, ``(K, d)``."""
+        """Return the bounds ``(K, d)`` of states with bounds ``sizes (K, states)`` of all coefficients."""
         return np.asarray(sizes.reshape(len(sizes), self.space.size, -1).sum(axis=1) * OUTWARD)
 
     def _apart(self, states: Array) -> Array:
@@ -781,8 +879,8 @@ class SpreadMotion:
 
 @dataclass(frozen=True, eq=False)
 class SpreadSupport:
-    """A part of the uncertainty on functionals ``rows (r, d)`` over a cell of parameters, by that of all coefficients
-    on the cell, `VaryingSupport`."""
+    """A part of the uncertainty on functionals ``rows (r, d)`` over a cell of parameters, from its effect on all
+    coefficients on the cell, a `VaryingSupport`."""
 
     motion: SpreadMotion
     every: VaryingSupport
@@ -793,18 +891,22 @@ class SpreadSupport:
     def of_disturbance(
         motion: SpreadMotion, model: DisturbanceModel, rows: Array, combination: Combination | None
     ) -> SpreadSupport:
-        """That of the worst disturbance."""
-        every = VaryingSupport.of_disturbance(motion.motion, model, motion.along_cell(rows), None)
-        return SpreadSupport(motion, every, rows, combination)
+        """Return the support of the worst disturbance on functionals ``rows (r, d)`` over a cell of parameters."""
+        support = VaryingSupport.of_disturbance(motion.motion, model, motion.along_cell(rows), None)
+        return SpreadSupport(motion, support, rows, combination)
 
     @staticmethod
     def of_initial(
         motion: SpreadMotion, bound: ConvexSet, rows: Array, combination: Combination | None
     ) -> SpreadSupport:
-        """That of the worst deviation of the initial state, which is one of the constant coefficient alone."""
-        every = VaryingSupport.of_initial(motion.motion, bound, motion.along_cell(rows), None)
-        every = replace(every, effect=every.effect[..., : motion.states])
-        return SpreadSupport(motion, every, rows, combination)
+        """Return the support of the worst deviation of the initial state on functionals ``rows (r, d)`` over a cell of
+        parameters.
+
+        The deviation is one of the constant coefficient alone.
+        """
+        support = VaryingSupport.of_initial(motion.motion, bound, motion.along_cell(rows), None)
+        support = replace(support, effect=support.effect[..., : motion.states])
+        return SpreadSupport(motion, support, rows, combination)
 
     def steepness(self, times: Array) -> Array:
         """`Support.steepness`."""
@@ -814,28 +916,30 @@ class SpreadSupport:
     def at(self, times: Array, ends: Array) -> tuple[Array, Array]:
         """`Support.at`."""
         return over_faces(
-            self._space, ends, lambda here, face: summed(self.every.set, self._seen(times)[here], face).sum(axis=2)
+            self._space,
+            ends,
+            lambda index, face: summed(self.every.set, self._seen(times)[index], face).sum(axis=2),
         )
 
     def deviation(self, start: Array, widths: Array) -> Array:
         """`Support.deviation`, of every coefficient on the cell."""
-        found = self.every.deviation(start, widths)
-        return np.asarray(found.reshape(start.size, len(self.rows), -1).sum(axis=2) * OUTWARD)
+        bounds = self.every.deviation(start, widths)
+        return np.asarray(bounds.reshape(start.size, len(self.rows), -1).sum(axis=2) * OUTWARD)
 
     @cached_property
     def neglected(self) -> Array:
-        """`Support.neglected`, with what is beyond the degree."""
-        motion, begun = self.motion, self.every.sizes[:-1]
-        inputs, pushed = (
-            np.zeros((len(begun), motion.motion.most.shape[2] - motion.motion.states)),
-            np.zeros((len(begun), 1, 1)),
+        """Bounds ``(r, K)`` of `Support.neglected`, with the truncation error beyond the degree."""
+        motion, start_sizes = self.motion, self.every.sizes[:-1]
+        inputs, forcing = (
+            np.zeros((len(start_sizes), motion.motion.most.shape[2] - motion.motion.states)),
+            np.zeros((len(start_sizes), 1, 1)),
         )
         if self.every.lasts:
             inputs[:, -self.every.far.size :] = self.every.far
-            pushed = motion.motion.flow.sizes[..., -self.every.far.size :] * self.every.far
-        lost = motion.truncation.lost(begun + motion.motion.left_out(begun, pushed), inputs)
-        found = self.every.neglected.reshape(len(self.rows), self.motion.space.size, -1).sum(axis=1)
-        return np.asarray((found + np.abs(self.rows) @ lost.T) * OUTWARD)
+            forcing = motion.motion.flow.sizes[..., -self.every.far.size :] * self.every.far
+        truncation = motion.truncation.lost(start_sizes + motion.motion.left_out(start_sizes, forcing), inputs)
+        remainders = self.every.neglected.reshape(len(self.rows), self.motion.space.size, -1).sum(axis=1)
+        return np.asarray((remainders + np.abs(self.rows) @ truncation.T) * OUTWARD)
 
     @cached_property
     def reached(self) -> Array:
@@ -851,10 +955,12 @@ class SpreadSupport:
         are remembered."""
         if self._asked.get("times") is not times:
             rows = np.broadcast_to(self.every.rows, (times.size, *self.every.rows.shape))
-            found = self.every.blocks(self.every.weights(times, rows))
-            found = found.reshape(times.size, len(self.rows), self.motion.space.size, *found.shape[2:])
-            found = found if self.combination is None else self.combination.apply(found)
-            self._asked.update(times=times, found=found)
+            coefficients = self.every.blocks(self.every.weights(times, rows))
+            coefficients = coefficients.reshape(
+                times.size, len(self.rows), self.motion.space.size, *coefficients.shape[2:]
+            )
+            coefficients = coefficients if self.combination is None else self.combination.apply(coefficients)
+            self._asked.update(times=times, found=coefficients)
         return self._asked["found"]
 
     @cached_property

@@ -79,8 +79,8 @@ class Ellipsoid(ConvexSet):
             raise InputError(
                 f"shape must be a square matrix of finite numbers, got shape {shape.shape}", path="ellipsoid"
             )
-        if (wrong := _indefinite(shape)) is not None:
-            raise InputError(f"shape must be symmetric positive definite, got {wrong}", path="ellipsoid")
+        if (fault := _indefinite(shape)) is not None:
+            raise InputError(f"shape must be symmetric positive definite, got {fault}", path="ellipsoid")
         object.__setattr__(self, "centre", finite("ellipsoid.centre", self.centre, shape.shape[0]))
         object.__setattr__(self, "shape", (shape + shape.T) / 2)
         sealed(self)
@@ -414,17 +414,18 @@ class NormBall(ConvexSet):
 
         Notes
         -----
-        The ``p``-norm is at most ``most`` times the Euclidean norm, and the Euclidean norm is at most ``least`` times
-        the ``p``-norm. The projection is computed only for points that these bounds leave undecided.
+        The ``p``-norm is at most ``to_p_norm`` times the Euclidean norm, and the Euclidean norm is at most
+        ``to_euclidean`` times the ``p``-norm. The projection is computed only for points that these bounds leave
+        undecided.
         """
         if self.halfspaces() is not None:
             return super().contains(points, tolerance)
         rays = np.asarray(points, dtype=float) - self.centre
         excess = np.atleast_1d(_norm(rays, self.p) - self.radius)
-        most, least = (self.dimension ** max(0.0, sign * (1.0 / self.p - 0.5)) for sign in (1.0, -1.0))
-        inside = excess <= most * tolerance
-        open_yet = inside & (excess > 0.0) & (least * excess > tolerance)
-        inside[open_yet] = self.violation(self.centre + rays.reshape(*excess.shape, -1)[open_yet]) <= tolerance
+        to_p_norm, to_euclidean = (self.dimension ** max(0.0, sign * (1.0 / self.p - 0.5)) for sign in (1.0, -1.0))
+        inside = excess <= to_p_norm * tolerance
+        undecided = inside & (excess > 0.0) & (to_euclidean * excess > tolerance)
+        inside[undecided] = self.violation(self.centre + rays.reshape(*excess.shape, -1)[undecided]) <= tolerance
         return np.asarray(inside.reshape(rays.shape[:-1]))
 
     def _projected(self, z: Array) -> Array:
@@ -511,9 +512,9 @@ def _indefinite(shape: Array) -> str | None:
 
     The matrix is judged with its diagonal scaled to 1, so that units change no answer.
     """
-    apart = np.abs(shape - shape.T) > 1e-12 * np.abs(shape.T)
-    if apart.any():
-        i, j = np.argwhere(apart)[0]
+    differs = np.abs(shape - shape.T) > 1e-12 * np.abs(shape.T)
+    if differs.any():
+        i, j = np.argwhere(differs)[0]
         return f"{shape[i, j]:.12g} in row {i + 1}, column {j + 1} and {shape[j, i]:.12g} across the diagonal"
     sizes = np.sqrt(np.maximum(np.diag(shape), 0.0))
     if not (sizes > 0.0).all():
@@ -562,8 +563,8 @@ def _shrunk(z: Array, multiplier: Array, power: float) -> Array:
     unit = multiplier if power < 1.0 else multiplier ** (-1.0 / q)
     a = np.minimum(z, unit * z ** (1.0 / q))
     for _ in range(HALVINGS):
-        other = (a / unit) ** q
-        step = ratios((a + other - z) * a, a + q * other)
+        convex_summand = (a / unit) ** q
+        step = ratios((a + convex_summand - z) * a, a + q * convex_summand)
         a = np.maximum(a - step, 0.0)
         if (np.abs(step) <= np.finfo(float).eps * a).all():
             break
@@ -620,8 +621,8 @@ def norm_curvature(centre: Float[Array, " b"], spread: Float[Array, "J b"]) -> F
     widths = np.abs(columns).sum(axis=1) ** 2
     # Terms whose widths agree up to a factor of 2 share the mean of their slopes, which is as good as any order.
     _, group = np.unique(np.frexp(widths)[1], return_inverse=True)
-    most, totals = size + float(np.abs(along).sum()), np.cumsum(np.bincount(group, widths))
-    slopes = np.diff(totals / (most + np.sqrt(most**2 + totals)), prepend=0.0) / np.diff(totals, prepend=0.0)
+    upper, totals = size + float(np.abs(along).sum()), np.cumsum(np.bincount(group, widths))
+    slopes = np.diff(totals / (upper + np.sqrt(upper**2 + totals)), prepend=0.0) / np.diff(totals, prepend=0.0)
     return np.asarray((2.0 * slopes[group] * columns.T) @ columns)
 
 
@@ -630,13 +631,17 @@ def _pivoted(matrix: Array) -> Array:
 
     The ``matrix (J, J)`` is positive semidefinite.
     """
-    rest, least, columns = matrix, matrix.shape[0] * np.finfo(float).eps * matrix.diagonal().max(initial=0.0), []
+    residual, tolerance, columns = (
+        matrix,
+        matrix.shape[0] * np.finfo(float).eps * matrix.diagonal().max(initial=0.0),
+        [],
+    )
     for _ in range(matrix.shape[0]):
-        pivot = int(rest.diagonal().argmax())
-        if rest[pivot, pivot] <= least:
+        pivot = int(residual.diagonal().argmax())
+        if residual[pivot, pivot] <= tolerance:
             break
-        columns.append(rest[pivot] / np.sqrt(rest[pivot, pivot]))
-        rest = rest - np.outer(columns[-1], columns[-1])
+        columns.append(residual[pivot] / np.sqrt(residual[pivot, pivot]))
+        residual = residual - np.outer(columns[-1], columns[-1])
     return np.array(columns).reshape(len(columns), matrix.shape[0])
 
 
@@ -664,13 +669,13 @@ def _continued_root(a: Array, b: Array, q: float) -> Array:
     largest = (np.abs(a) + b).max(axis=1, keepdims=True)
     unit = np.where(largest > 0.0, largest, 1.0)
     a, b = np.abs(a) / unit, b / unit
-    total, off = (a**q).sum(axis=1), (q * b * (a + b) ** (q - 1.0)).sum(axis=1)
-    analytic = off < ROOM * total
+    total, deviation = (a**q).sum(axis=1), (q * b * (a + b) ** (q - 1.0)).sum(axis=1)
+    analytic = deviation < ROOM * total
     if q == 2.0:
-        return np.where(analytic, unit[:, 0] * np.sqrt(total + off), np.inf)
+        return np.where(analytic, unit[:, 0] * np.sqrt(total + deviation), np.inf)
     away = ((a > b) | (b == 0.0)).all(axis=1)
-    found = np.where(analytic & away & (q < STEEP), (total + off) ** (1.0 / q), np.inf)
-    return np.asarray(unit[:, 0] * np.minimum(found, np.where(away, _beside_largest(a, b, q), np.inf)))
+    power_bound = np.where(analytic & away & (q < STEEP), (total + deviation) ** (1.0 / q), np.inf)
+    return np.asarray(unit[:, 0] * np.minimum(power_bound, np.where(away, _beside_largest(a, b, q), np.inf)))
 
 
 def _beside_largest(a: Array, b: Array, q: float) -> Array:
@@ -692,11 +697,11 @@ def _beside_largest(a: Array, b: Array, q: float) -> Array:
     array (k,)
         The bound, or ``inf`` where none is found.
     """
-    first = np.arange(a.shape[1]) == a.argmax(axis=1)[:, None]
-    least, most = (np.where(first, end, 0.0).sum(axis=1) for end in (a - b, a + b))
-    shares = (a + b) / np.where(least > 0.0, least, 1.0)[:, None] * (1.0 + 8.0 * np.finfo(float).eps)
-    others = np.where(first, 0.0, np.minimum(shares, 1.0) ** q).sum(axis=1)
-    return np.where((least > 0.0) & (others < ROOM), most * (1.0 + others) ** (1.0 / q), np.inf)
+    is_largest = np.arange(a.shape[1]) == a.argmax(axis=1)[:, None]
+    lower, upper = (np.where(is_largest, end, 0.0).sum(axis=1) for end in (a - b, a + b))
+    shares = (a + b) / np.where(lower > 0.0, lower, 1.0)[:, None] * (1.0 + 8.0 * np.finfo(float).eps)
+    ratio_sum = np.where(is_largest, 0.0, np.minimum(shares, 1.0) ** q).sum(axis=1)
+    return np.where((lower > 0.0) & (ratio_sum < ROOM), upper * (1.0 + ratio_sum) ** (1.0 / q), np.inf)
 
 
 def _norm(vectors: Array, q: float) -> Array:
@@ -729,7 +734,7 @@ def _power_excess(a: Float[Array, "*k d"], b: Float[Array, "*k d"], q: float) ->
         The bound; infinite where ``a`` is 0.
     """
     unit = np.abs(a).max(axis=-1, keepdims=True)
-    a, b, unit = *(one / np.where(unit > 0.0, unit, 1.0) for one in (a, b)), unit[..., 0]
+    a, b, unit = *(vector / np.where(unit > 0.0, unit, 1.0) for vector in (a, b)), unit[..., 0]
     slope = q * np.sign(a) * np.abs(a) ** (q - 1.0)
     ends = [np.abs(a + sign * b) ** q - np.abs(a) ** q - sign * slope * b for sign in (-1.0, 1.0)]
     norms = np.linalg.norm(a, ord=q, axis=-1)

@@ -107,8 +107,8 @@ def on_surface(z: Float[Array, "*k b"]) -> Float[Array, "*k b"]:
 def sampled(dimension: int) -> Array:
     """Return a lattice ``(k, b)`` on the surface of the cube of a ``dimension``, as a read-only array."""
     points = np.linspace(-1.0, 1.0, PER_EDGE.get(dimension, 3)) if dimension > 1 else np.array([-1.0, 1.0])
-    every = np.stack(np.meshgrid(*[points] * dimension, indexing="ij"), axis=-1).reshape(-1, dimension)
-    surface: Array = every[np.abs(every).max(axis=1) == 1.0]
+    lattice = np.stack(np.meshgrid(*[points] * dimension, indexing="ij"), axis=-1).reshape(-1, dimension)
+    surface: Array = lattice[np.abs(lattice).max(axis=1) == 1.0]
     surface.flags.writeable = False
     return surface
 
@@ -122,10 +122,10 @@ def neighbours(dimension: int) -> np.ndarray:
     points = sampled(dimension)
     spacing = 2.0 / max(1, PER_EDGE.get(dimension, 3) - 1)
     rows = [np.flatnonzero(np.abs(points - point).max(axis=1) <= 1.01 * spacing) for point in points]
-    found = np.tile(np.arange(len(rows))[:, None], max(row.size for row in rows))
+    indices = np.tile(np.arange(len(rows))[:, None], max(row.size for row in rows))
     for number, row in enumerate(rows):
-        found[number, : row.size] = row
-    return found
+        indices[number, : row.size] = row
+    return indices
 
 
 @shaped

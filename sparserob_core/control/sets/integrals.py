@@ -58,28 +58,29 @@ def curved_integral(bound: ConvexSet, terms: Array, lengths: Array, accuracy: Ar
     orders = np.arange(terms.shape[1])
     # from here on in powers of a variable that runs from -1 to 1 over the interval
     terms = _moved(terms.shape[1], 0.5, 0.5) @ terms
-    far = bound.reach(np.eye(bound.dimension))
-    each, first = 2.0 * orders.size * EPSILON, np.abs(terms).sum(axis=1) @ far
-    lost = each + (8.0 * far.size + 64.0) * EPSILON
+    reach = bound.reach(np.eye(bound.dimension))
+    step_rounding, first_sizes = 2.0 * orders.size * EPSILON, np.abs(terms).sum(axis=1) @ reach
+    rounding = step_rounding + (8.0 * reach.size + 64.0) * EPSILON
     to_series = _series(orders.size)
     powers, halves = NODES[:, None] ** orders, [_moved(orders.size, 0.5, side) for side in (-0.5, 0.5)]
-    for turn in range(HALVINGS + 1):
-        waves = to_series @ terms
-        spread = np.einsum("k,lkw->lw", RADIUS ** orders[1:], np.abs(waves[:, 1:])) * (1.0 + lost)
-        most = bound.continued(waves[:, 0], spread)
-        assert most is not None
-        sizes = np.abs(terms).sum(axis=1) @ far
+    for halving in range(HALVINGS + 1):
+        series = to_series @ terms
+        radii = np.einsum("k,lkw->lw", RADIUS ** orders[1:], np.abs(series[:, 1:])) * (1.0 + rounding)
+        maxima = bound.continued(series[:, 0], radii)
+        assert maxima is not None
+        sizes = np.abs(terms).sum(axis=1) @ reach
         middle = bound.support(powers @ terms) @ WEIGHTS / 2.0
-        off = np.where(np.isfinite(most), MISSED * most, np.inf)
+        error = np.where(np.isfinite(maxima), MISSED * maxima, np.inf)
         # the support function changes by at most the reach of the set along the change of its argument
-        plain, apart = bound.support(terms[:, 0]), np.abs(terms[:, 1:]).sum(axis=1) @ far
-        better = apart < off
-        middle, off = np.where(better, plain, middle), np.minimum(off, apart)
-        open_ = (2.0 * off * lengths > accuracy[owner]) & (off > lost * sizes) & (turn < HALVINGS)
-        off = off + lost * sizes + each * turn * first[owner]  # every halving rounds all coefficients again
-        found = np.stack([middle - off, middle + off], axis=1) * lengths[:, None]
-        np.add.at(total, owner[~open_], found[~open_])
-        terms, owner, lengths = terms[open_], np.tile(owner[open_], 2), np.tile(lengths[open_] / 2.0, 2)
+        constant, constant_error = bound.support(terms[:, 0]), np.abs(terms[:, 1:]).sum(axis=1) @ reach
+        is_better = constant_error < error
+        middle, error = np.where(is_better, constant, middle), np.minimum(error, constant_error)
+        is_open = (2.0 * error * lengths > accuracy[owner]) & (error > rounding * sizes) & (halving < HALVINGS)
+        # every halving rounds all coefficients again
+        error = error + rounding * sizes + step_rounding * halving * first_sizes[owner]
+        bounds = np.stack([middle - error, middle + error], axis=1) * lengths[:, None]
+        np.add.at(total, owner[~is_open], bounds[~is_open])
+        terms, owner, lengths = terms[is_open], np.tile(owner[is_open], 2), np.tile(lengths[is_open] / 2.0, 2)
         if not owner.size:
             break
         terms = np.concatenate([half @ terms for half in halves])
@@ -89,10 +90,10 @@ def curved_integral(bound: ConvexSet, terms: Array, lengths: Array, accuracy: Ar
 @cache
 def _series(count: int) -> Array:
     """Return the matrix ``(count, count)`` from coefficients of powers to those of Chebyshev polynomials."""
-    found = np.zeros((count, count))
+    matrix = np.zeros((count, count))
     for k, power in enumerate(np.eye(count)):
-        found[: k + 1, k] = np.polynomial.chebyshev.poly2cheb(power[: k + 1])
-    return found
+        matrix[: k + 1, k] = np.polynomial.chebyshev.poly2cheb(power[: k + 1])
+    return matrix
 
 
 @cache
@@ -101,12 +102,12 @@ def _moved(count: int, share: float, begin: float) -> Array:
 
     Its shape is ``(count, count)``.
     """
-    found = np.zeros((count, count))
+    matrix = np.zeros((count, count))
     power = np.ones(1)
     for j in range(count):
-        found[: power.size, j] = power
+        matrix[: power.size, j] = power
         power = np.convolve(power, [begin, share])
-    return found
+    return matrix
 
 
 def integrated(bound: ConvexSet, terms: Array, lengths: Array, accuracy: Array) -> Array:
@@ -133,14 +134,14 @@ def integrated(bound: ConvexSet, terms: Array, lengths: Array, accuracy: Array) 
     total, owner = np.zeros((lengths.size, 2)), np.arange(lengths.size)
     order = terms.shape[1] - 1
     points = np.einsum("kj,ljw->lkw", bezier(order), terms)
-    for turn in range(HALVINGS + 1):
+    for halving in range(HALVINGS + 1):
         best = bound.support_point(points[:, order // 2])
         low = (points @ best[:, :, None])[..., 0].mean(axis=1) * lengths
         high = bound.support(points).mean(axis=1) * lengths
-        open_ = (high - low > accuracy[owner]) & (turn < HALVINGS)
-        np.add.at(total, owner[~open_], np.stack([low, high], axis=1)[~open_])
-        points, owner = _halved(points[open_]), np.tile(owner[open_], 2)
-        lengths = np.tile(lengths[open_] / 2, 2)
+        is_open = (high - low > accuracy[owner]) & (halving < HALVINGS)
+        np.add.at(total, owner[~is_open], np.stack([low, high], axis=1)[~is_open])
+        points, owner = _halved(points[is_open]), np.tile(owner[is_open], 2)
+        lengths = np.tile(lengths[is_open] / 2, 2)
         if not owner.size:
             break
     return total
@@ -167,14 +168,14 @@ def absolute(terms: Array, accuracy: Array) -> Array:
     total, owner = np.zeros((len(terms), 2)), np.arange(len(terms))
     order = terms.shape[1] - 1
     points, lengths = terms @ bezier(order).T, np.ones(len(terms))
-    for turn in range(HALVINGS + 1):
+    for division in range(HALVINGS + 1):
         low, high = np.abs(points.mean(axis=1)) * lengths, np.abs(points).mean(axis=1) * lengths
-        open_ = (high - low > accuracy[owner]) & (turn < HALVINGS)
-        np.add.at(total, owner[~open_], np.stack([low, high], axis=1)[~open_])
-        points, owner, lengths = points[open_], np.tile(owner[open_], 2), lengths[open_]
+        is_open = (high - low > accuracy[owner]) & (division < HALVINGS)
+        np.add.at(total, owner[~is_open], np.stack([low, high], axis=1)[~is_open])
+        points, owner, lengths = points[is_open], np.tile(owner[is_open], 2), lengths[is_open]
         if not owner.size:
             break
-        at = _sign_changes(points) if turn < CUTS else np.full(len(points), 0.5)
+        at = _sign_changes(points) if division < CUTS else np.full(len(points), 0.5)
         points, lengths = _cut(points, at), np.concatenate([lengths * at, lengths * (1.0 - at)])
     return total
 
@@ -197,11 +198,11 @@ def _sign_changes(points: Array) -> Array:
     crossing, at = fa * fb < 0.0, np.full(len(points), 0.5)
     for _ in range(SECANTS):
         with np.errstate(divide="ignore", invalid="ignore"):
-            found = b - fb * (b - a) / (fb - fa)
-        at = np.where(crossing & (found > NEAR_END) & (found < 1.0 - NEAR_END), found, 0.5)
+            secant = b - fb * (b - a) / (fb - fa)
+        at = np.where(crossing & (secant > NEAR_END) & (secant < 1.0 - NEAR_END), secant, 0.5)
         value = (weights * at[:, None] ** powers * (1.0 - at[:, None]) ** powers[::-1]).sum(axis=1)
-        turned = value * fb < 0.0
-        a, fa = np.where(turned, b, a), np.where(turned, fb, fa / 2.0)
+        crosses = value * fb < 0.0
+        a, fa = np.where(crosses, b, a), np.where(crosses, fb, fa / 2.0)
         b, fb = at, value
     return at
 
@@ -222,10 +223,10 @@ def _cut(points: Array, at: Array) -> Array:
         The coefficients on the left parts, followed by those on the right parts.
     """
     left, right, row, last = np.empty_like(points), np.empty_like(points), points, points.shape[1] - 1
-    share, rest = at[:, None], 1.0 - at[:, None]
+    share, complement = at[:, None], 1.0 - at[:, None]
     for order in range(last + 1):
         left[:, order], right[:, last - order] = row[:, 0], row[:, -1]
-        row = rest * row[:, :-1] + share * row[:, 1:]
+        row = complement * row[:, :-1] + share * row[:, 1:]
     return np.concatenate([left, right])
 
 

@@ -106,10 +106,10 @@ class Polytope(ConvexSet):
         H = self.H * units
         sizes = np.abs(H).max(axis=1, initial=0.0)
         factors = np.ldexp(1.0, -np.frexp(np.where(sizes > 0.0, sizes, 1.0))[1])
-        made = object.__new__(Polytope)  # without the check for emptiness, which this set has passed
-        object.__setattr__(made, "H", H * factors[:, None])
-        object.__setattr__(made, "h", self.h * factors)
-        return made
+        polytope = object.__new__(Polytope)  # without the check for emptiness, which this set has passed
+        object.__setattr__(polytope, "H", H * factors[:, None])
+        object.__setattr__(polytope, "h", self.h * factors)
+        return polytope
 
     @cached_property
     def _balanced(self) -> tuple[Array, Array, Array]:
@@ -120,11 +120,13 @@ class Polytope(ConvexSet):
         """
         with np.errstate(divide="ignore"):
             entries = np.log2(np.abs(np.column_stack([self.H, self.h])))
-        there = np.isfinite(entries)
-        sizes, columns = np.where(there, entries, 0.0), np.zeros(self.dimension + 1)
+        is_nonzero = np.isfinite(entries)
+        sizes, columns = np.where(is_nonzero, entries, 0.0), np.zeros(self.dimension + 1)
         for _ in range(_SWEEPS):
-            rows = -np.where(there, sizes + columns, 0.0).sum(axis=1) / np.maximum(there.sum(axis=1), 1)
-            columns = -np.where(there, sizes + rows[:, None], 0.0).sum(axis=0) / np.maximum(there.sum(axis=0), 1)
+            rows = -np.where(is_nonzero, sizes + columns, 0.0).sum(axis=1) / np.maximum(is_nonzero.sum(axis=1), 1)
+            columns = -np.where(is_nonzero, sizes + rows[:, None], 0.0).sum(axis=0) / np.maximum(
+                is_nonzero.sum(axis=0), 1
+            )
             columns[-1] = 0.0  # the right-hand sides have no unit of their own
         exponents = np.rint(np.concatenate([rows, columns[:-1]])).astype(int)
         if np.abs(exponents).max(initial=0) <= _ORDINARY:
@@ -192,10 +194,10 @@ class Polytope(ConvexSet):
         from scipy.spatial import HalfspaceIntersection, QhullError
 
         try:
-            found = HalfspaceIntersection(np.column_stack([H, -h]), centre)
+            intersection = HalfspaceIntersection(np.column_stack([H, -h]), centre)
         except QhullError:
             return None
-        return self._polished(found.intersections, found.dual_facets) * units
+        return self._polished(intersection.intersections, intersection.dual_facets) * units
 
     def _corners(self) -> Array | None:
         """Return the vertices ``(v, d)`` of a set without an interior, computed in fractions.
@@ -206,17 +208,17 @@ class Polytope(ConvexSet):
         (rows, d), norms = self.H.shape, np.linalg.norm(self.H, axis=1)
         if comb(rows, d) > _MEETINGS:
             return None
-        chosen = np.array(list(combinations(range(rows), d)))
-        several, ends = (self.H / norms[:, None])[chosen], (self.h / norms)[chosen]
-        regular = np.abs(np.linalg.det(several)) > _REGULAR
-        points = np.linalg.solve(several[regular], ends[regular][..., None])[..., 0]
-        missed = points @ self.H.T - self.h > _BESIDE * (np.abs(points) @ np.abs(self.H).T + np.abs(self.h))
-        possible = np.concatenate([chosen[regular][~missed.any(axis=1)], chosen[~regular]])
-        H, h = ([[Fraction(float(x)) for x in row] for row in one] for one in (self.H, self.h[:, None]))
-        met = {_meeting([H[i] for i in which], [h[i][0] for i in which]) for which in possible}
+        choices = np.array(list(combinations(range(rows), d)))
+        normals, ends = (self.H / norms[:, None])[choices], (self.h / norms)[choices]
+        is_regular = np.abs(np.linalg.det(normals)) > _REGULAR
+        points = np.linalg.solve(normals[is_regular], ends[is_regular][..., None])[..., 0]
+        is_outside = points @ self.H.T - self.h > _BESIDE * (np.abs(points) @ np.abs(self.H).T + np.abs(self.h))
+        candidates = np.concatenate([choices[is_regular][~is_outside.any(axis=1)], choices[~is_regular]])
+        H, h = ([[Fraction(float(x)) for x in row] for row in array] for array in (self.H, self.h[:, None]))
+        meetings = {_meeting([H[i] for i in choice], [h[i][0] for i in choice]) for choice in candidates}
         corners = [
             x
-            for x in met
+            for x in meetings
             if x is not None
             and all(sum(a * b for a, b in zip(row, x, strict=True)) <= end[0] for row, end in zip(H, h, strict=True))
         ]
@@ -268,10 +270,10 @@ class Polytope(ConvexSet):
         array (count, d)
             The points.
         """
-        known = self.vertices
-        if known is None:
-            known = self.support_point(rng.normal(size=(min(count, _PROGRAMS), self.dimension)))
-        return np.asarray(known[rng.integers(0, known.shape[0], size=count)])
+        points = self.vertices
+        if points is None:
+            points = self.support_point(rng.normal(size=(min(count, _PROGRAMS), self.dimension)))
+        return np.asarray(points[rng.integers(0, points.shape[0], size=count)])
 
     @shaped
     def linearisation_excess(self, centre: Float[Array, "*k d"], spread: Float[Array, "*k J d"]) -> Float[Array, " *k"]:
@@ -296,23 +298,23 @@ class Polytope(ConvexSet):
         """
         _, h, units = self._balanced
         values, points = np.zeros(len(directions)), np.tile(self.interior_point(), (len(directions), 1))
-        endless = self._endless(directions * units)
-        values[endless] = np.inf
-        asking = np.flatnonzero((np.abs(directions).max(axis=1, initial=0.0) > 0) & ~endless)
-        for start in range(0, asking.size, _TOGETHER):
-            part = asking[start : start + _TOGETHER]
-            scaled = directions[part] * units
+        is_unbounded = self._endless(directions * units)
+        values[is_unbounded] = np.inf
+        pending = np.flatnonzero((np.abs(directions).max(axis=1, initial=0.0) > 0) & ~is_unbounded)
+        for start in range(0, pending.size, _TOGETHER):
+            batch = pending[start : start + _TOGETHER]
+            scaled = directions[batch] * units
             sizes = np.abs(scaled).max(axis=1)
             balanced = scaled / sizes[:, None]
-            if part.size > 1 and h.size and np.isfinite(balanced).all():
-                answer = self._side_by_side(balanced)
-                if answer is not None:
-                    found, multipliers = answer
+            if batch.size > 1 and h.size and np.isfinite(balanced).all():
+                solution = self._side_by_side(balanced)
+                if solution is not None:
+                    maximisers, multipliers = solution
                     proven = sizes * self._dual_bound(balanced, multipliers)
-                    values[part] = np.maximum((scaled * found).sum(axis=1), proven)
-                    points[part] = found * units
+                    values[batch] = np.maximum((scaled * maximisers).sum(axis=1), proven)
+                    points[batch] = maximisers * units
                     continue
-            for position in part:
+            for position in batch:
                 values[position], points[position] = self._maximise(directions[position])
         return values, points
 
@@ -347,13 +349,13 @@ class Polytope(ConvexSet):
 
         There are no rows where rounding leaves a doubt.
         """
-        _, sizes, turned = np.linalg.svd(self._balanced[0])
+        _, sizes, vectors = np.linalg.svd(self._balanced[0])
         sizes = np.concatenate([sizes, np.zeros(self.dimension - sizes.size)]) / max(
             float(sizes.max(initial=0.0)), 1e-300
         )
         if ((sizes > _NOTHING) & (sizes < _CLEAR)).any():
             return np.zeros((0, self.dimension))
-        return np.asarray(turned[sizes <= _NOTHING])
+        return np.asarray(vectors[sizes <= _NOTHING])
 
     @shaped
     def _maximise(self, direction: Float[Array, " d"]) -> tuple[float, Float[Array, " d"]]:
@@ -387,9 +389,9 @@ class Polytope(ConvexSet):
         """
         H, h, _ = self._balanced
         y = np.maximum(multipliers, 0.0)
-        left = np.abs(directions - y @ H).sum(axis=1)
+        residual = np.abs(directions - y @ H).sum(axis=1)
         with np.errstate(invalid="ignore"):
-            bound: Array = y @ h + np.where(left > 0.0, left * self._reach, 0.0)
+            bound: Array = y @ h + np.where(residual > 0.0, residual * self._reach, 0.0)
         return np.where(np.isfinite(bound), bound, -np.inf)
 
     @cached_property
@@ -401,17 +403,20 @@ class Polytope(ConvexSet):
         """
         H, h, _ = self._balanced
         axes = np.vstack([np.eye(self.dimension), -np.eye(self.dimension)])
-        highest, left = 0.0, 0.0
+        highest, residual = 0.0, 0.0
         if not h.size:
             return np.inf
         for start in range(0, len(axes), _TOGETHER):
-            part = axes[start : start + _TOGETHER]
-            answer = self._side_by_side(part)
-            if answer is None:
+            batch = axes[start : start + _TOGETHER]
+            solution = self._side_by_side(batch)
+            if solution is None:
                 return np.inf
-            y = np.maximum(answer[1], 0.0)
-            highest, left = max(highest, float((y @ h).max())), max(left, float(np.abs(part - y @ H).sum(axis=1).max()))
-        return 2.0 * abs(highest) / (1.0 - left) if left < 0.5 else np.inf
+            y = np.maximum(solution[1], 0.0)
+            highest, residual = (
+                max(highest, float((y @ h).max())),
+                max(residual, float(np.abs(batch - y @ H).sum(axis=1).max())),
+            )
+        return 2.0 * abs(highest) / (1.0 - residual) if residual < 0.5 else np.inf
 
 
 def _meeting(rows: Sequence[Sequence[Fraction]], ends: Sequence[Fraction]) -> tuple[Fraction, ...] | None:
@@ -424,14 +429,14 @@ def _meeting(rows: Sequence[Sequence[Fraction]], ends: Sequence[Fraction]) -> tu
     ends : sequence of d fractions
         The right-hand sides.
     """
-    left = [[*row, end] for row, end in zip(rows, ends, strict=True)]
-    for i in range(len(left)):
-        pivot = next((k for k in range(i, len(left)) if left[k][i]), None)
+    augmented = [[*row, end] for row, end in zip(rows, ends, strict=True)]
+    for i in range(len(augmented)):
+        pivot = next((k for k in range(i, len(augmented)) if augmented[k][i]), None)
         if pivot is None:
             return None
-        left[i], left[pivot] = left[pivot], left[i]
-        left[i] = [x / left[i][i] for x in left[i]]
-        for k, row in enumerate(left):
+        augmented[i], augmented[pivot] = augmented[pivot], augmented[i]
+        augmented[i] = [x / augmented[i][i] for x in augmented[i]]
+        for k, row in enumerate(augmented):
             if k != i and row[i]:
-                left[k] = [a - row[i] * b for a, b in zip(row, left[i], strict=True)]
-    return tuple(row[-1] for row in left)
+                augmented[k] = [a - row[i] * b for a, b in zip(row, augmented[i], strict=True)]
+    return tuple(row[-1] for row in augmented)

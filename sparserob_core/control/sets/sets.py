@@ -265,18 +265,18 @@ class Cylinder(ConvexSet):
 
     @shaped
     def in_units(self, units: Float[Array, " d"]) -> Cylinder:
-        mine, others = units[: self.base.dimension], units[self.base.dimension :]
-        slopes = None if self.slopes is None else self.slopes * others / mine[:, None]
-        return Cylinder(self.base.in_units(mine), self.size, slopes)
+        base, free = units[: self.base.dimension], units[self.base.dimension :]
+        slopes = None if self.slopes is None else self.slopes * free / base[:, None]
+        return Cylinder(self.base.in_units(base), self.size, slopes)
 
     @shaped
     def support(self, directions: Float[Array, "*k d"]) -> Float[Array, " *k"]:
         directions = np.asarray(directions, dtype=float)
-        own, others = directions[..., : self.base.dimension], directions[..., self.base.dimension :]
+        base, free = (directions[..., : self.base.dimension], directions[..., self.base.dimension :])
         room: Array | float = 0.0
         if self.slopes is not None:
-            others, room = others - own @ self.slopes, ROUNDED * (np.abs(own) @ np.abs(self.slopes))
-        height: Array = np.where((np.abs(others) <= room).all(axis=-1), self.base.support(own), np.inf)
+            free, room = (free - base @ self.slopes, ROUNDED * (np.abs(base) @ np.abs(self.slopes)))
+        height: Array = np.where((np.abs(free) <= room).all(axis=-1), self.base.support(base), np.inf)
         return height
 
     @shaped
@@ -302,15 +302,15 @@ class Cylinder(ConvexSet):
 
     def _lifted(self, directions: Array) -> Array:
         """Return directions ``(k, b)`` of the base as directions ``(k, size)`` of the cylinder."""
-        free = np.zeros((*directions.shape[:-1], self.size - self.base.dimension))
-        beside = free if self.slopes is None else directions @ self.slopes
-        return np.concatenate([directions, beside], axis=-1)
+        zeros = np.zeros((*directions.shape[:-1], self.size - self.base.dimension))
+        free = zeros if self.slopes is None else directions @ self.slopes
+        return np.concatenate([directions, free], axis=-1)
 
     def _seen(self, points: Array) -> Array:
         """Return points ``(..., size)`` projected into the space of the base: ``x[:b] + slopes x[b:]``."""
-        given = np.asarray(points, dtype=float)
-        own, others = given[..., : self.base.dimension], given[..., self.base.dimension :]
-        return own if self.slopes is None else own + others @ self.slopes.T
+        coordinates = np.asarray(points, dtype=float)
+        base, free = coordinates[..., : self.base.dimension], coordinates[..., self.base.dimension :]
+        return base if self.slopes is None else base + free @ self.slopes.T
 
 
 def oblique(base: ConvexSet, slopes: Array) -> Cylinder:
@@ -430,10 +430,10 @@ class Product(ConvexSet):
 
     @shaped
     def continued(self, centre: Float[Array, "k d"], spread: Float[Array, "k d"]) -> Float[Array, " k"] | None:
-        every = zip(self.split(centre), self.split(spread), strict=True)
-        found = [part.continued(own, apart) for (part, own), (_, apart) in every]
-        known = [one for one in found if one is not None]
-        return np.sum(known, axis=0) if len(known) == len(found) else None
+        pairs = zip(self.split(centre), self.split(spread), strict=True)
+        bounds = [part.continued(own, radii) for (part, own), (_, radii) in pairs]
+        known_bounds = [bound for bound in bounds if bound is not None]
+        return np.sum(known_bounds, axis=0) if len(known_bounds) == len(bounds) else None
 
     @shaped
     def support_point(self, directions: Float[Array, "*k d"]) -> Float[Array, "*k d"]:
@@ -456,9 +456,9 @@ class Product(ConvexSet):
         array (...,)
             The violation of each point.
         """
-        each = np.stack([part.violation(own) for part, own in self.split(points)])
-        outside = np.linalg.norm(np.maximum(each, 0.0), axis=0)
-        return np.asarray(np.where(outside > 0.0, outside, each.max(axis=0)))
+        violations = np.stack([part.violation(own) for part, own in self.split(points)])
+        outside = np.linalg.norm(np.maximum(violations, 0.0), axis=0)
+        return np.asarray(np.where(outside > 0.0, outside, violations.max(axis=0)))
 
     @shaped
     def gauge(self, points: Float[Array, "*k d"]) -> Float[Array, " *k"]:
@@ -497,23 +497,23 @@ class Product(ConvexSet):
     @shaped
     def linearisation_excess(self, centre: Float[Array, "*k d"], spread: Float[Array, "*k J d"]) -> Float[Array, " *k"]:
         pairs = zip(self.split(centre), self.split(spread), strict=True)
-        return np.asarray(sum(part.linearisation_excess(own, moved) for (part, own), (_, moved) in pairs))
+        return np.asarray(sum(part.linearisation_excess(own, deviations) for (part, own), (_, deviations) in pairs))
 
     @shaped
     def support_majorant(
         self, centre: Float[Array, "*k d"], spread: Float[Array, "*k J d"]
     ) -> tuple[Float[Array, "*k d"], Float[Array, " *k"]]:
         pairs = zip(self.split(centre), self.split(spread), strict=True)
-        each = [part.support_majorant(own, moved) for (part, own), (_, moved) in pairs]
-        return np.concatenate([point for point, _ in each], axis=-1), np.sum([excess for _, excess in each], axis=0)
+        bounds = [part.support_majorant(own, deviations) for (part, own), (_, deviations) in pairs]
+        return np.concatenate([point for point, _ in bounds], axis=-1), np.sum([excess for _, excess in bounds], axis=0)
 
     @shaped
     def support_minorant(
         self, centre: Float[Array, " d"], spread: Float[Array, "J d"]
     ) -> tuple[float, Float[Array, " J"], Float[Array, "J J"]]:
         pairs = zip(self.split(centre), self.split(spread), strict=True)
-        each = [part.support_minorant(own, moved) for (part, own), (_, moved) in pairs]
-        values, gradients, hessians = zip(*each, strict=True)
+        bounds = [part.support_minorant(own, deviations) for (part, own), (_, deviations) in pairs]
+        values, gradients, hessians = zip(*bounds, strict=True)
         return float(np.sum(values)), np.sum(gradients, axis=0), np.sum(hessians, axis=0)
 
 

@@ -53,34 +53,48 @@ def require_consistent(path: str, convex: ConvexSet | None) -> None:
     InputError
         The error names the contradiction and a direction.
     """
-    for one in strangers(convex):
-        said = _contradiction(one)
-        if said:
+    for stranger in strangers(convex):
+        contradiction = _contradiction(stranger)
+        if contradiction:
             raise InputError(
-                path=path, expected="the support function of a convex set", got=f"one of the kind {one.kind}: {said}"
+                path=path,
+                expected="the support function of a convex set",
+                got=f"one of the kind {stranger.kind}: {contradiction}",
             )
 
 
 def _contradiction(convex: ConvexSet) -> str:
     """Return the first contradiction of a set in words; empty where none is found."""
     axes = np.eye(convex.dimension)
-    drawn = np.random.default_rng(5).normal(size=(DIRECTIONS, convex.dimension))
-    c = np.vstack([axes, -axes, drawn, drawn + np.roll(drawn, 1, axis=0), np.zeros((1, convex.dimension))])
+    random_directions = np.random.default_rng(5).normal(size=(DIRECTIONS, convex.dimension))
+    c = np.vstack(
+        [
+            axes,
+            -axes,
+            random_directions,
+            random_directions + np.roll(random_directions, 1, axis=0),
+            np.zeros((1, convex.dimension)),
+        ]
+    )
     heights = np.asarray(convex.support(c), dtype=float)
     if heights.shape != (len(c),) or np.isnan(heights).any() or (heights == -np.inf).any():
         return "it is no number in some direction"
-    bounded = np.isfinite(heights)
-    c, heights, points = c[bounded], heights[bounded], np.asarray(convex.support_point(c[bounded]), dtype=float)
+    is_bounded = np.isfinite(heights)
+    c, heights, points = (
+        c[is_bounded],
+        heights[is_bounded],
+        np.asarray(convex.support_point(c[is_bounded]), dtype=float),
+    )
     if points.shape != c.shape or not np.isfinite(points).all():
         return "a support point is no point"
     lengths = np.linalg.norm(c, axis=1)
-    close = CLOSE * lengths * max(float(np.abs(heights).max()), float(np.abs(points).max()))
+    tolerances = CLOSE * lengths * max(float(np.abs(heights).max()), float(np.abs(points).max()))
     values = points @ c.T  # c'x for every support point x and every direction c
     return _first(
-        (np.abs(np.diag(values) - heights) > close, c, "it is not attained at its support point"),
-        (values.max(axis=0) > heights + close, c, "it does not bound its own support points: it is not sublinear"),
-        (np.abs(convex.support(2.5 * c) - 2.5 * heights) > 2.5 * close, c, "h(2.5 c) is not 2.5 h(c)"),
-        *_sides(convex, points, close),
+        (np.abs(np.diag(values) - heights) > tolerances, c, "it is not attained at its support point"),
+        (values.max(axis=0) > heights + tolerances, c, "it does not bound its own support points: it is not sublinear"),
+        (np.abs(convex.support(2.5 * c) - 2.5 * heights) > 2.5 * tolerances, c, "h(2.5 c) is not 2.5 h(c)"),
+        *_sides(convex, points, tolerances),
     )
 
 
@@ -96,7 +110,7 @@ def _sides(convex: ConvexSet, points: Array, close: Array) -> Iterator[tuple[Arr
 
 def _first(*looks: tuple[Array, Array, str]) -> str:
     """Return the words of the first check that fails, with the direction; empty where none fails."""
-    for wrong, directions, words in looks:
-        if wrong.any():
-            return f"{words}, in the direction {directions[int(np.argmax(wrong))].tolist()}"
+    for fails, directions, words in looks:
+        if fails.any():
+            return f"{words}, in the direction {directions[int(np.argmax(fails))].tolist()}"
     return ""

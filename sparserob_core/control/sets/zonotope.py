@@ -88,12 +88,12 @@ class Zonotope(ConvexSet):
         centre, spread : arrays (k, d)
             The real directions, and the distances by which each entry may differ from them.
         """
-        each = np.abs(self.generators).T
+        sizes = np.abs(self.generators).T
         along = continued_by_signs(
             np.zeros(len(self.generators)),
             np.ones(len(self.generators)),
             centre @ self.generators.T,
-            (spread + ROUNDED * np.abs(centre)) @ each,
+            (spread + ROUNDED * np.abs(centre)) @ sizes,
         )
         return np.asarray(along + (np.abs(centre) + spread) @ np.abs(self.centre))
 
@@ -127,8 +127,8 @@ class Zonotope(ConvexSet):
             Upper bounds of the excess.
         """
         along = np.abs(np.asarray(centre) @ self.generators.T)
-        moved = np.abs(np.asarray(spread) @ self.generators.T).sum(axis=-2)
-        excess: Array = np.where(along > 0, 2.0 * np.maximum(moved - along, 0.0), moved).sum(axis=-1)
+        deviations = np.abs(np.asarray(spread) @ self.generators.T).sum(axis=-2)
+        excess: Array = np.where(along > 0, 2.0 * np.maximum(deviations - along, 0.0), deviations).sum(axis=-1)
         return excess
 
     def support_majorant(self, centre: Array, spread: Array) -> tuple[Array, Array]:
@@ -149,19 +149,19 @@ class Zonotope(ConvexSet):
         """
         d, sizes = self.dimension, np.linalg.norm(self.generators, axis=1)
         generators = self.generators[sizes > 0] / sizes[sizes > 0, None]
-        _, values, turned = np.linalg.svd(generators, full_matrices=True)
+        _, values, basis = np.linalg.svd(generators, full_matrices=True)
         rank = int((values > PARALLEL).sum())
         if comb(len(generators), max(rank - 1, 0)) > MOST_SIDES:
             return None
-        turned = np.where(np.abs(turned) > ROUNDED, turned, 0.0) if rank < d else np.eye(d)
-        within = [normal @ turned[:rank] for normal in self._across(generators @ turned[:rank].T, rank)] if rank else []
-        H = np.vstack([*within, turned[rank:]])
-        H, both, size = (
+        basis = np.where(np.abs(basis) > ROUNDED, basis, 0.0) if rank < d else np.eye(d)
+        within = [normal @ basis[:rank] for normal in self._across(generators @ basis[:rank].T, rank)] if rank else []
+        H = np.vstack([*within, basis[rank:]])
+        H, widths, size = (
             np.vstack([H, -H]),
             np.tile(self.width(H), 2),
             np.abs(self.generators).sum(axis=0),
         )
-        room = np.where(both > CLOSED * (np.abs(H) @ size), 0.0, ROUNDED)
+        room = np.where(widths > CLOSED * (np.abs(H) @ size), 0.0, ROUNDED)
         return H, self.support(H) + room * (np.abs(H) @ (np.abs(self.centre) + size))
 
     @staticmethod

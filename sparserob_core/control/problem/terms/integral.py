@@ -75,14 +75,14 @@ class IntegralConstraint(Window):
     __repr__ = noun
 
     def checked(self, where: str, setting: Setting) -> Self:
-        given = {"H": (self.H, setting.states, "state"), "G": (self.G, setting.controls, "control")}
-        named = {name: one for name, one in given.items() if one[0] is not None}
-        told = dict(zip(named, coefficients(where, **named), strict=True))
-        if len({len(rows) for rows in told.values()}) != 1:
-            got = " and ".join(f"{len(rows)} in {name}" for name, rows in told.items()) or "neither"
+        matrices = {"H": (self.H, setting.states, "state"), "G": (self.G, setting.controls, "control")}
+        present = {name: entry for name, entry in matrices.items() if entry[0] is not None}
+        arrays = dict(zip(present, coefficients(where, **present), strict=True))
+        if len({len(rows) for rows in arrays.values()}) != 1:
+            got = " and ".join(f"{len(rows)} in {name}" for name, rows in arrays.items()) or "neither"
             raise InputError(path=where, expected="H, or G, or both with as many rows", got=got)
-        count = len(next(iter(told.values())))
-        H, G = (told.get(name, np.zeros((count, width))) for name, (_, width, _) in given.items())
+        count = len(next(iter(arrays.values())))
+        H, G = (arrays.get(name, np.zeros((count, width))) for name, (_, width, _) in matrices.items())
         if (empty := np.flatnonzero(~np.hstack([H, G]).any(axis=1))).size:
             raise InputError(path=where, expected="rows that integrate something", got=f"zeros in row {empty[0] + 1}")
         lower, upper = _limits(where, self, count)
@@ -104,10 +104,10 @@ class IntegralConstraint(Window):
         return replace(self, H=H, G=G, lower=lower, upper=upper, start=start, stop=stop)
 
     def remaining(self, begin: float, horizon: float, **given: Any) -> Self | None:
-        left = super().remaining(begin, horizon, **given)
-        if left is not None and (self.start < begin or not over(self.stop or 0.0, begin + horizon)):
+        constraint = super().remaining(begin, horizon, **given)
+        if constraint is not None and (self.start < begin or not over(self.stop or 0.0, begin + horizon)):
             raise InputError("a part of an integral is known as a state only: see `accumulated`", path="integral")
-        return left
+        return constraint
 
     @property
     def bounds(self) -> Box:
@@ -141,9 +141,9 @@ class Accumulated(PathConstraint):
 def _limits(where: str, entry: IntegralConstraint, count: int) -> tuple[Array, Array]:
     """Return the lower and upper bounds ``(r,)`` of an integral, infinite where there is none; raise `InputError`."""
     sides = []
-    for name, given, none in (("lower", entry.lower, -np.inf), ("upper", entry.upper, np.inf)):
-        filled = [none if v is None else v for v in given] if isinstance(given, list | tuple) else given
-        sides.append(as_bound(f"{where}.{name}", none if filled is None else filled, count))
+    for name, bound, infinity in (("lower", entry.lower, -np.inf), ("upper", entry.upper, np.inf)):
+        filled = [infinity if v is None else v for v in bound] if isinstance(bound, list | tuple) else bound
+        sides.append(as_bound(f"{where}.{name}", infinity if filled is None else filled, count))
     lower, upper = sides
     if not (lower <= upper).all() or np.isposinf(lower).any() or np.isneginf(upper).any():
         got = f"{lower.tolist()} and {upper.tolist()}"

@@ -67,8 +67,8 @@ def ending(bound: ConvexSet | None, centre: Array, horizon: float) -> tuple[list
     ends = [] if np.isnan(fixed).all() else [Equality(fixed)]
     if bound is None:
         return [], ends
-    moved = np.column_stack([[0.0, horizon], np.vstack([centre, centre])]) if centre.any() else None
-    return [Return(_free_where_flat(bound).scaled(1.0 - WITHIN), horizon, horizon, RETURN, moved)], ends
+    reference = np.column_stack([[0.0, horizon], np.vstack([centre, centre])]) if centre.any() else None
+    return [Return(_free_where_flat(bound).scaled(1.0 - WITHIN), horizon, horizon, RETURN, reference)], ends
 
 
 def widths(bound: ConvexSet | None, states: int) -> Array:

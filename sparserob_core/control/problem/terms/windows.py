@@ -25,8 +25,8 @@ W = TypeVar("W", bound="Window")
 
 def _moved(rows: npt.ArrayLike, begin: float, horizon: float) -> Array:
     """Return rows ``(q, 1 + d)`` of a time and a point from the time ``begin`` on, with times counted from there."""
-    given = np.asarray(rows, dtype=float)
-    shifted = given - np.eye(1, given.shape[1])[0] * begin
+    array = np.asarray(rows, dtype=float)
+    shifted = array - np.eye(1, array.shape[1])[0] * begin
     later: Array = shifted[shifted[:, 0] > 0.0]
     if shifted[0, 0] > 0.0:
         return later
@@ -242,8 +242,8 @@ class PathConstraint(Window):
 
     def widened(self, size: int) -> Self:
         """Return the constraint for a state of ``size`` coordinates, in which the additional coordinates are free."""
-        moved = None if self.relative_to is None else columns(self.relative_to, 1 + size)
-        return replace(self, set=cylinder(self.set, size), relative_to=moved)
+        reference = None if self.relative_to is None else columns(self.relative_to, 1 + size)
+        return replace(self, set=cylinder(self.set, size), relative_to=reference)
 
     def everywhere(self, corners: Sequence[Array], called: str) -> list[Self]:
         """Return the constraint on a larger state ``z`` that holds for all states ``x = corner z``.
@@ -260,10 +260,12 @@ class PathConstraint(Window):
         list of PathConstraint
             A single constraint where the set is flat; for a curved set, one constraint for each different corner.
         """
-        moved = None if self.relative_to is None else columns(self.relative_to, 1 + corners[0].shape[1])
-        found = everywhere(self.set, corners)
-        names = [called] if len(found) == 1 else [f"{called} at corner {i}" for i in range(1, len(found) + 1)]
-        return [replace(self, name=name, set=one, relative_to=moved) for name, one in zip(names, found, strict=True)]
+        reference = None if self.relative_to is None else columns(self.relative_to, 1 + corners[0].shape[1])
+        sets = everywhere(self.set, corners)
+        names = [called] if len(sets) == 1 else [f"{called} at corner {i}" for i in range(1, len(sets) + 1)]
+        return [
+            replace(self, name=name, set=bound, relative_to=reference) for name, bound in zip(names, sets, strict=True)
+        ]
 
     def scaled(self, factor: float) -> Self:
         return replace(self, set=self.set.scaled(factor))
@@ -330,12 +332,12 @@ class MixedConstraint(Window):
         h = as_bound(f"{where}.mixed.h", self.h, len(H))
         if np.isneginf(h).any():
             raise InputError(path=f"{where}.mixed.h", expected="numbers above -inf", got=f"{h.tolist()}")
-        found = replace(self, H=H, G=G, h=h)
+        constraint = replace(self, H=H, G=G, h=h)
         try:
-            _ = found.set
+            _ = constraint.set
         except InputError as error:
             raise InputError(error.sentence, path=f"{where}.mixed") from None
-        return placed(found, where, setting)
+        return placed(constraint, where, setting)
 
     @property
     def restricts(self) -> bool:
@@ -408,15 +410,15 @@ def placed(term: W, where: str, setting: Setting) -> W:
     if term.lasting and stop - start <= SAME_TIME * horizon:
         expected = "a window of positive length, since a control lasts"
         raise InputError(path=where, expected=expected, got=f"from {start:g} to {stop:g}")
-    told: dict[str, Any] = {"start": start, "stop": stop}
+    changes: dict[str, Any] = {"start": start, "stop": stop}
     if term.relative_to is not None:
-        told["relative_to"] = moved = _reference(f"{where}.relative_to", term.relative_to, setting.states)
+        changes["relative_to"] = reference = _reference(f"{where}.relative_to", term.relative_to, setting.states)
         slack = SAME_TIME * horizon
-        if moved[0, 0] > start + slack or moved[-1, 0] < stop - slack:
+        if reference[0, 0] > start + slack or reference[-1, 0] < stop - slack:
             expected = f"rows whose times cover the window, {start:g} to {stop:g}"
-            got = f"{moved[0, 0]:g} to {moved[-1, 0]:g}"
+            got = f"{reference[0, 0]:g} to {reference[-1, 0]:g}"
             raise InputError(path=f"{where}.relative_to", expected=expected, got=got)
-    placed: W = replace(cast("Any", term), **told)
+    placed: W = replace(cast("Any", term), **changes)
     return placed
 
 
@@ -459,8 +461,8 @@ def columns(rows: Any, count: int) -> Array:
     array (q, count)
         The rows, followed by zeros.
     """
-    given = np.asarray(rows)
-    return np.pad(given, ((0, 0), (0, count - given.shape[1])))
+    array = np.asarray(rows)
+    return np.pad(array, ((0, 0), (0, count - array.shape[1])))
 
 
 def at_corners(corners: Sequence[Array], H: npt.ArrayLike, *beside: npt.ArrayLike) -> list[Array]:
@@ -481,10 +483,10 @@ def at_corners(corners: Sequence[Array], H: npt.ArrayLike, *beside: npt.ArrayLik
         The coefficients ``(k, size)`` of ``z``, and the further columns ``(k, 1)`` or ``(k, q)``. A row that repeats an
         earlier one is left out.
     """
-    parts = [np.asarray(one) for one in beside]
-    rows = np.vstack([np.column_stack([np.asarray(H) @ one, *parts]) for one in corners])
+    extra_columns = [np.asarray(column) for column in beside]
+    rows = np.vstack([np.column_stack([np.asarray(H) @ corner, *extra_columns]) for corner in corners])
     _, first = np.unique(rows, axis=0, return_index=True)
-    widths = [corners[0].shape[1], *(1 if one.ndim == 1 else one.shape[1] for one in parts)]
+    widths = [corners[0].shape[1], *(1 if column.ndim == 1 else column.shape[1] for column in extra_columns)]
     return np.split(rows[np.sort(first)], np.cumsum(widths)[:-1], axis=1)
 
 
@@ -505,8 +507,8 @@ def everywhere(bound: ConvexSet, corners: Sequence[Array]) -> list[ConvexSet]:
     """
     flat, d = bound.halfspaces(), bound.dimension
     if flat is None:
-        found = [oblique(bound, one[:, d:]) for one in corners]
-        return [*{np.asarray(one.slopes).tobytes(): one for one in found}.values()]
+        cylinders = [oblique(bound, corner[:, d:]) for corner in corners]
+        return [*{np.asarray(cylinder.slopes).tobytes(): cylinder for cylinder in cylinders}.values()]
     H, h = at_corners(corners, *flat)
     return [Polytope(H, h[:, 0])]
 
@@ -590,7 +592,7 @@ def _matrix(where: str, rows: object, expected: str, columns: int) -> Array:
 
 def _reference(where: str, rows: object, states: int) -> Array:
     """Return rows ``(q, 1 + d)`` of a time and a point; raise `InputError` where the times do not increase."""
-    moved = _matrix(where, rows, f"rows of {1 + states} finite numbers, a time and a point each", 1 + states)
-    if (np.diff(moved[:, 0]) <= 0.0).any():
-        raise InputError(path=where, expected="rows whose times increase", got=f"times {moved[:, 0].tolist()}")
-    return moved
+    reference = _matrix(where, rows, f"rows of {1 + states} finite numbers, a time and a point each", 1 + states)
+    if (np.diff(reference[:, 0]) <= 0.0).any():
+        raise InputError(path=where, expected="rows whose times increase", got=f"times {reference[:, 0].tolist()}")
+    return reference
