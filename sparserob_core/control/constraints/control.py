@@ -26,20 +26,35 @@ CONTROL, RATE, STEP = "control", "rate", "control_step"
 
 
 def of_control(problem: OptimalControlProblem) -> str:
-    """What the control's own set is called: ``rate`` where a path constraint is called ``control``."""
+    """Return the name of the control's own set: ``rate`` where a path constraint has the name ``control``, else
+    ``control``."""
     return RATE if any(getattr(entry, "name", "") == CONTROL for entry in problem.path) else CONTROL
 
 
 @final
 @dataclass(frozen=True, eq=False)
 class Places:
-    """What a control does at some places in time: its value on every piece, or its change at every step, which is the
-    same linear function of a control that answers nothing, of a nominal one and of every answer.
+    """Values of a control on every piece, or its changes at every step, with the times that stand for them.
 
-    ``table (K, q)``: what the values on the pieces are multiplied by at the ``q`` places; ``offset (q, m)`` is added.
-    ``starts (q,)``: from when on a time stands for each place, until the next, or the end, ``stop``. ``times (q,)``:
-    the time of each place that is told. ``steps``: whether these are changes; ``seam``: whether the last one is that
-    from the last piece to the first of the next period.
+    Values and changes are the same linear function of the pieces for a control without feedback, for a nominal control
+    and for its response to a deviation.
+
+    Parameters
+    ----------
+    table : csr_array, shape (K, q)
+        Coefficients of the values on the pieces at each of the ``q`` places.
+    offset : ndarray, shape (q, m)
+        Constants that are added.
+    starts : ndarray, shape (q,)
+        Time from which on times stand for each place, until the next start.
+    stop : float
+        Time until which times stand for the last place.
+    times : ndarray, shape (q,)
+        Time of each place that is reported.
+    steps : bool
+        Whether the places are changes.
+    seam : bool
+        Whether the last place is the change from the last piece to the first piece of the next period.
     """
 
     table: csr_array
@@ -52,7 +67,7 @@ class Places:
 
     @staticmethod
     def of_values(breakpoints: Array, controls: int) -> Places:
-        """``u(t)`` on every piece."""
+        """Return the values ``u(t)`` on every piece."""
         from scipy.sparse import csr_array, eye_array
 
         ends, pieces = breakpoints, breakpoints.size - 1
@@ -61,8 +76,8 @@ class Places:
 
     @staticmethod
     def of_steps(breakpoints: Array, controls: int, before: Array | None, seam: bool = False) -> Places:
-        """``u_{k+1} - u_k`` at every step, and ``u_0 - before`` at time 0 unless ``before`` is ``None``; with a
-        ``seam`` from the last piece to the first at the horizon."""
+        """Return the changes ``u_{k+1} - u_k`` at every step, and ``u_0 - before`` at time 0 unless ``before`` is
+        ``None``; with a ``seam`` also the change from the last piece to the first at the horizon."""
         first, pieces = int(before is None), breakpoints.size - 1
         times = breakpoints[first : pieces + seam]
         offset = np.zeros((times.size, controls))
@@ -73,15 +88,15 @@ class Places:
 
     @property
     def spans(self) -> tuple[Array, Array]:
-        """From when on times stand for each place, and until when, ``(q,)`` each."""
+        """Intervals of time that stand for the places: their starts and their ends, ``(q,)`` each."""
         return self.starts, np.append(self.starts[1:], self.stop)
 
     def at(self, times: Array) -> np.ndarray:
-        """The place that each time stands for."""
+        """Return the place that each time stands for."""
         return np.clip(np.searchsorted(self.starts, times, side="right") - 1, 0, self.starts.size - 1)
 
     def words(self, time: float) -> str:
-        """What the control does at a time that is told."""
+        """Return the control, or its change, at the reported ``time`` in words."""
         return f"the change of u at {time:.6g}" if self.steps else f"u({time:.6g})"
 
 
@@ -89,25 +104,36 @@ def held_at(problem: OptimalControlProblem, breakpoints: Array, answering: bool)
     """The sets that a problem's control must stay in, by name, and where: its own on every piece, and that of its
     steps. A single piece that repeats follows itself; where it is ``answering``, by another value."""
     m, pieces, first, step = problem.system.controls, breakpoints.size - 1, before(problem), problem.control_step
-    found = [(of_control(problem), problem.control, Places.of_values(breakpoints, m))]
+    sets = [(of_control(problem), problem.control, Places.of_values(breakpoints, m))]
     seam = bool(problem.repeat) and (pieces > 1 or answering)
     if step is not None and (pieces > 1 or first is not None or seam):
-        found.append((STEP, step, Places.of_steps(breakpoints, m, first, seam)))
-    return found
+        sets.append((STEP, step, Places.of_steps(breakpoints, m, first, seam)))
+    return sets
 
 
 def before(problem: OptimalControlProblem) -> Array | None:
-    """The control ``(m,)`` before time 0, where it is told."""
+    """Return the control ``(m,)`` before time 0; ``None`` where the problem does not give it."""
     return None if problem.initial_control is None else np.asarray(problem.initial_control, dtype=float)
 
 
 @dataclass(frozen=True, eq=False)
 class ControlConstraint(Source):
-    """What the control does at ``places`` in a curved set. The index is ``(t, z)`` with ``z`` in ``[-1, 1]^m`` a
-    direction, not normalised.
+    """Constraint that the control at ``places`` stays in a curved set.
 
-    ``values (N, q)``: what every function of the dictionary is at the places. ``beside``: how many entries of the
-    decision come after the coefficients of the control.
+    The index is ``(t, z)`` with ``z`` in ``[-1, 1]^m`` a direction, not normalised.
+
+    Parameters
+    ----------
+    name : str
+        Name of the constraint.
+    set : ConvexSet
+        The curved set.
+    places : Places
+        Values of the control, or its changes.
+    values : csr_array, shape (N, q)
+        Value of every function of the dictionary at the places.
+    beside : int, default 0
+        Number of entries of the decision after the coefficients of the control.
     """
 
     name: str
@@ -118,7 +144,8 @@ class ControlConstraint(Source):
 
     @staticmethod
     def of(name: str, convex: ConvexSet, places: Places, dictionary: Dictionary, beside: int = 0) -> ControlConstraint:
-        """That of a control in a dictionary."""
+        """Return the constraint for a control in a ``dictionary``, whose coefficients are followed by ``beside``
+        entries of the decision."""
         from scipy.sparse import csr_array
 
         return ControlConstraint(name, convex, places, csr_array(dictionary.sparse @ places.table), beside)
@@ -147,7 +174,8 @@ class ControlConstraint(Source):
         return G, (self.set.support(directions) - (directions * self.places.offset[places]).sum(axis=1))[:, None]
 
     def normals_in(self, units: Units) -> tuple[Array, Array]:
-        """That of a gauge."""
+        """Return the normal ``(1, 1)`` and the unit ``(1,)`` of the one row, which is in multiples of the set's gauge
+        in any units."""
         return of_gauge()
 
     def gradient(self, x: Array, indices: Array, rows: Array) -> Array:
@@ -155,8 +183,8 @@ class ControlConstraint(Source):
         every piece."""
         z = np.asarray(indices, dtype=float)[:, 1:]
         point = self._points(x)[self.places.at(indices[:, 0])]
-        turned = across(self.set, z, (point - self.set.support_point(unit(self.set, z))) @ self.set.frame.T)
-        return np.hstack([np.zeros((z.shape[0], 1)), turned])
+        slopes = across(self.set, z, (point - self.set.support_point(unit(self.set, z))) @ self.set.frame.T)
+        return np.hstack([np.zeros((z.shape[0], 1)), slopes])
 
     def worst(self, x: Array) -> Separation:
         """The places furthest outside, each with its worst direction; the bound is exact, since the places are finitely
@@ -173,19 +201,21 @@ class ControlConstraint(Source):
             answer: Array = np.einsum("kc,kc->k", directions, points[places[which]]) - self.set.support(directions)
             return answer
 
-        z, found = climb(excess, start, np.full(self.set.dimension, 0.1), lambda at: on_surface(np.clip(at, -1.0, 1.0)))
-        order = np.argsort(-found, kind="stable")
+        z, violations = climb(
+            excess, start, np.full(self.set.dimension, 0.1), lambda at: on_surface(np.clip(at, -1.0, 1.0))
+        )
+        order = np.argsort(-violations, kind="stable")
         indices = np.hstack([self.places.times[places[order], None], z[order]])
-        return Separation(indices, np.zeros(order.size, dtype=int), found[order], float(outside.max()))
+        return Separation(indices, np.zeros(order.size, dtype=int), violations[order], float(outside.max()))
 
     def explain(self, index: Array, row: int) -> Explanation:
-        """One constraint for people."""
+        """Return the description of one constraint for a reader."""
         time = float(self.places.times[self.places.at(index[:1])[0]])
         text = f"{self.name}: {self.places.words(time)} in the {self.set.kind}"
         return TimedExplanation(text, self.name, text, time, unit(self.set, index[None, 1:])[0])
 
     def _points(self, x: Array) -> Array:
-        """What the control does at every place, ``(q, m)``."""
+        """Return the values of the control, or its changes, at every place, ``(q, m)``."""
         coefficients = x[: x.size - self.beside].reshape(self.set.dimension, -1)
         answer: Array = (coefficients @ self.values).T + self.places.offset
         return answer
@@ -196,9 +226,9 @@ def differences(pieces: int, at_start: bool, seam: bool = False) -> csr_array:
     the first too, ``seam``: from the last to the first too, after the others."""
     from scipy.sparse import csr_array, eye_array, hstack
 
-    every = csr_array(eye_array(pieces) - eye_array(pieces, k=1))
-    every = every if at_start else every[:, 1:]
+    changes = csr_array(eye_array(pieces) - eye_array(pieces, k=1))
+    changes = changes if at_start else changes[:, 1:]
     if not seam:
-        return every
-    around = csr_array(([1.0, -1.0], ([0, pieces - 1], [0, 0])), shape=(pieces, 1))
-    return csr_array(hstack([every, around]))
+        return changes
+    seam_change = csr_array(([1.0, -1.0], ([0, pieces - 1], [0, 0])), shape=(pieces, 1))
+    return csr_array(hstack([changes, seam_change]))

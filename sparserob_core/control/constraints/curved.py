@@ -62,7 +62,7 @@ class CurvedConstraint(StateConstraint):
 
     @property
     def sides(self) -> None:
-        """None: the set is curved."""
+        """Half-spaces of the set: ``None``, since the set is curved."""
 
     @property
     def shape(self) -> ConvexSet:
@@ -98,10 +98,10 @@ class CurvedConstraint(StateConstraint):
         vanish."""
         flat, box, times = self._flat, self.index_set, self._flat.times
         values = flat.on_lattice(x)
-        held, heights = self._profile(x, values)
+        worst_indices, heights = self._profile(x, values)
         samples = local_maxima(values, flat.lattice[1], SAMPLED)
         samples = samples[np.argsort(-values[tuple(samples.T)], kind="stable")][:SAMPLED]
-        others = self._at(vertices(values, samples, times)[0], samples)
+        sample_points = self._at(vertices(values, samples, times)[0], samples)
         step = np.concatenate(
             [
                 [np.max(np.diff(times), initial=0.0)],
@@ -111,12 +111,14 @@ class CurvedConstraint(StateConstraint):
         )
 
         def climbed(points: Array) -> tuple[Array, Array]:
-            every = np.vstack([points, others])
-            reached, found = climb(lambda at, _: self._height(x, at, self._rough), every, step, self._inside)
-            return reached, self._height(x, reached) if self._rough else found
+            starts = np.vstack([points, sample_points])
+            ends, violations = climb(lambda at, _: self._height(x, at, self._rough), starts, step, self._inside)
+            return ends, self._height(x, ends) if self._rough else violations
 
-        indices, found = ridden(held, heights, flat.pieces, flat.kinks, lambda points: self._turned(x, points), climbed)
-        return Separation(indices, np.zeros(found.size, dtype=int), found)
+        indices, violations = ridden(
+            worst_indices, heights, flat.pieces, flat.kinks, lambda points: self._turned(x, points), climbed
+        )
+        return Separation(indices, np.zeros(violations.size, dtype=int), violations)
 
     @shaped
     def _profile(
@@ -128,10 +130,10 @@ class CurvedConstraint(StateConstraint):
         places, likely = turns(values.max(axis=0), neighbours(self._b), self.unit)
         rows, at = places.T
         heights = values[:, rows, at].max(axis=0)
-        held = self._at(self._flat.times[at], np.stack([values[:, rows, at].argmax(axis=0), rows], axis=1))
-        held[:likely], heights[:likely] = self._turned(x, held[:likely])
+        worst_indices = self._at(self._flat.times[at], np.stack([values[:, rows, at].argmax(axis=0), rows], axis=1))
+        worst_indices[:likely], heights[:likely] = self._turned(x, worst_indices[:likely])
         best = highest_at(at, heights)
-        return held[best], heights[best]
+        return worst_indices[best], heights[best]
 
     @shaped
     def _turned(
@@ -150,9 +152,9 @@ class CurvedConstraint(StateConstraint):
             return np.asarray(along(c, which) - self.set.support(c) - (c * moves[which]).sum(axis=1))
 
         start = np.full(self._b, STEP)
-        z, found = climb(height, indices[:, first:], start, lambda z: on_surface(np.clip(z, -1.0, 1.0)))
-        turned = np.hstack([indices[:, :first], z])
-        return turned, self._height(x, turned) if self._rough else found
+        z, violations = climb(height, indices[:, first:], start, lambda z: on_surface(np.clip(z, -1.0, 1.0)))
+        ends = np.hstack([indices[:, :first], z])
+        return ends, self._height(x, ends) if self._rough else violations
 
     @shaped
     def _at(self, times: Float[Array, " k"], positions: Int[np.ndarray, "k q"]) -> Float[Array, "k j"]:
@@ -166,8 +168,11 @@ class CurvedConstraint(StateConstraint):
 
     @property
     def _rough(self) -> bool:
-        """Whether there is what of a direction is an integral, so that directions are only about right that are climbed
-        to; what is found is looked at again."""
+        """True where measurable disturbances or errors of execution add integrals to the rows.
+
+        Climbs then use approximate integrals, so that the directions they reach are approximate. The violations there
+        are evaluated again.
+        """
         return self.functionals.measurable is not None or self.functionals.execution is not None
 
     @shaped
@@ -196,10 +201,12 @@ class CurvedConstraint(StateConstraint):
         of the cube's directions."""
         nu = self.parameters.count
         touched = self.parameters.touches(lower[:, 1 : 1 + nu], upper[:, 1 : 1 + nu])
-        found = enclose(lower, upper, touched, nu, lambda low, high: self._cell(x, low, high))
+        enclosure = enclose(lower, upper, touched, nu, lambda low, high: self._cell(x, low, high))
         with np.errstate(divide="ignore"):
             rooms = np.maximum(self._rooms(lower[:, 1 + nu :], upper[:, 1 + nu :]), 0.0)
-            return replace(found, bounds=np.where(found.bounds > 0.0, found.bounds / rooms, found.bounds))
+            return replace(
+                enclosure, bounds=np.where(enclosure.bounds > 0.0, enclosure.bounds / rooms, enclosure.bounds)
+            )
 
     @shaped
     def _rooms(self, low: Float[Array, "k b"], high: Float[Array, "k b"]) -> Float[Array, " k"]:
@@ -213,7 +220,7 @@ class CurvedConstraint(StateConstraint):
 
     @shaped
     def _lengthening(self, H: Float[Array, "r d"], shortest: float) -> Float[Array, " j"]:
-        """By which share ``h(c) - c'm`` is larger than ``shortest`` where one coordinate of the directions
+        """Return the share by which ``h(c) - c'm`` exceeds ``shortest`` where one coordinate of the directions
         ``c = H[0] + sum_j eta_j H[j]`` is at an end."""
         ends = np.maximum(*(self.set.support(c) - c @ self.set.interior_point() for c in (H[0] + H[1:], H[0] - H[1:])))
         return np.asarray(ends / max(shortest, SHORTEST * ends.max(initial=0.0), TINY) - 1.0)
@@ -222,9 +229,11 @@ class CurvedConstraint(StateConstraint):
     def explain(self, index: Float[Array, " j"], row: int) -> TimedExplanation:
         times, directions, parameters, rhs = self.functionals_at(index[None])
         at = (float(times[0]), parameters[0])
-        said = explanation(self.name, self.functionals, directions, rhs, 0, *at, scale=float(np.abs(directions).max()))
+        description = explanation(
+            self.name, self.functionals, directions, rhs, 0, *at, scale=float(np.abs(directions).max())
+        )
         tangent = f" (a tangent of the {self.set.kind})"
-        return replace(said, text=said.text + tangent, statement=said.statement + tangent)
+        return replace(description, text=description.text + tangent, statement=description.statement + tangent)
 
     @property
     @shaped
@@ -236,13 +245,13 @@ class CurvedConstraint(StateConstraint):
         return np.asarray(np.abs(rows) @ nominal_sizes(self.functionals, x, np.eye(self.set.dimension)))
 
     def nominal(self) -> CurvedConstraint:
-        known = self.functionals.nominal()
-        return replace(self, functionals=known, parameters=ParameterIndex(None), shared=None)
+        functionals = self.functionals.nominal()
+        return replace(self, functionals=functionals, parameters=ParameterIndex(None), shared=None)
 
     @shaped
     def from_state(self, initial_state: Float[Array, " d"]) -> CurvedConstraint:
-        moved = self.functionals.from_state(initial_state)
-        return replace(self, functionals=moved, shared=self._sharing or self)
+        functionals = self.functionals.from_state(initial_state)
+        return replace(self, functionals=functionals, shared=self._sharing or self)
 
     @shaped
     def directions(
@@ -285,8 +294,8 @@ class CurvedConstraint(StateConstraint):
             moving = Moving(self.reference, H) if self.reference.moves else None
 
             def cell(leg: Leg) -> CellEnclosure:
-                known = self.functionals.support_over(leg, H, joined)
-                sigma = self.functionals.delivered_over(known, x, H, leg, joined)
+                supports = self.functionals.support_over(leg, H, joined)
+                sigma = self.functionals.delivered_over(supports, x, H, leg, joined)
                 return CellEnclosure(leg, sigma, H, rhs, control, joined, looseness, lengthening, cuts, moving)
 
             remember(self._cells, key, over_legs(legs, cell), kept(control))
@@ -329,20 +338,20 @@ class CurvedConstraint(StateConstraint):
     @property
     def _sharing(self) -> CurvedConstraint | None:
         """The ``shared`` constraint where it is the same but for its initial state."""
-        given = self.shared
-        if given is None or (given.start, given.stop) != (self.start, self.stop):
+        shared = self.shared
+        if shared is None or (shared.start, shared.stop) != (self.start, self.stop):
             return None
-        mine, other = self.functionals, given.functionals
+        functionals, shared_functionals = self.functionals, shared.functionals
         same = (
-            given.set is self.set
-            and given.reference is self.reference
-            and given.parameters is self.parameters
-            and mine.response.propagator is other.response.propagator
-            and mine.dictionary is other.dictionary
-            and mine.disturbance is other.disturbance
-            and mine.initial is other.initial
+            shared.set is self.set
+            and shared.reference is self.reference
+            and shared.parameters is self.parameters
+            and functionals.response.propagator is shared_functionals.response.propagator
+            and functionals.dictionary is shared_functionals.dictionary
+            and functionals.disturbance is shared_functionals.disturbance
+            and functionals.initial is shared_functionals.initial
         )
-        return given if same else None
+        return shared if same else None
 
     @cached_property
     def _cells(self) -> dict[bytes, Bounded]:

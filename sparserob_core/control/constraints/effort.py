@@ -34,16 +34,17 @@ class FeedbackEffort(Source):
     _known: dict[bytes, Effort] = field(default_factory=dict, repr=False)
 
     def normals_in(self, units: Units) -> tuple[Array, Array]:
-        """Its rows are costs, whatever the deviations."""
+        """Return one normal ``(1,)`` for each of two rows, and the unit of the cost: the rows are costs, whatever the
+        deviations."""
         return np.ones((2, 1)), np.array([units.cost])
 
     def index_units(self, units: Units) -> Array:
-        """None: signs have no unit."""
+        """Return an empty array, since the signs of an index have no unit."""
         return np.zeros(0)
 
     def family(self) -> ConstraintFamily:
         """The constraint as a family."""
-        ones, far = np.ones(self.prices.size), self.loop.spread.radii
+        ones, radii = np.ones(self.prices.size), self.loop.spread.radii
         family = ConstraintFamily(
             name=self.name,
             index_set=Box(-ones, ones),
@@ -58,7 +59,7 @@ class FeedbackEffort(Source):
             source=self,
             defines=True,
         )
-        box = Box(np.concatenate([-ones, -far]), np.concatenate([ones, far]))
+        box = Box(np.concatenate([-ones, -radii]), np.concatenate([ones, radii]))
         literal = replace(family, index_set=box, formulation="literal", reduced=family, worst=None, excess=None)
         return replace(family, literal=literal)
 
@@ -67,7 +68,8 @@ class FeedbackEffort(Source):
         return np.array([1.0, -1.0] if self.loop.spread.is_box else [1.0])
 
     def _control(self, x: Array) -> tuple[Array, Array]:
-        """What every entry of the control costs at no deviation, and what deviations add: ``(m K,), (m K, Q)``."""
+        """Return the entries of the control without deviations, and the coefficients of the deviations in them, both
+        times the prices: ``(m K,)`` and ``(m K, Q)``."""
         effects = self.loop.effects(x)
         return self.prices * self.loop.nominal(x).ravel(), self.prices[:, None] * effects.swapaxes(0, 1).reshape(
             self.prices.size, -1
@@ -84,11 +86,11 @@ class FeedbackEffort(Source):
         from scipy.sparse import csr_array
 
         loop, weight, count = self.loop, self.prices * index, self._sides.size
-        at, which, value = loop.answers.effect
+        position, variable, value = loop.answers.effect
         _, m, Q, _ = loop.answers.shape
-        piece, channel = np.divmod(at // Q, m)
+        piece, channel = np.divmod(position // Q, m)
         data = weight.reshape(m, -1)[channel, piece] * value
-        C = csr_array((data, (at % Q, loop.nominal_size + which)), shape=(Q, loop.variables))
+        C = csr_array((data, (position % Q, loop.nominal_size + variable)), shape=(Q, loop.variables))
         g = np.zeros((count, loop.variables))
         g[:, : weight.size] = self._sides[:, None] * weight
         g[:, self.bound] = -1.0
@@ -97,7 +99,7 @@ class FeedbackEffort(Source):
         )
 
     def effort(self, x: Array) -> Effort:
-        """Between what the largest effort lies."""
+        """Return bounds of the largest effort at the decision ``x (n,)``."""
         key = x[: self.bound].tobytes()
         if key not in self._known:
             self._known.clear()
@@ -105,7 +107,7 @@ class FeedbackEffort(Source):
         return self._known[key]
 
     def settled(self, x: Array) -> Array:
-        """The same decision with the variable at a proven bound of the effort."""
+        """Return the same decision with the variable ``bound`` at a proven upper bound of the effort."""
         answer, (a, A) = x.copy(), self._control(x)
         size = float(np.abs(a).sum() + (np.abs(A) @ self.loop.spread.radii).sum())
         answer[self.bound] = self.effort(x).upper + ROUND_OFF * size
@@ -113,18 +115,18 @@ class FeedbackEffort(Source):
 
     def worst(self, x: Array) -> Separation:
         """The signs of the largest efforts that were found, worst first."""
-        found = self.effort(x)
-        none = np.zeros(found.values.size, dtype=int)
-        return Separation(found.signs, none, found.values - x[self.bound], found.upper - float(x[self.bound]))
+        effort = self.effort(x)
+        rows = np.zeros(effort.values.size, dtype=int)
+        return Separation(effort.signs, rows, effort.values - x[self.bound], effort.upper - float(x[self.bound]))
 
     def enclosure(self, x: Array, lower: Array, upper: Array) -> Enclosure:
         """A proven bound of the violation, for all signs."""
-        over = self.settled(x)[self.bound] - x[self.bound]
-        return Enclosure(np.full(len(lower), over), np.zeros(len(lower), dtype=int))
+        violation = self.settled(x)[self.bound] - x[self.bound]
+        return Enclosure(np.full(len(lower), violation), np.zeros(len(lower), dtype=int))
 
     def explain(self, index: Array, row: int) -> Explanation:
-        """One constraint for people."""
+        """Return the description of one constraint for a reader."""
         signs = index[: self.prices.size]
         text = f"{self.name}: the control against {signs.size} signs <= the cost"
-        said = TimedExplanation(text, self.name, text, 0.0, self._sides[row] * signs)
-        return told(said, self.loop, index[self.prices.size :])
+        description = TimedExplanation(text, self.name, text, 0.0, self._sides[row] * signs)
+        return told(description, self.loop, index[self.prices.size :])

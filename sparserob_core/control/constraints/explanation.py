@@ -1,5 +1,8 @@
-"""One constraint of a control problem for people: what is bounded, when, and what the uncertainty does to it; and how a
-constraint in own units is told in the user's."""
+"""Descriptions of single constraints of a control problem for a reader, and the source of a constraint family.
+
+A description holds the bounded quantity, the time, and the effect of the uncertainty. The source of a family relates a
+constraint in own units to the same constraint in the user's units.
+"""
 
 from __future__ import annotations
 
@@ -32,8 +35,8 @@ class Source(ABC):
 
     @abstractmethod
     def normals_in(self, units: Units) -> tuple[Array, Array]:
-        """The normals of its rows, ``(r, q)``, and what one of each of their coordinates ``(q,)`` is in the user's
-        units, where its own are ``units``."""
+        """Return the normals ``(r, q)`` of the rows, and the size of a unit of each of their coordinates, ``(q,)``, in
+        the user's units, where the constraint itself is in ``units``."""
 
     def scale(self, x: Array) -> float:
         """Return the size of the smallest row at the decision ``x (n,)``, 1 where no row is smaller."""
@@ -41,16 +44,18 @@ class Source(ABC):
 
     @property
     def of_state(self) -> Source | None:
-        """The same constraint on the state where the control answers nothing; ``None`` for one on controls."""
+        """Constraint on the state without feedback; ``None`` for a constraint on controls."""
         return None
 
     def index_units(self, units: Units) -> Array:
-        """What one of the first coordinates of a reduced index is in the user's units; further ones have none."""
+        """Return the units of the first coordinates of a reduced index, in the user's units; further coordinates have
+        no unit."""
         return np.array([units.time])
 
 
 def of_gauge() -> tuple[Array, Array]:
-    """The one row of a curved set of controls, which is in multiples of its gauge in any units."""
+    """Return the normal and the unit of the one row of a curved set of controls, which is in multiples of its gauge in
+    any units."""
     return np.ones((1, 1)), np.ones(1)
 
 
@@ -73,20 +78,62 @@ class Witness(WorstConstraint):
 @final
 @dataclass(frozen=True, eq=False)
 class TimedExplanation(Explanation):
-    """One constraint at a ``time`` and a parameter ``(nu,)``, with the worst disturbance ``(mw, pieces)`` there, the
-    worst initial state ``begun (d,)`` where there is more than one, and the normal ``direction`` (of the state, or of
-    the control).
+    """Description of one constraint at a time and a parameter, with its worst uncertainty.
 
-    ``statement`` is what it asks for, ``text`` the same with remarks. A constraint on the state compares a ``quantity``
-    such as ``x1(5)`` with a ``limit``: ``bound`` is what the quantity may be (``|x1| <= 0.3``), ``free`` its value
-    without control and uncertainty, ``sign`` -1 for a lower limit, ``sigma`` how far what is uncertain of disturbance
-    and initial state (the ``cause``) moves it towards the limit, ``where`` the parameter in words. ``constraint``: the
-    name of the constraint. Words say all of these, and the ``direction``, divided by ``scale``; ``names``: what the
-    states are called. ``deviation (d,)`` is that of ``begun`` from the centre of the initial states. ``gain (m,)``: the
-    part of the normal on the control, of a mixed constraint, and ``piece`` the piece of the control that it looks at.
-    ``changes``: when each of the disturbance's pieces begins, where that depends on the constraint. ``noise (K, p)``:
-    the worst noise of what is measured at every breakpoint of the control, where there is any. ``following (d,)``: the
-    deviation of the next period's initial state, of a step across the seam of a plan that repeats.
+    A constraint on the state compares a ``quantity`` such as ``x1(5)`` with a ``limit``. Words show the numbers, and
+    the ``direction``, divided by ``scale``.
+
+    Parameters
+    ----------
+    text : str
+        The statement, with notes.
+    constraint : str
+        Name of the constraint.
+    statement : str
+        Requirement of the constraint.
+    time : float
+        Time of the constraint.
+    direction : ndarray
+        Normal, on the state or on the control.
+    parameter : ndarray, shape (nu,), optional
+        Parameter of the constraint.
+    disturbance : ndarray, shape (mw, pieces), optional
+        Worst disturbance.
+    begun : ndarray, shape (d,), optional
+        Worst initial state, where there is more than one.
+    deviation : ndarray, shape (d,), optional
+        Deviation of ``begun`` from the centre of the initial states.
+    cause : str
+        Uncertain quantities that move the quantity.
+    quantity : str
+        Bounded quantity in words.
+    bound : str
+        Range of the quantity in words, such as ``|x1| <= 0.3``.
+    limit : float
+        Limit of the quantity.
+    free : float
+        Value of the quantity without control and uncertainty.
+    sigma : float
+        Distance by which the uncertain disturbance and initial state (the ``cause``) move the quantity towards the
+        limit.
+    sign : float
+        -1 for a lower limit, else 1.
+    where : str
+        Parameter in words.
+    scale : float
+        Divisor of the numbers in words.
+    names : Names
+        Names of the states.
+    gain : ndarray, shape (m,), optional
+        Part of the normal on the control, for a mixed constraint.
+    piece : int, optional
+        Piece of the control in a mixed constraint.
+    changes : ndarray, optional
+        Beginnings of the disturbance's pieces, where they depend on the constraint.
+    noise : ndarray, shape (K, p), optional
+        Worst noise of the measurement at every breakpoint of the control, where there is a noise.
+    following : ndarray, shape (d,), optional
+        Deviation of the next period's initial state, for a step across the seam of a plan that repeats.
     """
 
     decides: ClassVar[str] = "control"
@@ -130,7 +177,7 @@ class TimedExplanation(Explanation):
         )
 
     def parameter_or(self, middle: Array) -> Array:
-        """Its parameter; the ``middle`` of a constraint without uncertainty."""
+        """Return the parameter of the constraint, or the ``middle`` where the constraint has none."""
         return middle if self.parameter is None or self.parameter.size == 0 else self.parameter
 
     def short(self) -> str:
@@ -144,73 +191,75 @@ class TimedExplanation(Explanation):
         return Unexplained(f"{self.statement} (sample {number})")
 
     def from_any_state(self) -> TimedExplanation:
-        """The same where the initial state is free: at time 0 without what the given one says."""
+        """Return the description for a free initial state; at time 0 it has no notes, which would give the value from
+        the given initial state."""
         return replace(self, text=self.statement) if self.time == 0.0 else self
 
     def beyond(self, amount: float) -> str:
         if not self.quantity:
             return super().beyond(amount)
-        reached, pushed = (self.free + self.sign * self.sigma) / self.scale, self.sigma / self.scale
+        value, shift = (self.free + self.sign * self.sigma) / self.scale, self.sigma / self.scale
         also = "" if " and " in self.cause else "s"
-        moved = (
-            f" under the worst {self.cause}, which move{also} it by {pushed:.4g}{self._in}," if self.sigma > 0 else ""
+        clause = (
+            f" under the worst {self.cause}, which move{also} it by {shift:.4g}{self._in}," if self.sigma > 0 else ""
         )
         return (
-            f"{self.quantity} = {reached:.6g}{self._in}{moved} is outside {self.bound} ({self.constraint}), "
+            f"{self.quantity} = {value:.6g}{self._in}{clause} is outside {self.bound} ({self.constraint}), "
             f"whatever the decision{self._at}"
         )
 
     def apart(self, other: Explanation, share: float, amount: float) -> str:
-        known = isinstance(other, TimedExplanation) and self.quantity and other.quantity
-        if not isinstance(other, TimedExplanation) or not known:
+        has_quantities = isinstance(other, TimedExplanation) and self.quantity and other.quantity
+        if not isinstance(other, TimedExplanation) or not has_quantities:
             return super().apart(other, share, amount)
         if self.gain is not None or other.gain is not None:
-            left, right = (np.zeros(1) if one.gain is None else one.gain for one in (self, other))
-            off = np.abs(left + share * right) > SAME * max(np.abs(left).max(), np.abs(right).max())
-            turned = np.abs(self.direction + share * other.direction) > SAME * np.abs(self.direction).max(initial=0.0)
-            if off.any() or turned.any():
+            gain, other_gain = (np.zeros(1) if side.gain is None else side.gain for side in (self, other))
+            gains_differ = np.abs(gain + share * other_gain) > SAME * max(np.abs(gain).max(), np.abs(other_gain).max())
+            differs = np.abs(self.direction + share * other.direction) > SAME * np.abs(self.direction).max(initial=0.0)
+            if gains_differ.any() or differs.any():
                 return super().apart(other, share, amount)
-        rest = self.direction + share * other.direction
-        rest = np.where(np.abs(rest) <= SAME * np.abs(self.direction).max(), 0.0, rest)
+        residual = self.direction + share * other.direction
+        residual = np.where(np.abs(residual) <= SAME * np.abs(self.direction).max(), 0.0, residual)
         allowed = self.sign * self.limit + share * other.sign * other.limit
-        moved = self.sigma + share * other.sigma
-        if rest.any():
-            return self._uncontrollable(other, rest, share, allowed, moved)
-        if moved > 0:
-            more, less = told_apart(moved / 2 / self.scale, allowed / 2 / self.scale)
+        shift = self.sigma + share * other.sigma
+        if residual.any():
+            return self._uncontrollable(other, residual, share, allowed, shift)
+        if shift > 0:
+            shift_words, room_words = told_apart(shift / 2 / self.scale, allowed / 2 / self.scale)
             verb = "move" if " and " in self.cause else "moves"
             return (
-                f"the {self.cause} alone {verb} {self.quantity} by {more}{self._in}, {self._set} allows"
-                f" {less}{self._in}{self._at}"
+                f"the {self.cause} alone {verb} {self.quantity} by {shift_words}{self._in}, {self._set} allows"
+                f" {room_words}{self._in}{self._at}"
             )
         return f"{self.text} and {other.text} leave nothing between them{self._at}"
 
     def _uncontrollable(self, other: TimedExplanation, rest: Array, share: float, allowed: float, moved: float) -> str:
-        """The control moves both quantities alike, so that it cannot change ``rest'x``, a combination of them."""
+        """Return the sentence for two rows whose quantities the control moves alike, so that it cannot change their
+        combination ``rest'x``."""
         side = -1.0 if rest[np.flatnonzero(rest)[0]] < 0 else 1.0
         free = (self.sign * self.free + share * other.sign * other.free) / self.scale
         rest, allowed, moved = rest / self.scale, allowed / self.scale, moved / self.scale
-        most = "at least" if side < 0 else "at most"
+        relation = "at least" if side < 0 else "at most"
         unit = measured_in(rest, self.names)
-        taken = f" less {moved:.4g}{unit} for the worst {self.cause}s" if moved > 0 and side > 0 else ""
-        taken = f" and {moved:.4g}{unit} more for the worst {self.cause}s" if moved > 0 and side < 0 else taken
+        note = f" less {moved:.4g}{unit} for the worst {self.cause}s" if moved > 0 and side > 0 else ""
+        note = f" and {moved:.4g}{unit} more for the worst {self.cause}s" if moved > 0 and side < 0 else note
         stated, corner = _stated(rest, self.names)
         quantity, at = combination(side * stated, self.names, f"({self.time:.6g})"), self._at
         asking = f"{self.statement} and {other.statement} ask"
         if self.names.corners and corner is None:  # the two are about different corners
-            first, second = sorted([self._share(side), other._share(side * share)], key=lambda one: one[0] == "-")
+            first, second = sorted([self._share(side), other._share(side * share)], key=lambda term: term[0] == "-")
             single = second[0] == "-" and not any(joint in second for joint in (" + ", " - "))
             quantity, at = f"{first} less {second[1:]}" if single else f"{first} plus {second}", ""
             asking = f"{self.short()}, and {other.short()}, ask"
         return (
             f"the control cannot move {quantity}, which is {side * free:.6g}{unit}, "
-            f"but {asking} for {most} {side * allowed:.6g}{unit}{taken}{at}"
+            f"but {asking} for {relation} {side * allowed:.6g}{unit}{note}{at}"
         )
 
     def _share(self, share: float) -> str:
-        """So much of the quantity that is bounded, in words, with the parameters that it is about."""
-        told = share / self.scale * _stated(self.direction, self.names)[0]
-        return combination(told, self.names, f"({self.time:.6g})") + (f" at {self.where}" if self.where else "")
+        """Return ``share`` times the bounded quantity in words, with the parameters that it belongs to."""
+        normal = share / self.scale * _stated(self.direction, self.names)[0]
+        return combination(normal, self.names, f"({self.time:.6g})") + (f" at {self.where}" if self.where else "")
 
     def out_of_reach(self, amount: float, needed: float) -> str:
         if not self.quantity:
@@ -219,17 +268,17 @@ class TimedExplanation(Explanation):
         if needed - amount < 0:
             return f"{self.text} is violated by at least {amount:.4g}{self._in}, whatever the control{self._at}"
         verb = "raise" if self.sign < 0 else "lower"
-        pushed = f", {self.sigma / self.scale:.4g}{self._in} of it for the worst {self.cause}" if self.sigma > 0 else ""
+        note = f", {self.sigma / self.scale:.4g}{self._in} of it for the worst {self.cause}" if self.sigma > 0 else ""
         can, must = told_apart(needed - amount, needed)
         return (
             f"the control can {verb} {self.quantity} by at most {can}{self._in}, and {must}{self._in} is needed"
-            f"{pushed}: without control it is {self.free / self.scale:.4g}{self._in}, {self._set} asks for"
+            f"{note}: without control it is {self.free / self.scale:.4g}{self._in}, {self._set} asks for"
             f" {self.bound}{self._at}"
         )
 
     @property
     def unit(self) -> str:
-        """What the quantity is measured in; empty where that is not known."""
+        """Unit of the quantity; empty where it is not known."""
         return self._in.strip()
 
     @property
@@ -249,11 +298,11 @@ class TimedExplanation(Explanation):
 def in_numbers(
     program: SemiInfiniteProgram, name: str, formulation: Formulation, index: Array, row: int
 ) -> TimedExplanation | None:
-    """One constraint of a program in numbers; ``None`` for one whose index does not say them, such as the number of a
-    sample."""
+    """Return the description of one constraint of a program, with its numbers; ``None`` where the index does not hold
+    them, as where it is the number of a sample."""
     family = program.formulated(name, formulation)
-    said = None if family is None else family.explanation(index, row)
-    return said if isinstance(said, TimedExplanation) else None
+    description = None if family is None else family.explanation(index, row)
+    return description if isinstance(description, TimedExplanation) else None
 
 
 def explanation(
@@ -267,21 +316,46 @@ def explanation(
     scale: float = 1.0,
     mixed: tuple[Array, int] | None = None,
 ) -> TimedExplanation:
-    """Row ``row`` of ``H x(t) <= h`` at a time and a parameter ``(nu,)``: what is bounded, when, and what the
-    uncertainty does to it; in words divided by ``scale``. ``mixed``: ``G (r, m)`` of ``H x + G u <= h``, and the piece
-    of the control."""
+    """Return the description of row ``row`` of ``H x(t) <= h`` at a time and a parameter.
+
+    Parameters
+    ----------
+    name : str
+        Name of the constraint.
+    functionals : WorstCase
+        Functionals of the system.
+    H : ndarray, shape (r, d)
+        Normals on the state.
+    h : ndarray, shape (r,)
+        Right-hand sides.
+    row : int
+        Number of the row.
+    time : float
+        Time of the constraint.
+    parameter : ndarray, shape (nu,)
+        Parameter of the constraint.
+    scale : float, default 1
+        Divisor of the numbers in words.
+    mixed : tuple of (ndarray, int), optional
+        ``G (r, m)`` of a mixed constraint ``H x + G u <= h``, and the piece of the control.
+
+    Returns
+    -------
+    TimedExplanation
+        Bounded quantity, time, and effect of the uncertainty.
+    """
     direction, system = H[row], functionals.response.system
     gain = None if mixed is None else mixed[0][row]
     normal = direction if gain is None else np.concatenate([direction, gain])
     stated, corner = _stated(normal, functionals.names)
     sign = -1.0 if np.count_nonzero(stated) == 1 and stated.sum() < 0 else 1.0
-    parts = functionals.parts(time, direction, parameter)
-    sigma = parts.sigma
-    free, limit = sign * parts.free + 0.0, sign * float(h[row]) + 0.0  # no negative zeros
+    contributions = functionals.parts(time, direction, parameter)
+    sigma = contributions.sigma
+    free, limit = sign * contributions.free + 0.0, sign * float(h[row]) + 0.0  # no negative zeros
     names = [
         name
-        for name, moved in (("disturbance", sigma - parts.begun), ("initial state", parts.begun))
-        if moved > SAME * sigma
+        for name, distance in (("disturbance", sigma - contributions.begun), ("initial state", contributions.begun))
+        if distance > SAME * sigma
     ]
     cause = " and ".join(names) or "disturbance"
     quantity, where = (
@@ -305,9 +379,9 @@ def explanation(
         time,
         direction,
         parameter,
-        parts.disturbance,
-        None if parts.deviation is None else functionals.response.initial_state + parts.deviation,
-        parts.deviation,
+        contributions.disturbance,
+        None if contributions.deviation is None else functionals.response.initial_state + contributions.deviation,
+        contributions.deviation,
         cause,
         quantity=quantity,
         bound=_bound(
@@ -341,24 +415,24 @@ def combination(direction: Array, names: Names, suffix: str = "", states: int | 
     is beyond the number of ``states`` is the control's, such as ``u1(5)``. Of more than `ENTRIES` terms the largest,
     and how many more there are."""
     last = direction.size if states is None else states
-    parts: list[str] = []
+    words: list[str] = []
     terms = np.flatnonzero(direction)
     largest = np.argsort(-np.abs(direction[terms]), kind="stable")[:ENTRIES]
     for state in terms[np.sort(largest)]:
         size = abs(direction[state])
-        sign = "-" if direction[state] < 0 else "+" if parts else ""
+        sign = "-" if direction[state] < 0 else "+" if words else ""
         name = names.state(int(state)) if state < last else names.control(int(state) - last)
-        parts.append(f"{sign}{' ' if parts else ''}{'' if size == 1 else f'{size:.4g} '}{name}{suffix}")
-    left = terms.size - largest.size
-    if left:
-        parts.append(f"+ ... ({left} smaller term{'s' if left > 1 else ''})")
-    return " ".join(parts) or "0"
+        words.append(f"{sign}{' ' if words else ''}{'' if size == 1 else f'{size:.4g} '}{name}{suffix}")
+    remaining = terms.size - largest.size
+    if remaining:
+        words.append(f"+ ... ({remaining} smaller term{'s' if remaining > 1 else ''})")
+    return " ".join(words) or "0"
 
 
 def _opposite(H: Array, h: Array, row: int) -> float | None:
     """The least right-hand side of the rows that look the other way; ``None`` without one."""
-    found = h[(-H[row] == H).all(axis=1)]
-    return float(found.min()) if found.size else None
+    limits = h[(-H[row] == H).all(axis=1)]
+    return float(limits.min()) if limits.size else None
 
 
 def _bound(words: str, limit: float, opposite: float | None, sign: float) -> str:

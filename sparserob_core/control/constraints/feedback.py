@@ -42,11 +42,11 @@ class Uncertain(Protocol):
 
     @property
     def name(self) -> str:
-        """Its name."""
+        """Name of the constraint."""
 
     @property
     def loop(self) -> ClosedLoop:
-        """The loop that it is about."""
+        """Closed loop of the constraint."""
 
     @property
     def measured(self) -> tuple[str, ...]:
@@ -66,10 +66,11 @@ class Uncertain(Protocol):
 
     @property
     def cells(self) -> tuple[Array, Array]:
-        """Those that a proof begins with."""
+        """Cells of the index with which a proof begins."""
 
     def explain(self, index: Array, row: int) -> Explanation:
-        """One constraint for people, at an index that may hold deviations too."""
+        """Return the description of one constraint for a reader, for every disturbance, or at the deviations that the
+        index holds."""
 
 
 def indexed(constraint: Uncertain, index_set: Box, start: Array, source: Source) -> ConstraintFamily:
@@ -90,8 +91,8 @@ def indexed(constraint: Uncertain, index_set: Box, start: Array, source: Source)
         along=constraint.loop.functionals.names.time,
         source=source,
     )
-    far = np.concatenate([constraint.loop.spread.radii])
-    box = Box(np.concatenate([index_set.lower, -far]), np.concatenate([index_set.upper, far]))
+    radii = np.concatenate([constraint.loop.spread.radii])
+    box = Box(np.concatenate([index_set.lower, -radii]), np.concatenate([index_set.upper, radii]))
     literal = replace(
         family,
         index_set=box,
@@ -114,7 +115,7 @@ class FeedbackConstraint(Source):
     flat: FlatConstraint
     loop: ClosedLoop
     exact: bool = False
-    """Whether the second half of the rows are the opposites of the first: an equality."""
+    """True for an equality, whose second half of rows are the opposites of the first half."""
 
     @property
     def name(self) -> str:
@@ -127,7 +128,8 @@ class FeedbackConstraint(Source):
         return self.flat.measured
 
     def normals_in(self, units: Units) -> tuple[Array, Array]:
-        """Those without feedback."""
+        """Return the normals of the rows, and the units of their coordinates, which are the same as without
+        feedback."""
         return self.flat.normals_in(units)
 
     def scale(self, x: Array) -> float:
@@ -135,26 +137,26 @@ class FeedbackConstraint(Source):
         small = sizes < 1.0
         if self.flat.gains is not None or not (small.any() or self.exact):
             return self.flat.scale(x)
-        found = np.maximum(sizes, self.loop.sizes(x, rows))[small | self.exact]
-        least = float(found[found > 0.0].min(initial=np.inf))  # a row of a state that rests at 0 is met exactly
+        row_sizes = np.maximum(sizes, self.loop.sizes(x, rows))[small | self.exact]
+        least = float(row_sizes[row_sizes > 0.0].min(initial=np.inf))  # a row of a state that rests at 0 is met exactly
         return least if self.exact and np.isfinite(least) else min(1.0, least)
 
     @property
     def of_state(self) -> FlatConstraint:
-        """The one without feedback."""
+        """Constraint without feedback."""
         return self.flat
 
     def family(self) -> ConstraintFamily:
         """The constraint as a family."""
         start, stop = self.flat.start, self.flat.stop
-        begun = np.unique(np.linspace(0, self.times.size - 1, min(BEGUN, self.times.size)).round().astype(int))
+        positions = np.unique(np.linspace(0, self.times.size - 1, min(BEGUN, self.times.size)).round().astype(int))
         source = self if self.exact else self.flat
-        family = indexed(self, Box(np.array([start]), np.array([stop])), self.times[begun][:, None], source)
+        family = indexed(self, Box(np.array([start]), np.array([stop])), self.times[positions][:, None], source)
         family = replace(family, scale=self.scale)
         return replace(family, scaled=self.scaled) if self.loop.scales else family
 
     def scaled(self, factor: float) -> ConstraintFamily:
-        """The same where deviations are ``factor`` times as large."""
+        """Return the family of the same constraint with all deviations multiplied by ``factor``."""
         return replace(self, loop=self.loop.scaled(factor)).family()
 
     @cached_property
@@ -164,12 +166,12 @@ class FeedbackConstraint(Source):
 
     def excess(self, x: Array, indices: Array) -> Array:
         """Violations ``(k, r)`` at times ``(k, 1)`` under the worst disturbances."""
-        found = self.loop.height(self._along(x, indices[:, 0])) - self.flat.h
-        within = self.loop.measurable
-        if within is not None:
+        violations = self.loop.height(self._along(x, indices[:, 0])) - self.flat.h
+        measurable = self.loop.measurable
+        if measurable is not None:
             for rows, pieces in self._halves(indices[:, 0]):
-                found[:, rows] += within.within(indices[:, 0], self.flat.H[rows], self.loop.origin[pieces])
-        return found
+                violations[:, rows] += measurable.within(indices[:, 0], self.flat.H[rows], self.loop.origin[pieces])
+        return violations
 
     def _halves(self, times: Array) -> list[tuple[slice, np.ndarray]]:
         """The rows that look at the state at times ``(k,)`` in the same pieces of the grid, and these pieces: those of
@@ -184,15 +186,15 @@ class FeedbackConstraint(Source):
         ]
 
     def _along(self, x: Array, times: Array) -> Array:
-        """The left sides at times ``(k,)``, with their answers to the deviations, ``(k, r, 1 + Q)``."""
+        """Return the left-hand sides at times ``(k,)`` and their responses to the deviations, ``(k, r, 1 + Q)``."""
         flat = self.flat
-        found = np.concatenate(
+        values = np.concatenate(
             [flat.H[rows] @ self.loop.states(x, times, pieces) for rows, pieces in self._halves(times)], axis=1
         )
-        found[:, :, 0] += flat.moved(times)
+        values[:, :, 0] += flat.moved(times)
         if flat.gains is not None:
-            found += np.einsum("rm,krmq->krq", flat.gains, self.loop.controls(x)[flat.commanded(times)])
-        return np.asarray(found)
+            values += np.einsum("rm,krmq->krq", flat.gains, self.loop.controls(x)[flat.commanded(times)])
+        return np.asarray(values)
 
     def uncertain(self, index: Array) -> UncertainRows:
         """The rows at one time."""
@@ -224,8 +226,8 @@ class FeedbackConstraint(Source):
     def met(self, x: Array) -> Array:
         """The nearest decision that meets an equality to rounding; one that no control enters is left as it is."""
         table, rhs = self.uncertain(np.array([self.flat.stop])).equations
-        entered = abs(table).max(axis=1).toarray().ravel() > IDLE * abs(table).max()
-        table, rhs = table[entered], rhs[entered]
+        has_control = abs(table).max(axis=1).toarray().ravel() > IDLE * abs(table).max()
+        table, rhs = table[has_control], rhs[has_control]
         square = (table @ table.T).toarray()
         for _ in range(2):
             x = x + table.T @ np.linalg.lstsq(square, rhs - table @ x, rcond=SAME)[0]
@@ -245,28 +247,30 @@ class FeedbackConstraint(Source):
         times, values = self._sampled(x)
         positions = local_maxima(values.T[None], (1,), KEPT)
         rows, at = positions[:, 1], positions[:, 2]
-        best, found = times[at].copy(), values[at, rows].copy()
+        best, violations = times[at].copy(), values[at, rows].copy()
         width = np.maximum(
             times[np.minimum(at + 1, times.size - 1)] - times[at], times[at] - times[np.maximum(at - 1, 0)]
         )
-        likely = np.argsort(-found, kind="stable")[: 4 * KEPT]
-        likely = likely[(found[likely] > -NEAR * np.abs(self.flat.h[rows[likely]])) | (np.arange(likely.size) < FEW)]
-        best, found, rows, width = best[likely], found[likely], rows[likely], width[likely]
+        likely = np.argsort(-violations, kind="stable")[: 4 * KEPT]
+        likely = likely[
+            (violations[likely] > -NEAR * np.abs(self.flat.h[rows[likely]])) | (np.arange(likely.size) < FEW)
+        ]
+        best, violations, rows, width = best[likely], violations[likely], rows[likely], width[likely]
         offsets = np.linspace(-1.0, 1.0, ZOOMED)
         for _ in range(ZOOMS if width.any() else 0):
-            star = np.clip(best[:, None] + width[:, None] * offsets, self.flat.start, self.flat.stop)
-            heights = self.excess(x, star.reshape(-1, 1)).reshape(*star.shape, -1)
+            samples = np.clip(best[:, None] + width[:, None] * offsets, self.flat.start, self.flat.stop)
+            heights = self.excess(x, samples.reshape(-1, 1)).reshape(*samples.shape, -1)
             heights = np.take_along_axis(heights, rows[:, None, None], axis=2)[..., 0]
             highest = heights.argmax(axis=1)
-            moved = heights[np.arange(rows.size), highest] > found
-            best = np.where(moved, star[np.arange(rows.size), highest], best)
-            found = np.where(moved, heights[np.arange(rows.size), highest], found)
+            is_higher = heights[np.arange(rows.size), highest] > violations
+            best = np.where(is_higher, samples[np.arange(rows.size), highest], best)
+            violations = np.where(is_higher, heights[np.arange(rows.size), highest], violations)
             width = width / CLOSER
-        order = np.argsort(-found, kind="stable")
+        order = np.argsort(-violations, kind="stable")
         if self.flat.gains is not None:  # where nothing jumps, both halves of the rows say the same
             pieces = self.flat.commanded(best[order])
             order = order[(rows[order] < self.flat.h.size // 2) | (pieces[:, 0] != pieces[:, -1])]
-        return Separation(best[order][:, None], rows[order], found[order])
+        return Separation(best[order][:, None], rows[order], violations[order])
 
     def _sampled(self, x: Array) -> tuple[Array, Array]:
         """Times ``(k,)`` in order and the violations there ``(k, r)``: halfway between two of them again and again,
@@ -281,16 +285,16 @@ class FeedbackConstraint(Source):
             lower, upper = times[cells], times[cells + 1]
             bounds = self.enclosure(x, lower[:, None], upper[:, None]).bounds
             ends = np.maximum(values[cells], values[cells + 1]).max(axis=1)
-            hidden = (bounds > HIDDEN) & (bounds - ends > SHARE * np.maximum(bounds, ends.max(initial=0.0)))
-            if not hidden.any():
+            is_hidden = (bounds > HIDDEN) & (bounds - ends > SHARE * np.maximum(bounds, ends.max(initial=0.0)))
+            if not is_hidden.any():
                 break
-            split = cells[hidden][np.argsort(-bounds[hidden], kind="stable")[:HALVED]]
+            split = cells[is_hidden][np.argsort(-bounds[is_hidden], kind="stable")[:HALVED]]
             split.sort()
             between = (times[split] + times[split + 1]) / 2
             times = np.insert(times, split + 1, between)
             values = np.insert(values, split + 1, self.excess(x, between[:, None]), axis=0)
-            left = split + np.arange(split.size)
-            cells = np.sort(np.concatenate([left, left + 1]))
+            left_cells = split + np.arange(split.size)
+            cells = np.sort(np.concatenate([left_cells, left_cells + 1]))
         return times, values
 
     @property
@@ -302,25 +306,29 @@ class FeedbackConstraint(Source):
         """Proven upper bounds of the violation on cells of time, each within one piece, with the control of that."""
         flat, ends = self.flat, (lower[:, 0], upper[:, 0])
         proven = flat.h.size if flat.gains is None else flat.h.size // 2
-        beside = [flat.moved(times)[:, :proven, None] for times in ends]
+        additions = [flat.moved(times)[:, :proven, None] for times in ends]
         if flat.gains is not None:
             acting = flat.commanded((ends[0] + ends[1]) / 2)[:, 0]
-            added = flat.gains[:proven] @ self.loop.controls(x)[acting]
-            beside = [np.concatenate([more + added[..., :1], added[..., 1:]], axis=-1) for more in beside]
-        found, late = self.loop.bounded(x, *ends, flat.H[:proven], (beside[0], beside[1]))
-        excess, every = found - flat.h[:proven], np.arange(found.shape[0])
+            control_terms = flat.gains[:proven] @ self.loop.controls(x)[acting]
+            additions = [
+                np.concatenate([addition + control_terms[..., :1], control_terms[..., 1:]], axis=-1)
+                for addition in additions
+            ]
+        bounds, chord_distances = self.loop.bounded(x, *ends, flat.H[:proven], (additions[0], additions[1]))
+        excess, cells = bounds - flat.h[:proven], np.arange(bounds.shape[0])
         worst = excess.argmax(axis=1)
-        return Enclosure(excess[every, worst], np.zeros_like(every), late[every, worst])
+        return Enclosure(excess[cells, worst], np.zeros_like(cells), chord_distances[cells, worst])
 
     def explain(self, index: Array, row: int) -> Explanation:
-        """One constraint for people, at every disturbance, or at the deviations that the index says."""
-        found = told(self.flat.explain(index[:1], row), self.loop, index[1:])
+        """Return the description of one constraint for a reader, for every disturbance, or at the deviations that the
+        index holds."""
+        description = told(self.flat.explain(index[:1], row), self.loop, index[1:])
         if not self._unanswered[row]:
-            return found
+            return description
         last = float(self.loop.functionals.dictionary.breakpoints[-2])
         at = f"{last:.6g} {self.loop.functionals.names.time}".rstrip()
-        late = f"{found.text} (what comes after the last measurement, at {at}, reaches it unanswered)"
-        return replace(found, text=late)
+        text = f"{description.text} (what comes after the last measurement, at {at}, reaches it unanswered)"
+        return replace(description, text=text)
 
     @cached_property
     def _unanswered(self) -> np.ndarray:
@@ -334,35 +342,38 @@ class FeedbackConstraint(Source):
 
 
 def acting(loop: ClosedLoop, places: Places, x: Array) -> tuple[Array, Array]:
-    """What the control does at places and its answers to the deviations, ``(q, m, 1 + Q)``, and the sizes of the
-    numbers that were added up. Across the seam the first control of the next period answers its own initial state."""
+    """Return the control at ``places`` and its responses to the deviations, ``(q, m, 1 + Q)``, and the sizes of the
+    numbers that were added up.
+
+    Across the seam, the first control of the next period responds to the initial state of that period.
+    """
     controls = loop.controls(x)
     pieces, table = len(controls), places.table.T
-    found = (table @ controls.reshape(pieces, -1)).reshape(-1, *controls.shape[1:])
-    size = (abs(table) @ np.abs(controls).reshape(pieces, -1)).reshape(found.shape)
+    values = (table @ controls.reshape(pieces, -1)).reshape(-1, *controls.shape[1:])
+    sizes = (abs(table) @ np.abs(controls).reshape(pieces, -1)).reshape(values.shape)
     if places.seam:  # of a single piece too, whose value and the next are no difference of the table
         first, at = controls[0], loop.begins.shape[0] * loop.anew
         first = np.concatenate([first[:, :1], np.roll(first[:, 1:], -at, axis=1)], axis=1)
-        found[-1], size[-1] = first - controls[-1], np.abs(first) + np.abs(controls[-1])
-    found[:, :, 0] += places.offset
-    size[:, :, 0] += np.abs(places.offset)
-    return found, size
+        values[-1], sizes[-1] = first - controls[-1], np.abs(first) + np.abs(controls[-1])
+    values[:, :, 0] += places.offset
+    sizes[:, :, 0] += np.abs(places.offset)
+    return values, sizes
 
 
 def rows_at(
     loop: ClosedLoop, places: Places, place: int, H: Array, h: Array, extra: Array | None = None
 ) -> UncertainRows:
-    """The rows ``H a <= h`` of what the control does at one place, for every deviation; ``extra (r, n)`` is added on
-    the left."""
+    """Return the rows ``H a <= h`` on the value or change ``a`` of the control at one place, for every deviation;
+    ``extra (r, n)`` is added on the left."""
     column = places.table[:, [place]].tocoo()
     pairs = sorted(zip(column.row.tolist(), column.data.tolist(), strict=True), reverse=True)
-    around = places.seam and place == places.starts.size - 1
-    if around:
+    across_seam = places.seam and place == places.starts.size - 1
+    if across_seam:
         pairs = [(places.table.shape[0] - 1, -1.0), (0, 1.0)]
-    following = around and loop.anew
-    (piece, share), *others = pairs
+    following = across_seam and loop.anew
+    (piece, share), *further_pairs = pairs
     rows = loop.control_rows(piece, share * H, h - H @ places.offset[place], extra)
-    for piece, share in others:
+    for piece, share in further_pairs:
         rows = loop.with_control(rows, share * H, np.full(h.size, piece), following=following)
     return rows
 
@@ -370,9 +381,12 @@ def rows_at(
 @final
 @dataclass(frozen=True, eq=False)
 class FeedbackControl(Source):
-    """``H a <= h`` of what the control does at ``places`` for every disturbance: of its value on every piece, or its
-    change at every step; with ``bound``, the first of the variables ``p (m, K)``, ``H u_k <= p_k`` instead. An index is
-    the time of a place, or with the deviations ``(t, w)``."""
+    """Constraint ``H a <= h`` for every disturbance, on the value ``a`` of the control on every piece or on its change
+    at every step.
+
+    With ``bound``, the position of the first of the variables ``p (m, K)``, it is ``H u_k <= p_k`` instead. An index is
+    the time of a place, or with the deviations ``(t, w)``.
+    """
 
     name: str
     loop: ClosedLoop
@@ -382,7 +396,7 @@ class FeedbackControl(Source):
     bound: int | None = None
 
     def normals_in(self, units: Units) -> tuple[Array, Array]:
-        """Its sides, and the units of controls."""
+        """Return the normals ``H`` of the rows, and the units of the controls."""
         return self.H, units.controls
 
     def scale(self, x: Array) -> float:
@@ -397,7 +411,7 @@ class FeedbackControl(Source):
         return family if self.bound is None else replace(family, defines=True)
 
     def scaled(self, factor: float) -> ConstraintFamily:
-        """The same where deviations are ``factor`` times as large."""
+        """Return the family of the same constraint with all deviations multiplied by ``factor``."""
         return replace(self, loop=self.loop.scaled(factor)).family()
 
     def limits(self, x: Array) -> Array:
@@ -410,24 +424,24 @@ class FeedbackControl(Source):
 
     def heights(self, x: Array) -> tuple[Array, Array]:
         """Violations ``(q, r)`` at all places, and the sizes of the numbers that were added up."""
-        (found, size), limits = acting(self.loop, self.places, x), self.limits(x)
+        (values, size), limits = acting(self.loop, self.places, x), self.limits(x)
         radii = np.concatenate([[1.0], self.loop.spread.radii])
-        return self.loop.height(self.H @ found) - limits, np.abs(self.H) @ size @ radii + np.abs(limits)
+        return self.loop.height(self.H @ values) - limits, np.abs(self.H) @ size @ radii + np.abs(limits)
 
     def settled(self, x: Array) -> Array:
-        """The same decision with the peaks at what they bound."""
+        """Return the same decision with the peaks at the largest values that they bound."""
         assert self.bound is not None
         peaks = np.zeros((self.H.shape[1], self.places.times.size))
-        found = self.heights(np.concatenate([x[: self.bound], peaks.ravel()]))[0]
+        violations = self.heights(np.concatenate([x[: self.bound], peaks.ravel()]))[0]
         for row, channel in enumerate(np.abs(self.H).argmax(axis=1)):
-            peaks[channel] = np.maximum(peaks[channel], found[:, row])
+            peaks[channel] = np.maximum(peaks[channel], violations[:, row])
         settled: Array = np.concatenate([x[: self.bound], peaks.ravel(), x[self.bound + peaks.size :]])
         return settled
 
     def excess(self, x: Array, indices: Array) -> Array:
         """Violations ``(k, r)`` at the places of times ``(k, 1)`` under the worst disturbances."""
-        found: Array = self.heights(x)[0][self.places.at(indices[:, 0])]
-        return found
+        violations: Array = self.heights(x)[0][self.places.at(indices[:, 0])]
+        return violations
 
     def uncertain(self, index: Array) -> UncertainRows:
         """The rows at the place of one time."""
@@ -445,14 +459,14 @@ class FeedbackControl(Source):
 
     @property
     def cells(self) -> tuple[Array, Array]:
-        """From each place to the next."""
+        """Cells of the index, one for the times that stand for each place."""
         lower, upper = self.places.spans
         return lower[:, None], upper[:, None]
 
     def enclosure(self, x: Array, lower: Array, upper: Array) -> Enclosure:
         """The violation itself: nothing changes between places."""
-        found, size = self.heights(x)
-        bounds = (found + ROUND_OFF * size).max(axis=1)[self.places.at((lower[:, 0] + upper[:, 0]) / 2)]
+        violations, size = self.heights(x)
+        bounds = (violations + ROUND_OFF * size).max(axis=1)[self.places.at((lower[:, 0] + upper[:, 0]) / 2)]
         return Enclosure(bounds, np.zeros(bounds.size, dtype=int))
 
     @property
@@ -461,7 +475,7 @@ class FeedbackControl(Source):
         return tuple(unit_of_row(normal, self.loop.functionals.names, 0).strip() for normal in self.H)
 
     def explain(self, index: Array, row: int) -> Explanation:
-        """One constraint for people."""
+        """Return the description of one constraint for a reader."""
         names, direction = self.loop.functionals.names, self.H[row]
         time = float(self.places.times[self.places.at(index[:1])[0]]) if self.places.steps else float(index[0])
         if self.places.steps:
@@ -471,12 +485,12 @@ class FeedbackControl(Source):
             terms = combination(direction, names, f"({time:.6g})", 0)
         right = f"{self.h[row] + 0.0:.6g} {self.measured[row]}".rstrip() if self.bound is None else "its peak"
         text = f"{self.name}: {terms} <= {right}"
-        said = TimedExplanation(text, self.name, text, time, direction)
-        return told(said, self.loop, index[1:], controls=True)
+        description = TimedExplanation(text, self.name, text, time, direction)
+        return told(description, self.loop, index[1:], controls=True)
 
 
 def worst_of_each(found: Array, times: Array) -> Separation:
-    """Of violations ``(k, r)`` at ``times (k,)`` the worst row of every time, worst first."""
+    """Return the worst row at every time, worst first, of violations ``(k, r)`` at ``times (k,)``."""
     rows = found.argmax(axis=1)
     heights = found[np.arange(rows.size), rows]
     order = np.argsort(-heights, kind="stable")
@@ -484,12 +498,12 @@ def worst_of_each(found: Array, times: Array) -> Separation:
 
 
 def told(said: TimedExplanation, loop: ClosedLoop, w: Array, controls: bool = False) -> TimedExplanation:
-    """What is said of a constraint, on the state or on the ``controls``, of every disturbance, or at deviations
-    ``w (Q,)``."""
+    """Return the description of a constraint for every disturbance, or at the deviations ``w (Q,)`` if ``w`` is not
+    empty. ``controls`` says that the constraint is on the controls, not on the state."""
     problem, noises = loop.functionals, loop.noises(w) if w.size else None
     noisy = True if loop.observer is not None and loop.observer.noisy else None
-    every = ("disturbance", problem.disturbance), ("noise", noisy), ("initial state", problem.initial)
-    text = f"{said.statement} for every {' and '.join(name for name, one in every if one is not None) or 'disturbance'}"
+    sources = ("disturbance", problem.disturbance), ("noise", noisy), ("initial state", problem.initial)
+    text = f"{said.statement} for every {' and '.join(name for name, s in sources if s is not None) or 'disturbance'}"
     if not w.size and loop.spread.size:
         return replace(said, text=text, disturbance=None, begun=None, deviation=None, quantity="", noise=None)
     point, width = loop.spread.middle + w, problem.response.system.disturbances

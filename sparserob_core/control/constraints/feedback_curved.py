@@ -31,9 +31,11 @@ BEGUN = 5  # times that a method begins with, in the directions of the axes
 
 @dataclass(frozen=True, eq=False)
 class Turning(ABC):
-    """What the loop makes of a quantity that must stay in the curved ``set``: in every direction ``c``, normalised such
-    that ``h(c) - c'm = unit`` for the middle ``m`` of the set. The index is ``(t, z)``, ``z`` a direction in the
-    coordinates of the set's frame, or with the deviations ``(t, z, w)``."""
+    """Constraint under feedback that a quantity stays in the curved ``set``, in every direction ``c``.
+
+    Directions are normalised such that ``h(c) - c'm = unit`` for the middle ``m`` of the set. The index is ``(t, z)``,
+    with a direction ``z`` in the coordinates of the set's frame, or ``(t, z, w)`` with the deviations.
+    """
 
     loop: ClosedLoop
 
@@ -49,7 +51,7 @@ class Turning(ABC):
 
     @property
     def unit(self) -> float:
-        """What 1 of the gauge is divided by."""
+        """Divisor of the gauge: violations are the gauge less 1, in multiples of this unit."""
         return 1.0
 
     @property
@@ -68,8 +70,8 @@ class Turning(ABC):
 
     @abstractmethod
     def between(self, x: Array, lower: Array, upper: Array, H: Array) -> tuple[Array, Array]:
-        """Upper bounds of its largest values along ``H (k, r, d)`` on cells of time, ``(k, r)``, and how much of them
-        is owed to the length of the cells."""
+        """Return upper bounds ``(k, r)`` of the quantity along ``H (k, r, d)`` on cells of time, and the part of each
+        bound that is due to the length of the cell."""
 
     @abstractmethod
     def rows(self, time: float, H: Array, h: Array) -> UncertainRows:
@@ -82,7 +84,7 @@ class Turning(ABC):
     @property
     @abstractmethod
     def source(self) -> Source:
-        """What the family is of."""
+        """Constraint that the family belongs to."""
 
     @property
     def measured(self) -> tuple[str, ...]:
@@ -92,16 +94,16 @@ class Turning(ABC):
     def family(self) -> ConstraintFamily:
         """The constraint as a family."""
         cube = np.ones(self._b)
-        low, high = (ends[place] for ends, place in zip(self.spans, (0, -1), strict=True))
+        low, high = (ends[position] for ends, position in zip(self.spans, (0, -1), strict=True))
         index_set = Box(np.append(low, -cube), np.append(high, cube))
-        begun = np.unique(np.linspace(0, self.times.size - 1, min(BEGUN, self.times.size)).round().astype(int))
+        positions = np.unique(np.linspace(0, self.times.size - 1, min(BEGUN, self.times.size)).round().astype(int))
         axes = np.vstack([np.eye(self._b), -np.eye(self._b)])
-        start = np.hstack([np.repeat(self.times[begun], len(axes))[:, None], np.tile(axes, (begun.size, 1))])
+        start = np.hstack([np.repeat(self.times[positions], len(axes))[:, None], np.tile(axes, (positions.size, 1))])
         family = indexed(self, index_set, start, self.source)
         return replace(family, scaled=self.scaled) if self.loop.scales else family
 
     def scaled(self, factor: float) -> ConstraintFamily:
-        """The same where deviations are ``factor`` times as large."""
+        """Return the family of the same constraint with all deviations multiplied by ``factor``."""
         return replace(self, loop=self.loop.scaled(factor)).family()
 
     @property
@@ -110,7 +112,8 @@ class Turning(ABC):
 
     @cached_property
     def _lattice(self) -> tuple[Array, Array, Array]:
-        """Sampled directions as cube points ``(r, b)`` and normalised ``(r, d)``, and how far the set reaches."""
+        """Sampled directions as points of the cube ``(r, b)`` and normalised ``(r, d)``, and the support function of
+        the set there, ``(r,)``."""
         z = sampled(self._b)
         c = self.normals(z)
         return z, c, self.set.support(c)
@@ -140,40 +143,41 @@ class Turning(ABC):
         values = values - reach
         places, likely = turns(values.T, neighbours(self._b), self.unit)
         rows, at = places.T
-        heights, held = values[at, rows], np.hstack([times[at, None], z[rows]])
-        held[:likely], heights[:likely] = self._turned(x, held[:likely])
+        heights, worst_indices = values[at, rows], np.hstack([times[at, None], z[rows]])
+        worst_indices[:likely], heights[:likely] = self._turned(x, worst_indices[:likely])
         best = highest_at(at, heights)
-        held, heights = held[best], heights[best]
-        wide, pieces = float(np.max(np.diff(times), initial=0.0)), np.searchsorted(self.spans[0], times)
-        indices, found = ridden(
-            held,
+        worst_indices, heights = worst_indices[best], heights[best]
+        largest_step, pieces = float(np.max(np.diff(times), initial=0.0)), np.searchsorted(self.spans[0], times)
+        indices, violations = ridden(
+            worst_indices,
             heights,
             pieces,
             np.flatnonzero(np.isin(times, np.concatenate(self.spans))),
             lambda points: self._turned(x, points),
-            lambda points: self._climbed(x, points, wide),
+            lambda points: self._climbed(x, points, largest_step),
         )
-        return Separation(indices, np.zeros(found.size, dtype=int), found)
+        return Separation(indices, np.zeros(violations.size, dtype=int), violations)
 
     def _turned(self, x: Array, points: Array) -> tuple[Array, Array]:
-        """Where climbs from points ``(k, 1 + b)`` over directions alone end, and how high."""
+        """Return the ends of climbs over directions alone from points ``(k, 1 + b)``, and the violations there."""
         if not points.size:
             return points, np.zeros(0)
-        held = np.clip(points[:, :1], self.spans[0][0], self.spans[1][-1])
-        at, step = self.answers(x, held[:, 0]), np.full(self._b, STEP)
+        times = np.clip(points[:, :1], self.spans[0][0], self.spans[1][-1])
+        responses, step = self.answers(x, times[:, 0]), np.full(self._b, STEP)
 
         def excess(z: Array, which: np.ndarray) -> Array:
             c = self.normals(z)
-            size = max(1, STATES // at[0].size)
-            parts = [slice(first, first + size) for first in range(0, which.size, size)]
-            along = [self.loop.height(np.einsum("kd,kdq->kq", c[part], at[which[part]])) for part in parts]
+            size = max(1, STATES // responses[0].size)
+            chunks = [slice(first, first + size) for first in range(0, which.size, size)]
+            along = [self.loop.height(np.einsum("kd,kdq->kq", c[chunk], responses[which[chunk]])) for chunk in chunks]
             return np.asarray(np.concatenate(along) - self.set.support(c))
 
-        z, found = climb(excess, points[:, 1:], step, lambda z: on_surface(np.clip(z, -1.0, 1.0)))
-        return np.hstack([held, z]), found
+        z, violations = climb(excess, points[:, 1:], step, lambda z: on_surface(np.clip(z, -1.0, 1.0)))
+        return np.hstack([times, z]), violations
 
     def _climbed(self, x: Array, points: Array, wide: float) -> tuple[Array, Array]:
-        """Where climbs from points ``(k, 1 + b)`` end, and how high; over directions alone at a single time."""
+        """Return the ends of climbs from points ``(k, 1 + b)``, and the violations there; for a single time, climb over
+        directions alone."""
         first, last = self.spans[0][0], self.spans[1][-1]
         if first == last:
             return self._turned(x, points)
@@ -188,10 +192,10 @@ class Turning(ABC):
     def cells(self) -> tuple[Array, Array]:
         """The spans of time, times the faces of the cube of directions."""
         low, high = faces(self._b)
-        found = []
+        corner_lists = []
         for ends, corners in zip(self.spans, (low, high), strict=True):
-            found.append(np.hstack([np.repeat(ends, len(low))[:, None], np.tile(corners, (ends.size, 1))]))
-        return found[0], found[1]
+            corner_lists.append(np.hstack([np.repeat(ends, len(low))[:, None], np.tile(corners, (ends.size, 1))]))
+        return corner_lists[0], corner_lists[1]
 
     def enclosure(self, x: Array, lower: Array, upper: Array) -> Enclosure:
         """Proven upper bounds of the violation on cells of times and directions, by a point ``p`` of the set for
@@ -200,20 +204,22 @@ class Turning(ABC):
         ends = np.stack([np.where(side, high, low) for side in product((False, True), repeat=self._b)], axis=1)
         H, centre = ends @ frame, (low + high) / 2 @ frame
         p = self.set.support_point(centre)
-        bounds, late = self.between(x, lower[:, 0], upper[:, 0], H)
+        bounds, chord_distances = self.between(x, lower[:, 0], upper[:, 0], H)
         tangent = np.einsum("krd,kd->kr", H, p)
         size = np.einsum("krd,kd->kr", np.abs(H), np.abs(p))
-        over = (bounds - tangent + ROUND_OFF * size).max(axis=1)
+        violations = (bounds - tangent + ROUND_OFF * size).max(axis=1)
         # in the length of the directions: at least how far p is from the middle along them
         rooms = (tangent - H @ self.set.interior_point()).min(axis=1) * self.unit
         with np.errstate(divide="ignore", invalid="ignore"):
-            over = np.where(over > 0.0, np.where(rooms > 0.0, over / np.maximum(rooms, 0.0), np.inf), over)
-        turned = (self.set.support(H) - tangent).max(axis=1)
+            violations = np.where(
+                violations > 0.0, np.where(rooms > 0.0, violations / np.maximum(rooms, 0.0), np.inf), violations
+            )
+        direction_gaps = (self.set.support(H) - tangent).max(axis=1)
         widest = 1 + (high - low).argmax(axis=1)
         narrow = (high - low).max(axis=1) <= 0.0
-        split = np.where((late.max(axis=1) > turned) | narrow, 0, widest)
+        split = np.where((chord_distances.max(axis=1) > direction_gaps) | narrow, 0, widest)
         split = np.where(upper[:, 0] > lower[:, 0], split, widest)
-        return Enclosure(over, split)
+        return Enclosure(violations, split)
 
     def against(self, x: Array, index: Array, row: int) -> tuple[Array, float, int | None]:
         """A deviation ``(Q,)`` that is the worst at an index, and what stands beside the state then: no control."""
@@ -221,7 +227,8 @@ class Turning(ABC):
         return self.loop.spread.worst(along[1:]), 0.0, None
 
     def explain(self, index: Array, row: int) -> Explanation:
-        """One constraint for people, at every disturbance, or at the deviations that the index says."""
+        """Return the description of one constraint for a reader, for every disturbance, or at the deviations that the
+        index holds."""
         return told(self.explained(index[: 1 + self._b]), self.loop, index[1 + self._b :])
 
 
@@ -263,17 +270,17 @@ class FeedbackCurved(Turning):
         return lower[:, 0], upper[:, 0]
 
     def answers(self, x: Array, times: Array) -> Array:
-        found = self.loop.states(x, times)
-        found[:, :, 0] += self.curved.beside(x, times)
-        return found
+        values = self.loop.states(x, times)
+        values[:, :, 0] += self.curved.beside(x, times)
+        return values
 
     def between(self, x: Array, lower: Array, upper: Array, H: Array) -> tuple[Array, Array]:
-        beside = tuple(H @ self.curved.beside(x, times)[:, :, None] for times in (lower, upper))
-        return self.loop.bounded(x, lower, upper, H, (beside[0], beside[1]))
+        additions = tuple(H @ self.curved.beside(x, times)[:, :, None] for times in (lower, upper))
+        return self.loop.bounded(x, lower, upper, H, (additions[0], additions[1]))
 
     def rows(self, time: float, H: Array, h: Array) -> UncertainRows:
-        moved = H @ self.curved.beside(np.zeros(0), np.array([time]))[0]
-        return self.loop.state_rows(time, H, h - moved, np.zeros(1, dtype=int), np.ones(1))
+        shift = H @ self.curved.beside(np.zeros(0), np.array([time]))[0]
+        return self.loop.state_rows(time, H, h - shift, np.zeros(1, dtype=int), np.ones(1))
 
     def explained(self, index: Array) -> TimedExplanation:
         return self.curved.explain(index, 0)
@@ -282,14 +289,16 @@ class FeedbackCurved(Turning):
 @final
 @dataclass(frozen=True, eq=False)
 class FeedbackCurvedControl(Turning, Source):
-    """What the control does at ``places``, on every piece or at every step, in a curved set for every disturbance."""
+    """Constraint that the control at ``places``, on every piece or at every step, stays in a curved set for every
+    disturbance."""
 
     convex: ConvexSet
     called: str
     places: Places
 
     def normals_in(self, units: Units) -> tuple[Array, Array]:
-        """That of a gauge."""
+        """Return the normal ``(1, 1)`` and the unit ``(1,)`` of the one row, which is in multiples of the set's gauge
+        in any units."""
         return of_gauge()
 
     @property
@@ -317,28 +326,28 @@ class FeedbackCurvedControl(Turning, Source):
 
     def between(self, x: Array, lower: Array, upper: Array, H: Array) -> tuple[Array, Array]:
         at = self.places.at((lower + upper) / 2)
-        along, size = (each[at] for each in acting(self.loop, self.places, x))
-        lost = np.abs(H) @ size @ np.concatenate([[1.0], self.loop.spread.radii])
-        found = self.loop.height(H @ along) + ROUND_OFF * lost
-        return found, np.zeros(found.shape)
+        along, sizes = (array[at] for array in acting(self.loop, self.places, x))
+        magnitudes = np.abs(H) @ sizes @ np.concatenate([[1.0], self.loop.spread.radii])
+        bounds = self.loop.height(H @ along) + ROUND_OFF * magnitudes
+        return bounds, np.zeros(bounds.shape)
 
     def rows(self, time: float, H: Array, h: Array) -> UncertainRows:
         return rows_at(self.loop, self.places, int(self.places.at(np.array([time]))[0]), H, h)
 
     def worst(self, x: Array) -> Separation:
-        """Every place in its worst direction, worst first."""
-        every, (z, c, reach) = acting(self.loop, self.places, x)[0], self._lattice
-        start = z[(self.loop.height(c @ every) - reach).argmax(axis=1)]
+        """Return every place with its worst direction, worst first."""
+        controls, (z, c, reach) = acting(self.loop, self.places, x)[0], self._lattice
+        start = z[(self.loop.height(c @ controls) - reach).argmax(axis=1)]
 
         def excess(at: Array, which: np.ndarray) -> Array:
             directions = self.normals(at)
-            along = np.einsum("kd,kdq->kq", directions, every[which])
+            along = np.einsum("kd,kdq->kq", directions, controls[which])
             return np.asarray(self.loop.height(along) - self.set.support(directions))
 
-        z, found = climb(excess, start, np.full(self._b, STEP), lambda at: on_surface(np.clip(at, -1.0, 1.0)))
-        order = np.argsort(-found, kind="stable")
+        z, violations = climb(excess, start, np.full(self._b, STEP), lambda at: on_surface(np.clip(at, -1.0, 1.0)))
+        order = np.argsort(-violations, kind="stable")
         indices = np.hstack([self.times[order, None], z[order]])
-        return Separation(indices, np.zeros(order.size, dtype=int), found[order])
+        return Separation(indices, np.zeros(order.size, dtype=int), violations[order])
 
     def explained(self, index: Array) -> TimedExplanation:
         time = float(self.places.times[self.places.at(index[:1])[0]]) if self.places.steps else float(index[0])

@@ -58,8 +58,11 @@ FOUND_KEPT = 1  # decisions whose separation is remembered
 @final
 @dataclass(frozen=True, eq=False)
 class Samples:
-    """What is remembered of ``H x(t) <= h`` in a window and does not depend on the initial state: sampled times and
-    parameters, and what the worst disturbance leaves there. ``H (r, d)``, ``h (r,)``."""
+    """Data of ``H x(t) <= h`` in a window that do not depend on the initial state.
+
+    They are sampled times and parameters, and the margins that the worst disturbance leaves there. ``H`` is ``(r, d)``,
+    ``h`` is ``(r,)``.
+    """
 
     functionals: WorstCase
     H: Array
@@ -69,17 +72,17 @@ class Samples:
     reference: Reference = STILL
     gains: Array | None = None
     undivided: tuple[Samples, Array] | None = None
-    """Those of which they are, and what their rows are divided by, ``(r,)``."""
+    """Samples of the undivided rows, and the divisors ``(r,)`` of the rows."""
     _supports: dict[bytes, list[Supports | None]] = field(default_factory=dict, repr=False)
 
     def serve(self, constraint: FlatConstraint) -> bool:
-        """Whether they are of this constraint, from whatever initial state."""
-        mine, other = self.functionals, constraint.functionals
+        """Return whether the samples belong to the constraint, whatever its initial state."""
+        functionals, other_functionals = self.functionals, constraint.functionals
         return (
-            mine.response.propagator is other.response.propagator
-            and mine.dictionary is other.dictionary
-            and mine.disturbance is other.disturbance
-            and mine.initial is other.initial
+            functionals.response.propagator is other_functionals.response.propagator
+            and functionals.dictionary is other_functionals.dictionary
+            and functionals.disturbance is other_functionals.disturbance
+            and functionals.initial is other_functionals.initial
             and self.H is constraint.H
             and self.h is constraint.h
             and self.window == (constraint.start, constraint.stop)
@@ -90,8 +93,8 @@ class Samples:
 
     @cached_property
     def proven(self) -> int:
-        """How many of the rows there are to be proven: those of a mixed constraint are there twice, for both values of
-        a control that jumps."""
+        """Number of rows that are to be proven. A mixed constraint has every row twice, for both values of a control
+        that jumps; its first half counts."""
         return self.h.size if self.gains is None else self.h.size // 2
 
     @cached_property
@@ -100,10 +103,10 @@ class Samples:
         where the commanded control of a mixed constraint changes, and where a system that changes with time is another
         polynomial of it."""
         start, stop = self.window
-        found = [self._response.propagator.marks, self.reference.times]
-        found += [] if self.gains is None else [self.functionals.dictionary.breakpoints]
-        every = np.concatenate(found)
-        return np.unique(every[(every > start) & (every < stop)])
+        sources = [self._response.propagator.marks, self.reference.times]
+        sources += [] if self.gains is None else [self.functionals.dictionary.breakpoints]
+        times = np.concatenate(sources)
+        return np.unique(times[(times > start) & (times < stop)])
 
     @cached_property
     def times(self) -> Array:
@@ -113,8 +116,8 @@ class Samples:
         grid, (start, stop) = self._response.grid, self.window
         pace = float(np.linalg.norm(self._response.steps(self.lattice[0]).A, axis=(2, 3)).max())
         counts = np.clip(np.ceil(pace * grid.lengths / SMOOTH), INSIDE + 1, MOST_INSIDE).astype(int)
-        which = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
-        inside = np.repeat(grid.breakpoints[:-1], counts) + which * np.repeat(grid.lengths / counts, counts)
+        sample_numbers = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
+        inside = np.repeat(grid.breakpoints[:-1], counts) + sample_numbers * np.repeat(grid.lengths / counts, counts)
         inside = np.concatenate([inside[(inside > start) & (inside < stop)], self.cuts])
         return self.apart(np.concatenate([[start], inside, [stop]]))
 
@@ -151,8 +154,8 @@ class Samples:
         """``H x (v, r, times)`` from the initial state of a response, under a control ``(m, K)``."""
         if self.undivided is not None:
             return self.undivided[0].along(response, control) / self.undivided[1][None, :, None]
-        found, (_, which, signs) = self.outputs.at(response, control), self._apart
-        return np.asarray(self.H @ found if self._by_states else found[:, which] * signs[:, None])
+        outputs, (_, inverse, signs) = self.outputs.at(response, control), self._apart
+        return np.asarray(self.H @ outputs if self._by_states else outputs[:, inverse] * signs[:, None])
 
     @property
     def _by_states(self) -> bool:
@@ -162,18 +165,19 @@ class Samples:
     def _apart(self) -> tuple[np.ndarray, np.ndarray, Array]:
         """The rows of ``H`` without copies and opposites, which of them every row is, and with which sign."""
         signs = np.where(self.H[np.arange(self.h.size), np.abs(self.H).argmax(axis=1)] < 0.0, -1.0, 1.0)
-        _, first, which = np.unique(self.H * signs[:, None], axis=0, return_index=True, return_inverse=True)
-        return first, which.reshape(-1), signs * signs[first[which.reshape(-1)]]
+        _, first, inverse = np.unique(self.H * signs[:, None], axis=0, return_index=True, return_inverse=True)
+        return first, inverse.reshape(-1), signs * signs[first[inverse.reshape(-1)]]
 
     @shaped
     def support_over(
         self, legs: Sequence[Leg], low: Float[Array, " nu"], high: Float[Array, " nu"]
     ) -> list[Supports | None]:
-        """What the uncertainty adds over a cell of parameters, for every leg; remembered."""
+        """Return the support functions of the uncertainty over a cell of parameters, one for each segment of time in
+        ``legs``; results are kept."""
         key = low.tobytes() + high.tobytes()
         if key not in self._supports:
-            found = [self.functionals.support_over(leg, self.H[: self.proven]) for leg in legs]
-            remember(self._supports, key, found, LEGS_KEPT)
+            supports = [self.functionals.support_over(leg, self.H[: self.proven]) for leg in legs]
+            remember(self._supports, key, supports, LEGS_KEPT)
         return self._supports[key]
 
     @property
@@ -211,7 +215,8 @@ class FlatConstraint(StateConstraint):
         parameters: ParameterIndex,
         reference: Reference = STILL,
     ) -> FlatConstraint:
-        """The rows of a constraint; those of a mixed one for the control before and after a jump."""
+        """Return the constraint of the given rows; mixed rows are taken twice, for the control before and after a
+        jump."""
         H, G, h = rows
         if G is not None:
             H, G, h = np.vstack([H, H]), np.vstack([G, G]), np.tile(h, 2)
@@ -219,7 +224,7 @@ class FlatConstraint(StateConstraint):
 
     @cached_property
     def samples(self) -> Samples:
-        """What does not depend on the initial state; the ``shared`` ones where they are of this constraint."""
+        """Data that do not depend on the initial state; the ``shared`` ones where they belong to this constraint."""
         if self.shared is not None and self.shared.serve(self):
             return self.shared
         window = (self.start, self.stop)
@@ -245,8 +250,11 @@ class FlatConstraint(StateConstraint):
 
     @shaped
     def looked_at_in(self, units: Float[Array, " r"]) -> FlatConstraint:
-        made, known = self.divided(units), self.samples
-        return replace(made, shared=replace(known, H=made.H, h=made.h, gains=made.gains, undivided=(known, units)))
+        constraint, samples = self.divided(units), self.samples
+        return replace(
+            constraint,
+            shared=replace(samples, H=constraint.H, h=constraint.h, gains=constraint.gains, undivided=(samples, units)),
+        )
 
     @shaped
     def functionals_at(
@@ -270,11 +278,11 @@ class FlatConstraint(StateConstraint):
 
     @shaped
     def beside(self, x: Float[Array, " n"], times: Float[Array, " k"]) -> Float[Array, "k r"]:
-        added = self.moved(times)
+        additions = self.moved(times)
         if self.gains is not None:
             control = self.functionals.control(x)[:, self.commanded(times)]
-            added = added + np.einsum("rm,mkr->kr", self.gains, control)
-        return added
+            additions = additions + np.einsum("rm,mkr->kr", self.gains, control)
+        return additions
 
     @shaped
     def direct(self, times: Float[Array, " k"]) -> Float[Array, "q n"] | None:
@@ -319,7 +327,7 @@ class FlatConstraint(StateConstraint):
         )
         heights, rows = values[tuple(positions.T)], positions[:, 1]
         indices = np.hstack([self.times[positions[:, 2], None], self.lattice[0][positions[:, 0]]])
-        found = heights
+        violations = heights
         times, predicted = vertices(values, positions, self.times)
         between = np.flatnonzero(times != indices[:, 0])  # the others are samples
         if self.parameters.count or self.functionals.response.grid.pieces >= MANY:
@@ -328,23 +336,23 @@ class FlatConstraint(StateConstraint):
             between = between[promised[between] >= min(0.0, heights.max(initial=-np.inf))]
         if between.size:
             at = np.hstack([times[between, None], indices[between, 1:]])
-            refined = self._refined(x, at, rows[between], predicted[between], found)
-            higher = refined[1] >= found[between]  # at a kink a parabola is no guide
+            refined = self._refined(x, at, rows[between], predicted[between], violations)
+            higher = refined[1] >= violations[between]  # at a kink a parabola is no guide
             between = between[higher]
-            indices[between, 0], found[between] = (part[higher] for part in refined)
+            indices[between, 0], violations[between] = (array[higher] for array in refined)
         if self.parameters.count:
-            likely = np.argsort(-found, kind="stable")[:CLIMBED]
+            likely = np.argsort(-violations, kind="stable")[:CLIMBED]
             # a maximum at a breakpoint is a kink: it is climbed along, not across
-            indices[likely], found[likely] = self._climbed(x, indices[likely], rows[likely])
-        order = np.argsort(-found, kind="stable")
+            indices[likely], violations[likely] = self._climbed(x, indices[likely], rows[likely])
+        order = np.argsort(-violations, kind="stable")
         if self.gains is not None:  # where nothing jumps, both halves of the rows say the same
             pieces = self.commanded(indices[order, 0])
             order = order[(rows[order] < self.samples.proven) | (pieces[:, 0] != pieces[:, -1])]
-        return Separation(indices[order], rows[order], found[order])
+        return Separation(indices[order], rows[order], violations[order])
 
     @cached_property
     def kinks(self) -> np.ndarray:
-        """The sampled times at which anything turns or jumps, and the ends."""
+        """Positions of the sampled times at which anything bends or jumps, and of the ends of the window."""
         return np.flatnonzero(np.isin(self.times, np.concatenate([[self.start], self.samples.cuts, [self.stop]])))
 
     @shaped
@@ -387,10 +395,10 @@ class FlatConstraint(StateConstraint):
         upper)``, ``(k, 1 + nu)`` each."""
         points = self.samples.apart(np.concatenate([[self.start], self.samples.cuts, [self.stop]]))
         starts, stops = (points[:-1], points[1:]) if points.size > 1 else (points, points)
-        box, parts = self.index_set, self.functionals.response.propagator.laws
+        box, laws = self.index_set, self.functionals.response.propagator.laws
         lower = np.hstack([starts[:, None], np.tile(box.lower[1:], (starts.size, 1))])
         upper = np.hstack([stops[:, None], np.tile(box.upper[1:], (starts.size, 1))])
-        return (lower, upper) if parts is None else parts.cut(lower, upper)
+        return (lower, upper) if laws is None else laws.cut(lower, upper)
 
     @shaped
     def enclosure(self, x: Float[Array, " n"], lower: Float[Array, "k j"], upper: Float[Array, "k j"]) -> Enclosure:
@@ -410,16 +418,16 @@ class FlatConstraint(StateConstraint):
             rhs[:, 0] = self.h[:rows]
             moving = Moving(self.reference, H) if self.reference.moves else None
             direct = None if self.gains is None else Direct(self.gains[:rows], self.functionals.dictionary, control)
-            known = self.samples.support_over(legs, low, high)
-            every = zip(known, legs, strict=True)
-            supports = iter([self.functionals.delivered_over(one, x, H, leg) for one, leg in every])
-            made = over_legs(
+            supports = self.samples.support_over(legs, low, high)
+            pairs = zip(supports, legs, strict=True)
+            delivered = iter([self.functionals.delivered_over(support, x, H, leg) for support, leg in pairs])
+            bounded = over_legs(
                 legs,
                 lambda leg: CellEnclosure(
-                    leg, next(supports), H, rhs, control, cuts=cuts, moving=moving, direct=direct
+                    leg, next(delivered), H, rhs, control, cuts=cuts, moving=moving, direct=direct
                 ),
             )
-            remember(self._cells, key, made, kept(control))
+            remember(self._cells, key, bounded, kept(control))
         return self._cells[key]
 
     @cached_property
@@ -432,7 +440,7 @@ class FlatConstraint(StateConstraint):
 
     @property
     def times(self) -> Array:
-        """`Samples.times`."""
+        """Sampled times of the window, increasing."""
         return self.samples.times
 
     @cached_property
@@ -442,7 +450,7 @@ class FlatConstraint(StateConstraint):
 
     @property
     def lattice(self) -> tuple[Array, tuple[int, ...]]:
-        """`Samples.lattice`."""
+        """Sampled parameters ``(v, nu)`` and the shape of their lattice."""
         return self.samples.lattice
 
     @shaped
@@ -452,17 +460,18 @@ class FlatConstraint(StateConstraint):
         answer: Array = along - self.samples.margins
         if self.functionals.execution is not None:
             answer = answer + self._executed(self.functionals.execution, x)
-        beside = self.reference.moves or self.gains is not None
-        return answer + self.beside(x, self.times).T if beside else answer
+        has_additions = self.reference.moves or self.gains is not None
+        return answer + self.beside(x, self.times).T if has_additions else answer
 
     def _executed(self, execution: Execution, x: Array) -> Array:
-        """What errors of execution add to all rows at every lattice point and sampled time, ``(v, r, times)``."""
+        """Return the contribution of the worst errors of execution to all rows at every lattice point and sampled time,
+        ``(v, r, times)``."""
         rows, copies = self.H[: self.samples.proven], self.h.size // max(1, self.samples.proven)
         (points, _), k, r = self.lattice, self.times.size, rows.shape[0]
         v = len(points)
         along = execution.seen(np.tile(rows, (v * k, 1)), np.repeat(points, k * r, axis=0))
-        added = execution.sampled(self.functionals.control(x), np.tile(np.repeat(self.times, r), v), along)
-        return np.tile(added.reshape(v, k, r).swapaxes(1, 2), (1, copies, 1))
+        contributions = execution.sampled(self.functionals.control(x), np.tile(np.repeat(self.times, r), v), along)
+        return np.tile(contributions.reshape(v, k, r).swapaxes(1, 2), (1, copies, 1))
 
     @shaped
     def _refined(
@@ -478,37 +487,37 @@ class FlatConstraint(StateConstraint):
         these are no guide, at a kink or beyond one, the candidate is climbed from. ``predicted (k,)``, ``heights
         (q,)``: what the first parabolas say, and what is known at samples."""
         spacing = float((self.times[1:] - self.times[:-1]).max())
-        middle, found, live = indices[:, 0].copy(), predicted.copy(), np.arange(rows.size)
+        middle, violations, live = indices[:, 0].copy(), predicted.copy(), np.arange(rows.size)
         width = np.full(rows.size, min(spacing / NEARER, (self.stop - self.start) / 2))
         for look in range(LOOKS):
-            far = width[live]
-            at = np.minimum(np.maximum(middle[live], self.start + far), self.stop - far)
-            around = indices[live].repeat(3, axis=0)
-            around[:, 0] = (at[:, None] + far[:, None] * STENCIL).ravel()
-            seen = self.violations(x, around, rows[live].repeat(3)).reshape(-1, 3)
-            before, now, after = seen.T
+            steps = width[live]
+            at = np.minimum(np.maximum(middle[live], self.start + steps), self.stop - steps)
+            neighbours = indices[live].repeat(3, axis=0)
+            neighbours[:, 0] = (at[:, None] + steps[:, None] * STENCIL).ravel()
+            samples = self.violations(x, neighbours, rows[live].repeat(3)).reshape(-1, 3)
+            before, now, after = samples.T
             slope, bend = (after - before) / 2, 2 * now - before - after
-            inside = np.abs(slope) < bend
-            share = slope / np.where(inside, bend, np.maximum(np.abs(slope), TINY))
-            error, size = np.abs(found[live] - now), np.maximum(1.0, np.abs(now))
-            sure = inside & (share * slope <= 2 * ARRIVED * size)
+            is_inside = np.abs(slope) < bend
+            share = slope / np.where(is_inside, bend, np.maximum(np.abs(slope), TINY))
+            error, size = np.abs(violations[live] - now), np.maximum(1.0, np.abs(now))
+            is_sure = is_inside & (share * slope <= 2 * ARRIVED * size)
             if look == 0:
-                sure |= error <= SURE * size
-            middle[live], found[live] = at, now
-            highest = max(float(found.max()), float(heights.max()))
-            wanted = now + 4.0 * np.maximum(error, np.abs(slope)) >= min(0.0, highest)
-            going = ~sure & wanted
-            if not going.any():
-                live = live[going]
+                is_sure |= error <= SURE * size
+            middle[live], violations[live] = at, now
+            highest = max(float(violations.max()), float(heights.max()))
+            is_relevant = now + 4.0 * np.maximum(error, np.abs(slope)) >= min(0.0, highest)
+            is_unfinished = ~is_sure & is_relevant
+            if not is_unfinished.any():
+                live = live[is_unfinished]
                 break
-            middle[live] = np.where(going, at + far * share, at)
-            width[live] = np.where(inside, far / NEARER, far)
-            live = live[going]
-        kinks = live[np.argsort(-found[live], kind="stable")][:CLIMBED]
+            middle[live] = np.where(is_unfinished, at + steps * share, at)
+            width[live] = np.where(is_inside, steps / NEARER, steps)
+            live = live[is_unfinished]
+        kinks = live[np.argsort(-violations[live], kind="stable")][:CLIMBED]
         if kinks.size and not self.parameters.count:
-            points, found[kinks] = self._climbed(x, indices[kinks], rows[kinks])
+            points, violations[kinks] = self._climbed(x, indices[kinks], rows[kinks])
             middle[kinks] = points[:, 0]
-        return middle, found
+        return middle, violations
 
     @shaped
     def _climbed(
@@ -525,13 +534,13 @@ class FlatConstraint(StateConstraint):
         def evaluate(points: Array, which: np.ndarray) -> Array:
             return self.violations(x, points, rows[which])
 
-        points, found = climb(evaluate, indices, radius, project)
+        points, violations = climb(evaluate, indices, radius, project)
         bound = self.parameters.set
         if bound is None or bound.is_box:
-            return points, found
-        stepped, higher = step_out(evaluate, points, found, bound)
-        moved = np.flatnonzero(higher > found)
-        points[moved], found[moved] = climb(
-            lambda at, which: evaluate(at, moved[which]), stepped[moved], radius / 16, project
+            return points, violations
+        stepped, higher = step_out(evaluate, points, violations, bound)
+        improved = np.flatnonzero(higher > violations)
+        points[improved], violations[improved] = climb(
+            lambda at, which: evaluate(at, improved[which]), stepped[improved], radius / 16, project
         )
-        return points, found
+        return points, violations

@@ -69,15 +69,15 @@ class LiteralConstraint:
 
     def worst(self, x: Array) -> Separation:
         """The separation of the reduced constraint, with the worst disturbance of each index written out."""
-        found = self.base.worst(x)
-        times, directions, parameters, _ = self.base.functionals_at(found.indices)
-        per_index = times.size // found.rows.size
-        pick = np.arange(found.rows.size) * per_index + found.rows
+        separation = self.base.worst(x)
+        times, directions, parameters, _ = self.base.functionals_at(separation.indices)
+        per_index = times.size // separation.rows.size
+        pick = np.arange(separation.rows.size) * per_index + separation.rows
         blocks = self.base.functionals.worst_blocks(times[pick], directions[pick], parameters[pick]).reshape(
-            found.rows.size, -1
+            separation.rows.size, -1
         )
-        indices = np.hstack([found.indices[:, :1], blocks, found.indices[:, 1:]])
-        return Separation(indices, found.rows, found.violations, found.bound)
+        indices = np.hstack([separation.indices[:, :1], blocks, separation.indices[:, 1:]])
+        return Separation(indices, separation.rows, separation.violations, separation.bound)
 
     def gradient(self, x: Array, indices: Array, rows: Array) -> Array:
         """The derivative ``(k, d)`` of ``row x - rhs`` in the index (`Sensitivity`); in ``Beta``: the functional on
@@ -109,7 +109,7 @@ class LiteralConstraint:
 
     @cached_property
     def _movable(self) -> np.ndarray:
-        """Which coefficients of a block have more than one value."""
+        """True for each coefficient of a block that has more than one value."""
         box = self._blocks.box
         return np.asarray(box.upper > box.lower)
 

@@ -39,20 +39,20 @@ def local_maxima(values: Array, lattice: tuple[int, ...], kept: int) -> np.ndarr
     """
     v, r, times = values.shape
     tensor = values.reshape(*lattice, r, times)
-    peak = np.ones(tensor.shape, dtype=bool)
+    is_peak = np.ones(tensor.shape, dtype=bool)
     for axis in (*range(len(lattice)), tensor.ndim - 1):
         first = [slice(None)] * tensor.ndim
         last = [slice(None)] * tensor.ndim
         first[axis], last[axis] = slice(None, -1), slice(1, None)
-        ahead = tensor[tuple(last)] - tensor[tuple(first)]
-        peak[tuple(first)] &= ahead <= 0
-        peak[tuple(last)] &= ahead >= 0
-    positions = np.array(peak.reshape(v, r, times).nonzero()).T
+        rise = tensor[tuple(last)] - tensor[tuple(first)]
+        is_peak[tuple(first)] &= rise <= 0
+        is_peak[tuple(last)] &= rise >= 0
+    positions = np.array(is_peak.reshape(v, r, times).nonzero()).T
     heights = values[tuple(positions.T)]
     best: list[np.ndarray] = []
     for row in range(r):  # every row keeps its own maxima, so that none starves another
-        mine = positions[:, 1] == row
-        best.append(positions[mine][(-heights[mine]).argsort(kind="stable")][:kept])
+        is_in_row = positions[:, 1] == row
+        best.append(positions[is_in_row][(-heights[is_in_row]).argsort(kind="stable")][:kept])
     return np.concatenate(best)
 
 
@@ -65,36 +65,38 @@ def along_spans(values: Array, maxima: np.ndarray, pieces: np.ndarray, kept: int
     piece later in the next round, and rounds would grow with its length.
     """
     heights = values.max(axis=0)
-    found = [np.zeros((0, 3), dtype=int)]
+    positions = [np.zeros((0, 3), dtype=int)]
     for row in np.flatnonzero((heights > 0.0).any(axis=1)):
         height = heights[row]
-        near = pieces[maxima[maxima[:, 1] == row, 2]]
-        over = np.flatnonzero((height > 0.0) & ~np.isin(pieces, [near - 1, near, near + 1]))
-        over = over[np.lexsort((-height[over], pieces[over]))]
-        over = over[np.unique(pieces[over], return_index=True)[1]]
-        over = over[np.unique(np.linspace(0, over.size - 1, min(kept, over.size)).astype(int))]
-        found.append(np.stack([values[:, row, over].argmax(axis=0), np.full(over.size, row), over], axis=1))
-    return np.concatenate(found)
+        near_pieces = pieces[maxima[maxima[:, 1] == row, 2]]
+        samples = np.flatnonzero((height > 0.0) & ~np.isin(pieces, [near_pieces - 1, near_pieces, near_pieces + 1]))
+        samples = samples[np.lexsort((-height[samples], pieces[samples]))]
+        samples = samples[np.unique(pieces[samples], return_index=True)[1]]
+        samples = samples[np.unique(np.linspace(0, samples.size - 1, min(kept, samples.size)).astype(int))]
+        positions.append(
+            np.stack([values[:, row, samples].argmax(axis=0), np.full(samples.size, row), samples], axis=1)
+        )
+    return np.concatenate(positions)
 
 
 def beside_kinks(values: Array, times: Array, kinks: np.ndarray, kept: int) -> np.ndarray:
     """Positions ``(k, 3)`` in ``values (v, r, times)`` next to ``kinks``, the places among ``times`` at which anything
     turns or jumps, where the violation may rise above 0 before the next samples, at most ``kept`` before and ``kept``
     behind such times: a parabola across a kink does not see that, one on either side of it does."""
-    found = [np.zeros((0, 3), dtype=int)]
+    positions = [np.zeros((0, 3), dtype=int)]
     for step in (-1, 1) if times.size > 2 else ():
         at = kinks[(kinks + 2 * step >= 0) & (kinks + 2 * step < times.size)]
-        near, far = (np.abs(times[at + k * step] - times[at]) for k in (1, 2))
-        here, next_, last = (values[:, :, at + k * step] for k in (0, 1, 2))
-        rate = (next_ - here) / near
-        bend = ((last - next_) / (far - near) - rate) / far
-        slope = rate - bend * near
+        near_distance, far_distance = (np.abs(times[at + k * step] - times[at]) for k in (1, 2))
+        base, next_, last = (values[:, :, at + k * step] for k in (0, 1, 2))
+        rate = (next_ - base) / near_distance
+        bend = ((last - next_) / (far_distance - near_distance) - rate) / far_distance
+        slope = rate - bend * near_distance
         # The vertex is slope / (-2 bend) away and slope^2 / (-4 bend) higher, of which parabolas may be wrong by 4.
-        rises = (slope > 0.0) & (slope < -2.0 * bend * far) & (slope**2 >= bend * here)
+        rises = (slope > 0.0) & (slope < -2.0 * bend * far_distance) & (slope**2 >= bend * base)
         v, r, t = rises.nonzero()
-        order = np.argsort(-here[v, r, t], kind="stable")[:kept]
-        found.append(np.stack([v[order], r[order], at[t[order]] + step], axis=1))
-    return np.concatenate(found)
+        order = np.argsort(-base[v, r, t], kind="stable")[:kept]
+        positions.append(np.stack([v[order], r[order], at[t[order]] + step], axis=1))
+    return np.concatenate(positions)
 
 
 def turns(heights: Array, beside: np.ndarray, unit: float) -> tuple[np.ndarray, int]:
@@ -106,23 +108,24 @@ def turns(heights: Array, beside: np.ndarray, unit: float) -> tuple[np.ndarray, 
     any of them the largest.
     """
     highest, lowest = heights[beside[:, 0]], heights[beside[:, 0]]
-    for near in beside.T[1:]:  # one by one: in six dimensions they are hundreds
-        around = heights[near]
-        np.maximum(highest, around, out=highest)
-        np.minimum(lowest, around, out=lowest)
-    peak = heights >= highest
-    promise = np.where(peak, 2.0 * heights - lowest, -np.inf)
-    order = np.argsort(-np.where(peak, heights, -np.inf), axis=0, kind="stable")[:TURNS]
+    for neighbour in beside.T[1:]:  # one by one: in six dimensions they are hundreds
+        neighbour_heights = heights[neighbour]
+        np.maximum(highest, neighbour_heights, out=highest)
+        np.minimum(lowest, neighbour_heights, out=lowest)
+    is_peak = heights >= highest
+    promise = np.where(is_peak, 2.0 * heights - lowest, -np.inf)
+    order = np.argsort(-np.where(is_peak, heights, -np.inf), axis=0, kind="stable")[:TURNS]
     rows, times = order.ravel(), np.tile(np.arange(heights.shape[1]), len(order))
     promised = promise[rows, times]
     first = np.argsort(-promised, kind="stable")
-    first = first[: int(peak[rows, times].sum())]
+    first = first[: int(is_peak[rows, times].sum())]
     likely = int((promised[first] * unit > -NEAR).sum())
     return np.stack([rows[first], times[first]], axis=1), min(HELD, max(TOLD, likely))
 
 
 def highest_at(times: np.ndarray, heights: Array) -> np.ndarray:
-    """Of candidates at the places ``times (k,)`` the position of the highest at every place, in the order of places."""
+    """Return the position of the highest of the candidates at each of the places ``times (k,)``, in the order of
+    places."""
     order = np.lexsort((-heights, times))
     return order[np.unique(times[order], return_index=True)[1]]
 
@@ -135,32 +138,51 @@ def ridden(
     turned: Callable[[Array], tuple[Array, Array]],
     climbed: Callable[[Array], tuple[Array, Array]],
 ) -> tuple[Array, Array]:
-    """Where a curved set is left, along time: indices ``(k, j)``, the first coordinate of which is the time, and the
-    violations there ``(k,)``, worst first.
+    """Return the indices at which a curved set is left, and the violations there, worst first.
 
-    ``held (n, j)``: the worst index at every sampled time, with its ``heights (n,)`` and the numbers of the ``pieces
-    (n,)`` of the control; ``kinks``: the places among them at which anything turns. The largest maxima along time are
-    ``climbed`` from; the others that may be violations are ``turned``, which leaves their times alone; and where there
-    is no maximum near, one sample a piece is taken.
+    The largest maxima along time are ``climbed`` from. The others that may be violations are narrowed down along time
+    by parabolas, whose points are ``turned``. Where there is no maximum near, one sample of each piece is taken.
+
+    Parameters
+    ----------
+    held : ndarray, shape (n, j)
+        Worst index at every sampled time; the first coordinate is the time.
+    heights : ndarray, shape (n,)
+        Violations at these indices.
+    pieces : ndarray of int, shape (n,)
+        Numbers of the pieces of the control that hold the times.
+    kinks : ndarray of int
+        Positions of the sampled times at which anything bends.
+    turned : callable
+        Function that improves indices at fixed times, and returns them with their violations.
+    climbed : callable
+        Function that improves indices in all coordinates, and returns them with their violations.
+
+    Returns
+    -------
+    indices : ndarray, shape (k, j)
+        Indices of the violations.
+    violations : ndarray, shape (k,)
+        Violations, worst first.
     """
     line, times = heights[None, None], held[:, 0]
     peaks = local_maxima(line, (1,), MOST)
     peaks = np.unique(np.vstack([peaks, beside_kinks(line, times, kinks, MOST)]), axis=0)
-    moved, promised = vertices(line, peaks, times)
+    vertex_times, promised = vertices(line, peaks, times)
     promised = line[0, 0, peaks[:, 2]] + UNSURE * (promised - line[0, 0, peaks[:, 2]])
     spans = along_spans(line, peaks, pieces, MOST)[:, 2]
     points = held[peaks[:, 2]]
-    points[:, 0] = moved
+    points[:, 0] = vertex_times
     order = np.argsort(-promised, kind="stable")
-    first, others = order[:CLIMBED], order[CLIMBED:]
-    others = others[promised[others] > 0.0]
-    known = np.concatenate([peaks[:, 2], spans])  # at a kink a parabola is no guide
-    nearer = _narrowed(points[others], float(np.diff(times).max(initial=0.0)), turned)
-    parts = [climbed(points[first]), nearer, (held[known], heights[known])]
-    indices, found = np.vstack([part[0] for part in parts]), np.concatenate([part[1] for part in parts])
-    order = _distinct(indices, found)
-    order = order[(found[order] > 0.0) | (np.arange(order.size) < TOLD)][:MOST]
-    return indices[order], found[order]
+    first, remaining = order[:CLIMBED], order[CLIMBED:]
+    remaining = remaining[promised[remaining] > 0.0]
+    sample_positions = np.concatenate([peaks[:, 2], spans])  # at a kink a parabola is no guide
+    nearer = _narrowed(points[remaining], float(np.diff(times).max(initial=0.0)), turned)
+    groups = [climbed(points[first]), nearer, (held[sample_positions], heights[sample_positions])]
+    indices, violations = np.vstack([group[0] for group in groups]), np.concatenate([group[1] for group in groups])
+    order = _distinct(indices, violations)
+    order = order[(violations[order] > 0.0) | (np.arange(order.size) < TOLD)][:MOST]
+    return indices[order], violations[order]
 
 
 def _narrowed(points: Array, spacing: float, turned: Callable[[Array], tuple[Array, Array]]) -> tuple[Array, Array]:
@@ -169,9 +191,9 @@ def _narrowed(points: Array, spacing: float, turned: Callable[[Array], tuple[Arr
         return points, np.zeros(0)
     width = spacing / NEARER
     for _ in range(LOOKS):
-        around = points.repeat(3, axis=0)
-        around[:, 0] += np.tile(width * np.array([-1.0, 0.0, 1.0]), len(points))
-        before, now, after = turned(around)[1].reshape(-1, 3).T
+        neighbours = points.repeat(3, axis=0)
+        neighbours[:, 0] += np.tile(width * np.array([-1.0, 0.0, 1.0]), len(points))
+        before, now, after = turned(neighbours)[1].reshape(-1, 3).T
         slope, bend = (after - before) / 2, 2 * now - before - after
         share = slope / np.where(np.abs(slope) < bend, bend, np.maximum(np.abs(slope), TINY))
         points[:, 0] += width * share
@@ -181,10 +203,10 @@ def _narrowed(points: Array, spacing: float, turned: Callable[[Array], tuple[Arr
 
 def _distinct(indices: Array, found: Array) -> np.ndarray:
     """Positions of different maxima, highest first."""
-    left, kept = np.argsort(-found, kind="stable"), []
-    while left.size:
-        kept.append(int(left[0]))
-        left = left[(np.abs(indices[left] - indices[left[0]]) > CLOSE).any(axis=1)]
+    remaining, kept = np.argsort(-found, kind="stable"), []
+    while remaining.size:
+        kept.append(int(remaining[0]))
+        remaining = remaining[(np.abs(indices[remaining] - indices[remaining[0]]) > CLOSE).any(axis=1)]
     return np.array(kept, dtype=int)
 
 
@@ -192,19 +214,19 @@ def vertices(values: Array, positions: np.ndarray, times: Array) -> tuple[Array,
     """The vertex of the parabola through every position's sample and the two beside it: its time ``(k,)`` and height
     ``(k,)``."""
     v, r, t = positions.T
-    moved, height = times[t].copy(), values[v, r, t].copy()
+    vertex_times, heights = times[t].copy(), values[v, r, t].copy()
     inner = (t > 0) & (t < times.size - 1)
     ti, vi, ri = t[inner], v[inner], r[inner]
     h1, h2 = times[ti] - times[ti - 1], times[ti + 1] - times[ti]
     d1 = (values[vi, ri, ti] - values[vi, ri, ti - 1]) / h1
     d2 = (values[vi, ri, ti + 1] - values[vi, ri, ti]) / h2
     curvature, slope = (d2 - d1) / (h1 + h2), (d1 * h2 + d2 * h1) / (h1 + h2)
-    bent = curvature < 0
+    is_peak = curvature < 0
     shift = np.zeros(ti.size)
-    shift[bent] = np.minimum(np.maximum(-slope[bent] / (2 * curvature[bent]), -h1[bent]), h2[bent])
-    moved[inner] += shift
-    height[inner] += slope * shift + curvature * shift**2
-    return moved, height
+    shift[is_peak] = np.minimum(np.maximum(-slope[is_peak] / (2 * curvature[is_peak]), -h1[is_peak]), h2[is_peak])
+    vertex_times[inner] += shift
+    heights[inner] += slope * shift + curvature * shift**2
+    return vertex_times, heights
 
 
 def climb(
@@ -219,24 +241,24 @@ def climb(
     points, stencil = points.copy(), np.vstack([np.eye(dimension), -np.eye(dimension)])
     if dimension <= 3:
         stencil = np.array([step for step in product((-1.0, 0.0, 1.0), repeat=dimension) if any(step)])
-    which = np.arange(points.shape[0])
+    numbers = np.arange(points.shape[0])
     size, smallest = np.tile(radius, (points.shape[0], 1)), SMALLEST * radius
-    best, last = evaluate(points, which), np.zeros_like(points)
+    best, last = evaluate(points, numbers), np.zeros_like(points)
     for _ in range(MOVES):
         live = np.flatnonzero((size > smallest).any(axis=1))
         if not live.size:
             break
         steps = np.concatenate([size[live, None] * stencil, last[live, None] * AGAIN], axis=1)
-        around = project((points[live, None] + steps).reshape(-1, dimension)).reshape(steps.shape)
-        found = evaluate(around.reshape(-1, dimension), np.repeat(live, steps.shape[1])).reshape(around.shape[:2])
-        top = found.argmax(axis=1)
-        value = found[np.arange(live.size), top]
+        trials = project((points[live, None] + steps).reshape(-1, dimension)).reshape(steps.shape)
+        values = evaluate(trials.reshape(-1, dimension), np.repeat(live, steps.shape[1])).reshape(trials.shape[:2])
+        top = values.argmax(axis=1)
+        value = values[np.arange(live.size), top]
         gain = value - best[live]
-        better = gain > 0
-        reached = around[np.arange(live.size), top]
-        last[live] = np.where(better[:, None], reached - points[live] + last[live] / 2, 0.0)
-        points[live[better]] = reached[better]
-        best[live[better]] = value[better]
+        is_better = gain > 0
+        highest = trials[np.arange(live.size), top]
+        last[live] = np.where(is_better[:, None], highest - points[live] + last[live] / 2, 0.0)
+        points[live[is_better]] = highest[is_better]
+        best[live[is_better]] = value[is_better]
         size[live[gain <= ENOUGH * np.abs(best[live])]] /= 3
     return points, best
 
@@ -252,22 +274,24 @@ def step_out(
     """
     points, values, middle = points.copy(), values.copy(), convex.interior_point()
     axes = np.eye(middle.size)
-    every, moves = np.arange(values.size), DIFFERENCE * convex.width(axes) * axes
+    numbers, moves = np.arange(values.size), DIFFERENCE * convex.width(axes) * axes
     for _ in range(STEPS):
         inner = np.repeat(points[:, None], 2 * middle.size, axis=1)
         inner[:, :, 1:] += INWARD * (middle - inner[:, :, 1:]) + np.vstack([moves, -moves])
         ahead, behind = np.split(
-            evaluate(inner.reshape(-1, points.shape[1]), every.repeat(2 * middle.size)).reshape(values.size, -1),
+            evaluate(inner.reshape(-1, points.shape[1]), numbers.repeat(2 * middle.size)).reshape(values.size, -1),
             2,
             axis=1,
         )
         gradient = (ahead - behind) / np.maximum(np.diag(moves), TINY)
         trials = np.repeat(points[:, None], SHARES.size, axis=1)
         trials[:, :, 1:] += SHARES[:, None] * (convex.support_point(gradient)[:, None] - trials[:, :, 1:])
-        found = evaluate(trials.reshape(-1, points.shape[1]), every.repeat(SHARES.size)).reshape(values.size, -1)
-        best = found.argmax(axis=1)
-        better = found[every, best] > values
-        if not better.any():
+        trial_values = evaluate(trials.reshape(-1, points.shape[1]), numbers.repeat(SHARES.size)).reshape(
+            values.size, -1
+        )
+        best = trial_values.argmax(axis=1)
+        is_better = trial_values[numbers, best] > values
+        if not is_better.any():
             break
-        points[better], values[better] = trials[every, best][better], found[every, best][better]
+        points[is_better], values[is_better] = trials[numbers, best][is_better], trial_values[numbers, best][is_better]
     return points, values

@@ -53,21 +53,21 @@ class ScenarioConstraint:
         )
 
     def explain(self, index: Array, row: int) -> Explanation:
-        """One row at a time, for one sample."""
+        """Return the description of one row at a time, for one sample."""
         sample = round(float(index[1]))
         return self.base.explain(np.append(index[0], self.parameters[sample]), row).of_sample(sample)
 
     def rows(self, indices: Array) -> tuple[Array, Array]:
         """``G (k, r, n)``, ``rhs (k, r)`` at indices ``(k, 2)``."""
         k, r = indices.shape[0], self.h.size
-        which = np.repeat(np.rint(indices[:, 1]).astype(int), r)
+        samples = np.repeat(np.rint(indices[:, 1]).astype(int), r)
         times, directions = np.repeat(indices[:, 0], r), np.tile(self.H, (k, 1))
-        signals = None if self.disturbances is None else self.disturbances[which]
-        begun = np.zeros(directions.shape) if self.deviations is None else self.deviations[which]
-        G, offset = self.base.functionals.rows_under(times, directions, self.parameters[which], signals, begun)
-        direct, still = self.base.direct(indices[:, 0]), np.zeros(self.base.functionals.variables)
+        signals = None if self.disturbances is None else self.disturbances[samples]
+        deviations = np.zeros(directions.shape) if self.deviations is None else self.deviations[samples]
+        G, offset = self.base.functionals.rows_under(times, directions, self.parameters[samples], signals, deviations)
+        direct, zero_decision = self.base.direct(indices[:, 0]), np.zeros(self.base.functionals.variables)
         G = G if direct is None else G + direct
-        return G.reshape(k, r, -1), self.h - self.base.beside(still, indices[:, 0]) - offset.reshape(k, r)
+        return G.reshape(k, r, -1), self.h - self.base.beside(zero_decision, indices[:, 0]) - offset.reshape(k, r)
 
     def worst(self, x: Array) -> Separation:
         """Local maxima in time of the worst sample's violation, at the breakpoints and between them."""
@@ -77,68 +77,72 @@ class ScenarioConstraint:
         rows = positions[:, 1]
         indices = np.stack([times, sample[rows, positions[:, 2]].astype(float)], axis=1)
         G, h = self.rows(indices)
-        found = (G @ x - h)[np.arange(rows.size), rows]
-        order = np.argsort(-found, kind="stable")
-        return Separation(indices[order], rows[order], found[order])
+        violations = (G @ x - h)[np.arange(rows.size), rows]
+        order = np.argsort(-violations, kind="stable")
+        return Separation(indices[order], rows[order], violations[order])
 
     def _worst_samples(self, x: Array) -> tuple[Array, np.ndarray]:
         """Largest violation over the samples, ``(r, times)``, and the sample that has it."""
-        beside = self.base.beside(x, self._times).T
+        additions = self.base.beside(x, self._times).T
         if self.parameters.shape[1] == 0:
             margins, sample = self._known
             undisturbed = self._states(x, slice(0, 1), None, None)[0]
-            return self.H @ undisturbed.T - margins + beside + self._missed(x, slice(0, 1))[0], sample
+            return self.H @ undisturbed.T - margins + additions + self._missed(x, slice(0, 1))[0], sample
         values, sample = self._maximum(
-            lambda part: self._states(x, part, self.disturbances, self.deviations), lambda part: self._missed(x, part)
+            lambda chunk: self._states(x, chunk, self.disturbances, self.deviations),
+            lambda chunk: self._missed(x, chunk),
         )
-        return values + beside, sample
+        return values + additions, sample
 
     def _missed(self, x: Array, part: slice) -> Array:
-        """What errors of execution add in some samples, ``(s, r, times)``: their worst is known, and none are drawn."""
+        """Return the contribution of the worst errors of execution in some samples, ``(s, r, times)``; the worst is
+        known, so that no errors are drawn."""
         functionals, parameters = self.base.functionals, self.parameters[part]
         samples, r, times = len(parameters), self.h.size, self._times.size
         if functionals.execution is None:
             return np.zeros((samples, r, times))
         rows, at = np.tile(self.H, (samples * times, 1)), np.tile(np.repeat(self._times, r), samples)
         along = functionals.execution.seen(rows, np.repeat(parameters, times * r, axis=0))
-        added = functionals.execution.added(functionals.control(x), at, along)
-        return np.asarray(added.reshape(samples, times, r).swapaxes(1, 2))
+        contributions = functionals.execution.added(functionals.control(x), at, along)
+        return np.asarray(contributions.reshape(samples, times, r).swapaxes(1, 2))
 
     @cached_property
     def _known(self) -> tuple[Array, np.ndarray]:
-        """For a known system: ``h - max_s H d_s(t)``, and the maximising samples; it does not depend on the
-        decision."""
+        """Margins ``h - max_s H d_s(t)`` of a known system, and the maximising samples, ``(r, times)`` each; they do
+        not depend on the decision."""
         if self.disturbances is None and self.deviations is None:
             return np.repeat(self.h[:, None], self._times.size, axis=1), np.zeros(
                 (self.h.size, self._times.size), dtype=int
             )
-        still = np.zeros(self.base.functionals.variables)
-        rest = self._states(still, slice(0, 1), None, None)
-        worst, sample = self._maximum(lambda part: self._states(still, part, self.disturbances, self.deviations) - rest)
+        zero_decision = np.zeros(self.base.functionals.variables)
+        undisturbed = self._states(zero_decision, slice(0, 1), None, None)
+        worst, sample = self._maximum(
+            lambda chunk: self._states(zero_decision, chunk, self.disturbances, self.deviations) - undisturbed
+        )
         return -worst, sample
 
     def _maximum(
         self, states: Callable[[slice], Array], more: Callable[[slice], Array] | None = None
     ) -> tuple[Array, np.ndarray]:
-        """``max_s H x_s(t) - h`` over the samples, with what is ``more`` of it, block by block, and where it is
-        attained."""
+        """Return ``max_s H x_s(t) - h`` over the samples, plus the term ``more``, block by block, and the maximising
+        samples."""
         samples, r, times = self.parameters.shape[0], self.h.size, self._times.size
-        best, where = np.full((r, times), -np.inf), np.zeros((r, times), dtype=int)
+        best, best_sample = np.full((r, times), -np.inf), np.zeros((r, times), dtype=int)
         size = max(1, BLOCK // (r * times))
         for start in range(0, samples, size):
-            part = slice(start, start + size)
-            values = np.einsum("ri,sti->srt", self.H, states(part)) - self.h[:, None]
-            values = values if more is None else values + more(part)
-            top = values.argmax(axis=0)
-            height = np.take_along_axis(values, top[None], axis=0)[0]
-            where = np.where(height > best, start + top, where)
+            chunk = slice(start, start + size)
+            values = np.einsum("ri,sti->srt", self.H, states(chunk)) - self.h[:, None]
+            values = values if more is None else values + more(chunk)
+            highest = values.argmax(axis=0)
+            height = np.take_along_axis(values, highest[None], axis=0)[0]
+            best_sample = np.where(height > best, start + highest, best_sample)
             best = np.maximum(best, height)
-        return best, where
+        return best, best_sample
 
     def _states(self, x: Array, part: slice, disturbances: Array | None, deviations: Array | None) -> Array:
         """States ``(s, times, d)`` of some samples."""
-        signal, begun = (None if drawn is None else drawn[part] for drawn in (disturbances, deviations))
-        path = self._fine.states(self.base.functionals.on_grid(x), self.parameters[part], signal, begun)
+        signal, deviation = (None if samples is None else samples[part] for samples in (disturbances, deviations))
+        path = self._fine.states(self.base.functionals.on_grid(x), self.parameters[part], signal, deviation)
         return path[:, self._kept]
 
     @cached_property

@@ -129,13 +129,14 @@ class Sensitivity:
         indices, rows = np.asarray(indices, dtype=float), np.asarray(rows, dtype=int)
         size = self._response.grid.pieces * self._tangent.initial_state.size * max(1, indices.shape[1] - 1 - self._nu)
         step = max(1, CHUNK // size)
-        parts = [slice(start, start + step) for start in range(0, indices.shape[0], step)]
-        if not parts:
+        chunks = [slice(start, start + step) for start in range(0, indices.shape[0], step)]
+        if not chunks:
             return indices, np.zeros((0, self._response.grid.pieces, self._response.system.disturbances))
-        found = [
-            self._slopes(x, indices[part], rows[part], None if signals is None else signals[part]) for part in parts
+        pairs = [
+            self._slopes(x, indices[chunk], rows[chunk], None if signals is None else signals[chunk])
+            for chunk in chunks
         ]
-        return np.vstack([slope for slope, _ in found]) * self._moves, np.concatenate([weights for _, weights in found])
+        return np.vstack([slope for slope, _ in pairs]) * self._moves, np.concatenate([weights for _, weights in pairs])
 
     def _slopes(self, x: Array, indices: Array, rows: Array, signals: Array | None) -> tuple[Array, Array]:
         times, points, z = np.split(indices, [1, 1 + self._nu], axis=1)
@@ -209,15 +210,17 @@ class Sensitivity:
     ) -> tuple[Array, Array]:
         """The weights of ``c'A x(t)``: those of ``c'x(t)`` times ``A``, which commutes with ``e^{As}``; of a system
         that changes those of the direction ``A'c``, with the ``A`` of the time of the index."""
-        response, mode = self._response, self._response.grid.mode
+        response, mode_of_piece = self._response, self._response.grid.mode
         if response.grid.varying:  # whose derivative in time is made otherwise
             return np.zeros(known[0][:, 0, 0].shape), np.zeros(known[1][:, 0, :, 0].shape)
-        every = [one.matrices(parameters)[0] for one in response.system.modes]
-        if mode is None:
+        matrices = [mode.matrices(parameters)[0] for mode in response.system.modes]
+        if mode_of_piece is None:
             along, gains, shares = known
-            free, driven = (np.einsum("kb,kb...->k...", shares, part) for part in (along[:, :, 0], gains[:, :, :, 0]))
-            return (free[:, None] @ every[0])[:, 0], driven @ every[0]
-        A = np.stack(every, axis=1)[np.arange(times.size), mode[pieces]]
+            free, input_weights = (
+                np.einsum("kb,kb...->k...", shares, array) for array in (along[:, :, 0], gains[:, :, :, 0])
+            )
+            return (free[:, None] @ matrices[0])[:, 0], input_weights @ matrices[0]
+        A = np.stack(matrices, axis=1)[np.arange(times.size), mode_of_piece[pieces]]
         return response.adjoint(times, (c[:, None] @ A)[:, 0], parameters)[:2]
 
     def _differing(self, times: Array, parameters: Array, at: Functional, x: Array, signals: Array | None) -> Array:
@@ -225,8 +228,8 @@ class Sensitivity:
         control, box = self.constraint.functionals.on_grid(x), self.constraint.parameters
 
         def value(p: Array, of: np.ndarray) -> Array:
-            known = self._response.weights(times[of], at.direction[of], p)
-            return _seen(known, at.start[of], control, None if signals is None else signals[of])
+            weights = self._response.weights(times[of], at.direction[of], p)
+            return _seen(weights, at.start[of], control, None if signals is None else signals[of])
 
         if not self._nu:
             return np.zeros((times.size, 0))
@@ -236,37 +239,38 @@ class Sensitivity:
         """`Functional.in_time` of a system that changes with time, ``c'(A(t) x(t) + B(t) u + E(t) w)``."""
         A, inputs = self._response.propagator.law.entries(times, parameters)
         along, pushes = (at.direction[:, None] @ A)[:, 0], (at.direction[:, None] @ inputs)[:, 0]
-        known = self._response.weights(times, along, parameters)
+        weights = self._response.weights(times, along, parameters)
         control = self.constraint.functionals.on_grid(x)
         acting = control[:, at.now].T
-        found = _seen(known, at.start, control, signals)
+        values = _seen(weights, at.start, control, signals)
         if signals is not None:
             acting = np.hstack([acting, signals[np.arange(times.size), :, at.now]])
-        return np.asarray(found + (pushes[:, : acting.shape[1]] * acting).sum(axis=1))[:, None]
+        return np.asarray(values + (pushes[:, : acting.shape[1]] * acting).sum(axis=1))[:, None]
 
     def _pieces(self, times: Array) -> np.ndarray:
         """The pieces on which the times are approached: from the left, but from the right at the start of the
         window."""
         grid = self._response.grid
-        entered = np.clip(np.searchsorted(grid.breakpoints, times, side="right") - 1, 0, grid.pieces - 1)
-        return np.where(times <= self.constraint.start, entered, grid.locate(times))
+        right_pieces = np.clip(np.searchsorted(grid.breakpoints, times, side="right") - 1, 0, grid.pieces - 1)
+        return np.where(times <= self.constraint.start, right_pieces, grid.locate(times))
 
     def _entered(self, weights: Array, at: Functional) -> Array:
         """The weights on the disturbance, with a trace of a piece that is only just entered and has none yet."""
         fresh = np.flatnonzero(~at.driven[np.arange(at.now.size), at.now, 0].any(axis=1))
         if not fresh.size:
             return weights
-        entered = weights.copy()
+        filled_weights = weights.copy()
         grid = self._response.grid
         trace = ENTERED * grid.lengths[at.now[fresh], None] * at.direction[fresh]
         gains = np.zeros((fresh.size, grid.pieces, trace.shape[1]))
         gains[np.arange(fresh.size), at.now[fresh]] = trace
-        found = grid.through(gains, at.W[fresh, 0])
-        entered[fresh, at.now[fresh]] = found[np.arange(fresh.size), at.now[fresh]]
-        return entered
+        trace_weights = grid.through(gains, at.W[fresh, 0])
+        filled_weights[fresh, at.now[fresh]] = trace_weights[np.arange(fresh.size), at.now[fresh]]
+        return filled_weights
 
     def _sigma_slopes(self, times: Array, parameters: Array, at: Functional) -> tuple[Array, Array, Array]:
-        """What measurable disturbances add to the derivatives in time, parameters and directions."""
+        """Return the derivatives of the contribution of measurable disturbances in time, in parameters and in the
+        shares of directions."""
         support, grid = self.constraint.functionals.measurable, self._response.grid
         assert support is not None
         if grid.mode is None:
@@ -276,8 +280,8 @@ class Sensitivity:
 
             ends, step = grid.breakpoints[[at.now, at.now + 1]], STEP * float(grid.breakpoints[-1])
             low, high = np.clip([times - step, times + step], *ends)
-            moved = support(high, at.direction, parameters) - support(low, at.direction, parameters)
-            in_time = (moved / (high - low))[:, None]
+            change = support(high, at.direction, parameters) - support(low, at.direction, parameters)
+            in_time = (change / (high - low))[:, None]
         in_parameters = np.zeros((times.size, self._nu))
         if self._nu:
             box = self.constraint.parameters.box
@@ -287,12 +291,15 @@ class Sensitivity:
         return in_time, in_parameters, self._in_shares(at, lambda c, of: support(times[of], c, parameters[of]))
 
     def _in_shares(self, at: Functional, value: Callable[[Array, np.ndarray], Array]) -> Array:
-        """The derivatives ``(k, b)`` of a value of directions ``(j, d)``, of the indices of these numbers, in the
-        shares of the normals that a direction of a curved set is made of; 0 where it is flat."""
+        """Return the derivatives ``(k, b)`` of a function of directions in the shares of the normals that make up a
+        direction of a curved set; 0 for flat sides.
+
+        ``value`` takes directions ``(j, d)`` and the numbers ``(j,)`` of their indices.
+        """
         if self.constraint.index_set.dimension == 1 + self._nu:
             return np.zeros(at.shares.shape)
-        normals, wide = at.directions[0], np.full(at.shares.shape[1], 2.0)
-        return differences(lambda shares, of: value(shares @ normals, of), at.shares, -wide, wide)
+        normals, bound = at.directions[0], np.full(at.shares.shape[1], 2.0)
+        return differences(lambda shares, of: value(shares @ normals, of), at.shares, -bound, bound)
 
     @property
     def _response(self) -> Response:
@@ -308,7 +315,7 @@ class Sensitivity:
 
     @cached_property
     def _moves(self) -> Array:
-        """1 for the coordinates ``(d,)`` of the index that can move, 0 for the others."""
+        """Factors ``(d,)`` of the coordinates of the index: 1 for those that can move, 0 for the others."""
         box = self.constraint.index_set
         return np.asarray(box.upper > box.lower, dtype=float)
 
@@ -316,5 +323,5 @@ class Sensitivity:
 def _seen(known: Weights, start: Array, control: Array, signals: Array | None) -> Array:
     """The functionals ``(k,)`` with these weights, from states ``start (k, d)``, under inputs on the pieces, ``(m, L)``
     and ``(k, mw, L)``."""
-    found = (known.free * start).sum(axis=1) + np.einsum("klm,ml->k", known.control, control)
-    return np.asarray(found if signals is None else found + np.einsum("klw,kwl->k", known.disturbance, signals))
+    values = (known.free * start).sum(axis=1) + np.einsum("klm,ml->k", known.control, control)
+    return np.asarray(values if signals is None else values + np.einsum("klw,kwl->k", known.disturbance, signals))

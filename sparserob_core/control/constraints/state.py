@@ -1,4 +1,4 @@
-"""What every constraint on the state offers: to a program, to proofs, to studies of single trajectories."""
+"""Interface of constraints on the state, for programs, for proofs, and for studies of single trajectories."""
 
 from __future__ import annotations
 
@@ -85,24 +85,26 @@ class StateConstraint(Source):
 
     @abstractmethod
     def explain(self, index: Float[Array, " j"], row: int) -> TimedExplanation:
-        """One constraint for people: what is bounded, when, and what the uncertainty does to it."""
+        """Return the description of one constraint for a reader: the bounded quantity, its time, and the effect of the
+        uncertainty."""
 
     @abstractmethod
     def nominal(self) -> StateConstraint:
-        """The same constraint without uncertainty: a middle parameter, and no disturbance (or a middle one where none
-        is not admissible)."""
+        """Return the same constraint without uncertainty: at a middle parameter, and without a disturbance (or with a
+        middle one, where no disturbance is not admissible)."""
 
     @abstractmethod
     def from_state(self, initial_state: Float[Array, " d"]) -> StateConstraint:
-        """The same constraint from another initial state ``(d,)``; what does not depend on it is shared."""
+        """Return the same constraint from another initial state ``(d,)``, sharing all data that do not depend on the
+        initial state."""
 
     @abstractmethod
     def divided(self, units: Float[Array, " r"]) -> StateConstraint:
-        """The same constraint with its rows divided by ``units (r,)``, one for a curved set."""
+        """Return the same constraint with its rows divided by ``units (r,)``; a curved set has one unit."""
 
     @shaped
     def looked_at_in(self, units: Float[Array, " r"]) -> StateConstraint:
-        """`divided`, of a constraint that has been looked at: what is known of it at samples is shared."""
+        """Return the `divided` constraint, which shares the samples of this one."""
         return self.divided(units)
 
     @abstractmethod
@@ -122,8 +124,11 @@ class StateConstraint(Source):
 
     @abstractmethod
     def beside(self, x: Float[Array, " n"], times: Float[Array, " k"]) -> Float[Array, "k j"]:
-        """What is added at times ``(k,)``, for a decision ``x (n,)``: to the rows of a set with flat sides, ``(k, r)``,
-        ``G u(t) - H r(t)``; to the state for a curved one, ``(k, d)``, ``-r(t)``."""
+        """Return the terms that are added at times ``(k,)`` for a decision ``x (n,)``.
+
+        For flat sides ``G u(t) - H r(t)``, ``(k, r)``, is added to the rows. For a curved set ``-r(t)``, ``(k, d)``, is
+        added to the state.
+        """
 
     @abstractmethod
     def outwardness(self, states: Float[Array, "d n"], beside: Float[Array, " j"] | None = None) -> Float[Array, " n"]:
@@ -132,14 +137,14 @@ class StateConstraint(Source):
 
     @shaped
     def excess(self, states: Float[Array, "d n"], beside: Float[Array, " j"] | None = None) -> Float[Array, " n"]:
-        """By how much states ``(d, n)`` violate the constraint, ``(n,)``; negative: a margin. With flat sides the
-        `outwardness` itself."""
+        """Return the violation ``(n,)`` of the constraint by states ``(d, n)``, negative where there is a margin. With
+        flat sides it is the `outwardness` itself."""
         return self.outwardness(states, beside)
 
     @shaped
     def direct(self, times: Float[Array, " k"]) -> Float[Array, "q n"] | None:
-        """What the control adds by itself to all rows at times ``(k,)``, as rows ``(k r, n)`` of the decision, time by
-        time; ``None`` where it adds nothing."""
+        """Return the direct contribution of the control to all rows at times ``(k,)``, as rows ``(k r, n)`` of the
+        decision, time by time; ``None`` where there is none."""
         return None
 
     @shaped
@@ -151,7 +156,7 @@ class StateConstraint(Source):
 
     @property
     def of_state(self) -> StateConstraint:
-        """Itself."""
+        """Constraint on the state without feedback, which is this constraint."""
         return self
 
     @property
@@ -187,17 +192,18 @@ class StateConstraint(Source):
         return {}
 
     def normals_in(self, units: Units) -> tuple[Array, Array]:
-        """Those of any index, and the units of states, and of controls where they are mixed."""
+        """Return the normals of the rows at one index, ``(r, q)``, and the units of the states, with those of the
+        controls for a mixed constraint, ``(q,)``."""
         coordinates = units.states if self.gains is None else np.concatenate([units.states, units.controls])
         return self.normals_at(self.index_set.lower), coordinates
 
     def index_units(self, units: Units) -> Array:
-        """Those of a time and a parameter."""
+        """Return the units of time and parameters, the first coordinates of a reduced index."""
         return np.concatenate([[units.time], units.parameters])
 
     def states_of(self, row: int) -> np.ndarray:
-        """Which states ``(d,)`` a row is about, those that the set looks at where it is curved; none where there is no
-        such row."""
+        """Return which states ``(d,)`` a row depends on; for a curved set, which states it bounds; no state where there
+        is no such row."""
         if self.shape is not None:
             normals = self.shape.frame
         else:
@@ -220,9 +226,9 @@ class StateConstraint(Source):
     def at(self, x: Float[Array, " n"], indices: Float[Array, "k j"]) -> Float[Array, "k r"]:
         """`violations` of all rows at indices ``(k, ...)``, ``(k, r)``."""
         times, directions, parameters, rhs = self.functionals_at(indices)
-        found, direct = self.functionals.values(x, times, directions, parameters) - rhs, self.direct(indices[:, 0])
+        violations, direct = self.functionals.values(x, times, directions, parameters) - rhs, self.direct(indices[:, 0])
         shape = (indices.shape[0], times.size // max(1, indices.shape[0]))
-        return np.asarray(found if direct is None else found + direct @ x).reshape(shape)
+        return np.asarray(violations if direct is None else violations + direct @ x).reshape(shape)
 
     @shaped
     def chosen(
@@ -230,10 +236,10 @@ class StateConstraint(Source):
     ) -> tuple[Float[Array, "k n"], Float[Array, " k"]]:
         """``G (k, n)``, ``rhs (k,)`` of one row of each index ``(k, ...)``, none of the others made."""
         times, directions, parameters, rhs = self.functionals_at(indices)
-        mine = np.arange(rows.size) * (times.size // max(1, rows.size)) + rows
-        G, offset = self.functionals.rows(times[mine], directions[mine], parameters[mine])
+        positions = np.arange(rows.size) * (times.size // max(1, rows.size)) + rows
+        G, offset = self.functionals.rows(times[positions], directions[positions], parameters[positions])
         direct = self.direct(indices[:, 0])
-        return (G if direct is None else G + direct[mine]), rhs[mine] - offset
+        return (G if direct is None else G + direct[positions]), rhs[positions] - offset
 
     @shaped
     def rows(self, indices: Float[Array, "k j"]) -> tuple[Float[Array, "k r n"], Float[Array, "k r"]]:

@@ -1,1 +1,1 @@
-"""What a control that answers its measurements makes of the state: innovations, gains, the closed loop."""
+"""Feedback of measurements: innovations, gains, and the state of the closed loop."""

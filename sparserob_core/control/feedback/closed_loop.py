@@ -1,8 +1,9 @@
-"""What the state does when the control answers the disturbance: linear in the deviations, exactly, at all times.
+"""State of the closed loop at all times: an exact affine function of the deviations.
 
-With the effects ``F`` of the gains, the control on piece ``k`` is ``u_k = v_k + F_k w``, and the state
-``x(t) = x_v(t) + sum_q y_q(t) w_q``: every ``y_q`` is the state of the same system from 0, driven by column ``q`` of
-the effects and by its own entry of the disturbance; where the initial states are a set, its last columns begin there.
+With the effects ``F`` of the gains, the control on piece ``k`` is ``u_k = v_k + F_k w``, and the state is
+``x(t) = x_v(t) + sum_q y_q(t) w_q``. Every response ``y_q`` is the state of the same system from 0, driven by column
+``q`` of the effects and by its own entry of the disturbance. Where the initial states are a set, the last entries of
+``w`` are deviations of the initial state, and their responses begin at its unit vectors.
 """
 
 from __future__ import annotations
@@ -34,14 +35,30 @@ FLOWS_KEPT = 8  # lists of times to which transitions of a system in t are remem
 @final
 @dataclass(frozen=True, eq=False)
 class ClosedLoop:
-    """The functionals of one system whose control answers what it sees.
+    """Functionals of one system whose control responds to its measurements.
 
-    The decision ``x (n,)`` begins with the nominal control ``v (m, K)``, raveled; the variables of ``answers`` follow,
-    and then whatever else the program has. ``spread``: the deviations of the disturbance, block after block (of
-    ``measurable`` ones what they make of the state at the end of every piece of the grid), of the noise of what is
-    measured, breakpoint after breakpoint, and of the initial state where there is a set of them. ``observer``: what
-    makes innovations of outputs; they are those of the whole state where there is none. ``anew``: before those of the
-    initial state come those of the next period's, of a plan that repeats, which only the step across the seam sees.
+    The decision ``x (n,)`` begins with the nominal control ``v (m, K)``, raveled. The variables of ``answers`` follow,
+    and then all other variables of the program.
+
+    Parameters
+    ----------
+    functionals : WorstCase
+        Functionals of the system.
+    answers : Answers
+        Variables of the gains.
+    spread : Spread
+        Set of deviations: those of the disturbance, block after block; those of the noise, breakpoint after breakpoint;
+        and those of the initial state, where there is a set of them. A measurable disturbance deviates by its effect on
+        the state at the end of every piece of the grid.
+    variables : int
+        Number of variables of the program.
+    measurable : MeasurablePieces, optional
+        Effects of measurable disturbances.
+    observer : Observer, optional
+        Source of the innovations of outputs. Without an observer they are the innovations of the whole state.
+    anew : bool, default False
+        Whether the plan repeats with a new initial state. The deviations of the next period's initial state then stand
+        before those of the initial state; only the step across the seam depends on them.
     """
 
     functionals: WorstCase
@@ -56,34 +73,35 @@ class ClosedLoop:
 
     @property
     def nominal_size(self) -> int:
-        """How many variables the nominal control has."""
+        """Number of variables of the nominal control."""
         return self.functionals.variables
 
     @property
     def scales(self) -> bool:
-        """Whether deviations are those of a disturbance alone, as it is, so that they can be `scaled`."""
+        """True where the deviations are in copies of a single set and no disturbance is measurable, so that they can be
+        `scaled`."""
         return self.measurable is None and len(self.spread.sets) == 1
 
     def scaled(self, factor: float) -> ClosedLoop:
-        """The same loop where all deviations are ``factor`` times as large."""
+        """Return the same loop with all deviations multiplied by ``factor``."""
         sets = tuple((count, convex.scaled(factor)) for count, convex in self.spread.sets)
         return replace(self, spread=replace(self.spread, sets=sets), _paths={})
 
     def nominal(self, x: Array) -> Array:
-        """The nominal control ``(m, K)``."""
+        """Return the nominal control ``(m, K)`` of the decision ``x (n,)``."""
         return x[: self.nominal_size].reshape(-1, self.functionals.dictionary.pieces)
 
     def effects(self, x: Array) -> Array:
-        """``F (K, m, Q)``."""
+        """Return the effects ``F (K, m, Q)`` of the deviations on the control, at the decision ``x (n,)``."""
         return self.answers.effects(x[self.nominal_size : self.nominal_size + self.answers.variables])
 
     def gains(self, x: Array) -> Array:
-        """``M (K, K, m, d)``."""
+        """Return the gains ``M (K, K, m, d)`` at the decision ``x (n,)``."""
         return self.answers.gains(x[self.nominal_size : self.nominal_size + self.answers.variables])
 
     def written(self, x: Array | None) -> dict[str, Array]:
-        """What is written down of how a decision answers: its `gains`, where there is a decision, and of outputs the
-        ``observer (K, d, p)``."""
+        """Return the arrays of the feedback that are stored in files: its ``gains`` at the decision ``x``, if there is
+        one, and the gains ``(K, d, p)`` of its ``observer``, if outputs are measured."""
         observer = {} if self.observer is None else {"observer": self.observer.L}
         return observer if x is None else {"gains": self.gains(x), **observer}
 
@@ -101,7 +119,7 @@ class ClosedLoop:
 
     @cached_property
     def origin(self) -> np.ndarray:
-        """The piece of the grid of control and disturbance that each of these is in, ``(L,)``."""
+        """Piece of the grid of control and disturbance that holds each piece of the loop's own grid, ``(L,)``."""
         return np.arange(self.grid.pieces) if self.motion is None else self.motion.origin
 
     @cached_property
@@ -111,7 +129,8 @@ class ClosedLoop:
 
     @cached_property
     def entries(self) -> Array:
-        """Which entries of the deviations act on every piece of the grid, and how: ``(L, mw, Q)``."""
+        """Matrices ``(L, mw, Q)`` from all deviations to the deviation of the disturbance on every piece of the grid; 0
+        for measurable disturbances."""
         model, grid = self.functionals.disturbance, self.functionals.response.grid
         width = self.functionals.response.system.disturbances
         table = np.zeros((grid.pieces, width, self.spread.size))
@@ -124,14 +143,14 @@ class ClosedLoop:
 
     @cached_property
     def begins(self) -> Array:
-        """Which entries of the deviations are those of the initial state, ``(d, Q)``."""
+        """Matrix ``(d, Q)`` from all deviations to the deviation of the initial state."""
         d = self.functionals.response.initial_state.size
         count = 0 if self.functionals.initial is None else d
         return np.hstack([np.zeros((d, self.spread.size - count)), np.eye(d, count)])
 
     @property
     def noise(self) -> slice:
-        """Which entries of the deviations are those of the noise; none where there is none."""
+        """Slice of the deviations that belongs to the noise of the measurements; empty where there is no noise."""
         last = self.spread.size - int(self.begins.sum()) * (1 + self.anew)
         noisy = self.observer is not None and self.observer.noisy
         return slice(last - (self.answers.shape[0] * self.answers.shape[3] if noisy else 0), last)
@@ -143,12 +162,12 @@ class ClosedLoop:
 
     @cached_property
     def innovations(self) -> Array:
-        """What every innovation is of the deviations, ``(K, p, Q)``."""
-        problem, begun = self.functionals, int(self.begins.sum())
-        seen = innovations_seen(
-            problem.response, problem.dictionary, problem.disturbance, begun > 0, pieces=self.measurable
+        """Matrices ``(K, p, Q)`` from all deviations to every innovation."""
+        problem, initial_count = self.functionals, int(self.begins.sum())
+        state_innovations = innovations_seen(
+            problem.response, problem.dictionary, problem.disturbance, initial_count > 0, pieces=self.measurable
         )
-        return innovations_of(seen, begun, self.observer, self.anew)
+        return innovations_of(state_innovations, initial_count, self.observer, self.anew)
 
     @cached_property
     def expected(self) -> tuple[Array, Array]:
@@ -157,15 +176,16 @@ class ClosedLoop:
 
     @cached_property
     def following(self) -> Array:
-        """Which entries of the deviations are those of the next period's initial state, ``(d, Q)``."""
+        """Matrix ``(d, Q)`` from all deviations to that of the next period's initial state; 0 unless the plan repeats
+        ``anew``."""
         d = self.begins.shape[0]
         return np.roll(self.begins, -d, axis=1) * self.anew
 
     @cached_property
     def start(self) -> Array:
         """The initial state ``(d,)`` that deviations are counted from."""
-        begun: Array = self.functionals.response.initial_state + self.begins @ self.spread.middle
-        return begun
+        initial_state: Array = self.functionals.response.initial_state + self.begins @ self.spread.middle
+        return initial_state
 
     @cached_property
     def middles(self) -> Array:
@@ -175,62 +195,70 @@ class ClosedLoop:
         return np.asarray(self.entries @ self.spread.middle)
 
     def inputs(self, x: Array) -> Array:
-        """What acts on the pieces of the grid, nominally and as answers: control, drift and disturbance, ``(L, m + mw,
-        1 + Q)``."""
+        """Return the nominal inputs on the pieces of the grid and their responses to the deviations,
+        ``(L, m + mw, 1 + Q)``. The rows are control, drift and disturbance."""
         grid, m, origin = self.grid, self.answers.shape[1], self.origin
         nominal = np.concatenate([grid.inputs(self.nominal(x)).T[:, :, None], self.middles[origin, :, None]], axis=1)
-        acts, entries = grid.control_piece >= 0, self.entries[origin]
-        answered = np.zeros((*nominal.shape[:2], entries.shape[2]))
-        answered[:, nominal.shape[1] - entries.shape[1] :] = entries
-        answered[acts, :m] = self.effects(x)[grid.control_piece[acts]]
-        return np.concatenate([nominal, answered], axis=2)
+        has_control, entries = grid.control_piece >= 0, self.entries[origin]
+        responses = np.zeros((*nominal.shape[:2], entries.shape[2]))
+        responses[:, nominal.shape[1] - entries.shape[1] :] = entries
+        responses[has_control, :m] = self.effects(x)[grid.control_piece[has_control]]
+        return np.concatenate([nominal, responses], axis=2)
 
     def drives(self, x: Array) -> Array:
-        """What drives the nominal state and every response, on the pieces of the grid: ``(L, d, 1 + Q)``; of a system
-        that changes with time, through which matrices too, so that it is the `inputs` themselves."""
+        """Return the driving terms of the nominal state and of every response on the pieces of the grid,
+        ``(L, d, 1 + Q)``.
+
+        In a system that changes with time, the matrices of the inputs change within a piece. The `inputs` themselves
+        are then returned.
+        """
         if self.motion is not None:
             return self.inputs(x)
         B, E = (self.grid.of_modes(matrices)[self.grid.modes] for matrices in (self.steps.B[0], self.steps.E[0]))
         return np.asarray(np.concatenate([B, E], axis=2) @ self.inputs(x))
 
     def path(self, x: Array) -> tuple[Array, Array]:
-        """The nominal state and every response at the breakpoints of the grid, ``(L + 1, d, 1 + Q)``, and what drives
-        them; those of the last few decisions are remembered. What measurable disturbances have done is told when a
-        piece is over."""
+        """Return the nominal state and every response at the breakpoints of the grid, ``(L + 1, d, 1 + Q)``, and their
+        `drives`.
+
+        Results for the last two decisions are kept. The effect of a measurable disturbance is added at the end of its
+        piece.
+        """
         key = x.tobytes()
         if key not in self._paths:
             response, drives, motion = self.functionals.response, self.drives(x), self.motion
-            Phi, Gamma, which = self.steps.Phi[0], self.steps.Gamma[0], response.which
+            Phi, Gamma, step_numbers = self.steps.Phi[0], self.steps.Gamma[0], response.which
             if motion is not None:
-                Phi, Gamma, which = motion.flow.state, motion.inputs, motion.every
+                Phi, Gamma, step_numbers = motion.flow.state, motion.inputs, motion.every
             nodes = np.zeros((drives.shape[0] + 1, self.start.size, drives.shape[2]))
             nodes[0] = np.column_stack([self.start, self.begins])
-            over = np.append(np.diff(self.origin) > 0, True)
-            for piece, length in enumerate(which.tolist()):
-                nodes[piece + 1] = Phi[length] @ nodes[piece] + Gamma[length] @ drives[piece]
-                if self.measurable is not None and over[piece]:
-                    place, outward = self.measurable.at(int(self.origin[piece]))
-                    nodes[piece + 1, :, 1:][:, place] += outward
+            is_last = np.append(np.diff(self.origin) > 0, True)
+            for piece, step in enumerate(step_numbers.tolist()):
+                nodes[piece + 1] = Phi[step] @ nodes[piece] + Gamma[step] @ drives[piece]
+                if self.measurable is not None and is_last[piece]:
+                    entries, outward = self.measurable.at(int(self.origin[piece]))
+                    nodes[piece + 1, :, 1:][:, entries] += outward
             while len(self._paths) > 1:
                 self._paths.pop(next(iter(self._paths)))
             self._paths[key] = (nodes, drives)
         return self._paths[key]
 
     def states(self, x: Array, times: Array, pieces: np.ndarray | None = None) -> Array:
-        """The nominal state and every response at ``times (k,)``, which lie in these pieces: ``(k, d, 1 + Q)``."""
+        """Return the nominal state and every response at ``times (k,)``, which lie in the given ``pieces (k,)`` of the
+        grid: ``(k, d, 1 + Q)``."""
         pieces = self.grid.locate(times) if pieces is None else pieces
         nodes, drives = self.path(x)
-        flow, driven = self._flows_in(pieces, np.clip(times - self.grid.breakpoints[pieces], 0.0, None))
-        return np.asarray(flow @ nodes[pieces] + driven @ drives[pieces])
+        flow, input_flow = self._flows_in(pieces, np.clip(times - self.grid.breakpoints[pieces], 0.0, None))
+        return np.asarray(flow @ nodes[pieces] + input_flow @ drives[pieces])
 
     def _enclosed(self, x: Array, times: Array, pieces: np.ndarray) -> tuple[Array, Array]:
         """The `states` at ``times (k,)`` on these pieces, and their rounding error under any deviation, ``(k, d)``."""
         nodes, drives = self.path(x)
-        flow, driven = self._flows_in(pieces, np.clip(times - self.grid.breakpoints[pieces], 0.0, None))
-        sizes, pushed, errors = self._rounded(x)
-        added = np.abs(flow) @ sizes[pieces, :, None] + np.abs(driven) @ pushed[pieces, :, None]
-        off = ROUND_OFF * added + np.abs(flow) @ errors[pieces, :, None]
-        return np.asarray(flow @ nodes[pieces] + driven @ drives[pieces]), off[:, :, 0]
+        flow, input_flow = self._flows_in(pieces, np.clip(times - self.grid.breakpoints[pieces], 0.0, None))
+        sizes, drive_sizes, errors = self._rounded(x)
+        magnitudes = np.abs(flow) @ sizes[pieces, :, None] + np.abs(input_flow) @ drive_sizes[pieces, :, None]
+        rounding_errors = ROUND_OFF * magnitudes + np.abs(flow) @ errors[pieces, :, None]
+        return np.asarray(flow @ nodes[pieces] + input_flow @ drives[pieces]), rounding_errors[:, :, 0]
 
     def _rounded(self, x: Array) -> tuple[Array, Array, Array]:
         """The sizes of the nodes ``(L + 1, d)`` and of what drives them ``(L, ..)`` under any deviation, and the
@@ -242,19 +270,23 @@ class ClosedLoop:
         key = x.tobytes()
         if key not in self._errors:
             (nodes, drives), radii = self.path(x), np.concatenate([[1.0], self.spread.radii])
-            sizes, pushed = np.abs(nodes) @ radii, np.abs(drives) @ radii
+            sizes, drive_sizes = np.abs(nodes) @ radii, np.abs(drives) @ radii
             errors = np.zeros_like(sizes)
             if self.motion is None:
-                Phi, Gamma, which = self.steps.Phi[0], self.steps.Gamma[0], self.functionals.response.which
-                every = np.empty((which.size, *Phi.shape[1:]))
-                step = np.einsum("kij,kj->ki", np.abs(Phi)[which], sizes[:-1])
-                step = ROUND_OFF * (step + np.einsum("kij,kj->ki", np.abs(Gamma)[which], pushed))
-                for piece, length in enumerate(which.tolist()):
-                    every[:piece] = Phi[length] @ every[:piece]
-                    every[piece] = np.eye(self.start.size)
-                    errors[piece + 1] = np.einsum("kij,kj->i", np.abs(every[: piece + 1]), step[: piece + 1])
+                Phi, Gamma, step_numbers = self.steps.Phi[0], self.steps.Gamma[0], self.functionals.response.which
+                transitions = np.empty((step_numbers.size, *Phi.shape[1:]))
+                step_errors = np.einsum("kij,kj->ki", np.abs(Phi)[step_numbers], sizes[:-1])
+                step_errors = ROUND_OFF * (
+                    step_errors + np.einsum("kij,kj->ki", np.abs(Gamma)[step_numbers], drive_sizes)
+                )
+                for piece, step in enumerate(step_numbers.tolist()):
+                    transitions[:piece] = Phi[step] @ transitions[:piece]
+                    transitions[piece] = np.eye(self.start.size)
+                    errors[piece + 1] = np.einsum(
+                        "kij,kj->i", np.abs(transitions[: piece + 1]), step_errors[: piece + 1]
+                    )
             self._errors.clear()
-            self._errors[key] = sizes, pushed, errors
+            self._errors[key] = sizes, drive_sizes, errors
         return self._errors[key]
 
     @cached_property
@@ -267,16 +299,17 @@ class ClosedLoop:
         return np.asarray(np.maximum(self.height(along), self.height(-along)).max(axis=0))
 
     def _flows_in(self, pieces: np.ndarray, durations: Array) -> tuple[Array, Array]:
-        """What the first ``durations (k,)`` of ``pieces (k,)`` of the grid make of a state, and of what drives it."""
+        """Return the matrices that propagate a state, and the terms that drive it, over the first ``durations (k,)`` of
+        ``pieces (k,)`` of the grid."""
         if self.motion is None:
             return self.functionals.response.flows_in(pieces, durations)
         starts = self.grid.breakpoints[pieces]
         key = np.concatenate([starts, durations]).tobytes()
         if key not in self._flows:
-            distinct, which = np.unique(np.stack([starts, starts + durations]), axis=1, return_inverse=True)
-            over, which = self.motion.expansion.flow(distinct[0], distinct[1]), which.reshape(-1)
-            driven = np.concatenate([over.control, over.disturbance], axis=2)
-            remember(self._flows, key, (over.state[which], driven[which]), FLOWS_KEPT)
+            distinct, inverse = np.unique(np.stack([starts, starts + durations]), axis=1, return_inverse=True)
+            flows, inverse = self.motion.expansion.flow(distinct[0], distinct[1]), inverse.reshape(-1)
+            input_flow = np.concatenate([flows.control, flows.disturbance], axis=2)
+            remember(self._flows, key, (flows.state[inverse], input_flow[inverse]), FLOWS_KEPT)
         return self._flows[key]
 
     def height(self, along: Array) -> Array:
@@ -285,8 +318,8 @@ class ClosedLoop:
 
     def values(self, x: Array, times: Array, H: Array) -> Array:
         """``max_w H x(t)`` at ``times (k,)`` for ``H (r, d)``: ``(k, r)``."""
-        found = self.height(H @ self.states(x, times))
-        return found if self.measurable is None else found + self.measurable.within(times, H)
+        heights = self.height(H @ self.states(x, times))
+        return heights if self.measurable is None else heights + self.measurable.within(times, H)
 
     def bounds(self, x: Array, lower: Array, upper: Array, H: Array) -> Array:
         """Upper bounds ``(k, r)`` of ``max_w H x(t)`` over cells of time ``[lower, upper] (k,)``, each within one piece
@@ -308,30 +341,31 @@ class ClosedLoop:
         support function of a chord lies below the chord of the support functions.
         """
         pieces = self.grid.locate((lower + upper) / 2)
-        states, off = self._enclosed(x, np.concatenate([lower, upper]), np.tile(pieces, 2))
-        ends, off = np.split(states, 2), np.maximum(*np.split(off, 2))
+        states, rounding_errors = self._enclosed(x, np.concatenate([lower, upper]), np.tile(pieces, 2))
+        ends, rounding_errors = np.split(states, 2), np.maximum(*np.split(rounding_errors, 2))
         along = [H @ end for end in ends]
         radii = np.concatenate([[1.0], self.spread.radii])
-        late = self._late(x, H, lower, upper - lower, pieces, ends[0])
-        size = np.abs(H) @ np.maximum(np.abs(ends[0]), np.abs(ends[1]))
-        for end, more in zip(along, beside or (), strict=False):
-            end[..., : more.shape[-1]] += more
-            size[..., : more.shape[-1]] += np.abs(more)
-        found, lost = [self.height(one) for one in along], ROUND_OFF * (size @ radii)
-        lost += (np.abs(H) @ off[:, :, None])[:, :, 0]
+        chord_distances = self._late(x, H, lower, upper - lower, pieces, ends[0])
+        sizes = np.abs(H) @ np.maximum(np.abs(ends[0]), np.abs(ends[1]))
+        for end, addition in zip(along, beside or (), strict=False):
+            end[..., : addition.shape[-1]] += addition
+            sizes[..., : addition.shape[-1]] += np.abs(addition)
+        heights, error_bounds = [self.height(functional) for functional in along], ROUND_OFF * (sizes @ radii)
+        error_bounds += (np.abs(H) @ rounding_errors[:, :, None])[:, :, 0]
         if self.motion is not None:
-            lost += (np.abs(H) @ self._left_out(x, self.motion)[pieces][:, :, None])[:, :, 0]
+            error_bounds += (np.abs(H) @ self._left_out(x, self.motion)[pieces][:, :, None])[:, :, 0]
         if self.measurable is not None:
-            under_way = self.origin[pieces]
-            inside = (self.measurable.within(end, H, under_way) for end in (lower, upper))
-            found = [value + more for value, more in zip(found, inside, strict=True)]
-            lost += self.measurable.allowance(lower, upper, H, under_way) + MISSED * (size @ radii)
-        most = np.maximum(*found) + late + lost
-        return np.where(np.isnan(most), np.inf, most), late
+            origins = self.origin[pieces]
+            inside = (self.measurable.within(end, H, origins) for end in (lower, upper))
+            heights = [height + contribution for height, contribution in zip(heights, inside, strict=True)]
+            error_bounds += self.measurable.allowance(lower, upper, H, origins) + MISSED * (sizes @ radii)
+        bounds = np.maximum(*heights) + chord_distances + error_bounds
+        return np.where(np.isnan(bounds), np.inf, bounds), chord_distances
 
     def _late(self, x: Array, H: Array, start: Array, width: Array, pieces: np.ndarray, states: Array) -> Array:
-        """How far ``H x(t)`` may be from its chord on ``[start, start + width]``, each within one of the ``pieces
-        (k,)``, from ``states (k, d, 1 + Q)`` at the start, for any deviations: ``(k, r)``."""
+        """Bound the distance of ``H x(t)`` from its chord on every cell ``[start, start + width]``, for any deviations:
+        ``(k, r)``. Each cell lies within one of the ``pieces (k,)`` of the grid and begins in
+        ``states (k, d, 1 + Q)``."""
         drives, radii = self.path(x)[1][pieces], np.concatenate([[1.0], self.spread.radii])
         if self.motion is not None:
             return self.motion.bent(H, start, width, pieces, states, drives, radii)
@@ -354,14 +388,15 @@ class ClosedLoop:
         return np.asarray((h[..., 0] ** 2 / 8.0) * ((second + tail) @ radii))
 
     def _left_out(self, x: Array, motion: VaryingMotion) -> Array:
-        """What the transitions of a system that changes with time may be off by, on every piece, ``(L, d)``."""
+        """Bound the error that inexact transitions of a system that changes with time cause in the state on every
+        piece, ``(L, d)``."""
         nodes, inputs = self.path(x)
         radii = np.concatenate([[1.0], self.spread.radii])
-        begun, pushed = np.abs(nodes[:-1]) @ radii, motion.flow.sizes * (np.abs(inputs) @ radii)[:, None]
+        state_sizes, input_sizes = np.abs(nodes[:-1]) @ radii, motion.flow.sizes * (np.abs(inputs) @ radii)[:, None]
         if self.measurable is not None:
-            under_way, driven = self.measurable.reached
-            begun, pushed = begun + under_way, np.concatenate([pushed, driven], axis=2)
-        return motion.left_out(begun, pushed)
+            contributions, driving_sizes = self.measurable.reached
+            state_sizes, input_sizes = state_sizes + contributions, np.concatenate([input_sizes, driving_sizes], axis=2)
+        return motion.left_out(state_sizes, input_sizes)
 
     def worst(self, x: Array, time: float, direction: Array) -> Array:
         """A deviation ``(Q,)`` that attains the worst case of ``c'x(t)``."""
@@ -369,22 +404,28 @@ class ClosedLoop:
         return self.spread.worst(along[1:])
 
     def seen_from(self, times: Array, acting: np.ndarray | None = None) -> np.ndarray:
-        """The pieces ``(k,)`` of the grid in which the state at ``times (k,)`` is looked at. A breakpoint is one of the
-        piece that it ends; but where the control on a piece ``acting (k,)`` stands beside the state, which begins then,
-        of that: this control has answered what happened before."""
-        ends, found = self.functionals.dictionary.breakpoints, self.grid.locate(times)
-        return found if acting is None else np.maximum(found, np.searchsorted(self.grid.commanded(ends), acting))
+        """Return the pieces ``(k,)`` of the grid in which the state at ``times (k,)`` is taken.
+
+        A breakpoint belongs to the piece that it ends. With ``acting (k,)`` a row also contains the control on these
+        pieces. A control that begins at the breakpoint has responded to what happened before, so the state is then
+        taken in the piece that begins.
+        """
+        ends, pieces = self.functionals.dictionary.breakpoints, self.grid.locate(times)
+        return pieces if acting is None else np.maximum(pieces, np.searchsorted(self.grid.commanded(ends), acting))
 
     def signal(
         self, deviation: Array, time: float, direction: Array | None, acting: int | None = None
     ) -> tuple[Array, Array]:
-        """Breakpoints and the disturbance ``(mw, L)`` between them that has a deviation ``(Q,)``: on the pieces of the
-        grid, or measurable and the worst for ``direction'x(time)`` on the piece that holds ``time``, where the control
-        on piece ``acting`` may stand beside it."""
+        """Return breakpoints and the disturbance ``(mw, L)`` between them that has a deviation ``(Q,)``.
+
+        A disturbance on blocks is given on the pieces of the grid. A measurable disturbance is the worst for
+        ``direction'x(time)`` on the piece that holds ``time``; the row may also contain the control on piece
+        ``acting``.
+        """
         if self.measurable is not None:
-            beside = None if acting is None else np.array([acting])
-            over = int(self.origin[self.seen_from(np.array([time]), beside)[0]])
-            return self.measurable.signal(deviation, time, direction, over)
+            acting_pieces = None if acting is None else np.array([acting])
+            piece = int(self.origin[self.seen_from(np.array([time]), acting_pieces)[0]])
+            return self.measurable.signal(deviation, time, direction, piece)
         return self.functionals.response.grid.breakpoints, (self.entries @ (self.spread.middle + deviation)).T
 
     def begun(self, deviation: Array) -> Array:
@@ -394,9 +435,11 @@ class ClosedLoop:
     def state_rows(
         self, time: float, H: Array, h: Array, part: np.ndarray, factor: Array, acting: np.ndarray | None = None
     ) -> UncertainRows:
-        """The rows ``H x(t) <= h`` at one time, beside the control on the pieces ``acting (r,)`` where that is given,
-        as `UncertainRows`: row ``r`` is ``factor_r`` times the direction of its ``part_r``, the first row with which it
-        shares it."""
+        """Return the rows ``H x(t) <= h`` at one time as `UncertainRows`.
+
+        Row ``r`` is ``factor_r`` times the first row of its part, ``part_r``. With ``acting (r,)``, the rows will also
+        contain the control on these pieces (`with_control`).
+        """
         count = H.shape[0]
         firsts = [int(np.flatnonzero(part == p)[0]) for p in range(int(part.max()) + 1)]
         free, weights, on_noise = self.functionals.response.weights(np.full(count, time), H, np.zeros((count, 0)))
@@ -404,15 +447,15 @@ class ClosedLoop:
         offset = free @ self.start + self.functionals.given(weights)
         offset = offset + np.einsum("rli,li->r", on_noise, self.middles)
         K = self.functionals.dictionary.pieces
-        at, which, value = self.answers.effect
+        position, variable, value = self.answers.effect
         m, Q = self.answers.shape[1], self.spread.size
-        position, entry = at // Q, at % Q
-        piece, channel = position // m, position % m
-        parts = []
+        control_entry, entry = position // Q, position % Q
+        piece, channel = control_entry // m, control_entry % m
+        matrices = []
         for first in firsts:
             data = on_control[first].reshape(m, K)[channel, piece] * value
             kept = data != 0.0
-            parts.append(table_of(entry[kept], self.nominal_size + which[kept], data[kept], (Q, self.variables)))
+            matrices.append(table_of(entry[kept], self.nominal_size + variable[kept], data[kept], (Q, self.variables)))
         rows, columns = np.nonzero(on_control)
         g = table_of(rows, columns, on_control[rows, columns], (count, self.variables))
         d = np.einsum("pli,liq->pq", on_noise[firsts], self.entries) + free[firsts] @ self.begins
@@ -422,75 +465,82 @@ class ClosedLoop:
             for piece in np.unique(pieces):
                 rows = pieces == piece
                 offset[rows] += self.measurable.within(np.array([time]), H[rows], np.array([piece]))[0]
-        return UncertainRows(g, h - offset, part, factor, tuple(parts), d)
+        return UncertainRows(g, h - offset, part, factor, tuple(matrices), d)
 
     def with_control(self, rows: UncertainRows, G: Array, pieces: np.ndarray, following: bool = False) -> UncertainRows:
-        """The rows with ``G u_k`` added on the left, ``G (r, m)``, of the piece ``k`` of each, ``(r,)``; rows of one
-        part have the same direction of the control, times their factors, and the same piece. ``following``: the first
-        control of the next period, which answers that one's initial state."""
+        """Return the rows with ``G u_k`` added on the left, ``G (r, m)``, for the piece ``k`` of each row,
+        ``pieces (r,)``.
+
+        Rows of one part have the same direction of the control, times their factors, and the same piece. ``following``
+        says that the control is the first one of the next period, which responds to the initial state of that period.
+        """
         from scipy.sparse import csr_array
 
         K, Q = self.functionals.dictionary.pieces, self.spread.size
         row, channel = np.nonzero(G)
-        place = (row, channel * K + pieces[row])
-        g = csr_array(rows.g + csr_array((G[row, channel], place), shape=rows.g.shape))
-        parts = []
+        coordinates = (row, channel * K + pieces[row])
+        g = csr_array(rows.g + csr_array((G[row, channel], coordinates), shape=rows.g.shape))
+        matrices = []
         for p, C in enumerate(rows.C):
             first = int(np.flatnonzero(rows.part == p)[0])
-            at, which, value = self.of_piece(int(pieces[first]))
-            seen = at % Q - following * self.begins.shape[0]
-            added = csr_array((G[first][at // Q] * value, (seen, self.nominal_size + which)), shape=C.shape)
-            parts.append(csr_array(C + added))
-        return replace(rows, g=g, C=tuple(parts))
+            position, variable, value = self.of_piece(int(pieces[first]))
+            entry = position % Q - following * self.begins.shape[0]
+            response = csr_array(
+                (G[first][position // Q] * value, (entry, self.nominal_size + variable)), shape=C.shape
+            )
+            matrices.append(csr_array(C + response))
+        return replace(rows, g=g, C=tuple(matrices))
 
     def control_rows(self, piece: int, H: Array, h: Array, extra: Array | None = None) -> UncertainRows:
         """The rows ``H u_k <= h`` on one piece for every deviation; ``extra (r, n)`` is added on the left."""
         part, factor = shared(H, self.spread)
         firsts = [int(np.flatnonzero(part == p)[0]) for p in range(int(part.max()) + 1)]
-        at, which, value = self.of_piece(piece)
+        position, variable, value = self.of_piece(piece)
         Q, K = self.spread.size, self.functionals.dictionary.pieces
-        channel, entry = at // Q, at % Q
-        parts = []
+        channel, entry = position // Q, position % Q
+        matrices = []
         for first in firsts:
             data = H[first][channel] * value
             kept = data != 0.0
-            parts.append(table_of(entry[kept], self.nominal_size + which[kept], data[kept], (Q, self.variables)))
+            matrices.append(table_of(entry[kept], self.nominal_size + variable[kept], data[kept], (Q, self.variables)))
         rows, channels = np.nonzero(H)
         columns, values = channels * K + piece, H[rows, channels]
         if extra is not None:
-            more = np.nonzero(extra)
-            rows, columns = np.concatenate([rows, more[0]]), np.concatenate([columns, more[1]])
-            values = np.concatenate([values, extra[more]])
+            extra_entries = np.nonzero(extra)
+            rows, columns = np.concatenate([rows, extra_entries[0]]), np.concatenate([columns, extra_entries[1]])
+            values = np.concatenate([values, extra[extra_entries]])
         g = table_of(rows, columns, values, (H.shape[0], self.variables))
-        return UncertainRows(g, h, part, factor, tuple(parts), np.zeros((len(firsts), Q)))
+        return UncertainRows(g, h, part, factor, tuple(matrices), np.zeros((len(firsts), Q)))
 
     def controls(self, x: Array) -> Array:
         """The nominal control and its answers to the deviations on every piece, ``(K, m, 1 + Q)``."""
         return np.concatenate([self.nominal(x).T[:, :, None], self.effects(x)], axis=2)
 
     def of_piece(self, piece: int) -> tuple[np.ndarray, np.ndarray, Array]:
-        """Of `Answers.effect` what is about one piece: positions in ``(m, Q)``, variables and values."""
-        at, which, value = self.answers.effect
+        """Return the entries of `Answers.effect` that belong to one piece: positions in ``(m, Q)``, variables and
+        values."""
+        position, variable, value = self.answers.effect
         first, last = self._bounds_of_pieces[piece : piece + 2]
         m, Q = self.answers.shape[1], self.spread.size
-        return at[first:last] - piece * m * Q, which[first:last], value[first:last]
+        return position[first:last] - piece * m * Q, variable[first:last], value[first:last]
 
     @cached_property
     def _bounds_of_pieces(self) -> np.ndarray:
-        """Where the entries of `Answers.effect` of every piece begin; they come piece by piece."""
+        """Positions ``(K + 1,)`` at which the entries of `Answers.effect` of every piece begin; the entries are sorted
+        by piece."""
         K, m, Q, _ = self.answers.shape
         return np.searchsorted(self.answers.effect[0] // max(1, m * Q), np.arange(K + 1))
 
 
 def shared(H: Array, spread: Spread) -> tuple[np.ndarray, Array]:
-    """Which rows of ``H (r, d)`` look the same way or, where deviations are symmetric, opposite ways: the part of every
-    row and the factor that it is of the first row of that part."""
+    """Group the rows of ``H (r, d)`` into parts of parallel rows; opposite rows share a part where deviations are
+    symmetric. Return the part of every row, and its factor relative to the first row of the part."""
     part, factor = np.zeros(H.shape[0], dtype=int), np.ones(H.shape[0])
     firsts: list[int] = []
     for row in range(H.shape[0]):
         for p, first in enumerate(firsts):
-            at = int(np.abs(H[first]).argmax())
-            share = H[row, at] / H[first, at]
+            column = int(np.abs(H[first]).argmax())
+            share = H[row, column] / H[first, column]
             if np.array_equal(H[row], share * H[first]) and (share > 0.0 or spread.is_symmetric):
                 part[row], factor[row] = p, share
                 break
@@ -510,5 +560,5 @@ def deviations_of(
 ) -> Spread:
     """The deviations of a disturbance with values in ``bound``, ``blocks`` times, of a ``noise``, ``measured`` times,
     and of the initial state where its own are in ``initial``, of so many ``periods``."""
-    every = ((blocks, bound), (measured, noise), (periods, initial))
-    return Spread(tuple((count, one) for count, one in every if one is not None))
+    counted_sets = ((blocks, bound), (measured, noise), (periods, initial))
+    return Spread(tuple((count, convex) for count, convex in counted_sets if convex is not None))

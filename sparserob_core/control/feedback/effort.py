@@ -28,8 +28,17 @@ KEPT = 16  # signs that are remembered
 @final
 @dataclass(frozen=True, eq=False)
 class Effort:
-    """Between what the largest effort lies, ``lower`` and ``upper``, and the ``signs (c, n)`` of the largest efforts
-    that were found, the largest first, with their ``values (c,)``: those of the signs over all deviations."""
+    """Bounds of the largest effort, and the best signs that the search found.
+
+    Parameters
+    ----------
+    lower, upper : float
+        Bounds of the largest effort.
+    signs : ndarray, shape (c, n)
+        Signs with the largest efforts, the largest first.
+    values : ndarray, shape (c,)
+        Effort of each row of signs, the largest over all deviations.
+    """
 
     lower: float
     upper: float
@@ -44,7 +53,8 @@ def largest_effort(a: Array, A: Array, spread: Spread, parts: int = PARTS) -> Ef
 
 @final
 class _Search:
-    """One search. A part of all signs is its ``slopes (n,)``: signs, or those of the chords where they are open."""
+    """Branch and bound over the signs of the control's entries. A part holds sign vectors by its ``slopes (n,)``: a
+    sign where it is fixed, and the slope of the chord where it is open."""
 
     def __init__(self, a: Array, A: Array, spread: Spread) -> None:
         self.a, self.A, self.spread = a, A, spread
@@ -59,25 +69,25 @@ class _Search:
 
     @property
     def enough(self) -> float:
-        """A bound with which a part is not divided."""
+        """Upper bound up to which a part is not divided any more."""
         return self.lower + CLOSE * abs(self.lower)
 
     def run(self, parts: int) -> Effort:
         self.bound(self.slopes[None], self.open[None])
-        most = min(parts, WORK // max(1, self.A.size))
-        while self.heap and self.count < most:
-            taken = [heapq.heappop(self.heap) for _ in range(min(AT_ONCE, len(self.heap)))]
-            if -taken[0][0] <= self.enough:
-                self.closed = max(self.closed, -taken[0][0])
+        limit = min(parts, WORK // max(1, self.A.size))
+        while self.heap and self.count < limit:
+            batch = [heapq.heappop(self.heap) for _ in range(min(AT_ONCE, len(self.heap)))]
+            if -batch[0][0] <= self.enough:
+                self.closed = max(self.closed, -batch[0][0])
                 self.heap = []
                 break
-            slopes, open_ = (np.repeat([one[part] for one in taken], 2, axis=0) for part in (2, 3))
-            at, which = np.arange(2 * len(taken)), np.repeat([one[4] for one in taken], 2)
-            open_[at, which] = False
-            slopes[at, which] = np.tile([1.0, -1.0], len(taken))
+            slopes, open_ = (np.repeat([item[position] for item in batch], 2, axis=0) for position in (2, 3))
+            rows, entries = np.arange(2 * len(batch)), np.repeat([item[4] for item in batch], 2)
+            open_[rows, entries] = False
+            slopes[rows, entries] = np.tile([1.0, -1.0], len(batch))
             self.bound(slopes, open_)
         upper = max(self.enough, self.closed, -self.heap[0][0] if self.heap else -np.inf)
-        best = sorted(self.found.values(), key=lambda one: -one[0])[:KEPT]
+        best = sorted(self.found.values(), key=lambda candidate: -candidate[0])[:KEPT]
         return Effort(self.lower, upper, np.array([s for _, s in best]), np.array([value for value, _ in best]))
 
     def bound(self, slopes: Array, open_: np.ndarray) -> None:
@@ -89,25 +99,26 @@ class _Search:
         values = self.a + w @ self.A.T
         self.improve(values)
         slack = np.where(open_, self.heights + slopes * values - np.abs(values), -1.0)
-        which = slack.argmax(axis=1)
+        entries = slack.argmax(axis=1)
         for i, height in enumerate(bounds.tolist()):
             if height <= self.enough or not open_[i].any():
                 self.closed = max(self.closed, height)
             else:
-                heapq.heappush(self.heap, (-height, self.count + i, slopes[i], open_[i], int(which[i])))
+                heapq.heappush(self.heap, (-height, self.count + i, slopes[i], open_[i], int(entries[i])))
 
     def improve(self, values: Array) -> None:
-        """Better signs and deviations in turn, from the best of what the control is ``(k, n)``."""
+        """Improve signs and deviations in turn, starting from the largest efforts among the controls
+        ``values (k, n)``."""
         order = np.argsort(-np.abs(values).sum(axis=1), kind="stable")[:KEPT]
         signs = np.where(values[order] >= 0.0, 1.0, -1.0)
         for _ in range(ASCENT):
             along = signs @ self.A
             heights = signs @ self.a + self.spread.support(along)
-            for one, height in zip(signs, heights.tolist(), strict=True):
-                self.found.setdefault(one.tobytes(), (height, one))
+            for sign_vector, height in zip(signs, heights.tolist(), strict=True):
+                self.found.setdefault(sign_vector.tobytes(), (height, sign_vector))
             self.lower = max(self.lower, float(heights.max()))
-            better = np.where(self.a + self.spread.worst(along) @ self.A.T >= 0.0, 1.0, -1.0)
-            changed = (better != signs).any(axis=1)
-            if not changed.any():
+            better_signs = np.where(self.a + self.spread.worst(along) @ self.A.T >= 0.0, 1.0, -1.0)
+            is_changed = (better_signs != signs).any(axis=1)
+            if not is_changed.any():
                 break
-            signs = better[changed]
+            signs = better_signs[is_changed]

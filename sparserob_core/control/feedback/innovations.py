@@ -1,9 +1,9 @@
-"""What is seen of the disturbance at the breakpoints, and coordinates of the gains that answer it.
+"""Innovations of the disturbance at the breakpoints, and coordinates of the gains that respond to them.
 
 The innovation ``e_j`` is linear in the deviations ``w`` of the disturbance from its middle: ``e_j = D_j w``. A gain
-acts through its *effect* ``F_k = sum_j M_kj D_j``, how the control on piece ``k`` depends on ``w``, alone. So the
-variables are entries of ``F_k``, at as many entries of ``w`` as are independent of one another in what is seen, and
-the gains that have these effects are ``M_k = F_k D^+``.
+acts only through its *effect* ``F_k = sum_j M_kj D_j``, which is the dependence of the control on piece ``k`` on ``w``.
+So the variables are entries of ``F_k``, at as many entries of ``w`` as are linearly independent in the innovations. The
+gains that have these effects are ``M_k = F_k D^+``.
 """
 
 from __future__ import annotations
@@ -34,31 +34,35 @@ def innovations_seen(
     begins: bool = False,
     pieces: MeasurablePieces | None = None,
 ) -> Array:
-    """``D (K, d, Q)``: what every innovation is of the deviations, block after block, and then, where a set of initial
-    states ``begins``, of those of the initial state, of which ``e_0`` is all; ``e_0`` is 0 from one initial state."""
+    """Return the matrices ``D (K, d, Q)`` from the deviations to every innovation.
+
+    The columns belong to the blocks of the disturbance, one after another. Where ``begins`` says that the initial
+    states are a set, the last ``d`` columns are the deviations of the initial state, of which ``e_0`` consists. From a
+    single initial state ``e_0`` is 0.
+    """
     K, d = control.pieces, response.initial_state.size
-    begun = np.zeros((K, d, d if begins else 0))
+    initial_innovations = np.zeros((K, d, d if begins else 0))
     if begins:
-        begun[0] = np.eye(d)
+        initial_innovations[0] = np.eye(d)
     if model is None:
-        return begun
+        return initial_innovations
     if pieces is not None:
-        return np.concatenate([_measurable(response, control, pieces), begun], axis=2)
+        return np.concatenate([_measurable(response, control, pieces), initial_innovations], axis=2)
     grid, steps = response.grid, response.steps(KNOWN)
     block, pushes = _pushes(response, model)
     commanded = grid.commanded(control.breakpoints)
     D = np.zeros((K, d, model.block_count, pushes.shape[2]))
     for piece in range(int(np.searchsorted(commanded, K - 1))):  # what happens on the last one is seen when all is over
-        seen, last = D[commanded[piece] + 1], int(block[piece]) + 1
+        innovation, last = D[commanded[piece] + 1], int(block[piece]) + 1
         first = int(block[np.searchsorted(commanded, commanded[piece])])
-        seen[:, first:last] = np.tensordot(steps.Phi[0, response.which[piece]], seen[:, first:last], axes=1)
-        seen[:, block[piece]] += pushes[piece]
-    return np.concatenate([D.reshape(K, d, -1), begun], axis=2)
+        innovation[:, first:last] = np.tensordot(steps.Phi[0, response.which[piece]], innovation[:, first:last], axes=1)
+        innovation[:, block[piece]] += pushes[piece]
+    return np.concatenate([D.reshape(K, d, -1), initial_innovations], axis=2)
 
 
 def _pushes(response: Response, model: DisturbanceModel) -> tuple[np.ndarray, Array]:
-    """The block that acts on every piece of the grid ``(L,)``, and what one of each of its entries makes of the state
-    at the end, ``(L, d, mw)``."""
+    """Return the block that acts on every piece of the grid, ``(L,)``, and the state at the end of the piece per unit
+    of each of its entries, ``(L, d, mw)``."""
     grid, steps = response.grid, response.steps(KNOWN)
     assert model.starts is not None
     block = np.searchsorted(model.starts, np.arange(grid.pieces), side="right") - 1
@@ -68,36 +72,52 @@ def _pushes(response: Response, model: DisturbanceModel) -> tuple[np.ndarray, Ar
 def unfelt(
     response: Response, model: DisturbanceModel | None, far: Array, begun: Array, rows: Array, least: float
 ) -> np.ndarray:
-    """Which entries ``(Q,)`` of a disturbance of at most ``far (mw,)``, block after block, and then of initial states
-    that deviate by at most ``begun (d,)``, or none, ``(0,)``, bring none of the ``rows (r, d)`` further than ``least``
-    at any breakpoint."""
+    """Return which entries ``(Q,)`` of the deviations move none of the rows by more than ``least`` at any breakpoint.
+    The entries are those of the disturbance, block after block, and then those of the initial state.
+
+    Parameters
+    ----------
+    response : Response
+        Response of the system.
+    model : DisturbanceModel or None
+        Disturbance, if any.
+    far : ndarray, shape (mw,)
+        Largest deviations of the disturbance.
+    begun : ndarray, shape (d,) or (0,)
+        Largest deviations of the initial state; empty for a single initial state.
+    rows : ndarray, shape (r, d)
+        Rows on the state.
+    least : float
+        Largest movement of a row that is ignored.
+    """
     grid, steps, first = response.grid, response.steps(KNOWN), 0
     if model is not None:
         block, pushes = _pushes(response, model)
         first, pushes = model.block_count * far.size, pushes * far
-        own = block[:, None] * far.size + np.arange(far.size)
+        columns = block[:, None] * far.size + np.arange(far.size)
     nodes = np.zeros((response.initial_state.size, first + begun.size))
     nodes[:, first:] = np.eye(len(nodes), begun.size) * begun
-    most = np.abs(rows @ nodes).max(axis=0, initial=0.0)
+    largest_movements = np.abs(rows @ nodes).max(axis=0, initial=0.0)
     for piece in range(grid.pieces):
         nodes = steps.Phi[0, response.which[piece]] @ nodes
         if first:
-            nodes[:, own[piece]] += pushes[piece]
-        most = np.maximum(most, np.abs(rows @ nodes).max(axis=0, initial=0.0))
-    felt: np.ndarray = most > least
-    return ~felt
+            nodes[:, columns[piece]] += pushes[piece]
+        largest_movements = np.maximum(largest_movements, np.abs(rows @ nodes).max(axis=0, initial=0.0))
+    is_felt: np.ndarray = largest_movements > least
+    return ~is_felt
 
 
 def _measurable(response: Response, control: Dictionary, pieces: MeasurablePieces) -> Array:
-    """The same of what measurable disturbances make of the state at the end of every piece."""
+    """Return the matrices ``D`` of `innovations_seen` for measurable disturbances, whose deviations are their effects
+    on the state at the end of every piece."""
     grid, K = response.grid, control.pieces
     ends = control.breakpoints[grid.control_piece + 1]
     flows = pieces.carried(np.arange(grid.pieces), ends)
     D = np.zeros((K, response.initial_state.size, pieces.size))
     for piece in range(grid.pieces):
         if grid.control_piece[piece] + 1 < K:
-            place, outward = pieces.at(piece)
-            D[grid.control_piece[piece] + 1, :, place] = flows[piece] @ outward * pieces.seen(piece)
+            entries, outward = pieces.at(piece)
+            D[grid.control_piece[piece] + 1, :, entries] = flows[piece] @ outward * pieces.seen(piece)
     return D
 
 
@@ -121,62 +141,82 @@ class Answers:
 
     @property
     def variables(self) -> int:
-        """How many."""
+        """Number of variables of the gains."""
         return int(self.piece.size)
 
     def effects(self, numbers: Array) -> Array:
-        """``F (K, m, Q)``."""
+        """Return the effects ``F (K, m, Q)`` of the variables ``numbers (n,)``."""
         K, m, Q, _ = self.shape
-        at, which, value = self.effect
-        found: Array = np.bincount(at, value * numbers[which], K * m * Q).astype(float).reshape(K, m, Q)
-        return found
+        position, variable, value = self.effect
+        effects: Array = np.bincount(position, value * numbers[variable], K * m * Q).astype(float).reshape(K, m, Q)
+        return effects
 
     def gains(self, numbers: Array) -> Array:
-        """``M (K, K, m, d)``: ``M[k, j]`` acts on ``e_j``, zero for ``j > k``."""
+        """Return the gains ``M (K, K, m, d)`` of the variables ``numbers (n,)``: ``M[k, j]`` acts on ``e_j``, and is 0
+        for ``j > k``."""
         K, m, _, d = self.shape
-        at, which, value = self.gain
-        found: Array = np.bincount(at, value * numbers[which], K * K * m * d).astype(float).reshape(K, K, m, d)
-        return found
+        position, variable, value = self.gain
+        gains: Array = np.bincount(position, value * numbers[variable], K * K * m * d).astype(float).reshape(K, K, m, d)
+        return gains
 
     def on(self, sizes: Array) -> Answers:
-        """The same with variables that are effects on so much of every entry of the deviations, ``sizes (Q,)``."""
+        """Return the same gains with rescaled variables, each the effect of ``sizes (Q,)`` of its entry of the
+        deviations."""
         share = sizes[self.entry]
         if (share == 1.0).all():
             return self
-        effect, gain = ((at, which, value / share[which]) for at, which, value in (self.effect, self.gain))
+        effect, gain = (
+            (position, variable, value / share[variable]) for position, variable, value in (self.effect, self.gain)
+        )
         return replace(self, share=share * self.share, effect=effect, gain=gain)
 
     @cached_property
     def single(self) -> bool:
-        """Whether every entry of the effects is one variable, or 0."""
-        at, _, value = self.effect
-        return bool(np.unique(at).size == at.size and (value == 1.0).all())
+        """True where every entry of the effects is one variable or 0."""
+        position, _, value = self.effect
+        return bool(np.unique(position).size == position.size and (value == 1.0).all())
 
 
 def answers(D: Array, mask: np.ndarray, channels: int, seen: Array | None = None) -> Answers:
-    """The coordinates of gains that answer innovations ``D (K, d, Q)``, each piece those of its row of the truth values
-    ``mask (K, K)``; in units in which states and deviations are of ordinary size. Variables are numbered piece by piece
-    of the control, and then channel by channel of everything that hangs together. Where more is ``seen (K, d, Q)`` than
-    is to be answered, gains have effects there too."""
+    """Return coordinates of the gains that respond to innovations.
+
+    Variables are numbered piece by piece of the control, and then channel by channel of every cluster of innovations.
+
+    Parameters
+    ----------
+    D : ndarray, shape (K, d, Q)
+        Innovations that are answered, in units in which states and deviations are of ordinary size.
+    mask : ndarray of bool, shape (K, K)
+        For each piece, a row of the innovations that it responds to.
+    channels : int
+        Number ``m`` of controls.
+    seen : ndarray, shape (K, d, Q), optional
+        All innovations, where ``D`` leaves out some of their entries. The gains have effects at these entries too.
+
+    Returns
+    -------
+    Answers
+        Variables of the gains.
+    """
     K, d, Q = D.shape
-    alike = list(_alike(D, mask, D if seen is None else seen))
-    sizes = np.zeros((K, 1 + max((one.cluster for one in alike), default=0)), dtype=int)
-    for one in alike:
-        sizes[one.pieces, one.cluster] = channels * one.free.size
+    groups = list(_alike(D, mask, D if seen is None else seen))
+    sizes = np.zeros((K, 1 + max((group.cluster for group in groups), default=0)), dtype=int)
+    for group in groups:
+        sizes[group.pieces, group.cluster] = channels * group.free.size
     starts = (np.cumsum(sizes.ravel()) - sizes.ravel()).reshape(sizes.shape)
     piece, channel, entry = (np.zeros(int(sizes.sum()), dtype=int) for _ in range(3))
     effect: list[tuple[np.ndarray, np.ndarray, Array]] = []
     gain: list[tuple[np.ndarray, np.ndarray, Array]] = []
     i = np.arange(channels)[:, None]
-    for one in alike:
-        k, r = one.pieces[:, None, None], one.free.size
-        names = starts[one.pieces, one.cluster][:, None, None] + i * r + np.arange(r)
-        piece[names], channel[names], entry[names] = k, i, one.free
-        rows, cols = np.nonzero(one.Z)
-        effect.append(_listed((k * channels + i) * Q + one.columns[cols], names[..., rows], one.Z[rows, cols]))
-        rows, cols = np.nonzero(one.G)
-        at = ((k * K + one.seen[cols // d]) * channels + i) * d + cols % d
-        gain.append(_listed(at, names[..., rows], one.G[rows, cols]))
+    for group in groups:
+        k, r = group.pieces[:, None, None], group.free.size
+        variables = starts[group.pieces, group.cluster][:, None, None] + i * r + np.arange(r)
+        piece[variables], channel[variables], entry[variables] = k, i, group.free
+        rows, cols = np.nonzero(group.Z)
+        effect.append(_listed((k * channels + i) * Q + group.columns[cols], variables[..., rows], group.Z[rows, cols]))
+        rows, cols = np.nonzero(group.G)
+        positions = ((k * K + group.seen[cols // d]) * channels + i) * d + cols % d
+        gain.append(_listed(positions, variables[..., rows], group.G[rows, cols]))
     return Answers((K, channels, Q, d), piece, channel, entry, np.ones(entry.size), _joined(effect), _joined(gain))
 
 
@@ -196,21 +236,23 @@ class _Alike:
 
 
 def _alike(D: Array, mask: np.ndarray, every: Array) -> Iterator[_Alike]:
-    """All pieces of the control that answer anything, cluster by cluster."""
+    """Yield the pieces of the control that respond to any innovation, cluster by cluster."""
     plain = np.array_equal(D, every)
-    for number, cluster in enumerate(_clusters((D != 0.0).any(axis=1))):
-        choices, which = np.unique(mask[:, cluster], axis=0, return_inverse=True)
-        for place, chosen in enumerate(choices):
-            if not chosen.any():
+    for cluster_number, cluster in enumerate(_clusters((D != 0.0).any(axis=1))):
+        choices, choice_of_piece = np.unique(mask[:, cluster], axis=0, return_inverse=True)
+        for choice, is_answered in enumerate(choices):
+            if not is_answered.any():
                 continue
-            seen = cluster[chosen]
-            columns, free, Z, G = _coordinates(D[seen])
+            breakpoints = cluster[is_answered]
+            columns, free, Z, G = _coordinates(D[breakpoints])
             if not plain:
-                flat = every[seen].reshape(-1, every.shape[2])
+                flat = every[breakpoints].reshape(-1, every.shape[2])
                 columns = np.flatnonzero(flat.any(axis=0))
                 Z = G @ flat[:, columns]
             if free.size:
-                yield _Alike(np.flatnonzero(which.ravel() == place), number, seen, columns, free, Z, G)
+                yield _Alike(
+                    np.flatnonzero(choice_of_piece.ravel() == choice), cluster_number, breakpoints, columns, free, Z, G
+                )
 
 
 def _listed(at: Array, which: Array, value: Array) -> tuple[np.ndarray, np.ndarray, Array]:
@@ -221,19 +263,30 @@ def _clusters(where: np.ndarray) -> list[np.ndarray]:
     """The breakpoints ``(K, Q)`` that see something in common, together; those that see nothing are left out."""
     clusters: list[tuple[set[int], np.ndarray]] = []
     for j in np.flatnonzero(where.any(axis=1)):
-        mine, rest = ({int(j)}, where[j].copy()), []
+        union, disjoint = ({int(j)}, where[j].copy()), []
         for members, columns in clusters:
-            if (columns & mine[1]).any():
-                mine = (mine[0] | members, mine[1] | columns)
+            if (columns & union[1]).any():
+                union = (union[0] | members, union[1] | columns)
             else:
-                rest.append((members, columns))
-        clusters = [*rest, mine]
-    return [np.array(sorted(members)) for members, _ in sorted(clusters, key=lambda one: min(one[0]))]
+                disjoint.append((members, columns))
+        clusters = [*disjoint, union]
+    return [np.array(sorted(members)) for members, _ in sorted(clusters, key=lambda cluster: min(cluster[0]))]
 
 
 def _coordinates(seen: Array) -> tuple[np.ndarray, np.ndarray, Array, Array]:
-    """Of innovations ``(J, d, Q)``: the entries of the deviations that they see ``(c,)``, those of them that are
-    independent ``(r,)``, what the effect of each is on all, ``(r, c)``, and gains of such effects, ``(r, J d)``."""
+    """Return coordinates of the effects of gains on innovations ``seen (J, d, Q)``.
+
+    Returns
+    -------
+    columns : ndarray of int, shape (c,)
+        Entries of the deviations in the innovations.
+    free : ndarray of int, shape (r,)
+        Linearly independent ones among these entries.
+    Z : ndarray, shape (r, c)
+        Effect at all entries for a unit effect at each independent one.
+    G : ndarray, shape (r, J d)
+        Gains with these effects.
+    """
     from scipy.linalg import qr
 
     flat = seen.reshape(-1, seen.shape[2])
@@ -241,21 +294,21 @@ def _coordinates(seen: Array) -> tuple[np.ndarray, np.ndarray, Array, Array]:
     columns = np.flatnonzero(sizes > 0.0)
     unit = flat[:, columns] / sizes[columns]
     _, R, order = qr(unit, mode="economic", pivoting=True)
-    chosen = np.sort(order[: int((np.abs(np.diag(R)) > DEPENDENT).sum())])
-    inverse = np.linalg.pinv(unit[:, chosen])  # well conditioned: every column is of size 1
-    rest = np.setdiff1d(np.arange(columns.size), chosen)
-    Z = np.zeros((chosen.size, columns.size))
-    Z[np.arange(chosen.size), chosen] = 1.0
-    Z[:, rest] = inverse @ unit[:, rest]
+    independent = np.sort(order[: int((np.abs(np.diag(R)) > DEPENDENT).sum())])
+    inverse = np.linalg.pinv(unit[:, independent])  # well conditioned: every column is of size 1
+    dependent = np.setdiff1d(np.arange(columns.size), independent)
+    Z = np.zeros((independent.size, columns.size))
+    Z[np.arange(independent.size), independent] = 1.0
+    Z[:, dependent] = inverse @ unit[:, dependent]
     Z[np.abs(Z) < DEPENDENT] = 0.0
-    far = sizes[columns]
-    return columns, columns[chosen], Z * far / far[chosen][:, None], inverse / far[chosen][:, None]
+    scale = sizes[columns]
+    return columns, columns[independent], Z * scale / scale[independent][:, None], inverse / scale[independent][:, None]
 
 
 def _joined(parts: list[tuple[np.ndarray, np.ndarray, Array]]) -> tuple[np.ndarray, np.ndarray, Array]:
     """Positions, variables and values, in the order of the variables."""
     if not parts:
         return np.zeros(0, dtype=int), np.zeros(0, dtype=int), np.zeros(0)
-    at, which, value = (np.concatenate(part) for part in zip(*parts, strict=True))
-    order = np.argsort(which, kind="stable")
-    return at[order], which[order], value[order]
+    position, variable, value = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
+    order = np.argsort(variable, kind="stable")
+    return position[order], variable[order], value[order]

@@ -1,12 +1,12 @@
-"""What a control knows of a signal, and what a constraint can still meet that the control does not know yet.
+"""Information that a causal control has about a signal, and the worst continuations that it cannot exclude.
 
-A causal control is a function of the reports that reached it: under two signals with the same reports it is the same.
-Where nothing hides a disturbance, its blocks are the reports. Where outputs are measured with a noise, the outputs are:
-two disturbances whose outputs differ by no more than the noise can make up have the same reports, since each signal
-comes with the noise that makes up the difference, ``v_j = eta_j - C x_j(w)``. So a signal is a disturbance, an initial
-state and a history ``eta`` of outputs beside those of the nominal signal, and any are possible with which all noises
-are in their set. This is what a set of states that are possible after a history says (Witsenhausen 1968; Bertsekas and
-Rhodes 1971), signal by signal.
+A causal control is a function of the reports that it has received: it is the same under two signals with the same
+reports. Where nothing hides a disturbance, its blocks are the reports. Where outputs are measured with a noise, the
+outputs are the reports. Two disturbances have the same reports if their outputs differ by no more than the noise can
+make up: each signal comes with the noise that makes up the difference, ``v_j = eta_j - C x_j(w)``. So a signal is a
+disturbance, an initial state and a history ``eta`` of outputs, relative to the outputs of the nominal signal. All
+signals whose noises are in their set are possible. This describes, signal by signal, the set of states that are
+possible after a history (Witsenhausen 1968; Bertsekas and Rhodes 1971).
 """
 
 from __future__ import annotations
@@ -38,8 +38,12 @@ CORNERS = 8  # outputs at once up to which the 2^p corners of a box are looked a
 
 
 class Knowledge(ABC):
-    """``seen (K,)``: how many reports every piece of the control knows. Signals are arrays that begin with the
-    deviations ``(Q,)``; rows ask ``N (R, Q)`` of these, of which ``begun (R,)`` reports are older than their times."""
+    """Information of a causal control about signals.
+
+    Signals are arrays that begin with the deviations ``(Q,)``. The number of reports that every piece of the control
+    knows is ``seen (K,)``. The rows ``N (R, Q)`` are linear functions of the deviations; ``begun (R,)`` is the number
+    of reports that are older than the time of each row.
+    """
 
     N: Array
     seen: np.ndarray
@@ -49,7 +53,7 @@ class Knowledge(ABC):
     @property
     @abstractmethod
     def reports(self) -> int:
-        """How many there are."""
+        """Number of reports of a signal."""
 
     @property
     @abstractmethod
@@ -59,34 +63,54 @@ class Knowledge(ABC):
     @property
     @abstractmethod
     def most(self) -> Array:
-        """The most that deviations give to every row, ``(R,)``, or more."""
+        """Upper bounds ``(R,)`` of the contribution of the deviations to every row."""
 
     @abstractmethod
     def history(self, signal: Array, reports: int) -> bytes:
-        """What the first so many reports of a signal are: equal where a control cannot tell two apart."""
+        """Return the first ``reports`` reports of a signal as bytes; equal bytes mean that a control cannot distinguish
+        two signals."""
 
     @abstractmethod
     def gives(self, signals: Array, beside: Array) -> Array:
-        """The most that deviations give to every row, of which the first reports are those of a signal, ``(S, R,
-        reports + 1)``; where that and what is ``beside`` it, of the same shape, are not above 0, any number that does
-        not lift them above it."""
+        """Return the largest contribution of the deviations to every row, among signals whose first reports are those
+        of a given signal: ``(S, R, reports + 1)``.
+
+        Where this value plus ``beside``, of the same shape, is not above 0, any number may stand instead that keeps the
+        sum at or below 0.
+        """
 
     @abstractmethod
     def changed(self, signal: Array, row: int, report: int) -> tuple[float, Array]:
-        """What gives the most to a row of all signals whose first reports are those of this one, and how much."""
+        """Return the largest contribution of the deviations to a row, among signals whose first ``report`` reports are
+        those of the given signal, and a signal that attains it."""
 
     @abstractmethod
     def leaving(
         self, signals: Array, own: Array, answered: Array | None, scale: float, units: Array
     ) -> Iterator[tuple[int, int, Array]]:
-        """Signals that leave one of these at a report, by number both, and are the worst for a row from there on, those
-        that exceed theirs by most ``units (R,)`` first. ``own (S, R)``: what the rows have otherwise under each, of
-        which a control is part that adds ``answered (R, ..)`` of all deviations, noises too, to what it does under the
-        signal; nothing where that is ``None``. All deviations count ``scale`` times."""
+        """Yield signals that depart from a given one at a report and are the worst for a row from there on.
+
+        Every item holds the number of the given signal, the number of the report, and the new signal. Signals whose row
+        has the largest excess come first.
+
+        Parameters
+        ----------
+        signals : ndarray, shape (S, ...)
+            Given signals.
+        own : ndarray, shape (S, R)
+            Values of the rows under each signal without the deviations. A control is part of them.
+        answered : ndarray, shape (R, ...), optional
+            Coefficients, in every row, of the control's response to deviations, and to noises, that differ from those
+            of the signal. Without it the control does not respond.
+        scale : float
+            Factor of all deviations.
+        units : ndarray, shape (R,)
+            Units in which the excess of the rows is compared.
+        """
 
     @abstractmethod
     def known(self, z: Array) -> Array:
-        """The signal of a disturbance with these deviations ``(Q,)``."""
+        """Return the signal of a disturbance with the deviations ``z (Q,)``."""
 
     @cached_property
     def first(self) -> np.ndarray:
@@ -97,7 +121,8 @@ class Knowledge(ABC):
 @final
 @dataclass(eq=False)
 class OfDisturbances(Knowledge):
-    """Reports are the blocks of the disturbance, ``width`` deviations each, all in ``spread``."""
+    """Information of a control from which nothing hides the disturbance. Reports are the blocks of the disturbance,
+    ``width`` deviations each, all in ``spread``."""
 
     N: Array
     spread: Spread
@@ -108,7 +133,7 @@ class OfDisturbances(Knowledge):
 
     @property
     def reports(self) -> int:
-        """How many blocks there are."""
+        """Number of blocks of the disturbance."""
         return int(self.N.shape[1] // max(1, self.width))
 
     @property
@@ -123,7 +148,7 @@ class OfDisturbances(Knowledge):
 
     @cached_property
     def most(self) -> Array:
-        """Under the worst deviations."""
+        """Upper bounds ``(R,)`` of the contribution of the worst deviations to every row."""
         return np.asarray(np.abs(self.N * self.worst).sum(axis=1))
 
     def history(self, signal: Array, reports: int) -> bytes:
@@ -131,39 +156,40 @@ class OfDisturbances(Knowledge):
         return signal[: reports * self.width].tobytes()
 
     def gives(self, signals: Array, beside: Array) -> Array:
-        """The signal's own blocks, and the worst from a report on."""
+        """Return the contribution of the signal's own blocks, plus that of the worst blocks from every report on."""
         return sums(self.by_block(self.N * signals[:, None]).sum(axis=3)) + self._pushed
 
     def changed(self, signal: Array, row: int, report: int) -> tuple[float, Array]:
-        """One that is the worst for the row from the block on."""
-        begun, end, z = self.begun[row] * self.width, report * self.width, signal.copy()
-        z[end:begun] = self.worst[row, end:begun]
-        return float(self.N[row, :end] @ z[:end]) + float(self._pushed[row, report]), z
+        """Return the largest contribution to the row, and the signal with the blocks that are the worst for the row
+        from ``report`` on."""
+        stop, start, z = self.begun[row] * self.width, report * self.width, signal.copy()
+        z[start:stop] = self.worst[row, start:stop]
+        return float(self.N[row, :start] @ z[:start]) + float(self._pushed[row, report]), z
 
     def leaving(
         self, signals: Array, own: Array, answered: Array | None, scale: float, units: Array
     ) -> Iterator[tuple[int, int, Array]]:
-        """In closed form."""
-        acted = np.zeros_like(self.N) if answered is None else answered[:, : self.N.shape[1]]
-        closed = acted + self.N
+        """Find the signals in closed form, for all rows and reports."""
+        responses = np.zeros_like(self.N) if answered is None else answered[:, : self.N.shape[1]]
+        closed = responses + self.N
         closed = np.where(np.abs(closed) > NONE * np.abs(self.N), closed, self.N * NONE)
         worst = extreme(self.spread, closed)
-        past = sums(self.by_block(self.N * signals[:, None]).sum(axis=-1))
-        given = self._after(acted * signals[:, None])
-        over = own[:, :, None] + scale * (past - given + self._after(closed * worst))
-        over = over / units[:, None]
-        over[:, :, -1] = -np.inf
-        over = np.where(np.arange(over.shape[2]) < self.begun[:, None], over, -np.inf)
-        for place in np.argsort(-over, axis=None).tolist():
-            signal, row, report = (int(v) for v in np.unravel_index(place, over.shape))
-            if over[signal, row, report] <= NONE:
+        past_values = sums(self.by_block(self.N * signals[:, None]).sum(axis=-1))
+        later_responses = self._after(responses * signals[:, None])
+        excess = own[:, :, None] + scale * (past_values - later_responses + self._after(closed * worst))
+        excess = excess / units[:, None]
+        excess[:, :, -1] = -np.inf
+        excess = np.where(np.arange(excess.shape[2]) < self.begun[:, None], excess, -np.inf)
+        for flat_index in np.argsort(-excess, axis=None).tolist():
+            signal, row, report = (int(v) for v in np.unravel_index(flat_index, excess.shape))
+            if excess[signal, row, report] <= NONE:
                 return
             child = signals[signal].copy()
             child[report * self.width :] = worst[row, report * self.width :]
             yield signal, report, child
 
     def known(self, z: Array) -> Array:
-        """It is its deviations."""
+        """Return the deviations, which are the signal."""
         return z
 
     def _after(self, a: Array) -> Array:
@@ -184,11 +210,35 @@ class OfDisturbances(Knowledge):
 @final
 @dataclass(eq=False)
 class OfOutputs(Knowledge):
-    """Reports are outputs ``(p,)``: ``C (J, p, Q)`` is what the deviations in ``spread`` give to each, and ``hidden``,
-    half-spaces ``(H, h)``, holds what a ``noise``, both about its middle, can add to them; ``place``: that of the noise
-    among all deviations. A signal is the deviations and then the outputs beside the nominal ones, ``(Q + J p,)``. No
-    more than ``limit`` of ``work`` is done, and nothing once its time has ``passed``: what is not known by then is not
-    asked of anybody."""
+    """Information of a control that measures outputs with a noise.
+
+    Reports are outputs ``(p,)``. A signal is the deviations and then the outputs relative to the nominal ones,
+    ``(Q + J p,)``. Once ``work`` exceeds ``limit``, or the time has ``passed``, no further program is solved, and what
+    only such a program can find counts as unknown.
+
+    Parameters
+    ----------
+    N : ndarray, shape (R, Q)
+        Rows on the deviations.
+    C : ndarray, shape (J, p, Q)
+        Contribution of the deviations to each output.
+    spread : Spread
+        Set of the deviations of disturbance and initial state.
+    hidden : tuple of ndarray
+        Half-spaces ``(H, h)``, about the middle, of the values that the noise can certainly add to an output.
+    noise : Spread
+        Noises of all outputs, about their middle.
+    place : slice
+        Entries of the noise among all deviations of the loop.
+    seen : ndarray, shape (K,)
+        Number of reports that every piece of the control knows.
+    begun : ndarray, shape (R,)
+        Number of reports that are older than the time of each row.
+    limit : float
+        Largest work.
+    passed : callable
+        Function that says whether the time is over.
+    """
 
     N: Array
     C: Array
@@ -211,50 +261,70 @@ class OfOutputs(Knowledge):
             if convex.is_box:
                 box = convex.bounding_box()
                 low, high = box.lower - middle, box.upper - middle
-            far = self._far[entries]
-            none = np.zeros(far.size)
-            columns = self._linear.variables(np.tile(low, count) / far, np.tile(high, count) / far, none)
+            units = self._far[entries]
+            none = np.zeros(units.size)
+            columns = self._linear.variables(np.tile(low, count) / units, np.tile(high, count) / units, none)
             flat = None if convex.is_box else about(convex)
             if flat is None:
                 continue
             row, channel = np.nonzero(flat[0])
             for copy in columns.reshape(count, -1):
-                asked = flat[0][row, channel] * self._far[copy[channel]] / flat[1][row]
+                coefficients = flat[0][row, channel] * self._far[copy[channel]] / flat[1][row]
                 none = np.full(flat[1].size, -np.inf)
-                self._linear.rows([(row, copy[channel], asked)], none, np.ones(flat[1].size))
+                self._linear.rows([(row, copy[channel], coefficients)], none, np.ones(flat[1].size))
         self._rows = np.zeros((self.reports, h.size), dtype=int)
-        for report, given in enumerate(self.C):
-            asked = -(H @ given) * self._far / h[:, None]
-            row, column = np.nonzero(asked)
+        for report, output_matrix in enumerate(self.C):
+            coefficients = -(H @ output_matrix) * self._far / h[:, None]
+            row, column = np.nonzero(coefficients)
             free = np.full(h.size, np.inf)
-            self._rows[report] = self._linear.rows([(row, column, asked[row, column])], -free, free)
+            self._rows[report] = self._linear.rows([(row, column, coefficients[row, column])], -free, free)
 
     @staticmethod
     def of(
         loop: ClosedLoop, N: Array, times: Array, measured: Array, seen: np.ndarray, share: float
     ) -> OfOutputs | None:
-        """Of a ``loop`` whose outputs are ``measured (K,)`` at these times, with a noise, and rows that look at ``times
-        (R,)`` and ask ``N (R, Q)`` of disturbance and initial state; ``None`` where there is no noise, or one of these
-        is in a set that is curved or flat. ``share``: which of the noise and of the initial states is used."""
-        observer, sets, begun = loop.observer, loop.spread.sets, int(loop.begins.sum())
+        """Return the knowledge of a loop that measures outputs with a noise.
+
+        Parameters
+        ----------
+        loop : ClosedLoop
+            Loop with an observer.
+        N : ndarray, shape (R, Q)
+            Rows on the deviations of disturbance and initial state.
+        times : ndarray, shape (R,)
+            Times of the rows.
+        measured : ndarray, shape (K,)
+            Times of the measurements.
+        seen : ndarray, shape (K,)
+            Number of reports that every piece of the control knows.
+        share : float
+            Factor of the sets of the noise and of the initial states.
+
+        Returns
+        -------
+        OfOutputs or None
+            ``None`` where there is no noise, where the disturbance is measurable, or where one of the sets, other than
+            the box of a disturbance or of initial states, has no half-spaces about its middle.
+        """
+        observer, sets, initial_count = loop.observer, loop.spread.sets, int(loop.begins.sum())
         if observer is None or not observer.noisy or loop.measurable is not None:
             return None
-        first = int(loop.noise.start > 0)  # whether a disturbance stands before the noise
-        noise = sets[first][1].scaled(share)
-        own = [(1, sets[-1][1].scaled(share))] if begun else []
-        spread, hidden = Spread((*sets[:first], *own)), hiding(noise)
-        if hidden is None or any(about(one) is None and not one.is_box for _, one in spread.sets):
+        noise_position = int(loop.noise.start > 0)  # whether a disturbance stands before the noise
+        noise = sets[noise_position][1].scaled(share)
+        initial_sets = [(1, sets[-1][1].scaled(share))] if initial_count else []
+        spread, hidden = Spread((*sets[:noise_position], *initial_sets)), hiding(noise)
+        if hidden is None or any(about(convex) is None and not convex.is_box for _, convex in spread.sets):
             return None
         plain, problem = replace(observer, L=np.zeros_like(observer.L)), loop.functionals
-        entering = innovations_seen(problem.response, problem.dictionary, problem.disturbance, begun > 0)
-        given = plain.seen(entering, begun)
-        C = np.concatenate([given[:, :, : loop.noise.start], given[:, :, loop.noise.stop :]], axis=2)
+        entering = innovations_seen(problem.response, problem.dictionary, problem.disturbance, initial_count > 0)
+        outputs = plain.seen(entering, initial_count)
+        C = np.concatenate([outputs[:, :, : loop.noise.start], outputs[:, :, loop.noise.stop :]], axis=2)
         begins = np.searchsorted(measured, times)
         return OfOutputs(N, C, spread, hidden, Spread(((measured.size, noise),)), loop.noise, seen, begins)
 
     @property
     def reports(self) -> int:
-        """How many outputs there are."""
+        """Number ``J`` of measured outputs ``(p,)``."""
         return int(self.C.shape[0])
 
     @property
@@ -264,11 +334,11 @@ class OfOutputs(Knowledge):
 
     @cached_property
     def most(self) -> Array:
-        """Under the worst deviations, whatever is seen of them."""
+        """Largest contribution ``(R,)`` of the deviations to every row, whatever the outputs."""
         return self.spread.support(self.N)
 
     def outputs(self, signal: Array) -> Array:
-        """Those of a signal, ``(J, p)``."""
+        """Return the outputs ``(J, p)`` of a signal, relative to the nominal ones."""
         return signal[self.N.shape[1] :].reshape(self.C.shape[:2])
 
     def history(self, signal: Array, reports: int) -> bytes:
@@ -276,37 +346,45 @@ class OfOutputs(Knowledge):
         return self.outputs(signal)[:reports].tobytes()
 
     def signal(self, z: Array, beside: Array, noise: Array, reports: int) -> Array:
-        """Deviations ``z (Q,)`` whose first outputs are those of another signal ``beside``, and then those with this
-        ``noise (J, p)``."""
-        own = self.C @ z + noise
-        own[:reports] = self.outputs(beside)[:reports]
-        return np.concatenate([z, own.ravel()]) + 0.0
+        """Return the signal of deviations ``z (Q,)`` whose first ``reports`` outputs are those of the signal
+        ``beside``, and whose later outputs have this ``noise (J, p)``."""
+        outputs = self.C @ z + noise
+        outputs[:reports] = self.outputs(beside)[:reports]
+        return np.concatenate([z, outputs.ravel()]) + 0.0
 
     def gives(self, signals: Array, beside: Array) -> Array:
-        """By a linear program each, of what promises most first, until `LOOKED` were solved and one lifts a row."""
-        found = np.full(beside.shape, -np.inf)
-        for own, rest, signal in zip(found, beside, signals, strict=True):
-            most, known = np.broadcast_to(self.most[:, None], rest.shape).copy(), np.zeros(rest.shape, dtype=bool)
+        """Solve one linear program for each row and report, the most promising ones first.
+
+        Once one of them lifts a row above 0, no more than `LOOKED` programs are solved for a signal. Entries that were
+        not found are ``-inf``.
+        """
+        values = np.full(beside.shape, -np.inf)
+        for signal_values, offset, signal in zip(values, beside, signals, strict=True):
+            bounds, is_known = (
+                np.broadcast_to(self.most[:, None], offset.shape).copy(),
+                np.zeros(offset.shape, dtype=bool),
+            )
             for report in range(1, self.reports + 1):
                 history = self.history(signal, report)
-                for row in np.flatnonzero(most[:, report] + rest[:, report] > 0.0).tolist():
+                for row in np.flatnonzero(bounds[:, report] + offset[:, report] > 0.0).tolist():
                     if (history, row) in self._held:
-                        most[row, report], known[row, report] = self._worst(signal, row, report)[0], True
-            known[:, 0] = True
-            own[known] = most[known]
-            most = np.minimum.accumulate(most, axis=1)  # what is hidden for longer gives no more
-            lifted, solved = bool((own + rest > 0.0).any()), 0
-            promise = np.where(known, -np.inf, most + rest)
-            for place in np.argsort(-promise, axis=None).tolist():
-                row, report = divmod(place, self.reports + 1)
-                if not promise[row, report] > 0.0 or (lifted and solved >= LOOKED):
+                        bounds[row, report], is_known[row, report] = self._worst(signal, row, report)[0], True
+            is_known[:, 0] = True
+            signal_values[is_known] = bounds[is_known]
+            bounds = np.minimum.accumulate(bounds, axis=1)  # what is hidden for longer gives no more
+            is_above, solved = bool((signal_values + offset > 0.0).any()), 0
+            promise = np.where(is_known, -np.inf, bounds + offset)
+            for flat_index in np.argsort(-promise, axis=None).tolist():
+                row, report = divmod(flat_index, self.reports + 1)
+                if not promise[row, report] > 0.0 or (is_above and solved >= LOOKED):
                     break
-                own[row, report] = self._worst(signal, row, report)[0]
-                lifted, solved = lifted or bool(own[row, report] + rest[row, report] > 0.0), solved + 1
-        return found
+                signal_values[row, report] = self._worst(signal, row, report)[0]
+                is_above, solved = is_above or bool(signal_values[row, report] + offset[row, report] > 0.0), solved + 1
+        return values
 
     def changed(self, signal: Array, row: int, report: int) -> tuple[float, Array]:
-        """The worst of all deviations that a noise within its set hides so long."""
+        """Return the largest contribution to the row, and the signal of the worst deviations that a noise within its
+        set hides for ``report`` reports."""
         worst = self._worst(signal, row, report)
         return worst[0], self.signal(worst[1], signal, np.zeros(self.C.shape[:2]), report)
 
@@ -318,8 +396,8 @@ class OfOutputs(Knowledge):
         return self._held[key]
 
     def along(self, direction: Array, signal: Array, reports: int) -> tuple[float, Array] | None:
-        """The largest of ``direction (Q,)`` over all deviations whose first outputs can be those of a signal, and where
-        it is; ``None`` where that was not found within the limits."""
+        """Return the largest value of ``direction (Q,)`` over all deviations whose first outputs can be those of a
+        signal, and a maximiser; ``None`` where it was not found within the limits."""
         if not reports:
             z = extreme(self.spread, direction)
             return float(direction @ z), z
@@ -335,64 +413,69 @@ class OfOutputs(Knowledge):
         cost = -direction * self._far
         cost = cost / (float(np.abs(cost).max(initial=0.0)) or 1.0)
         self._linear.highs.changeColsCost(cost.size, np.arange(cost.size, dtype=np.int32), cost)
-        done, _, x, _ = self._linear.solve()
+        is_solved, _, x, _ = self._linear.solve()
         self.work += self._linear.work + self.C.size
-        if not done:
+        if not is_solved:
             return None
         z = self._inside(x * self._far)
         H, h = self.hidden
-        hides = (self.outputs(signal) - self.C @ z)[:reports] @ H.T
-        return (float(direction @ z), z) if (hides <= KEPT * h).all() else None
+        noise_values = (self.outputs(signal) - self.C @ z)[:reports] @ H.T
+        return (float(direction @ z), z) if (noise_values <= KEPT * h).all() else None
 
     def known(self, z: Array) -> Array:
-        """With a noise that hides what it can, where no outputs are told; from the middle of the initial states."""
+        """Return the signal of a disturbance with the noise that hides it from the outputs as far as it can.
+
+        The initial state is the middle of its set, unless ``z`` holds it. A ``z`` that holds outputs is returned as it
+        is.
+        """
         if z.size > self.N.shape[1]:
             return z
         z = np.concatenate([z, np.zeros(self.N.shape[1] - z.size)])
         return self.signal(z, self.nominal, self._nearest(-(self.C @ z)), 0)
 
     def _nearest(self, noise: Array) -> Array:
-        """The noise ``(J, p)`` that is as near to another one as it can be, of a box; the middle of what is none."""
-        far = ROOM * self.noise.radii.reshape(noise.shape)
-        return np.clip(noise, -far, far) if self.noise.is_box else np.zeros(noise.shape)
+        """Return the noise ``(J, p)`` in a box that is nearest to ``noise``; the middle of a set that is no box."""
+        radii = ROOM * self.noise.radii.reshape(noise.shape)
+        return np.clip(noise, -radii, radii) if self.noise.is_box else np.zeros(noise.shape)
 
     def leaving(
         self, signals: Array, own: Array, answered: Array | None, scale: float, units: Array
     ) -> Iterator[tuple[int, int, Array]]:
-        """By a linear program each, of as many as promise most."""
+        """Find the signals by one linear program each, for at most `TRIED` candidates that promise most."""
         (J, p, Q), R = self.C.shape, self.N.shape[0]
-        whole = self.C.reshape(J * p, Q)
-        told = np.zeros((R, J * p)) if answered is None else answered[:, self.place]  # an output is its noise, and more
-        tried: list[tuple[float, int, int, int, float, Array, Array]] = []
+        output_matrix = self.C.reshape(J * p, Q)
+        # an output is its noise, and more
+        noise_part = np.zeros((R, J * p)) if answered is None else answered[:, self.place]
+        candidates: list[tuple[float, int, int, int, float, Array, Array]] = []
         for report in range(J):
-            acting = told.copy()
+            acting = noise_part.copy()
             acting[:, : report * p] = 0.0
-            along = self.N + acting @ whole
+            along = self.N + acting @ output_matrix
             noise = self.noise.support(acting)
-            most = noise + self.spread.support(along)
+            bounds = noise + self.spread.support(along)
             rows = np.flatnonzero(report < self.begun)
-            for which, signal in enumerate(signals):
-                rest = own[which] - scale * (acting @ signal[Q:])
-                most_of_it = (rest + scale * most) / units
-                best = rows[np.argsort(-most_of_it[rows])[:EACH]]
-                tried += [
-                    (most_of_it[row], which, report, row, rest[row], along[row], acting[row])
-                    for row in best[most_of_it[best] > NONE].tolist()
+            for number, signal in enumerate(signals):
+                offset = own[number] - scale * (acting @ signal[Q:])
+                promises = (offset + scale * bounds) / units
+                best = rows[np.argsort(-promises[rows])[:EACH]]
+                candidates += [
+                    (promises[row], number, report, row, offset[row], along[row], acting[row])
+                    for row in best[promises[best] > NONE].tolist()
                 ]
-        tried.sort(key=lambda one: -one[0])
-        found: list[tuple[float, int, int, Array]] = []
-        for _, which, report, row, rest, along, acting in tried[:TRIED]:
-            worst = self.along(along, signals[which], report)
+        candidates.sort(key=lambda candidate: -candidate[0])
+        children: list[tuple[float, int, int, Array]] = []
+        for _, number, report, row, offset, along, acting in candidates[:TRIED]:
+            worst = self.along(along, signals[number], report)
             if worst is None:
                 continue
             noise = ROOM * extreme(self.noise, acting)
-            over = (rest + scale * (worst[0] + float(acting @ noise))) / units[row]
-            if over > NONE:
-                hides = self._nearest(self.outputs(signals[which]) - self.C @ worst[1])
-                told = np.where(acting.reshape(J, p) == 0.0, hides, noise.reshape(J, p))
-                found.append((over, which, report, self.signal(worst[1], signals[which], told, report)))
-        for _, which, report, child in sorted(found, key=lambda one: -one[0]):
-            yield which, report, child
+            excess = (offset + scale * (worst[0] + float(acting @ noise))) / units[row]
+            if excess > NONE:
+                nearest_noise = self._nearest(self.outputs(signals[number]) - self.C @ worst[1])
+                noise_part = np.where(acting.reshape(J, p) == 0.0, nearest_noise, noise.reshape(J, p))
+                children.append((excess, number, report, self.signal(worst[1], signals[number], noise_part, report)))
+        for _, number, report, child in sorted(children, key=lambda item: -item[0]):
+            yield number, report, child
 
     @cached_property
     def _far(self) -> Array:
@@ -400,11 +483,11 @@ class OfOutputs(Knowledge):
         return np.where(radii > 0.0, radii, 1.0)
 
     def _inside(self, z: Array) -> Array:
-        """Deviations that rounding has not taken out of their set."""
+        """Return the deviations moved back into their set, which rounding may have left."""
         for entries, _, convex, middle in self.spread.parts if z.size else ():
             if convex.is_box:
-                box, own = convex.bounding_box(), z[entries].reshape(-1, convex.dimension)
-                z[entries] = np.clip(own, box.lower - middle, box.upper - middle).ravel()
+                box, values = convex.bounding_box(), z[entries].reshape(-1, convex.dimension)
+                z[entries] = np.clip(values, box.lower - middle, box.upper - middle).ravel()
             else:
                 z[entries] *= ROOM
         return z
@@ -425,19 +508,20 @@ def hiding(noise: ConvexSet) -> tuple[Array, Array] | None:
     flat = about(noise)
     if flat is None and noise.halfspaces() is None and noise.dimension <= CORNERS:
         axes, middle = np.eye(noise.dimension), noise.middle()
-        far = np.minimum(noise.support(axes) - middle, noise.support(-axes) + middle) / noise.dimension
-        corners = middle + far * np.array(list(product((-1.0, 1.0), repeat=noise.dimension)))
-        flat = about(Box(-far, far)) if (noise.gauge(corners) <= 1.0).all() else None
+        radii = np.minimum(noise.support(axes) - middle, noise.support(-axes) + middle) / noise.dimension
+        corners = middle + radii * np.array(list(product((-1.0, 1.0), repeat=noise.dimension)))
+        flat = about(Box(-radii, radii)) if (noise.gauge(corners) <= 1.0).all() else None
     return None if flat is None else (flat[0], ROOM * flat[1])
 
 
 def extreme(spread: Spread, along: Array) -> Array:
-    """An extreme deviation ``(..., Q)`` of the set that is the worst along ``(..., Q)``; any where nothing is."""
+    """Return an extreme deviation ``(..., Q)`` of the set that is the worst along ``along (..., Q)``; any one where the
+    direction is 0."""
     if spread.is_box:
         return np.asarray(np.where(along >= 0.0, 1.0, -1.0) * spread.radii)
     return np.asarray(spread.worst(along))
 
 
 def sums(a: Array) -> Array:
-    """The sums over the last axis of what is before each place, and of all."""
+    """Return the sums over the last axis of the entries before each position, and of all entries."""
     return np.concatenate([np.zeros((*a.shape[:-1], 1)), np.cumsum(a, axis=-1)], axis=-1)

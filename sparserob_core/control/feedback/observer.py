@@ -1,8 +1,8 @@
-"""What outputs tell of the deviations: innovations of a one-step observer, and an observer gain that is stable.
+"""Innovations of outputs by a one-step observer, and an observer gain that is stable.
 
 From the centre of the initial states on, ``x^_{j+1} = Phi_j x^_j + (what the control, the drift and the middle of the
 disturbance add) + L_j (y_j - C x^_j - v_m)`` with the middle ``v_m`` of the noise. The error ``x - x^`` does not depend
-on the control; so the innovations ``e_j = y_j - C x^_j - v_m`` are linear in the deviations of the disturbance, of the
+on the control. So the innovations ``e_j = y_j - C x^_j - v_m`` are linear in the deviations of the disturbance, of the
 noise and of the initial state, whatever the gains are. Where every innovation is answered, any ``L`` gives the same
 policies.
 """
@@ -39,9 +39,21 @@ def between(response: Response, control: Dictionary) -> Array:
 @final
 @dataclass(frozen=True, eq=False)
 class Observer:
-    """``C (p, d)``, the gains ``L (K, d, p)`` of every breakpoint, the last of which nothing follows, the transitions
-    ``flows (K - 1, d, d)`` of the state from each to the next, and the middle of the noise ``(p,)``; ``noisy``: whether
-    there is any."""
+    """One-step observer of the state from outputs.
+
+    Parameters
+    ----------
+    C : ndarray, shape (p, d)
+        Matrix of the outputs.
+    L : ndarray, shape (K, d, p)
+        Gain at every breakpoint; nothing follows the last one.
+    flows : ndarray, shape (K - 1, d, d)
+        Transitions of the state from each breakpoint to the next.
+    middle : ndarray, shape (p,)
+        Middle of the noise.
+    noisy : bool
+        Whether there is a noise.
+    """
 
     C: Array
     L: Array
@@ -51,57 +63,82 @@ class Observer:
 
     @staticmethod
     def of(measured: Measurements, seen: Array, flows: Array, radii: Array) -> Observer:
-        """A stable one for a state of which ``seen (K, d, Q)`` enters from breakpoint to breakpoint, where deviations
-        go as far as ``radii (Q,)``: the one-step predictor of Kalman (1960) for deviations of these sizes. Where the
-        outputs say the whole state and there is no noise it predicts from what was measured alone."""
+        """Return the one-step predictor of Kalman (1960) for deviations of given sizes, a stable observer.
+
+        Where the outputs determine the whole state and there is no noise, it predicts from the last measurement alone.
+
+        Parameters
+        ----------
+        measured : Measurements
+            Outputs and their noise.
+        seen : ndarray, shape (K, d, Q)
+            Contribution of the deviations to the state from breakpoint to breakpoint.
+        flows : ndarray, shape (K - 1, d, d)
+            Transitions of the state from each breakpoint to the next.
+        radii : ndarray, shape (Q,)
+            Largest deviations.
+        """
         C, K = np.asarray(measured.C), seen.shape[0]
         p, d = C.shape
         L = np.zeros((K, d, p))
         box, middle = measured.noises.bounding_box(), measured.noises.middle()
         noise = (box.upper - box.lower) / 2.0  # from its middle, which is no deviation
-        whole = measured.noise is None and p == d and np.linalg.matrix_rank(C) == d
-        entered = seen * radii
-        P = entered[0] @ entered[0].T
+        is_state_known = measured.noise is None and p == d and np.linalg.matrix_rank(C) == d
+        input_factors = seen * radii
+        P = input_factors[0] @ input_factors[0].T
         for j in range(K - 1):
-            if whole:
+            if is_state_known:
                 L[j] = flows[j] @ np.linalg.inv(C)
                 continue
             S = C @ P @ C.T + np.diag(noise**2)
             L[j] = flows[j] @ P @ C.T @ np.linalg.pinv(S, rcond=TELLING, hermitian=True)
-            left = flows[j] - L[j] @ C
-            P = left @ P @ left.T + (L[j] * noise**2) @ L[j].T + entered[j + 1] @ entered[j + 1].T
+            error_transition = flows[j] - L[j] @ C
+            P = (
+                error_transition @ P @ error_transition.T
+                + (L[j] * noise**2) @ L[j].T
+                + input_factors[j + 1] @ input_factors[j + 1].T
+            )
         return Observer(C, L, flows, middle, measured.noise is not None)
 
     def outputs(self, states: Array, noise: Array | None = None) -> Array:
-        """What is measured of ``states (d, n)``, ``(p, n)``; with the middle of the noise unless it is given."""
+        """Return the outputs ``(p, n)`` of ``states (d, n)``, with the given ``noise`` or else the middle of the
+        noise."""
         return np.asarray(self.C @ states + (self.middle[:, None] if noise is None else noise))
 
     def seen(self, D: Array, begun: int) -> Array:
-        """The innovations ``(K, p, Q + K p)`` of the deviations that enter the state as ``D (K, d, Q)`` from breakpoint
-        to breakpoint, and of those of the noise, which stand before the last ``begun``, of the initial state."""
+        """Return the matrices ``(K, p, Q + K p)`` from all deviations to the innovations, or ``(K, p, Q)`` without a
+        noise.
+
+        Disturbance and initial state enter the state as ``D (K, d, Q)`` from breakpoint to breakpoint. The entries of
+        the noise stand before the last ``begun`` entries, which belong to the initial state.
+        """
         (K, d, Q), p = D.shape, self.C.shape[0]
         count = K * p if self.noisy else 0
-        entered = np.concatenate([D[:, :, : Q - begun], np.zeros((K, d, count)), D[:, :, Q - begun :]], axis=2)
-        found, error = np.zeros((K, p, Q + count)), np.zeros((d, Q + count))
+        inputs = np.concatenate([D[:, :, : Q - begun], np.zeros((K, d, count)), D[:, :, Q - begun :]], axis=2)
+        innovations, error = np.zeros((K, p, Q + count)), np.zeros((d, Q + count))
         for j in range(K):
-            error = error + entered[j]
-            found[j] = self.C @ error
+            error = error + inputs[j]
+            innovations[j] = self.C @ error
             if self.noisy:
-                place = Q - begun + j * p
-                found[j, :, place : place + p] += np.eye(p)
+                first = Q - begun + j * p
+                innovations[j, :, first : first + p] += np.eye(p)
             if j + 1 < K:
-                error = self.flows[j] @ error - self.L[j] @ found[j]
-        return found
+                error = self.flows[j] @ error - self.L[j] @ innovations[j]
+        return innovations
 
     def in_units(self, states: Array, outputs: Array) -> Observer:
-        """The same where one of a state was ``states (d,)``, and one of an output ``outputs (p,)``."""
+        """Return the same observer in other units: one unit of a state before is ``states (d,)`` units after, and one
+        unit of an output is ``outputs (p,)``."""
         C, L = self.C * outputs[:, None] / states, self.L * states[:, None] / outputs
         return Observer(C, L, self.flows * states[:, None] / states, self.middle * outputs, self.noisy)
 
 
 def innovations_of(entering: Array, begun: int, observer: Observer | None, anew: bool) -> Array:
-    """The innovations ``(K, p, Q)`` of all deviations, where those of disturbance and initial state enter the state as
-    ``entering (K, d, Q')``: those of the noise stand before the last ``begun``, of the initial state, and with ``anew``
-    so many of the next period's initial state between them, which nobody sees in this one."""
-    seen = entering if observer is None else observer.seen(entering, begun)
-    return np.insert(seen, np.full(begun, seen.shape[2] - begun), 0.0, axis=2) if anew else seen
+    """Return the matrices ``(K, p, Q)`` from all deviations to the innovations.
+
+    Disturbance and initial state enter the state as ``entering (K, d, Q')``. The entries of the noise stand before the
+    last ``begun`` entries, which belong to the initial state. With ``anew``, as many entries of the next period's
+    initial state stand between them; no measurement of this period depends on them.
+    """
+    innovations = entering if observer is None else observer.seen(entering, begun)
+    return np.insert(innovations, np.full(begun, innovations.shape[2] - begun), 0.0, axis=2) if anew else innovations

@@ -50,26 +50,27 @@ class Sampled:
 
     @staticmethod
     def of(loop: ClosedLoop, constraints: list[tuple[Array, Array, Array]]) -> Sampled:
-        """Of constraints ``H x(t) <= h`` at times each, ``(H, h, times)``."""
-        parts: list[tuple[np.ndarray, ...]] = []
+        """Return the rows of constraints ``H x(t) <= h``, each given as ``(H, h, times)``, for the control and the
+        deviations of a loop."""
+        blocks: list[tuple[np.ndarray, ...]] = []
         response, K = loop.functionals.response, loop.functionals.dictionary.pieces
         for number, (H, h, times) in enumerate(constraints):
             if not H.shape[0] or not times.size:
                 continue
-            at, side = np.repeat(times, H.shape[0]), np.tile(np.arange(H.shape[0]), times.size)
-            free, weights, on_noise = response.weights(at, H[side], np.zeros((at.size, 0)))
+            row_times, side = np.repeat(times, H.shape[0]), np.tile(np.arange(H.shape[0]), times.size)
+            free, weights, on_noise = response.weights(row_times, H[side], np.zeros((row_times.size, 0)))
             constant = free @ loop.start + loop.functionals.given(weights)
             constant = constant + np.einsum("rli,li->r", on_noise, loop.middles)
-            T = loop.functionals.on_decision(weights).reshape(at.size, -1, K)
+            T = loop.functionals.on_decision(weights).reshape(row_times.size, -1, K)
             N = np.einsum("rli,liq->rq", on_noise, loop.entries[..., : loop.noise.start])
             N = np.concatenate([N, free @ loop.begins[:, loop.spread.size - int(loop.begins.sum()) :]], axis=1)
-            limits, numbers = h[side] - constant, np.full(at.size, number)
-            parts.append((T, N, limits, numbers, side, at))
+            limits, numbers = h[side] - constant, np.full(row_times.size, number)
+            blocks.append((T, N, limits, numbers, side, row_times))
         m, Q = loop.answers.shape[1], loop.noise.start + int(loop.begins.sum())
-        if not parts:
+        if not blocks:
             none = np.zeros(0, dtype=int)
             return Sampled(np.zeros((0, m, K)), np.zeros((0, Q)), np.zeros(0), none, none, np.zeros(0))
-        T, N, b, constraint, side, time = (np.concatenate(part) for part in zip(*parts, strict=True))
+        T, N, b, constraint, side, time = (np.concatenate(arrays) for arrays in zip(*blocks, strict=True))
         return Sampled(T, N, b, constraint, side, time)
 
 
@@ -122,14 +123,15 @@ class Tree:
         m, K = self.prices.shape
         axes = np.eye(m)
         low, high = -self.control.support(-axes), self.control.support(axes)
-        far = np.maximum(np.abs(low), np.abs(high))
-        self._far = np.where(far > 0.0, far, 1.0)  # columns are controls in this unit, and costs in that of the largest
+        radii = np.maximum(np.abs(low), np.abs(high))
+        # columns are controls in this unit, and costs in that of the largest
+        self._far = np.where(radii > 0.0, radii, 1.0)
         self._low, self._high = low / self._far, high / self._far
         largest = float((self.prices * self._far[:, None]).sum())
         self._unit = largest if largest > 0.0 else 1.0
         self._linear = Growing()
-        most, price = (0.0, 0.0) if self.highest is None else (self.highest, -1.0)
-        self._linear.variables(np.zeros(1), np.array([most]), np.array([price]))
+        upper, price = (0.0, 0.0) if self.highest is None else (self.highest, -1.0)
+        self._linear.variables(np.zeros(1), np.array([upper]), np.array([price]))
         self._sizes = np.zeros((m, 0), dtype=int)
         if self.priced:
             self._charges, reach = self._rates.ravel(), np.ones(m * K)
@@ -143,7 +145,7 @@ class Tree:
 
     @property
     def priced(self) -> bool:
-        """Whether the program has a cost."""
+        """True where the program minimises a cost, False where it maximises the factor of all deviations."""
         return self.highest is None
 
     @cached_property
@@ -163,42 +165,44 @@ class Tree:
 
     @cached_property
     def _moves(self) -> Array:
-        """What the columns give to the rows, ``(R, m, K)``."""
+        """Coefficients of the columns in the rows, ``(R, m, K)``."""
         return np.asarray(self.sampled.T * self._far[:, None])
 
     @cached_property
     def units(self) -> Array:
-        """What every row is divided by: how large it can be."""
+        """Largest possible size of every row, ``(R,)``, by which the row is divided."""
         s = self.sampled
         size = np.abs(self._moves).sum(axis=(1, 2)) + self.knowledge.most + np.abs(s.b)
         return np.where(size > 0.0, size, 1.0)
 
     def add(self, z: Array) -> bool:
-        """One more signal; whether it is new."""
+        """Add a signal, and return whether it is new."""
         z = np.asarray(z, dtype=float) + 0.0
-        if any(np.array_equal(z, other) for other in self.signals):
+        if any(np.array_equal(z, signal) for signal in self.signals):
             return False
         m, K = self.prices.shape
         columns, nominal, flat = np.zeros((m, K), dtype=int), not self.signals, self._flat
         for k in range(K):
             key = self._known(z, k)
-            fresh = key not in self._groups
-            if fresh:
+            is_new = key not in self._groups
+            if is_new:
                 self._groups[key] = self._linear.variables(self._low, self._high, np.zeros(m))
             columns[:, k] = self._groups[key]
-            if fresh and flat is not None:
+            if is_new and flat is not None:
                 row, channel = np.nonzero(flat[0])
                 self._rows([(row, columns[channel, k], flat[0][row, channel])], flat[1])
-            if fresh and self.priced and (nominal or self.cost != "nominal"):
-                which = np.arange(m)
+            if is_new and self.priced and (nominal or self.cost != "nominal"):
+                channels = np.arange(m)
                 if self.cost == "worst":
                     self._own[key] = self._linear.variables(np.zeros(m), np.ones(m), np.zeros(m))
                 sizes = self._own[key] if self.cost == "worst" else self._sizes[:, k]
                 for sign in (1.0, -1.0):
-                    self._rows([(which, columns[:, k], np.full(m, sign)), (which, sizes, -np.ones(m))], np.zeros(m))
+                    self._rows(
+                        [(channels, columns[:, k], np.full(m, sign)), (channels, sizes, -np.ones(m))], np.zeros(m)
+                    )
         if self.priced and self.cost == "worst":
-            own = [self._own[self._known(z, k)] for k in range(K)]
-            column = np.concatenate([*own, self._charged])
+            size_variables = [self._own[self._known(z, k)] for k in range(K)]
+            column = np.concatenate([*size_variables, self._charged])
             self._efforts.append(
                 self._rows([(np.zeros(column.size, dtype=int), column, np.append(self._rates.T, -1.0))], np.zeros(1))
             )
@@ -210,33 +214,34 @@ class Tree:
         return int(self._linear.rows(entries, np.full(upper.size, -np.inf), upper)[0])
 
     def _known(self, z: Array, k: int) -> tuple[int, bytes]:
-        """What is equal for signals that the control on a piece cannot tell apart."""
+        """Return a key that is equal for all signals that the control on piece ``k`` cannot distinguish."""
         return k, self.knowledge.history(z, int(self.knowledge.seen[k]))
 
     def changed(self, signal: int, row: int, report: int) -> Array:
-        """The worst signal for a row of those with the reports of one of the tree before this one."""
+        """Return the worst signal for a row among those that share the first ``report`` reports with a signal of the
+        tree."""
         return self.knowledge.changed(self.signals[signal], row, report)[1]
 
     def _impose(self, signal: int, row: int, report: int) -> bool:
-        """One row under a `changed` signal; whether it was not there."""
+        """Impose one row under a `changed` signal, and return whether it is new."""
         s, z = self.sampled, self.signals[signal]
         key = (row, report, self.knowledge.history(z, report))
         if key in self._imposed:
             return False
         self._imposed.add(key)
-        late, unit = self.knowledge.seen > report, self.units[row]
-        channel, piece = np.nonzero(self._moves[row] * ~late)
+        is_informed, unit = self.knowledge.seen > report, self.units[row]
+        channel, piece = np.nonzero(self._moves[row] * ~is_informed)
         noise, _ = self.knowledge.changed(z, row, report)
         columns, values = [self._columns[signal][channel, piece]], [self._moves[row][channel, piece]]
         columns.append(np.zeros(1, dtype=int))
         values.append(np.array([-unit if self.priced else noise]))
         limit = s.b[row] - (noise if self.priced else 0.0)
         if self._limited:
-            columns.append(self._sizes[:, late].ravel())
-            values.append(-self._by_size[row][:, late].ravel())
-            limit -= float(self._fixed[row][:, late].sum())
+            columns.append(self._sizes[:, is_informed].ravel())
+            values.append(-self._by_size[row][:, is_informed].ravel())
+            limit -= float(self._fixed[row][:, is_informed].sum())
         else:
-            limit -= float(self._least[row, late].sum())
+            limit -= float(self._least[row, is_informed].sum())
         column, value = np.concatenate(columns), np.concatenate(values) / unit
         self._numbers.append(self._rows([(np.zeros(column.size, dtype=int), column, value)], np.array([limit / unit])))
         self._order.append((signal, row, report))
@@ -244,19 +249,19 @@ class Tree:
 
     @property
     def _limited(self) -> bool:
-        """Whether controls are limited by variables."""
+        """True where variables bound the sizes of the controls, as with the cost ``peak``."""
         return self.cost == "peak" and self.priced
 
     @cached_property
     def _by_size(self) -> Array:
-        """How much a control no larger than its peak can take off every row, times the peak, ``(R, m, K)``."""
+        """Largest decrease of every row by a control, per unit of the peak that bounds the control, ``(R, m, K)``."""
         T = self._moves
         moves = np.where(T > 0.0, (self._low < 0.0)[:, None], (self._high > 0.0)[:, None])
         return np.asarray(np.abs(T) * moves)
 
     @cached_property
     def _fixed(self) -> Array:
-        """What it must give to every row where 0 is out of its reach, ``(R, m, K)``."""
+        """Least contribution of the control to every row where its bounds exclude 0, ``(R, m, K)``; 0 elsewhere."""
         T = self._moves
         return np.asarray(
             T * np.where(T > 0.0, np.maximum(self._low, 0.0)[:, None], np.minimum(self._high, 0.0)[:, None])
@@ -268,7 +273,8 @@ class Tree:
         return np.asarray(-self.control.support(-self.sampled.T.swapaxes(1, 2)))
 
     def least(self) -> Grown | None:
-        """The least cost, or the largest factor; ``None`` where nothing is feasible or nothing was solved."""
+        """Return the tree of least cost, or of the largest factor; ``None`` where nothing is feasible or nothing was
+        solved."""
         return self._solved()
 
     def relaxed(self, budget: float = np.inf, central: bool = False) -> Grown | None:
@@ -298,49 +304,51 @@ class Tree:
 
     def _solved(self, relaxed: bool = False) -> Grown | None:
         """The program with every sampled row, which are imposed as they are violated."""
-        found = None
+        solution = None
         for _ in range(PASSES):
-            done, _, x, y = self._linear.solve(self.seconds())
+            is_solved, _, x, y = self._linear.solve(self.seconds())
             self.work += self._linear.work + len(self.signals) * (self.sampled.T.size + self.sampled.N.size)
-            if not done:
+            if not is_solved:
                 return None
-            u, mine = x[np.array(self._columns)] * self._far[:, None], np.array([y[at] for at in self._numbers])
-            kept = np.flatnonzero(mine > 0.0)
+            u, multipliers = x[np.array(self._columns)] * self._far[:, None], np.array([y[at] for at in self._numbers])
+            kept = np.flatnonzero(multipliers > 0.0)
             signals, rows, reports = np.array(self._order, dtype=int).reshape(-1, 3)[kept].T
             unit = 1.0 if relaxed or not self.priced else self._unit
             value = float(x[0]) if relaxed or not self.priced else unit * float(self._charges @ x[self._charged])
             shares = np.maximum([y[at] for at in self._efforts], 0.0)
-            found = Grown(value, x, u, signals, rows, reports, unit * mine[kept] / self.units[rows], shares)
-            if not self._separate(found):
+            solution = Grown(value, x, u, signals, rows, reports, unit * multipliers[kept] / self.units[rows], shares)
+            if not self._separate(solution):
                 break
-        return found
+        return solution
 
     def _separate(self, found: Grown) -> bool:
-        s, over, grew = self.sampled, self.excess(found), False
+        s, excess, grew = self.sampled, self.excess(found), False
         kinds = s.constraint * (1 + s.side.max(initial=0)) + s.side
         for kind in np.unique(kinds):
-            at = np.flatnonzero(kinds == kind)
-            some = over[:, at].reshape(over.shape[0], -1)
-            for signal, places in enumerate(np.argsort(-some, axis=1)[:, :AT_ONCE]):
-                for place in places[some[signal, places] > EXCEEDED].tolist():
-                    row, report = divmod(place, over.shape[2])
-                    grew |= self._impose(signal, int(at[row]), report)
+            rows = np.flatnonzero(kinds == kind)
+            violations = excess[:, rows].reshape(excess.shape[0], -1)
+            for signal, flat_indices in enumerate(np.argsort(-violations, axis=1)[:, :AT_ONCE]):
+                for flat_index in flat_indices[violations[signal, flat_indices] > EXCEEDED].tolist():
+                    row, report = divmod(flat_index, excess.shape[2])
+                    grew |= self._impose(signal, int(rows[row]), report)
         return grew
 
     def excess(self, found: Grown) -> Array:
-        """By how many units every row is exceeded under every `changed` signal, whatever the controls that can know of
-        the change, ``(S, R, reports + 1)``, or less than 0 where it is not; ``-inf`` where the change comes after the
-        row."""
+        """Return the excess of every row under every `changed` signal, in units of the row, ``(S, R, reports + 1)``.
+
+        The controls that can know of the change take their best values. Values of rows that hold may be any numbers
+        that are not above 0, and ``-inf`` stands where the change comes after the row.
+        """
         s, knowledge = self.sampled, self.knowledge
-        own = np.einsum("rmk,smk->srk", s.T, found.u)
+        control_values = np.einsum("rmk,smk->srk", s.T, found.u)
         best = self._least
         if self._limited:
             best = (self._fixed - self._by_size * found.x[self._sizes]).sum(axis=1)
-        rest = sums(best[:, ::-1])[:, ::-1]  # of every piece and all later ones
+        later_best = sums(best[:, ::-1])[:, ::-1]  # of every piece and all later ones
         reports, scale = np.arange(knowledge.reports + 1), 1.0 if self.priced else max(found.x[0], np.finfo(float).tiny)
-        beside = sums(own)[:, :, knowledge.first] + rest[:, knowledge.first] - s.b[:, None]
+        offsets = sums(control_values)[:, :, knowledge.first] + later_best[:, knowledge.first] - s.b[:, None]
         if self.priced:
-            beside = beside - found.x[0] * self.units[:, None]
-        beside = np.where(reports <= knowledge.begun[:, None], beside, -np.inf)
-        over = beside + scale * knowledge.gives(np.array(self.signals), beside / scale)
-        return np.asarray(over / self.units[:, None])
+            offsets = offsets - found.x[0] * self.units[:, None]
+        offsets = np.where(reports <= knowledge.begun[:, None], offsets, -np.inf)
+        excess = offsets + scale * knowledge.gives(np.array(self.signals), offsets / scale)
+        return np.asarray(excess / self.units[:, None])

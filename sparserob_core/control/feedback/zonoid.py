@@ -1,8 +1,8 @@
-"""What measurable disturbances of one piece make of the state at its end: a set of vectors, the integral of a set.
+"""Effects of measurable disturbances of one piece on the state at its end: a set of vectors, the integral of a set.
 
 ``Z = {int_0^l K(r) (w(r) - m) dr : w(r) in W}`` is convex (Lyapunov 1940, Aumann 1965) and closed; its support function
-is ``int_0^l max_v (v - m)'K(r)'a dr`` over the corners ``v`` of ``W``. Which corner is best changes at finitely many
-times, the roots of exponential polynomials: they are looked for between samples that are certain to be apart, and the
+is ``int_0^l max_v (v - m)'K(r)'a dr`` over the corners ``v`` of ``W``. The best corner changes at finitely many times,
+the roots of exponential polynomials. They are searched for where samples do not prove that one corner is the best; the
 integral in between is that of a polynomial.
 """
 
@@ -38,7 +38,7 @@ EDGE = 1e-9  # of a cell, a root that is so near to an end is no progress
 
 
 def has_corners(bound: ConvexSet) -> bool:
-    """Whether a set has `corners` that are known."""
+    """Return whether the `corners` of a set are known."""
     return bound.is_box or getattr(bound, "vertices", None) is not None
 
 
@@ -48,9 +48,9 @@ def corners(bound: ConvexSet) -> list[Array]:
         box = bound.bounding_box()
         radii = (box.upper - box.lower) / 2
         return [np.outer([1.0, -1.0], row) for row in np.diag(radii)[radii > 0.0]]
-    found = getattr(bound, "vertices", None)
-    assert found is not None
-    return [np.asarray(found) - bound.middle()]
+    vertices = getattr(bound, "vertices", None)
+    assert vertices is not None
+    return [np.asarray(vertices) - bound.middle()]
 
 
 @final
@@ -66,39 +66,56 @@ class Arc:
 @final
 @dataclass(frozen=True, eq=False)
 class Pushes:
-    """What a disturbance at any time of a piece makes of the state at its end, ``K (d, mw)``: polynomials ``terms (S, p
-    + 1, d, mw)`` of ``u`` from -1 to 1 across each part, between ``ends (S + 1,)``, times that are left of the piece,
-    from 0 on."""
+    """Kernel ``K (d, mw)`` from a disturbance at any time of a piece to the state at its end, as polynomials.
+
+    Parameters
+    ----------
+    terms : ndarray, shape (S, p + 1, d, mw)
+        Coefficients of polynomials of ``u`` from -1 to 1 across each part of the piece.
+    ends : ndarray, shape (S + 1,)
+        Ends of the parts, as times that are left until the end of the piece, from 0 on.
+    """
 
     terms: Array
     ends: Array
 
     @staticmethod
     def of(A: Array, E: Array, length: float) -> Pushes:
-        """``e^{A r} E`` for ``r`` from 0 to a length, on equal parts."""
+        """Return the kernel ``e^{A r} E`` for ``r`` from 0 to ``length``, on equal parts."""
         count = _parts(A, length)
         half, term = length / count / 2.0, E
         flows = exponential(A * ((np.arange(count) + 0.5) * (2.0 * half))[:, None, None])
-        found = []
+        terms = []
         for order in range(_degree(float(np.linalg.norm(A, 2)) * half) + 1):
-            found.append(flows @ term)
+            terms.append(flows @ term)
             term = A @ term * (half / (order + 1))
-        return Pushes(np.stack(found, axis=1), np.linspace(0.0, length, count + 1))
+        return Pushes(np.stack(terms, axis=1), np.linspace(0.0, length, count + 1))
 
     @staticmethod
     def joined(kernels: Sequence[Array], ends: Array, counts: Sequence[int]) -> Pushes:
-        """Of polynomials ``(q + 1, d, mw)`` of the share from 0 to 1 of intervals between ``ends (n + 1,)``, which are
-        the pushes times an interval's length: on so many equal parts of each, without terms that do not show."""
+        """Join the kernels of consecutive intervals, without terms of negligible size at the highest orders.
+
+        Parameters
+        ----------
+        kernels : sequence of ndarray, shape (q + 1, d, mw)
+            Polynomials of the share, from 0 to 1, of each interval: the kernel times the length of the interval.
+        ends : ndarray, shape (n + 1,)
+            Ends of the intervals, as times that are left until the end of the piece.
+        counts : sequence of int
+            Number of equal parts of each interval.
+        """
         terms, cuts = [], [ends[:1]]
         for kernel, low, high, count in zip(kernels, ends[:-1], ends[1:], counts, strict=True):
-            every = np.einsum("skj,jdw->skdw", _across(len(kernel), count), kernel) / (high - low)
-            terms.append(every)
+            part_terms = np.einsum("skj,jdw->skdw", _across(len(kernel), count), kernel) / (high - low)
+            terms.append(part_terms)
             cuts.append(low + (high - low) * np.arange(1, count + 1) / count)
-        most = max(len(kernel) for kernel in kernels)
-        found = np.concatenate([np.pad(one, ((0, 0), (0, most - one.shape[1]), (0, 0), (0, 0))) for one in terms])
-        sizes = np.abs(found).max(axis=(0, 2, 3))
-        shown = np.flatnonzero(sizes > REST * sizes.max(initial=0.0))
-        return Pushes(found[:, : 1 + int(shown.max(initial=0))], np.concatenate(cuts))
+        size = max(len(kernel) for kernel in kernels)
+        coefficients = np.concatenate(
+            [np.pad(part_terms, ((0, 0), (0, size - part_terms.shape[1]), (0, 0), (0, 0))) for part_terms in terms]
+        )
+        sizes = np.abs(coefficients).max(axis=(0, 2, 3))
+        significant = np.flatnonzero(sizes > REST * sizes.max(initial=0.0))
+        return Pushes(coefficients[:, : 1 + int(significant.max(initial=0))], np.concatenate(cuts))
 
     @cached_property
     def halves(self) -> Array:
@@ -124,17 +141,23 @@ class Zonoid(ConvexSet):
     @staticmethod
     def of(pushes: Pushes, bound: ConvexSet) -> Zonoid:
         """The set of one piece, in the coordinates in which the ellipsoid of its second moments is a ball."""
-        parts, (d, mw) = tuple(corners(bound)), pushes.terms.shape[2:]
+        corner_sets, (d, mw) = tuple(corners(bound)), pushes.terms.shape[2:]
         nodes, weights = np.polynomial.legendre.leggauss(32)
         share = weights * pushes.halves[:, None]
-        reach = np.zeros(mw) if not parts else np.max([np.abs(part).max(axis=0) for part in parts], axis=0)
+        reach = (
+            np.zeros(mw)
+            if not corner_sets
+            else np.max([np.abs(corner_set).max(axis=0) for corner_set in corner_sets], axis=0)
+        )
         powers = nodes[:, None] ** np.arange(pushes.terms.shape[1])
-        pushed = np.einsum("np,spdw->sndw", powers, pushes.terms) * reach
-        moments = (pushed * np.sqrt(share)[:, :, None, None]).reshape(-1, d, mw).transpose(1, 0, 2).reshape(d, -1)
+        kernel_values = np.einsum("np,spdw->sndw", powers, pushes.terms) * reach
+        moments = (
+            (kernel_values * np.sqrt(share)[:, :, None, None]).reshape(-1, d, mw).transpose(1, 0, 2).reshape(d, -1)
+        )
         U, sizes, _ = np.linalg.svd(moments, full_matrices=False)
         kept = sizes > NEGLIGIBLE * sizes.max(initial=0.0)
         U, sizes = U[:, kept], sizes[kept]
-        return Zonoid(pushes, parts, (U / sizes).T, U * sizes)
+        return Zonoid(pushes, corner_sets, (U / sizes).T, U * sizes)
 
     @property
     def dimension(self) -> int:
@@ -163,7 +186,7 @@ class Zonoid(ConvexSet):
 
     @property
     def is_symmetric(self) -> bool:
-        return all(part.shape[0] == 2 and not part.sum(axis=0).any() for part in self.parts)
+        return all(corner_set.shape[0] == 2 and not corner_set.sum(axis=0).any() for corner_set in self.parts)
 
     @property
     def kind(self) -> str:
@@ -171,12 +194,12 @@ class Zonoid(ConvexSet):
 
     @property
     def count(self) -> int:
-        """How many parts the piece is cut into."""
+        """Number ``S`` of parts of the piece."""
         return int(self.pushes.ends.size - 1)
 
     @property
     def channels(self) -> int:
-        """How many entries a disturbance has."""
+        """Number ``mw`` of entries of a disturbance."""
         return int(self.pushes.terms.shape[3])
 
     @cached_property
@@ -188,8 +211,8 @@ class Zonoid(ConvexSet):
     def integrals(self) -> Array:
         """The integral of the `coefficients` over time from the middle of a part, ``(S, p + 2, r, mw)``."""
         orders, halves = np.arange(1, self.coefficients.shape[1] + 1), self.pushes.halves
-        found = halves[:, None, None, None] * self.coefficients / orders[:, None, None]
-        return np.concatenate([np.zeros_like(self.coefficients[:, :1]), found], axis=1)
+        terms = halves[:, None, None, None] * self.coefficients / orders[:, None, None]
+        return np.concatenate([np.zeros_like(self.coefficients[:, :1]), terms], axis=1)
 
     @cached_property
     def across(self) -> Array:
@@ -212,46 +235,46 @@ class Zonoid(ConvexSet):
 
     def support(self, directions: Array) -> Array:
         flat = np.asarray(directions, dtype=float).reshape(-1, self.dimension)
-        found = np.zeros(flat.shape[0])
-        for part in self.parts:
-            for here in self._chunks(flat.shape[0], part):
-                found[here] += self._swept(part, flat[here]).values()
-        return found.reshape(np.shape(directions)[:-1])
+        values = np.zeros(flat.shape[0])
+        for corner_set in self.parts:
+            for chunk in self._chunks(flat.shape[0], corner_set):
+                values[chunk] += self._swept(corner_set, flat[chunk]).values()
+        return values.reshape(np.shape(directions)[:-1])
 
     def support_point(self, directions: Array) -> Array:
         flat = np.asarray(directions, dtype=float).reshape(-1, self.dimension)
-        found = np.zeros(flat.shape)
-        for part in self.parts:
-            for here in self._chunks(flat.shape[0], part):
-                found[here] += self._swept(part, flat[here]).points()
-        found[~flat.any(axis=1)] = 0.0
-        return found.reshape(np.shape(directions))
+        points = np.zeros(flat.shape)
+        for corner_set in self.parts:
+            for chunk in self._chunks(flat.shape[0], corner_set):
+                points[chunk] += self._swept(corner_set, flat[chunk]).points()
+        points[~flat.any(axis=1)] = 0.0
+        return points.reshape(np.shape(directions))
 
     def signals(self, points: Array) -> list[Arc]:
         """A signal that leads to each of the points ``(k, r)`` of the set: a mean of at most ``r`` that attain support
         functions and of the middle (Caratheodory)."""
-        every, shares = self._made_of(points)
+        all_directions, shares = self._made_of(points)
         return [
             _mean([self.best(a) for a in directions[share > 0.0]], share[share > 0.0], self.channels)
-            for directions, share in zip(every, shares, strict=True)
+            for directions, share in zip(all_directions, shares, strict=True)
         ]
 
     def best(self, direction: Array) -> Arc:
         """The signal that attains the support function of a direction ``(r,)``."""
-        made = [self._swept(part, direction[None]).arc() for part in self.parts]
-        return _mean(made, np.ones(len(made)), self.channels)
+        arcs = [self._swept(corner_set, direction[None]).arc() for corner_set in self.parts]
+        return _mean(arcs, np.ones(len(arcs)), self.channels)
 
     def reached(self, signal: Arc) -> Array:
         """The point ``(r,)`` that a signal leads to."""
         ends, halves = self.pushes.ends, self.pushes.halves
-        left = ends[-1] * (1.0 - np.concatenate([[0.0], signal.ends]))
-        part = np.clip(np.searchsorted(ends, left, side="right") - 1, 0, self.count - 1)
-        along = (left - ends[part]) / halves[part] - 1.0
+        times_left = ends[-1] * (1.0 - np.concatenate([[0.0], signal.ends]))
+        part_numbers = np.clip(np.searchsorted(ends, times_left, side="right") - 1, 0, self.count - 1)
+        along = (times_left - ends[part_numbers]) / halves[part_numbers] - 1.0
         orders = np.arange(self.integrals.shape[1])
-        moved = along[:, None] ** orders - (-1.0) ** orders
-        whole = np.concatenate([np.zeros((1, *self.across.shape[1:])), np.cumsum(self.across, axis=0)])
-        since = whole[part] + np.einsum("np,nprw->nrw", moved, self.integrals[part])
-        return np.asarray(np.einsum("nrw,nw->r", since[:-1] - since[1:], signal.values))
+        powers = along[:, None] ** orders - (-1.0) ** orders
+        cumulative = np.concatenate([np.zeros((1, *self.across.shape[1:])), np.cumsum(self.across, axis=0)])
+        integrals = cumulative[part_numbers] + np.einsum("np,nprw->nrw", powers, self.integrals[part_numbers])
+        return np.asarray(np.einsum("nrw,nw->r", integrals[:-1] - integrals[1:], signal.values))
 
     def _chunks(self, size: int, part: Array) -> Iterator[slice]:
         step = max(1, HELD // ((self.count + 1) * max(self.channels, part.shape[0])))
@@ -265,11 +288,11 @@ class Zonoid(ConvexSet):
         directions in these shares are ``points (k, r)`` of the set, nearly: the gauge of a point as a linear program
         whose columns are generated, as in `ConvexSet`. By how much they miss it, `reached` says."""
         k, r = points.shape
-        turned = np.where(points < 0.0, -1.0, 1.0)
+        signs = np.where(points < 0.0, -1.0, 1.0)
         lengths = np.linalg.norm(points, axis=1)
-        tilted = points / np.where(lengths > 0.0, lengths, 1.0)[:, None] + TILT * turned * (1.0 + np.arange(r) / 7.0)
-        columns = SPIKE * turned[:, :, None] * np.eye(r)
-        chosen, made = np.zeros((k, r, r)), np.zeros((k, r), dtype=bool)
+        tilted = points / np.where(lengths > 0.0, lengths, 1.0)[:, None] + TILT * signs * (1.0 + np.arange(r) / 7.0)
+        columns = SPIKE * signs[:, :, None] * np.eye(r)
+        chosen, is_replaced = np.zeros((k, r, r)), np.zeros((k, r), dtype=bool)
         open_ = np.flatnonzero(lengths > 0.0)
         for _ in range(PIVOTS):
             directions = np.linalg.solve(columns[open_], np.ones((open_.size, r, 1)))[..., 0]
@@ -283,30 +306,33 @@ class Zonoid(ConvexSet):
             with np.errstate(divide="ignore", invalid="ignore"):
                 leaving = np.where(slope > 0.0, np.maximum(share, 0.0) / slope, np.inf).argmin(axis=1)
             columns[open_, leaving], chosen[open_, leaving] = entering, directions
-            made[open_, leaving] = True
+            is_replaced[open_, leaving] = True
         shares = np.linalg.solve(np.swapaxes(columns, 1, 2), points[..., None])[..., 0]
-        for point in np.flatnonzero(((shares < 0.0) | ~made).any(axis=1)):
-            shares[point] = _shares(np.where(made[point][:, None], columns[point], 0.0), points[point])
+        for point in np.flatnonzero(((shares < 0.0) | ~is_replaced).any(axis=1)):
+            shares[point] = _shares(np.where(is_replaced[point][:, None], columns[point], 0.0), points[point])
         return chosen, shares / np.maximum(1.0, shares.sum(axis=1, keepdims=True))
 
 
 @final
 class _Sweep:
-    """Which corner of ``part (v, mw)`` is best along a piece for ``directions (N, r)``: one on every part of the piece
-    that is `clean`, cells ``[low, high]`` of the others with the best corner of each."""
+    """Best corners of ``part (v, mw)`` along a piece, for ``directions (N, r)``.
+
+    On parts of the piece that are `clean` one corner is best throughout. The other parts are cut into cells
+    ``[low, high]``, each with its best corner.
+    """
 
     def __init__(self, zonoid: Zonoid, part: Array, directions: Array) -> None:
         self.zonoid, self.part, self.directions = zonoid, part, directions
         heights = np.tensordot(directions, zonoid.nodes, axes=(1, 1)) @ part.T  # (N, S + 1, v)
         self.best = heights[:, :-1].argmax(axis=2)
-        bent = np.tensordot(np.abs(directions), zonoid.bend, axes=(1, 1))  # (N, S, mw)
-        bent = bent @ np.abs(part[:, None] - part).transpose(2, 0, 1).reshape(part.shape[1], -1)
-        bent = np.take_along_axis(
-            bent.reshape(*self.best.shape, part.shape[0], -1), self.best[:, :, None, None], axis=2
+        curvature = np.tensordot(np.abs(directions), zonoid.bend, axes=(1, 1))  # (N, S, mw)
+        curvature = curvature @ np.abs(part[:, None] - part).transpose(2, 0, 1).reshape(part.shape[1], -1)
+        curvature = np.take_along_axis(
+            curvature.reshape(*self.best.shape, part.shape[0], -1), self.best[:, :, None, None], axis=2
         )[:, :, 0]
         highest = self.best[..., None]
-        left, right = (np.take_along_axis(one, highest, axis=2) - one for one in (heights[:, :-1], heights[:, 1:]))
-        self.clean: np.ndarray = np.all(_apart(left, right, 2.0 * bent, 0.0), axis=2)
+        first, last = (np.take_along_axis(end, highest, axis=2) - end for end in (heights[:, :-1], heights[:, 1:]))
+        self.clean: np.ndarray = np.all(_apart(first, last, 2.0 * curvature, 0.0), axis=2)
         self._split()
 
     def _split(self) -> None:
@@ -316,52 +342,54 @@ class _Sweep:
         scale = np.abs(P).sum(axis=1).max(axis=1, initial=0.0)
         low, high = -np.ones(n.size), np.ones(n.size)
         orders = np.arange(P.shape[1])
-        here = np.arange(n.size)  # the polynomial of every open cell
-        done: list[tuple[np.ndarray, Array, Array, np.ndarray]] = []
+        owner = np.arange(n.size)  # the polynomial of every open cell
+        cells: list[tuple[np.ndarray, Array, Array, np.ndarray]] = []
         for halving in range(HALVINGS + 1):
-            left, right = _at(P[here], low), _at(P[here], high)
-            best = (left + right).argmax(axis=1)
-            over = P[here] - np.take_along_axis(P[here], best[:, None, None], axis=2)
-            bent = (np.abs(over) * (orders * (orders - 1))[:, None]).sum(axis=1)
-            g, h = (np.take_along_axis(one, best[:, None], axis=1) - one for one in (left, right))
-            wide = ((high - low) ** 2 / 2.0)[:, None]
-            ready = np.all(_apart(g, h, wide * bent, FLAT * scale[here][:, None]), axis=1) | (halving == HALVINGS)
-            done.append((here[ready], low[ready], high[ready], best[ready]))
-            here, low, high, left, right = here[~ready], low[~ready], high[~ready], left[~ready], right[~ready]
-            if not here.size:
+            first, last = _at(P[owner], low), _at(P[owner], high)
+            best = (first + last).argmax(axis=1)
+            gaps = P[owner] - np.take_along_axis(P[owner], best[:, None, None], axis=2)
+            curvature = (np.abs(gaps) * (orders * (orders - 1))[:, None]).sum(axis=1)
+            g, h = (np.take_along_axis(end, best[:, None], axis=1) - end for end in (first, last))
+            half_square = ((high - low) ** 2 / 2.0)[:, None]
+            ready = np.all(_apart(g, h, half_square * curvature, FLAT * scale[owner][:, None]), axis=1) | (
+                halving == HALVINGS
+            )
+            cells.append((owner[ready], low[ready], high[ready], best[ready]))
+            owner, low, high, first, last = owner[~ready], low[~ready], high[~ready], first[~ready], last[~ready]
+            if not owner.size:
                 break
-            a, b = left.argmax(axis=1), right.argmax(axis=1)
-            rows = np.arange(here.size)
-            cut = _root(P[here][rows, :, a] - P[here][rows, :, b], low, high)
-            here, low, high = np.tile(here, 2), np.concatenate([low, cut]), np.concatenate([cut, high])
-        place, low, high, best = (np.concatenate(one) for one in zip(*done, strict=True))
-        self.cells = (n[place], s[place], low, high, best)
+            a, b = first.argmax(axis=1), last.argmax(axis=1)
+            rows = np.arange(owner.size)
+            cut = _root(P[owner][rows, :, a] - P[owner][rows, :, b], low, high)
+            owner, low, high = np.tile(owner, 2), np.concatenate([low, cut]), np.concatenate([cut, high])
+        owners, low, high, best = (np.concatenate(arrays) for arrays in zip(*cells, strict=True))
+        self.cells = (n[owners], s[owners], low, high, best)
 
     def values(self) -> Array:
-        """The integrals of the best, ``(N,)``."""
+        """Return the integrals of the largest heights over the corners, ``(N,)``."""
         return np.asarray((self.directions * self.points()).sum(axis=1))
 
     def points(self) -> Array:
-        """What the best corners lead to, ``(N, r)``."""
+        """Return the points ``(N, r)`` of the set that the best corners give."""
         zonoid, (n, s, low, high, best) = self.zonoid, self.cells
-        found = np.tensordot(self.part[self.best] * self.clean[..., None], zonoid.across, axes=([1, 2], [0, 2]))
+        points = np.tensordot(self.part[self.best] * self.clean[..., None], zonoid.across, axes=([1, 2], [0, 2]))
         if n.size:
             orders = np.arange(zonoid.integrals.shape[1])
-            moved = high[:, None] ** orders - low[:, None] ** orders
-            more = np.einsum("np,nprw,nw->nr", moved, zonoid.integrals[s], self.part[best], optimize=True)
-            np.add.at(found, n, more)
-        return np.asarray(found)
+            powers = high[:, None] ** orders - low[:, None] ** orders
+            contributions = np.einsum("np,nprw,nw->nr", powers, zonoid.integrals[s], self.part[best], optimize=True)
+            np.add.at(points, n, contributions)
+        return np.asarray(points)
 
     def arc(self) -> Arc:
         """The signal of the first direction."""
         _, s, low, high, best = self.cells
         ends = self.zonoid.pushes.ends
-        clean, halves, begins = np.flatnonzero(self.clean[0]), np.diff(ends) / 2.0, ends[:-1]
-        stop = np.concatenate([ends[clean + 1], begins[s] + halves[s] * (high + 1.0)])  # backwards in time
-        start = np.concatenate([begins[clean], begins[s] + halves[s] * (low + 1.0)])
-        which = np.concatenate([self.best[0, clean], best])
+        clean_parts, halves, begins = np.flatnonzero(self.clean[0]), np.diff(ends) / 2.0, ends[:-1]
+        stop = np.concatenate([ends[clean_parts + 1], begins[s] + halves[s] * (high + 1.0)])  # backwards in time
+        start = np.concatenate([begins[clean_parts], begins[s] + halves[s] * (low + 1.0)])
+        corner_numbers = np.concatenate([self.best[0, clean_parts], best])
         order = np.argsort(-stop)
-        return Arc(1.0 - start[order] / ends[-1], self.part[which[order]])
+        return Arc(1.0 - start[order] / ends[-1], self.part[corner_numbers[order]])
 
 
 def _parts(A: Array, length: float) -> int:
@@ -370,7 +398,8 @@ def _parts(A: Array, length: float) -> int:
 
 
 def _degree(reach: float) -> int:
-    """Of polynomials that stand for an exponential, whose exponent goes from ``-reach`` to ``reach``."""
+    """Return the degree of polynomials that approximate an exponential whose exponent goes from ``-reach`` to
+    ``reach``, at most `DEGREE`."""
     term = 1.0
     for order in range(1, DEGREE):
         term *= reach / order
@@ -380,20 +409,25 @@ def _degree(reach: float) -> int:
 
 
 def _across(size: int, count: int) -> Array:
-    """From coefficients ``(size,)`` of powers of a share of an interval from 0 to 1 to those of powers of ``u`` from -1
-    to 1 across each of ``count`` equal parts, ``(count, size, size)``."""
-    found, orders = np.zeros((count, size, size)), np.arange(size)
+    """Return the matrices ``(count, size, size)`` that expand a polynomial again on each of ``count`` equal parts.
+
+    They map the coefficients of powers of the share, from 0 to 1, of an interval to those of powers of ``u`` from -1 to
+    1 across each part.
+    """
+    matrices, orders = np.zeros((count, size, size)), np.arange(size)
     for j in range(size):
         binomials = np.array([comb(j, k) for k in range(j + 1)], dtype=float)
         middles = (np.arange(count)[:, None] + 0.5) / count
-        found[:, : j + 1, j] = binomials * middles ** (j - orders[: j + 1]) * (0.5 / count) ** orders[: j + 1]
-    return found
+        matrices[:, : j + 1, j] = binomials * middles ** (j - orders[: j + 1]) * (0.5 / count) ** orders[: j + 1]
+    return matrices
 
 
 def _apart(left: Array, right: Array, bent: Array, spare: Array | float) -> np.ndarray:
-    """Whether a function with these values at the ends of a cell is not negative on it, where its second derivative
-    times half the square of the cell's length is at most ``bent``: the chord less a parabola, by Cauchy's
-    inequality."""
+    """Return whether a function is certainly not negative on a cell, given its values at the ends.
+
+    The second derivative times half the square of the cell's length is at most ``bent``. The function is then at least
+    its chord less a parabola, which Cauchy's inequality bounds. Violations by ``spare`` count as rounding.
+    """
     near = np.sqrt(np.maximum(left, 0.0)) + np.sqrt(np.maximum(right, 0.0))
     return (left >= -spare) & (right >= -spare) & (near**2 >= bent - spare)
 
@@ -412,10 +446,10 @@ def _root(P: Array, low: Array, high: Array) -> Array:
     elsewhere."""
     first, last = _at(P, low), _at(P, high)
     middle = (low + high) / 2.0
-    crossing = first * last < 0.0
+    is_crossing = first * last < 0.0
     slope = P[:, 1:] * np.arange(1, P.shape[1])
     a, b = low.copy(), high.copy()
-    u = np.where(crossing, low - first * (high - low) / np.where(crossing, last - first, 1.0), middle)
+    u = np.where(is_crossing, low - first * (high - low) / np.where(is_crossing, last - first, 1.0), middle)
     for _ in range(NEWTON):
         value = _at(P, u)
         same = value * first > 0.0
@@ -424,30 +458,33 @@ def _root(P: Array, low: Array, high: Array) -> Array:
             step = u - value / _at(slope, u)
         u = np.where((step >= a) & (step <= b), step, (a + b) / 2.0)  # at an end, a root that was found
     least = EDGE * (high - low)
-    inside = crossing & (u > low + least) & (u < high - least)
-    return np.asarray(np.where(inside, u, middle))
+    is_inside = is_crossing & (u > low + least) & (u < high - least)
+    return np.asarray(np.where(is_inside, u, middle))
 
 
 def _shares(columns: Array, point: Array) -> Array:
-    """Shares ``(r,) >= 0`` in which ``columns (r, r)``, one in each row, are a point, as nearly as those do that are
-    left: where columns are the same but for rounding a share of one may be negative, and is taken over by the others.
+    """Return shares ``(r,) >= 0`` with which ``columns (r, r)``, one in each row, add up to a ``point``, as nearly as
+    least squares can.
+
+    Where columns are equal but for rounding, the share of one of them may be negative. That column is left out, and the
+    others take over its share.
     """
-    left = np.flatnonzero(columns.any(axis=1))
+    kept = np.flatnonzero(columns.any(axis=1))
     while True:
-        shares = np.linalg.lstsq(columns[left].T, point, rcond=None)[0]
+        shares = np.linalg.lstsq(columns[kept].T, point, rcond=None)[0]
         if not (shares < 0.0).any():
             break
-        left = np.delete(left, shares.argmin())
-    found = np.zeros(point.size)
-    found[left] = shares
-    return found
+        kept = np.delete(kept, shares.argmin())
+    all_shares = np.zeros(point.size)
+    all_shares[kept] = shares
+    return all_shares
 
 
 def _mean(signals: Sequence[Arc], shares: Array, channels: int) -> Arc:
     """The sum of signals in these shares, constants that are equal joined."""
-    ends = np.unique(np.concatenate([[1.0], *(one.ends for one in signals)]))
+    ends = np.unique(np.concatenate([[1.0], *(signal.ends for signal in signals)]))
     total = np.zeros((ends.size, channels))
-    for one, share in zip(signals, shares, strict=True):
-        total += share * one.values[np.minimum(np.searchsorted(one.ends, ends), one.ends.size - 1)]
+    for signal, share in zip(signals, shares, strict=True):
+        total += share * signal.values[np.minimum(np.searchsorted(signal.ends, ends), signal.ends.size - 1)]
     kept = np.append((np.diff(total, axis=0) != 0.0).any(axis=1), True)
     return Arc(ends[kept], total[kept])
