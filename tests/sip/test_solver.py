@@ -184,6 +184,18 @@ def test_reasons_that_differ_in_numbers_alone_are_one_and_what_is_new_can_be_tol
     assert [(one.kind, one.count) for one in failures.since(before)] == [("relaxed", 1), ("feedback", 1)]
 
 
+def test_a_growing_program_forgets_the_limit_of_the_call_before():
+    rng, growing, n = np.random.default_rng(0), Growing(), 40
+    growing.variables(np.full(n, -2.0), np.full(n, 2.0), rng.normal(size=n))
+    table = rng.normal(size=(60, n))
+    row, column = np.nonzero(table)
+    growing.rows([(row, column, table[row, column])], np.full(60, -1.0), np.full(60, 1.0))
+    assert "Time limit" in growing.solve(seconds=0.0)[1]
+    first = np.zeros(1, dtype=int)
+    growing.rows([(first, first, np.ones(1))], np.array([-np.inf]), np.array([-0.01]))
+    assert growing.solve()[0]
+
+
 @pytest.mark.parametrize("seed", range(3))
 def test_a_growing_program_has_the_same_answer_by_whoever_is_asked(seed):
     rng = np.random.default_rng(seed)

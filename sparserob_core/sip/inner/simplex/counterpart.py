@@ -489,8 +489,7 @@ class Growing:
                 return answer
             reason = answer
         self._begin()
-        if np.isfinite(seconds):
-            self.highs.setOptionValue("time_limit", self.highs.getRunTime() + max(seconds, 0.0))
+        self.highs.setOptionValue("time_limit", self.highs.getRunTime() + max(seconds, 0.0))  # none of an earlier call
         has_basis, large = bool(self.highs.getBasis().valid), self.highs.getNumNz() >= LARGE
         patience = PATIENT if has_basis and large else STALLED
         self.highs.setOptionValue("simplex_iteration_limit", int(patience * (self.columns + self.count)))

@@ -35,8 +35,8 @@ def run(highs: Any) -> None:
     stop, finished = threading.Event(), threading.Event()
 
     def asked(event: Any) -> None:
-        if stop.is_set():
-            event.interrupt()
+        if event.data_in is not None:
+            event.data_in.user_interrupt = stop.is_set()  # said anew: HiGHS keeps what an earlier solution was told
 
     def solve() -> None:
         try:
@@ -56,9 +56,11 @@ def run(highs: Any) -> None:
         if not finished.wait(GRACE):
             atexit.register(finished.wait)  # a thread that asks for the interpreter after its end aborts the process
         raise
-    highs.cbSimplexInterrupt -= asked
-    highs.cbIpmInterrupt -= asked
-    highs.cbMipInterrupt -= asked
+    finally:
+        if finished.is_set():  # else they are what ends it; the next solution must not hear of this interrupt
+            highs.cbSimplexInterrupt -= asked
+            highs.cbIpmInterrupt -= asked
+            highs.cbMipInterrupt -= asked
 
 
 def with_integers(

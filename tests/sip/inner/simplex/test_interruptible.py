@@ -77,6 +77,40 @@ def test_who_does_not_look_is_left_behind(monkeypatch: pytest.MonkeyPatch) -> No
     assert waited[0](5.0)
 
 
+def test_after_an_interrupt_the_same_program_is_solved(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(interruptible, "GRACE", 20.0)  # a loaded machine hears late
+    highs = highspy.Highs()
+    for name, value in (("output_flag", False), ("solver", "simplex"), ("presolve", "off")):
+        highs.setOptionValue(name, value)
+    columns, number = [highs.addVariable(0.0, 1.0, -1.0) for _ in range(3)], signal.SIGINT
+    highs.addConstr(columns[0] + columns[1] + columns[2] <= 2.0)
+    real, before = highs.run, signal.signal(number, signal.default_int_handler)
+
+    class Interrupted:
+        """The program, whose first run is interrupted from the keyboard."""
+
+        def __getattr__(self, name: str) -> Any:
+            return getattr(highs, name)
+
+        def __setattr__(self, name: str, value: Any) -> None:
+            setattr(highs, name, value)
+
+        def run(self) -> Any:
+            signal.raise_signal(number)
+            time.sleep(0.2)  # until the main thread has heard of it
+            return real()
+
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            run(Interrupted())
+        assert highs.getModelStatus() == highspy.HighsModelStatus.kInterrupt
+        run(highs)
+    finally:
+        signal.signal(number, before)
+    assert highs.getModelStatus() == highspy.HighsModelStatus.kOptimal
+    assert highs.getInfo().objective_function_value == pytest.approx(-2.0)
+
+
 def test_in_another_thread_it_just_solves() -> None:
     highs = highspy.Highs()
     highs.setOptionValue("output_flag", False)
