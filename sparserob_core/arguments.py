@@ -8,7 +8,7 @@ from sparserob_core.errors import InputError
 
 
 def is_whole(value: object, least: int) -> bool:
-    """Whether it is a whole number of at least ``least``."""
+    """Return whether a value is a whole number of at least ``least``; a truth value is no number."""
     return isinstance(value, int | np.integer) and not isinstance(value, bool) and bool(value >= least)
 
 
@@ -21,8 +21,8 @@ def whole(name: str, value: int, least: int) -> int:
 
 def share(name: str, value: float) -> float:
     """The argument ``name``, which must be a share of the budget; raises `InputError`."""
-    given: object = value
-    is_number = isinstance(given, int | float | np.integer | np.floating) and not isinstance(given, bool)
+    argument: object = value
+    is_number = isinstance(argument, int | float | np.integer | np.floating) and not isinstance(argument, bool)
     if not is_number or not 0.0 <= value < 1.0:
         raise InputError(f"{name}: expected a share of the budget, at least 0 and below 1, got {value!r}")
     return float(value)

@@ -41,7 +41,7 @@ def _lines(heading: str, shown: Sequence[tuple[str, object]]) -> str:
 
 
 def _shown(record: Any) -> list[tuple[str, object]]:
-    names = [one.name for one in fields(record) if one.repr and not one.name.startswith("_")]
+    names = [item.name for item in fields(record) if item.repr and not item.name.startswith("_")]
     return [(name, getattr(record, name)) for name in names]
 
 
@@ -58,9 +58,9 @@ def noun(record: Any) -> str:
     `brief` says it. What was left out, ``None`` or nothing, is not said. A record may have a name and fields of its own
     to be shown by, ``noun_of``."""
     heading, shown = getattr(record, "noun_of", None) or (type(record).__name__, _shown(record))
-    given = _given(shown)
-    line = f"{heading}({', '.join(f'{name}={_value(value)}' for name, value in given)})"
-    return line if len(line) <= WIDTH else _lines(heading, given)
+    entries = _given(shown)
+    line = f"{heading}({', '.join(f'{name}={_value(value)}' for name, value in entries)})"
+    return line if len(line) <= WIDTH else _lines(heading, entries)
 
 
 def _value(value: object) -> str:
@@ -75,9 +75,9 @@ def _value(value: object) -> str:
         line = repr(value) if type(value).__repr__ is noun else ""
         return line if line and "\n" not in line else getattr(value, "noun_of", (type(value).__name__,))[0]
     if isinstance(value, Mapping):
-        return _cut("{" + ", ".join(f"{key}: {_value(one)}" for key, one in value.items()) + "}")
+        return _cut("{" + ", ".join(f"{key}: {_value(item)}" for key, item in value.items()) + "}")
     if isinstance(value, list | tuple):
-        return _cut("[" + ", ".join(_value(one) for one in value) + "]")
+        return _cut("[" + ", ".join(_value(item) for item in value) + "]")
     return _cut(value if isinstance(value, str) else repr(value))
 
 

@@ -67,13 +67,14 @@ class InputError(SparseRobError, ValueError):
         self.message, self.expected, self.got, self.path = message, expected, got, steps(path)
 
     def under(self, *prefix: str | int) -> Self:
-        """The same error about a value that sits below ``prefix``; the error itself is changed, for raising again."""
-        self.path = tuple(step for part in prefix for step in steps(str(part))) + self.path
+        """Put ``prefix`` before the path of the error, whose value sits below it; return the error itself, to be raised
+        again."""
+        self.path = tuple(step for entry in prefix for step in steps(str(entry))) + self.path
         return self
 
     @property
     def sentence(self) -> str:
-        """What is wrong, without saying where."""
+        """Description of the fault without its place."""
         if self.expected:
             return f"expected {self.expected}, got {self.got}" if self.got else f"expected {self.expected}"
         return self.message

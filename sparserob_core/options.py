@@ -35,15 +35,15 @@ class Checked(ModelMetaclass):
         try:
             with warnings.catch_warnings():
                 warnings.filterwarnings("ignore", "Field name .* shadows")  # what is hidden is an error below
-                made: type = super().__new__(mcs, name, bases, namespace, **keywords)
+                model: type = super().__new__(mcs, name, bases, namespace, **keywords)
         except (ValueError, NameError) as error:  # by pydantic, whose classes differ
             hidden = re.search(r"Field ['\"](\w+)['\"] conflicts with member", str(error))
             if hidden is None:
                 raise
             raise InputError(f"{name}: the option {hidden[1]!r} bears a name that pydantic uses; rename it") from None
-        for key, owner in _names_in_use(made):
+        for key, owner in _names_in_use(model):
             raise InputError(f"{name}: the option {key!r} bears a name that {owner} uses; rename it")
-        return made
+        return model
 
     def __call__(cls, *arguments: object, **keywords: object) -> Any:
         if arguments:
@@ -72,12 +72,12 @@ class Exact(BaseModel):
     @classmethod
     def _no_disguise(cls, value: object, info: ValidationInfo) -> object:
         allowed = set(_types(cls.model_fields[str(info.field_name)].annotation))
-        several = isinstance(value, list | tuple)
-        if {int, float} & allowed and not {Any, object} & allowed and (several or not {list, tuple} & allowed):
+        is_sequence = isinstance(value, list | tuple)
+        if {int, float} & allowed and not {Any, object} & allowed and (is_sequence or not {list, tuple} & allowed):
             for scalar in _scalars(value):
                 true_or_false = isinstance(scalar, bool) and bool not in allowed
                 if true_or_false or (isinstance(scalar, str) and str not in allowed and _reads_as_number(scalar)):
-                    raise InputError("must be a number" if not several else "every entry must be a number")
+                    raise InputError("must be a number" if not is_sequence else "every entry must be a number")
         return value
 
 
@@ -91,17 +91,17 @@ def _reads_as_number(text: str) -> bool:
 
 def _types(annotation: object) -> Iterator[object]:
     """Every type inside an annotation such as ``list[float | None]``; a literal counts as the types of its values."""
-    parts = get_args(annotation)
-    if parts:
+    arguments = get_args(annotation)
+    if arguments:
         yield get_origin(annotation)
     else:
         yield type(annotation) if isinstance(annotation, str | bool | int | float) else annotation
-    for part in parts:
-        yield from _types(part)
+    for argument in arguments:
+        yield from _types(argument)
 
 
 def _scalars(value: object) -> Iterator[object]:
-    """What is inside nested lists; mappings have fields, and checks, of their own."""
+    """Yield every value inside nested lists and tuples. Mappings are skipped: their fields have checks of their own."""
     if isinstance(value, list | tuple):
         for item in value:
             yield from _scalars(item)
@@ -130,15 +130,15 @@ class Options(Exact, metaclass=Checked):
 
 @cache
 def meanings(model: type[BaseModel]) -> Mapping[str, str]:
-    """What each field of a model means: its description, or else the docstring below it.
+    """Return the meaning of each field of a model: its description, or else the docstring below it.
 
-    The source is read when somebody asks, not whenever the class is made: that took a third of a start.
+    The source is read at the first call and not when the class is made, which took a third of the start of the program.
     """
-    found = {}
+    descriptions = {}
     for name, field in model.model_fields.items():
-        owner = next((one for one in model.__mro__ if name in inspect.get_annotations(one)), model)
-        found[name] = field.description or _docstrings(owner).get(name, "")
-    return found
+        owner = next((base for base in model.__mro__ if name in inspect.get_annotations(base)), model)
+        descriptions[name] = field.description or _docstrings(owner).get(name, "")
+    return descriptions
 
 
 @cache
@@ -148,13 +148,13 @@ def _docstrings(owner: type) -> Mapping[str, str]:
         body = ast.parse(textwrap.dedent(inspect.getsource(owner))).body[0]
     except (OSError, TypeError, SyntaxError):
         return {}
-    found = {}
+    docstrings = {}
     for node, below in pairwise(getattr(body, "body", [])):
         if isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name) and isinstance(below, ast.Expr):
             text = below.value.value if isinstance(below.value, ast.Constant) else None
             if isinstance(text, str):
-                found[node.target.id] = inspect.cleandoc(text)
-    return found
+                docstrings[node.target.id] = inspect.cleandoc(text)
+    return docstrings
 
 
 def part(kind: str, of: type | None = None) -> Any:
@@ -164,15 +164,15 @@ def part(kind: str, of: type | None = None) -> Any:
     A config names the component; the registry builds it before the component that has the option. In Python the option
     takes the component itself.
     """
-    which = {} if of is None else {"of": f"{of.__module__}:{of.__qualname__}"}
-    return Field(default=None, json_schema_extra={"component": kind, **which})
+    restriction = {} if of is None else {"of": f"{of.__module__}:{of.__qualname__}"}
+    return Field(default=None, json_schema_extra={"component": kind, **restriction})
 
 
 def _sentences(name: str, error: ValidationError) -> list[str]:
     sentences = []
     for item in error.errors(include_url=False):
         cause = item.get("ctx", {}).get("error")  # what a validator has raised
-        said = item["msg"] if cause is None else str(cause)
+        text = item["msg"] if cause is None else str(cause)
         got = "" if isinstance(cause, InputError) and cause.got else f", got {item['input']!r}"
-        sentences.append(f"{'.'.join([name, *map(str, item['loc'])])}: {said}{got}")
+        sentences.append(f"{'.'.join([name, *map(str, item['loc'])])}: {text}{got}")
     return sentences

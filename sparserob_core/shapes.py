@@ -104,9 +104,12 @@ def dense(value: Any) -> Any:
 
 
 def read_only(value: Any) -> Any:
-    """What is told, as a copy that cannot be written to where it is an array or holds some: a tuple, or a sparse
-    matrix, whose entries are put in order first. What cannot be written to already is itself, so that its identity says
-    what it holds; everything else is handed back."""
+    """Return a value as a copy that cannot be written to, where it is an array, a sparse matrix, or a tuple of such
+    values.
+
+    The entries of a sparse matrix are sorted and its duplicates summed first. A value that already cannot be written to
+    is returned itself, so that its identity determines its content; every other value is returned unchanged.
+    """
     if isinstance(value, np.ndarray):
         if value.base is None and not value.flags.writeable:
             return value
@@ -114,13 +117,13 @@ def read_only(value: Any) -> Any:
         value.flags.writeable = False
         return value
     if type(value) is tuple:
-        parts = tuple(read_only(part) for part in value)
-        return value if all(new is old for new, old in zip(parts, value, strict=True)) else parts
+        copies = tuple(read_only(item) for item in value)
+        return value if all(copied is original for copied, original in zip(copies, value, strict=True)) else copies
     if hasattr(value, "indptr") and value.data.flags.writeable:
         value = value.copy()
         value.sum_duplicates()
-        for part in (value.data, value.indices, value.indptr):
-            part.flags.writeable = False
+        for array in (value.data, value.indices, value.indptr):
+            array.flags.writeable = False
     return value
 
 

@@ -1,4 +1,5 @@
-"""What executors need when they start workers: one thread of linear algebra, and not the script that is run here."""
+"""Support for worker processes: the number of processors, one thread of linear algebra, and no import of the running
+script."""
 
 from __future__ import annotations
 
@@ -19,7 +20,7 @@ LIBRARIES = (
 
 
 def processors() -> int:
-    """How many processors this process may use."""
+    """Return the number of processors that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 

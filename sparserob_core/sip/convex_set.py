@@ -417,13 +417,13 @@ class ConvexSet(ABC):
             with np.errstate(divide="ignore"):
                 high, low = (1.0 / self._boundary(points, sign * directions)[0] for sign in (1.0, -1.0))
             return -low, high
-        slopes, room = directions @ flat[0].T, np.maximum(flat[1] - points @ flat[0].T, 0.0)
+        slopes, distances = directions @ flat[0].T, np.maximum(flat[1] - points @ flat[0].T, 0.0)
         slopes = np.where(np.abs(slopes) > CLOSED * (np.abs(directions) @ np.abs(flat[0]).T), slopes, 0.0)
         with np.errstate(divide="ignore", invalid="ignore"):
-            reach = room / slopes
+            lengths = distances / slopes
         return (
-            np.where(slopes < 0, reach, -np.inf).max(axis=1, initial=-np.inf),
-            np.where(slopes > 0, reach, np.inf).min(axis=1, initial=np.inf),
+            np.where(slopes < 0, lengths, -np.inf).max(axis=1, initial=-np.inf),
+            np.where(slopes > 0, lengths, np.inf).min(axis=1, initial=np.inf),
         )
 
     @shaped
@@ -455,20 +455,20 @@ class ConvexSet(ABC):
         N = self.normals
         widths = self.width(N) / 2
         widths = np.where(widths > 0, widths, 1.0)[:, None]
-        into, back = N.T / widths.T, N / widths  # to coordinates in which the bounding box is a cube; of directions
-        origins, rays = origins @ into, rays @ into
+        to_cube, back = N.T / widths.T, N / widths  # to coordinates in which the bounding box is a cube; of directions
+        origins, rays = origins @ to_cube, rays @ to_cube
         k, b = rays.shape
         lengths = np.linalg.norm(rays, axis=1)
-        turned = np.where(rays < 0, -1.0, 1.0)
-        tilted = rays / np.where(lengths > 0, lengths, 1.0)[:, None] + TILT * turned * (1.0 + np.arange(b) / 7.0)
+        signs = np.where(rays < 0, -1.0, 1.0)
+        tilted = rays / np.where(lengths > 0, lengths, 1.0)[:, None] + TILT * signs * (1.0 + np.arange(b) / 7.0)
         # The first columns represent the least thickness of a set; none of them may remain in the end.
-        columns = SPIKE * turned[:, :, None] * np.eye(b)
-        made = np.ones((k, b), dtype=bool)
+        columns = SPIKE * signs[:, :, None] * np.eye(b)
+        is_artificial = np.ones((k, b), dtype=bool)
         open_ = np.flatnonzero(lengths > 0)
         for _ in range(PIVOTS):
             chosen = columns[open_]
             directions = np.linalg.solve(chosen, np.ones((open_.size, b, 1)))[..., 0]
-            entering = self.support_point(directions @ back) @ into - origins[open_]
+            entering = self.support_point(directions @ back) @ to_cube - origins[open_]
             better = (directions * entering).sum(axis=1) > 1.0 + RELATIVE
             open_, chosen, entering = open_[better], chosen[better], entering[better]
             if not open_.size:
@@ -478,9 +478,9 @@ class ConvexSet(ABC):
             with np.errstate(divide="ignore", invalid="ignore"):
                 leaving = np.where(slope > 0, np.maximum(share, 0.0) / slope, np.inf).argmin(axis=1)
             columns[open_, leaving] = entering
-            made[open_, leaving] = False
+            is_artificial[open_, leaving] = False
         shares = np.linalg.solve(np.swapaxes(columns, 1, 2), rays[..., None])[..., 0]
-        sizes = np.where((made & (np.abs(shares) > 0)).any(axis=1), np.inf, np.abs(shares).sum(axis=1))
+        sizes = np.where((is_artificial & (np.abs(shares) > 0)).any(axis=1), np.inf, np.abs(shares).sum(axis=1))
         return np.where(lengths > 0, sizes, 0.0), np.linalg.solve(columns, np.ones((k, b, 1)))[..., 0] @ back
 
     @cached_property
@@ -515,8 +515,8 @@ class ConvexSet(ABC):
         ndarray, shape (count, d)
             Points of the set.
         """
-        found = self._by_rejection(count, rng) if self.dimension <= PLAIN else None
-        return self._hit_and_run(count, rng) if found is None else found
+        points = self._by_rejection(count, rng) if self.dimension <= PLAIN else None
+        return self._hit_and_run(count, rng) if points is None else points
 
     @shaped
     def sample_extreme(self, count: int, rng: np.random.Generator) -> Float[Array, "{count} d"]:
@@ -541,14 +541,14 @@ class ConvexSet(ABC):
     def _by_rejection(self, count: int, rng: np.random.Generator) -> Array | None:
         """Return random points of the bounding box that lie in the set; ``None`` where too few of them do."""
         box = self.bounding_box()
-        found, drawn = np.empty((0, self.dimension)), 0
-        while found.shape[0] < count:
+        accepted_points, drawn_count = np.empty((0, self.dimension)), 0
+        while accepted_points.shape[0] < count:
             points = rng.uniform(box.lower, box.upper, size=(max(64, count), self.dimension))
-            found = np.vstack([found, points[self.contains(points, 0.0)]])
-            drawn += points.shape[0]
-            if drawn > TRIES * (found.shape[0] + 1):
+            accepted_points = np.vstack([accepted_points, points[self.contains(points, 0.0)]])
+            drawn_count += points.shape[0]
+            if drawn_count > TRIES * (accepted_points.shape[0] + 1):
                 return None
-        return found[:count]
+        return accepted_points[:count]
 
     def _hit_and_run(self, count: int, rng: np.random.Generator) -> Array:
         """Return the ends of ``count`` chains of hit and run, all from the interior point.
@@ -589,15 +589,20 @@ class ConvexSet(ABC):
         Sets override it with a tighter one.
         """
         point = self.support_point(centre)[..., None, :]
-        along = (point * spread).sum(axis=-1)
-        first = np.maximum(self.support(spread) - along, self.support(-spread) + along)  # with no share of the centre
+        projections = (point * spread).sum(axis=-1)
+        first = np.maximum(
+            self.support(spread) - projections, self.support(-spread) + projections
+        )  # with no share of the centre
         total = first.sum(axis=-1, keepdims=True)
         if not (total > 0.0).any() or not np.isfinite(total).all():
             return np.asarray(total[..., 0])
         shares = first / np.where(total > 0.0, total, 1.0)
-        begun = shares[..., None] * np.asarray(centre)[..., None, :]
-        ahead, back = self.support(begun + spread) - along, self.support(begun - spread) + along
-        gains = np.maximum(ahead, back) - (point * begun).sum(axis=-1)
+        centre_shares = shares[..., None] * np.asarray(centre)[..., None, :]
+        ahead, back = (
+            self.support(centre_shares + spread) - projections,
+            self.support(centre_shares - spread) + projections,
+        )
+        gains = np.maximum(ahead, back) - (point * centre_shares).sum(axis=-1)
         excess: Array = np.minimum(np.maximum(gains, 0.0), first).sum(axis=-1)
         return excess
 
@@ -902,10 +907,10 @@ def continued_by_corners(corners: Array, centre: Array, spread: Array) -> Array:
     """
     heights = centre @ corners.T
     best = corners[heights.argmax(axis=1)]
-    apart = np.einsum("kvd,kd->kv", np.abs(best[:, None] - corners), spread)
-    behind = heights.max(axis=1, keepdims=True) - heights
-    alone = (behind > apart) | ~(best[:, None] != corners).any(axis=2)
-    return np.where(alone.all(axis=1), (np.abs(best) * (np.abs(centre) + spread)).sum(axis=1), np.inf)
+    changes = np.einsum("kvd,kd->kv", np.abs(best[:, None] - corners), spread)
+    gaps = heights.max(axis=1, keepdims=True) - heights
+    is_settled = (gaps > changes) | ~(best[:, None] != corners).any(axis=2)
+    return np.where(is_settled.all(axis=1), (np.abs(best) * (np.abs(centre) + spread)).sum(axis=1), np.inf)
 
 
 @dataclass(frozen=True, eq=False)
@@ -1009,13 +1014,13 @@ def null_space(rows: Array) -> Array:
     Axes that belong to the complement are among them, exactly.
     """
     axes = ~rows.any(axis=0)
-    plain, rest = np.eye(rows.shape[1])[axes], rows[:, ~axes]
-    if not rest.size:
-        return plain
-    _, sizes, turned = np.linalg.svd(rest / np.linalg.norm(rest, axis=1, keepdims=True))
-    found = np.zeros((turned.shape[0] - int((sizes > SPIKE * sizes[0]).sum()), rows.shape[1]))
-    found[:, ~axes] = turned[turned.shape[0] - len(found) :]
-    return np.vstack([plain, found])
+    unit_rows, columns = np.eye(rows.shape[1])[axes], rows[:, ~axes]
+    if not columns.size:
+        return unit_rows
+    _, singular_values, basis = np.linalg.svd(columns / np.linalg.norm(columns, axis=1, keepdims=True))
+    complement = np.zeros((basis.shape[0] - int((singular_values > SPIKE * singular_values[0]).sum()), rows.shape[1]))
+    complement[:, ~axes] = basis[basis.shape[0] - len(complement) :]
+    return np.vstack([unit_rows, complement])
 
 
 @shaped
@@ -1067,8 +1072,8 @@ class Scaled(ConvexSet):
     def support(self, directions: Float[Array, "*k d"]) -> Float[Array, " *k"]:
         directions, height = np.asarray(directions, dtype=float), self.base.support(directions)
         finite = np.isfinite(height)
-        moved = self.factor * np.where(finite, height, 0.0) + (1.0 - self.factor) * (directions @ self.about)
-        return np.asarray(np.where(finite, moved, height))
+        scaled_height = self.factor * np.where(finite, height, 0.0) + (1.0 - self.factor) * (directions @ self.about)
+        return np.asarray(np.where(finite, scaled_height, height))
 
     @shaped
     def support_point(self, directions: Float[Array, "*k d"]) -> Float[Array, "*k d"]:
@@ -1110,8 +1115,8 @@ class Scaled(ConvexSet):
         self, centre: Float[Array, " d"], spread: Float[Array, "J d"]
     ) -> tuple[float, Float[Array, " J"], Float[Array, "J J"]]:
         value, gradient, hessian = self.base.support_minorant(centre, spread)
-        f, rest = self.factor, (1.0 - self.factor) * self.about
-        return f * value + float(centre @ rest), f * gradient + spread @ rest, f * hessian
+        f, shift = self.factor, (1.0 - self.factor) * self.about
+        return f * value + float(centre @ shift), f * gradient + spread @ shift, f * hessian
 
     def _moved(self, points: Array) -> Array:
         return self.about + self.factor * (points - self.about)
@@ -1144,13 +1149,13 @@ def vertex_excess(
     flat_centre, flat_spread = centre.reshape(-1, centre.shape[-1]), spread.reshape(-1, *spread.shape[-2:])
     excess = np.empty(flat_centre.shape[0])
     for start in range(0, excess.size, blocks):
-        part = slice(start, start + blocks)
-        heights = flat_centre[part] @ vertices.T
+        block = slice(start, start + blocks)
+        heights = flat_centre[block] @ vertices.T
         best = heights.argmax(axis=1)
-        steepness = flat_spread[part] @ vertices.T
+        steepness = flat_spread[block] @ vertices.T
         steepness = np.abs(steepness - np.take_along_axis(steepness, best[:, None, None], axis=2)).sum(axis=1)
         gain = heights - np.take_along_axis(heights, best[:, None], axis=1) + steepness
-        excess[part] = np.maximum(gain.max(axis=1), 0.0)
+        excess[block] = np.maximum(gain.max(axis=1), 0.0)
     return excess.reshape(centre.shape[:-1])
 
 

@@ -156,11 +156,11 @@ def sparse_matrix(path: str, matrix: object) -> csc_array:
         raise InputError(f"{path}: expected a matrix of numbers, got {matrix!r}") from error
     if array.ndim != 2 or array.dtype.kind not in "fiub":
         raise InputError(path=path, expected="a matrix of numbers", got=f"shape {array.shape} of {array.dtype}")
-    wrong = np.flatnonzero(~np.isfinite(array.data))
-    if wrong.size:
-        row, column = int(array.indices[wrong[0]]), int(np.searchsorted(array.indptr, wrong[0], "right")) - 1
+    indices = np.flatnonzero(~np.isfinite(array.data))
+    if indices.size:
+        row, column = int(array.indices[indices[0]]), int(np.searchsorted(array.indptr, indices[0], "right")) - 1
         raise InputError(
-            path=path, expected="a matrix of finite numbers", got=f"{array.data[wrong[0]]} {_place(row, column)}"
+            path=path, expected="a matrix of finite numbers", got=f"{array.data[indices[0]]} {_place(row, column)}"
         )
     kept: csc_array = read_only(array)
     return kept
@@ -197,11 +197,11 @@ def _descent(P: csc_array) -> Array | None:
     shift = 1.0 + ROUNDED * int(np.diff(P.indptr).max(initial=1))
     if (size * (abs(P) @ size) <= 1.0 + shift).all():  # every row is dominated by its diagonal (Gershgorin)
         return None
-    found = _failing(P, shift)
-    if found is None:
+    kept_direction = _failing(P, shift)
+    if kept_direction is None:
         return None
     direction = np.zeros(diagonal.size)
-    direction[kept] = found
+    direction[kept] = kept_direction
     return direction
 
 
@@ -218,9 +218,9 @@ def _bare(P: csc_array, diagonal: Array, bare: np.ndarray) -> Array | None:
     columns = P[:, bare]
     if not columns.data.any():
         return None
-    place = int(np.argmax(np.abs(columns.data)))
-    row, column = int(columns.indices[place]), int(bare[np.searchsorted(columns.indptr, place, "right") - 1])
-    direction[row], direction[column] = 1.0, -(diagonal[row] + 1.0) / columns.data[place]
+    position = int(np.argmax(np.abs(columns.data)))
+    row, column = int(columns.indices[position]), int(bare[np.searchsorted(columns.indptr, position, "right") - 1])
+    direction[row], direction[column] = 1.0, -(diagonal[row] + 1.0) / columns.data[position]
     return direction
 
 
@@ -238,15 +238,17 @@ def _failing(P: csc_array, factor: float) -> Array | None:
     shifted = csc_array(P + (factor - 1.0) * diags_array(P.diagonal()))
     options = {"SymmetricMode": True, "Equil": False}
     try:
-        found = splu(shifted, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options)
+        factorisation = splu(shifted, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options)
     except RuntimeError:  # a pivot that is exactly 0
         return np.ones(n)
-    pivots = found.U.diagonal()
-    if np.array_equal(found.perm_r, found.perm_c) and (pivots > 0.0).all():
+    pivots = factorisation.U.diagonal()
+    if np.array_equal(factorisation.perm_r, factorisation.perm_c) and (pivots > 0.0).all():
         return None
     unit = np.zeros(n)
     unit[int(np.argmax(~(pivots > 0.0)))] = 1.0  # L'v = e gives v'A v = pivot, of A = L D L' up to there
-    direction: Array = np.asarray(spsolve_triangular(csc_array(found.L.T), unit, lower=False))[found.perm_c]
+    direction: Array = np.asarray(spsolve_triangular(csc_array(factorisation.L.T), unit, lower=False))[
+        factorisation.perm_c
+    ]
     return direction
 
 
@@ -279,23 +281,25 @@ def _symmetric(path: str, P: csc_array) -> csc_array:
     if not P.has_canonical_format:
         P = P.copy()
         P.sum_duplicates()
-    turned = csc_array(P.T)
-    turned.sort_indices()
-    if all(np.array_equal(getattr(P, part), getattr(turned, part)) for part in ("indptr", "indices", "data")):
+    transpose = csc_array(P.T)
+    transpose.sort_indices()
+    if all(np.array_equal(getattr(P, name), getattr(transpose, name)) for name in ("indptr", "indices", "data")):
         return P
-    apart = abs(P - turned).tocoo()
+    difference = abs(P - transpose).tocoo()
     size = np.sqrt(np.abs(P.diagonal()))
-    allowed = ROUNDED * np.maximum(size[apart.row] * size[apart.col], np.abs(P[apart.row, apart.col]))
-    over = np.flatnonzero(apart.data > allowed)
-    if over.size:
-        worst = over[int(np.argmax(apart.data[over]))]
-        i, j = int(apart.row[worst]), int(apart.col[worst])
+    allowed = ROUNDED * np.maximum(
+        size[difference.row] * size[difference.col], np.abs(P[difference.row, difference.col])
+    )
+    excessive = np.flatnonzero(difference.data > allowed)
+    if excessive.size:
+        worst = excessive[int(np.argmax(difference.data[excessive]))]
+        i, j = int(difference.row[worst]), int(difference.col[worst])
         raise InputError(
             path=path,
             expected="a symmetric matrix",
             got=f"{float(P[i, j]):.12g} {_place(i, j)} and {float(P[j, i]):.12g} {_place(j, i)}",
         )
-    return csc_array((P + turned) / 2)
+    return csc_array((P + transpose) / 2)
 
 
 def _place(row: int, column: int) -> str:

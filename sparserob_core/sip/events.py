@@ -196,9 +196,9 @@ class Batch:
         acceptance."""
         accepted = np.ones(len(self.trace.points), dtype=bool)
         rows = self.trace.notes.get("accepted", np.empty((0, 2)))
-        which = rows[:, 0].astype(int) - 1 - self.first
-        mine = (which >= 0) & (which < accepted.size)
-        accepted[which[mine]] = rows[mine, 1] > 0.0
+        indices = rows[:, 0].astype(int) - 1 - self.first
+        is_own = (indices >= 0) & (indices < accepted.size)
+        accepted[indices[is_own]] = rows[is_own, 1] > 0.0
         return accepted
 
 
@@ -237,10 +237,10 @@ def gains(values: Array, accepted: np.ndarray, stood: float = np.nan) -> Array:
         The rise; exactly 0 from ``-inf`` to ``-inf``, and where two values differ by rounding only (`UNCHANGED`).
     """
     before = standing_before(accepted)
-    at = np.where(before < 0, stood, values[before])
-    gained = np.subtract(values, at, out=np.zeros(values.size), where=values != at)
-    gained[np.abs(gained) <= UNCHANGED * np.where(np.isfinite(at), np.abs(at), 0.0)] = 0.0
-    return gained
+    reference = np.where(before < 0, stood, values[before])
+    rises = np.subtract(values, reference, out=np.zeros(values.size), where=values != reference)
+    rises[np.abs(rises) <= UNCHANGED * np.where(np.isfinite(reference), np.abs(reference), 0.0)] = 0.0
+    return rises
 
 
 @dataclass(frozen=True, eq=False)

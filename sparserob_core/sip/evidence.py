@@ -121,17 +121,17 @@ class InfeasibleSubsystem:
             count = len(self.reasons) + self.others
             head = f"{count} separate reasons: " if count > 1 else ""
             return head + "; ".join([*self.reasons, *([f"and {self.others} more"] if self.others else [])])
-        missed = amounts and np.isfinite(self.amount)
+        has_amount = amounts and np.isfinite(self.amount)
         whatever = f"whatever the {self.decides}"
         if not self.members:
-            what = "equalities" if self.equalities else "fixed constraints"
-            by = f": one is missed by at least {self.amount:.4g} times its norm" if missed else ""
-            return f"the {what} cannot be met within the bounds, {whatever}{by}"
+            kind = "equalities" if self.equalities else "fixed constraints"
+            by = f": one is missed by at least {self.amount:.4g} times its norm" if has_amount else ""
+            return f"the {kind} cannot be met within the bounds, {whatever}{by}"
         if len(self.members) + self.others > 1:
             head = "these cannot hold together" + (", though all but any one of them can" if self.irreducible else "")
         else:
             head = "nothing meets this " + ("and the equalities" if self.equalities else "within the bounds")
-        by = f" (one is violated by at least {self.amount:.4g} times its norm, {whatever})" if missed else ""
+        by = f" (one is violated by at least {self.amount:.4g} times its norm, {whatever})" if has_amount else ""
         named = "; ".join([*self.members, *([f"and {self.others} more"] if self.others else [])])
         return f"{head}{by}: {named}" + (f"; {self.demand}" if self.demand else "")
 

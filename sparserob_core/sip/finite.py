@@ -183,7 +183,7 @@ class FiniteProgram:
         """
         own = self.h.size
         G, h = (np.vstack([self.G, G]), np.concatenate([self.h, h])) if own else (G, h)
-        more = FiniteProgram(
+        program = FiniteProgram(
             self.q,
             self.weights,
             self.lower,
@@ -198,8 +198,10 @@ class FiniteProgram:
             self.blocks,
         )
         # quantities that do not depend on the rows
-        more.__dict__.update(curvature=self.curvature, steepest=self.steepest, bounded=self.bounded, _sound=self._sound)
-        return more
+        program.__dict__.update(
+            curvature=self.curvature, steepest=self.steepest, bounded=self.bounded, _sound=self._sound
+        )
+        return program
 
     def curved(self, P: csc_array, q: Array) -> FiniteProgram:
         """Return the program with another quadratic and linear cost.
@@ -216,10 +218,10 @@ class FiniteProgram:
         FiniteProgram
             The program with this cost.
         """
-        other = replace(self, P=P, q=q)
+        program = replace(self, P=P, q=q)
         if q is self.q:
-            other.__dict__.update(steepest=self.steepest, bounded=self.bounded, _sound=self._sound)
-        return other
+            program.__dict__.update(steepest=self.steepest, bounded=self.bounded, _sound=self._sound)
+        return program
 
     @cached_property
     def bounded(self) -> bool:
@@ -249,12 +251,12 @@ class FiniteProgram:
         if self.P is None or self.curvature is not None:
             return square, abs(square)
         size = np.abs(x)
-        added = 0.5 * float(size @ (abs(self.P) @ size))
-        if added <= CANCELS * abs(square):
-            return square, added
+        magnitude = 0.5 * float(size @ (abs(self.P) @ size))
+        if magnitude <= CANCELS * abs(square):
+            return square, magnitude
         wide = x.astype(np.longdouble)
         square = 0.5 * float(wide @ (self.P.astype(np.longdouble) @ wide))
-        return square, abs(square) + added * float(np.finfo(np.longdouble).eps / np.finfo(float).eps)
+        return square, abs(square) + magnitude * float(np.finfo(np.longdouble).eps / np.finfo(float).eps)
 
     @shaped
     def _lengths(self, x: Float[Array, " n"]) -> Float[Array, " k"]:
@@ -274,8 +276,8 @@ class FiniteProgram:
         """Return the program with ``1/2 x'P x`` replaced by its tangent at ``at``, which lies below it."""
         if self.P is None:
             return self
-        bent = self._bent(at)
-        return replace(self, P=None, q=self.q + bent, constant=self.constant - 0.5 * float(at @ bent))
+        gradient = self._bent(at)
+        return replace(self, P=None, q=self.q + gradient, constant=self.constant - 0.5 * float(at @ gradient))
 
     @shaped
     def magnitude(self, x: Float[Array, " n"]) -> float:
@@ -499,13 +501,13 @@ class Spread:
 
     @cached_property
     def parts(self) -> tuple[tuple[slice, int, ConvexSet, Array], ...]:
-        """For every set its entries, its number of copies, the set itself and its middle ``(q,)``."""
-        found, start = [], 0
+        """Entries, number of copies, set and middle ``(q,)`` of every set, in order."""
+        blocks, start = [], 0
         for count, convex in self.sets:
             stop = start + count * convex.dimension
-            found.append((slice(start, stop), count, convex, convex.middle()))
+            blocks.append((slice(start, stop), count, convex, convex.middle()))
             start = stop
-        return tuple(found)
+        return tuple(blocks)
 
     @property
     def size(self) -> int:
@@ -527,12 +529,12 @@ class Spread:
     @cached_property
     def radii(self) -> Array:
         """Largest absolute value ``(Q,)`` of each entry of a deviation."""
-        found = [np.zeros(0)]
+        radii = [np.zeros(0)]
         for _, count, convex, middle in self.parts:
             axes = np.eye(convex.dimension)
-            far = np.maximum(convex.support(axes) - middle, convex.support(-axes) + middle)
-            found.append(np.tile(np.maximum(far, 0.0), count))
-        return np.concatenate(found)
+            extents = np.maximum(convex.support(axes) - middle, convex.support(-axes) + middle)
+            radii.append(np.tile(np.maximum(extents, 0.0), count))
+        return np.concatenate(radii)
 
     @cached_property
     def lost(self) -> float:
@@ -541,8 +543,8 @@ class Spread:
         The error is `missed` plus the rounding of points that are far from 0 compared with their deviations.
         """
         moving = self.radii > 0.0 if self.still is None else (self.radii > 0.0) & ~self.still
-        far = (np.abs(self.middle) / np.where(moving, self.radii, np.inf)).max(initial=0.0)
-        return float(self.missed + np.finfo(float).eps * (1.0 + far))
+        ratio = (np.abs(self.middle) / np.where(moving, self.radii, np.inf)).max(initial=0.0)
+        return float(self.missed + np.finfo(float).eps * (1.0 + ratio))
 
     @cached_property
     def chords(self) -> Array:
@@ -551,16 +553,16 @@ class Spread:
         For all ``a`` in the span of the set, the width of the set along ``a`` is at least that length times ``|a_i|``.
         For a set without an interior, the axes are their projections onto its span.
         """
-        found = [np.zeros(0)]
-        for (_, count, convex, middle), within in zip(self.parts, self._projectors, strict=True):
+        lengths = [np.zeros(0)]
+        for (_, count, convex, middle), matrix in zip(self.parts, self._projectors, strict=True):
             if convex.is_box:
                 box = convex.bounding_box()
                 low, high = box.lower, box.upper
             else:
-                low, high = convex.chord(np.broadcast_to(middle, within.shape), within)
-                low, high = (np.where(within.any(axis=1), side, 0.0) for side in (low, high))
-            found.append(np.tile(np.maximum(high - low, 0.0), count))
-        return np.concatenate(found)
+                low, high = convex.chord(np.broadcast_to(middle, matrix.shape), matrix)
+                low, high = (np.where(matrix.any(axis=1), side, 0.0) for side in (low, high))
+            lengths.append(np.tile(np.maximum(high - low, 0.0), count))
+        return np.concatenate(lengths)
 
     @cached_property
     def _projectors(self) -> list[Array]:
@@ -570,7 +572,7 @@ class Spread:
     @property
     def leans(self) -> bool:
         """True where a set has no interior, and its span is not spanned by axes."""
-        return any(not _is_diagonal(within) for within in self._projectors)
+        return any(not _is_diagonal(matrix) for matrix in self._projectors)
 
     def within(self, a: Array) -> Array:
         """Return ``a (..., Q)`` projected onto the span of the set; 0 for entries that do not deviate, or are
@@ -587,12 +589,12 @@ class Spread:
 
     def _projected(self, a: Array) -> Array:
         """Return ``a (..., Q)`` projected onto the span of the set."""
-        found = np.array(a)
-        for (part, count, convex, _), within in zip(self.parts, self._projectors, strict=True):
-            if not _is_diagonal(within):
-                blocks = a[..., part].reshape(*a.shape[:-1], count, convex.dimension)
-                found[..., part] = (blocks @ within).reshape(*a.shape[:-1], -1)
-        return found
+        projection = np.array(a)
+        for (entries, count, convex, _), matrix in zip(self.parts, self._projectors, strict=True):
+            if not _is_diagonal(matrix):
+                blocks = a[..., entries].reshape(*a.shape[:-1], count, convex.dimension)
+                projection[..., entries] = (blocks @ matrix).reshape(*a.shape[:-1], -1)
+        return projection
 
     @property
     def is_box(self) -> bool:
@@ -609,27 +611,29 @@ class Spread:
         if self.is_box:
             return np.asarray(np.abs(a) @ self.radii)
         total = np.zeros(a.shape[:-1])
-        for part, count, convex, middle in self.parts:
-            blocks = a[..., part].reshape(*a.shape[:-1], count, convex.dimension)
+        for entries, count, convex, middle in self.parts:
+            blocks = a[..., entries].reshape(*a.shape[:-1], count, convex.dimension)
             total = total + (convex.support(blocks) - blocks @ middle).sum(axis=-1)
         return total
 
     def holds(self, w: Array) -> bool:
         """Return whether ``w (Q,)`` is a deviation."""
         return all(
-            bool((convex.violation(w[part].reshape(count, -1) + middle) <= 0.0).all())
-            for part, count, convex, middle in self.parts
+            bool((convex.violation(w[entries].reshape(count, -1) + middle) <= 0.0).all())
+            for entries, count, convex, middle in self.parts
         )
 
     def worst(self, a: Array) -> Array:
         """Return deviations ``(..., Q)`` that attain `support`."""
         if self.is_box:
             return np.asarray(np.sign(a) * self.radii)
-        found = np.empty(a.shape)
-        for part, count, convex, middle in self.parts:
-            blocks = a[..., part].reshape(*a.shape[:-1], count, convex.dimension)
-            found[..., part] = (convex.support_point(blocks) - middle).reshape(*a.shape[:-1], part.stop - part.start)
-        return found
+        deviations = np.empty(a.shape)
+        for entries, count, convex, middle in self.parts:
+            blocks = a[..., entries].reshape(*a.shape[:-1], count, convex.dimension)
+            deviations[..., entries] = (convex.support_point(blocks) - middle).reshape(
+                *a.shape[:-1], entries.stop - entries.start
+            )
+        return deviations
 
 
 def _is_diagonal(matrix: Array) -> bool:
@@ -660,14 +664,14 @@ def gathered(
     values : ndarray
         Values, row by row.
     """
-    place = row * np.int64(shape[1]) + column
-    order = place.argsort(kind="stable")
-    place, value = place[order], value[order]
-    first = np.flatnonzero(np.diff(place, prepend=-1))
-    if first.size < place.size:
-        place, value = place[first], np.add.reduceat(value, first)
-    starts = place.searchsorted(np.arange(shape[0] + 1) * np.int64(shape[1]))
-    return starts.astype(np.int32), (place % max(1, shape[1])).astype(np.int32), value
+    positions = row * np.int64(shape[1]) + column
+    order = positions.argsort(kind="stable")
+    positions, value = positions[order], value[order]
+    first = np.flatnonzero(np.diff(positions, prepend=-1))
+    if first.size < positions.size:
+        positions, value = positions[first], np.add.reduceat(value, first)
+    starts = positions.searchsorted(np.arange(shape[0] + 1) * np.int64(shape[1]))
+    return starts.astype(np.int32), (positions % max(1, shape[1])).astype(np.int32), value
 
 
 def table_of(row: np.ndarray, column: np.ndarray, value: Array, shape: tuple[int, int]) -> csr_array:

@@ -353,23 +353,28 @@ class ConstraintFamily:
             outside the index set, or a bound below a violation.
         """
         assert self.worst is not None
-        found, box = self.worst(x), self.index_set
-        indices, violations = np.asarray(found.indices, dtype=float), np.asarray(found.violations, dtype=float)
-        if indices.ndim != 2 or not len(indices) == np.size(found.rows) == violations.size:
+        separation, box = self.worst(x), self.index_set
+        indices, violations = (
+            np.asarray(separation.indices, dtype=float),
+            np.asarray(separation.violations, dtype=float),
+        )
+        if indices.ndim != 2 or not len(indices) == np.size(separation.rows) == violations.size:
             raise self._wrong("worst", "indices (k, d), rows (k,) and violations (k,)", f"shape {indices.shape}")
-        if np.asarray(found.rows).dtype.kind not in "iu" or (np.asarray(found.rows) < 0).any():
-            raise self._wrong("worst", "numbers of rows, from 0", f"{np.asarray(found.rows).tolist()}")
+        if np.asarray(separation.rows).dtype.kind not in "iu" or (np.asarray(separation.rows) < 0).any():
+            raise self._wrong("worst", "numbers of rows, from 0", f"{np.asarray(separation.rows).tolist()}")
         if np.isnan(violations).any():
             raise self._wrong("worst", "violations that are numbers", f"{violations.tolist()}")
-        if violations.size and found.bound < violations.max() - TOLERANCE:
-            raise self._wrong("worst", f"a bound of at least {violations.max():.6g}, its own", f"{found.bound:.6g}")
+        if violations.size and separation.bound < violations.max() - TOLERANCE:
+            raise self._wrong(
+                "worst", f"a bound of at least {violations.max():.6g}, its own", f"{separation.bound:.6g}"
+            )
         if indices.shape[1] != box.dimension:
             raise self._wrong("worst", f"indices (k, {box.dimension})", f"shape {indices.shape}")
-        room = OUTSIDE * (box.upper - box.lower + np.abs(box.lower) + np.abs(box.upper))
-        outside = ~((indices >= box.lower - room) & (indices <= box.upper + room)).all(axis=1)
+        slack = OUTSIDE * (box.upper - box.lower + np.abs(box.lower) + np.abs(box.upper))
+        outside = ~((indices >= box.lower - slack) & (indices <= box.upper + slack)).all(axis=1)
         if outside.any():
             raise self._wrong("worst", "indices of the index set", f"{indices[outside][0].tolist()}")
-        return found
+        return separation
 
     @shaped
     def enclosed(self, x: Float[Array, " n"], lower: Float[Array, "k d"], upper: Float[Array, "k d"]) -> Enclosure:
@@ -393,11 +398,11 @@ class ConstraintFamily:
             Where the answer is not one bound and one coordinate for each cell.
         """
         assert self.enclosure is not None
-        found = self.enclosure(x, lower, upper)
-        if np.shape(found.bounds) != (len(lower),) or np.shape(found.split) != (len(lower),):
-            got = f"shapes {np.shape(found.bounds)} and {np.shape(found.split)}"
+        enclosure = self.enclosure(x, lower, upper)
+        if np.shape(enclosure.bounds) != (len(lower),) or np.shape(enclosure.split) != (len(lower),):
+            got = f"shapes {np.shape(enclosure.bounds)} and {np.shape(enclosure.split)}"
             raise self._wrong("enclosure", f"bounds and coordinates ({len(lower)},)", got)
-        return replace(found, bounds=np.where(np.isnan(found.bounds), np.inf, found.bounds))
+        return replace(enclosure, bounds=np.where(np.isnan(enclosure.bounds), np.inf, enclosure.bounds))
 
     @cached_property
     def partition(self) -> tuple[Array, Array]:
@@ -524,31 +529,31 @@ def uncovered(lower: Array, upper: Array, box: Box) -> Array | None:
     lower, upper = np.asarray(lower, dtype=float), np.asarray(upper, dtype=float)
     if lower.ndim != 2 or lower.shape != upper.shape or lower.shape[1:] != box.lower.shape or not lower.size:
         return box.lower
-    moves = np.flatnonzero(box.upper > box.lower)
-    low, sides = box.lower[moves], (box.upper - box.lower)[moves]
-    begins, ends = ((corners[:, moves] - low) / sides for corners in (lower, upper))
-    filled = np.prod(np.minimum(ends, 1.0) - np.maximum(begins, 0.0), axis=1)
-    if not np.isfinite(filled).all():
+    free_axes = np.flatnonzero(box.upper > box.lower)
+    low, sides = box.lower[free_axes], (box.upper - box.lower)[free_axes]
+    begins, ends = ((corners[:, free_axes] - low) / sides for corners in (lower, upper))
+    volumes = np.prod(np.minimum(ends, 1.0) - np.maximum(begins, 0.0), axis=1)
+    if not np.isfinite(volumes).all():
         return box.lower
-    if ((begins == ends) & ((begins == 0.0) | (begins == 1.0))).any(axis=1).all() and moves.size:
+    if ((begins == ends) & ((begins == 0.0) | (begins == 1.0))).any(axis=1).all() and free_axes.size:
         return None
-    edges = [_apart(np.concatenate([begins[:, i], ends[:, i], [0.0, 1.0]])) for i in range(moves.size)]
+    edges = [_apart(np.concatenate([begins[:, i], ends[:, i], [0.0, 1.0]])) for i in range(free_axes.size)]
     middle = (box.lower + box.upper) / 2
-    if np.prod([float(one.size) for one in edges]) > PARTS:
-        return middle if filled.sum() < 1.0 - OUTSIDE else None
+    if np.prod([float(axis_edges.size) for axis_edges in edges]) > PARTS:
+        return middle if volumes.sum() < 1.0 - OUTSIDE else None
     places = [
-        [np.searchsorted(edges[i], corners[:, i] - NARROW) for i in range(moves.size)] for corners in (begins, ends)
+        [np.searchsorted(edges[i], corners[:, i] - NARROW) for i in range(free_axes.size)] for corners in (begins, ends)
     ]
-    count = np.zeros([one.size for one in edges], dtype=int)
-    for corner in product((0, 1), repeat=moves.size):
+    count = np.zeros([axis_edges.size for axis_edges in edges], dtype=int)
+    for corner in product((0, 1), repeat=free_axes.size):
         at = tuple(places[side][i] for i, side in enumerate(corner))
         np.add.at(count, at, -1 if sum(corner) % 2 else 1)
-    for axis in range(moves.size):
+    for axis in range(free_axes.size):
         count = np.cumsum(count, axis=axis)
-    empty = np.argwhere(count[(slice(None, -1),) * moves.size] <= 0)
+    empty = np.argwhere(count[(slice(None, -1),) * free_axes.size] <= 0)
     if not empty.size:
         return None
-    middle[moves] = low + sides * [(edges[i][at] + edges[i][at + 1]) / 2 for i, at in enumerate(empty[0])]
+    middle[free_axes] = low + sides * [(edges[i][at] + edges[i][at + 1]) / 2 for i, at in enumerate(empty[0])]
     return middle
 
 
@@ -713,20 +718,20 @@ class SemiInfiniteProgram:
         sealed(finite)
         for name, kept in (("S", finite.S), ("P", finite.P), ("finite", finite)):
             object.__setattr__(self, name, kept)
-        for each in fields(self):
-            value = getattr(self, each.name)
+        for entry in fields(self):
+            value = getattr(self, entry.name)
             if isinstance(value, list):
-                object.__setattr__(self, each.name, np.array(value))
+                object.__setattr__(self, entry.name, np.array(value))
         sealed(self)
 
     def _blocks(self, weights: Array) -> Blocks | None:
         if self.blocks is None:
             return None
-        given = np.asarray(self.blocks)
-        if given.shape != weights.shape or given.dtype.kind not in "iu":
-            raise InputError(f"blocks: expected {weights.size} whole numbers, got shape {given.shape}")
-        _, number = np.unique(np.where(given < 0, -1, given), return_inverse=True)
-        blocks = Blocks(number.reshape(-1) - int((given < 0).any()))
+        numbers = np.asarray(self.blocks)
+        if numbers.shape != weights.shape or numbers.dtype.kind not in "iu":
+            raise InputError(f"blocks: expected {weights.size} whole numbers, got shape {numbers.shape}")
+        _, number = np.unique(np.where(numbers < 0, -1, numbers), return_inverse=True)
+        blocks = Blocks(number.reshape(-1) - int((numbers < 0).any()))
         if (weights[blocks.entries] != weights[blocks.first][blocks.of]).any():
             raise InputError("weights: expected one weight for all images of a block")
         return blocks if blocks.entries.size else None
@@ -743,11 +748,12 @@ class SemiInfiniteProgram:
 
     @property
     def own_units(self) -> OwnUnits | None:
-        """This program in its own units; ``None`` where it has no twin, or was changed after the twin was attached."""
+        """Twin of this program in its own units; ``None`` where it has no twin, or was changed after the twin was
+        attached."""
         own = None if self.twin is None else self.twin()
         if own is None or len(own.of) != len(self._parts):
             return None
-        return own if all(mine is theirs for mine, theirs in zip(self._parts, own.of, strict=True)) else None
+        return own if all(value is twin_value for value, twin_value in zip(self._parts, own.of, strict=True)) else None
 
     @property
     def _parts(self) -> tuple[object, ...]:
@@ -756,7 +762,7 @@ class SemiInfiniteProgram:
         Arrays cannot be written to, and families and sets are frozen records. So the same objects mean the same
         program.
         """
-        own = [getattr(self, each.name) for each in fields(self) if each.name not in ("twin", "finite", "families")]
+        own = [getattr(self, entry.name) for entry in fields(self) if entry.name not in ("twin", "finite", "families")]
         return (*own, *self.families)
 
     def mirrored(self, twin: Callable[[SemiInfiniteProgram], OwnUnits]) -> SemiInfiniteProgram:
@@ -772,12 +778,12 @@ class SemiInfiniteProgram:
         SemiInfiniteProgram
             This program with the twin.
         """
-        made: list[OwnUnits] = []
+        cache: list[OwnUnits] = []
 
         def once() -> OwnUnits:
-            if not made:
-                made.append(replace(twin(self), of=self._parts))
-            return made[0]
+            if not cache:
+                cache.append(replace(twin(self), of=self._parts))
+            return cache[0]
 
         return replace(self, twin=once)
 
@@ -822,13 +828,13 @@ class SemiInfiniteProgram:
         if self.largest is not None:
             return self.largest
         program = self.finite
-        reach = np.maximum(np.abs(program.lower), np.abs(program.upper))
-        size = np.full(self.n, np.inf) if program.S is not None else reach
+        radii = np.maximum(np.abs(program.lower), np.abs(program.upper))
+        size = np.full(self.n, np.inf) if program.S is not None else radii
         curvature = np.zeros(self.n) if program.P is None else abs(program.P).sum(axis=0)
         with np.errstate(invalid="ignore"):
             terms = [
-                np.where(cost > 0.0, cost * far, 0.0)
-                for cost, far in ((program.weights, reach), (np.abs(program.q), size), (curvature / 2, size**2))
+                np.where(cost > 0.0, cost * bound, 0.0)
+                for cost, bound in ((program.weights, radii), (np.abs(program.q), size), (curvature / 2, size**2))
             ]
         largest = float(sum(term.sum() for term in terms)) + abs(program.constant)
         if np.isfinite(largest):

@@ -125,27 +125,29 @@ class SearchTrace:
     def gains(self) -> Array:
         """Rise ``(n,)`` of each value above that of the point at which its search stood (`sip.events.gains`)."""
         judged = self.notes.get("accepted", np.zeros(self.value.size))
-        found = np.full(self.value.size, np.nan)
+        rises = np.full(self.value.size, np.nan)
         for outer in np.unique(self.outer):
-            mine = self.outer == outer
-            found[mine] = gains(self.value[mine], judged[mine] != 0.0)
-        return found
+            is_outer = self.outer == outer
+            rises[is_outer] = gains(self.value[is_outer], judged[is_outer] != 0.0)
+        return rises
 
     @staticmethod
     def joined(parts: Sequence[SearchTrace]) -> SearchTrace:
         """Return one trace of all outer iterations, from the traces of each; points are left out where they are too
         many."""
         outer, epsilon, value, bound, seconds = (
-            np.concatenate([getattr(part, name) for part in parts]) for name in COLUMNS
+            np.concatenate([getattr(trace, name) for trace in parts]) for name in COLUMNS
         )
-        kept = len({part.points.shape[1] for part in parts}) == 1 and sum(part.points.size for part in parts) <= POINTS
-        points = np.concatenate([part.points for part in parts]) if kept else np.zeros((value.size, 0))
-        names = dict.fromkeys(name for part in parts for name in part.notes)
+        kept = (
+            len({trace.points.shape[1] for trace in parts}) == 1 and sum(trace.points.size for trace in parts) <= POINTS
+        )
+        points = np.concatenate([trace.points for trace in parts]) if kept else np.zeros((value.size, 0))
+        names = dict.fromkeys(name for trace in parts for name in trace.notes)
         notes = {
-            name: np.concatenate([part.notes.get(name, np.full(part.value.size, np.nan)) for part in parts])
+            name: np.concatenate([trace.notes.get(name, np.full(trace.value.size, np.nan)) for trace in parts])
             for name in names
         }
-        polished = np.concatenate([part.polished for part in parts])
+        polished = np.concatenate([trace.polished for trace in parts])
         return SearchTrace(outer, epsilon, value, bound, seconds, points, notes, polished)
 
     def arrays(self) -> dict[str, Array]:
@@ -276,9 +278,9 @@ class Result:
     def charged(self, others: Iterable[Result]) -> Result:
         """Return this result with the relaxed programs of ``others``, solved on the way, added to its counts."""
         solved_by, programs = Counter(self.solved_by), self.counts.get("relaxed_programs", 0)
-        for other in others:
-            solved_by.update(other.solved_by)
-            programs += other.counts.get("relaxed_programs", 0)
+        for result in others:
+            solved_by.update(result.solved_by)
+            programs += result.counts.get("relaxed_programs", 0)
         return replace(self, solved_by=dict(solved_by), counts={**self.counts, "relaxed_programs": programs})
 
     def __repr__(self) -> str:

@@ -49,13 +49,13 @@ class ScenarioBound:
     @property
     def sentence(self) -> str:
         """The bounds in words, with their meaning."""
-        known = f"{at_most(self.before)} from the {self.variables} decision variables alone"
+        prior = f"{at_most(self.before)} from the {self.variables} decision variables alone"
         if self.before == 1.0:
-            known = f"nothing from the {self.variables} decision variables alone, for which these are too few scenarios"
+            prior = f"nothing from the {self.variables} decision variables alone, for which these are too few scenarios"
         return (
             f"with confidence 1 - {self.beta:g} an uncertainty drawn like the {self.scenarios} scenarios breaks a"
             f" constraint with probability at most {at_most(self.after)} (seen {self.support} active constraints;"
-            f" {known}), which is a probability under the sampling law and does not bound the worst case"
+            f" {prior}), which is a probability under the sampling law and does not bound the worst case"
         )
 
 

@@ -116,11 +116,11 @@ class QuadraticProgram:
             The absolute value of each entry. For the variables of a cone, the residual is in the first entry: the
             amount by which the gradient is outside of the cone.
         """
-        missed = np.abs(slope)
+        residuals = np.abs(slope)
         for cone in self.cones:
-            missed[cone] = 0.0
-            missed[cone[0]] = max(float(np.linalg.norm(slope[cone[1:]])) - slope[cone[0]], 0.0)
-        return missed
+            residuals[cone] = 0.0
+            residuals[cone[0]] = max(float(np.linalg.norm(slope[cone[1:]])) - slope[cone[0]], 0.0)
+        return residuals
 
 
 @dataclass(frozen=True, eq=False)
@@ -235,7 +235,7 @@ class Claim:
         )
         slope = P @ x + program.q + G.T @ z + A.T @ y + box
         slopes = abs(P) @ size + np.abs(program.q) + abs(G).T @ np.abs(z) + abs(A).T @ np.abs(y) + np.abs(box)
-        missed = (
+        residuals = (
             (G @ x - program.h, abs(G) @ size + np.abs(program.h)),
             (np.abs(A @ x - program.b), abs(A) @ size + np.abs(program.b)),
             (outside, size),
@@ -245,7 +245,7 @@ class Claim:
         )
         return signs <= accuracy and all(
             amount.max(initial=0.0) <= max(accuracy, ROUNDING * float(sizes.max(initial=0.0)))
-            for amount, sizes in missed
+            for amount, sizes in residuals
         )
 
 
@@ -404,8 +404,8 @@ class Failures:
             Number of programs.
         """
         key = (kind, NUMBERS.sub("#", reason), by)
-        known = self._known.get(key, Unanswered(kind, 0, reason, by))
-        self._known[key] = replace(known, count=known.count + count)
+        entry = self._known.get(key, Unanswered(kind, 0, reason, by))
+        self._known[key] = replace(entry, count=entry.count + count)
         if self.name and (kind, by) not in self._logged:
             self._logged.add((kind, by))
             logger.warning("solver %s did not answer a %s program, %s did: %s", self.name, kind, by, reason)
@@ -427,18 +427,18 @@ class Failures:
             Programs of the stored account.
         """
         self.calls += calls
-        for one in missed:
-            self._logged.add((one.kind, one.by))
-            self.add(one.kind, one.reason, one.by, one.count)
+        for entry in missed:
+            self._logged.add((entry.kind, entry.by))
+            self.add(entry.kind, entry.reason, entry.by, entry.count)
 
     def __iter__(self) -> Iterator[Unanswered]:
         return iter(tuple(self._known.values()))
 
     def since(self, before: tuple[Unanswered, ...]) -> tuple[Unanswered, ...]:
         """Return the programs that were added after ``before``, an earlier ``tuple`` of this account."""
-        counts = {replace(one, count=0): one.count for one in before}
-        new = (replace(one, count=one.count - counts.get(replace(one, count=0), 0)) for one in self)
-        return tuple(one for one in new if one.count)
+        counts = {replace(entry, count=0): entry.count for entry in before}
+        differences = (replace(entry, count=entry.count - counts.get(replace(entry, count=0), 0)) for entry in self)
+        return tuple(entry for entry in differences if entry.count)
 
 
 @final
@@ -549,10 +549,10 @@ class Asked(Solver):
         """
         self.calls += 1
         self.failures.calls += 1
-        asked = self.cones[0] if program.cones and self.cones is not None else self.solver
-        if POSSIBLE and (asked.aborts or (self.deadline.bounded and program.work > LONG)):
-            return call_apart(lambda: asked.solve(program, accuracy), self.deadline)
-        return asked.solve(program, accuracy)
+        solver = self.cones[0] if program.cones and self.cones is not None else self.solver
+        if POSSIBLE and (solver.aborts or (self.deadline.bounded and program.work > LONG)):
+            return call_apart(lambda: solver.solve(program, accuracy), self.deadline)
+        return solver.solve(program, accuracy)
 
 
 def named(solver: Solver, name: str, instead: Solver) -> Solver:

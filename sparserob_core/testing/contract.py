@@ -1,4 +1,4 @@
-"""What every contract is made of: the component that is tested, and how a broken promise is told."""
+"""Base of every contract: the component under test, and the report of a broken promise."""
 
 from __future__ import annotations
 
@@ -36,12 +36,13 @@ def demand(held: object, wrong: str, mend: str) -> None:
 
 
 def same(first: Any, second: Any) -> bool:
-    """Whether two arrays, or numbers, are equal to the last bit; NaN equals NaN."""
+    """Return whether two arrays, or numbers, are equal to the last bit; NaN equals NaN."""
     return bool(np.array_equal(np.asarray(first), np.asarray(second), equal_nan=True))
 
 
 def without_output(test: Callable[..., None]) -> Callable[..., None]:
-    """The same test, which fails too where the component prints: the standard output belongs to whoever runs it."""
+    """Return a test that also fails where the component prints: the standard output belongs to the command that is
+    run."""
 
     @wraps(test)
     def watched(*arguments: Any, **keywords: Any) -> None:
@@ -57,24 +58,30 @@ def without_output(test: Callable[..., None]) -> Callable[..., None]:
 
 
 def _waits_for_arguments(given: Callable[..., object]) -> bool:
-    """Whether it is a method, a function with arguments, or a fixture of pytest, none of which can be called as it is.
-    What a class asks for, its own error says."""
+    """Return whether a callable is a method, a function with arguments or a fixture of pytest, which cannot be called
+    as it is.
+
+    A class is not examined: its own error names the arguments that it needs.
+    """
     if not inspect.isfunction(given):
         return type(given).__module__.startswith("_pytest.")
     parameters = inspect.signature(given).parameters.values()
-    return any(one.default is one.empty and one.kind not in (one.VAR_POSITIONAL, one.VAR_KEYWORD) for one in parameters)
+    return any(
+        parameter.default is parameter.empty and parameter.kind not in (parameter.VAR_POSITIONAL, parameter.VAR_KEYWORD)
+        for parameter in parameters
+    )
 
 
 class Contract(ABC, Generic[Component]):
-    """What every component of a kind must keep: subclass the contract of the kind in a test module as
-    ``class TestMine(...)``, and say with the class attribute ``component`` what is tested.
+    """Base class of the contracts, each of which states and tests what every component of one kind must keep.
 
-    ``component``: the class, or any function without arguments that makes a new component (such as a
-    ``functools.partial`` of the class with its options); or what a config would say of an installed one: its name, or
-    a mapping with its name and its options. A subclass may override `create` instead.
+    Subclass the contract of the kind in a test module as ``class TestMine(...)``, and name the component under test
+    with the class attribute ``component``: the class, or any function without arguments that makes a new component
+    (such as a ``functools.partial`` of the class with its options). For an installed component its entry in a config
+    will do: its name, or a mapping with its name and its options. A subclass may override `create` instead.
 
-    pytest then runs every test of the contract. A test that fails says what is wrong, and how to mend it. So does a
-    component that prints, in whichever test it does so.
+    pytest then runs every test of the contract. A test that fails says what is wrong, and how to mend it. A component
+    that prints fails too, in whichever test it does so.
     """
 
     component: ClassVar[Any] = None
@@ -91,24 +98,24 @@ class Contract(ABC, Generic[Component]):
 
     def create(self) -> Component:
         """A new component, as ``component`` says; raises `TypeError` where it says nothing of use."""
-        given = type(self).component
-        if isinstance(given, str | Mapping):
-            options = {"name": given} if isinstance(given, str) else dict(given)
+        source = type(self).component
+        if isinstance(source, str | Mapping):
+            options = {"name": source} if isinstance(source, str) else dict(source)
             name = str(options.pop("name"))
-            made: object = load_registry().build(self.kind, name, options)
-        elif callable(given) and not _waits_for_arguments(given):
-            made = given()
+            component: object = load_registry().build(self.kind, name, options)
+        elif callable(source) and not _waits_for_arguments(source):
+            component = source()
         else:
             raise TypeError(
                 f"{type(self).__name__}: expected the attribute `component`: the class of the {self.kind}, a function "
                 "without arguments that makes one, or its name in a config (a method is called `create`); "
-                f"got {given!r}"
+                f"got {source!r}"
             )
         expected = self.expected()
-        if not isinstance(made, expected):
-            names = " or ".join(one.__name__ for one in expected)
-            raise TypeError(f"{type(self).__name__}: `component` gave {made!r}, expected a {names}")
-        return made  # type: ignore[return-value]
+        if not isinstance(component, expected):
+            names = " or ".join(cls.__name__ for cls in expected)
+            raise TypeError(f"{type(self).__name__}: `component` gave {component!r}, expected a {names}")
+        return component  # type: ignore[return-value]
 
     def expected(self) -> tuple[type, ...]:
         """The classes of which a component of this kind may be."""
@@ -119,27 +126,28 @@ class Contract(ABC, Generic[Component]):
 
     @without_output
     def test_no_option_bears_a_name_that_the_framework_uses(self) -> None:
-        made = self.create()
-        if isinstance(made, Options):
-            taken = record_type(self.kind).taken(type(made))
+        component = self.create()
+        if isinstance(component, Options):
+            clashes = record_type(self.kind).taken(type(component))
             demand(
-                not taken,
-                f"these options of {type(made).__name__} bear names that the framework uses itself: {', '.join(taken)}",
+                not clashes,
+                f"these options of {type(component).__name__} bear names that the framework uses itself: "
+                f"{', '.join(clashes)}",
                 "rename them: in a config, or as an argument in Python, the framework's own key would be meant",
             )
 
     @without_output
     def test_every_option_is_documented(self) -> None:
-        made = self.create()
-        if isinstance(made, Options):
-            silent = [name for name, meaning in meanings(type(made)).items() if not meaning]
+        component = self.create()
+        if isinstance(component, Options):
+            silent = [name for name, meaning in meanings(type(component)).items() if not meaning]
             demand(
                 not silent,
-                f"these options of {type(made).__name__} have no documentation: {', '.join(silent)}",
+                f"these options of {type(component).__name__} have no documentation: {', '.join(silent)}",
                 "write a string under each field of the class; `sparserob plugins NAME` shows it to users",
             )
             demand(
-                (type(made).__doc__ or "").strip() != (Options.__doc__ or "").strip() and type(made).__doc__,
-                f"{type(made).__name__} has no docstring",
+                (type(component).__doc__ or "").strip() != (Options.__doc__ or "").strip() and type(component).__doc__,
+                f"{type(component).__name__} has no docstring",
                 "say in its first line what the component does, and from where the idea is (author, year)",
             )

@@ -17,12 +17,12 @@ MOST = 20_000  # pieces
 
 
 class DictionaryContract(Contract[DictionaryFactory], kind="dictionary"):
-    """What every dictionary must keep: subclass it as ``class TestMine(DictionaryContract)`` and give ``component``.
+    """Contract of a dictionary: subclass it as ``class TestMine(DictionaryContract)`` and give ``component``.
 
     ``build(horizon)`` returns a `Dictionary`: ``breakpoints (K + 1,)`` from exactly 0 to exactly the horizon, and
-    ``values (N, K)``, ``N <= K`` linearly independent functions on the ``K`` pieces; nothing else may depend on what
-    was built before. ``horizons``: those that are tried; options that fit some horizons only need others. A horizon
-    that options do not fit is refused with an `InputError`.
+    ``values (N, K)``, ``N <= K`` linearly independent functions on the ``K`` pieces. Nothing else may depend on earlier
+    calls. ``horizons`` are the horizons that are tried; a component whose options fit some horizons only needs its own.
+    A horizon that the options do not fit is refused with an `InputError`.
     """
 
     horizons: tuple[float, ...] = HORIZONS
@@ -30,21 +30,21 @@ class DictionaryContract(Contract[DictionaryFactory], kind="dictionary"):
     def built(self, factory: DictionaryFactory, horizon: float) -> Dictionary:
         """A dictionary on the horizon; a broken contract where something else comes back, or something is raised."""
         try:
-            made: object = factory.build(horizon)
+            dictionary: object = factory.build(horizon)
         except Exception as error:  # noqa: BLE001  a component may raise anything, and must not
             broken(
                 f"build({horizon:g}) raised {type(error).__name__}: {error}",
                 "build any horizon; where options fit some horizons only, set `horizons` of this contract to those",
             )
-        if not isinstance(made, Dictionary):
-            broken(f"build({horizon:g}) returned {made!r}", "return a `sparserob_core.Dictionary`")
-        return made
+        if not isinstance(dictionary, Dictionary):
+            broken(f"build({horizon:g}) returned {dictionary!r}", "return a `sparserob_core.Dictionary`")
+        return dictionary
 
     def test_it_covers_the_horizon_from_end_to_end(self) -> None:
         factory = self.create()
         for horizon in self.horizons:
-            made = self.built(factory, horizon)
-            first, last = float(made.breakpoints[0]), float(made.breakpoints[-1])
+            dictionary = self.built(factory, horizon)
+            first, last = float(dictionary.breakpoints[0]), float(dictionary.breakpoints[-1])
             demand(
                 first == 0.0 and last == horizon,
                 f"build({horizon!r}) covers the times from {first!r} to {last!r}",
@@ -54,34 +54,36 @@ class DictionaryContract(Contract[DictionaryFactory], kind="dictionary"):
     def test_breakpoints_increase_by_lengths_that_count(self) -> None:
         factory = self.create()
         for horizon in self.horizons:
-            made = self.built(factory, horizon)
-            shortest = float(np.diff(made.breakpoints).min()) / horizon
+            dictionary = self.built(factory, horizon)
+            shortest = float(np.diff(dictionary.breakpoints).min()) / horizon
             demand(
                 shortest >= SHORTEST,
                 f"build({horizon:g}) has a piece of {shortest:.1e} of the horizon",
                 f"join pieces shorter than {SHORTEST:g} of the horizon with their neighbours: rounding eats them",
             )
             demand(
-                1 <= made.values.shape[1] <= MOST and made.values.shape[1] == made.breakpoints.size - 1,
-                f"build({horizon:g}) has values on {made.values.shape[1]} of {made.breakpoints.size - 1} pieces",
+                1 <= dictionary.values.shape[1] <= MOST
+                and dictionary.values.shape[1] == dictionary.breakpoints.size - 1,
+                f"build({horizon:g}) has values on {dictionary.values.shape[1]} of "
+                f"{dictionary.breakpoints.size - 1} pieces",
                 f"values have one column for each piece, of at most {MOST} pieces",
             )
 
     def test_its_functions_are_linearly_independent(self) -> None:
         factory = self.create()
         for horizon in self.horizons:
-            made = self.built(factory, horizon)
-            weighted = made.values * np.sqrt(np.diff(made.breakpoints))
+            dictionary = self.built(factory, horizon)
+            weighted = dictionary.values * np.sqrt(np.diff(dictionary.breakpoints))
             norms = np.linalg.norm(weighted, axis=1)
             demand(
                 (norms > 0.0).all(),
                 f"build({horizon:g}): function {int(norms.argmin())} is zero",
                 "leave out functions that are zero on the whole horizon",
             )
-            spread = np.linalg.svd(weighted / norms[:, None], compute_uv=False)
-            condition = np.inf if spread[-1] == 0.0 else float((spread[0] / spread[-1]) ** 2)
+            singular_values = np.linalg.svd(weighted / norms[:, None], compute_uv=False)
+            condition = np.inf if singular_values[-1] == 0.0 else float((singular_values[0] / singular_values[-1]) ** 2)
             demand(
-                spread.size == made.values.shape[0] and condition <= CONDITION,
+                singular_values.size == dictionary.values.shape[0] and condition <= CONDITION,
                 f"build({horizon:g}): the functions are linearly dependent, or nearly so (condition {condition:.1e})",
                 "leave out functions that others make up; orthogonal ones are safest",
             )
@@ -100,9 +102,9 @@ class DictionaryContract(Contract[DictionaryFactory], kind="dictionary"):
     def test_the_same_horizon_gives_the_same_dictionary_whatever_was_built_before(self) -> None:
         factory = self.create()
         for horizon in self.horizons:
-            old, new = self.built(factory, horizon), self.built(self.create(), horizon)
+            reused, fresh = self.built(factory, horizon), self.built(self.create(), horizon)
             demand(
-                same(old.breakpoints, new.breakpoints) and same(old.values, new.values),
+                same(reused.breakpoints, fresh.breakpoints) and same(reused.values, fresh.values),
                 f"build({horizon:g}) of an old factory and of a new one give different dictionaries",
                 "keep nothing between calls of `build`, and use neither clock nor random numbers without a seed option",
             )
@@ -125,7 +127,7 @@ class DictionaryContract(Contract[DictionaryFactory], kind="dictionary"):
         factory = self.create()
         for horizon in (1e-9, 1e9):
             try:
-                made: object = factory.build(horizon)
+                dictionary: object = factory.build(horizon)
             except InputError:
                 continue
             except Exception as error:  # noqa: BLE001  as above
@@ -134,7 +136,11 @@ class DictionaryContract(Contract[DictionaryFactory], kind="dictionary"):
                     "raise `sparserob_core.InputError`, with the option and the horizon in its text, where they do "
                     "not fit together",
                 )
-            demand(isinstance(made, Dictionary), f"build({horizon:g}) returned {made!r}", "return a `Dictionary`")
+            demand(
+                isinstance(dictionary, Dictionary),
+                f"build({horizon:g}) returned {dictionary!r}",
+                "return a `Dictionary`",
+            )
 
     def test_a_control_can_be_written_in_it(self) -> None:
         from sparserob_core.control.problem.problem import OptimalControlProblem
@@ -143,7 +149,7 @@ class DictionaryContract(Contract[DictionaryFactory], kind="dictionary"):
         from sparserob_core.sip.convex_set import Box
 
         horizon = self.horizons[0]
-        made = self.built(self.create(), horizon)
+        dictionary = self.built(self.create(), horizon)
         problem = OptimalControlProblem(
             system=LinearSystem(np.zeros((1, 1)), np.ones((1, 1))),
             horizon=horizon,
@@ -151,14 +157,14 @@ class DictionaryContract(Contract[DictionaryFactory], kind="dictionary"):
             control=Box(-np.ones(1), np.ones(1)),
             terminal=[Box(np.array([-0.3 * horizon]), np.array([0.3 * horizon]))],
         )
-        result = solve(problem, control=made)
+        result = solve(problem, control=dictionary)
         demand(
             result.status in ("certified", "infeasible"),
             f"a control of one integrator in this dictionary: {result.status}, {result.message}",
             "the functions may be too much alike, or their values of too different sizes",
         )
         if result.decision is not None:
-            area = float(made.control(result.decision)[0] @ made.lengths)
+            area = float(dictionary.control(result.decision)[0] @ dictionary.lengths)
             demand(
                 area <= -0.2 * horizon * (1.0 - 1e-6) and abs(result.cost + area) <= 1e-6 * horizon,
                 f"the control has the integral {area:.6g} and the cost {result.cost:.6g}, where -0.2 times the horizon "

@@ -27,7 +27,7 @@ MOMENT = 0.05  # seconds that a call takes where it has to take some
 
 
 class ExecutorContract(Contract[ExecutorFactory], kind="executor"):
-    """What every executor must keep: subclass it in a test module as ``class TestMine(ExecutorContract)`` and give
+    """Contract of an executor: subclass it in a test module as ``class TestMine(ExecutorContract)`` and give
     ``component``.
 
     An executor is a component whose ``open()`` is a context with a `concurrent.futures.Executor`. The contract asks for
@@ -74,10 +74,10 @@ class ExecutorContract(Contract[ExecutorFactory], kind="executor"):
                 self.answer(future)
             for future in [executor.submit(mark, folder, "equal") for _ in range(CALLS)]:  # equal calls are calls
                 self.answer(future)
-            made, due = marks(folder), {**{f"{k}": 1 for k in range(CALLS)}, "equal": CALLS}
+            counts, expected = marks(folder), {**{f"{k}": 1 for k in range(CALLS)}, "equal": CALLS}
             demand(
-                made == due,
-                f"calls were made so often: {made}, not {due}",
+                counts == expected,
+                f"calls were made so often: {counts}, not {expected}",
                 "make each call that is submitted once, and remember no answers (in dask: pure=False)",
             )
 
@@ -96,12 +96,12 @@ class ExecutorContract(Contract[ExecutorFactory], kind="executor"):
         with self.opened() as executor:
             array = self.answer(executor.submit(echo, numbers))
             demand(np.asarray(array).tobytes() == numbers.tobytes(), f"{numbers} came back as {array}", mend)
-            several = self.answer(executor.submit(echo, {"a": (1, "b", None)}, again=[2]))
-            demand(several == ({"a": (1, "b", None)}, [2]), f"what came back was {several!r}", mend)
+            answer = self.answer(executor.submit(echo, {"a": (1, "b", None)}, again=[2]))
+            demand(answer == ({"a": (1, "b", None)}, [2]), f"what came back was {answer!r}", mend)
             products = np.random.default_rng(0).random((3, 40, 40))
-            there = [self.answer(executor.submit(product, matrix)) for matrix in products]
+            remote = [self.answer(executor.submit(product, matrix)) for matrix in products]
             demand(
-                [one.tobytes() for one in there] == [product(matrix).tobytes() for matrix in products],
+                [matrix.tobytes() for matrix in remote] == [product(matrix).tobytes() for matrix in products],
                 "a product of matrices has other digits there than here",
                 f"{mend}; give linear algebra one thread, see `test_linear_algebra_has_one_thread`",
             )
@@ -111,22 +111,22 @@ class ExecutorContract(Contract[ExecutorFactory], kind="executor"):
         with self.opened() as executor:
             futures = [executor.submit(fails if k == 1 else echo, f"call {k}") for k in range(4)]
             error = self.error(futures[1])
-            told = named(error)
+            text = named(error)
             demand(type(error) is ArithmeticError, f"an ArithmeticError arrived as a {type(error).__name__}", mend)
-            demand(told == "ArithmeticError: call 1 has no answer", f"the error arrived as: {told}", mend)
+            demand(text == "ArithmeticError: call 1 has no answer", f"the error arrived as: {text}", mend)
             demand("in fails" in "".join(traceback.format_exception(error)), "the traceback is lost", mend)
-            others = [self.answer(futures[k]) for k in (0, 2, 3)]
-            demand(others == ["call 0", "call 2", "call 3"], "an error has harmed other calls", mend)
-            told = named(self.error(executor.submit(refuses)))
+            answers = [self.answer(futures[k]) for k in (0, 2, 3)]
+            demand(answers == ["call 0", "call 2", "call 3"], "an error has harmed other calls", mend)
+            text = named(self.error(executor.submit(refuses)))
             demand(
-                told == "InputError: horizon: expected a number, got None", f"an InputError arrived as: {told}", mend
+                text == "InputError: horizon: expected a number, got None", f"an InputError arrived as: {text}", mend
             )
 
     def test_an_error_that_cannot_be_sent_arrives_in_its_words(self) -> None:
         mend = "try in the worker whether the exception can be pickled; if not, send its text in a RuntimeError"
         with self.opened() as executor:
-            told = "".join(traceback.format_exception(self.error(executor.submit(fails_oddly))))
-            demand("it is odd" in told, f"an error that cannot be pickled arrived as: {told}", mend)
+            text = "".join(traceback.format_exception(self.error(executor.submit(fails_oddly))))
+            demand("it is odd" in text, f"an error that cannot be pickled arrived as: {text}", mend)
             demand(self.answer(executor.submit(echo, 1)) == 1, "it has ended the workers", mend)
 
     def test_what_cannot_be_sent_is_named_and_harms_nothing_else(self) -> None:
@@ -140,21 +140,21 @@ class ExecutorContract(Contract[ExecutorFactory], kind="executor"):
                     demand(not isinstance(error, BrokenExecutor), "what cannot be sent has ended the workers", mend)
                     demand("_unsendable" in str(error), f"it is not named: {named(error)}", mend)
             if self.isolated:
-                told = named(self.error(executor.submit(echo, threading.Lock())))
-                demand("lock" in told, f"a lock cannot be sent, and that is told as: {told}", mend)
+                text = named(self.error(executor.submit(echo, threading.Lock())))
+                demand("lock" in text, f"a lock cannot be sent, and that is told as: {text}", mend)
             demand(self.answer(executor.submit(echo, 1)) == 1, "what cannot be sent has ended the workers", mend)
 
     def test_who_waits_is_told_once(self) -> None:
-        told: list[Future[Any]] = []
+        notified: list[Future[Any]] = []
         mend = "give a future its answer once, by `set_result` or `set_exception` of `concurrent.futures.Future`"
         with self.opened() as executor:
             futures = [executor.submit(echo, k) for k in range(3)] + [executor.submit(fails, "it")]
             for future in futures:
-                future.add_done_callback(told.append)
+                future.add_done_callback(notified.append)
             demand(not wait(futures, self.patience).not_done, "a future is never done", mend)
         demand(
-            sorted(map(id, told)) == sorted(map(id, futures)),
-            f"{len(futures)} futures have told those who wait {len(told)} times",
+            sorted(map(id, notified)) == sorted(map(id, futures)),
+            f"{len(futures)} futures have told those who wait {len(notified)} times",
             mend,
         )
 
@@ -175,8 +175,8 @@ class ExecutorContract(Contract[ExecutorFactory], kind="executor"):
                         demand(
                             self.answer(future) == f"{k}", "a future that was not cancelled has another answer", mend
                         )
-            made = {name for name in marks(folder) if cancelled[int(name)]}
-            demand(not made, f"{len(made)} calls that were cancelled were made all the same", mend)
+            called = {name for name in marks(folder) if cancelled[int(name)]}
+            demand(not called, f"{len(called)} calls that were cancelled were made all the same", mend)
 
     def test_the_end_waits_for_what_was_submitted(self) -> None:
         mend = "let `open` end with `shutdown(wait=True)`; drop nothing unless the context ends by an exception"
@@ -199,21 +199,21 @@ class ExecutorContract(Contract[ExecutorFactory], kind="executor"):
         broken("a call was accepted after the end", "let `submit` raise a RuntimeError after `shutdown`")
 
     def test_an_error_of_the_caller_passes_and_abandons_what_is_running(self) -> None:
-        futures, began, passed = list[Future[Any]](), time.monotonic(), ""
+        futures, start, passed = list[Future[Any]](), time.monotonic(), ""
         try:
             with self.opened() as executor:
                 self.answer(executor.submit(echo, 1))
                 if self.isolated:
                     futures += [executor.submit(late, k, self.long) for k in range(4)]
-                began = time.monotonic()
+                start = time.monotonic()
                 raise KeyboardInterrupt("the caller's")
         except KeyboardInterrupt as error:
             passed = str(error)
         demand(passed == "the caller's", "the caller's error was swallowed", "raise in `open` what is raised inside it")
         mend = "where `open` ends by an exception, cancel what waits, and end the workers at once"
-        seconds = time.monotonic() - began
+        seconds = time.monotonic() - start
         demand(seconds < min(self.patience, self.long), f"the end took {seconds:.0f} s: calls nobody waits for", mend)
-        demand(all(one.done() for one in futures), "who waits for a call that was abandoned waits for ever", mend)
+        demand(all(future.done() for future in futures), "who waits for a call that was abandoned waits for ever", mend)
 
     def test_it_can_be_opened_again_and_leaves_no_thread(self) -> None:
         factory, before = self.create(), set(threading.enumerate())
@@ -224,11 +224,11 @@ class ExecutorContract(Contract[ExecutorFactory], kind="executor"):
             except RuntimeError as error:
                 broken(f"opened {k + 1} times it says: {named(error)}", "make the workers in `open`, anew each time")
         ends = time.monotonic() + min(self.patience, 5.0)
-        while (left := set(threading.enumerate()) - before) and time.monotonic() < ends:
+        while (new_threads := set(threading.enumerate()) - before) and time.monotonic() < ends:
             time.sleep(0.01)
         demand(
-            not left,
-            f"still running after the end: {', '.join(thread.name for thread in left)}",
+            not new_threads,
+            f"still running after the end: {', '.join(thread.name for thread in new_threads)}",
             "start in `open` whatever runs, and end it there",
         )
 
@@ -248,8 +248,8 @@ class ExecutorContract(Contract[ExecutorFactory], kind="executor"):
             return
         mend = "watch the workers; where one ends, give the futures of its calls a `concurrent.futures.BrokenExecutor`"
         with self.opened() as executor:
-            told = self.error(executor.submit(dies))
-            demand(isinstance(told, BrokenExecutor), f"a worker that dies is told as: {named(told)}", mend)
+            error = self.error(executor.submit(dies))
+            demand(isinstance(error, BrokenExecutor), f"a worker that dies is told as: {named(error)}", mend)
         with self.opened() as executor:
             demand(self.answer(executor.submit(echo, 1)) == 1, "it cannot be opened again after that", mend)
 
@@ -265,21 +265,22 @@ class ExecutorContract(Contract[ExecutorFactory], kind="executor"):
             )
 
     def answer(self, future: Future[Any]) -> Any:
-        """What a call has returned."""
+        """Return the result of a call, or raise its error."""
         error = self.outcome(future)
         if error is not None:
             raise error
         return future.result()
 
     def error(self, future: Future[Any]) -> BaseException:
-        """What a call has raised, or that it was cancelled."""
+        """Return the exception of a call, or its cancellation; the contract is broken where there is none."""
         error = self.outcome(future)
         if error is None:
             broken("an error was swallowed", "pass what a call raises to `Future.set_exception`")
         return error
 
     def outcome(self, future: Future[Any]) -> BaseException | None:
-        """What a call has raised, or that it was cancelled, or none."""
+        """Return the exception of a call, its cancellation, or ``None``; the contract is broken where the call does not
+        end."""
         try:
             return future.exception(self.patience)
         except CancelledError as cancelled:
@@ -292,12 +293,12 @@ class ExecutorContract(Contract[ExecutorFactory], kind="executor"):
 
 
 def echo(value: Any, **more: Any) -> Any:
-    """Its argument, or all of them."""
+    """Return the argument, or all arguments as a tuple."""
     return (value, *more.values()) if more else value
 
 
 def late(value: int, seconds: float) -> int:
-    """Its first argument, after some time."""
+    """Return the first argument after a delay of ``seconds``."""
     time.sleep(seconds)
     return value
 
@@ -316,7 +317,7 @@ def mark(folder: str, name: str, seconds: float = 0.0) -> str:
 
 
 def marks(folder: str) -> dict[str, int]:
-    """How often each name was marked."""
+    """Return how often each name was marked in a folder."""
     return {path.name: len(path.read_text().splitlines()) for path in Path(folder).iterdir()}
 
 
@@ -367,7 +368,7 @@ def dies() -> None:
 
 
 def interrupts_itself() -> str:
-    """What Ctrl-C in a terminal does to a worker."""
+    """Send this process the signal that Ctrl-C in a terminal sends to a worker."""
     os.kill(os.getpid(), signal.SIGINT)
     time.sleep(2 * MOMENT)
     return "still here"

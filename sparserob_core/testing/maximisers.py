@@ -41,7 +41,7 @@ def ripples(points: Array) -> Array:
 
 
 def bowl(points: Array) -> Array:
-    """One maximum, 0 at 0.3 in every coordinate."""
+    """Evaluate a concave function with a single maximum, 0 where every coordinate is 0.3."""
     return np.asarray(-((points - 0.3) ** 2).sum(axis=1), dtype=float)
 
 
@@ -56,7 +56,7 @@ def spike(points: Array) -> Array:
 
 
 def nowhere(points: Array) -> Array:
-    """Not a number, anywhere."""
+    """Return NaN at every point."""
     return np.full(len(points), np.nan)
 
 
@@ -91,12 +91,12 @@ class _Counted:
 
 
 class MaximiserContract(Contract[Maximiser], kind="maximiser"):
-    """What every maximiser must keep: subclass it in a test module as ``class TestMine(MaximiserContract)`` and give
+    """Contract of a maximiser: subclass it in a test module as ``class TestMine(MaximiserContract)`` and give
     ``component``.
 
-    The core keeps the accounts (domain, budget, best point); the contract checks that a maximiser works with them:
+    The core keeps the accounts (domain, budget, best point). The contract checks that a maximiser works with them:
     reproducible in a fresh process, at home in any box, unharmed by values that are no numbers, and honest in its upper
-    bound. It may spend its whole budget in one call. The largest box has 1200 coordinates (400 indices of 3), the
+    bound. It may spend its whole budget in one call. The largest box has 1200 coordinates (400 indices of 3); the
     budget there is 50 evaluations.
     """
 
@@ -125,9 +125,11 @@ class MaximiserContract(Contract[Maximiser], kind="maximiser"):
         from multiprocessing import get_context
 
         with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as fresh:
-            there = fresh.submit(maximise, Target(ripples, PLANE), self.create(), 60, np.random.default_rng(3)).result()
+            result = fresh.submit(
+                maximise, Target(ripples, PLANE), self.create(), 60, np.random.default_rng(3)
+            ).result()
         demand(
-            there.trace.points.tolist() == self.search(ripples, seed=3).trace.points.tolist(),
+            result.trace.points.tolist() == self.search(ripples, seed=3).trace.points.tolist(),
             "the same seed gives other points in another process",
             "let nothing depend on `hash` of a text, on `id`, or on the order of a set",
         )
@@ -234,12 +236,12 @@ class MaximiserContract(Contract[Maximiser], kind="maximiser"):
         )
 
     def test_an_infinite_value_ends_the_search(self) -> None:
-        """One call may find it among many points; it is the last call."""
-        found: list[bool] = []
+        """Check that the call which meets the infinite value, perhaps among many points, is the last call."""
+        has_infinity: list[bool] = []
 
         def watched(points: Array) -> Array:
             values = unbounded(points)
-            found.append(bool(np.isposinf(values).any()))
+            has_infinity.append(bool(np.isposinf(values).any()))
             return values
 
         best = self.search(watched, budget=400).best_value
@@ -249,7 +251,7 @@ class MaximiserContract(Contract[Maximiser], kind="maximiser"):
             "spread some of the points over the whole box",
         )
         demand(
-            found.index(True) == len(found) - 1,
+            has_infinity.index(True) == len(has_infinity) - 1,
             "the search went on after +inf",
             "let `SearchEnded` pass: `objective.evaluate` raises it once nothing is left to gain",
         )
@@ -266,11 +268,11 @@ class MaximiserContract(Contract[Maximiser], kind="maximiser"):
                 )
 
     def test_a_function_evaluated_in_batches_or_point_by_point_gives_the_same_search(self) -> None:
-        singly = self.search(lambda points: np.concatenate([ripples(point[np.newaxis]) for point in points]))
-        together = self.search(ripples)
+        pointwise_result = self.search(lambda points: np.concatenate([ripples(point[np.newaxis]) for point in points]))
+        batch_result = self.search(ripples)
         demand(
-            singly.trace.points.tolist() == together.trace.points.tolist()
-            and singly.trace.values.tolist() == together.trace.values.tolist(),
+            pointwise_result.trace.points.tolist() == batch_result.trace.points.tolist()
+            and pointwise_result.trace.values.tolist() == batch_result.trace.values.tolist(),
             "the search depends on how its function computes a batch",
             "take the values of `objective.evaluate` as they are; let no clock decide what is evaluated",
         )
@@ -319,9 +321,9 @@ class MaximiserContract(Contract[Maximiser], kind="maximiser"):
             first.append(time.perf_counter())
             return bowl(points)
 
-        maximiser, began = self.create(), time.perf_counter()
+        maximiser, start = self.create(), time.perf_counter()
         maximise(Target(timed, PLANE), maximiser, 1, np.random.default_rng(0))
-        return first[0] - began
+        return first[0] - start
 
     def test_a_tuple_of_many_indices_is_searched_within_the_budget(self) -> None:
         count, width = 400, 3

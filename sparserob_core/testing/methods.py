@@ -44,15 +44,15 @@ def _dip(provable: bool) -> ConstraintFamily:
     """``x1 + x2 t <= 1 + (t - DIP)^2 - 0.3 exp(-((t - DIP) / WIDTH)^2)`` for all t in [0, 1]."""
 
     def rows(t: Array) -> tuple[Array, Array]:
-        away = t[:, 0] - DIP
-        rhs = 1.0 + away**2 - 0.3 * np.exp(-((away / WIDTH) ** 2))
+        offset = t[:, 0] - DIP
+        rhs = 1.0 + offset**2 - 0.3 * np.exp(-((offset / WIDTH) ** 2))
         return np.stack([np.ones(len(t)), t[:, 0]], axis=1)[:, None], rhs[:, None]
 
     def enclosure(x: Array, lower: Array, upper: Array) -> Enclosure:
         low, high = lower[:, 0], upper[:, 0]
-        near = np.maximum(np.maximum(low - DIP, DIP - high), 0.0)
-        left = x[0] + np.maximum(x[1] * low, x[1] * high)
-        bounds = left - 1.0 - near**2 + 0.3 * np.exp(-((near / WIDTH) ** 2))
+        distance = np.maximum(np.maximum(low - DIP, DIP - high), 0.0)
+        lhs = x[0] + np.maximum(x[1] * low, x[1] * high)
+        bounds = lhs - 1.0 - distance**2 + 0.3 * np.exp(-((distance / WIDTH) ** 2))
         return Enclosure(bounds, np.zeros(len(low), dtype=int))
 
     return ConstraintFamily(
@@ -102,8 +102,8 @@ def _curved() -> SemiInfiniteProgram:
         return np.ones((len(t), 1, 1)), 0.5 + (t - 0.5) ** 2
 
     def enclosure(x: Array, lower: Array, upper: Array) -> Enclosure:
-        near = np.maximum(np.maximum(lower - 0.5, 0.5 - upper), 0.0)[:, 0]
-        return Enclosure(x[0] - 0.5 - near**2, np.zeros(len(lower), dtype=int))
+        distance = np.maximum(np.maximum(lower - 0.5, 0.5 - upper), 0.0)[:, 0]
+        return Enclosure(x[0] - 0.5 - distance**2, np.zeros(len(lower), dtype=int))
 
     below = ConstraintFamily(name="below", index_set=Box(np.zeros(1), np.ones(1)), rows=rows, enclosure=enclosure)
     return SemiInfiniteProgram(n=1, P=np.array([[2.0]]), q=np.array([-2.0]), families=[below])
@@ -181,12 +181,13 @@ class _Lying(Solver):
 
 
 class MethodContract(Contract[Method], kind="method"):
-    """What every method must keep: subclass it as ``class TestMine(MethodContract)`` and give ``component``.
+    """Contract of a method: subclass it as ``class TestMine(MethodContract)`` and give ``component``.
 
     ``solve(program, tools)`` returns a `Result` for every program, whose status never claims more than was proven. The
-    contract compares every claim with programs whose value is known: bounds lie on their side of the value, multipliers
-    prove the lower bound, a certified decision is proven anew, an infeasible answer has multipliers that prove it, a
-    refuted one a witness. A method that does not suit a program raises `InputError`, but has to suit one of them.
+    contract compares every claim with programs whose value is known. Bounds must lie on their side of the value, and
+    multipliers must prove the lower bound. A certified decision is proven anew; an infeasible answer needs multipliers
+    that prove it, a refuted one a witness. A method that does not suit a program raises `InputError`, but has to suit
+    one of them.
     """
 
     def tools(self, **changed: object) -> Tools:
@@ -204,7 +205,10 @@ class MethodContract(Contract[Method], kind="method"):
         return Tools(**own)  # type: ignore[arg-type]
 
     def solved(self, one: Known, method: Method | None = None, **changed: object) -> Result | None:
-        """What the method makes of a program; ``None`` where it does not suit it. A broken contract where it raises."""
+        """Return the method's result for a program, or ``None`` where it does not suit the program.
+
+        The contract is broken where the method raises anything but `InputError`, or returns no `Result`.
+        """
         chosen, tools = method or self.create(), self.tools(**changed)
         try:
             result: object = chosen.solve(one.program, tools)
@@ -228,46 +232,46 @@ class MethodContract(Contract[Method], kind="method"):
 
     def test_what_it_claims_is_true(self) -> None:
         answered = 0
-        for one in known():
-            result = self.solved(one)
+        for case in known():
+            result = self.solved(case)
             if result is not None:
                 answered += 1
-                judge(one, result)
+                judge(case, result)
         demand(answered, "it refuses every program", "answer one kind of program at least")
 
     def test_the_rounds_that_it_tells_are_true(self) -> None:
-        for one in known():
+        for case in known():
             events: list[Event] = []
-            self.solved(one, notify=events.append)
+            self.solved(case, notify=events.append)
             for event in events:
                 if isinstance(event, RoundFinished):
                     demand(
-                        event.lower_bound <= one.value + CLOSE,
-                        f"{one.name}: round {event.round} tells the lower bound {event.lower_bound:.9g}, and the value "
-                        f"is {one.value:.9g}",
+                        event.lower_bound <= case.value + CLOSE,
+                        f"{case.name}: round {event.round} tells the lower bound {event.lower_bound:.9g}, and the "
+                        f"value is {case.value:.9g}",
                         "tell bounds that are proven, -inf while there is none",
                     )
                     demand(
                         event.decision is None or not event.decision.flags.writeable,
-                        f"{one.name}: observers may write into the decision of round {event.round}",
+                        f"{case.name}: observers may write into the decision of round {event.round}",
                         "set `decision.flags.writeable = False` on a view of it before it is told",
                     )
 
     def test_a_solver_that_lies_misleads_nobody(self) -> None:
         for liar in (_Lying("solved"), _Lying("infeasible"), _Lying("failed")):
-            for one in known():
-                if one.name in ("a narrow dip", "a contradiction"):
-                    result = self.solved(one, solver=liar)
+            for case in known():
+                if case.name in ("a narrow dip", "a contradiction"):
+                    result = self.solved(case, solver=liar)
                     if result is not None:
-                        judge(one, result)
+                        judge(case, result)
 
     def test_the_same_seed_gives_the_same_result(self) -> None:
         shared, own = str(np.random.get_state(legacy=False)), random.getstate()  # noqa: NPY002
-        for one in known():
-            first, second = self.solved(one), self.solved(one)
+        for case in known():
+            first, second = self.solved(case), self.solved(case)
             demand(
                 _numbers(first) == _numbers(second),
-                f"{one.name}: the same seed gives another result: {_numbers(first)[:3]}, {_numbers(second)[:3]}",
+                f"{case.name}: the same seed gives another result: {_numbers(first)[:3]}, {_numbers(second)[:3]}",
                 "draw from `tools.rng` only, and let no clock decide",
             )
         demand(
@@ -278,82 +282,82 @@ class MethodContract(Contract[Method], kind="method"):
 
     def test_one_method_may_solve_many_programs(self) -> None:
         method = self.create()
-        for one in known():
-            old, new = self.solved(one, method), self.solved(one)
+        for case in known():
+            reused, fresh = self.solved(case, method), self.solved(case)
             demand(
-                _numbers(old) == _numbers(new),
-                f"{one.name}: a method that has solved other programs before comes to another result than a new one",
+                _numbers(reused) == _numbers(fresh),
+                f"{case.name}: a method that has solved other programs before comes to another result than a new one",
                 "keep nothing of a program in `self`",
             )
 
     def test_the_program_is_left_as_it_was(self) -> None:
-        for one in known():
-            program = one.program.finite
+        for case in known():
+            program = case.program.finite
             names = ("q", "weights", "lower", "upper", "G", "h", "A", "b")
             before = {name: deepcopy(getattr(program, name)) for name in names}
-            self.solved(one)
+            self.solved(case)
             changed = [name for name in names if not same(before[name], getattr(program, name))]
             demand(
                 not changed,
-                f"{one.name}: the method has changed {', '.join(changed)} of the program",
+                f"{case.name}: the method has changed {', '.join(changed)} of the program",
                 "make a new program with `dataclasses.replace`",
             )
 
     def test_it_ends_when_its_time_is_over(self) -> None:
-        for one in known():
+        for case in known():
             late = _Watched(1e-9)
-            result = self.solved(one, deadline=late)
+            result = self.solved(case, deadline=late)
             if result is None:
                 continue
-            judge(one, result)
+            judge(case, result)
             demand(
                 late.asked,
-                f"{one.name}: the method never asks whether its time is over",
+                f"{case.name}: the method never asks whether its time is over",
                 "call `tools.deadline.check()` between steps, or look at `tools.deadline.passed`",
             )
             demand(
                 result.stopped or result.status in ("certified", "infeasible"),
-                f"{one.name}: time is over, the result is {result.status}, and does not say why it came to an end",
+                f"{case.name}: time is over, the result is {result.status}, and does not say why it came to an end",
                 "return `tools.deadline.reason` as `stopped`",
             )
 
     def test_an_interrupt_ends_it_with_what_is_known(self) -> None:
-        for one in known():
-            told: list[Event] = []
+        for case in known():
+            events: list[Event] = []
 
-            def interrupt(event: Event, told: list[Event] = told) -> None:
+            def interrupt(event: Event, told: list[Event] = events) -> None:
                 told.append(event)
                 raise KeyboardInterrupt
 
-            result = self.solved(one, notify=interrupt)
-            if result is None or not told:
+            result = self.solved(case, notify=interrupt)
+            if result is None or not events:
                 continue
-            judge(one, result)
+            judge(case, result)
             demand(
-                len(told) <= 2,
-                f"{one.name}: {len(told)} events were told after the interrupt from the keyboard",
+                len(events) <= 2,
+                f"{case.name}: {len(events)} events were told after the interrupt from the keyboard",
                 "let KeyboardInterrupt end the work",
             )
             demand(
                 result.stopped,
-                f"{one.name}: it was interrupted, and the result does not say so",
+                f"{case.name}: it was interrupted, and the result does not say so",
                 "return what `tools.deadline.interrupt(error)` returns as `stopped`",
             )
 
     def test_without_a_maximiser_it_works_or_says_what_it_needs(self) -> None:
-        for one in known():
+        for case in known():
             method, tools = self.create(), self.tools(maximiser=None)
             try:
-                result: object = method.solve(one.program, tools)
+                result: object = method.solve(case.program, tools)
             except InputError:
                 continue
             except Exception as error:  # noqa: BLE001  as above
                 broken(
-                    f"{one.name}: without a maximiser solve raised {type(error).__name__}: {error}",
+                    f"{case.name}: without a maximiser solve raised {type(error).__name__}: {error}",
                     "`tools.maximiser` may be None: raise `InputError` where it is needed",
                 )
             if isinstance(result, Result):
-                judge(one, result)
+                judge(case, result)
 
 
 def judge(one: Known, result: Result) -> None:
@@ -433,8 +437,11 @@ def _judge_bounds(one: Known, result: Result, scale: float) -> None:
 
 
 def _derived(program: SemiInfiniteProgram, result: Result) -> float | None:
-    """What the multipliers of a result prove: a lower bound, or by how much all is infeasible; ``None`` where they are
-    of constraints that are not the program's own (samples)."""
+    """Derive the bound that the multipliers of a result prove: a lower bound of the value, or the margin of
+    infeasibility.
+
+    ``None`` where the multipliers belong to constraints that are not the program's own (samples).
+    """
     base, rows, sides, y = program.finite, [], [], []
     for cut in result.dual.cuts:
         family = program.formulated(cut.family, cut.formulation)
@@ -480,10 +487,11 @@ def _judge_decision(one: Known, result: Result, x: Array, scale: float) -> None:
         f"{one.name}: it is {result.status}, and {', '.join(unproven)} cannot be proven at the decision",
         HONEST,
     )
-    told = {proof.family for proof in result.proofs if proof.verdict == "proven"}
+    proven_names = {proof.family for proof in result.proofs if proof.verdict == "proven"}
     demand(
-        told >= {family.name for family in program.families},
-        f"{one.name}: it is {result.status}, and `proofs` has a proof of {', '.join(sorted(told)) or 'no family'} only",
+        proven_names >= {family.name for family in program.families},
+        f"{one.name}: it is {result.status}, and `proofs` has a proof of "
+        f"{', '.join(sorted(proven_names)) or 'no family'} only",
         "return a `Proof` for each family; `check` looks at them",
     )
     demand(
@@ -509,10 +517,10 @@ def _judge_witness(one: Known, result: Result, x: Array) -> None:
     family = one.program.formulated(worst.constraint, worst.formulation)
     if family is None:
         return
-    found = float(family.violations(x, np.asarray(worst.index)[None])[0, worst.row])
+    violation = float(family.violations(x, np.asarray(worst.index)[None])[0, worst.row])
     demand(
-        found > 0.0 and abs(found - worst.violation) <= CLOSE * max(1.0, found),
-        f"{one.name}: the witness is said to be violated by {worst.violation:.6g}, and is by {found:.6g}",
+        violation > 0.0 and abs(violation - worst.violation) <= CLOSE * max(1.0, violation),
+        f"{one.name}: the witness is said to be violated by {worst.violation:.6g}, and is by {violation:.6g}",
         "take the violation from `family.violations(decision, index)`, in the row that is named",
     )
 

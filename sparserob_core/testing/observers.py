@@ -97,15 +97,15 @@ class Recording(Observer):
 
 
 class ObserverContract(Contract[Observer], kind="observer"):
-    """What every observer must keep: subclass it in a test module as ``class TestMine(ObserverContract)`` and give
+    """Contract of an observer: subclass it in a test module as ``class TestMine(ObserverContract)`` and give
     ``component``.
 
-    The core keeps the order of events, detaches an observer that raises, and closes it; the contract checks that an
+    The core keeps the order of events, detaches an observer that raises, and closes it. The contract checks that an
     observer can live with that: no event is a surprise, a run may end at any of them, and afterwards nothing is left.
     """
 
     def watched(self, method: str, observer: Recording | None = None, quiet: bool = False) -> tuple[Outcome, Recording]:
-        """One run of `METHODS`, watched by a new observer or by the given one."""
+        """Perform one run of `METHODS`, watched by a new observer or by the given one."""
         recording = observer or Recording(self.create())
         with TemporaryDirectory() as directory:
             return (
@@ -211,9 +211,9 @@ class ObserverContract(Contract[Observer], kind="observer"):
         try:
             for number in range(EVENTS):
                 event = bare_events()[2 if number % 3 else 0]
-                began = time.perf_counter()
+                start = time.perf_counter()
                 observer.receive(event)
-                seconds.append(time.perf_counter() - began)
+                seconds.append(time.perf_counter() - start)
             observer.receive(RunFinished(status="failed", message="broken off", seconds=1.0))
         finally:
             observer.close()
@@ -250,7 +250,7 @@ class _Terminal(io.StringIO):
     """A standard error stream that somebody looks at."""
 
     def isatty(self) -> bool:
-        """It is one."""
+        """Return ``True``: the stream passes for a terminal."""
         return True
 
 
@@ -285,7 +285,7 @@ def study_events(directory: Path) -> Sequence[Event]:
 
 
 def bare_events() -> Sequence[Event]:
-    """One event of every kind with as little in it as there may be, and the end of a run without a result."""
+    """Return events of every kind with as little content as possible, and the end of a run without a result."""
     points, values = np.array([[0.5, 0.5], [0.25, 0.5]]), np.array([-np.inf, -1.0])
     batch = Batch([points], [values], [(2, 0.1)], {"temperature": [(1, 2.0), (2, 1.0)]})
     return (
@@ -314,18 +314,18 @@ def nothing_left() -> Iterator[None]:
     before = set(threading.enumerate())
     yield
     deadline = time.monotonic() + GRACE
-    while (left := set(threading.enumerate()) - before) and time.monotonic() < deadline:
+    while (new_threads := set(threading.enumerate()) - before) and time.monotonic() < deadline:
         time.sleep(0.01)
     demand(
-        not left,
-        f"threads are still running after the run: {', '.join(thread.name for thread in left)}",
+        not new_threads,
+        f"threads are still running after the run: {', '.join(thread.name for thread in new_threads)}",
         "end and join them in `close`, which is called however a run ends, with or without `RunFinished`",
     )
 
 
 def numbers(result: Result) -> list[object]:
-    """Everything of a result that must not depend on who is watching."""
+    """Return all parts of a result that must not depend on its observers."""
     decision = None if result.decision is None else result.decision.tolist()
     trace = [] if result.trace is None else result.trace.value.tolist()
-    rounds = [(one.lower_bound, one.upper_bound, one.violation, one.active_indices) for one in result.history]
+    rounds = [(event.lower_bound, event.upper_bound, event.violation, event.active_indices) for event in result.history]
     return [result.status, result.message, decision, trace, rounds, result.lower_bound, result.upper_bound]

@@ -18,17 +18,19 @@ GRIDS = ([0.0, 2.0], [0.0, 0.1, 0.3, 0.7, 1.0], [0.0, 1e-3, 2e-3, 3e-3], [float(
 
 
 class PolicyContract(Contract[Policy], kind="policy"):
-    """What every policy must keep: subclass it as ``class TestMine(PolicyContract)`` and give ``component``.
+    """Contract of a policy: subclass it as ``class TestMine(PolicyContract)`` and give ``component``.
 
     ``knows`` is a property: the frozen set of the quantities (``state``, ``disturbance``, ``parameters``) whose *past*
-    values are known when the control is chosen. Nothing can be known of the future. It is a promise about the whole
-    run, so it never changes. ``answers(breakpoints)`` returns truth values ``(K, K)`` for breakpoints ``(K + 1,)``:
-    whether the control on piece ``k`` answers what is measured at breakpoint ``j``, which is never later than the
-    piece. Whoever answers anything knows the ``state``. ``charge`` is a `Charge`, the cost that it is chosen by.
+    values are known when the control is chosen. Nothing can be known of the future. The set is a promise about the
+    whole run, so it never changes. ``answers(breakpoints)`` returns truth values ``(K, K)`` for breakpoints
+    ``(K + 1,)``: whether the control on piece ``k`` answers the measurement at breakpoint ``j``, which is never later
+    than the piece. A policy that answers anything knows the ``state``. ``charge`` is a `Charge`, the cost by which the
+    policy is chosen.
     """
 
     def known(self, policy: Policy) -> frozenset[str]:
-        """What the policy knows; a broken contract where that cannot be known."""
+        """Return the quantities that the policy knows; the contract is broken where ``knows`` raises, or is no set of
+        quantities that can be known."""
         try:
             knows: object = policy.knows
         except Exception as error:  # noqa: BLE001  a component may raise anything, and must not
@@ -43,16 +45,17 @@ class PolicyContract(Contract[Policy], kind="policy"):
                 f"knows is {knows!r}, a {type(knows).__name__}",
                 'return a frozenset, such as `frozenset()` or `frozenset({"state"})`: nobody may add to it later',
             )
-        beyond = sorted(str(one) for one in knows - QUANTITIES)
+        unknown = sorted(str(quantity) for quantity in knows - QUANTITIES)
         demand(
-            not beyond,
-            f"knows names {', '.join(beyond)}, which no control can know",
+            not unknown,
+            f"knows names {', '.join(unknown)}, which no control can know",
             f"name quantities whose past values are measured: {', '.join(sorted(QUANTITIES))}; the future is not known",
         )
         return knows
 
     def answered(self, policy: Policy, breakpoints: list[float]) -> np.ndarray:
-        """What the policy answers; a broken contract where that is no table of truth values, or comes too early."""
+        """Return the policy's table of answers; the contract is broken where it is no table of truth values, or answers
+        too early."""
         times = np.array(breakpoints)
         try:
             mask = answers_of(policy, times)
@@ -106,9 +109,9 @@ class PolicyContract(Contract[Policy], kind="policy"):
         )
 
     def test_its_options_are_what_it_depends_on(self) -> None:
-        policy, other = self.create(), self.create()
+        policy, twin = self.create(), self.create()
         demand(
-            policy == other and hash(policy) == hash(other),
+            policy == twin and hash(policy) == hash(twin),
             "two policies with the same options are not equal",
             "derive it from `sparserob_core.Policy` and `sparserob_core.Options`, and add no other fields",
         )
@@ -122,9 +125,9 @@ class PolicyContract(Contract[Policy], kind="policy"):
         copy = pickle.loads(pickle.dumps(policy))  # noqa: S301  made here
         for breakpoints in GRIDS:
             first = self.answered(policy, breakpoints)
-            for other in (policy, self.create(), copy):
+            for twin in (policy, self.create(), copy):
                 demand(
-                    bool((self.answered(other, breakpoints) == first).all()),
+                    bool((self.answered(twin, breakpoints) == first).all()),
                     f"on {len(breakpoints) - 1} pieces it answers other measurements when it is asked again",
                     "let `answers` depend on the breakpoints and the options only, and not write into them",
                 )

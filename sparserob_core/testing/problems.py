@@ -34,15 +34,17 @@ SECONDS = 20.0  # that a solve may take
 
 
 class ProblemContract(Contract[ProblemFactory], kind="problem"):
-    """What every problem must keep: subclass it as ``class TestMine(ProblemContract)`` and give ``component``, with
-    options where it needs some (``{"name": "linear", "horizon": ...}``, or a ``functools.partial`` of the class).
+    """Contract of a problem: subclass it as ``class TestMine(ProblemContract)`` and give ``component``, with options
+    where it needs some (``{"name": "linear", "horizon": ...}``, or a ``functools.partial`` of the class).
 
-    ``build()`` returns an `OptimalControlProblem`, or a `SemiInfiniteProgram` with its families. The program, or what
-    becomes of the control problem in dictionaries of 12 pieces, is looked at family by family: ``rows`` maps indices
-    ``(k, d)`` to ``(G (k, r, n), h (k, r))``, one index like the other; and whatever a family offers beside them
-    (gradient, worst, enclosure, cells, nominal, sample, literal, explain) has to agree with its rows. ``provable``:
-    whether a decision can be proven; set it to False for a problem that cannot. ``policy``: what the control may know,
-    such as an `AffinePolicy`; then rows hold for every deviation, and ``excess`` and ``uncertain`` have to agree.
+    ``build()`` returns an `OptimalControlProblem`, or a `SemiInfiniteProgram` with its families. A control problem is
+    transcribed in dictionaries of 12 pieces, and the program is examined family by family. ``rows`` maps indices
+    ``(k, d)`` to ``(G (k, r, n), h (k, r))``, and treats each index alike. All other functions of a family (gradient,
+    worst, enclosure, cells, nominal, sample, literal, explain) have to agree with its rows.
+
+    ``provable``: whether a decision can be proven; set it to False for a problem that cannot. ``policy``: the knowledge
+    of the control, such as an `AffinePolicy`; then rows hold for every deviation, and ``excess`` and ``uncertain`` have
+    to agree.
     """
 
     provable = True
@@ -52,27 +54,28 @@ class ProblemContract(Contract[ProblemFactory], kind="problem"):
         """The problem; a broken contract where something else comes back, or something is raised."""
         factory = self.create()
         try:
-            made: object = factory.build()
+            problem: object = factory.build()
         except Exception as error:  # noqa: BLE001  a component may raise anything, and must not
             broken(
                 f"build raised {type(error).__name__}: {error}",
                 "build the problem of the options that the contract is given; `InputError` is for options at fault",
             )
-        if not isinstance(made, OptimalControlProblem | SemiInfiniteProgram):
+        if not isinstance(problem, OptimalControlProblem | SemiInfiniteProgram):
             broken(
-                f"build returned {made!r}", "return a `sparserob_core.OptimalControlProblem` or a `SemiInfiniteProgram`"
+                f"build returned {problem!r}",
+                "return a `sparserob_core.OptimalControlProblem` or a `SemiInfiniteProgram`",
             )
-        return made
+        return problem
 
     def program(self) -> SemiInfiniteProgram:
         """The program, or that of the control problem in dictionaries of 12 pieces."""
         from sparserob_core.control.transcription.transcribe import transcribe
 
-        made = self.built()
-        if isinstance(made, SemiInfiniteProgram):
-            return made
-        pieces = Dictionary(np.linspace(0.0, made.horizon, PIECES + 1), np.eye(PIECES))
-        return transcribe(made, control=pieces, disturbance=pieces, policy=self.policy)
+        problem = self.built()
+        if isinstance(problem, SemiInfiniteProgram):
+            return problem
+        pieces = Dictionary(np.linspace(0.0, problem.horizon, PIECES + 1), np.eye(PIECES))
+        return transcribe(problem, control=pieces, disturbance=pieces, policy=self.policy)
 
     def families(self) -> Iterator[tuple[ConstraintFamily, list[Array]]]:
         """Every family, with decisions ``(n,)`` at which it is looked at."""
@@ -89,19 +92,21 @@ class ProblemContract(Contract[ProblemFactory], kind="problem"):
         names = ("q", "weights", "lower", "upper", "G", "h", "A", "b")
         changed = [name for name in names if not same(getattr(first.finite, name), getattr(second.finite, name))]
         demand(
-            not changed and [one.name for one in first.families] == [one.name for one in second.families],
+            not changed and [family.name for family in first.families] == [family.name for family in second.families],
             f"two builds with the same options differ in {', '.join(changed) or 'their families'}",
             "let nothing but the options decide: no clock, and no random numbers without a seed among the options",
         )
-        for one, other in zip(first.families, second.families, strict=True):
-            points = _points(one.index_set, np.random.default_rng(1), POINTS)
+        for family, twin in zip(first.families, second.families, strict=True):
+            points = _points(family.index_set, np.random.default_rng(1), POINTS)
             x = np.random.default_rng(2).random(first.n)
-            alike = same(one.violations(x, points), other.violations(x, points))
-            if one.uncertain is None:
-                alike = alike and all(same(a, b) for a, b in zip(one.rows(points), other.rows(points), strict=True))
+            is_same = same(family.violations(x, points), twin.violations(x, points))
+            if family.uncertain is None:
+                is_same = is_same and all(
+                    same(a, b) for a, b in zip(family.rows(points), twin.rows(points), strict=True)
+                )
             demand(
-                alike,
-                f"two builds with the same options have different rows of {one.name}",
+                is_same,
+                f"two builds with the same options have different rows of {family.name}",
                 "let nothing but the options decide",
             )
 
@@ -138,10 +143,10 @@ class ProblemContract(Contract[ProblemFactory], kind="problem"):
                 "look for a division by zero, or a root of a negative number, at the ends of the index set",
             )
             order = np.random.default_rng(4).permutation(len(points))
-            singly = [_rows(family, points[[k]]) for k in order]
-            for k, (one, side) in zip(order, singly, strict=True):
+            single_rows = [_rows(family, points[[k]]) for k in order]
+            for k, (G_alone, h_alone) in zip(order, single_rows, strict=True):
                 demand(
-                    np.allclose(one[0], G[k], rtol=1e-9, atol=1e-12) and np.allclose(side[0], h[k], rtol=1e-9),
+                    np.allclose(G_alone[0], G[k], rtol=1e-9, atol=1e-12) and np.allclose(h_alone[0], h[k], rtol=1e-9),
                     f"{family.name}: an index has other rows alone than among others",
                     "compute each row from its own index: no mean, maximum or order over the batch",
                 )
@@ -159,18 +164,19 @@ class ProblemContract(Contract[ProblemFactory], kind="problem"):
             assert spread is not None
             for x in decisions:
                 points = _points(family.index_set, np.random.default_rng(13), 8)
-                every = _asked(family, "excess", lambda f=family, x=x, p=points: f.violations(x, p))
-                for point, together in zip(points, every, strict=True):
-                    alone = family.violations(x, point[None])[0]
+                violations = _asked(family, "excess", lambda f=family, x=x, p=points: f.violations(x, p))
+                for point, batch_violation in zip(points, violations, strict=True):
+                    violation = family.violations(x, point[None])[0]
                     rows = _asked(family, "uncertain", lambda f=family, p=point: f.uncertain(p))
-                    told, size = rows.excess(x, spread), _size(family, x, point[None])
+                    excess, size = rows.excess(x, spread), _size(family, x, point[None])
                     demand(
-                        told.shape == alone.shape and np.abs(told - alone).max(initial=0.0) <= CLOSE * size,
-                        f"{family.name}: the rows are violated by {told[:3]} at {point}, and excess says {alone[:3]}",
+                        excess.shape == violation.shape and np.abs(excess - violation).max(initial=0.0) <= CLOSE * size,
+                        f"{family.name}: the rows are violated by {excess[:3]} at {point}, and excess says "
+                        f"{violation[:3]}",
                         "`excess` is the violation of the rows of `uncertain` at the worst deviation of the spread",
                     )
                     demand(
-                        np.allclose(alone, together, rtol=1e-9, atol=1e-12 * size),
+                        np.allclose(violation, batch_violation, rtol=1e-9, atol=1e-12 * size),
                         f"{family.name}: an index has another violation alone than among others",
                         "compute each violation from its own index: no mean, maximum or order over the batch",
                     )
@@ -183,8 +189,8 @@ class ProblemContract(Contract[ProblemFactory], kind="problem"):
             points = _points(box, rng, POINTS, margin=0.01)
             for x in decisions:
                 rows = rng.integers(0, _rows(family, points)[1].shape[1], len(points))
-                told = _asked(family, "gradient", lambda f=family, x=x, p=points, r=rows: f.gradient(x, p, r))
-                wrong = _wrong_slopes(family, x, points, rows, np.asarray(told))
+                gradients = _asked(family, "gradient", lambda f=family, x=x, p=points, r=rows: f.gradient(x, p, r))
+                wrong = _wrong_slopes(family, x, points, rows, np.asarray(gradients))
                 demand(
                     wrong.mean() <= 0.1,
                     f"{family.name}: at {wrong.mean():.0%} of the indices the gradient is not the derivative of "
@@ -198,16 +204,17 @@ class ProblemContract(Contract[ProblemFactory], kind="problem"):
                 continue
             points = _points(family.index_set, np.random.default_rng(6), 50 * POINTS)
             for x in decisions:
-                found = _asked(family, "worst", lambda f=family, x=x: f.worst(x))
+                separation = _asked(family, "worst", lambda f=family, x=x: f.worst(x))
                 size = _size(family, x, points)
-                self._look_at(family, x, found, size)
+                self._look_at(family, x, separation, size)
                 sampled = float(family.violations(x, points).max())
                 demand(
-                    sampled <= found.bound + CLOSE * size,
-                    f"{family.name}: worst says that no violation is above {found.bound:.9g}, and one is {sampled:.9g}",
+                    sampled <= separation.bound + CLOSE * size,
+                    f"{family.name}: worst says that no violation is above {separation.bound:.9g}, and one "
+                    f"is {sampled:.9g}",
                     "`bound` holds for the whole index set; give inf where none is proven",
                 )
-                top = float(found.violations.max(initial=-np.inf))
+                top = float(separation.violations.max(initial=-np.inf))
                 demand(
                     sampled <= top + CLOSE * size,
                     f"{family.name}: worst finds at most {top:.9g}, and a drawn index has {sampled:.9g}",
@@ -221,16 +228,16 @@ class ProblemContract(Contract[ProblemFactory], kind="problem"):
             f"{family.name}: worst has indices {found.indices.shape}, rows {found.rows.shape} and {count} violations",
             f"one index of {box.dimension} coordinates and one row for each violation",
         )
-        inside = 1e-9 * (box.upper - box.lower)
+        tolerance = 1e-9 * (box.upper - box.lower)
         demand(
-            (found.indices >= box.lower - inside).all() and (found.indices <= box.upper + inside).all(),
+            (found.indices >= box.lower - tolerance).all() and (found.indices <= box.upper + tolerance).all(),
             f"{family.name}: worst names an index outside of the index set",
             "clip the indices to `index_set`",
         )
-        real = family.violations(x, found.indices)[np.arange(count), found.rows] if count else np.zeros(0)
+        violations = family.violations(x, found.indices)[np.arange(count), found.rows] if count else np.zeros(0)
         demand(
-            np.abs(real - found.violations).max(initial=0.0) <= CLOSE * size,
-            f"{family.name}: worst says {found.violations[:3]} where the rows say {real[:3]}",
+            np.abs(violations - found.violations).max(initial=0.0) <= CLOSE * size,
+            f"{family.name}: worst says {found.violations[:3]} where the rows say {violations[:3]}",
             "a violation is `row x - rhs` at the index and row that are named with it",
         )
         demand(
@@ -247,19 +254,23 @@ class ProblemContract(Contract[ProblemFactory], kind="problem"):
             for x in decisions[:2]:
                 for share in (1.0, 0.2, 0.01, SMALL):
                     lower, upper = _cells(family, rng, share)
-                    told = _asked(family, "enclosure", lambda f=family, x=x, a=lower, b=upper: f.enclosure(x, a, b))
-                    drawn = lower[:, None] + rng.random((len(lower), INSIDE, box.dimension)) * (upper - lower)[:, None]
-                    inside = family.violations(x, drawn.reshape(-1, box.dimension))
-                    most = inside.reshape(len(lower), INSIDE, -1).max(axis=(1, 2))
-                    size = _size(family, x, drawn.reshape(-1, box.dimension))
+                    enclosure = _asked(
+                        family, "enclosure", lambda f=family, x=x, a=lower, b=upper: f.enclosure(x, a, b)
+                    )
+                    samples = (
+                        lower[:, None] + rng.random((len(lower), INSIDE, box.dimension)) * (upper - lower)[:, None]
+                    )
+                    violations = family.violations(x, samples.reshape(-1, box.dimension))
+                    largest = violations.reshape(len(lower), INSIDE, -1).max(axis=(1, 2))
+                    size = _size(family, x, samples.reshape(-1, box.dimension))
                     demand(
-                        np.shape(told.bounds) == np.shape(told.split) == (len(lower),),
-                        f"{family.name}: enclosure has bounds {np.shape(told.bounds)} and split {np.shape(told.split)} "
-                        f"for {len(lower)} cells",
+                        np.shape(enclosure.bounds) == np.shape(enclosure.split) == (len(lower),),
+                        f"{family.name}: enclosure has bounds {np.shape(enclosure.bounds)} and split "
+                        f"{np.shape(enclosure.split)} for {len(lower)} cells",
                         "one bound and one coordinate for each cell",
                     )
                     # Below 0 the scale of a row is its own affair: rows of a curved set are those of directions.
-                    below = float((most - np.maximum(told.bounds, 0.0)).max())
+                    below = float((largest - np.maximum(enclosure.bounds, 0.0)).max())
                     demand(
                         below <= CLOSE * size,
                         f"{family.name}: an enclosure is {below:.3g} below a violation in "
@@ -267,14 +278,14 @@ class ProblemContract(Contract[ProblemFactory], kind="problem"):
                         "bound every term of the row over the whole cell: the least of what is subtracted, the most of "
                         "what is added",
                     )
-                    split = np.asarray(told.split)
+                    split = np.asarray(enclosure.split)
                     demand(
                         (split >= 0).all() and (split < max(1, box.dimension)).all() and split.dtype.kind in "iu",
                         f"{family.name}: enclosure wants coordinate {split.max()} of {box.dimension} to be halved",
                         "name coordinates from 0, as whole numbers",
                     )
                     if share == SMALL and self.provable:
-                        gap = float((told.bounds - most).max())
+                        gap = float((enclosure.bounds - largest).max())
                         demand(
                             gap <= CLOSES * size,
                             f"{family.name}: on cells of {SMALL:g} of the index set the enclosure is still {gap:.3g} "
@@ -316,18 +327,18 @@ class ProblemContract(Contract[ProblemFactory], kind="problem"):
         for family, decisions in self.families():
             if family.worst is None or family.uncertain is not None:  # whose literal form has no rows of a decision
                 continue
-            others = {"nominal": family.nominal, "literal": family.literal}
+            forms = {"nominal": family.nominal, "literal": family.literal}
             if family.sample is not None:
                 with suppress(InputError):
-                    others["sampled"] = family.sample(POINTS, np.random.default_rng(9))
-            for name, other in others.items():
-                if other is None:
+                    forms["sampled"] = family.sample(POINTS, np.random.default_rng(9))
+            for name, form in forms.items():
+                if form is None:
                     continue
-                points = _points(other.index_set, np.random.default_rng(10), POINTS)
+                points = _points(form.index_set, np.random.default_rng(10), POINTS)
                 for x in decisions:
-                    bound, drawn = family.worst(x).bound, float(other.violations(x, points).max())
+                    bound, drawn = family.worst(x).bound, float(form.violations(x, points).max())
                     demand(
-                        drawn <= bound + CLOSE * _size(other, x, points),
+                        drawn <= bound + CLOSE * _size(form, x, points),
                         f"{family.name}: its {name} form has a violation of {drawn:.9g}, the family itself at most "
                         f"{bound:.9g}",
                         "the nominal, the sampled and the literal form have some of the constraints, and no others",
@@ -337,22 +348,24 @@ class ProblemContract(Contract[ProblemFactory], kind="problem"):
         for family, _ in self.families():
             points = _points(family.index_set, np.random.default_rng(11), 5)
             for point in points:
-                told = _asked(family, "explain", lambda f=family, p=point: f.explanation(p, 0))
+                explanation = _asked(family, "explain", lambda f=family, p=point: f.explanation(p, 0))
                 demand(
-                    isinstance(told, Explanation) and bool(told.text.strip()),
-                    f"{family.name}: a constraint is explained by {told!r}",
+                    isinstance(explanation, Explanation) and bool(explanation.text.strip()),
+                    f"{family.name}: a constraint is explained by {explanation!r}",
                     "return an `Explanation` whose text says what the constraint asks for, or leave `explain` out",
                 )
 
     def test_a_decision_can_be_proven(self) -> None:
         from sparserob_core.control.transcription.provable import unprovable
 
-        made = self.built()
-        why = unprovable(made) if isinstance(made, OptimalControlProblem) else None
-        without = [one.name for one, _ in self.families() if one.enclosure is None and one.reduced is None]
+        problem = self.built()
+        reason = unprovable(problem) if isinstance(problem, OptimalControlProblem) else None
+        open_families = [
+            family.name for family, _ in self.families() if family.enclosure is None and family.reduced is None
+        ]
         demand(
-            not self.provable or (why is None and not without),
-            f"nothing can be certified: {why or f'{without} has no enclosure'}",
+            not self.provable or (reason is None and not open_families),
+            f"nothing can be certified: {reason or f'{open_families} has no enclosure'}",
             "write A, B and E as arithmetic of numpy functions of p, give families an `enclosure`, or set "
             "`provable = False` here and tell your users",
         )
@@ -360,13 +373,13 @@ class ProblemContract(Contract[ProblemFactory], kind="problem"):
     def test_it_is_solved_or_says_why_not(self) -> None:
         from sparserob_core.experiment.run.solve import solve
 
-        made = self.built()
+        problem = self.built()
         control = {"name": "piecewise_constant", "pieces": PIECES}
-        given: dict[str, Any] = {}
-        if isinstance(made, OptimalControlProblem):
-            given = {"control": control} | ({} if self.policy is None else {"policy": self.policy})
+        options: dict[str, Any] = {}
+        if isinstance(problem, OptimalControlProblem):
+            options = {"control": control} | ({} if self.policy is None else {"policy": self.policy})
         try:
-            result = solve(made, seconds=SECONDS, **given)
+            result = solve(problem, seconds=SECONDS, **options)
         except InputError as error:
             broken(f"the exchange method refuses it: {error}", "see what the message says of the problem")
         demand(
@@ -415,10 +428,10 @@ def _size(family: ConstraintFamily, x: Array, points: Array) -> float:
     """The largest sum of the terms of a row; of one that holds for every deviation, of its nominal ones and what these
     make of it."""
     if family.uncertain is not None:
-        few = points[:: 1 + len(points) // 8]
-        rows = [family.uncertain(point) for point in few]
-        sums = [float((abs(one.g) @ np.abs(x) + np.abs(one.h)).max(initial=0.0)) for one in rows]
-        return max(*sums, 0.0, float(np.abs(family.violations(x, few)).max(initial=0.0))) or 1.0
+        sample = points[:: 1 + len(points) // 8]
+        rows = [family.uncertain(point) for point in sample]
+        sums = [float((abs(row.g) @ np.abs(x) + np.abs(row.h)).max(initial=0.0)) for row in rows]
+        return max(*sums, 0.0, float(np.abs(family.violations(x, sample)).max(initial=0.0))) or 1.0
     G, h = family.rows(points)
     terms = np.abs(G) @ np.abs(x) + np.where(np.isfinite(h), np.abs(h), 0.0)
     return float(terms.max(initial=0.0)) or 1.0
@@ -428,32 +441,35 @@ def _cells(family: ConstraintFamily, rng: np.random.Generator, share: float) -> 
     """Cells whose sides are a share of those of the family's own cells, or of its index set."""
     box = family.index_set
     lower, upper = (box.lower[None], box.upper[None]) if family.cells is None else family.cells
-    chosen = rng.integers(0, len(lower), CELLS)
-    low, sides = lower[chosen], (upper - lower)[chosen]
+    cells = rng.integers(0, len(lower), CELLS)
+    low, sides = lower[cells], (upper - lower)[cells]
     first = low + rng.random(low.shape) * (1.0 - share) * sides
     return first, np.minimum(first + share * sides, low + sides)
 
 
 def _wrong_slopes(family: ConstraintFamily, x: Array, points: Array, rows: np.ndarray, told: Array) -> np.ndarray:
-    """Where ``told (k, d)`` is no derivative: neither of the two one-sided differences, for a row may have kinks."""
+    """Return a mask ``(k,)`` of the indices at which ``told (k, d)`` is no derivative of the row.
+
+    A derivative must equal one of the two one-sided differences, as a row may have kinks.
+    """
     box, k = family.index_set, np.arange(len(points))
     sides = box.upper - box.lower
-    size, wrong = _size(family, x, points), np.zeros(len(points), dtype=bool)
+    size, is_wrong = _size(family, x, points), np.zeros(len(points), dtype=bool)
     demand(
         told.shape == points.shape,
         f"{family.name}: gradient returned the shape {told.shape} for {len(points)} indices",
         "return one derivative for each coordinate of each index",
     )
-    here = family.violations(x, points)[k, rows]
+    values = family.violations(x, points)[k, rows]
     for i in np.flatnonzero(sides > 0.0):
         ahead, behind = points.copy(), points.copy()
         ahead[:, i] += STEP * sides[i]
         behind[:, i] -= STEP * sides[i]
         slopes = [
-            (family.violations(x, ahead)[k, rows] - here) / STEP,
-            (here - family.violations(x, behind)[k, rows]) / STEP,
+            (family.violations(x, ahead)[k, rows] - values) / STEP,
+            (values - family.violations(x, behind)[k, rows]) / STEP,
         ]
-        apart = np.min([np.abs(told[:, i] * sides[i] - slope) for slope in slopes], axis=0)
+        errors = np.min([np.abs(told[:, i] * sides[i] - slope) for slope in slopes], axis=0)
         largest = np.max(np.abs(slopes), axis=0)
-        wrong |= apart > SLOPE * (largest + np.abs(told[:, i] * sides[i])) + 1e-6 * size
-    return wrong
+        is_wrong |= errors > SLOPE * (largest + np.abs(told[:, i] * sides[i])) + 1e-6 * size
+    return is_wrong

@@ -20,7 +20,8 @@ VALUE = 0.4  # of `two_thrusters`
 
 
 def images() -> list[ControlImage]:
-    """One control and two; pieces of equal and of different lengths; as many functions as pieces, and fewer."""
+    """Return images of one to three channels, with pieces of equal and of different lengths, and with as many functions
+    as pieces or fewer."""
     from scipy.sparse import csc_array, eye_array, kron
 
     haar = np.array([[1, 1, 1, 1], [1, 1, -1, -1], [1, -1, 0, 0]], dtype=float)
@@ -42,11 +43,11 @@ def two_thrusters() -> SemiInfiniteProgram:
 
 
 class RegulariserContract(Contract[Regulariser], kind="regulariser"):
-    """What every regulariser must keep: subclass it as ``class TestMine(RegulariserContract)`` and give ``component``.
+    """Contract of a regulariser: subclass it as ``class TestMine(RegulariserContract)`` and give ``component``.
 
     ``quadratic(image)`` returns ``P (n, n)``, sparse, symmetric and positive definite, and ``q (n,)``, of
-    ``rho(x) = 1/2 x'P x + q'x``, where ``n`` is the number of columns of ``image.S``. The image says what a decision
-    means: ``S x`` is channel by channel what the control is on each piece, and ``lengths`` are those of the pieces.
+    ``rho(x) = 1/2 x'P x + q'x``, where ``n`` is the number of columns of ``image.S``. The image gives the meaning of a
+    decision: ``S x`` is the control on each piece, channel by channel, and ``lengths`` are the lengths of the pieces.
     """
 
     def quadratic(self, regulariser: Regulariser, image: ControlImage) -> tuple[csc_array, Array]:
@@ -55,15 +56,15 @@ class RegulariserContract(Contract[Regulariser], kind="regulariser"):
 
         where = f"an image with {image.channels} channels of {image.pieces} pieces and {image.S.shape[1]} coefficients"
         try:
-            made: object = regulariser.quadratic(image)
+            answer: object = regulariser.quadratic(image)
         except Exception as error:  # noqa: BLE001  a component may raise anything, and must not
             broken(
                 f"quadratic raised {type(error).__name__}: {error} for {where}",
                 "take every size from the image: `image.S.shape[1]`, `image.channels`, `image.pieces`",
             )
-        if not (isinstance(made, tuple) and len(made) == 2):
-            broken(f"quadratic returned {type(made).__name__} for {where}", "return the pair `P, q`")
-        P, q = made[0], np.asarray(made[1])
+        if not (isinstance(answer, tuple) and len(answer) == 2):
+            broken(f"quadratic returned {type(answer).__name__} for {where}", "return the pair `P, q`")
+        P, q = answer[0], np.asarray(answer[1])
         n = image.S.shape[1]
         demand(
             issparse(P) and P.shape == (n, n) and q.shape == (n,),

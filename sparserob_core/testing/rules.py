@@ -40,7 +40,7 @@ def an_hour_later() -> Iterator[None]:
 
 
 def asked(call: Callable[[], Any], what: str, mend: str) -> Any:
-    """What a rule answers; a broken contract where it raises, or warns."""
+    """Return the answer of a rule; the contract is broken where the rule raises or warns."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error")
@@ -57,23 +57,23 @@ def truth(answer: object, what: str) -> bool:
 
 
 class ScheduleContract(Contract[Schedule], kind="rule", of=Schedule):
-    """What every schedule (the paper's ``Regu``) must keep: subclass it as ``class TestMine(ScheduleContract)`` and
-    give ``component``.
+    """Contract of a schedule (the paper's ``Regu``): subclass it as ``class TestMine(ScheduleContract)`` and give
+    ``component``.
 
-    Called with the weight ``epsilon`` of iteration ``j - 1`` and ``j = 1, 2, ...``, it returns the weight of iteration
-    ``j``: a positive number below ``epsilon``, that comes down to a millionth of the first weight sooner or later. The
-    method stops it at ``continuation.stop``.
+    Called with the weight ``epsilon`` of iteration ``j - 1`` and ``j = 1, 2, ...``, a schedule returns the weight of
+    iteration ``j``: a positive number below ``epsilon``. Sooner or later the weight falls to a millionth of the first
+    one. The method stops the schedule at ``continuation.stop``.
     """
 
     def weight(self, schedule: Schedule, epsilon: float, j: int) -> float:
         """The next weight; a broken contract where it is none."""
-        what = f"called with epsilon = {epsilon:g} and j = {j}"
-        answer = asked(lambda: schedule(epsilon, j), what, "return a number for every positive weight and every j >= 1")
+        call = f"called with epsilon = {epsilon:g} and j = {j}"
+        answer = asked(lambda: schedule(epsilon, j), call, "return a number for every positive weight and every j >= 1")
         if isinstance(answer, bool) or not isinstance(answer, int | float | np.integer | np.floating):
-            broken(f"{what}: it answered {answer!r}, a {type(answer).__name__}", "return one number")
+            broken(f"{call}: it answered {answer!r}, a {type(answer).__name__}", "return one number")
         demand(
             0.0 < answer < epsilon,
-            f"{what}: it answered {answer!r}",
+            f"{call}: it answered {answer!r}",
             "return a positive weight below `epsilon`: the regulariser has to vanish, but not all at once",
         )
         return float(answer)
@@ -103,8 +103,8 @@ class ScheduleContract(Contract[Schedule], kind="rule", of=Schedule):
     def test_the_same_question_has_the_same_answer(self) -> None:
         schedule = self.create()
         questions = [(epsilon, j) for epsilon in FIRST for j in (1, 2, 7, 3, 1)]
-        answers = [[self.weight(schedule, *one) for one in questions] for _ in range(2)]
-        fresh = [self.weight(self.create(), *one) for one in questions]
+        answers = [[self.weight(schedule, *question) for question in questions] for _ in range(2)]
+        fresh = [self.weight(self.create(), *question) for question in questions]
         demand(
             answers[0] == answers[1] == fresh,
             "asked the same again, or in another order, it answers otherwise",
@@ -137,27 +137,28 @@ class ScheduleContract(Contract[Schedule], kind="rule", of=Schedule):
 
 def walk(changes: Sequence[float]) -> tuple[OuterStep, ...]:
     """Outer iterations whose optimiser, cost and value change by these amounts, one after another."""
-    steps, moved = [], 0.0
+    steps, total = [], 0.0
     for j, change in enumerate(changes):
-        moved += change
-        decision = np.array([1.0 + moved, -2.0, 0.5])
-        steps.append(OuterStep(j, 2.0**-j, 3.0 + moved, 2.0 + moved, 1.0 + min(moved, 0.5), decision))
+        total += change
+        decision = np.array([1.0 + total, -2.0, 0.5])
+        steps.append(OuterStep(j, 2.0**-j, 3.0 + total, 2.0 + total, 1.0 + min(total, 0.5), decision))
     return tuple(steps)
 
 
 class OuterStopContract(Contract[OuterStop], kind="rule", of=OuterStop):
-    """What every outer stopping rule (the paper's ``SC1``) must keep: subclass it as
-    ``class TestMine(OuterStopContract)`` and give ``component``.
+    """Contract of an outer stopping rule (the paper's ``SC1``): subclass it as ``class TestMine(OuterStopContract)``
+    and give ``component``.
 
-    Called with the outer iterations so far (`OuterStep`, the last one last, at least one), it returns True or False. It
-    does not stop while optimisers and costs still change by as much as they are, and does once nothing changes.
+    Called with the outer iterations so far (`OuterStep`, the last one last, at least one), the rule returns True or
+    False. It does not stop while optimisers and costs still change by as much as their own size, and does once nothing
+    changes.
     """
 
     def stops(self, rule: OuterStop, steps: Sequence[OuterStep]) -> bool:
-        """What the rule says."""
-        what = f"called with {len(steps)} outer iterations"
-        answer = asked(lambda: rule(steps), what, "answer for one iteration too, and whatever the numbers in it")
-        return truth(answer, what)
+        """Return the rule's answer; the contract is broken where it is no truth value."""
+        call = f"called with {len(steps)} outer iterations"
+        answer = asked(lambda: rule(steps), call, "answer for one iteration too, and whatever the numbers in it")
+        return truth(answer, call)
 
     def test_it_stops_where_nothing_changes_any_more(self) -> None:
         rule, steps = self.create(), walk([1.0, *[0.0] * 1000])
@@ -194,11 +195,11 @@ class OuterStopContract(Contract[OuterStop], kind="rule", of=OuterStop):
     def test_the_steps_are_left_as_they_were(self) -> None:
         steps, before = list(walk([1.0, 0.5, 0.0])), walk([1.0, 0.5, 0.0])
         self.stops(self.create(), steps)
-        held = len(steps) == len(before) and all(
+        is_unchanged = len(steps) == len(before) and all(
             (a.cost, a.value, a.decision.tolist()) == (b.cost, b.value, b.decision.tolist())
             for a, b in zip(steps, before, strict=False)
         )
-        demand(held, "it has changed the steps", "copy what you change: the method goes on with these records")
+        demand(is_unchanged, "it has changed the steps", "copy what you change: the method goes on with these records")
 
     def test_numbers_that_are_not_finite_are_survived(self) -> None:
         rule = self.create()
@@ -219,23 +220,23 @@ def searched(count: int, every: int = 1, rises: float = 1.0, notes: dict[str, fl
 
 
 class InnerStopContract(Contract[InnerStop], kind="rule", of=InnerStop):
-    """What every inner stopping rule (the paper's ``SC2``) must keep: subclass it as
-    ``class TestMine(InnerStopContract)`` and give ``component``.
+    """Contract of an inner stopping rule (the paper's ``SC2``): subclass it as ``class TestMine(InnerStopContract)``
+    and give ``component``.
 
-    Called with the `Progress` of a search after every batch of evaluations, it returns True or False, at once. It does
-    not stop a search that has only begun, needs no note that a maximiser may not write, and once it has stopped a
-    search it would not have it go on. The budget ends a search in any case.
+    Called with the `Progress` of a search after every batch of evaluations, the rule returns True or False, at once. It
+    does not stop a search that has only begun, and needs no note that a maximiser may not write. Once it has stopped a
+    search, it never lets that search go on. The budget ends a search in any case.
     """
 
     def stops(self, rule: InnerStop, progress: Progress) -> bool:
-        """What the rule says."""
-        what = f"called after {progress.evaluations} evaluations, notes {dict(progress.notes)}"
+        """Return the rule's answer; the contract is broken where it is no truth value."""
+        call = f"called after {progress.evaluations} evaluations, notes {dict(progress.notes)}"
         answer = asked(
             lambda: rule(progress),
-            what,
+            call,
             "ask with `progress.notes.get(name, default)`, and expect -inf as a best value and no improvement at all",
         )
-        return truth(answer, what)
+        return truth(answer, call)
 
     def test_a_search_that_has_only_begun_goes_on(self) -> None:
         rule = self.create()
@@ -259,12 +260,12 @@ class InnerStopContract(Contract[InnerStop], kind="rule", of=InnerStop):
 
     def test_the_same_progress_has_the_same_answer(self) -> None:
         rule = self.create()
-        asks = [searched(count, every) for every in (1, 50, 10_000) for count in (1, 10, 100, 1000, 5000)]
+        asks = [searched(count, interval) for interval in (1, 50, 10_000) for count in (1, 10, 100, 1000, 5000)]
         asks += [searched(100, 1000, 1.0, {"temperature": heat}) for heat in (1.0, 1e-3, 1e-30)]
-        answers = [[self.stops(rule, one) for one in order] for order in (asks, asks[::-1])]
+        answers = [[self.stops(rule, progress) for progress in order] for order in (asks, asks[::-1])]
         with an_hour_later():
-            answers.append([self.stops(rule, one) for one in asks])
-        fresh = [self.stops(self.create(), one) for one in asks]
+            answers.append([self.stops(rule, progress) for progress in asks])
+        fresh = [self.stops(self.create(), progress) for progress in asks]
         demand(
             answers[0] == answers[1][::-1] == answers[2] == fresh,
             "asked the same again, or in another order, it answers otherwise",
@@ -294,9 +295,9 @@ class InnerStopContract(Contract[InnerStop], kind="rule", of=InnerStop):
     def test_it_takes_no_time(self) -> None:
         rule, seconds, long = self.create(), [], searched(20_000, 3)
         for _ in range(21):
-            began = time.perf_counter()
+            start = time.perf_counter()
             self.stops(rule, long)
-            seconds.append(time.perf_counter() - began)
+            seconds.append(time.perf_counter() - start)
         demand(
             float(np.median(seconds)) <= QUICK,
             f"one answer takes {1e3 * float(np.median(seconds)):.1f} ms after 20 000 evaluations",
@@ -305,28 +306,28 @@ class InnerStopContract(Contract[InnerStop], kind="rule", of=InnerStop):
 
 
 class SelectionContract(Contract[Selection], kind="rule", of=Selection):
-    """What every rule of acceptance (the paper's ``SlCr``) must keep: subclass it as
-    ``class TestMine(SelectionContract)`` and give ``component``.
+    """Contract of a rule of acceptance (the paper's ``SlCr``): subclass it as ``class TestMine(SelectionContract)`` and
+    give ``component``.
 
-    Called with the value where the walk stands, that of a candidate, a temperature (0 or more) and a generator of
-    random numbers, it returns whether the walk goes on from the candidate. Values are maximised. What is worse is
-    accepted the less often the worse and the colder it is, never at the temperature 0 and never at -inf; what is
-    better, at least every second time, and always at 0.
+    The rule is called with the current value of the walk, the value of a candidate, a temperature (0 or more) and a
+    generator of random numbers. It returns whether the walk goes on from the candidate. Values are maximised. A worse
+    candidate is accepted the less often the worse it is and the lower the temperature is, never at the temperature 0
+    and never at -inf. A better candidate is accepted at least every second time, and always at the temperature 0.
     """
 
     def accepts(self, rule: Selection, current: float, candidate: float, heat: float, rng: np.random.Generator) -> bool:
-        """What the rule says."""
-        what = f"called with current {current:g}, candidate {candidate:g}, temperature {heat:g}"
+        """Return the rule's answer for one candidate; the contract is broken where it is no truth value."""
+        call = f"called with current {current:g}, candidate {candidate:g}, temperature {heat:g}"
         answer = asked(
             lambda: rule(current, candidate, heat, rng),
-            what,
+            call,
             "values may be -inf, differences huge, and the temperature 0: ask first which value is larger, and bound "
             "what goes into `exp`",
         )
-        return truth(answer, what)
+        return truth(answer, call)
 
     def share(self, current: float, candidate: float, heat: float) -> float:
-        """How often a candidate is accepted, of many times."""
+        """Return the share of `DRAWS` trials in which a new rule accepts a candidate."""
         rule, rng = self.create(), np.random.default_rng(5)
         return float(np.mean([self.accepts(rule, current, candidate, heat, rng) for _ in range(DRAWS)]))
 
@@ -389,7 +390,7 @@ class SelectionContract(Contract[Selection], kind="rule", of=Selection):
 
         def walked(by: Selection, order: Sequence[tuple[float, float, float]]) -> list[bool]:
             rng = np.random.default_rng(9)
-            return [self.accepts(by, *one, rng) for one in order]
+            return [self.accepts(by, *case, rng) for case in order]
 
         demand(
             walked(rule, cases) == walked(rule, cases) == walked(self.create(), cases),

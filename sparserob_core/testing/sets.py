@@ -15,19 +15,19 @@ CLOSE = 1e-7  # relative to the set's extent
 
 
 class SetContract(Contract[ConvexSet], kind="set"):
-    """What every convex set must keep: subclass it in a test module as ``class TestMine(SetContract)`` and give
-    ``component``: a `ConvexSet`, or a `SetFactory`, which then builds one in ``dimension`` coordinates (2).
+    """Contract of a convex set: subclass it in a test module as ``class TestMine(SetContract)`` and give ``component``.
 
-    The support function is taken as the definition of the set, and is itself tested to be one; a linear program says
-    what the half-spaces of a flat set allow, and sampled directions what any set does.
+    The component is a `ConvexSet`, or a `SetFactory`, which then builds a set in ``dimension`` coordinates (2). The
+    support function is taken as the definition of the set, and is itself tested to be a support function. A linear
+    program gives the points that the half-spaces of a flat set allow; sampled directions serve for every set.
     """
 
     dimension = 2
 
     def create(self) -> ConvexSet:
         """A bounded set with an interior, in one to four dimensions."""
-        made: object = super().create()
-        return made.build(self.dimension) if isinstance(made, SetFactory) else cast(ConvexSet, made)
+        component: object = super().create()
+        return component.build(self.dimension) if isinstance(component, SetFactory) else cast(ConvexSet, component)
 
     def expected(self) -> tuple[type, ...]:
         """A set, or what builds one."""
@@ -59,16 +59,16 @@ class SetContract(Contract[ConvexSet], kind="set"):
         convex = self.create()
         c = self.directions(convex)
         points, tolerance = convex.support_point(c), CLOSE * self.extent(convex)
-        missed = np.abs((c * points).sum(axis=1) - convex.support(c)) / np.linalg.norm(c, axis=1)
+        errors = np.abs((c * points).sum(axis=1) - convex.support(c)) / np.linalg.norm(c, axis=1)
         demand(
-            (missed <= tolerance).all(),
-            f"at its support point `c'x` is not the support function, but off by {missed.max():.2g} |c|",
+            (errors <= tolerance).all(),
+            f"at its support point `c'x` is not the support function, but off by {errors.max():.2g} |c|",
             "return the point of the set that goes furthest in the direction c, which need not have length 1",
         )
-        beyond = float(self.excess(convex, points).max())
+        excess = float(self.excess(convex, points).max())
         demand(
-            beyond <= tolerance,
-            f"a support point is outside of the set, by {beyond:.2g}",
+            excess <= tolerance,
+            f"a support point is outside of the set, by {excess:.2g}",
             "see that `support` and `support_point` are about the same set",
         )
 
@@ -226,22 +226,24 @@ class SetContract(Contract[ConvexSet], kind="set"):
     def test_violation_is_positive_outside_only_and_never_below_the_excess(self) -> None:
         convex = self.create()
         points = np.vstack([self.around(convex), convex.support_point(self.directions(convex)[:20])])
-        found, least, size = convex.violation(points), self.excess(convex, points), self.extent(convex)
+        violations, least, size = convex.violation(points), self.excess(convex, points), self.extent(convex)
         if convex.halfspaces() is None:
             demand(
-                (found >= least - 1e-6 * size).all(),
+                (violations >= least - 1e-6 * size).all(),
                 "a violation is smaller than what the point sticks out in some direction",
                 "`violation` is at least `max c'x - h(c)` over directions of length 1; or leave it out",
             )
         sizes = convex.gauge(points)
-        clear = np.abs(sizes - 1.0) > 1e-5
+        is_clear = np.abs(sizes - 1.0) > 1e-5
         demand(
-            ((found > 0) == (sizes > 1))[clear].all(),
+            ((violations > 0) == (sizes > 1))[is_clear].all(),
             "the violation is positive for a point inside, or not for one outside",
             "positive outside, at most 0 inside; or leave `violation` out",
         )
         demand(
-            (convex.contains(points, 1e-6 * size) == (sizes <= 1.0))[clear & (np.abs(found) > 1e-5 * size)].all(),
+            (convex.contains(points, 1e-6 * size) == (sizes <= 1.0))[
+                is_clear & (np.abs(violations) > 1e-5 * size)
+            ].all(),
             "contains does not say the same as the gauge",
             "leave `contains` out: the default asks `violation`",
         )
@@ -304,17 +306,17 @@ class SetContract(Contract[ConvexSet], kind="set"):
     def test_in_other_units_it_is_the_same_set(self) -> None:
         convex = self.create()
         units = np.ldexp(1.0, np.arange(convex.dimension) - 1)
-        other, c = convex.in_units(units), self.directions(convex)
+        scaled, c = convex.in_units(units), self.directions(convex)
         demand(
-            np.allclose(other.support(c), convex.support(c / units), rtol=1e-12),
+            np.allclose(scaled.support(c), convex.support(c / units), rtol=1e-12),
             f"in_units({units}) is not the set of all x / units",
             "h(c) becomes h(c / units); or leave `in_units` out",
         )
         points = self.around(convex)
         sizes = convex.gauge(points)
-        clear = np.abs(sizes - 1.0) > 1e-5  # about another interior point, perhaps
+        is_clear = np.abs(sizes - 1.0) > 1e-5  # about another interior point, perhaps
         demand(
-            ((other.gauge(points / units) > 1) == (sizes > 1))[clear].all(),
+            ((scaled.gauge(points / units) > 1) == (sizes > 1))[is_clear].all(),
             "in other units another point is inside",
             "points become x / units; or leave `in_units` out",
         )
@@ -333,9 +335,9 @@ class SetContract(Contract[ConvexSet], kind="set"):
                 "linearisation_excess says: what it proves is not true",
                 "bound `h(c + s'D) - (c + s'D)'x(c)` for all s in [-1, 1]^k, from above; or leave it out",
             )
-            point, added = convex.support_majorant(centre, spread)
+            point, offset = convex.support_majorant(centre, spread)
             demand(
-                (truth - (centre + shifts @ spread) @ point).max() <= added + tolerance,
+                (truth - (centre + shifts @ spread) @ point).max() <= offset + tolerance,
                 "around a direction the support function is above what support_majorant says",
                 "bound `h(c + s'D) - (c + s'D)'x` for all s in [-1, 1]^k, from above, by the x that you return; or "
                 "leave it out",

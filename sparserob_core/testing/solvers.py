@@ -31,7 +31,7 @@ class Instance:
 
     @property
     def feasible(self) -> bool:
-        """Whether the program has a solution."""
+        """True where the program has a solution."""
         return bool(np.isfinite(self.highest))
 
 
@@ -61,7 +61,7 @@ def double_integrator(pieces: int = 50, horizon: float = 5.0) -> tuple[Array, Ar
 
 
 def regularised(program: FiniteProgram, epsilon: float) -> FiniteProgram:
-    """With ``epsilon/2 sum_k weights_k x_k^2`` added to the cost."""
+    """Return the program with ``epsilon/2 sum_k weights_k x_k^2`` added to its cost."""
     from scipy.sparse import csc_array, diags_array
 
     return program if epsilon == 0 else replace(program, P=csc_array(diags_array(epsilon * program.weights)))
@@ -117,17 +117,17 @@ def by_linear_programming(name: str, program: FiniteProgram) -> Instance:
     )
     h = np.concatenate([program.h, np.zeros(2 * k), program.upper, -program.lower])
     A = np.hstack([program.A, np.zeros((program.b.size, k))])
-    kept = np.isfinite(h)
-    found = linprog(
+    is_finite = np.isfinite(h)
+    solution = linprog(
         np.concatenate([program.q, program.weights]),
-        G[kept],
-        h[kept],
+        G[is_finite],
+        h[is_finite],
         A,
         program.b,
         [(None, None)] * (n + k),
         method="highs",
     )
-    value = float(found.fun) if found.status == 0 else np.inf
+    value = float(solution.fun) if solution.status == 0 else np.inf
     return Instance(name, program, value - 1e-7 * max(1.0, abs(value)), value + 1e-7 * max(1.0, abs(value)))
 
 
@@ -358,10 +358,10 @@ def hopeless() -> Iterator[Question]:
     for n, curved in ((2, True), (10, False)):
         eye, none = np.eye(n), np.zeros((0, n))
         P, q, free = csc_array(eye * curved), np.ones(n), np.full(n, np.inf)
-        opposed, apart = np.vstack([eye[0], -eye[0]]), np.array([-1.0, -1.0])
+        opposed, rhs = np.vstack([eye[0], -eye[0]]), np.array([-1.0, -1.0])
         yield Question(
             "opposed rows",
-            QuadraticProgram(P, q, csc_array(opposed), apart, csc_array(none), np.zeros(0), -free, free),
+            QuadraticProgram(P, q, csc_array(opposed), rhs, csc_array(none), np.zeros(0), -free, free),
             np.inf,
         )
         yield Question(
@@ -386,7 +386,8 @@ def objective(program: QuadraticProgram, x: Array) -> float:
 
 
 def misses(program: QuadraticProgram, claim: Claim) -> dict[str, float]:
-    """By how much a claim misses each condition of optimality (Karush 1939; Kuhn and Tucker 1951), in words."""
+    """Return the residual of each condition of optimality (Karush 1939; Kuhn and Tucker 1951) at a claim, by the
+    condition in words."""
     x, z, y, z_box = claim.x, claim.z, claim.y, claim.z_box
     stationary = program.P @ x + program.q + program.G.T @ z + program.A.T @ y + z_box
     low, high = np.minimum(z_box, 0.0), np.maximum(z_box, 0.0)
@@ -426,32 +427,33 @@ class Counted(Solver):
 
 
 class SolverContract(Contract[Solver], kind="solver"):
-    """What every solver must keep: subclass it as ``class TestMine(SolverContract)`` and give ``component``.
+    """Contract of a solver: subclass it as ``class TestMine(SolverContract)`` and give ``component``.
 
-    The first tests look at its claims themselves: shapes, signs of multipliers, residuals, programs without a solution.
-    The others look at what comes out of the check (`sip.inner`), which believes nothing: there a solver may fail where
-    a program is too hard for it, but it may not be believed when it is wrong. ``may_fail``: the number of programs of
-    a test on which it may give up. ``precision``: the residuals at which a claim of its own counts as a solution, when
-    it is asked for 1e-9; a first-order method needs a larger one.
+    The first tests examine its claims themselves: shapes, signs of multipliers, residuals, programs without a solution.
+    The other tests examine the result of the check (`sip.inner`), which believes nothing. There a solver may fail where
+    a program is too hard for it, but it may not be believed when it is wrong. ``may_fail``: the number of programs of a
+    test on which it may give up. ``precision``: the residuals at which a claim of its own counts as a solution, when it
+    is asked for 1e-9; a first-order method needs a larger value.
     """
 
     may_fail = 0
     precision = 1e-6
 
     def claim(self, solver: Solver, question: Question) -> Claim:
-        """What a solver says to a question; a broken contract where it raises, or says what no claim can say."""
+        """Return the claim of a solver about a question; the contract is broken where it raises, or returns no valid
+        claim."""
         program = question.program
         try:
-            said: object = solver.solve(program, ASKED)
+            answer: object = solver.solve(program, ASKED)
         except Exception as error:  # noqa: BLE001  a solver may raise anything, and must not
             broken(
                 f"{question.name}: solve raised {type(error).__name__}: {error}",
                 'return a Claim with the status "failed" and the reason as its message',
             )
-        claim = said if isinstance(said, Claim) else None
+        claim = answer if isinstance(answer, Claim) else None
         if claim is None or claim.status not in ("solved", "infeasible", "failed"):
             broken(
-                f"{question.name}: solve returned {said!r}",
+                f"{question.name}: solve returned {answer!r}",
                 'return a Claim whose status is "solved", "infeasible" or "failed"',
             )
         if claim.status == "solved":
@@ -467,27 +469,28 @@ class SolverContract(Contract[Solver], kind="solver"):
 
     def test_a_claim_satisfies_the_conditions_of_optimality(self) -> None:
         solver, given_up = self.create(), []
-        for one in questions(solver.conic):
-            claim = self.claim(solver, one)
+        for question in questions(solver.conic):
+            claim = self.claim(solver, question)
             demand(
                 claim.status != "infeasible",
-                f'{one.name}: claims "infeasible" of a program that has a solution',
+                f'{question.name}: claims "infeasible" of a program that has a solution',
                 'claim "infeasible" only with a Farkas ray, and "failed" where the method merely got stuck',
             )
             if claim.status == "failed":
-                given_up.append(f"{one.name} ({claim.message})")
+                given_up.append(f"{question.name} ({claim.message})")
                 continue
-            for condition, missed in misses(one.program, claim).items():
+            for condition, residual in misses(question.program, claim).items():
                 demand(
-                    missed <= self.precision,
-                    f"{one.name}: claims a solution that misses `{condition}` by {missed:.1e} "
+                    residual <= self.precision,
+                    f"{question.name}: claims a solution that misses `{condition}` by {residual:.1e} "
                     f"(asked for {ASKED:g}, allowed {self.precision:g})",
                     "compare the signs of your solver's multipliers with `P x + q + G'z + A'y + z_box = 0`, hand its "
                     "tolerances `accuracy`, and see that every part of the program reaches it",
                 )
             demand(
-                abs(objective(one.program, claim.x) - one.value) <= 10 * self.precision,
-                f"{one.name}: the cost at x is {objective(one.program, claim.x):.9g}, the optimum {one.value:.9g}",
+                abs(objective(question.program, claim.x) - question.value) <= 10 * self.precision,
+                f"{question.name}: the cost at x is {objective(question.program, claim.x):.9g}, the optimum "
+                f"{question.value:.9g}",
                 "see that P is taken as a whole (or its upper triangle, where your solver wants that) and with 1/2",
             )
         demand(
@@ -498,21 +501,21 @@ class SolverContract(Contract[Solver], kind="solver"):
 
     def test_a_program_without_a_solution_is_not_claimed_to_be_solved(self) -> None:
         solver = self.create()
-        for one in hopeless():
-            claim = self.claim(solver, one)
+        for question in hopeless():
+            claim = self.claim(solver, question)
             demand(
-                claim.status != "solved" or max(misses(one.program, claim).values()) > self.precision,
-                f"{one.name}: a contradiction, a claim that no solution can satisfy holds",
+                claim.status != "solved" or max(misses(question.program, claim).values()) > self.precision,
+                f"{question.name}: a contradiction, a claim that no solution can satisfy holds",
                 "this is a fault of the contract; please report it",
             )
             demand(
                 claim.status != "solved",
-                f"{one.name}: claims to have solved a program that has no solution",
+                f"{question.name}: claims to have solved a program that has no solution",
                 'translate the status of your solver: only its word for an optimum is "solved"',
             )
             demand(
-                claim.status != "infeasible" or one.value == np.inf,
-                f'{one.name}: claims "infeasible" of a program whose cost falls for ever',
+                claim.status != "infeasible" or question.value == np.inf,
+                f'{question.name}: claims "infeasible" of a program whose cost falls for ever',
                 '"dual infeasible" is not "infeasible": claim "failed" there',
             )
 
@@ -520,34 +523,34 @@ class SolverContract(Contract[Solver], kind="solver"):
         from copy import deepcopy
 
         solver = self.create()
-        for one in questions():
-            before = deepcopy(one.program)
-            self.claim(solver, one)
+        for question in questions():
+            before = deepcopy(question.program)
+            self.claim(solver, question)
             changed = [
                 name
                 for name in ("P", "q", "G", "h", "A", "b", "lower", "upper")
-                if not np.array_equal(_dense(getattr(before, name)), _dense(getattr(one.program, name)))
+                if not np.array_equal(_dense(getattr(before, name)), _dense(getattr(question.program, name)))
             ]
             demand(
                 not changed,
-                f"{one.name}: solve has changed {', '.join(changed)} of the program",
+                f"{question.name}: solve has changed {', '.join(changed)} of the program",
                 "copy what your solver scales in place, infinite bounds above all",
             )
 
     def test_a_second_program_is_not_solved_by_the_answer_to_the_first(self) -> None:
         solver = self.create()
-        for one in [*questions(), *questions()]:
-            again, fresh = self.claim(solver, one), self.claim(self.create(), one)
+        for question in [*questions(), *questions()]:
+            again, fresh = self.claim(solver, question), self.claim(self.create(), question)
             if "solved" == again.status == fresh.status:
-                apart = float(np.abs(again.x - fresh.x).max())
+                distance = float(np.abs(again.x - fresh.x).max())
                 demand(
-                    apart <= 1e3 * self.precision,
-                    f"{one.name}: an old and a new solver give answers that are {apart:.1e} apart",
+                    distance <= 1e3 * self.precision,
+                    f"{question.name}: an old and a new solver give answers that are {distance:.1e} apart",
                     "a warm start may save time, but must not change the answer: set up every program anew",
                 )
             demand(
                 again.status == fresh.status,
-                f"{one.name}: an old solver says {again.status}, a new one {fresh.status}",
+                f"{question.name}: an old solver says {again.status}, a new one {fresh.status}",
                 "set up every program anew: shapes, bounds and P may all differ from the last one's",
             )
 

@@ -97,12 +97,12 @@ def _judged(
     result = method.close(simple, replace(tools, notify=notify), unproven)  # the full one is proven below
     if result.decision is None:
         return result
-    x, found = result.decision, []
+    x, separations = result.decision, []
     try:
-        found = separate(program, x, tools, TOLERANCE)
+        separations = separate(program, x, tools, TOLERANCE)
     except KeyboardInterrupt as error:
         tools.deadline.interrupt(error)
-    proofs = as_bad_as_found(prove(program, x, tools.notify, deadline=tools.deadline), found)
+    proofs = as_bad_as_found(prove(program, x, tools.notify, deadline=tools.deadline), separations)
     status, message = verdict(proofs, relative_gap(result.dual.bound, result.cost, result.cost_scale), tolerance)
     proven = status in ("certified", "verified")
     wrong = alarm(simple, result.dual, x) if proven else ""
@@ -110,10 +110,10 @@ def _judged(
     return replace(
         result,
         status="failed" if wrong else status,
-        message="; ".join(part for part in (wrong or message, stopped) if part),
+        message="; ".join(sentence for sentence in (wrong or message, stopped) if sentence),
         decision=None if wrong else x,
         proofs=tuple(proofs),
-        worst=witness(program, worst_of(found), proofs),
+        worst=witness(program, worst_of(separations), proofs),
         lower_bound=min(result.dual.bound, result.cost) if proven and not wrong else result.dual.bound,
         upper_bound=result.cost if proven and not wrong else np.inf,
         stopped=stopped,

@@ -33,9 +33,12 @@ INWARDS = 1e-9  # of a bound, so that whoever derives it with another rounding d
 
 @dataclass(frozen=True, eq=False)
 class Part:
-    """One part of the decisions: the change of one image's bounds (``lower``, ``upper``), or that it counts (``on``),
-    from the part ``above`` it, and with it of all that count together with it: that they are 0, or count; and what was
-    found: the count is at least ``bound`` there, ``x (n,)`` is where to look next."""
+    """Subset of the decisions, a node of the tree: one change of the bounds of an image in the part ``above`` it.
+
+    Either the image has the bounds ``lower`` and ``upper``, or it counts (``on``). All images that count together with
+    it are 0, or count, with it. In this part the count is at least ``bound``, and ``x (n,)`` is the point to examine
+    next.
+    """
 
     above: int
     image: int
@@ -63,20 +66,20 @@ class Branching:
     def __post_init__(self) -> None:
         base = self.program.finite
         self.prices, self._vectors = prices_of(self.program), vectors(self.program)
-        whole = Part(-1, 0, float(base.lower[0]), float(base.upper[0]), False)
-        self.parts, self.nodes = [whole], [Leaf(NO_BOUND)]
+        root = Part(-1, 0, float(base.lower[0]), float(base.upper[0]), False)
+        self.parts, self.nodes = [root], [Leaf(NO_BOUND)]
         self._heap = [(self._renewed(0), 0)]
 
     @property
     def lower(self) -> float:
-        """What every decision counts at least, in the user's units; infinite where nothing is feasible."""
+        """Lower bound of the count of every decision, in the user's units; infinite where nothing is feasible."""
         return min((self._safe(bound) for bound, _ in self._heap), default=np.inf)
 
     def _safe(self, bound: float) -> float:
         return bound if np.isinf(bound) else whole(self.program, bound - INWARDS * abs(bound))
 
     def open(self, incumbent: float) -> bool:
-        """Whether a part may hold a decision that counts less than the ``incumbent``."""
+        """Return whether a part may contain a decision that counts less than the ``incumbent``."""
         least = self._heap[0][0] if self._heap else np.inf
         return least < np.inf and self._safe(least) < incumbent * (1.0 - MISSED)
 
@@ -102,26 +105,26 @@ class Branching:
         low, high, _ = self._bounds(self.parts[number])
         below, above = float(low[image]), float(high[image])
         if self.letters is None:
-            at = None
+            letters_at_cut = None
             children = [Part(number, image, 0.0, 0.0, False), Part(number, image, below, above, True)]
         else:
             allowed = self.letters[image]
-            inside = np.flatnonzero((allowed >= below) & (allowed <= above))
-            cut = int(np.clip(np.searchsorted(allowed[inside], value, side="right"), 1, inside.size - 1))
-            left, right = int(inside[cut - 1]), int(inside[cut])
-            at = (float(self.alphabet[left]), float(self.alphabet[right]))
+            indices = np.flatnonzero((allowed >= below) & (allowed <= above))
+            cut = int(np.clip(np.searchsorted(allowed[indices], value, side="right"), 1, indices.size - 1))
+            lower_index, upper_index = int(indices[cut - 1]), int(indices[cut])
+            letters_at_cut = (float(self.alphabet[lower_index]), float(self.alphabet[upper_index]))
             children = [
-                Part(number, image, below, float(allowed[left]), False),
-                Part(number, image, float(allowed[right]), above, False),
+                Part(number, image, below, float(allowed[lower_index]), False),
+                Part(number, image, float(allowed[upper_index]), above, False),
             ]
         # measured before anything is changed: whoever is interrupted leaves a tree that covers every decision
-        measured, first = [self._measured(child, Leaf(NO_BOUND)) for child in children], len(self.nodes)
+        bounded_children, first = [self._measured(child, Leaf(NO_BOUND)) for child in children], len(self.nodes)
         heap = [entry for entry in self._heap if entry[1] != number]
-        heap += [(part.bound, first + k) for k, (part, _) in enumerate(measured)]
+        heap += [(child.bound, first + k) for k, (child, _) in enumerate(bounded_children)]
         heapq.heapify(heap)
-        self.parts += [part for part, _ in measured]
-        self.nodes += [leaf for _, leaf in measured]
-        self.nodes[number], self._heap = Branch(image, first, first + 1, at), heap
+        self.parts += [child for child, _ in bounded_children]
+        self.nodes += [leaf for _, leaf in bounded_children]
+        self.nodes[number], self._heap = Branch(image, first, first + 1, letters_at_cut), heap
         self.parts[number] = replace(self.parts[number], x=None)
 
     def _renewed(self, number: int) -> float:
@@ -136,20 +139,20 @@ class Branching:
         finite, certain = self._finite(part)
         corner = self._corner(finite)
         y, mu, z = corner.y, corner.mu, corner.z
-        known = replace(part, bound=max(part.bound, 0.0))
+        fallback = replace(part, bound=max(part.bound, 0.0))
         if corner.status == "infeasible":
             amount = farkas_proof(finite, y, mu, z, IMPOSSIBLE)
             if amount is None:
-                return known, leaf
+                return fallback, leaf
             size = float(y @ np.linalg.norm(finite.G, axis=1) + np.abs(mu) @ np.linalg.norm(finite.A, axis=1))
             z = None if z is None else z / size
-            told = self._told(finite, y / size, mu / size, z, amount, False)
-            return replace(part, bound=np.inf, x=None), Leaf(told, feasible=False)
+            dual = self._told(finite, y / size, mu / size, z, amount, False)
+            return replace(part, bound=np.inf, x=None), Leaf(dual, feasible=False)
         if corner.status == "failed":
-            return known, leaf
-        offers = [(y, mu, z), (np.zeros_like(y), np.zeros_like(mu), None)]
-        proven = [proving(finite, *offer) for offer in offers]
-        bound, y, mu, z = max(proven, key=lambda one: one[0])
+            return fallback, leaf
+        candidates = [(y, mu, z), (np.zeros_like(y), np.zeros_like(mu), None)]
+        bounds = [proving(finite, *candidate) for candidate in candidates]
+        bound, y, mu, z = max(bounds, key=lambda item: item[0])
         bound += certain - self.relaxed.rounding(finite, y, mu, corner.x)
         if bound > part.bound:
             leaf = Leaf(self._told(finite, y, mu, z, bound))
@@ -177,50 +180,52 @@ class Branching:
     def _bounds(self, part: Part) -> tuple[Array, Array, np.ndarray]:
         """The bounds of all images in one part, and which count there whatever their value."""
         base = self.program.finite
-        lower, upper, on = base.lower.copy(), base.upper.copy(), np.zeros(base.lower.size, dtype=bool)
-        seen: set[int] = set()
+        lower, upper, is_on = base.lower.copy(), base.upper.copy(), np.zeros(base.lower.size, dtype=bool)
+        assigned_images: set[int] = set()
         while part.above >= 0:
-            if part.image not in seen:
-                lower[part.image], upper[part.image], on[part.image] = part.lower, part.upper, part.on
-                seen.add(part.image)
+            if part.image not in assigned_images:
+                lower[part.image], upper[part.image], is_on[part.image] = part.lower, part.upper, part.on
+                assigned_images.add(part.image)
                 for image in np.flatnonzero(self._vectors == self._vectors[part.image]).tolist():
-                    if image not in seen:  # nothing else was said of it, so that its bounds are those of the program
+                    if (
+                        image not in assigned_images
+                    ):  # nothing else was said of it, so that its bounds are those of the program
                         lower[image], upper[image] = (lower[image], upper[image]) if part.on else (0.0, 0.0)
-                        on[image] = part.on
-                        seen.add(image)
+                        is_on[image] = part.on
+                        assigned_images.add(image)
             part = self.parts[part.above]
-        return lower, upper, on
+        return lower, upper, is_on
 
     def _finite(self, part: Part) -> tuple[FiniteProgram, float]:
-        lower, upper, on = self._bounds(part)
+        lower, upper, is_on = self._bounds(part)
         base = replace(self.relaxed.finite(self.rows.G, self.rows.h, 0.0), lower=lower, upper=upper)
-        finite, _, certain = convex_below(base, self.prices, on)
+        finite, _, certain = convex_below(base, self.prices, is_on)
         return finite, certain
 
     def _undecided(self, number: int, x: Array) -> int | None:
         """The image that is furthest from being decided at ``x``; ``None`` where each is 0, on, or a letter."""
-        lower, upper, on = self._bounds(self.parts[number])
+        lower, upper, is_on = self._bounds(self.parts[number])
         image = self.program.finite.image(x)
-        counted = self.prices > 0.0
+        is_counted = self.prices > 0.0
         if self.letters is not None:
-            apart = np.abs(image[: len(self.letters), None] - self.letters).min(axis=1)
-            reach = np.maximum(np.abs(lower), np.abs(upper))[: apart.size]
-            share = np.where(counted[: apart.size], apart / np.where(reach > 0.0, reach, 1.0), 0.0)
+            distances = np.abs(image[: len(self.letters), None] - self.letters).min(axis=1)
+            radii = np.maximum(np.abs(lower), np.abs(upper))[: distances.size]
+            share = np.where(is_counted[: distances.size], distances / np.where(radii > 0.0, radii, 1.0), 0.0)
         else:
             with np.errstate(divide="ignore", invalid="ignore"):
-                part = np.where(image > 0.0, image / upper, image / lower)
-            part = np.where(counted & ~on & (lower <= 0.0) & (upper >= 0.0) & (image != 0.0), part, 0.0)
-            share = np.minimum(part, 1.0 - part)
-        found = int(np.argmax(share))
-        return found if share[found] > INTEGRAL else None
+                fraction = np.where(image > 0.0, image / upper, image / lower)
+            fraction = np.where(is_counted & ~is_on & (lower <= 0.0) & (upper >= 0.0) & (image != 0.0), fraction, 0.0)
+            share = np.minimum(fraction, 1.0 - fraction)
+        choice = int(np.argmax(share))
+        return choice if share[choice] > INTEGRAL else None
 
     def _free(self, number: int) -> int | None:
         """An image that may still be 0 or not, or one of several letters."""
-        lower, upper, on = self._bounds(self.parts[number])
-        free = (self.prices > 0.0) & ~on & (lower < upper)
+        lower, upper, is_on = self._bounds(self.parts[number])
+        is_free = (self.prices > 0.0) & ~is_on & (lower < upper)
         if self.letters is None:
-            free &= (lower <= 0.0) & (upper >= 0.0)
-        return int(np.argmax(free)) if free.any() else None
+            is_free &= (lower <= 0.0) & (upper >= 0.0)
+        return int(np.argmax(is_free)) if is_free.any() else None
 
 
 def _unrelaxed(program: FiniteProgram) -> Corner:
@@ -234,28 +239,49 @@ def _unrelaxed(program: FiniteProgram) -> Corner:
 def proposed(
     program: SemiInfiniteProgram, relaxed: RelaxedProgram, rows: Rows, letters: Array | None, gap: float = 0.0
 ) -> Array | None:
-    """What HiGHS takes for the decision ``(n,)`` of which the fewest entries count among those that meet the ``rows``,
-    up to a relative ``gap``; ``None`` where it finds none in time. Nothing is believed of it."""
+    """Return a decision ``(n,)`` with the fewest counted entries among all that satisfy the ``rows``, as HiGHS finds
+    it.
+
+    The optimality gap of the mixed-integer program is relative. Nothing of the answer is believed.
+
+    Parameters
+    ----------
+    program : SemiInfiniteProgram
+        The program whose entries are counted.
+    relaxed : RelaxedProgram
+        Maker of the finite program, with the deadline.
+    rows : Rows
+        Constraints that the decision must satisfy.
+    letters : array, (k, letters), or None
+        Allowed values of each entry; ``None``: an entry may be 0 or between its bounds.
+    gap : float
+        Relative gap at which HiGHS may stop.
+
+    Returns
+    -------
+    array, (n,), or None
+        The decision; ``None`` where HiGHS finds none in time.
+    """
     from scipy.optimize import LinearConstraint
     from scipy.sparse import csr_array, eye_array, hstack
 
     finite, prices = relaxed.finite(rows.G, rows.h, 0.0), prices_of(program)
     n, unit = program.n, prices[prices > 0.0].min()
     S = csr_array(eye_array(n)) if finite.S is None else csr_array(finite.S)
-    together = vectors(program)
-    blocks = _off_or_on(S, finite, prices, together) if letters is None else _spelt(S, letters, prices)
+    groups = vectors(program)
+    blocks = _off_or_on(S, finite, prices, groups) if letters is None else _spelt(S, letters, prices)
     cost, couplings = blocks[0] / unit, list(blocks[1])
-    count, left = cost.size, relaxed.deadline.left
-    plain = [(S, finite.lower, finite.upper), (finite.G, -np.inf, finite.h), (finite.A, finite.b, finite.b)]
+    count, seconds_left = cost.size, relaxed.deadline.left
+    linear_rows = [(S, finite.lower, finite.upper), (finite.G, -np.inf, finite.h), (finite.A, finite.b, finite.b)]
     couplings += [
-        LinearConstraint(hstack([csr_array(part), csr_array((part.shape[0], count))], format="csr"), low, high)
-        for part, low, high in plain
-        if part.shape[0]
+        LinearConstraint(hstack([csr_array(matrix), csr_array((matrix.shape[0], count))], format="csr"), low, high)
+        for matrix, low, high in linear_rows
+        if matrix.shape[0]
     ]
     bounds = np.repeat([-np.inf, 0.0], [n, count]), np.repeat([np.inf, 1.0], [n, count])
-    seconds = SECONDS if left is None else min(SECONDS, left)
-    found = with_integers(np.concatenate([np.zeros(n), cost]), couplings, *bounds, n, seconds, gap)
-    return None if found is None else found[:n]
+    seconds = SECONDS if seconds_left is None else min(SECONDS, seconds_left)
+    solution = with_integers(np.concatenate([np.zeros(n), cost]), couplings, *bounds, n, seconds, gap)
+    return None if solution is None else solution[:n]
 
 
 def _off_or_on(S: Any, finite: FiniteProgram, prices: Array, together: np.ndarray) -> tuple[Array, list[Any]]:
@@ -264,21 +290,23 @@ def _off_or_on(S: Any, finite: FiniteProgram, prices: Array, together: np.ndarra
     from scipy.optimize import LinearConstraint
     from scipy.sparse import csr_array, diags_array, hstack
 
-    either = np.flatnonzero((prices > 0.0) & (finite.lower <= 0.0) & (finite.upper >= 0.0))
-    above, below = (diags_array(-side[either]) for side in (finite.upper, finite.lower))
+    optional = np.flatnonzero((prices > 0.0) & (finite.lower <= 0.0) & (finite.upper >= 0.0))
+    above, below = (diags_array(-side[optional]) for side in (finite.upper, finite.lower))
     couplings = [
-        LinearConstraint(hstack([S[either], above], format="csr"), -np.inf, 0.0),
-        LinearConstraint(hstack([S[either], below], format="csr"), 0.0, np.inf),
+        LinearConstraint(hstack([S[optional], above], format="csr"), -np.inf, 0.0),
+        LinearConstraint(hstack([S[optional], below], format="csr"), 0.0, np.inf),
     ]
-    _, first, which = np.unique(together[either], return_index=True, return_inverse=True)
-    others = np.flatnonzero(first[which] != np.arange(either.size))
-    if others.size:
-        row = np.arange(others.size)
-        place = np.concatenate([others, first[which[others]]]) + S.shape[1]
-        value = np.repeat([1.0, -1.0], others.size)
-        same = csr_array((value, (np.tile(row, 2), place)), shape=(others.size, S.shape[1] + either.size))
-        couplings.append(LinearConstraint(same, 0.0, 0.0))
-    return prices[either], couplings
+    _, firsts, groups = np.unique(together[optional], return_index=True, return_inverse=True)
+    followers = np.flatnonzero(firsts[groups] != np.arange(optional.size))
+    if followers.size:
+        rows = np.arange(followers.size)
+        columns = np.concatenate([followers, firsts[groups[followers]]]) + S.shape[1]
+        values = np.repeat([1.0, -1.0], followers.size)
+        equalities = csr_array(
+            (values, (np.tile(rows, 2), columns)), shape=(followers.size, S.shape[1] + optional.size)
+        )
+        couplings.append(LinearConstraint(equalities, 0.0, 0.0))
+    return prices[optional], couplings
 
 
 def _spelt(S: Any, letters: Array, prices: Array) -> tuple[Array, list[Any]]:
@@ -287,10 +315,10 @@ def _spelt(S: Any, letters: Array, prices: Array) -> tuple[Array, list[Any]]:
     from scipy.sparse import csr_array, eye_array, hstack, kron
 
     size, width = letters.shape
-    place = (np.repeat(np.arange(size), width), np.arange(size * width))
-    spelt = csr_array((letters.ravel(), place), shape=(size, size * width))
-    one = csr_array(kron(eye_array(size), np.ones((1, width))))
+    positions = (np.repeat(np.arange(size), width), np.arange(size * width))
+    combinations = csr_array((letters.ravel(), positions), shape=(size, size * width))
+    sums = csr_array(kron(eye_array(size), np.ones((1, width))))
     return (prices[:size, None] * (letters != 0.0)).ravel(), [
-        LinearConstraint(hstack([S[:size], -spelt], format="csr"), 0.0, 0.0),
-        LinearConstraint(hstack([csr_array((size, S.shape[1])), one], format="csr"), 1.0, 1.0),
+        LinearConstraint(hstack([S[:size], -combinations], format="csr"), 0.0, 0.0),
+        LinearConstraint(hstack([csr_array((size, S.shape[1])), sums], format="csr"), 1.0, 1.0),
     ]

@@ -97,7 +97,7 @@ class Rounds:
     kept: tuple[Answer, Found] | None = None
 
     def step(self, number: int) -> Result | None:
-        """One round; its result where it is the last."""
+        """Perform one round; return its result where it is the last round, and ``None`` otherwise."""
         ledger, working, prover = self.ledger, self.working, self.prover
         program, tools, last = ledger.program, ledger.tools, number == self.method.rounds
 
@@ -108,14 +108,14 @@ class Rounds:
         ledger.best, x = ledger.best or answer, answer.solution.x
 
         # Separate: the constraints of the continuum that this decision violates most.
-        found: Found = [one for one in separate(program, x, tools, ALLOWED, number) if not one[0].defines]
-        violated: Violated = [above(*one) for one in found]
+        separations: Found = [pair for pair in separate(program, x, tools, ALLOWED, number) if not pair[0].defines]
+        violated: Violated = [above(*pair) for pair in separations]
         feasible = not any(rows.size for _, rows, _ in violated)
-        ledger.tell(number, answer, found, program.cost(x) if feasible else np.inf, kept=working.size)
-        self.kept = (answer, found) if feasible else self.kept
+        ledger.tell(number, answer, separations, program.cost(x) if feasible else np.inf, kept=working.size)
+        self.kept = (answer, separations) if feasible else self.kept
 
         # Secure: where time runs out, prove a decision that keeps away from the constraints while there is some.
-        imposed = secure_in_time(working, ledger, prover, answer, found, number)
+        imposed = secure_in_time(working, ledger, prover, answer, separations, number)
 
         # Exchange: impose them, drop what has been idle; of what is violated though imposed, solve a crude answer more
         # closely, and tighten else.
@@ -124,34 +124,34 @@ class Rounds:
             working.exchange(answer, violated, number)
             or imposed
             or (crude and working.sharpen(ledger, answer))
-            or working.tighten(found)
+            or working.tighten(separations)
         )
         # Rest: what costs is put to 0 where that meets the lower bound and violates nothing.
         if not exchanged:
-            answer, found = working.rested(ledger, answer, found, number)
+            answer, separations = working.rested(ledger, answer, separations, number)
             x = answer.solution.x
         # Sharpen: nothing is violated but the bounds have not met, so solve what is imposed more closely.
         if exchanged or (not last and ledger.open(x) and working.sharpen(ledger, answer)):
             return None
 
         # Choose: of the decisions that cost as little, the one that is preferred; it may ask for more constraints.
-        answer, found, asked = working.choose(ledger, answer, found, number, prover)
-        if not last and working.exchange(answer, asked, number):
+        answer, separations, extra = working.choose(ledger, answer, separations, number, prover)
+        if not last and working.exchange(answer, extra, number):
             return None
 
         # Prove: over the whole continuum; a witness that the proof meets is one more index to impose, and what rounding
         # may do, where it alone keeps a proof open, is allowed for like the solver's accuracy.
-        proofs, imposed = proofs_of(working, ledger, prover, answer, found)
+        proofs, imposed = proofs_of(working, ledger, prover, answer, separations)
         again = imposed or working.exchange(answer, witnesses(program, proofs), number)
         again = again or working.allow_for(ledger, answer, proofs)
         if again and not last and not tools.deadline.passed:
             return None
 
         # Terminate: with what was proven of this decision, or of an earlier one that is.
-        return self._earlier(ledger.judged(answer, worst_of(found), proofs, self._ending(answer, last)), answer)
+        return self._earlier(ledger.judged(answer, worst_of(separations), proofs, self._ending(answer, last)), answer)
 
     def _ending(self, answer: Answer, last: bool) -> str:
-        """Why there is no further round, where that is not by the rules of the exchange."""
+        """Return the reason why there is no further round, where the rules of the exchange are not the reason."""
         if self.ledger.tools.deadline.passed:
             return self.ledger.tools.deadline.reason
         if last:
@@ -166,6 +166,6 @@ class Rounds:
         result = or_proven(self.ledger, result)
         if result.status not in ("refuted", "undecided") or self.kept is None or self.kept[0] is answer:
             return result
-        kept, found = self.kept
-        earlier = self.ledger.judged(kept, worst_of(found), self.prover(kept.solution.x))
+        kept_answer, separations = self.kept
+        earlier = self.ledger.judged(kept_answer, worst_of(separations), self.prover(kept_answer.solution.x))
         return earlier if earlier.status in ("certified", "verified") else result

@@ -1,4 +1,4 @@
-"""How few entries may count: bounds of the least count over all feasible decisions, by one convex program at most."""
+"""Bounds of the least count of entries over all feasible decisions, by one convex program at most."""
 
 from __future__ import annotations
 
@@ -27,12 +27,12 @@ def multiple(program: SemiInfiniteProgram) -> float | None:
     """The count is at least this times the cost: where the convex cost below the count is a multiple of the program's
     own, up to rounding; ``None`` where it is not."""
     below = counted_below(program)
-    own, other = program.finite, below.program.finite
-    if own.P is not None or own.blocks is not None or own.q.any() or other.q.any() or below.certain:
+    own, convex = program.finite, below.program.finite
+    if own.P is not None or own.blocks is not None or own.q.any() or convex.q.any() or below.certain:
         return None
-    if not np.array_equal(own.weights > 0.0, other.weights > 0.0) or not other.weights.any():
+    if not np.array_equal(own.weights > 0.0, convex.weights > 0.0) or not convex.weights.any():
         return None
-    shares = other.weights[other.weights > 0.0] / own.weights[own.weights > 0.0]
+    shares = convex.weights[convex.weights > 0.0] / own.weights[own.weights > 0.0]
     return float(shares.min()) if np.ptp(shares) <= PROPORTIONAL * shares.max() else None
 
 
@@ -52,7 +52,7 @@ class LeastCount(Method):
     def solve(self, program: SemiInfiniteProgram, tools: Tools) -> Result:
         def prover(x: Array, cells: int = CELLS) -> Sequence[Proof]:
             fewer = count(program, x) < self.beaten * (1.0 - TOLERANCE)
-            share = {name: min(cells, most) for name, most in self.cells.items()}
+            share = {name: min(cells, limit) for name, limit in self.cells.items()}
             return prove(program, x, ignore, share, tools.deadline) if fewer else ()
 
         below = counted_below(program)
@@ -66,8 +66,10 @@ class LeastCount(Method):
 
 
 def is_vertex(program: SemiInfiniteProgram, result: Result) -> bool:
-    """Whether no more entries that count are strictly between 0 and their bounds than rows are active: then no vertex
-    with these rows has fewer, if that is one."""
+    """Return whether at most as many counted entries are strictly between 0 and their bounds as rows are active.
+
+    Then no vertex with these active rows has fewer such entries, if the decision is a vertex.
+    """
     base, image = program.finite, program.finite.image(np.asarray(result.decision))
     low, high = (np.abs(image - side) <= DUST * np.abs(side) for side in (base.lower, base.upper))
     between = (prices_of(program) > 0.0) & (image != 0.0) & ~low & ~high
@@ -77,17 +79,17 @@ def is_vertex(program: SemiInfiniteProgram, result: Result) -> bool:
 def imposed(program: SemiInfiniteProgram, cuts: Sequence[Cut]) -> Violated:
     """Constraints that are told in the user's units, as constraints of a program in its own: those whose family states
     its indices as the program does."""
-    found: list[tuple[Array, np.ndarray, str]] = []
+    constraints: list[tuple[Array, np.ndarray, str]] = []
     for family in program.families:
-        mine = {
+        family_cuts = {
             (cut.index.tobytes(), cut.row): cut
             for cut in cuts
             if cut.family == family.name
             and cut.formulation == family.formulation
             and cut.index.size == family.index_set.dimension
         }
-        if mine:
+        if family_cuts:
             units = 1.0 if family.index_units is None else family.index_units
-            indices = np.array([cut.index for cut in mine.values()]) / units
-            found.append((indices, np.array([cut.row for cut in mine.values()], dtype=int), family.name))
-    return found
+            indices = np.array([cut.index for cut in family_cuts.values()]) / units
+            constraints.append((indices, np.array([cut.row for cut in family_cuts.values()], dtype=int), family.name))
+    return constraints

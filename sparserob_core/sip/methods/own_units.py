@@ -43,14 +43,32 @@ ORDER: Sequence[Status] = ("certified", "infeasible", "verified", "refuted", "un
 
 
 def solve_in_own_units(method: Method, program: SemiInfiniteProgram, tools: Tools) -> Result:
-    """What the method makes of the program, solved in the program's own units and told in the user's."""
+    """Solve a program by a method in the program's own units; return the result in the user's units."""
     return answered_in_own_units(method.solve, program, tools)
 
 
 def answered_in_own_units(
     solve: Callable[[SemiInfiniteProgram, Tools], Result], program: SemiInfiniteProgram, tools: Tools
 ) -> Result:
-    """What ``solve`` makes of the program in the program's own units, told in the user's."""
+    """Call ``solve`` with the program in its own units; return the result, and report all events, in the user's units.
+
+    Where the units suit small decisions only, and the result is not conclusive, the program is solved again in wider
+    units; the result that says more is returned.
+
+    Parameters
+    ----------
+    solve : callable
+        Function of a program and tools that returns a `Result`.
+    program : SemiInfiniteProgram
+        Program in the user's units; solved as it is where it has no own units.
+    tools : Tools
+        Tools whose ``notify`` hears the events.
+
+    Returns
+    -------
+    Result
+        The result in the user's units.
+    """
     own = program.own_units
     if own is None:
         return solve(program, tools)
@@ -137,7 +155,7 @@ class UsersUnits:
             upper_bound=own.upper_bound * self.cost,
             proven=own.proven * self.cost,
             violation=own.violation * self._row_unit(own.worst_family, row),
-            separations={name: self._separation(name, one) for name, one in own.separations.items()},
+            separations={name: self._separation(name, separation) for name, separation in own.separations.items()},
             imposed=self.cuts(own.imposed),
             multipliers=frozen(np.array(multipliers, dtype=float)),
             added=self.cuts(own.added),
@@ -184,13 +202,15 @@ class UsersUnits:
         """The families whose indices a tuple of ``width`` coordinates may be made of: literal ones where they fit."""
         reduced = self.program.families
         literal = [family.literal or family for family in reduced]
-        sizes = [max((one.index_set.dimension for one in each), default=1) for each in (literal, reduced)]
+        sizes = [max((family.index_set.dimension for family in families), default=1) for families in (literal, reduced)]
         return literal if width and width % sizes[0] == 0 and sizes[0] != sizes[1] else reduced
 
     def tuple_units(self, size: int, block: int) -> Array:
         """The units ``(size,)`` of a tuple's coordinates: block after block those of the longest index."""
-        forms = [one for family in self.program.families for one in (family.literal, family) if one is not None]
-        longest = next((one for one in forms if one.index_set.dimension == block and one.index_units is not None), None)
+        forms = [form for family in self.program.families for form in (family.literal, family) if form is not None]
+        longest = next(
+            (form for form in forms if form.index_set.dimension == block and form.index_units is not None), None
+        )
         unit = np.ones(block) if longest is None or longest.index_units is None else longest.index_units
         return np.tile(unit, size // max(block, 1)) if size % max(block, 1) == 0 else np.ones(size)
 
@@ -230,7 +250,8 @@ class UsersUnits:
         )
 
     def _price(self, cut: Cut) -> float:
-        """What a multiplier of 1 of the row is in the user's cost for one of the user's units of the row."""
+        """Return the multiplier, in the user's units of cost and row, of a row whose multiplier is 1 in the program's
+        own units."""
         return self.cost / self._row_unit(cut.family, cut.row)
 
     def _witness(self, own: WorstConstraint) -> WorstConstraint:

@@ -59,26 +59,31 @@ class Reweighted(Method, Options):
             return first
         best, spent = first.decision, list[Result]()
         x = best
-        known = [*first.indices, *first.dual.cuts]
-        plain = replace(tools, regulariser=None)
+        cuts = [*first.indices, *first.dual.cuts]
+        plain_tools = replace(tools, regulariser=None)
         exchange = Exchange(tolerance=self.tolerance, rounds=self.rounds)
         for number in range(1, self.passes + 1):
             if tools.deadline.passed:
                 break
-            told = replace(plain, notify=beside(tools.notify, f"weighted program {number} of at most {self.passes}"))
-            heavier = replace(program, weights=program.finite.weights * self._weights(program, x), twin=None)
-            found = exchange.close(heavier, told, unproven, imposed_cuts(known))
-            spent.append(found)
-            if found.decision is None or found.status not in PROVEN:
+            labelled_tools = replace(
+                plain_tools, notify=beside(tools.notify, f"weighted program {number} of at most {self.passes}")
+            )
+            heavier_program = replace(program, weights=program.finite.weights * self._weights(program, x), twin=None)
+            weighted_result = exchange.close(heavier_program, labelled_tools, unproven, imposed_cuts(cuts))
+            spent.append(weighted_result)
+            if weighted_result.decision is None or weighted_result.status not in PROVEN:
                 break
-            known = [*first.indices, *first.dual.cuts, *found.indices]
-            settled, x = bool(np.allclose(found.decision, x, rtol=0.0, atol=FEWER)), found.decision
+            cuts = [*first.indices, *first.dual.cuts, *weighted_result.indices]
+            has_converged, x = (
+                bool(np.allclose(weighted_result.decision, x, rtol=0.0, atol=FEWER)),
+                weighted_result.decision,
+            )
             best = x if count(program, x) < count(program, best) * (1.0 - FEWER) else best
-            if settled:
+            if has_converged:
                 break
         if best is first.decision:
             return first.charged(spent)
-        result = on_support(program, best, tools, exchange, known)
+        result = on_support(program, best, tools, exchange, cuts)
         spent.append(result)
         if (
             result.decision is None
@@ -102,10 +107,10 @@ class Reweighted(Method, Options):
 
     def _weights(self, program: SemiInfiniteProgram, x: Array) -> Array:
         """The slope of the penalty at ``x (n,)``, ``(k,)``, 1 at 0; 1 where nothing counts."""
-        base, counted = program.finite, prices_of(program) > 0.0
-        reach = np.maximum(np.abs(base.lower), np.abs(base.upper))
-        usable = counted & np.isfinite(reach) & (reach > 0.0)
-        share = np.where(usable, np.abs(base.image(x)) / np.where(usable, reach, 1.0), 0.0)
+        base, is_counted = program.finite, prices_of(program) > 0.0
+        radii = np.maximum(np.abs(base.lower), np.abs(base.upper))
+        is_usable = is_counted & np.isfinite(radii) & (radii > 0.0)
+        share = np.where(is_usable, np.abs(base.image(x)) / np.where(is_usable, radii, 1.0), 0.0)
         if self.penalty == "capped":
             return np.where(share < self.scale, 1.0, 0.0)
         return np.asarray(self.scale / (share + self.scale))
@@ -117,16 +122,16 @@ def on_support(
     """The decision of least cost, proven, that acts on no other entries than ``x (n,)`` does; ``known`` constraints are
     imposed from the beginning."""
     base, prices = program.finite, prices_of(program)
-    reach = np.maximum(np.abs(base.lower), np.abs(base.upper))
-    acts = np.abs(base.image(x)) > DUST * np.where(np.isfinite(reach), reach, 1.0)
-    off = ~acts & (prices > 0.0)
-    lower, upper = np.where(off, 0.0, base.lower), np.where(off, 0.0, base.upper)
+    radii = np.maximum(np.abs(base.lower), np.abs(base.upper))
+    is_acting = np.abs(base.image(x)) > DUST * np.where(np.isfinite(radii), radii, 1.0)
+    is_off = ~is_acting & (prices > 0.0)
+    lower, upper = np.where(is_off, 0.0, base.lower), np.where(is_off, 0.0, base.upper)
     narrow = replace(program, lower=lower, upper=upper, twin=None)
-    quiet = replace(tools, notify=beside(tools.notify, "least cost on the entries that were found"))
-    return exchange.close(narrow, quiet, prover_of(program, quiet), imposed_cuts(known))
+    quiet_tools = replace(tools, notify=beside(tools.notify, "least cost on the entries that were found"))
+    return exchange.close(narrow, quiet_tools, prover_of(program, quiet_tools), imposed_cuts(known))
 
 
 def imposed_cuts(cuts: Sequence[Cut]) -> list[tuple[Array, np.ndarray, str]]:
     """Constraints in the program's own units, one by one, each once."""
-    once = {(cut.family, cut.row, cut.index.tobytes()): cut for cut in cuts}
-    return [(cut.index[None], np.array([cut.row]), cut.family) for cut in once.values()]
+    unique_cuts = {(cut.family, cut.row, cut.index.tobytes()): cut for cut in cuts}
+    return [(cut.index[None], np.array([cut.row]), cut.family) for cut in unique_cuts.values()]

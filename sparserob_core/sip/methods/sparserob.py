@@ -140,9 +140,9 @@ class _Outer:
         answer = Answer(g.solution, g.rows(), epsilon, value)
         self.steps.append(OuterStep(j, epsilon, value, program.cost(x), ledger.lower, x))
         if np.isfinite(value):
-            found = separate(program, x, tools, number=number)
-            _secured(ledger, answer, found, tools)
-            ledger.tell(number, answer, found, np.inf, kept=int((answer.multipliers > 0).sum()))
+            separations = separate(program, x, tools, number=number)
+            _secured(ledger, answer, separations, tools)
+            ledger.tell(number, answer, separations, np.inf, kept=int((answer.multipliers > 0).sum()))
 
         # No optimiser: g is infinite where nothing meets the constraints at the tuple.
         if g.solution.status == "infeasible" or not np.isfinite(x).all():
@@ -159,10 +159,10 @@ class _Outer:
         if plain.status == "optimal":
             ledger.improve(ledger.relaxed.lower_bound(answer.rows, plain))
         proofs = prove(program, x, tools.notify, deadline=tools.deadline)
-        found = separate(program, x, tools)
-        told = as_bad_as_found(proofs, found)
-        short = MORE_EVALUATIONS if any(proof.verdict == "refuted" for proof in told) else ""
-        result = ledger.judged(answer, worst_of(found), told, tools.deadline.reason or short)
+        separations = separate(program, x, tools)
+        worst_proofs = as_bad_as_found(proofs, separations)
+        short = MORE_EVALUATIONS if any(proof.verdict == "refuted" for proof in worst_proofs) else ""
+        result = ledger.judged(answer, worst_of(separations), worst_proofs, tools.deadline.reason or short)
         return _or_backed_off(ledger, result, answer)
 
 
@@ -170,12 +170,12 @@ def _or_backed_off(ledger: Ledger, result: Result, answer: Answer) -> Result:
     """The result of the last ``answer``, or that of the decision that is proven in its place, with what that one is."""
     if result.status not in ("refuted", "undecided") or ledger.proven is None:
         return result
-    secured, found, proofs = ledger.proven
-    which = f"is that of an earlier weight, epsilon = {secured.epsilon:g}"
-    if secured.epsilon == answer.epsilon:
-        which = "keeps away from the constraints by as much as that of the search misses them by"
-    ending = f"the decision {which} ({result.message})"
-    return ledger.judged(secured, worst_of(found), proofs, ledger.tools.deadline.reason or ending)
+    proven_answer, separations, proofs = ledger.proven
+    origin = f"is that of an earlier weight, epsilon = {proven_answer.epsilon:g}"
+    if proven_answer.epsilon == answer.epsilon:
+        origin = "keeps away from the constraints by as much as that of the search misses them by"
+    ending = f"the decision {origin} ({result.message})"
+    return ledger.judged(proven_answer, worst_of(separations), proofs, ledger.tools.deadline.reason or ending)
 
 
 def _secured(ledger: Ledger, answer: Answer, found: Found, tools: Tools) -> None:
@@ -192,8 +192,8 @@ def _searched(
     """The best tuple that one search for the maximum of ``g`` finds from ``point``; of every value that is the best so
     far the multipliers are turned into a lower bound. An interrupt leaves the optimiser of the best tuple with the
     ledger, proven or backed off where it can be, and goes on; so the search ends a little before a limit."""
-    tools, began = ledger.tools, time.perf_counter() - ledger.started
-    proven: list[float] = []
+    tools, start = ledger.tools, time.perf_counter() - ledger.started
+    lower_bounds: list[float] = []
     g.epsilon = epsilon
     oracle = None if tools.rebuild is None else Oracle(tools.rebuild, method.formulation, g.layout.count)
     batches = Batches(g, oracle, tools.executor, tools.budget, watched=tools.notify is not ignore)
@@ -201,7 +201,7 @@ def _searched(
     def tell(value: float, bound: Dual | None) -> None:
         if bound is not None:
             ledger.improve(bound)
-        proven.append(ledger.lower)
+        lower_bounds.append(ledger.lower)
 
     def values(points: Array) -> Array:
         return batches.values(points, tell)
@@ -217,14 +217,16 @@ def _searched(
     rules = Rules(method.sc2, method.slcr or Metropolis(), tools.polish)
     target = Target(values, g.domain, g.gradient, g.block, g.linear, g.acting)
     notify = forwarded(tools.notify, EvaluationsFinished, completed)
-    soon = tools.deadline.sooner(min(MOMENT, RESERVED * (tools.deadline.seconds or 0.0)))
-    ledger.relaxed.deadline = soon
+    early_deadline = tools.deadline.sooner(min(MOMENT, RESERVED * (tools.deadline.seconds or 0.0)))
+    ledger.relaxed.deadline = early_deadline
     report = maximise(target, tools.maximiser, tools.budget, tools.rng, rules, notify, point)
     ledger.relaxed.deadline = tools.deadline
-    parts.append(SearchTrace.of(j, epsilon, report.trace, np.array(proven[: report.evaluations]), began))
+    parts.append(SearchTrace.of(j, epsilon, report.trace, np.array(lower_bounds[: report.evaluations]), start))
     if report.interrupted:
         _at_interrupt(g, ledger, report.best_point, report.best_value, epsilon)
-        raise (OutOfTime if soon.passed else KeyboardInterrupt)(report.stopped)  # of which only one was pressed
+        raise (OutOfTime if early_deadline.passed else KeyboardInterrupt)(
+            report.stopped
+        )  # of which only one was pressed
     return report.best_point
 
 

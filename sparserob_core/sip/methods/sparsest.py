@@ -123,7 +123,8 @@ class SparsestMethod(Method, Options):
 
 @dataclass(eq=False)
 class _Search:
-    """What is known while the bounds close: the rows that were found, the best decision with its result, the tree."""
+    """State of the search while its two bounds close: the rows found so far, the best decision with its result, and the
+    tree."""
 
     method: SparsestMethod
     program: SemiInfiniteProgram
@@ -181,8 +182,8 @@ class _Search:
         self.spent.append(result)
         if result.status == "infeasible":
             letters = tuple(self.method.alphabet or ())
-            said = f"no control with values in {list(letters)}: {result.message}" if letters else result.message
-            return _none(self.program, replace(result, message=said), letters)
+            message = f"no control with values in {list(letters)}: {result.message}" if letters else result.message
+            return _none(self.program, replace(result, message=message), letters)
         self._keep([*result.indices, *result.dual.cuts])
         self.rounds = list(result.history)
         self.tree = Branching(self.bounded, self.relaxed, self.rows, self.letters, tuple(self.method.alphabet or ()))
@@ -192,8 +193,8 @@ class _Search:
 
     def _keep(self, cuts: Sequence[Cut]) -> bool:
         """Impose constraints; ``False`` where all are known."""
-        known = {(cut.family, cut.row, cut.index.tobytes()) for cut in self.rows.cuts}
-        fresh = [cut for cut in cuts if (cut.family, cut.row, cut.index.tobytes()) not in known]
+        imposed_keys = {(cut.family, cut.row, cut.index.tobytes()) for cut in self.rows.cuts}
+        fresh = [cut for cut in cuts if (cut.family, cut.row, cut.index.tobytes()) not in imposed_keys]
         for cut in {(cut.family, cut.row, cut.index.tobytes()): cut for cut in fresh}.values():
             self.rows = self.rows.joined(rows_at(self.program, cut.family, cut.index[None], np.array([cut.row])))
         if self.tree is not None:
@@ -205,25 +206,25 @@ class _Search:
         something is known now that was not."""
         base, prices = self.program.finite, prices_of(self.program)
         image = base.image(x)
-        reach = np.maximum(np.abs(base.lower), np.abs(base.upper))
-        acts = np.abs(image) > DUST * np.where(np.isfinite(reach), reach, 1.0)
+        radii = np.maximum(np.abs(base.lower), np.abs(base.upper))
+        is_acting = np.abs(image) > DUST * np.where(np.isfinite(radii), radii, 1.0)
         if self.letters is not None:
             return self._exactly(self._spelt(image))
-        key = np.packbits(acts[prices > 0.0]).tobytes()
-        if count_of(self.program, acts) >= self.least * (1.0 - SAME) or key in self.tried:
+        key = np.packbits(is_acting[prices > 0.0]).tobytes()
+        if count_of(self.program, is_acting) >= self.least * (1.0 - SAME) or key in self.tried:
             return False
         self.tried.add(key)
         method = Exchange(tolerance=self.method.tolerance, rounds=self.method.rounds)
         result = on_support(self.program, x, self.tools, method, self.rows.cuts)
         self.spent.append(result)
-        fresh = self._keep([*result.indices, *result.dual.cuts])
+        is_new = self._keep([*result.indices, *result.dual.cuts])
         if result.status in PROVEN and result.decision is not None:
-            counted = count(self.program, result.decision)
-            if counted < self.least * (1.0 - SAME):
-                self.best, self.least = result, counted
+            new_count = count(self.program, result.decision)
+            if new_count < self.least * (1.0 - SAME):
+                self.best, self.least = result, new_count
                 self.tell()
                 return True
-        return fresh
+        return is_new
 
     def _spelt(self, image: Array) -> Array:
         assert self.letters is not None
@@ -238,19 +239,19 @@ class _Search:
         program, tools = self.program, self.tools
         if count(program, x) >= self.least * (1.0 - SAME):
             return False
-        found = separate(program, x, replace(tools, notify=ignore), TOLERANCE)
+        separations = separate(program, x, replace(tools, notify=ignore), TOLERANCE)
         fresh: list[Cut] = []
-        for family, separation in found:
+        for family, separation in separations:
             above = separation.violations > TOLERANCE
             pairs = zip(separation.indices[above], separation.rows[above], strict=True)
             fresh += [Cut(family.name, index, int(row), formulation=family.formulation) for index, row in pairs]
         if fresh:
-            known = self.rows.h.size
-            new = self._keep(fresh)
-            G, h = self.rows.G[known:], self.rows.h[known:]
+            row_count = self.rows.h.size
+            is_new = self._keep(fresh)
+            G, h = self.rows.G[row_count:], self.rows.h[row_count:]
             norms = np.maximum(np.linalg.norm(G, axis=1), np.finfo(float).tiny)
             self.missed = float(((G @ x - h) / norms).max(initial=0.0))
-            return new
+            return is_new
         if program.finite.residual(x) > TOLERANCE or program.finite.missed(x) > TOLERANCE:
             return False
         proofs = prove(program, x, tools.notify, deadline=tools.deadline)
@@ -262,7 +263,7 @@ class _Search:
             ]
             return self._keep(cuts)
         self.least = count(program, x)
-        worst = witness(program, worst_of(found), proofs)
+        worst = witness(program, worst_of(separations), proofs)
         self.best = Result(
             status="verified",
             message="",
@@ -290,14 +291,16 @@ class _Search:
             decision=self.told.decision if decision is None else decision,
             gap=relative_gap(self.lower, self.least),
             proven=self.least / unit,
-            relaxed_programs=self.relaxed.solves + sum(one.counts["relaxed_programs"] for one in self.spent),
+            relaxed_programs=self.relaxed.solves + sum(result.counts["relaxed_programs"] for result in self.spent),
         )
         self.rounds.append(self.told)
         self.tools.notify(self.told)
 
     def step(self, number: int) -> Result | None:
-        """One proposal, and where there are no more, one division of a part of the tree; the result where the bounds
-        have met, or nothing is left to try."""
+        """Make one proposal, or, where no more are made, one division of a part of the tree.
+
+        Returns the result where the bounds have met or nothing is left to try, and ``None`` otherwise.
+        """
         assert self.tree is not None
 
         # Propose: a decision that counts less than the best, as the mixed-integer solver sees it.
@@ -319,7 +322,7 @@ class _Search:
         return None if self.tree.grow(lambda: self.least, self.look) else self.result()
 
     def stopped(self, error: KeyboardInterrupt) -> Result:
-        """What is known where the time is over or a key was pressed."""
+        """Note the interrupt, and return the result from what is known so far."""
         self.tools.deadline.interrupt(error)
         return self.result()
 
@@ -340,16 +343,17 @@ class _Search:
         return True
 
     def _hindrance(self) -> str:
-        """Why there is no control, though none is excluded, and what would help."""
+        """Return the reason why there is no control although none is excluded, and the remedy, in words."""
         if self.plain is not None:
             return f"no control was proven: {self.plain.message}"
-        more = "more seconds (limits.seconds)" if self.tools.deadline.passed else "more nodes (method.nodes)"
+        remedy = "more seconds (limits.seconds)" if self.tools.deadline.passed else "more nodes (method.nodes)"
         return (
-            f"no control of letters was found, and none is excluded; {more} or letters nearer to one another would help"
+            f"no control of letters was found, and none is excluded; {remedy} or letters nearer to one another "
+            "would help"
         )
 
     def result(self) -> Result:
-        """What is known, told as a result whose cost is the count."""
+        """Return the result of the search so far, whose cost is the count."""
         assert self.tree is not None
         program, unit = self.program, self.program.cost_unit
         ending = self.ending or self.tools.deadline.reason
@@ -359,13 +363,13 @@ class _Search:
         letters = None if self.method.alphabet is None else tuple(self.method.alphabet)
         tree, history, seconds = tuple(self.tree.nodes), tuple(self.rounds), time.perf_counter() - self.started
         if self.best is None:
-            none = self.tree.lower == np.inf
-            said = f"no control with values in {list(letters or ())} meets the constraints, by branch and bound"
+            is_infeasible = self.tree.lower == np.inf
+            exclusion = f"no control with values in {list(letters or ())} meets the constraints, by branch and bound"
             return Result(
-                status="infeasible" if none else "undecided",
-                message=said if none else "; ".join(part for part in (self._hindrance(), ending) if part),
-                stopped="" if none else self.tools.deadline.reason,
-                lower_bound=np.inf if none else self.lower / unit,
+                status="infeasible" if is_infeasible else "undecided",
+                message=exclusion if is_infeasible else "; ".join(text for text in (self._hindrance(), ending) if text),
+                stopped="" if is_infeasible else self.tools.deadline.reason,
+                lower_bound=np.inf if is_infeasible else self.lower / unit,
                 counts=counts,
                 solved_by=dict(self.relaxed.solved_by),
                 sparsest=Sparsest(np.nan, None, None, tree, letters),
@@ -375,7 +379,7 @@ class _Search:
         lower = min(self.tree.lower, self.least)
         status, message = verdict(self.best.proofs, relative_gap(lower, self.least), self.method.tolerance)
         plain = self.plain if self.plain is not None and self.plain.status in PROVEN else None
-        beside = Sparsest(
+        sparsest = Sparsest(
             norm=self.best.cost,
             plain=None if plain is None else plain.cost,
             plain_count=None if plain is None or plain.decision is None else count(program, plain.decision),
@@ -396,7 +400,7 @@ class _Search:
             stopped=self.tools.deadline.reason,
             counts={**counts, "active_indices": len(self.best.indices)},
             solved_by=dict(self.relaxed.solved_by),
-            sparsest=beside,
+            sparsest=sparsest,
             history=history,
             seconds=seconds,
             cost_scale=self.least / unit,

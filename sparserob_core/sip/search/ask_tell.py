@@ -138,8 +138,8 @@ class AskTell:
         self._seconds: list[float] = []
         self._started = time.monotonic()
         self._known = _Values(repeats=bool(ranges.integer))
-        told, self._owed = ([], []) if state is None else _told(state, self._about, self.domain)
-        for point, value in told:
+        evaluations, self._owed = ([], []) if state is None else _told(state, self._about, self.domain)
+        for point, value in evaluations:
             self._take(point, value)
         self._batch: list[Key] | None = None  # points for which the search waits
         self._answers: list[float | None] = []  # their values, as far as they are known
@@ -236,15 +236,22 @@ class AskTell:
             For points that were not asked for, or that have a value already; then no value is accepted.
         """
         try:
-            given, told = np.atleast_2d(np.array(points, dtype=float)), np.atleast_1d(np.array(values, dtype=float))
+            point_array, value_array = (
+                np.atleast_2d(np.array(points, dtype=float)),
+                np.atleast_1d(np.array(values, dtype=float)),
+            )
         except (TypeError, ValueError):
             raise InputError(f"tell: expected points and numbers, got {_short(points)} and {_short(values)}") from None
-        if given.ndim != 2 or given.shape[1] != self.domain.dimension or told.shape != (len(given),):
+        if (
+            point_array.ndim != 2
+            or point_array.shape[1] != self.domain.dimension
+            or value_array.shape != (len(point_array),)
+        ):
             raise InputError(
                 f"tell: expected points of shape (j, {self.domain.dimension}), and as many values, "
-                f"got shapes {given.shape} and {told.shape}"
+                f"got shapes {point_array.shape} and {value_array.shape}"
             )
-        keys = _keys(given)
+        keys = _keys(point_array)
         with self._lock:
             if self._owed:  # values of a state, for which the search first asks again
                 self._waiting()
@@ -253,7 +260,7 @@ class AskTell:
                     raise InputError(
                         f"tell: expected points that were asked for and have no value yet, got {list(key)}"
                     )
-            for key, value in zip(keys, told.tolist(), strict=True):
+            for key, value in zip(keys, value_array.tolist(), strict=True):
                 self._given -= Counter((key,))
                 if key in self._ahead:
                     self._ahead.remove(key)
@@ -294,8 +301,8 @@ class AskTell:
                 if waited[key]:
                     waited[key] -= 1
                     ahead.append(number)
-            apart = {"aside": aside, "out": [list(key) for key in out], "ahead": ahead}
-            return {"format": FORMAT, **self._about, **rows, **{name: row for name, row in apart.items() if row}}
+            extras = {"aside": aside, "out": [list(key) for key in out], "ahead": ahead}
+            return {"format": FORMAT, **self._about, **rows, **{name: row for name, row in extras.items() if row}}
 
     def close(self) -> None:
         """End the search, if it has not ended; its values can still be read."""
@@ -353,10 +360,12 @@ class AskTell:
         if not owed or isinstance(self._end, BaseException):
             return
         if missing:
-            wrong = f"the search asks for {list(missing[0])} where {self._points[owed[0]].tolist()} was told; "
+            reason = f"the search asks for {list(missing[0])} where {self._points[owed[0]].tolist()} was told; "
         else:
-            wrong = f"the search has ended {len(owed)} values before those that were told; "
-        self._end = InputError(f"state: {wrong}it is another maximiser, another version, or one that is not repeatable")
+            reason = f"the search has ended {len(owed)} values before those that were told; "
+        self._end = InputError(
+            f"state: {reason}it is another maximiser, another version, or one that is not repeatable"
+        )
 
     def _fresh(self, waiting: list[Key], k: int) -> list[Key]:
         """Return at most ``k`` points that nobody has received: first those the search waits for, then predicted
@@ -369,10 +378,10 @@ class AskTell:
             elif len(keys) < k:
                 keys.append(key)
         self._given += Counter(keys)
-        while len(keys) < k and (more := self._wanted_next(waiting)[: k - len(keys)]):
-            keys += more
-            self._ahead += more
-            self._given += Counter(more)
+        while len(keys) < k and (predictions := self._wanted_next(waiting)[: k - len(keys)]):
+            keys += predictions
+            self._ahead += predictions
+            self._given += Counter(predictions)
         return keys
 
     def _wanted_next(self, waiting: list[Key]) -> list[Key]:
@@ -381,17 +390,19 @@ class AskTell:
         usable = self._usable()
         worst = float(usable[np.isfinite(usable)].min(initial=np.inf))
         lie = worst if np.isfinite(worst) else -np.inf
-        known, out = _Values(repeats=bool(self._ranges.integer)), {*waiting, *self._ahead}
+        known_values, out = _Values(repeats=bool(self._ranges.integer)), {*waiting, *self._ahead}
         for number, point in enumerate(self._points):
-            known.add(_keys(point[np.newaxis])[0], number)
-        with _searching(self._search) as other:
-            while isinstance(wanted := other.wanted.get(), np.ndarray):
+            known_values.add(_keys(point[np.newaxis])[0], number)
+        with _searching(self._search) as other_search:
+            while isinstance(wanted := other_search.wanted.get(), np.ndarray):
                 keys = _keys(self._ranges.shown(wanted))
-                numbers = [known.use(key) for key in keys]
-                new = [key for key, number in zip(keys, numbers, strict=True) if number is None and key not in out]
-                if new:
-                    return list(dict.fromkeys(new))
-                other.answers.put(
+                numbers = [known_values.use(key) for key in keys]
+                missing_keys = [
+                    key for key, number in zip(keys, numbers, strict=True) if number is None and key not in out
+                ]
+                if missing_keys:
+                    return list(dict.fromkeys(missing_keys))
+                other_search.answers.put(
                     np.array([lie if number is None else self._sign * self._values[number] for number in numbers])
                 )
         return []
@@ -443,11 +454,11 @@ def _taken_out(again: Callable[..., AskTell], state: Mapping[str, Any], closed: 
 
 @contextmanager
 def _searching(search: Search) -> Iterator[_Other]:
-    other = _Other(search)
+    other_search = _Other(search)
     try:
-        yield other
+        yield other_search
     finally:
-        other.close()
+        other_search.close()
 
 
 def _keys(points: Array) -> list[Key]:
@@ -474,7 +485,7 @@ def _told(state: object, about: Mapping[str, Any], domain: Box) -> tuple[list[tu
         raise InputError(path="state.points", expected="a list of points, and a value for each", got=_short(points))
     if not isinstance(aside, list) or not all(is_whole(number, 0) and number < len(points) for number in aside):
         raise InputError(path="state.aside", expected="numbers of points", got=_short(aside))
-    told = []
+    evaluations = []
     for row, (point, value) in enumerate(zip(points, values, strict=True)):
         try:
             position = np.array(point, dtype=float)
@@ -483,9 +494,9 @@ def _told(state: object, about: Mapping[str, Any], domain: Box) -> tuple[list[tu
             raise InputError(path=f"state.values.{row}", expected="a point and a number", got=_short(value)) from None
         if position.shape != domain.lower.shape or not ((position >= domain.lower) & (position <= domain.upper)).all():
             raise InputError(path=f"state.points.{row}", expected="a point of the domain", got=_short(point))
-        told.append((position, number))
+        evaluations.append((position, number))
     same = state.get("budget") == about["budget"]
-    return told, [number for number in range(len(told)) if number not in set(aside)] if same else []
+    return evaluations, [number for number in range(len(evaluations)) if number not in set(aside)] if same else []
 
 
 def _out(state: Mapping[str, Any], domain: Box) -> tuple[list[Key], list[Key]]:

@@ -48,19 +48,19 @@ def block_ascent(objective: Objective, start: Array | None = None) -> bool:
     if linear is None or (start is None and not np.isfinite(objective.best_value)):
         return False
     idle = IdleBlocks(objective.domain, objective.block, linear)
-    best, still, tried = objective.best_point if start is None else start, 0, 0.0
+    best, stalls, tried = objective.best_point if start is None else start, 0, 0.0
     value = float(objective.evaluate(best[np.newaxis])[0])
     if not np.isfinite(value):
         return False
-    while still < PATIENCE or tried < 2.0 * OCTAVES:
+    while stalls < PATIENCE or tried < 2.0 * OCTAVES:
         acts = linear.acting()
         objective.note(acting=float(acts.sum()))
         trial = linear.steepest(idle.placed(best, acts))
-        reached = float(objective.evaluate(trial[np.newaxis])[0])
-        gained = reached > value + GAIN * abs(value)
-        still, tried = (0, 0.0) if gained else (still + 1, tried + idle.neighbours(acts))
-        if reached >= value:
-            best, value = trial, reached
+        trial_value = float(objective.evaluate(trial[np.newaxis])[0])
+        is_better = trial_value > value + GAIN * abs(value)
+        stalls, tried = (0, 0.0) if is_better else (stalls + 1, tried + idle.neighbours(acts))
+        if trial_value >= value:
+            best, value = trial, trial_value
         else:  # lower by rounding only: restore the inner solution of the last point
             objective.evaluate(best[np.newaxis])
     return bool(np.isfinite(tried))
@@ -92,8 +92,8 @@ class IdleBlocks:
         """Return the number of neighbours that one step tries for each acting block in each coordinate; ``inf`` where
         none can be."""
         directions = acts.sum() * self.others.size
-        beside = (acts.size - acts.sum() + 1) // 2
-        return float(beside / directions) if beside and directions else np.inf
+        near_count = (acts.size - acts.sum() + 1) // 2
+        return float(near_count / directions) if near_count and directions else np.inf
 
     def placed(self, point: Array, acts: np.ndarray) -> Array:
         """Return a point with its idle blocks moved, near the acting blocks and over the box.
@@ -114,22 +114,24 @@ class IdleBlocks:
         idle, acting = np.flatnonzero(~acts), np.flatnonzero(acts)
         if not self.others.size:
             return point
-        beside = idle[: (idle.size + 1) // 2] if acting.size else idle[:0]
-        spread = idle[beside.size :]
-        if beside.size:
-            number = self.beside + np.arange(beside.size)
+        near_blocks = idle[: (idle.size + 1) // 2] if acting.size else idle[:0]
+        spread_blocks = idle[near_blocks.size :]
+        if near_blocks.size:
+            number = self.beside + np.arange(near_blocks.size)
             turn, owner = np.divmod(number, acting.size)
             pair, axis = np.divmod(turn, self.others.size)
             octave = 1.0 + (OCTAVES - 1.0) * np.mod(pair * GOLDEN, 1.0)
-            blocks[beside], axes = blocks[acting[owner]], self.others[axis]
-            blocks[beside, axes] += np.where(pair % 2, 1.0, -1.0) * (upper - lower)[beside, axes] * 2.0**-octave
-        number = self.spread + np.arange(spread.size)
-        where = np.ix_(spread, self.others)
+            blocks[near_blocks], axes = blocks[acting[owner]], self.others[axis]
+            blocks[near_blocks, axes] += (
+                np.where(pair % 2, 1.0, -1.0) * (upper - lower)[near_blocks, axes] * 2.0**-octave
+            )
+        number = self.spread + np.arange(spread_blocks.size)
+        grid = np.ix_(spread_blocks, self.others)
         shares = np.mod(0.5 + np.outer(number, self.shares), 1.0)
         if self.faces:
             shares[::2] = np.clip(2.0 * shares[::2] - 0.5, 0.0, 1.0)
-        blocks[where] = lower[where] + shares * (upper - lower)[where]
-        self.beside, self.spread = self.beside + beside.size, self.spread + spread.size
+        blocks[grid] = lower[grid] + shares * (upper - lower)[grid]
+        self.beside, self.spread = self.beside + near_blocks.size, self.spread + spread_blocks.size
         return np.clip(blocks, lower, upper).ravel()
 
 

@@ -44,10 +44,10 @@ class FromAskTell(Maximiser):
             first = True
             while objective.remaining and (first or not stop()):
                 first = False
-                asked = optimiser.ask()
-                points = np.array(self.read(asked), dtype=float)
+                query = optimiser.ask()
+                points = np.array(self.read(query), dtype=float)
                 losses = unit.losses(np.atleast_2d(points))
-                optimiser.tell(asked, losses.tolist() if points.ndim == 2 else float(losses[0]))
+                optimiser.tell(query, losses.tolist() if points.ndim == 2 else float(losses[0]))
         return float("inf")
 
 

@@ -175,11 +175,11 @@ class Moving(Handed):
 
     def full(self, points: Array) -> Array:
         """Return points ``(k, d)`` with the fixed coordinates filled in; raise `PluginError` for a wrong shape."""
-        moved = np.asarray(points, dtype=float)
-        if moved.ndim != 2 or moved.shape[1] != self._moves.size:
-            raise PluginError(f"{self._asker}: points: expected shape (k, {self._moves.size}), got {moved.shape}")
-        full = np.repeat(self._fixed[np.newaxis], len(moved), axis=0)
-        full[:, self._moves] = moved
+        free_points = np.asarray(points, dtype=float)
+        if free_points.ndim != 2 or free_points.shape[1] != self._moves.size:
+            raise PluginError(f"{self._asker}: points: expected shape (k, {self._moves.size}), got {free_points.shape}")
+        full = np.repeat(self._fixed[np.newaxis], len(free_points), axis=0)
+        full[:, self._moves] = free_points
         return full
 
     def own(self, points: Array) -> Array:
@@ -277,13 +277,13 @@ class Apart(Handed):
     def __init__(self, objective: Objective) -> None:
         super().__init__(objective)
         self.domain, self.block = objective.domain, objective.block
-        count, rest = self.domain.dimension // self.block, self.block - 1
+        count, other_count = self.domain.dimension // self.block, self.block - 1
         root = 2.0
         for _ in range(60):
-            root = (1.0 + root) ** (1.0 / (rest + 1.0))
+            root = (1.0 + root) ** (1.0 / (other_count + 1.0))
         numbers = np.arange(count)[:, np.newaxis]
-        others = 0.5 + (numbers - (count - 1) / 2.0) * root ** -np.arange(1.0, rest + 1.0)
-        places = np.hstack([(numbers + 0.5) / count, others]).ravel()
+        other_places = 0.5 + (numbers - (count - 1) / 2.0) * root ** -np.arange(1.0, other_count + 1.0)
+        places = np.hstack([(numbers + 0.5) / count, other_places]).ravel()
         self._sides = self.domain.upper - self.domain.lower
         self._shift = np.mod(places - 0.5, 1.0) * self._sides
 
@@ -310,9 +310,11 @@ class Apart(Handed):
         self._objective.sketch(role, low, high, rounded)
 
     def _moved(self, points: Array, shift: Array) -> Array:
-        moved = points - self.domain.lower + shift
-        moved = np.where(moved < 0.0, moved + self._sides, np.where(moved > self._sides, moved - self._sides, moved))
-        return np.clip(self.domain.lower + moved, self.domain.lower, self.domain.upper)
+        offsets = points - self.domain.lower + shift
+        offsets = np.where(
+            offsets < 0.0, offsets + self._sides, np.where(offsets > self._sides, offsets - self._sides, offsets)
+        )
+        return np.clip(self.domain.lower + offsets, self.domain.lower, self.domain.upper)
 
 
 def _block(block: int, moves: NDArray[np.intp], dimension: int) -> int:

@@ -49,15 +49,15 @@ def polish(objective: Objective, points: Array, values: Array) -> None:
     if not finite.any():
         return
     order = np.flatnonzero(finite)[np.argsort(-values[finite], kind="stable")][:CONSIDERED]
-    seen = _Seen(objective, points[order], values[order])
+    evaluated_points = _Seen(objective, points[order], values[order])
     if objective.differentiable:
         if objective.acting is not None:
-            _ascend_with_idle_blocks(seen, objective.acting)
-        _ascend(seen)
-    if seen.dimension <= MODELLED:
-        _climb(seen)
+            _ascend_with_idle_blocks(evaluated_points, objective.acting)
+        _ascend(evaluated_points)
+    if evaluated_points.dimension <= MODELLED:
+        _climb(evaluated_points)
     else:
-        _feel(seen)
+        _feel(evaluated_points)
 
 
 class _Seen:
@@ -91,8 +91,8 @@ class _Seen:
     def below(self, start: Array) -> tuple[Array, Array]:
         """Return the points and values that are no better than ``start``, itself included."""
         own = self.value_of(start)
-        kept = self.values <= own
-        return self.points[kept], self.values[kept]
+        is_below = self.values <= own
+        return self.points[is_below], self.values[is_below]
 
     def value_of(self, point: Array) -> float:
         """Return the value of an evaluated point."""
@@ -228,9 +228,9 @@ def _climb(seen: _Seen) -> None:
 
 def _climb_and_cross(seen: _Seen, start: Array) -> None:
     """Climb from a start, then cross the result with the best point as long as that improves it."""
-    found = _climb_from(seen, start)
-    while _cross(seen, found):
-        found = _climb_from(seen, seen.top)
+    end_point = _climb_from(seen, start)
+    while _cross(seen, end_point):
+        end_point = _climb_from(seen, seen.top)
 
 
 def _climb_from(seen: _Seen, start: Array) -> Array:
@@ -256,15 +256,15 @@ def _cross(seen: _Seen, other: Array) -> bool:
 
     Local maxima of a nearly separable function may exchange blocks.
     """
-    crossed = False
+    has_improved = False
     for block in np.unique(seen.blocks):
         best = seen.top
         trial = np.where(seen.blocks == block, other, best)
         if not seen.objective.remaining or np.abs(trial - best).max() < APART:
             continue
         before = float(seen.values.max())
-        crossed = seen.evaluate(trial) > before or crossed
-    return crossed
+        has_improved = seen.evaluate(trial) > before or has_improved
+    return has_improved
 
 
 def _feel(seen: _Seen) -> None:
@@ -278,16 +278,16 @@ def _feel(seen: _Seen) -> None:
     coordinate = 0
     while seen.objective.remaining and steps.max() > 1e-12:
         coordinate = (coordinate + stride) % seen.dimension
-        gained = False
+        is_better = False
         for direction in (steps[coordinate], -steps[coordinate]):
             trial = best.copy()
             trial[coordinate] = min(max(trial[coordinate] + direction, 0.0), 1.0)
-            if gained or trial[coordinate] == best[coordinate] or not seen.objective.remaining:
+            if is_better or trial[coordinate] == best[coordinate] or not seen.objective.remaining:
                 continue
-            reached = seen.evaluate(trial)
-            if reached > value:
-                best, value, gained = trial, reached, True
-        steps[coordinate] = min(0.5, abs(steps[coordinate]) * 2.0) if gained else 0.5 * steps[coordinate]
+            trial_value = seen.evaluate(trial)
+            if trial_value > value:
+                best, value, is_better = trial, trial_value, True
+        steps[coordinate] = min(0.5, abs(steps[coordinate]) * 2.0) if is_better else 0.5 * steps[coordinate]
 
 
 def _stride(dimension: int) -> int:

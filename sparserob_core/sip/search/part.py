@@ -122,17 +122,17 @@ class SearchPart(Handed):
         SearchEnded
             Where the budget of the part is spent, or the whole search has ended.
         """
-        asked = np.array(points, dtype=float)
-        values = np.full(len(asked), np.nan)
+        point_array = np.array(points, dtype=float)
+        values = np.full(len(point_array), np.nan)
         if self._before and self._recalls < self._budget:
-            values[:] = [self._before.get(point.tobytes(), np.nan) for point in asked]
+            values[:] = [self._before.get(point.tobytes(), np.nan) for point in point_array]
             self._recalls += int((~np.isnan(values)).sum())
-        new = np.flatnonzero(np.isnan(values))
-        allowed = new[: self.remaining]
+        unknown = np.flatnonzero(np.isnan(values))
+        allowed = unknown[: self.remaining]
         if allowed.size:
-            values[allowed] = self._objective.evaluate(asked[allowed])
-            self._take(asked[allowed], values[allowed])
-        if allowed.size < new.size:
+            values[allowed] = self._objective.evaluate(point_array[allowed])
+            self._take(point_array[allowed], values[allowed])
+        if allowed.size < unknown.size:
             raise _PartEnded("the budget of the part is spent")
         return values
 

@@ -226,17 +226,17 @@ class CountedObjective:
             raise self.ended
         if self._notifier is not None and self._notifier.due(self.evaluations, self.budget):
             self.notify_observers()
-        asked = self._checked(points)
-        values = self._recalled(asked)
-        new = np.flatnonzero(np.isnan(values))
-        allowed = new[: self.remaining]
+        point_array = self._checked(points)
+        values = self._recalled(point_array)
+        unknown = np.flatnonzero(np.isnan(values))
+        allowed = unknown[: self.remaining]
         while len(allowed):  # in one batch, unless the search may end within it for lack of a gain
             batch = allowed[: self._patient]
-            values[batch] = self._values_at(asked[batch])
-            self._record(asked[batch], values[batch])
+            values[batch] = self._values_at(point_array[batch])
+            self._record(point_array[batch], values[batch])
             allowed = allowed[len(batch) :]
             self._judge()
-        if not len(new):
+        if not len(unknown):
             self._judge()
         if np.isnan(values).any():
             raise self._end(SearchEnded("the budget is spent"))
@@ -288,12 +288,12 @@ class CountedObjective:
         values : ndarray, shape (k,)
             Their values; NaN counts as ``-inf``.
         """
-        known, self.learnt = np.where(np.isnan(values), -np.inf, values), len(values)
-        self._known = self._checked(points), known
-        self._before = dict(zip(map(tuple, self._known[0].tolist()), known.tolist(), strict=True))
+        clean_values, self.learnt = np.where(np.isnan(values), -np.inf, values), len(values)
+        self._known = self._checked(points), clean_values
+        self._before = dict(zip(map(tuple, self._known[0].tolist()), clean_values.tolist(), strict=True))
         self.budget, self.evaluations, self._gained = self.budget + self.learnt, self.learnt, self.learnt
-        top = int(known.argmax())
-        self.best_value, self.best_point = float(known[top]), self._known[0][top].copy()
+        top = int(clean_values.argmax())
+        self.best_value, self.best_point = float(clean_values[top]), self._known[0][top].copy()
         if self._notifier is not None:
             self._notifier.notified = self.learnt
         self._judge()
@@ -401,16 +401,18 @@ class CountedObjective:
         return bool(_of_rule("sc2", lambda: stop(progress)))
 
     def _checked(self, points: Array) -> Array:
-        asked = np.array(points, dtype=float)
-        if asked.ndim != 2 or asked.shape[1] != self.domain.dimension:
-            raise PluginError(f"{self.asker}: points: expected shape (k, {self.domain.dimension}), got {asked.shape}")
-        if not ((asked >= self.domain.lower).all() and (asked <= self.domain.upper).all()):
-            outside = ~((asked >= self.domain.lower) & (asked <= self.domain.upper)).all(axis=1)
+        point_array = np.array(points, dtype=float)
+        if point_array.ndim != 2 or point_array.shape[1] != self.domain.dimension:
             raise PluginError(
-                f"{self.asker}: points: {_shown(asked[outside][0])} lies outside the domain, "
+                f"{self.asker}: points: expected shape (k, {self.domain.dimension}), got {point_array.shape}"
+            )
+        if not ((point_array >= self.domain.lower).all() and (point_array <= self.domain.upper).all()):
+            outside = ~((point_array >= self.domain.lower) & (point_array <= self.domain.upper)).all(axis=1)
+            raise PluginError(
+                f"{self.asker}: points: {_shown(point_array[outside][0])} lies outside the domain, "
                 f"lower {_shown(self.domain.lower)}, upper {_shown(self.domain.upper)}"
             )
-        return asked
+        return point_array
 
     def _end(self, reason: SearchEnded | EvaluationError) -> SearchEnded | EvaluationError:
         self.ended = reason

@@ -52,11 +52,11 @@ def separable_maxima(points: Array, values: Array) -> Iterator[Array]:
         if count < POINTS * knots * dimension:
             continue
         places = points * (knots - 1)
-        left = np.minimum(places.astype(int), knots - 2)
-        share = places - left
+        lower_knots = np.minimum(places.astype(int), knots - 2)
+        share = places - lower_knots
         hats = np.zeros((count, dimension, knots))
         rows, columns = np.arange(count)[:, np.newaxis], np.arange(dimension)
-        hats[rows, columns, left], hats[rows, columns, left + 1] = 1.0 - share, share
+        hats[rows, columns, lower_knots], hats[rows, columns, lower_knots + 1] = 1.0 - share, share
         basis = hats.reshape(count, -1)
         heights = np.linalg.solve(basis.T @ basis + RIDGE * np.eye(basis.shape[1]), basis.T @ scaled)
         yield heights.reshape(dimension, knots).argmax(axis=1) / (knots - 1.0)

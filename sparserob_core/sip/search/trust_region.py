@@ -119,11 +119,11 @@ class TrustRegion:
         """Receive the value at the point that was proposed last, and adapt the radius."""
         if self._spanning:
             return
-        gained = (value - self._best) / self.promise
-        self._failed = not gained >= 0.25
+        ratio = (value - self._best) / self.promise
+        self._failed = not ratio >= 0.25
         if self._failed:
             self.radius = 0.5 * min(self.radius, max(self._length, 0.25 * self.radius))
-        elif gained > 0.75:
+        elif ratio > 0.75:
             self.radius = max(self.radius, min(LARGEST, 2.0 * self._length))
 
 
@@ -133,15 +133,15 @@ def _neighbours(points: Array, values: Array, top: int) -> tuple[Array, Array, A
     offsets = points - points[top]
     squares = np.einsum("ij,ij->i", offsets, offsets)
     coefficients = dimension * (dimension + 3) // 2
-    wanted = 1 + min(int(SURPLUS * coefficients), max(POINTS, 2 * dimension))
-    near = np.argpartition(squares, wanted - 1)[:wanted] if len(points) > wanted else np.arange(len(points))
-    near = near[np.argsort(squares[near], kind="stable")]
-    near = near[squares[near] > 0.0]
-    rises = values[near] - values[top]
+    count = 1 + min(int(SURPLUS * coefficients), max(POINTS, 2 * dimension))
+    nearest = np.argpartition(squares, count - 1)[:count] if len(points) > count else np.arange(len(points))
+    nearest = nearest[np.argsort(squares[nearest], kind="stable")]
+    nearest = nearest[squares[nearest] > 0.0]
+    rises = values[nearest] - values[top]
     finite = np.isfinite(rises)
     return (
-        offsets[near],
-        np.sqrt(squares[near]),
+        offsets[nearest],
+        np.sqrt(squares[nearest]),
         np.where(finite, rises, rises[finite].min(initial=-np.finfo(float).tiny)),
     )
 
@@ -168,14 +168,14 @@ def _fit(offsets: Array, distances: Array, rises: Array, radius: float) -> _Quad
 def _missing_direction(offsets: Array, distances: Array, radius: float, lower: Array, upper: Array) -> Array | None:
     """Return a step of length ``radius`` in the direction that the near points span least; ``None`` where they span the
     space."""
-    near = offsets[distances <= 5.0 * radius] / radius
-    if not len(near):
-        near = np.zeros((1, lower.size))
-    _, singular, right = np.linalg.svd(near, full_matrices=True)
+    near_offsets = offsets[distances <= 5.0 * radius] / radius
+    if not len(near_offsets):
+        near_offsets = np.zeros((1, lower.size))
+    _, singular, right = np.linalg.svd(near_offsets, full_matrices=True)
     if singular.size == lower.size and singular[-1] > 0.1:
         return None
-    along, against = (np.clip(sign * radius * right[-1], lower, upper) for sign in (1.0, -1.0))
-    return np.asarray(along if np.abs(along).max() >= np.abs(against).max() else against)
+    forward, backward = (np.clip(sign * radius * right[-1], lower, upper) for sign in (1.0, -1.0))
+    return np.asarray(forward if np.abs(forward).max() >= np.abs(backward).max() else backward)
 
 
 def highest_in_ball_and_box(gradient: Array, hessian: Array, radius: float, lower: Array, upper: Array) -> Array:
@@ -203,18 +203,18 @@ def highest_in_ball_and_box(gradient: Array, hessian: Array, radius: float, lowe
     step = np.zeros(gradient.size)
     free = ~(((lower >= 0.0) & (gradient < 0.0)) | ((upper <= 0.0) & (gradient > 0.0)))
     while free.any():
-        room = float(np.sqrt(max(radius**2 - float(step @ step), 0.0)))
-        if room == 0.0:
+        remaining_radius = float(np.sqrt(max(radius**2 - float(step @ step), 0.0)))
+        if remaining_radius == 0.0:
             break
         slope = gradient[free] + hessian[np.ix_(free, ~free)] @ step[~free]
-        inner = highest_in_ball(slope, hessian[np.ix_(free, free)], room)
+        inner = highest_in_ball(slope, hessian[np.ix_(free, free)], remaining_radius)
         clipped = np.clip(inner, lower[free], upper[free])
         outside = clipped != inner
         step[free] = np.where(outside, clipped, 0.0) if outside.any() else inner
         if not outside.any():
             return step
-        where = np.flatnonzero(free)
-        free[where[outside]] = False
+        free_indices = np.flatnonzero(free)
+        free[free_indices[outside]] = False
     return step
 
 

@@ -152,10 +152,10 @@ def completed(program: SemiInfiniteProgram, entries: Array) -> Array:
     if program.n == size:
         return entries
     assert base.S is not None
-    rows, rest = base.lower - base.S[:, :size] @ entries, base.S[:, size:].tocoo()
-    found = np.zeros(program.n - size)
-    np.maximum.at(found, rest.col, rows[rest.row] / rest.data)
-    return np.concatenate([entries, found])
+    rows, other_columns = base.lower - base.S[:, :size] @ entries, base.S[:, size:].tocoo()
+    other_entries = np.zeros(program.n - size)
+    np.maximum.at(other_entries, other_columns.col, rows[other_columns.row] / other_columns.data)
+    return np.concatenate([entries, other_entries])
 
 
 def count(program: SemiInfiniteProgram, x: Array) -> float:
@@ -178,20 +178,20 @@ def together(program: SemiInfiniteProgram) -> Array:
 
 def vectors(program: SemiInfiniteProgram) -> np.ndarray:
     """Return for each image ``(k,)`` the number of the first image of its vector, with which it counts."""
-    alone, blocks = np.arange(program.finite.weights.size), program.finite.blocks
+    numbers, blocks = np.arange(program.finite.weights.size), program.finite.blocks
     if blocks is None:
-        return alone
+        return numbers
     first = np.full(int(blocks.number.max(initial=-1)) + 1, -1)
     first[blocks.number[blocks.first]] = blocks.first
-    return np.asarray(np.where(blocks.number >= 0, first[blocks.number], alone))
+    return np.asarray(np.where(blocks.number >= 0, first[blocks.number], numbers))
 
 
 def share_of(program: SemiInfiniteProgram, counted: float) -> float:
     """Return a count as a share of the largest count."""
     prices = together(program)
     prices = prices[prices > 0.0]
-    one = _one(prices)
-    return float(np.rint(counted / one) / prices.size if one else counted / math.fsum(prices))
+    price = _one(prices)
+    return float(np.rint(counted / price) / prices.size if price else counted / math.fsum(prices))
 
 
 def whole(program: SemiInfiniteProgram, least: float) -> float:
@@ -210,10 +210,10 @@ def whole(program: SemiInfiniteProgram, least: float) -> float:
         A multiple of the price, not more than the largest count; ``least`` itself, at least 0, where prices differ.
     """
     prices = together(program)
-    one = _one(prices[prices > 0.0])
-    if not one:
+    price = _one(prices[prices > 0.0])
+    if not price:
         return max(0.0, least)
-    return float(min(np.count_nonzero(prices), max(0.0, np.ceil(least / one - MISSED)))) * one
+    return float(min(np.count_nonzero(prices), max(0.0, np.ceil(least / price - MISSED)))) * price
 
 
 def _one(prices: Array) -> float:
@@ -228,28 +228,28 @@ def tidied(program: SemiInfiniteProgram, x: Array) -> Array:
     returned. The new decision may violate constraints, which must be checked again.
     """
     base, prices = program.finite, prices_of(program)
-    reach = np.maximum(np.abs(base.lower), np.abs(base.upper))
+    radii = np.maximum(np.abs(base.lower), np.abs(base.upper))
     image = base.image(x)
-    near = np.isfinite(reach) & (prices > 0.0) & (np.abs(image) <= DUST * reach)
-    near &= (base.lower <= 0.0) & (base.upper >= 0.0)
-    if not (near & (image != 0.0)).any():
+    is_small = np.isfinite(radii) & (prices > 0.0) & (np.abs(image) <= DUST * radii)
+    is_small &= (base.lower <= 0.0) & (base.upper >= 0.0)
+    if not (is_small & (image != 0.0)).any():
         return x
-    if (np.abs(image) <= DUST * reach).all():
+    if (np.abs(image) <= DUST * radii).all():
         return np.zeros_like(x)  # least squares would leave rounding errors, and a cost that is not exactly 0
     if base.S is None:
-        return np.where(near, 0.0, x)
+        return np.where(is_small, 0.0, x)
     if x.size > LARGE:
         return x
     with np.errstate(invalid="ignore"):
-        targets = np.where(near, 0.0, np.where(image > 0.0, base.upper, base.lower))
-        still = near | (np.isfinite(targets) & (np.abs(image - targets) <= DUST * np.abs(targets)))
-    rows = base.S[np.flatnonzero(still)].toarray()
-    alone = np.count_nonzero(rows, axis=1) == 1  # images of one entry, which are 0 exactly where the entry is 0
-    moved, free = x.copy(), np.ones(x.size, dtype=bool)
-    free[np.abs(rows[alone & near[still]]).argmax(axis=1)] = False
-    moved[~free] = 0.0
-    moved[free] += np.linalg.lstsq(rows[:, free], targets[still] - rows @ moved, rcond=None)[0]
-    return moved if count(program, moved) < count(program, x) else x
+        targets = np.where(is_small, 0.0, np.where(image > 0.0, base.upper, base.lower))
+        is_fixed = is_small | (np.isfinite(targets) & (np.abs(image - targets) <= DUST * np.abs(targets)))
+    rows = base.S[np.flatnonzero(is_fixed)].toarray()
+    is_single = np.count_nonzero(rows, axis=1) == 1  # images of one entry, which are 0 exactly where the entry is 0
+    candidate, is_free = x.copy(), np.ones(x.size, dtype=bool)
+    is_free[np.abs(rows[is_single & is_small[is_fixed]]).argmax(axis=1)] = False
+    candidate[~is_free] = 0.0
+    candidate[is_free] += np.linalg.lstsq(rows[:, is_free], targets[is_fixed] - rows @ candidate, rcond=None)[0]
+    return candidate if count(program, candidate) < count(program, x) else x
 
 
 def met(program: SemiInfiniteProgram, x: Array, G: Array, h: Array) -> Array:
@@ -278,23 +278,23 @@ def met(program: SemiInfiniteProgram, x: Array, G: Array, h: Array) -> Array:
     base = program.finite
     if not base.b.size + h.size or (base.S is not None and x.size > LARGE):
         return x
-    reach = np.where(np.isfinite(base.upper - base.lower), base.upper - base.lower, 1.0)
-    image, free, kept = base.image(x), np.ones(x.size, dtype=bool), np.zeros((0, x.size))
-    ends = (image <= base.lower + DUST * reach) | (image >= base.upper - DUST * reach)
+    widths = np.where(np.isfinite(base.upper - base.lower), base.upper - base.lower, 1.0)
+    image, is_free, kept_rows = base.image(x), np.ones(x.size, dtype=bool), np.zeros((0, x.size))
+    is_at_bound = (image <= base.lower + DUST * widths) | (image >= base.upper - DUST * widths)
     if base.S is None:
-        free = (np.abs(x) > DUST * reach) & ~ends
+        is_free = (np.abs(x) > DUST * widths) & ~is_at_bound
     else:
-        still = ends | ((image == 0.0) & (prices_of(program) > 0.0))
-        rows = base.S[np.flatnonzero(still)].toarray()
-        alone = np.count_nonzero(rows, axis=1) == 1
-        free[np.abs(rows[alone]).argmax(axis=1)], kept = False, rows[~alone]
-    columns, moved = np.vstack([base.A, G, kept])[:, free], x.copy()
+        is_fixed = is_at_bound | ((image == 0.0) & (prices_of(program) > 0.0))
+        rows = base.S[np.flatnonzero(is_fixed)].toarray()
+        is_single = np.count_nonzero(rows, axis=1) == 1
+        is_free[np.abs(rows[is_single]).argmax(axis=1)], kept_rows = False, rows[~is_single]
+    columns, decision = np.vstack([base.A, G, kept_rows])[:, is_free], x.copy()
     sizes = np.linalg.norm(columns, axis=1)
     sizes = np.where(sizes > 0.0, sizes, 1.0)[:, None]
     for _ in range(REFINED):
-        missed = np.concatenate([base.excess(moved), G @ moved - h, kept @ (moved - x)])
-        moved[free] -= np.linalg.lstsq(columns / sizes, missed / sizes[:, 0], rcond=None)[0]
-    return moved
+        residuals = np.concatenate([base.excess(decision), G @ decision - h, kept_rows @ (decision - x)])
+        decision[is_free] -= np.linalg.lstsq(columns / sizes, residuals / sizes[:, 0], rcond=None)[0]
+    return decision
 
 
 REFINED = 3

@@ -192,7 +192,7 @@ class Ledger:
             seconds=time.perf_counter() - self.started,
             cost=self.program.cost(x),
             decision=frozen(x),
-            separations={family.name: one for family, one in found},
+            separations={family.name: separation for family, separation in found},
             imposed=answer.rows.cuts,
             multipliers=frozen(answer.multipliers),
             added=added,
@@ -230,7 +230,7 @@ class Ledger:
         if len(proofs) != len(self.program.families) or any(proof.verdict != "proven" for proof in proofs):
             return False
         x = answer.solution.x
-        if any(missed > most for _, missed, most in self._fixed(x, strictly=True)):
+        if any(excess > limit for _, excess, limit in self._fixed(x, strictly=True)):
             return False
         errors = self._errors(x)
         if errors is not None and not errors.kept:
@@ -265,9 +265,9 @@ class Ledger:
         """
         x, deadline = answer.solution.x, self.tools.deadline
         status, message = verdict(proofs, self._resolved_gap(x), self.tolerance)
-        for what, missed, most in self._fixed(x, strictly=status in ("certified", "verified")):
-            if missed > most:
-                status, message = "failed", f"the decision misses {what} by {missed:.1e} of what they compare; {ADVICE}"
+        for name, excess, limit in self._fixed(x, strictly=status in ("certified", "verified")):
+            if excess > limit:
+                status, message = "failed", f"the decision misses {name} by {excess:.1e} of what they compare; {ADVICE}"
         errors = self._errors(x) if status in ("certified", "verified") else None
         if errors is not None and not errors.kept:
             status, message = "undecided", errors.advice
@@ -314,8 +314,8 @@ class Ledger:
         """
         reason = self.tools.deadline.interrupt(error)
         if self.proven is not None:
-            answer, found, proofs = self.proven
-            return self.judged(answer, worst_of(found), proofs, reason)
+            answer, separations, proofs = self.proven
+            return self.judged(answer, worst_of(separations), proofs, reason)
         if self.best is None:
             return Result(
                 status="undecided",
@@ -331,8 +331,8 @@ class Ledger:
             with self.tools.deadline.enforced():
                 proven = prover(self.best.solution.x)
         except KeyboardInterrupt:
-            said = MEANING["undecided"]
-            proven = [Proof(family.name, "undecided", np.inf, reason=said) for family in self.program.families]
+            meaning = MEANING["undecided"]
+            proven = [Proof(family.name, "undecided", np.inf, reason=meaning) for family in self.program.families]
         proofs = as_bad_as_found(proven, self._found)
         return self.judged(self.best, worst_of(self._found), proofs, reason)
 
@@ -348,9 +348,9 @@ class Ledger:
 
         rows, solution = irreducible(self.relaxed, answer.rows, solution)
         answer = replace(answer, rows=rows, solution=solution)
-        found, worst = infeasible_subsystem(self.relaxed.program, rows, solution.y, solution.infeasibility)
+        subsystem, worst = infeasible_subsystem(self.relaxed.program, rows, solution.y, solution.infeasibility)
         self.dual = self.relaxed.dual(rows, solution.y, solution.mu, solution.z, solution.infeasibility, priced=False)
-        return replace(self.result("infeasible", found.sentence(), answer, worst), infeasible=found)
+        return replace(self.result("infeasible", subsystem.sentence(), answer, worst), infeasible=subsystem)
 
     def salvaged(self, failed: Result) -> Result:
         """Return the result of the proven decision in place of one that ``failed``, with the reason of the failure.
@@ -359,8 +359,8 @@ class Ledger:
         """
         if failed.status != "failed" or self.proven is None:
             return failed
-        answer, found, proofs = self.proven
-        return self.judged(answer, worst_of(found), proofs, failed.message)
+        answer, separations, proofs = self.proven
+        return self.judged(answer, worst_of(separations), proofs, failed.message)
 
     def result(self, status: Status, message: str, answer: Answer, worst: WorstConstraint | None = None) -> Result:
         """Return a result with this answer, whose bounds are claimed as far as the status allows.
@@ -416,9 +416,11 @@ class Ledger:
 
 def _change(before: Sequence[Cut], now: Sequence[Cut]) -> tuple[tuple[Cut, ...], tuple[Cut, ...]]:
     """Return the constraints that were added and those that were dropped."""
-    old, new = ({(cut.family, cut.index.tobytes(), cut.row): cut for cut in cuts} for cuts in (before, now))
-    return tuple(cut for key, cut in new.items() if key not in old), tuple(
-        cut for key, cut in old.items() if key not in new
+    cuts_before, cuts_now = (
+        {(cut.family, cut.index.tobytes(), cut.row): cut for cut in cuts} for cuts in (before, now)
+    )
+    return tuple(cut for key, cut in cuts_now.items() if key not in cuts_before), tuple(
+        cut for key, cut in cuts_before.items() if key not in cuts_now
     )
 
 
@@ -458,8 +460,8 @@ def alarm(program: SemiInfiniteProgram, dual: Dual, x: Array) -> str:
     allowed = ROUNDING * base.magnitude(x)
     allowed += sum(cut.multiplier * TOLERANCE for cut in dual.cuts)
     if dual.z is not None and base.S is not None:
-        missed, rounding = _missed(base, x)
-        allowed += float(np.abs(dual.z) @ np.minimum(missed, TOLERANCE * _units(base.lower, base.upper) + rounding))
+        violations, rounding = _missed(base, x)
+        allowed += float(np.abs(dual.z) @ np.minimum(violations, TOLERANCE * _units(base.lower, base.upper) + rounding))
     if dual.mu.size:
         allowed += float(np.abs(dual.mu) @ np.abs(base.A @ x - base.b))
     if dual.fixed.size:
@@ -483,9 +485,9 @@ def _missed(base: FiniteProgram, x: Array) -> tuple[Array, Array]:
 
 def _beyond(program: SemiInfiniteProgram, x: Array) -> float:
     """Return the largest violation of a bound by the image of ``x (n,)``, in the bound's own unit, less rounding."""
-    missed, rounding = _missed(program.finite, x)
+    violations, rounding = _missed(program.finite, x)
     units = _units(program.finite.lower, program.finite.upper)
-    shares = np.maximum(missed - rounding, 0.0) / np.where(units > 0.0, units, 1.0)
+    shares = np.maximum(violations - rounding, 0.0) / np.where(units > 0.0, units, 1.0)
     return float(shares.max(initial=0.0))
 
 

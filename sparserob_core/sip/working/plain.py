@@ -139,10 +139,10 @@ class PlainRows(Working):
             candidate = self._solve(ledger, lighter)
             if not usable(candidate):
                 break
-            before, after = ledger.program.cost(solution.x), ledger.program.cost(candidate.x)
+            cost_before, cost_after = ledger.program.cost(solution.x), ledger.program.cost(candidate.x)
             self.epsilon, solution = lighter, candidate
-            settled = abs(after - before) <= regu.tolerance * max(1.0, abs(ledger.lower))
-            if settled and self.exact and ledger.open(solution.x):
+            has_converged = abs(cost_after - cost_before) <= regu.tolerance * max(1.0, abs(ledger.lower))
+            if has_converged and self.exact and ledger.open(solution.x):
                 self._plain(ledger)
         return Answer(solution, self.rows, self.epsilon, solution.value)
 
@@ -185,15 +185,15 @@ class PlainRows(Working):
         fresh = self._unknown(violated)
         if not fresh.h.size:
             return 0
-        known, added = answer.multipliers, np.zeros(fresh.h.size)
-        y = np.concatenate([known, np.zeros(self.rows.h.size - known.size)])  # zeros for rows imposed since
+        multipliers, zeros = answer.multipliers, np.zeros(fresh.h.size)
+        y = np.concatenate([multipliers, np.zeros(self.rows.h.size - multipliers.size)])  # zeros for rows imposed since
         idle = np.where(y > 0.0, 0, self.idle + 1)
         keep = (idle < IDLE_ROUNDS) | (number > DROPPING_ROUNDS) | (not self.sheds)
         self.rows = self.rows.take(keep).joined(fresh)
-        self.idle = np.concatenate([idle[keep], added.astype(int)])
-        fixed = answer.solution.y[: answer.solution.y.size - known.size]
-        self.guess = replace(answer.solution, y=np.concatenate([fixed, y[keep], added]))
-        return added.size
+        self.idle = np.concatenate([idle[keep], zeros.astype(int)])
+        fixed = answer.solution.y[: answer.solution.y.size - multipliers.size]
+        self.guess = replace(answer.solution, y=np.concatenate([fixed, y[keep], zeros]))
+        return zeros.size
 
     def impose(self, violated: Violated) -> int:
         """Impose rows that no answer contains yet; return the number of new rows."""
@@ -209,13 +209,14 @@ class PlainRows(Working):
 
     def _unknown(self, violated: Violated) -> Rows:
         """Return the rows of violated constraints that are not imposed."""
-        known, fresh = {(cut.family, cut.row, cut.index.tobytes()) for cut in self.rows.cuts}, Rows.none(self.program.n)
+        keys, fresh = {(cut.family, cut.row, cut.index.tobytes()) for cut in self.rows.cuts}, Rows.none(self.program.n)
         for indices, rows, family in violated:
-            new = np.array(
-                [(family, int(r), i.tobytes()) not in known for i, r in zip(indices, rows, strict=True)], dtype=bool
+            is_new = np.array(
+                [(family, int(r), i.tobytes()) not in keys for i, r in zip(indices, rows, strict=True)],
+                dtype=bool,
             )
-            if new.any():
-                fresh = fresh.joined(rows_at(self.program, family, indices[new], rows[new]))
+            if is_new.any():
+                fresh = fresh.joined(rows_at(self.program, family, indices[is_new], rows[is_new]))
         return fresh
 
     def priced(self, answer: Answer) -> float:
@@ -230,8 +231,8 @@ class PlainRows(Working):
     @property
     def unit(self) -> float:
         """Unit of margins: the largest bound of the decision, and at most 1."""
-        reach = np.maximum(np.abs(self.program.finite.lower), np.abs(self.program.finite.upper))
-        return min(1.0, float(np.where(np.isfinite(reach), reach, 1.0).max()))
+        radii = np.maximum(np.abs(self.program.finite.lower), np.abs(self.program.finite.upper))
+        return min(1.0, float(np.where(np.isfinite(radii), radii, 1.0).max()))
 
     def distance(self, missed: Missed) -> float:
         """Return the distance by which a violated row has to be moved along its normal."""
@@ -274,28 +275,30 @@ class PlainRows(Working):
         program, x = self.program, answer.solution.x
         if program.activity is None or (number > SPARSIFYING and answer.epsilon == 0.0):
             return answer, found, ()
-        held, closed = answer.rows.G[answer.multipliers > 0.0], not ledger.open(x)
-        candidates = [met(program, tidied(program, x), held, held @ x)]  # small entries may keep the gap open
+        active, closed = answer.rows.G[answer.multipliers > 0.0], not ledger.open(x)
+        candidates = [met(program, tidied(program, x), active, active @ x)]  # small entries may keep the gap open
         if closed and answer.epsilon == 0.0 and program.finite.P is None and program.blocks is None:
             rows = answer.rows
-            plain = ledger.relaxed.finite(rows.G, rows.h - self.margin * rows.norms, 0.0)
-            corner = vertex(plain, answer.solution.y, answer.solution.mu)
-            candidates += [] if corner is None else [met(program, tidied(program, corner), held, held @ corner)]
+            finite = ledger.relaxed.finite(rows.G, rows.h - self.margin * rows.norms, 0.0)
+            corner = vertex(finite, answer.solution.y, answer.solution.mu)
+            candidates += [] if corner is None else [met(program, tidied(program, corner), active, active @ corner)]
         kept, violated, least = (answer, found), list[tuple[Array, np.ndarray, str]](), count(program, x)
-        for other in candidates:
-            if other is x or count(program, other) >= least or not fits(ledger, other):
+        for candidate in candidates:
+            if candidate is x or count(program, candidate) >= least or not fits(ledger, candidate):
                 continue
-            looked = separate(program, other, ledger.tools, ALLOWED, number)
-            beyond = [one for family, separation in looked if (one := above(family, separation))[1].size]
+            separations = separate(program, candidate, ledger.tools, ALLOWED, number)
+            violations = [
+                constraints for family, separation in separations if (constraints := above(family, separation))[1].size
+            ]
             room = 0.5 * min(0.0, worst_of(found).violation)
-            if self.allowed and worst_of(looked).violation > room:
+            if self.allowed and worst_of(separations).violation > room:
                 continue  # a proof needs a margin, which the answer has and this candidate lacks
-            if not beyond:
-                value = program.cost(other) if answer.epsilon == 0.0 else answer.value
-                kept = replace(answer, solution=replace(answer.solution, x=other), value=value), looked
-                violated, least = [], count(program, other)
+            if not violations:
+                value = program.cost(candidate) if answer.epsilon == 0.0 else answer.value
+                kept = replace(answer, solution=replace(answer.solution, x=candidate), value=value), separations
+                violated, least = [], count(program, candidate)
             elif answer.epsilon == 0.0:
-                violated = beyond
+                violated = violations
         return *kept, violated
 
 

@@ -112,9 +112,9 @@ class RobustRows(Working):
             The working set.
         """
         assert program.spread is not None
-        central, asked = Interior(program.finite, program.spread), ledger.relaxed.counted
+        central, solver = Interior(program.finite, program.spread), ledger.relaxed.counted
         working = RobustRows(program, counterpart=central, close=close, tolerance=ledger.tolerance)
-        working.asked = None if asked.instead is None else asked
+        working.asked = None if solver.instead is None else solver
         if working.asked is not None or program.guide is not None or not central.many:
             working.by_simplex()
         for family in program.families:
@@ -129,9 +129,9 @@ class RobustRows(Working):
         """Continue with the simplex method, which solves every counterpart, or with the named solver."""
         if isinstance(self.counterpart, Counterpart):
             return
-        known = self.counterpart.blocks
+        blocks = self.counterpart.blocks
         self.counterpart = Counterpart(self.program.finite, self.counterpart.spread, asked=self.asked)
-        for block in known:
+        for block in blocks:
             self.counterpart.add(block)
 
     def solve(self, margin: float, accuracy: float, seconds: float = np.inf) -> RobustAnswer:
@@ -169,21 +169,21 @@ class RobustRows(Working):
         self._guide(ledger)
         program = self.program
         size = program.largest_cost if ledger.best is None else size_of(program, ledger.best)
-        while not (found := self.solve(self.margin, self.accuracy * size, left(ledger.tools))).solved:
+        while not (solution := self.solve(self.margin, self.accuracy * size, left(ledger.tools))).solved:
             self._count(ledger)
             if ledger.tools.deadline.passed:
-                if found.x.size:  # the solution was interrupted: its last decision is the best known
-                    ledger.best = ledger.best or self._told(ledger, found)
+                if solution.x.size:  # the solution was interrupted: its last decision is the best known
+                    ledger.best = ledger.best or self._told(ledger, solution)
                 ledger.tools.deadline.check()
             if isinstance(self.counterpart, Interior):
-                refuted = self.refuted(found)
+                refuted = self.refuted(solution)
                 if refuted is not None:
-                    return self._refuted(ledger, found, refuted)
+                    return self._refuted(ledger, solution, refuted)
                 self.by_simplex()
             elif not self.thin():
-                return self._infeasible(ledger, found.said)
+                return self._infeasible(ledger, solution.said)
         self._count(ledger)
-        answer = self._told(ledger, found)
+        answer = self._told(ledger, solution)
         self.price = self.priced(answer)
         self.pay(ledger, answer)
         if self.best.size and ledger.open(answer.solution.x) and (last or not ledger.open(self.best)):
@@ -206,9 +206,9 @@ class RobustRows(Working):
         self.best = self.raw if program.settle is None else program.settle(self.raw)
         imposed = result.history[-1].imposed
         for family in program.families:
-            held = [cut.index for cut in imposed if cut.family == family.name and not cut.row]
-            if not family.defines and held:
-                self.add(family, np.array(held))
+            indices = [cut.index for cut in imposed if cut.family == family.name and not cut.row]
+            if not family.defines and indices:
+                self.add(family, np.array(indices))
         self.impose(self._undefined(self.best, False))
 
     def _undefined(self, x: Array, feasible: bool) -> Violated:
@@ -226,14 +226,16 @@ class RobustRows(Working):
             if not family.defines or family.worst is None:
                 continue
             for share in SHARES:
-                at = share * raw + (1.0 - share) * best
-                separation = family.separated(at)
-                over = family.violations(raw, separation.indices).max(axis=1) > ALLOWED
-                violated.append((separation.indices[over][:CUTS], separation.rows[over][:CUTS], family.name))
+                candidate = share * raw + (1.0 - share) * best
+                separation = family.separated(candidate)
+                is_violated = family.violations(raw, separation.indices).max(axis=1) > ALLOWED
+                violated.append(
+                    (separation.indices[is_violated][:CUTS], separation.rows[is_violated][:CUTS], family.name)
+                )
                 if feasible and program.settle is not None:
-                    at = program.settle(at)
-                    if program.cost(at) < program.cost(self.best):
-                        self.best = at
+                    candidate = program.settle(candidate)
+                    if program.cost(candidate) < program.cost(self.best):
+                        self.best = candidate
         return violated
 
     def candidate(self, answer: Answer) -> Answer | None:
@@ -254,11 +256,11 @@ class RobustRows(Working):
         x = answer.solution.x
         if not any(rows.size for _, rows, _ in violated):
             return 0
-        added = self.impose(violated)
+        changes = self.impose(violated)
         if self.program.guide is not None:
-            added += self.impose(self._undefined(x, False))
+            changes += self.impose(self._undefined(x, False))
         worst = max(float(self.program.family(name).violations(x, at).max(initial=0.0)) for at, _, name in violated)
-        return added + self._closer(answer, worst, bool(added)) + self.counterpart.sharpen(x)
+        return changes + self._closer(answer, worst, bool(changes)) + self.counterpart.sharpen(x)
 
     def sharpen(self, ledger: Ledger, answer: Answer) -> bool:
         """Add constraints that the guide does not contain, more accuracy, or the worst deviations; return false where
@@ -283,7 +285,7 @@ class RobustRows(Working):
     def add(self, family: ConstraintFamily, indices: Array) -> int:
         """Impose all rows of a family at indices ``(k, d)``; return the number of new indices."""
         assert family.uncertain is not None
-        added = 0
+        count = 0
         for index in indices:
             key = (family.name, index.tobytes())
             if key in self.known:
@@ -292,8 +294,8 @@ class RobustRows(Working):
             self.known.add(key)
             self.counterpart.add(rows)
             self.cuts += [Cut(family.name, index, row) for row in range(rows.h.size)]
-            added += 1
-        return added
+            count += 1
+        return count
 
     def knows(self, missed: Missed) -> bool:
         """Return whether an index is imposed."""
@@ -320,9 +322,9 @@ class RobustRows(Working):
     def tightened(self, ledger: Ledger, answer: Answer, margin: float) -> Answer | None:
         """Return the optimum of the imposed rows tightened by ``margin``, no more accurate than its margin costs."""
         accuracy = min(self.accuracy, SHARPER * SPARED) * size_of(self.program, answer)
-        found = self.solve(margin, accuracy, left(ledger.tools))
+        solution = self.solve(margin, accuracy, left(ledger.tools))
         self._count(ledger)
-        return self._told(ledger, found) if found.solved else None
+        return self._told(ledger, solution) if solution.solved else None
 
     def _told(self, ledger: Ledger, found: RobustAnswer) -> Answer:
         """Return the decision of a solved counterpart; the bound of its multipliers improves the lower bound."""
@@ -368,19 +370,19 @@ class RobustRows(Working):
             The bound, reduced by its rounding error.
         """
         blocks = self.counterpart.blocks
-        at = answer.at
+        decision = answer.at
         if not priced:
-            at = None
-        elif at is None and (self.program.P is not None or self.program.finite.blocks is not None):
-            at = np.zeros(self.program.n)
+            decision = None
+        elif decision is None and (self.program.P is not None or self.program.finite.blocks is not None):
+            decision = np.zeros(self.program.n)
         named = self.counterpart.spread.named(answer.deviations)
-        bound, size = robust_bound(self.program.finite, blocks, answer.y, named, answer.mu, priced, at)
+        bound, size = robust_bound(self.program.finite, blocks, answer.y, named, answer.mu, priced, decision)
         cuts = tuple(
             replace(cut, index=np.concatenate([cut.index, w]), multiplier=float(y), formulation="literal")
             for cut, y, w in zip(self.cuts, answer.y, named, strict=True)
             if y > 0.0
         )
-        return Dual(bound - (ROUNDING + self.counterpart.spread.lost) * size, cuts, answer.mu, at=at)
+        return Dual(bound - (ROUNDING + self.counterpart.spread.lost) * size, cuts, answer.mu, at=decision)
 
     @property
     def at_rest(self) -> Dual:
@@ -415,8 +417,8 @@ class RobustRows(Working):
         if dual is not None:
             return self._refuted(ledger, elastic, dual)
         x = np.zeros(self.program.n)
-        found = FiniteSolution("failed", x, np.nan, -np.inf, none, none, none, np.inf, np.inf, said)
-        answer = Answer(found, self._rows, 0.0, np.nan)
+        solution = FiniteSolution("failed", x, np.nan, -np.inf, none, none, none, np.inf, np.inf, said)
+        answer = Answer(solution, self._rows, 0.0, np.nan)
         return ledger.result("failed", f"the relaxed program was not solved: {said}", answer)
 
     def _refuted(self, ledger: Ledger, answer: RobustAnswer, dual: Dual) -> Result:
@@ -437,8 +439,8 @@ class RobustRows(Working):
         )
         ledger.dual = dual
         reason, worst = _reason(self.program, dual)
-        found = Answer(solution, self._rows, 0.0, np.inf)
-        return replace(ledger.result("infeasible", reason.sentence(), found, worst), infeasible=reason)
+        final_answer = Answer(solution, self._rows, 0.0, np.inf)
+        return replace(ledger.result("infeasible", reason.sentence(), final_answer, worst), infeasible=reason)
 
     def _count(self, ledger: Ledger) -> None:
         """Record the number of answers in the accounts."""
@@ -460,7 +462,7 @@ class RobustRows(Working):
         The choice is among decisions whose cost is at most the lower bound plus half of the tolerance.
         """
         second, x = self.program.among, answer.solution.x
-        violated = any(above(*one)[1].size for one in found)
+        violated = any(above(*pair)[1].size for pair in found)
         if second is None or second[0].n > MANY or violated or ledger.open(x):
             return answer, found, ()
         if not ledger.prove(answer, found, prover(x, GLANCE)):
@@ -468,10 +470,10 @@ class RobustRows(Working):
         decision = self._preferred(ledger, answer, *second)
         if decision is None or self.program.finite.residual(decision) > TOLERANCE or ledger.open(decision):
             return answer, found, ()
-        looked = separate(self.program, decision, ledger.tools, ALLOWED, number)
-        if any(above(*one)[1].size for one in looked):
+        separations = separate(self.program, decision, ledger.tools, ALLOWED, number)
+        if any(above(*pair)[1].size for pair in separations):
             return answer, found, ()
-        return self._at(answer, decision), looked, ()
+        return self._at(answer, decision), separations, ()
 
     def _preferred(self, ledger: Ledger, answer: Answer, second: SemiInfiniteProgram, shared: int) -> Array | None:
         """Return the optimum of the ``second`` program under the active rows and one more row of the cost.
@@ -480,23 +482,23 @@ class RobustRows(Working):
         """
         program, tools, spread = self.program, replace(ledger.tools, notify=ignore), self.counterpart.spread
         weights = np.append(program.finite.weights[:shared], np.zeros(second.n - shared))
-        most = max(ledger.lower, 0.0) * (1.0 + 0.5 * ledger.tolerance)
-        counterpart = Counterpart(second.finite, spread, ceiling=(weights, most), asked=self.asked)
+        cost_limit = max(ledger.lower, 0.0) * (1.0 + 0.5 * ledger.tolerance)
+        counterpart = Counterpart(second.finite, spread, ceiling=(weights, cost_limit), asked=self.asked)
         working = RobustRows(second, margin=self.margin, counterpart=counterpart, asked=self.asked)
         for family in second.families:
-            held = {cut.index.tobytes(): cut.index for cut in answer.active if cut.family == family.name}
+            active_indices = {cut.index.tobytes(): cut.index for cut in answer.active if cut.family == family.name}
             start = np.zeros((0, family.index_set.dimension)) if family.start is None else family.start
-            working.add(family, np.array(list(held.values())) if held else start)
+            working.add(family, np.array(list(active_indices.values())) if active_indices else start)
         violated: Violated = ()
         for number in range(1, CHOOSING + 1):
             if tools.deadline.passed:
                 return None
-            solved = working.solve(working.margin, 0.0, left(tools))
-            if not solved.solved:
+            solution = working.solve(working.margin, 0.0, left(tools))
+            if not solution.solved:
                 return None
-            x = np.clip(solved.x, second.finite.lower, second.finite.upper)
+            x = np.clip(solution.x, second.finite.lower, second.finite.upper)
             x = x if second.settle is None else second.settle(x)
-            violated = [above(*one) for one in separate(second, x, tools, ALLOWED, number)]
+            violated = [above(*pair) for pair in separate(second, x, tools, ALLOWED, number)]
             if not (working.impose([*violated, *self._violated(second, x)]) or counterpart.sharpen(x)):
                 break
         self.calls += working.calls
@@ -507,14 +509,14 @@ class RobustRows(Working):
 
     def _violated(self, second: SemiInfiniteProgram, x: Array) -> Violated:
         """Return the indices imposed here that a decision of the ``second`` program violates."""
-        found = []
+        violated = []
         for family in second.families:
-            held = {cut.index.tobytes(): cut.index for cut in self.cuts if cut.family == family.name}
-            if held:
-                indices = np.array(list(held.values()))
-                over = family.violations(x, indices).max(axis=1) > ALLOWED
-                found.append((indices[over], np.zeros(int(over.sum()), dtype=int), family.name))
-        return found
+            imposed_indices = {cut.index.tobytes(): cut.index for cut in self.cuts if cut.family == family.name}
+            if imposed_indices:
+                indices = np.array(list(imposed_indices.values()))
+                is_violated = family.violations(x, indices).max(axis=1) > ALLOWED
+                violated.append((indices[is_violated], np.zeros(int(is_violated.sum()), dtype=int), family.name))
+        return violated
 
 
 def left(tools: Tools) -> float:
@@ -525,17 +527,22 @@ def left(tools: Tools) -> float:
 def _reason(program: SemiInfiniteProgram, dual: Dual) -> tuple[InfeasibleSubsystem, WorstConstraint | None]:
     """Return the constraints that cannot hold together, those with the largest multipliers first, and the first of
     them."""
-    units = {family.name: family for family in program.families}
+    families = {family.name: family for family in program.families}
     order = sorted(dual.cuts, key=lambda cut: -cut.multiplier)
-    told = [units[cut.family].explanation(cut.index[: units[cut.family].index_set.dimension], cut.row) for cut in order]
+    explanations = [
+        families[cut.family].explanation(cut.index[: families[cut.family].index_set.dimension], cut.row)
+        for cut in order
+    ]
     first = order[0]
-    bare = WorstConstraint(dual.bound, first.family, first.index[: units[first.family].index_set.dimension], first.row)
-    members = tuple(one.text for one in told[:NAMED])
-    found = InfeasibleSubsystem(
+    bare = WorstConstraint(
+        dual.bound, first.family, first.index[: families[first.family].index_set.dimension], first.row
+    )
+    members = tuple(explanation.text for explanation in explanations[:NAMED])
+    subsystem = InfeasibleSubsystem(
         members=members,
-        others=max(0, len(told) - NAMED),
+        others=max(0, len(explanations) - NAMED),
         equalities=bool(program.finite.b.size),
         decides="policy",
         irreducible=False,
     )
-    return found, explained(program, bare)
+    return subsystem, explained(program, bare)

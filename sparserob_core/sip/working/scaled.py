@@ -34,23 +34,27 @@ def least_slack(program: SemiInfiniteProgram, tools: Tools, accuracy: float = 1e
     assert program.spread is not None
     relaxing = Counterpart(program.finite, program.spread, elastic=True, lowest=-ROOM)
     families = [family for family in program.families if not family.defines and family.uncertain is not None]
-    new = [(family, index) for family in families if family.start is not None for index in family.start]
-    known: set[tuple[str, bytes]] = set()
+    pairs = [(family, index) for family in families if family.start is not None for index in family.start]
+    imposed_keys: set[tuple[str, bytes]] = set()
     for _ in range(SLACKENED):
         tools.deadline.check()
-        fresh = [(family, index) for family, index in new if (family.name, index.tobytes()) not in known]
+        fresh = [(family, index) for family, index in pairs if (family.name, index.tobytes()) not in imposed_keys]
         for family, index in fresh:
             assert family.uncertain is not None
-            known.add((family.name, index.tobytes()))
+            imposed_keys.add((family.name, index.tobytes()))
             relaxing.add(family.uncertain(index))
         answer = relaxing.solve(seconds=left(tools))
         if not answer.solved:
             return np.inf
-        beyond = answer.slack + accuracy
-        found = [(family, family.worst(answer.x)) for family in families if family.worst is not None]
-        new = [(family, index) for family, one in found for index in one.indices[one.violations > beyond]]
-        unknown = any((family.name, index.tobytes()) not in known for family, index in new)
-        if not new or not (relaxing.sharpen(answer.x) or unknown):
+        limit = answer.slack + accuracy
+        separations = [(family, family.worst(answer.x)) for family in families if family.worst is not None]
+        pairs = [
+            (family, index)
+            for family, separation in separations
+            for index in separation.indices[separation.violations > limit]
+        ]
+        unknown = any((family.name, index.tobytes()) not in imposed_keys for family, index in pairs)
+        if not pairs or not (relaxing.sharpen(answer.x) or unknown):
             return answer.slack
     return np.inf
 
@@ -82,16 +86,16 @@ def largest_factor(program: SemiInfiniteProgram, tools: Tools, highest: float, a
         return None
     growing = Counterpart(program.finite, program.spread, scales=True, highest=highest)
     answers = np.zeros(program.n, dtype=bool)
-    known: set[tuple[str, bytes]] = set()
-    new = [(family, index) for family in families if family.start is not None for index in family.start]
+    imposed_keys: set[tuple[str, bytes]] = set()
+    pairs = [(family, index) for family in families if family.start is not None for index in family.start]
     for _ in range(SLACKENED):
         tools.deadline.check()
-        for family, index in new:
+        for family, index in pairs:
             key = (family.name, index.tobytes())
-            if key in known or family.uncertain is None:
+            if key in imposed_keys or family.uncertain is None:
                 continue
             rows = family.uncertain(index)
-            known.add(key)
+            imposed_keys.add(key)
             answers[rows.stacked.indices] = True
             growing.add(rows)
         answer = growing.solve(seconds=left(tools))
@@ -100,9 +104,13 @@ def largest_factor(program: SemiInfiniteProgram, tools: Tools, highest: float, a
             return None
         x = np.where(answers, answer.x / factor, answer.x)
         sharper = growing.sharpen(x)
-        found = [(one, one.scaled(factor).worst) for one in families if one.scaled is not None]
-        worst = [(one, separation(x)) for one, separation in found if separation is not None]
-        new = [(one, index) for one, each in worst for index in each.indices[each.violations > accuracy]]
-        if not sharper and all((one.name, index.tobytes()) in known for one, index in new):
+        oracles = [(family, family.scaled(factor).worst) for family in families if family.scaled is not None]
+        separations = [(family, oracle(x)) for family, oracle in oracles if oracle is not None]
+        pairs = [
+            (family, index)
+            for family, separation in separations
+            for index in separation.indices[separation.violations > accuracy]
+        ]
+        if not sharper and all((family.name, index.tobytes()) in imposed_keys for family, index in pairs):
             return factor
     return None

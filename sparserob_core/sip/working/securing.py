@@ -88,10 +88,10 @@ def proofs_of(
     proofs = prover(x, GLANCE // 4 if ledger.tools.deadline.bounded else GLANCE)
     if ledger.prove(answer, found, proofs) or not proofs:
         return proofs, False
-    missed, imposed = left_open(ledger.program, proofs), False
-    searched = any(above(*one)[1].size for one in found)  # then the rounds are used up, and no more may follow
-    if missed and not searched and not _is_secured(ledger):
-        imposed = _secure(working, ledger, prover, answer, missed, witnesses(ledger.program, proofs))
+    violations, imposed = left_open(ledger.program, proofs), False
+    is_violated = any(above(*pair)[1].size for pair in found)  # then the rounds are used up, and no more may follow
+    if violations and not is_violated and not _is_secured(ledger):
+        imposed = _secure(working, ledger, prover, answer, violations, witnesses(ledger.program, proofs))
     # Without cells, another proof would be the same one.
     if any(proof.cells for proof in proofs) and not any(proof.verdict == "refuted" for proof in proofs):
         proofs = prover(x)
@@ -128,31 +128,31 @@ def secure_in_time(working: Working, ledger: Ledger, prover: Prover, answer: Ans
     """
     if not all(family.provable for family in ledger.program.families):
         return False
-    deadline, began = ledger.tools.deadline, [event.seconds for event in ledger.history]
+    deadline, round_times = ledger.tools.deadline, [event.seconds for event in ledger.history]
     candidate = working.candidate(answer) if number & (number - 1) == 0 else None  # 1, 2, 4, 8, ...
     if candidate is not None and ledger.cheaper(candidate):
         x = candidate.solution.x
         ledger.prove(candidate, separate(ledger.program, x, ledger.tools, ALLOWED), prover(x, GLANCE))
-    missed, violated = [Missed.most(*one) for one in found], [above(*one) for one in found]
-    near = working.secured == 0
+    violations, violated = [Missed.most(*pair) for pair in found], [above(*pair) for pair in found]
+    is_near = working.secured == 0
     if deadline.left is None:  # with nothing left to impose, the proof of this decision follows at once
-        near = near and (ledger.open(answer.solution.x) or any(rows.size for _, rows, _ in violated))
-    near = near and _is_near(working, ledger.program, answer, missed)
+        is_near = is_near and (ledger.open(answer.solution.x) or any(rows.size for _, rows, _ in violated))
+    is_near = is_near and _is_near(working, ledger.program, answer, violations)
     if deadline.left is None:
-        working.secured += near
-        due = near or (number >= PATIENT and number & (number - 1) == 0)
+        working.secured += is_near
+        is_due = is_near or (number >= PATIENT and number & (number - 1) == 0)
     else:
-        due = near or (working.secured < len(DUE) and deadline.used >= DUE[working.secured])
-        working.secured += due
-        longest = max(np.diff(began, prepend=0.0), default=0.0)
-        due = due or (ledger.proven is None and deadline.left <= RESERVED * longest)
-    if not due or _is_secured(ledger):
+        is_due = is_near or (working.secured < len(DUE) and deadline.used >= DUE[working.secured])
+        working.secured += is_due
+        longest = max(np.diff(round_times, prepend=0.0), default=0.0)
+        is_due = is_due or (ledger.proven is None and deadline.left <= RESERVED * longest)
+    if not is_due or _is_secured(ledger):
         return False
     if not any(rows.size for _, rows, _ in violated):  # the answer may be proven as it is, which takes less time
         ledger.prove(answer, found, prover(answer.solution.x, GLANCE // 4))
         if ledger.proven is not None:
             return False
-    return _secure(working, ledger, prover, answer, missed, violated)
+    return _secure(working, ledger, prover, answer, violations, violated)
 
 
 def back_off(working: Working, ledger: Ledger, prover: Prover, answer: Answer, found: Found) -> None:
@@ -177,31 +177,31 @@ def back_off(working: Working, ledger: Ledger, prover: Prover, answer: Answer, f
         Most violated constraints of each family at the answer.
     """
     x, program = answer.solution.x, ledger.program
-    missed = [Missed.most(*one) for one in found if not one[0].defines]
-    violated: Violated = [above(*one) for one in found]
-    if not ledger.cheaper(answer) or not _is_near(working, program, answer, missed):
+    violations = [Missed.most(*pair) for pair in found if not pair[0].defines]
+    violated: Violated = [above(*pair) for pair in found]
+    if not ledger.cheaper(answer) or not _is_near(working, program, answer, violations):
         return
     if not any(rows.size for _, rows, _ in violated):
         proofs = prover(x, GLANCE)
         if ledger.prove(answer, found, proofs):
             return
-        missed, violated = left_open(program, proofs), witnesses(program, proofs)
-        if not missed or not _is_near(working, program, answer, missed):
+        violations, violated = left_open(program, proofs), witnesses(program, proofs)
+        if not violations or not _is_near(working, program, answer, violations):
             return
-    aside = replace(ledger)
-    _secure(working, aside, prover, answer, missed, violated, ledger.tolerance)
-    if aside.proven is not None and aside.proven is not ledger.proven:
-        secured, looked, proofs = aside.proven
-        ledger.prove(replace(secured, value=answer.value), looked, proofs)
+    trial_ledger = replace(ledger)
+    _secure(working, trial_ledger, prover, answer, violations, violated, ledger.tolerance)
+    if trial_ledger.proven is not None and trial_ledger.proven is not ledger.proven:
+        proven_answer, separations, proofs = trial_ledger.proven
+        ledger.prove(replace(proven_answer, value=answer.value), separations, proofs)
 
 
 def or_proven(ledger: Ledger, result: Result) -> Result:
     """Return the result, or that of the proven decision where the result is not proven."""
     if result.status not in ("refuted", "undecided") or ledger.proven is None:
         return result
-    secured, found, proofs = ledger.proven
-    why = ledger.tools.deadline.reason or f"of a decision that costs less it is not proven: {result.message}"
-    return ledger.judged(secured, worst_of(found), proofs, why)
+    proven_answer, separations, proofs = ledger.proven
+    reason = ledger.tools.deadline.reason or f"of a decision that costs less it is not proven: {result.message}"
+    return ledger.judged(proven_answer, worst_of(separations), proofs, reason)
 
 
 def _secure(
@@ -245,40 +245,40 @@ def _secure(
         Whether constraints were imposed.
     """
     program, margin, imposed = ledger.program, working.margin, 0
-    near: tuple[Answer, Found] | None = None  # a short proof left cells open, and no search finds a violation
-    cells, dear = GLANCE, _dear(abs(program.cost(answer.solution.x)), working.priced(answer))
+    kept: tuple[Answer, Found] | None = None  # a short proof left cells open, and no search finds a violation
+    cells, dear_margin = GLANCE, _dear(abs(program.cost(answer.solution.x)), working.priced(answer))
     for _ in range(SECURED):
         cost, price = abs(program.cost(answer.solution.x)), working.priced(answer)
         fresh = working.impose(violated)
         imposed += fresh
-        more = PAID * max((working.distance(one) for one in missed), default=0.0)
+        addition = PAID * max((working.distance(violation) for violation in missed), default=0.0)
         margin = max(margin, working.margin + (spared * cost / price if price > 0.0 else 0.0))
-        margin += 0.0 if fresh else more
-        more = more if fresh and more * price < DEAR * cost else 0.0
-        farther = _farther(working, ledger, answer, margin, more)
-        if farther is None and near is not None:  # no margin as large cells require: smaller cells, a margin that costs
-            if dear * price <= PAID * spared * cost:
+        margin += 0.0 if fresh else addition
+        addition = addition if fresh and addition * price < DEAR * cost else 0.0
+        tighter = _farther(working, ledger, answer, margin, addition)
+        if tighter is None and kept is not None:  # no margin as large cells require: smaller cells, a margin that costs
+            if dear_margin * price <= PAID * spared * cost:
                 break
-            cells, margin, missed, dear = CLOSER * GLANCE, working.margin + dear, (), NEARER * dear
+            cells, margin, missed, dear_margin = CLOSER * GLANCE, working.margin + dear_margin, (), NEARER * dear_margin
             continue
-        if farther is None:  # no such margin, for example where two constraints are close to each other
+        if tighter is None:  # no such margin, for example where two constraints are close to each other
             margin, spared, missed = working.margin, THINNER * spared, ()
             if price > 0.0 and spared >= ledger.tolerance:
                 continue
             break
-        answer = farther
-        x = farther.solution.x
-        looked, missed, violated = _looked(ledger, x)
+        answer = tighter
+        x = tighter.solution.x
+        separations, missed, violated = _looked(ledger, x)
         if missed:
             continue
         proofs = prover(x, cells)
         missed, violated = left_open(program, proofs), witnesses(program, proofs)
-        if ledger.prove(farther, looked, proofs) or not missed:
+        if ledger.prove(tighter, separations, proofs) or not missed:
             return imposed > 0
         if cells == GLANCE:
-            near = None if any(rows.size for _, rows, _ in violated) else (farther, looked)
-    if near is not None:
-        ledger.prove(*near, prover(near[0].solution.x, CLOSER * GLANCE))
+            kept = None if any(rows.size for _, rows, _ in violated) else (tighter, separations)
+    if kept is not None:
+        ledger.prove(*kept, prover(kept[0].solution.x, CLOSER * GLANCE))
     return imposed > 0
 
 
@@ -294,17 +294,19 @@ def _farther(working: Working, ledger: Ledger, answer: Answer, margin: float, mo
     """
     for distance in (margin + more, margin) if more else (margin,):
         if np.isfinite(PAID * float(distance) * working.longest):  # in Python's numbers, which overflow
-            farther = working.tightened(ledger, answer, distance)
-            if farther is not None:
-                return farther
+            tighter = working.tightened(ledger, answer, distance)
+            if tighter is not None:
+                return tighter
     return None
 
 
 def _looked(ledger: Ledger, x: Array) -> tuple[Found, Sequence[Missed], Violated]:
     """Return the separations at ``x (n,)``, the largest violations among them, and the constraints to impose."""
-    looked = separate(ledger.program, x, ledger.tools, ALLOWED, max(1, len(ledger.history)))
-    found = [one for one in looked if not one[0].defines and one[1].violations.max(initial=0.0) > ALLOWED]
-    return looked, [Missed.most(*one) for one in found], [above(*one) for one in found]
+    separations = separate(ledger.program, x, ledger.tools, ALLOWED, max(1, len(ledger.history)))
+    violated_pairs = [
+        pair for pair in separations if not pair[0].defines and pair[1].violations.max(initial=0.0) > ALLOWED
+    ]
+    return separations, [Missed.most(*pair) for pair in violated_pairs], [above(*pair) for pair in violated_pairs]
 
 
 def _is_near(working: Working, program: SemiInfiniteProgram, answer: Answer, missed: Sequence[Missed]) -> bool:
@@ -312,7 +314,7 @@ def _is_near(working: Working, program: SemiInfiniteProgram, answer: Answer, mis
 
     A round may take longer than all rounds before it, so the method does not wait for a better answer then.
     """
-    distance = max((working.distance(one) for one in missed if one.violation > 0.0), default=0.0)
+    distance = max((working.distance(violation) for violation in missed if violation.violation > 0.0), default=0.0)
     price = working.priced(answer)
     if distance > 0.0 and not price > 0.0:  # no row has a multiplier, so the price of a margin is unknown
         return False

@@ -79,20 +79,20 @@ def first_rows(program: SemiInfiniteProgram) -> list[tuple[Array, np.ndarray, st
     move; otherwise it has one index. The indices are dense at the faces of the index set, where polynomials and cosines
     grow most (nodes of Chebyshev). Nothing is returned where the decision has bounds.
     """
-    chosen: list[tuple[Array, np.ndarray, str]] = []
+    rows: list[tuple[Array, np.ndarray, str]] = []
     if _has_bounds(program):
-        return chosen
+        return rows
     for family in program.families:
         box = family.index_set
-        moves = np.flatnonzero(box.upper > box.lower)
-        side = int(np.ceil((program.n + 1) ** (1.0 / max(1, moves.size)) - 1e-9)) if moves.size <= FEW else 1
+        free_axes = np.flatnonzero(box.upper > box.lower)
+        side = int(np.ceil((program.n + 1) ** (1.0 / max(1, free_axes.size)) - 1e-9)) if free_axes.size <= FEW else 1
         share = 0.5 - 0.5 * np.cos(np.pi * np.arange(side) / max(1, side - 1)) if side > 1 else np.array([0.5])
-        lines = [share if i in moves else np.zeros(1) for i in range(box.dimension)]
+        lines = [share if i in free_axes else np.zeros(1) for i in range(box.dimension)]
         unit = np.stack(np.meshgrid(*lines, indexing="ij"), axis=-1).reshape(-1, box.dimension)
         indices = np.clip(box.lower + unit * (box.upper - box.lower), box.lower, box.upper)
         count = family.violations(np.zeros(program.n), indices[:1]).shape[1]
-        chosen.append((np.repeat(indices, count, axis=0), np.tile(np.arange(count), len(indices)), family.name))
-    return chosen
+        rows.append((np.repeat(indices, count, axis=0), np.tile(np.arange(count), len(indices)), family.name))
+    return rows
 
 
 def bounding_rows(
@@ -163,16 +163,18 @@ def falls_for_ever(ledger: Ledger, close: Close, prover: Prover, ray: Array) -> 
     cost = program.cost(result.decision)
     slope = float(program.finite.weights @ np.abs(program.finite.image(ray)) + program.finite.q @ ray)
     order = np.argsort(-np.abs(ray), kind="stable")[:SHOWN]
-    said = ", ".join(f"{ray[i]:.4g} in x{i + 1}" for i in np.sort(order))
-    more = ", ..." if program.n > SHOWN else ""
-    proven = result.status in ("certified", "verified")
-    met = "the decision is proven to meet the constraints" if proven else "the decision meets them as far as was seen"
-    words = f"unbounded below: along the ray ({said}{more}) the cost falls for ever, by {-slope:.4g} per unit; {met}"
-    status: Status = "verified" if proven else result.status
+    terms = ", ".join(f"{ray[i]:.4g} in x{i + 1}" for i in np.sort(order))
+    dots = ", ..." if program.n > SHOWN else ""
+    is_proven = result.status in ("certified", "verified")
+    met = (
+        "the decision is proven to meet the constraints" if is_proven else "the decision meets them as far as was seen"
+    )
+    text = f"unbounded below: along the ray ({terms}{dots}) the cost falls for ever, by {-slope:.4g} per unit; {met}"
+    status: Status = "verified" if is_proven else result.status
     return replace(
         result,
         status=status,
-        message=words if status == "verified" else f"{words}; {result.message}",
+        message=text if status == "verified" else f"{text}; {result.message}",
         cost=cost,
         value=cost,
         lower_bound=-np.inf,

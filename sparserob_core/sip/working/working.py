@@ -278,19 +278,19 @@ class Working(ABC):
         found : Found
             Most violated constraints at it.
         """
-        x, other = answer.solution.x, at_rest(self.program, answer.solution.x)
-        cost = self.program.cost(other)
+        x, decision = answer.solution.x, at_rest(self.program, answer.solution.x)
+        cost = self.program.cost(decision)
         if answer.epsilon or not ledger.open(x) or not ledger.lower <= cost < self.program.cost(x):
             return answer, found  # what costs less than the lower bound is proven not to be feasible
-        ledger.improve(self.proven(ledger, answer, other))
-        if not fits(ledger, other):
+        ledger.improve(self.proven(ledger, answer, decision))
+        if not fits(ledger, decision):
             return answer, found
-        every = separate(self.program, other, ledger.tools, ALLOWED, number)
-        looked = [one for one in every if not one[0].defines]
-        if any(above(*one)[1].size for one in looked):
+        all_separations = separate(self.program, decision, ledger.tools, ALLOWED, number)
+        separations = [pair for pair in all_separations if not pair[0].defines]
+        if any(above(*pair)[1].size for pair in separations):
             return answer, found
-        solution = replace(answer.solution, x=other, value=cost, gap=cost - answer.solution.lower_bound)
-        return replace(answer, solution=solution, value=cost), looked
+        solution = replace(answer.solution, x=decision, value=cost, gap=cost - answer.solution.lower_bound)
+        return replace(answer, solution=solution, value=cost), separations
 
     def thin(self) -> bool:
         """Reduce the margin, after it left nothing feasible; return false where there is no margin.
@@ -324,11 +324,15 @@ class Working(ABC):
         The margin becomes twice the largest of these violations, or twice the present margin. False is returned where
         that does not help.
         """
-        violated = [one for each in found if (one := Missed.most(*each)).violation > ALLOWED and self.knows(one)]
+        violated = [
+            violation
+            for pair in found
+            if (violation := Missed.most(*pair)).violation > ALLOWED and self.knows(violation)
+        ]
         if not violated or not self.slater or self.floor >= self.most:
             return False
-        missed = max(self.distance(one) for one in violated)
-        self.floor = float(np.clip(2.0 * max(missed, self.margin), SMALLEST_MARGIN, self.most))
+        distance = max(self.distance(violation) for violation in violated)
+        self.floor = float(np.clip(2.0 * max(distance, self.margin), SMALLEST_MARGIN, self.most))
         self.margin = max(self.margin, self.floor)
         return True
 
@@ -354,8 +358,8 @@ class Working(ABC):
         """
         if any(proof.verdict == "refuted" for proof in proofs) or not self.slater:
             return False
-        missed = [self.distance(one) for one in left_open(self.program, proofs)]
-        floor = self.margin + 1.25 * max(missed, default=np.inf)
+        distances = [self.distance(violation) for violation in left_open(self.program, proofs)]
+        floor = self.margin + 1.25 * max(distances, default=np.inf)
         if (floor > self.most and not self._affords(ledger, answer, floor)) or self.allowed >= ALLOWANCES:
             return False
         self.floor = self.margin = floor
@@ -419,7 +423,7 @@ def left_open(program: SemiInfiniteProgram, proofs: Sequence[Proof]) -> list[Mis
         The violations. The list is empty where a proof excludes nothing at all, or is about another formulation than
         the imposed rows, since no margin would help then.
     """
-    missed = [
+    violations = [
         Missed(
             proof.violation if proof.verdict == "refuted" else proof.bound,
             proof.family,
@@ -431,5 +435,5 @@ def left_open(program: SemiInfiniteProgram, proofs: Sequence[Proof]) -> list[Mis
         and proof.index is not None
         and proof.formulation == program.family(proof.family).formulation
     ]
-    complete = len(missed) == sum(proof.verdict != "proven" for proof in proofs)
-    return missed if complete and all(np.isfinite(one.violation) for one in missed) else []
+    complete = len(violations) == sum(proof.verdict != "proven" for proof in proofs)
+    return violations if complete and all(np.isfinite(violation.violation) for violation in violations) else []
