@@ -25,8 +25,10 @@ a clock could tell what is taken for one."""
 
 
 def over(stop: float, begin: float, horizon: float = 0.0) -> bool:
-    """Whether of what lasts until ``stop`` nothing but rounding is left from ``begin`` on, where times go on for as
-    long as ``horizon``."""
+    """Return whether a term that lasts until ``stop`` has ended by the time ``begin``, up to rounding.
+
+    The tolerance is `SAME_TIME` of the latest time, ``begin + horizon``.
+    """
     return stop <= begin + SAME_TIME * (begin + horizon)
 
 
@@ -37,20 +39,23 @@ class Term:
         sealed(self)
 
     def in_units(self, units: Any) -> Self:
-        """The same with every number in these `Units`."""
+        """Return the term with every number converted to these `Units`."""
         return self._changed("in_units", units)
 
     def remaining(self, begin: float, horizon: float, **given: Any) -> Self | None:
-        """Itself from the time ``begin`` on, for as long as ``horizon``, with times that are counted from ``begin``;
-        ``None`` where nothing of it is left. ``given``: fields that are told anew."""
+        """Return the term from the time ``begin`` on, over a ``horizon``, with times counted from ``begin``.
+
+        The result is ``None`` where nothing of the term is left. ``given`` holds new values of fields, which are taken
+        as they are.
+        """
         return self._changed("remaining", begin, horizon, **given)
 
     def _changed(self, verb: str, *how: Any, **given: Any) -> Self:
         kept: Any = self
         changes = {
-            one.name: _each(one.metadata[verb], getattr(self, one.name), *how)
-            for one in fields(kept)
-            if one.name not in given
+            field.name: _each(field.metadata[verb], getattr(self, field.name), *how)
+            for field in fields(kept)
+            if field.name not in given
         }
         changed: Self = replace(kept, **changes, **given)
         return changed
@@ -59,13 +64,13 @@ class Term:
 def _each(change: Callable[..., Any], value: Any, *how: Any) -> Any:
     """A value that is changed, or each of a tuple, without those of which nothing is left; of ``None`` nothing is."""
     if isinstance(value, tuple):
-        every = [(one, _each(change, one, *how)) for one in value]
-        return tuple(new for one, new in every if new is not None or one is None)
+        pairs = [(item, _each(change, item, *how)) for item in value]
+        return tuple(changed for item, changed in pairs if changed is not None or item is None)
     return None if value is None else change(value, *how)
 
 
 def unchanged(value: Any, *how: Any) -> Any:
-    """What has no unit, or does not depend on time."""
+    """Return a value as it is, for a field that has no unit or does not depend on time."""
     return value
 
 

@@ -23,9 +23,13 @@ SEEN = 1e-7  # of the size of a state, a deviation that is rounding
 @final
 @dataclass(frozen=True)
 class Step:
-    """What one step of a `Controller` was: it began at ``time``, took ``seconds``, and was from a control that was
-    ``resolved`` anew at this step or not; ``covered``: whether the proof covers what was measured so far. ``cost`` and
-    ``lower_bound`` enclose the cost of what is left, where a re-solve has told them (else NaN)."""
+    """Record of one step of a `Controller`.
+
+    Attributes: the ``time`` at which the step began, in the time of the problem, and the ``seconds`` that it took.
+    ``resolved``: true where the control comes from a problem that was solved anew at this step. ``covered``: true where
+    the proof covers everything that was measured so far. ``cost`` and ``lower_bound`` enclose the cost over the
+    remaining horizon where a re-solve reported them (otherwise NaN).
+    """
 
     time: float
     seconds: float
@@ -80,29 +84,32 @@ class Controller:
 
     @property
     def breakpoints(self) -> Array:
-        """When the pieces of the control begin, and the horizon at the end, ``(K + 1,)``, in the time of the
-        problem."""
+        """Times at which the pieces of the control begin, and the horizon as the last one, ``(K + 1,)``, in the time of
+        the problem."""
         return np.array(self._planned.model.control.breakpoints)
 
     @property
     def prepared(self) -> float:
-        """How many seconds were spent before the first step, on what no step with a limit waits for; 0 without a
-        re-solve. A limit is one of every step, the first one too: make the controller before the system runs."""
+        """Seconds spent before the first step on work that no step with a time limit waits for; 0 without a re-solve.
+        The time limit applies to every step, also to the first one: make the controller before the system runs."""
         return self._prepared
 
     @property
     def covered(self) -> bool:
-        """Whether the proof covers every state that was measured since the last `reset`, or since the last plan that
-        was made of a measured state. Exact where every state tells what the disturbance was, that is, one value on
-        each piece of the control, which moves the states independently; else states are compared one by one, and it may
-        be true too long. Parameters are not told from a disturbance: with uncertain ones it is true as long as no
-        measurement was missing."""
+        """True where the proof covers every state measured since the last `reset`, or since the last plan that was made
+        from a measured state.
+
+        The answer is exact where every measured state determines the disturbance: one value on each piece of the
+        control, which moves the states independently. Otherwise states are compared coordinate by coordinate, and the
+        answer may stay true too long. Parameters cannot be told apart from a disturbance: with uncertain parameters the
+        answer is true as long as no measurement was missing.
+        """
         return self._covered
 
     @property
     def ever_uncovered(self) -> bool:
-        """Whether a state since the last `reset` was missing, or one that the proof did not cover, a later plan or not:
-        then what acts on the system is more than the problem says."""
+        """True where any state since the last `reset` was missing or not covered by the proof, even if a later plan
+        covers the states again. Then more acts on the system than the problem says."""
         return self._ever
 
     @property
@@ -127,11 +134,28 @@ class Controller:
         self._added_up = np.zeros(self._planned.model.problem.system.states - self._states - self._beside)
 
     def step(self, time: float, state: npt.ArrayLike | None) -> Array:
-        """The control ``(m,)`` for the piece that begins at ``time``, a breakpoint, from the ``state (d,)`` measured
-        then, or of a problem with ``measurements`` from the outputs ``(p,)``; ``None`` where the measurement is
-        missing. Breakpoints come one after another. Raises `InputError` for a time or a state that is none, and is then
-        as it was before."""
-        began = clock.perf_counter()
+        """Return the control ``(m,)`` for the piece that begins at ``time``, a breakpoint. Breakpoints come one after
+        another.
+
+        Parameters
+        ----------
+        time : float
+            The breakpoint, in the time of the problem.
+        state : array (d,) or None
+            The state measured then, or the outputs ``(p,)`` of a problem with ``measurements``. ``None`` where the
+            measurement is missing.
+
+        Returns
+        -------
+        array (m,)
+            The control.
+
+        Raises
+        ------
+        InputError
+            For a time or a state that is none. The controller is then as it was before.
+        """
+        start_time = clock.perf_counter()
         period, piece = self._timed(time)
         measured = None if state is None else self._measured(state)
         if period > self._period:
@@ -150,13 +174,13 @@ class Controller:
             else:
                 answer = None
         u = self._control(piece - self._plan.first, measured)
-        told = None if self._observer is not None else measured
-        self._reach = None if told is None else self._plan.reach(piece - self._plan.first, told, u)
+        measured_state = None if self._observer is not None else measured
+        self._reach = None if measured_state is None else self._plan.reach(piece - self._plan.first, measured_state, u)
         self._added_up = self._added_up + self._plan.added(piece - self._plan.first, u)[self._states + self._beside :]
         self._next, self._covered, self._before, self._last = piece + 1, covered, u, measured
         at = self._begins_at(period, piece)
-        taken = (False, np.nan, np.nan) if answer is None else (answer.plan is not None, answer.cost, answer.lower)
-        self._steps.append(Step(at, clock.perf_counter() - began, taken[0], covered, *taken[1:]))
+        outcome = (False, np.nan, np.nan) if answer is None else (answer.plan is not None, answer.cost, answer.lower)
+        self._steps.append(Step(at, clock.perf_counter() - start_time, outcome[0], covered, *outcome[1:]))
         return u.copy()
 
     def _begin(self, period: int) -> None:
@@ -185,7 +209,7 @@ class Controller:
         self._measuring = replace(self._measuring, nominal=self._nominal)
 
     def _timed(self, time: object) -> tuple[int, int]:
-        """The period and the piece of it that begins at a time, which must be the next one."""
+        """Return the period, and the piece of it, that begin at a time, which must be the next breakpoint."""
         points = self._planned.model.control.breakpoints
         period, piece = self._period, self._next
         if piece >= points.size - 1 and self._planned.model.problem.repeat:
@@ -196,45 +220,48 @@ class Controller:
         expected = self._begins_at(period, piece)
         number = isinstance(time, int | float | np.number) and not isinstance(time, bool)
         if not number or not abs(float(time) - expected) <= SAME_BREAKPOINT * points[-1]:  # type: ignore[arg-type]
-            said = "0, since it begins there" if not period + piece else f"{expected!r}, the next breakpoint"
-            raise InputError(path="time", expected=said, got=f"{time!r}")
+            expectation = "0, since it begins there" if not period + piece else f"{expected!r}, the next breakpoint"
+            raise InputError(path="time", expected=expectation, got=f"{time!r}")
         return period, piece
 
     @property
     def _states(self) -> int:
-        """How many states are measured where all of them are: those of the problem as it was stated."""
+        """Number of states of the problem as the user stated it, all of which are measured where the whole state is
+        measured."""
         return self._planned.model.stated.system.states
 
     @property
     def _beside(self) -> int:
-        """How many states after these hold what parameters beside the time add, which is nothing where a state is
-        measured."""
+        """Number of further states that hold the effect of the parameters of a system that also depends on time. They
+        follow the `_states` states of the user, and are 0 where a state is measured."""
         first, end = self._planned.model.problem.names.corners.added
         return end - first
 
     @property
     def _observer(self) -> Observer | None:
-        """What makes innovations of outputs; ``None`` where the state is measured."""
+        """Observer that makes innovations of measured outputs; ``None`` where the state is measured."""
         return self._plan.known.observer
 
     def _measured(self, state: object) -> Array:
-        """The outputs, or the state with what is not measured after it."""
-        observer, count, one = self._observer, self._states, "state"
+        """Return the measured outputs; or the measured state, followed by the states that nobody measures."""
+        observer, count, kind = self._observer, self._states, "state"
         if observer is not None:
-            count, one = observer.C.shape[0], "output"
+            count, kind = observer.C.shape[0], "output"
         try:
             measured = np.array(state, dtype=float)
         except (TypeError, ValueError):
             measured = np.zeros(0)
         if measured.shape != (count,) or not np.isfinite(measured).all():
-            expected = f"{count} finite numbers, one per {one}, or None where the measurement is missing"
+            expected = f"{count} finite numbers, one per {kind}, or None where the measurement is missing"
             raise InputError(path="state", expected=expected, got=f"{state!r}")
-        unseen = np.append(np.zeros(self._beside), self._added_up)
-        return measured if observer is not None else np.append(measured, unseen)
+        unmeasured = np.append(np.zeros(self._beside), self._added_up)
+        return measured if observer is not None else np.append(measured, unmeasured)
 
     def _within(self, state: Array) -> bool:
-        """Whether a state is among those that the last one may lead to, or may begin with; coordinate by coordinate. Of
-        outputs: whether the innovation is as large as deviations can make it, number by number."""
+        """Return whether the last state may lead to this state, or, at the first step, whether it is an admissible
+        initial state. Later states are compared coordinate by coordinate; the result is true where the last state tells
+        no bounds. Of outputs, return whether each entry of the innovation is within the bounds that admissible
+        deviations give."""
         if self._observer is not None:
             return self._expected(state)
         if self._next == 0:
@@ -243,47 +270,50 @@ class Controller:
             deviation, size = state - centre, np.abs(state) + np.abs(centre)
             if problem.initial_set is None:
                 return bool((np.abs(deviation) <= SEEN * np.maximum(size, size.max())).all())
-            room = SEEN * float(problem.initial_set.reach(axes).max() + size.max())
-            return float(problem.initial_set.violation(deviation)) <= room
+            tolerance = SEEN * float(problem.initial_set.reach(axes).max() + size.max())
+            return float(problem.initial_set.violation(deviation)) <= tolerance
         if self._reach is None or self._last is None:
             return True
         lower, upper = (bound[: self._states] for bound in self._reach)
-        room = SEEN * max(float(np.abs(lower).max()), float(np.abs(upper).max()), np.finfo(float).tiny)
-        seen = state[: self._states]
-        return bool((seen >= lower - room).all() and (seen <= upper + room).all()) and self._caused(state, room)
+        tolerance = SEEN * max(float(np.abs(lower).max()), float(np.abs(upper).max()), np.finfo(float).tiny)
+        user_state = state[: self._states]
+        return bool(
+            (user_state >= lower - tolerance).all() and (user_state <= upper + tolerance).all()
+        ) and self._caused(state, tolerance)
 
     def _expected(self, outputs: Array) -> bool:
         assert self._measuring is not None
-        new = self._measuring.seen(outputs)[-1]
-        least, most = (bound[self._next - self._plan.first] for bound in self._plan.known.answering.loop.expected)
-        room = SEEN * float(np.max([np.abs(outputs), np.abs(new), np.abs(least), np.abs(most)]))
-        return bool((new >= least - room).all() and (new <= most + room).all())
+        innovation = self._measuring.seen(outputs)[-1]
+        lower, upper = (bound[self._next - self._plan.first] for bound in self._plan.known.answering.loop.expected)
+        tolerance = SEEN * float(np.max([np.abs(outputs), np.abs(innovation), np.abs(lower), np.abs(upper)]))
+        return bool((innovation >= lower - tolerance).all() and (innovation <= upper + tolerance).all())
 
     def _caused(self, state: Array, room: float) -> bool:
-        """Whether an admissible disturbance led from the last state to this one, where that can be told."""
+        """Return whether an admissible disturbance led from the last state to this one; true where the states do not
+        determine the disturbance."""
         assert self._last is not None and self._before is not None
-        told = self._plan.caused(self._next - 1 - self._plan.first, self._last, self._before, state)
+        cause = self._plan.caused(self._next - 1 - self._plan.first, self._last, self._before, state)
         bound = self._planned.model.problem.disturbance
-        if told is None or bound is None:
+        if cause is None or bound is None:
             return True
-        block, value, rest, growth = told
-        rest = rest[: self._states]
-        near = growth * room + SEEN * float(np.abs(value).max())
-        known = self._acting is None or self._acting[0] != block
-        same = known or bool((np.abs(value - self._acting[1]) <= 2.0 * near).all())  # type: ignore[index]
+        block, value, residual, growth = cause
+        residual = residual[: self._states]
+        margin = growth * room + SEEN * float(np.abs(value).max())
+        is_new_block = self._acting is None or self._acting[0] != block
+        is_same = is_new_block or bool((np.abs(value - self._acting[1]) <= 2.0 * margin).all())  # type: ignore[index]
         self._acting = (block, value)
-        return same and bool((np.abs(rest) <= room).all()) and float(bound.violation(value)) <= near
+        return is_same and bool((np.abs(residual) <= room).all()) and float(bound.violation(value)) <= margin
 
     def _innovations(self, state: Array) -> list[Array]:
-        """What the applied plan knows of the disturbance when this state is measured, one vector for each breakpoint
-        since it began."""
+        """Return the innovations that the applied plan answers when this state is measured, one vector for each
+        breakpoint since the plan began; a single zero vector where the plan has no feedback."""
         return [np.zeros(state.size)] if self._measuring is None else self._measuring.seen(state)
 
     def _control(self, piece: int, state: Array | None) -> Array:
         nominal = self._nominal[:, piece]
         if self._measuring is None:
             return nominal.copy()
-        seen = self._measuring.predicted() if state is None else state[:, None]
+        observed = self._measuring.predicted() if state is None else state[:, None]
         for number in np.flatnonzero(self._measuring.commanded == piece).tolist():
-            self._measuring.after(number, lambda _: seen)
+            self._measuring.after(number, lambda _: observed)
         return self._plan.drawn_in(self._measuring.command(piece)[:, 0], nominal)

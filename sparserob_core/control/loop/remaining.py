@@ -1,4 +1,4 @@
-"""What is left of a problem from one breakpoint of the control on: the same constraints, a shorter horizon."""
+"""Remaining problem from one breakpoint of the control on: the same constraints on a shorter horizon."""
 
 from __future__ import annotations
 
@@ -46,14 +46,28 @@ def remaining(
     alone: bool = False,
     again: Array | None = None,
 ) -> Transcription:
-    """The problem that is left where piece ``piece`` of the control begins in ``state (d,)``, after the control
-    ``before (m,)``, transcribed as the ``model`` was; its times begin at 0.
+    """Return the problem that remains where piece ``piece`` of the control begins in ``state (d,)``, transcribed as the
+    ``model`` was; its times begin at 0.
 
-    The parameters may be any of their set, also those beside the time, which add nothing to a state that is measured
-    and begin to when it is; and every piece of the disturbance that is left may be any of its own, also
-    what is left of one that has begun: no less than what can happen. ``alone``: the nominal control and state alone,
-    as if nothing disturbed them and nothing were answered. ``again (m,)``: of a plan that repeats, the control with
-    which the next period begins, to which the last control takes a step of ``control_step``.
+    The parameters may be any of their set, also those of a system that depends on time as well. The latter add nothing
+    to a state that is measured, and begin to act from the measurement on. Every remaining piece of the disturbance may
+    take any value of its own, also the rest of a piece that has begun. This covers at least everything that can happen.
+
+    Parameters
+    ----------
+    model : Transcription
+        The transcription of the whole problem.
+    piece : int
+        The piece of the control that begins now.
+    state : array (d,)
+        The measured state.
+    before : array (m,) or None
+        The last control, from which the first one takes a step where the problem has a ``control_step``.
+    alone : bool
+        True for the nominal control and state alone, without disturbance and without feedback.
+    again : array (m,), optional
+        Of a plan that repeats, the control with which the next period begins. The last control takes a step of
+        ``control_step`` to it.
     """
     problem, begin = model.problem, float(model.control.breakpoints[piece])
     control = _rest(model.control, begin, problem.horizon)
@@ -63,7 +77,7 @@ def remaining(
         entry.remaining(begin, horizon, name=name)
         for entry, name in zip(problem.windows, problem.called("path"), strict=True)
     ]
-    left = problem.remaining(
+    remainder = problem.remaining(
         begin,
         horizon,
         initial_state=state,
@@ -73,12 +87,12 @@ def remaining(
         repeat=False,  # the return is among the windows
         **({"disturbance": None} if alone else {}),
     )
-    assert left is not None
-    return prepare(left, control, disturbance, policy=None if alone else model.policy)
+    assert remainder is not None
+    return prepare(remainder, control, disturbance, policy=None if alone else model.policy)
 
 
 def _rest(dictionary: Dictionary, begin: float, horizon: float) -> Dictionary:
-    """One indicator for each piece that is left."""
+    """Return the dictionary of the remaining pieces after ``begin``, with one indicator function for each piece."""
     slack = SAME_TIME * horizon
     later = dictionary.breakpoints[dictionary.breakpoints > begin + slack] - begin
     later[-1] = horizon - begin
@@ -86,10 +100,11 @@ def _rest(dictionary: Dictionary, begin: float, horizon: float) -> Dictionary:
 
 
 def _seam(problem: OptimalControlProblem, control: Dictionary, again: Array | None) -> list[MixedConstraint]:
-    """The last control, from which the one that begins the next period is a step."""
+    """Return the constraint on the last control, from which the first control of the next period is a step. The list is
+    empty for a plan that does not repeat, and for a ``control_step`` without flat sides."""
     flat = None if problem.control_step is None else problem.control_step.halfspaces()
     if not problem.repeat or again is None or flat is None:
         return []
     (H, h), begin = flat, float(control.breakpoints[-2])
-    still = np.zeros((h.size, problem.system.states))
-    return [MixedConstraint(still, -H, h - H @ again, begin, control.horizon, name="seam")]
+    zeros = np.zeros((h.size, problem.system.states))
+    return [MixedConstraint(zeros, -H, h - H @ again, begin, control.horizon, name="seam")]

@@ -39,9 +39,12 @@ BETTER = 1e-6  # of the cost of what is left: less than that is no better
 @final
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """A proven decision ``(n,)`` of a transcribed problem, whose time 0 is the beginning of piece ``first`` of the
-    control that it is a plan for; ``cuts`` are the constraints that mattered. ``known`` is the problem, or the same one
-    from another initial state than its own, ``state (d,)``."""
+    """Proven decision ``(n,)`` of a transcribed problem, whose time 0 is the beginning of piece ``first`` of the
+    control that the plan is for.
+
+    ``cuts`` are the constraints that were active. ``known`` is the transcribed problem. Where ``state (d,)`` is given,
+    the plan begins in this state, and ``known`` is the same problem from another initial state.
+    """
 
     known: Transcription
     decision: Array
@@ -51,12 +54,12 @@ class Plan:
 
     @cached_property
     def model(self) -> Transcription:
-        """The transcribed problem; written down when it is asked for, since a controller does without it."""
+        """Transcribed problem of this plan; written down when it is asked for, since a controller does without it."""
         return self.known if self.state is None else from_state(self.known, self.state)
 
     def reach(self, piece: int, state: Array, control: Array) -> tuple[Array, Array] | None:
-        """The least and the largest of every state ``(d,)`` to which a piece that begins in ``state (d,)`` may lead
-        under a ``control (m,)``; ``None`` where that is not told from one piece alone."""
+        """Return the least and the largest value of every state ``(d,)`` after a piece that begins in ``state (d,)``
+        under a ``control (m,)``; ``None`` where one piece alone does not determine them."""
         problem, response = self.known.problem, self.known.response
         if problem.system.parameters is not None or problem.system.delay > 0.0 or problem.system.switches:
             return None
@@ -65,22 +68,27 @@ class Plan:
         if problem.classes - {"piecewise_constant"}:
             return None
         steps, grid = response.steps(KNOWN), response.grid
-        acting, pushes, middle = np.append(control, np.ones(grid.constants)), list[Array](), state
+        inputs, disturbance_responses, nominal = np.append(control, np.ones(grid.constants)), list[Array](), state
         for number in np.flatnonzero(grid.control_piece == piece).tolist():
-            Phi, Gamma = (part[0, int(response.which[number])] for part in (steps.Phi, steps.Gamma))
-            B, E = (grid.of_modes(part[0])[int(grid.modes[number])] for part in (steps.B, steps.E))
-            middle = Phi @ middle + Gamma @ (B @ acting)
-            pushes = [Phi @ push for push in pushes] + [Gamma @ E]
-        lower, upper = middle, middle
+            Phi, Gamma = (table[0, int(response.which[number])] for table in (steps.Phi, steps.Gamma))
+            B, E = (grid.of_modes(table[0])[int(grid.modes[number])] for table in (steps.B, steps.E))
+            nominal = Phi @ nominal + Gamma @ (B @ inputs)
+            disturbance_responses = [Phi @ disturbance_response for disturbance_response in disturbance_responses] + [
+                Gamma @ E
+            ]
+        lower, upper = nominal, nominal
         if problem.disturbance is not None:
-            for push in pushes:
-                upper, lower = upper + problem.disturbance.support(push), lower - problem.disturbance.support(-push)
+            for disturbance_response in disturbance_responses:
+                upper, lower = (
+                    upper + problem.disturbance.support(disturbance_response),
+                    lower - problem.disturbance.support(-disturbance_response),
+                )
         return lower, upper
 
     def added(self, piece: int, control: Array) -> Array:
-        """What a ``control (m,)`` on a piece drives every state by, ``(d,)``, if nothing else did: of an integral of
-        controls alone, what it adds to it."""
-        response, found = self.known.response, np.zeros(self.known.problem.system.states)
+        """Return the change of every state ``(d,)`` that a ``control (m,)`` on a piece alone causes, without the flow
+        of the system. For a state that is an integral of controls alone this is the exact increase."""
+        response, change = self.known.response, np.zeros(self.known.problem.system.states)
         grid, system = response.grid, response.system
         for number in np.flatnonzero(grid.control_piece == piece).tolist():
             if grid.varying:  # whose pieces are its modes
@@ -88,13 +96,19 @@ class Plan:
             else:
                 mode = system.modes[int(grid.modes[number])]
                 B = mode.matrices(mode.probes[:1])[1][0]
-            found = found + grid.lengths[number] * (B[: found.size, : control.size] @ control)
-        return found
+            change = change + grid.lengths[number] * (B[: change.size, : control.size] @ control)
+        return change
 
     def caused(self, piece: int, state: Array, control: Array, after: Array) -> tuple[int, Array, Array, float] | None:
-        """What the disturbance was on a piece that led from ``state (d,)`` to ``after (d,)`` under a ``control (m,)``:
-        the number of its own piece, its value ``(mw,)``, what of the state that leaves unexplained ``(d,)``, and by how
-        much at most an error of the state grows in the value; ``None`` where the state does not tell it."""
+        """Return the disturbance on a piece that led from ``state (d,)`` to ``after (d,)`` under a ``control (m,)``.
+
+        Returns
+        -------
+        tuple or None
+            The index of the piece of the disturbance; its value ``(mw,)``; the residual of the state ``(d,)`` that this
+            value does not explain; and the largest factor by which an error of the state grows in the value. ``None``
+            where the states do not determine the disturbance.
+        """
         problem, response, signal = self.known.problem, self.known.response, self.known.functionals.disturbance
         numbers = np.flatnonzero(response.grid.control_piece == piece).tolist()
         if response.propagator.laws is not None:  # which parameters did it is not known
@@ -103,20 +117,21 @@ class Plan:
             return None
         steps, length = response.steps(KNOWN), int(response.which[numbers[0]])
         Phi, Gamma = steps.Phi[0, length], steps.Gamma[0, length]
-        seen = self.known.stated.system.states
-        pushed = (Gamma @ steps.E[0])[:seen]
-        sizes = np.linalg.svd(pushed, compute_uv=False)
-        if pushed.shape[0] < pushed.shape[1] or not sizes[-1] > DEPENDENT * sizes[0]:
+        state_count = self.known.stated.system.states
+        input_response = (Gamma @ steps.E[0])[:state_count]
+        sizes = np.linalg.svd(input_response, compute_uv=False)
+        if input_response.shape[0] < input_response.shape[1] or not sizes[-1] > DEPENDENT * sizes[0]:
             return None
-        driven = steps.B[0] @ np.append(control, np.ones(response.grid.constants))
-        moved = (after - Phi @ state - Gamma @ driven)[:seen]
-        value = np.linalg.lstsq(pushed, moved, rcond=None)[0]
+        forcing = steps.B[0] @ np.append(control, np.ones(response.grid.constants))
+        difference = (after - Phi @ state - Gamma @ forcing)[:state_count]
+        value = np.linalg.lstsq(input_response, difference, rcond=None)[0]
         block = int(np.searchsorted(signal.starts, numbers[0], side="right")) - 1
-        return block, value, moved - pushed @ value, 1.0 / float(sizes[-1])
+        return block, value, difference - input_response @ value, 1.0 / float(sizes[-1])
 
     def drawn_in(self, control: Array, nominal: Array) -> Array:
-        """A control ``(m,)`` within the set of controls: as it is, but for rounding, where the proof covers what was
-        measured."""
+        """Return the control ``(m,)``, clipped to the box of controls, or moved towards the ``nominal`` control until
+        it is on the flat sides of their set. Where the proof covers the measurements, the control changes by rounding
+        only. For a set without flat sides the control is returned as it is."""
         bound = self.known.problem.control
         flat = bound.halfspaces()
         if bound.is_box:
@@ -130,8 +145,8 @@ class Plan:
         return np.asarray(nominal + min(1.0, float(share)) * (control - nominal))
 
     def left(self, piece: int, innovations: Sequence[Array]) -> Array:
-        """The nominal control ``(m, K')`` that is left from piece ``piece`` of this plan on, when nothing more happens
-        than what was seen: one innovation ``(d,)`` for each breakpoint so far."""
+        """Return the nominal control ``(m, K')`` that remains from piece ``piece`` of this plan on, if nothing more
+        happens than was measured: one innovation ``(d,)`` for each breakpoint so far."""
         nominal = self.known.pieces(self.decision)[:, piece:]
         feedback = self.known.feedback
         if feedback is None:
@@ -140,15 +155,17 @@ class Plan:
         return np.asarray(nominal + np.einsum("kjmd,jd->mk", gains, np.array(innovations)))
 
     def cost_left(self, piece: int, innovations: Sequence[Array]) -> float:
-        """The cost of that under feedback: of the nominal control, or of its peaks over what may still happen."""
+        """Return the cost of the remaining control under feedback, from piece ``piece`` of this plan on: of the nominal
+        control, or of its peaks over the deviations that may still happen."""
         feedback, problem = self.known.answering, self.known.problem
         nominal, spread = self.left(piece, innovations), feedback.loop.spread
         size = np.abs(nominal)
         if feedback.charge.cost == "peak":
             effects = feedback.loop.effects(self.decision)[piece:].copy()
             begin, grid = float(self.known.control.breakpoints[piece]), self.known.response.grid
-            acting = feedback.loop.entries[grid.breakpoints[1:] > begin]  # (L', mw, Q): which deviations act later
-            effects[:, :, np.abs(acting).sum(axis=(0, 1)) == 0.0] = 0.0
+            # (L', mw, Q): which deviations act later
+            later_entries = feedback.loop.entries[grid.breakpoints[1:] > begin]
+            effects[:, :, np.abs(later_entries).sum(axis=(0, 1)) == 0.0] = 0.0
             size = np.maximum(nominal.T + spread.support(effects), -nominal.T + spread.support(-effects)).T
         return float((problem.prices(self.known.control.breakpoints)[:, piece:] * size).sum())
 
@@ -156,8 +173,8 @@ class Plan:
 @final
 @dataclass(frozen=True, eq=False)
 class Solved:
-    """What a re-solve gave: a ``plan``, or none that is proven, its ``cost`` and the ``lower`` bound of it, and whether
-    it is ``cheaper`` than what the last plan has left."""
+    """Result of a re-solve: a ``plan``, or ``None`` where none is proven, its ``cost`` and the ``lower`` bound of the
+    cost. ``cheaper`` is true where the plan costs less than the remainder of the last plan."""
 
     plan: Plan | None
     cost: float = np.nan
@@ -188,14 +205,14 @@ class Resolving:
         self._written = 0.0  # what it takes to write a whole program down, however few pieces are left
 
     def prepare(self, plan: Plan) -> None:
-        """Make what steps with a limit are not to wait for, for the plan that loops begin with; nothing without a
-        limit."""
+        """Compute everything that steps with a time limit should not wait for, for the plan that loops begin with;
+        nothing without a limit."""
         self._again = plan.known.pieces(plan.decision)[:, 0]
         if self._seconds is None:
             return
-        state, began = np.asarray(self._model.problem.initial_state, dtype=float), clock.perf_counter()
+        state, start_time = np.asarray(self._model.problem.initial_state, dtype=float), clock.perf_counter()
         remaining(self._model, 0, state, None)
-        self._written = clock.perf_counter() - began
+        self._written = clock.perf_counter() - start_time
         self._took = WHOLE * self._written
         if self._model.feedback is not None:
             retuning = Retuning(plan.known, plan.decision)
@@ -208,7 +225,7 @@ class Resolving:
                     return  # those that are left are never begun
 
     def _in_time(self, piece: int) -> bool:
-        """Whether a whole program from a piece on is expected to end within the limit."""
+        """Return whether a whole program from a piece on is expected to end within the time limit."""
         pieces = self._model.control.pieces - piece
         needed = max(self._written, self._took * (pieces / self._pieces) ** 2)
         return self._seconds is None or needed <= self._seconds
@@ -216,23 +233,23 @@ class Resolving:
     def answer(
         self, plan: Plan, piece: int, state: Array, before: Array | None, innovations: Sequence[Array]
     ) -> Solved:
-        """The best of what is left from piece ``piece`` of the whole control on, compared with what ``plan`` has left
-        after what was seen; the state ``(d,)`` is measured, ``before (m,)`` is the last control. Nothing where no
-        answer is proven."""
+        """Return the best plan for the remaining horizon from piece ``piece`` of the whole control on, compared with
+        the remainder of ``plan`` after the ``innovations`` so far. The ``state (d,)`` is measured, ``before (m,)`` is
+        the last control. The result holds no plan where no answer is proven."""
         deadline = Deadline(self._seconds)
         tools = replace(self._tools, deadline=deadline, notify=ignore)
         try:
-            found = (self._fixed if self._model.feedback is None else self._feedback)(
+            solved = (self._fixed if self._model.feedback is None else self._feedback)(
                 plan, piece, state, before, innovations, tools
             )
         except (
             SparseRobError,
             OutOfTime,
         ):  # a state from which nothing is to be had; what the last plan has left is proven
-            found = Solved(None)
+            solved = Solved(None)
         if deadline.pressed:
             raise KeyboardInterrupt
-        return found
+        return solved
 
     def _feedback(
         self,
@@ -247,40 +264,41 @@ class Resolving:
         tuned, pieces = self._tuned(plan, piece, state, innovations), self._model.control.pieces - piece
         if not self._in_time(piece):
             return tuned
-        began, whole = clock.perf_counter(), Solved(None)
+        start_time, full = clock.perf_counter(), Solved(None)
         with suppress(SparseRobError, OutOfTime):
             model = remaining(self._model, piece, state, before)
             gap = float(self._model.control.breakpoints[piece] - self._model.control.breakpoints[plan.first])
             result = answered_in_own_units(partial(self._begun, plan.cuts, gap), model.program, tools)
-            known = plan.cost_left(piece - plan.first, innovations)
-            whole = self._judged(model, result, piece, result.decision, result.cost, result.lower_bound, known)
-        self._took, self._pieces = clock.perf_counter() - began, pieces
-        if whole.plan is None:
+            known_cost = plan.cost_left(piece - plan.first, innovations)
+            full = self._judged(model, result, piece, result.decision, result.cost, result.lower_bound, known_cost)
+        self._took, self._pieces = clock.perf_counter() - start_time, pieces
+        if full.plan is None:
             self._took *= 2.0  # it needs more than it had
-        if tuned.plan is None or (whole.plan is not None and whole.cost <= tuned.cost):
-            return whole
-        return replace(tuned, lower=whole.lower)
+        if tuned.plan is None or (full.plan is not None and full.cost <= tuned.cost):
+            return full
+        return replace(tuned, lower=full.lower)
 
     def _begun(self, cuts: Sequence[Cut], gap: float, program: SemiInfiniteProgram, tools: Tools) -> Result:
-        """The exchange of a program in its own units that begins ``gap`` later than where these ``cuts`` mattered."""
+        """Solve a program in its own units by the exchange method, starting from the ``cuts`` of an earlier solve. The
+        program begins ``gap`` later than the program in which these cuts were active."""
         return self._method.close(program, tools, prover_of(program, tools), shifted(cuts, gap, program))
 
     def _tuned(self, plan: Plan, piece: int, state: Array, innovations: Sequence[Array]) -> Solved:
-        """The same gains with the best nominal control for them, where `Retuning` knows such problems."""
-        retuning = next((one for one in self._retuning if one.model is plan.known), None)
+        """Solve for the best nominal control with the same gains, where `Retuning` accepts the problem."""
+        retuning = next((entry for entry in self._retuning if entry.model is plan.known), None)
         if retuning is None:
             if self._seconds is not None and self._written > self._seconds:
                 return Solved(None)
             retuning = Retuning(plan.known, plan.decision)
             self._retuning = [*self._retuning[:1], retuning]  # that of the plan that loops begin with, and the last
-        begun = piece - plan.first
-        found = retuning.solve(begun, state)
-        if found is None:
+        plan_piece = piece - plan.first
+        tracked = retuning.solve(plan_piece, state)
+        if tracked is None:
             return Solved(None)
-        decision = retuned(plan.known, plan.decision, begun, plan.left(begun, innovations), found.decision)
+        decision = retuned(plan.known, plan.decision, plan_piece, plan.left(plan_piece, innovations), tracked.decision)
         tuned = replace(plan, decision=decision)
-        cost, known = (one.cost_left(begun, innovations) for one in (tuned, plan))
-        return Solved(tuned, cost, cheaper=is_cheaper(cost, known))
+        cost, known_cost = (candidate.cost_left(plan_piece, innovations) for candidate in (tuned, plan))
+        return Solved(tuned, cost, cheaper=is_cheaper(cost, known_cost))
 
     def _fixed(
         self,
@@ -291,17 +309,17 @@ class Resolving:
         innovations: Sequence[Array],
         tools: Tools,
     ) -> Solved:
-        quick = self._tracked(plan, piece, state, innovations)
-        if quick is not None:
-            return quick
+        tracked = self._tracked(plan, piece, state, innovations)
+        if tracked is not None:
+            return tracked
         tools.deadline.check()
         if not self._in_time(piece):
             return Solved(None)
-        began = clock.perf_counter()
+        start_time = clock.perf_counter()
         try:
             return self._closed(plan, piece, state, before, innovations, tools)
         finally:
-            self._took, self._pieces = clock.perf_counter() - began, self._model.control.pieces - piece
+            self._took, self._pieces = clock.perf_counter() - start_time, self._model.control.pieces - piece
 
     def _closed(
         self,
@@ -312,7 +330,7 @@ class Resolving:
         innovations: Sequence[Array],
         tools: Tools,
     ) -> Solved:
-        """The program of what is left, closed by the exchange."""
+        """Solve the remaining program by the exchange method until its gap is closed."""
         model, own, units = self._own(piece, state, before)
         program = own.program
         gap = float(self._model.control.breakpoints[piece] - self._model.control.breakpoints[plan.first])
@@ -322,56 +340,59 @@ class Resolving:
             prover_of(program, replace(tools, notify=ignore)),
             shifted(plan.cuts, gap, program),
         )
-        theirs = np.repeat(units.controls, own.control.functions)
-        decision = None if result.decision is None else result.decision * theirs
-        tail = plan.left(piece - plan.first, innovations).ravel() / theirs
-        known = units.cost * float(program.cost(tail))
+        control_units = np.repeat(units.controls, own.control.functions)
+        decision = None if result.decision is None else result.decision * control_units
+        tail = plan.left(piece - plan.first, innovations).ravel() / control_units
+        known_cost = units.cost * float(program.cost(tail))
         cuts = tuple(replace(cut, index=cut.index * index_units(program, cut)) for cut in result.indices)
         result = replace(result, indices=cuts)
         return self._judged(
-            model, result, piece, decision, units.cost * result.cost, units.cost * result.lower_bound, known
+            model, result, piece, decision, units.cost * result.cost, units.cost * result.lower_bound, known_cost
         )
 
     def _tracked(self, plan: Plan, piece: int, state: Array, innovations: Sequence[Array]) -> Solved | None:
-        """The answer of `Tracking` where it knows such problems and closes the gap."""
+        """Return the answer of `Tracking` where it accepts the problem and closes the gap; otherwise ``None``."""
         if self._model.problem.control_step is not None:
             return None
-        late = self._seconds is not None and self._written > self._seconds and piece not in self._tracking
-        tracking = None if late else self._tracker(piece, state)
+        is_too_late = self._seconds is not None and self._written > self._seconds and piece not in self._tracking
+        tracking = None if is_too_late else self._tracker(piece, state)
         if tracking is None:
             return None
         model, own, units = self._prepared(piece, state)
-        found = tracking.solve(state / units.states)
-        if found is None:
+        tracked = tracking.solve(state / units.states)
+        if tracked is None:
             return None
-        if relative_gap(found.lower, found.cost, own.program.added(found.decision)) > self._method.tolerance:
+        if relative_gap(tracked.lower, tracked.cost, own.program.added(tracked.decision)) > self._method.tolerance:
             return None
-        theirs = np.repeat(units.controls, own.control.functions)
-        known = float(own.program.cost(plan.left(piece - plan.first, innovations).ravel() / theirs))
-        decision, cost = found.decision * theirs, units.cost * found.cost
+        control_units = np.repeat(units.controls, own.control.functions)
+        known_cost = float(own.program.cost(plan.left(piece - plan.first, innovations).ravel() / control_units))
+        decision, cost = tracked.decision * control_units, units.cost * tracked.cost
         return Solved(
             Plan(model, decision, piece, state=state.copy()),
             cost,
-            units.cost * found.lower,
-            is_cheaper(found.cost, known),
+            units.cost * tracked.lower,
+            is_cheaper(tracked.cost, known_cost),
         )
 
     def _tracker(self, piece: int, state: Array) -> Tracking | None:
-        """What solves from a piece on, where it knows such problems."""
+        """Return the solver `Tracking` of the remaining problem from a piece on; ``None`` where it does not accept the
+        problem."""
         if piece not in self._tracking:
             own = self._prepared(piece, state)[1]
             self._tracking[piece] = Tracking(own) if trackable(own) else None
         return self._tracking[piece]
 
     def _prepared(self, piece: int, state: Array) -> tuple[Transcription, Transcription, Units]:
-        """What is left, from the first state that was asked for, in the user's units and in its own."""
+        """Return the remaining problem in the user's units, the same problem in its own units, and these units. The
+        initial state is the first one that was asked for at this piece."""
         if piece not in self._kept:
             model = remaining(self._model, piece, state, None)
             self._kept[piece] = (model, *in_own_units(model))
         return self._kept[piece]
 
     def _own(self, piece: int, state: Array, before: Array | None) -> tuple[Transcription, Transcription, Units]:
-        """What is left, in the user's units and in its own."""
+        """Return the remaining problem from this state in the user's units, the same problem in its own units, and
+        these units."""
         if self._model.problem.control_step is not None:
             model = remaining(self._model, piece, state, before, again=self._again)
             return (model, *in_own_units(model))
@@ -394,15 +415,18 @@ class Resolving:
 
 
 def is_cheaper(cost: float, known: float) -> bool:
-    """Whether a cost is less than a known one by more than rounding."""
+    """Return whether a cost is less than a known cost by more than rounding."""
     return cost < known - BETTER * max(abs(known), abs(cost))
 
 
 def shifted(cuts: Sequence[Cut], gap: float, program: SemiInfiniteProgram) -> Violated:
-    """Cuts in the user's units as rows of a program in its own that begins ``gap`` later; those of the past, and of
-    constraints that are over, are left out. Where a program holds for every deviation they are times, with all rows."""
+    """Return cuts, given in the user's units, as rows of a program in its own units that begins ``gap`` later.
+
+    Cuts of the past, and of constraints that are over, are left out. For a family that holds for every deviation, the
+    cuts are times, with all rows.
+    """
     families = {family.name: family for family in program.families}
-    found = []
+    rows = []
     for cut in cuts:
         family = families.get(cut.family)
         if family is None:
@@ -413,18 +437,21 @@ def shifted(cuts: Sequence[Cut], gap: float, program: SemiInfiniteProgram) -> Vi
         index = cut.index[:size].copy()
         index[0] -= gap
         index = index if units is None else index / units
-        begun = family.uncertain is not None and family.start is not None and _holds(family.start, index, box.upper[0])
-        if box.lower[0] <= index[0] <= box.upper[0] and not begun:
-            found.append((index[None], np.array([cut.row]), cut.family))
-    return found
+        is_start = (
+            family.uncertain is not None and family.start is not None and _holds(family.start, index, box.upper[0])
+        )
+        if box.lower[0] <= index[0] <= box.upper[0] and not is_start:
+            rows.append((index[None], np.array([cut.row]), cut.family))
+    return rows
 
 
 def _holds(start: Array, index: Array, last: float) -> bool:
-    """Whether an index is among those that a method begins with, but for the rounding of times up to ``last``."""
+    """Return whether an index is among the indices that a method begins with, up to the rounding of times up to
+    ``last``."""
     return bool((np.abs(start - index).max(axis=1) <= SAME_TIME * abs(last)).any())
 
 
 def index_units(program: SemiInfiniteProgram, cut: Cut) -> Array:
-    """What one of each coordinate of a cut's index is in the user's units."""
+    """Return the value of one unit of each coordinate of a cut's index, in the user's units."""
     units = program.family(cut.family).index_units
     return np.ones(cut.index.size) if units is None else units

@@ -1,8 +1,9 @@
-"""Gains that stay as they are, and a nominal control that is chosen anew when a state is measured.
+"""Nominal control that is chosen anew when a state is measured, with unchanged gains.
 
-When innovations were seen until ``tau_p``, the control that is left is ``v_k + sum_{p < j} M_kj e_j``, with
-``v_k`` the nominal one and what the gains make of the past. With the same ``M`` this is a problem in ``v`` alone: what
-future disturbances add to a row does not depend on it. So it is as quickly solved and proven as one without feedback.
+After innovations up to ``tau_p``, the remaining control is ``v_k + sum_{p < j} M_kj e_j``. Here ``v_k`` is the nominal
+control plus the response of the gains to the past. With the same ``M`` this is a problem in ``v`` alone: the effect of
+future disturbances on a row does not depend on ``v``. So the problem is solved and proven as quickly as one without
+feedback.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from sparserob_core.sip.convex_set import Array
 
 @final
 class Kept:
-    """What future disturbances add under the gains of a ``decision (n,)``, from piece ``piece`` on, to rows ``H (R,
+    """Effect of future disturbances under the gains of a ``decision (n,)``, from piece ``piece`` on, on rows ``H (R,
     d)``: the `Answering` of a `Tracking`."""
 
     def __init__(self, model: Transcription, decision: Array, piece: int, H: Array) -> None:
@@ -36,39 +37,41 @@ class Kept:
         self.effects = loop.effects(decision)[piece:] * later
 
     def room(self) -> tuple[Array, Array]:
-        """See `Answering`."""
+        """Return how far the control may lie below and above the nominal control on every piece, ``(m, K)`` each."""
         return self.spread.support(-self.effects).T, self.spread.support(self.effects).T
 
     def added(self, flow: Array, driven: Array, piece: int) -> Array:
-        """See `Answering`."""
+        """Return the support value ``(q, R)`` of the future deviations in every row at instants of a piece."""
         return self.spread.support(self.H @ (flow @ self.nodes[piece] + driven @ self.drives[piece]))
 
     def bending(self, curvature: Callable[[Array], Array]) -> tuple[Array, Array]:
-        """See `Answering`."""
+        """Return bounds ``(K, R)`` of the second derivative of the support value over every piece, and the sums of
+        absolute numbers ``(K + 1, R)`` from which the support value is computed."""
         rates = (self.A @ self.nodes + self.drives)[:-1].swapaxes(1, 2)  # (K, Q, d)
-        bent = np.einsum("kqr,q->kr", curvature(rates), self.spread.radii)
-        return bent, np.einsum("kdq,rd,q->kr", np.abs(self.nodes), np.abs(self.H), self.spread.radii)
+        bounds = np.einsum("kqr,q->kr", curvature(rates), self.spread.radii)
+        return bounds, np.einsum("kdq,rd,q->kr", np.abs(self.nodes), np.abs(self.H), self.spread.radii)
 
 
 @final
 class Retuning:
-    """Chooses the nominal control of one plan anew at its pieces; gains and everything that belongs to them are kept
-    from one loop to the next."""
+    """Solver for the nominal control of one plan at its pieces; gains and everything that depends on them are kept from
+    one loop to the next."""
 
     def __init__(self, model: Transcription, decision: Array) -> None:
         self.model, self.decision = model, decision
         self._tracking: dict[int, Tracking | None] = {}
 
     def prepare(self, state: Array) -> None:
-        """Make what belongs to every piece, as long as the problem is of the kind; the state ``(d,)`` changes
-        nothing."""
+        """Compute the solver of every piece, as long as `Tracking` accepts the problem; the value of ``state (d,)``
+        does not matter."""
         for piece in range(self.model.control.pieces):
             if self._tracking.setdefault(piece, self._prepared(piece, state)) is None:
                 return
 
     def solve(self, piece: int, state: Array) -> Tracked | None:
-        """The nominal control ``(m K',)`` that is left from ``piece`` on, with what the gains make of the past, from a
-        measured ``state (d,)``; ``None`` where no answer is proven, or where the problem is not of the kind."""
+        """Return the nominal control ``(m K',)`` that remains from ``piece`` on, with the response of the gains to the
+        past, from a measured ``state (d,)``. ``None`` where no answer is proven, or where `Tracking` does not accept
+        the problem."""
         if piece not in self._tracking:
             self._tracking[piece] = self._prepared(piece, state)
         tracking = self._tracking[piece]
@@ -84,29 +87,34 @@ class Retuning:
         if signal is None or signal.starts is None or signal.starts.size != grid.pieces or not _plain(model):
             return None
         try:
-            left = remaining(model, piece, state, None, alone=True)
+            remainder = remaining(model, piece, state, None, alone=True)
         except SparseRobError:
             return None
-        control = left.problem.control
-        left = replace(left, constraints=tuple(one.divided(row_units(one, control)) for one in left.constraints))
-        if not trackable(left):
+        control = remainder.problem.control
+        remainder = replace(
+            remainder,
+            constraints=tuple(
+                constraint.divided(row_units(constraint, control)) for constraint in remainder.constraints
+            ),
+        )
+        if not trackable(remainder):
             return None
-        tracking = Tracking(left, lambda H: Kept(model, self.decision, piece, H))
+        tracking = Tracking(remainder, lambda H: Kept(model, self.decision, piece, H))
         return tracking if tracking.limited else None
 
 
 def _plain(model: Transcription) -> bool:
-    """Whether the problem, without feedback, has nothing that a nominal control alone does not tell: no parameters, no
-    steps, no equalities, on equal pieces."""
+    """Return whether the nominal control alone determines the problem without feedback: no parameters, no steps of the
+    control, no equalities, on equal pieces."""
     problem, grid = model.problem, model.response.grid
-    plain = problem.system.parameters is None and problem.control_step is None and model.program.A is None
-    return plain and model.response.uniform and grid.pieces == model.control.pieces
+    is_plain = problem.system.parameters is None and problem.control_step is None and model.program.A is None
+    return is_plain and model.response.uniform and grid.pieces == model.control.pieces
 
 
 def retuned(model: Transcription, decision: Array, piece: int, left: Array, found: Array) -> Array:
-    """The decision whose control from ``piece`` on is ``found (m K',)`` where it was ``left (m, K')``: the nominal
-    control moves by the difference."""
-    moved = decision.copy()
-    nominal = moved[: model.control.pieces * left.shape[0]].reshape(left.shape[0], -1)
+    """Return the decision with another control from ``piece`` on: ``found (m K',)`` instead of ``left (m, K')``. The
+    nominal control moves by the difference."""
+    changed = decision.copy()
+    nominal = changed[: model.control.pieces * left.shape[0]].reshape(left.shape[0], -1)
     nominal[:, piece:] += found.reshape(left.shape) - left
-    return moved
+    return changed

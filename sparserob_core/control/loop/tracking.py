@@ -1,7 +1,7 @@
-"""The open-loop program of a known system on equal pieces, solved and proven again for one initial state after another.
+"""Open-loop program of a known system on equal pieces, solved and proven again for one initial state after another.
 
-Rows, the worst disturbance at a time, and how far it bends, do not depend on the initial state. They are kept by where
-in a piece a time is, so that what is left for a new state is a linear program from the last basis, and a proof in which
+Rows, the worst disturbance at a time, and its curvature do not depend on the initial state. They are stored by the
+position of a time in its piece. A new state then needs only a linear program from the last basis, and a proof in which
 only the nominal state is new.
 """
 
@@ -46,8 +46,8 @@ class Tracked:
 @final
 @dataclass(frozen=True, eq=False)
 class _Instants:
-    """What all pieces share at some times after they begin: ``flow``, ``driven (q, d, d)``, and what the disturbance
-    adds to the rows until then, ``pushed (q, K + 1, R)``."""
+    """Quantities that all pieces share at some times after they begin: ``flow``, ``driven (q, d, d)``, and the support
+    value of the disturbance in the rows until then, ``pushed (q, K + 1, R)``."""
 
     flow: Array
     driven: Array
@@ -55,46 +55,54 @@ class _Instants:
 
 
 def trackable(own: Transcription) -> bool:
-    """Whether a transcription, in its own units, is one that `Tracking` knows."""
+    """Return whether `Tracking` accepts a transcription, given in its own units: a linear open-loop program of a known
+    system, with flat constraints, a box of controls around 0, and windows that end at breakpoints of equal pieces."""
     problem, grid, program, model = own.problem, own.response.grid, own.program, own.functionals.disturbance
     K = own.control.pieces
-    plain = problem.system.parameters is None and not problem.system.switches and problem.system.delay == 0.0
-    plain = plain and problem.initial_set is None and problem.control_step is None and own.feedback is None
-    linear = program.S is None and program.P is None and program.A is None and problem.cost.is_linear
-    linear = linear and problem.control.is_box and own.control.is_indicators
-    pieces = own.response.uniform and grid.pieces == K
+    is_plain = problem.system.parameters is None and not problem.system.switches and problem.system.delay == 0.0
+    is_plain = is_plain and problem.initial_set is None and problem.control_step is None and own.feedback is None
+    is_linear = program.S is None and program.P is None and program.A is None and problem.cost.is_linear
+    is_linear = is_linear and problem.control.is_box and own.control.is_indicators
+    is_uniform = own.response.uniform and grid.pieces == K
     if model is not None:
-        pieces = pieces and model.kind == "piecewise_constant" and model.starts is not None and model.starts.size == K
-    if not (plain and linear and pieces) or K * K * problem.system.states * problem.system.controls > NUMBERS:
+        is_uniform = (
+            is_uniform and model.kind == "piecewise_constant" and model.starts is not None and model.starts.size == K
+        )
+    if not (is_plain and is_linear and is_uniform) or K * K * problem.system.states * problem.system.controls > NUMBERS:
         return False
-    flat = all(isinstance(one, FlatConstraint) and one.gains is None and not one.reference.moves
-               for one in own.constraints)  # fmt: skip
-    box, ends = problem.control.bounding_box(), [t for one in own.constraints for t in (one.start, one.stop)]
+    is_flat = all(isinstance(constraint, FlatConstraint) and constraint.gains is None and not constraint.reference.moves
+                  for constraint in own.constraints)  # fmt: skip
+    box, ends = (
+        problem.control.bounding_box(),
+        [t for constraint in own.constraints for t in (constraint.start, constraint.stop)],
+    )
     places = np.array(ends) * K / problem.horizon
-    on = bool((np.abs(places - np.rint(places)) <= SAME).all())
-    return flat and on and bool((box.lower <= 0.0).all() and (box.upper >= 0.0).all())
+    is_on_grid = bool((np.abs(places - np.rint(places)) <= SAME).all())
+    return is_flat and is_on_grid and bool((box.lower <= 0.0).all() and (box.upper >= 0.0).all())
 
 
 class Answering(Protocol):
-    """What future disturbances add to rows ``H x <= h (R,)`` under gains, at times that are counted as those of the
-    nominal problem: from the beginning of each of its ``K`` pieces."""
+    """Effect of future disturbances under gains on rows ``H x <= h (R,)``. Times are counted as in the nominal problem:
+    from the beginning of each of its ``K`` pieces."""
 
     def room(self) -> tuple[Array, Array]:
-        """By how much the control may come below and above the nominal one on every piece, ``(m, K)`` each."""
+        """Return how far the control may lie below and above the nominal control on every piece, ``(m, K)`` each."""
 
     def added(self, flow: Array, driven: Array, piece: int) -> Array:
-        """The largest that is added ``(q, R)`` at instants of a piece, with these flows ``(q, d, d)`` from its
-        beginning; the last piece is followed by a time alone."""
+        """Return the support value ``(q, R)`` of future disturbances in every row at instants of a piece, which have
+        the flows ``flow``, ``driven (q, d, d)`` from its beginning. After the last piece, ``piece = K`` is the horizon
+        alone."""
 
     def bending(self, curvature: Callable[[Array], Array]) -> tuple[Array, Array]:
-        """Bounds ``(K, R)`` of the second derivative of that over every piece, and the numbers ``(K + 1, R)`` of which
-        it is made; ``curvature`` bounds those of the rows of a state from its rates ``(..., d)``."""
+        """Return bounds ``(K, R)`` of the second derivative of the support value over every piece, and the sums of
+        absolute numbers ``(K + 1, R)`` from which the support value is computed. ``curvature`` bounds the second
+        derivative of the rows of a state from its rates ``(..., d)``."""
 
 
 @final
 class Tracking:
-    """`trackable` transcriptions from one initial state ``(d,)`` after another: `solve`. ``answering``: with gains that
-    stay as they are, ``own`` is then what is left when nothing happens."""
+    """Solver for `trackable` transcriptions from one initial state ``(d,)`` after another. With ``answering``, the
+    control also has gains that do not change; ``own`` is then the remaining problem if nothing happens."""
 
     def __init__(self, own: Transcription, answering: Callable[[Array], Answering] | None = None) -> None:
         problem, response, steps = own.problem, own.response, own.response.steps(KNOWN)
@@ -103,21 +111,21 @@ class Tracking:
         self.length = self.horizon / self.K
         self.A, self.B, self.E = steps.A[0, 0], steps.B[0][:, : self.m], steps.E[0]
         self.drift = steps.B[0][:, self.m :].sum(axis=1)
-        flats = [one for one in own.constraints if isinstance(one, FlatConstraint)]
+        flats = [flat for flat in own.constraints if isinstance(flat, FlatConstraint)]
         d = problem.system.states
-        self.H = np.vstack([np.zeros((0, d)), *(one.H for one in flats)])
-        self.h = np.concatenate([np.zeros(0), *(one.h for one in flats)])
-        sizes = [one.h.size for one in flats]
-        self.start = np.repeat([round(one.start / self.length) for one in flats], sizes).astype(int)
-        self.stop = np.repeat([round(one.stop / self.length) for one in flats], sizes).astype(int)
+        self.H = np.vstack([np.zeros((0, d)), *(flat.H for flat in flats)])
+        self.h = np.concatenate([np.zeros(0), *(flat.h for flat in flats)])
+        sizes = [flat.h.size for flat in flats]
+        self.start = np.repeat([round(flat.start / self.length) for flat in flats], sizes).astype(int)
+        self.stop = np.repeat([round(flat.stop / self.length) for flat in flats], sizes).astype(int)
         self.kernel = np.ascontiguousarray(response.kernel.swapaxes(0, 1))  # (K, d, d): what a piece of an age gives
         self.powers = response.flows(response.grid.breakpoints)[0]
-        driven, pushed = self.kernel @ self.B, np.cumsum(self.kernel @ self.drift, axis=0)
+        control_response, effects = self.kernel @ self.B, np.cumsum(self.kernel @ self.drift, axis=0)
         nodes = np.zeros((self.K + 1, d, self.m, self.K))
         for k in range(1, self.K + 1):
-            nodes[k, :, :, :k] = driven[k - 1 :: -1].transpose(1, 2, 0)
+            nodes[k, :, :, :k] = control_response[k - 1 :: -1].transpose(1, 2, 0)
         self.nodes = nodes.reshape(self.K + 1, d, -1)
-        self.fixed = np.vstack([np.zeros((1, d)), pushed])
+        self.fixed = np.vstack([np.zeros((1, d)), effects])
         box = problem.control.bounding_box()
         self._answering = None if answering is None else answering(self.H)
         low, high = np.repeat(box.lower, self.K), np.repeat(box.upper, self.K)
@@ -141,21 +149,21 @@ class Tracking:
         self._offsets: dict[int, tuple[Array, Array]] = {}
         self._given = self.kernel @ self.E
         self._added: dict[tuple[int, int, int], Array] = {}
-        self._first, still = self._pushed(np.eye(d)[None], np.zeros((1, d, d)))[0], np.zeros((1, d, d))
-        self._bent, made = self._bending(), np.zeros_like(self._first)
+        self._first, zeros = self._pushed(np.eye(d)[None], np.zeros((1, d, d)))[0], np.zeros((1, d, d))
+        self._bent, magnitudes = self._bending(), np.zeros_like(self._first)
         if self._answering is not None:
-            ends = [self._answering.added(np.eye(d)[None], still, k) for k in range(self.K + 1)]
+            ends = [self._answering.added(np.eye(d)[None], zeros, k) for k in range(self.K + 1)]
             self._first = np.concatenate(ends)
-            self._bent, made = self._answering.bending(lambda rates: self._curvature(rates, self.length))
+            self._bent, magnitudes = self._answering.bending(lambda rates: self._curvature(rates, self.length))
         self._flat = self.nodes.reshape(-1, self.nodes.shape[2])
         self._sizes = np.abs(self.powers)
         self._absolute = ROUND_OFF * np.abs(self.H).T
         number = np.arange(self.K + 1)[:, None]
         self._seen = (number >= self.start) & (number <= self.stop)
         self._inside = (number[:-1] >= self.start) & (number[:-1] < self.stop)
-        pushed = np.abs(self._first)
-        self._noise = self.sizes @ self._absolute + ROUND_OFF * (np.abs(self.h) + pushed.max(axis=0, initial=0.0))
-        self._noise = self._noise + ROUND_OFF * made
+        effects = np.abs(self._first)
+        self._noise = self.sizes @ self._absolute + ROUND_OFF * (np.abs(self.h) + effects.max(axis=0, initial=0.0))
+        self._noise = self._noise + ROUND_OFF * magnitudes
         self._recent: list[tuple[int, int, int, int]] = []  # rows that had a multiplier, those of the last states last
         self._begin()
 
@@ -165,147 +173,151 @@ class Tracking:
         self._free, self._right = np.zeros((0, self.H.shape[1])), np.zeros(0)
 
     def solve(self, state: Array) -> Tracked | None:
-        """The answer from an initial state; ``None`` where none was proven."""
+        """Return the answer from an initial state; ``None`` where none was proven."""
         if len(self._places) > KEPT:
             self._forget()
         nominal = self._undriven(state)
         for round_ in range(ROUNDS):
             h = self._right - self._free @ state
-            found = self._program.solve(h - MARGIN)
-            if found is None:
+            solution = self._program.solve(h - MARGIN)
+            if solution is None:
                 return None
-            x, y = found
-            open_ = self._open(x, *nominal)
-            if open_ is None:
+            x, y = solution
+            open_instants = self._open(x, *nominal)
+            if open_instants is None:
                 return None
-            if not open_:
+            if not open_instants:
                 self._recent = [*self._recent, *(self._places[i] for i in np.flatnonzero(y > 0.0))][-RECENT:]
                 weights = self.limits[0]
                 return Tracked(x, float(weights @ np.abs(x)), self._program.bound(h, y))
-            fresh = [place for place in open_ if place not in self._places]
-            if not fresh:
+            new_instants = [instant for instant in open_instants if instant not in self._places]
+            if not new_instants:
                 return None
-            self._impose(fresh + self._between(fresh) if round_ else fresh)
+            self._impose(new_instants + self._between(new_instants) if round_ else new_instants)
         return None
 
     def _forget(self) -> None:
-        """Leave out the rows that had no multiplier for long."""
+        """Remove the rows without a multiplier in the last solutions."""
         needed = set(list(dict.fromkeys(self._recent))[-KEPT // 2 :])
-        kept = self._program.keep(np.array([place in needed for place in self._places], dtype=bool))
+        kept = self._program.keep(np.array([instant in needed for instant in self._places], dtype=bool))
         self._places = [self._places[i] for i in np.flatnonzero(kept)]
         self._free, self._right = self._free[kept], self._right[kept]
 
     def _between(self, fresh: list[tuple[int, int, int, int]]) -> list[tuple[int, int, int, int]]:
-        """Instants halfway from new ones to the next on both sides: a peak between two rows is else halved round by
-        round."""
-        found = list[tuple[int, int, int, int]]()
+        """Return instants halfway from new rows to the next rows on both sides. Without them, a peak between two rows
+        would be halved round by round."""
+        instants = list[tuple[int, int, int, int]]()
         for row, piece, level, number in fresh:
-            known = sorted(n for *same, n in self._places if same == [row, piece, level])
-            after = bisect_left(known, number)
-            found += [(row, piece, level, (number + n) // 2) for n in known[max(after - 1, 0) : after + 1]]
-        return [place for place in dict.fromkeys(found) if place not in fresh and place not in self._places]
+            numbers = sorted(n for *same, n in self._places if same == [row, piece, level])
+            after = bisect_left(numbers, number)
+            instants += [(row, piece, level, (number + n) // 2) for n in numbers[max(after - 1, 0) : after + 1]]
+        return [instant for instant in dict.fromkeys(instants) if instant not in fresh and instant not in self._places]
 
     def _impose(self, places: list[tuple[int, int, int, int]]) -> None:
         G, F, right = [], [], []
         for row, piece, level, number in places:
-            c, here, pushed = self.H[row], np.zeros(self.H.shape[1]), self._first[piece, row]
+            c, input_row, support_value = self.H[row], np.zeros(self.H.shape[1]), self._first[piece, row]
             if level:
                 parent = min(number // PARTS, PARTS ** (level - 1) - 1)
                 block, at = self._block(level, parent), number - parent * PARTS
-                c, here, pushed = c @ block.flow[at], c @ block.driven[at], self._at(level, parent, piece)[at, row]
+                c, input_row, support_value = (
+                    c @ block.flow[at],
+                    c @ block.driven[at],
+                    self._at(level, parent, piece)[at, row],
+                )
             g = (c @ self.nodes[piece]).reshape(self.m, self.K)
             if level:
-                g[:, piece] += here @ self.B
+                g[:, piece] += input_row @ self.B
             G.append(g.ravel())
             F.append(c @ self.powers[piece])
-            right.append(self.h[row] - c @ self.fixed[piece] - here @ self.drift - pushed)
+            right.append(self.h[row] - c @ self.fixed[piece] - input_row @ self.drift - support_value)
         self._program.add(np.array(G))
         self._free = np.vstack([self._free, F])
         self._right = np.concatenate([self._right, right])
         self._places += places
 
     def _undriven(self, state: Array) -> tuple[Array, Array]:
-        """The states ``(K + 1, d)`` at the breakpoints without control, and what rounding may do to the rows there,
-        ``(K + 1, R)``."""
+        """Return the states ``(K + 1, d)`` at the breakpoints without control, and the rounding error of the rows
+        there, ``(K + 1, R)``."""
         return self.powers @ state + self.fixed, self._noise + self._sizes @ np.abs(state) @ self._absolute
 
     def _open(self, x: Array, undriven: Array, noise: Array) -> list[tuple[int, int, int, int]] | None:
-        """The worst instant of every row in every run of cells in which it is not proven to hold; none where all are
-        proven, ``None`` where that is not told."""
+        """Return the worst instant of every row in every run of cells in which the row is not proven to hold. The list
+        is empty where all rows are proven; ``None`` where this remains undecided."""
         nodes = (self._flat @ x).reshape(self.fixed.shape) + undriven
         drives = x.reshape(self.m, self.K).T @ self.B.T + self.drift
         heights = nodes @ self.H.T + self._first - self.h
-        wrong = (heights + noise > TOLERANCE) & self._seen
-        if wrong.any():
-            worst = np.where(wrong, heights, -np.inf)
+        is_violated = (heights + noise > TOLERANCE) & self._seen
+        if is_violated.any():
+            worst = np.where(is_violated, heights, -np.inf)
             peaks = self._peaks(worst, 0, np.zeros(self.K + 1, int), np.arange(self.K + 1))
             return self._sharpened(peaks, nodes, drives)
         rates = nodes[:-1] @ self.A.T + drives
-        bent = (self._curvature(rates, self.length) + self._bent) * (self.length**2 / 8.0)
+        curvature = (self._curvature(rates, self.length) + self._bent) * (self.length**2 / 8.0)
         noise = np.maximum(noise[:-1], noise[1:])
-        open_ = (np.maximum(heights[:-1], heights[1:]) + bent + noise > TOLERANCE) & self._inside
-        cells = [(int(k), 0) for k in np.flatnonzero(open_.any(axis=1))]
+        is_open = (np.maximum(heights[:-1], heights[1:]) + curvature + noise > TOLERANCE) & self._inside
+        cells = [(int(k), 0) for k in np.flatnonzero(is_open.any(axis=1))]
         for level in range(1, LEVELS + 1):
             if not cells or len(cells) > FEW:
                 break
-            found, left = list[tuple[int, int, int, int]](), list[tuple[int, int]]()
+            instants, open_cells = list[tuple[int, int, int, int]](), list[tuple[int, int]]()
             width = self.length / PARTS**level
             for k, parent in cells:
                 at = self._block(level, parent)
                 states = at.flow @ nodes[k] + at.driven @ drives[k]  # (PARTS + 1, d)
                 heights = states @ self.H.T + self._at(level, parent, k) - self.h
-                wrong = (heights + noise[k] > TOLERANCE) & self._inside[k]
+                is_violated = (heights + noise[k] > TOLERANCE) & self._inside[k]
                 first = parent * PARTS
-                if wrong.any():
+                if is_violated.any():
                     numbers = np.arange(first, first + PARTS + 1)
-                    worst = np.where(wrong, heights, -np.inf)
-                    found += self._peaks(worst, level, numbers, np.full(numbers.size, k))
-                elif not found:
-                    curved = self._curvature(states[:-1] @ self.A.T + drives[k], width) + self._bent[k]
-                    above = np.maximum(heights[:-1], heights[1:]) + curved * (width**2 / 8.0) + noise[k]
-                    still = ((above > TOLERANCE) & self._inside[k]).any(axis=1)
-                    left += [(k, first + int(one)) for one in np.flatnonzero(still)]
-            if found:
-                return self._sharpened(found, nodes, drives)
-            cells = left
+                    worst = np.where(is_violated, heights, -np.inf)
+                    instants += self._peaks(worst, level, numbers, np.full(numbers.size, k))
+                elif not instants:
+                    cell_curvature = self._curvature(states[:-1] @ self.A.T + drives[k], width) + self._bent[k]
+                    upper_bounds = np.maximum(heights[:-1], heights[1:]) + cell_curvature * (width**2 / 8.0) + noise[k]
+                    is_open_cell = ((upper_bounds > TOLERANCE) & self._inside[k]).any(axis=1)
+                    open_cells += [(k, first + int(cell)) for cell in np.flatnonzero(is_open_cell)]
+            if instants:
+                return self._sharpened(instants, nodes, drives)
+            cells = open_cells
         return None if cells else []
 
     def _peaks(self, worst: Array, level: int, at: np.ndarray, pieces: np.ndarray) -> list[tuple[int, int, int, int]]:
-        """Local maxima of violations ``(k, R)`` at instants that follow one another."""
+        """Return the local maxima of violations ``(k, R)`` at consecutive instants."""
         padded = np.vstack([np.full(worst.shape[1], -np.inf), worst, np.full(worst.shape[1], -np.inf)])
-        top = (worst > padded[:-2]) & (worst >= padded[2:]) & np.isfinite(worst)
-        return [(int(row), int(pieces[k]), level, int(at[k])) for k, row in np.argwhere(top)]
+        is_peak = (worst > padded[:-2]) & (worst >= padded[2:]) & np.isfinite(worst)
+        return [(int(row), int(pieces[k]), level, int(at[k])) for k, row in np.argwhere(is_peak)]
 
     def _sharpened(
         self, places: list[tuple[int, int, int, int]], nodes: Array, drives: Array
     ) -> list[tuple[int, int, int, int]]:
-        """Where the rows at these places are worst close by: a row at the very peak of a trajectory saves the rounds
-        that would come closer to it one by one."""
-        found = []
+        """Return the instants near these places at which the rows are worst. A row at the very peak of a trajectory
+        saves the rounds that would approach the peak row by row."""
+        instants = []
         for row, piece, level, number in places:
             while level < SHARP:
-                size, tried = PARTS**level, list[tuple[float, int, int]]()
+                size, candidates = PARTS**level, list[tuple[float, int, int]]()
                 for before in (1, 0):  # the cells that end and begin in the instant
                     k, cell = (piece - 1, size - 1) if number < before else (piece, number - before)
                     k, cell = (k + 1, 0) if cell == size else (k, cell)
                     if 0 <= k < self.K and self._inside[k, row]:
-                        at = self._block(level + 1, cell)
-                        states = at.flow @ nodes[k] + at.driven @ drives[k]
+                        block = self._block(level + 1, cell)
+                        states = block.flow @ nodes[k] + block.driven @ drives[k]
                         heights = states @ self.H[row] + self._at(level + 1, cell, k)[:, row]
                         worst = int(heights.argmax())
-                        tried.append((float(heights[worst]), k, cell * PARTS + worst))
-                if not tried:
+                        candidates.append((float(heights[worst]), k, cell * PARTS + worst))
+                if not candidates:
                     break
-                _, piece, number = max(tried)
+                _, piece, number = max(candidates)
                 level += 1
-            found.append((row, piece, level, number))
-        return list(dict.fromkeys(found))
+            instants.append((row, piece, level, number))
+        return list(dict.fromkeys(instants))
 
     def _curvature(self, rates: Array, width: float) -> Array:
-        """Bounds ``(..., R)`` of the second derivative over a cell in whose beginning the states have ``rates (...,
-        d)``."""
+        """Return bounds ``(..., R)`` of the second derivative of the rows over a cell of this ``width``, at whose
+        beginning the states have the ``rates (..., d)``."""
         if rates.ndim > 2:
-            return np.array([self._curvature(one, width) for one in rates]).reshape(*rates.shape[:-1], self.h.size)
+            return np.array([self._curvature(table, width) for table in rates]).reshape(*rates.shape[:-1], self.h.size)
         if width not in self._series:
             powers = np.cumprod([1.0] + [width] * TERMS)
             tail = self.factors[-1] / TERMS * powers[-1] * np.exp(self.growth * width)
@@ -316,20 +328,21 @@ class Tracking:
         return np.asarray(np.abs(rates @ terms) @ self._summed + sizes[:, None] * tail)
 
     def _block(self, level: int, parent: int) -> _Instants:
-        """The ``PARTS + 1`` ends of the parts of one cell of the level before."""
+        """Return the quantities at the ``PARTS + 1`` ends of the parts of one cell of the level before."""
         key = (level, parent)
         if key not in self._blocks:
             if level not in self._offsets:
                 self._offsets[level] = self.own.response.flows(np.arange(PARTS + 1) * self.length / PARTS**level)
-            flow, driven = self._offsets[level]
+            flow, integral = self._offsets[level]
             if level > 1:
                 before, at = self._block(level - 1, parent // PARTS), parent % PARTS
-                flow, driven = flow @ before.flow[at], flow @ before.driven[at] + driven
-            self._blocks[key] = _Instants(flow, driven, self._pushed(flow, driven))
+                flow, integral = flow @ before.flow[at], flow @ before.driven[at] + integral
+            self._blocks[key] = _Instants(flow, integral, self._pushed(flow, integral))
         return self._blocks[key]
 
     def _at(self, level: int, parent: int, piece: int) -> Array:
-        """What the worst disturbance adds to every row at the instants of a block on one piece, ``(q, R)``."""
+        """Return the support value of the disturbance in every row at the instants of a block on one piece, ``(q, R)``.
+        Under gains, the effect of the control that answers is included."""
         block = self._block(level, parent)
         if self._answering is None:
             return np.asarray(block.pushed[:, piece])
@@ -339,23 +352,24 @@ class Tracking:
         return self._added[key]
 
     def _pushed(self, flow: Array, driven: Array) -> Array:
-        """What the worst disturbance adds to every row on every piece, ``(q, K + 1, R)``."""
-        pushed = np.zeros((flow.shape[0], self.K + 1, self.h.size))
+        """Return the support value of the disturbance in every row on every piece, ``(q, K + 1, R)``, at instants with
+        these flows from the beginning of a piece."""
+        support_values = np.zeros((flow.shape[0], self.K + 1, self.h.size))
         if self.bound is not None:
             q, (K, d, w) = flow.shape[0], self._given.shape
-            past = (self.H @ flow).reshape(-1, d) @ self._given.transpose(1, 0, 2).reshape(d, -1)
-            past = past.reshape(q, self.h.size, K, w).swapaxes(1, 2)
-            pushed[:, 1:] = np.cumsum(self.bound.support(past), axis=1)
-            pushed[:, : self.K] += self.bound.support(self.H @ driven @ self.E)[:, None]
-        return pushed
+            responses = (self.H @ flow).reshape(-1, d) @ self._given.transpose(1, 0, 2).reshape(d, -1)
+            responses = responses.reshape(q, self.h.size, K, w).swapaxes(1, 2)
+            support_values[:, 1:] = np.cumsum(self.bound.support(responses), axis=1)
+            support_values[:, : self.K] += self.bound.support(self.H @ driven @ self.E)[:, None]
+        return support_values
 
     def _bending(self) -> Array:
-        """Bounds ``(K, R)`` of the second derivative of what any disturbance adds, over every piece: the sum of those
-        of its entries, each as large as it may be."""
+        """Return bounds ``(K, R)`` of the second derivative of the effect of any disturbance over every piece: the sum
+        of the bounds of its entries, each as large as it may be."""
         if self.bound is None:
             return np.zeros((self.K, self.h.size))
         reach = self.bound.reach(np.eye(self.E.shape[1]))
         rates = (self.A @ self._given).swapaxes(1, 2)  # (K, mw, d)
-        every = np.einsum("kir,i->kr", self._curvature(rates, self.length), reach)
-        past = np.vstack([np.zeros((1, self.h.size)), np.cumsum(every, axis=0)[:-1]])
+        bounds = np.einsum("kir,i->kr", self._curvature(rates, self.length), reach)
+        past = np.vstack([np.zeros((1, self.h.size)), np.cumsum(bounds, axis=0)[:-1]])
         return np.asarray(past + reach @ self._curvature(self.E.T, self.length))

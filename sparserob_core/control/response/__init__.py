@@ -1,1 +1,1 @@
-"""What the state does: responses to control and disturbance, of known, uncertain and changing systems."""
+"""Responses of the state to control and disturbance, for known, uncertain and time-varying systems."""

@@ -1,6 +1,6 @@
-"""Which disturbances are admissible, and how far the worst of them can push the state.
+"""Admissible disturbances, and the largest effect of any of them on the state.
 
-Every class is a product of copies of one convex set ``D``, one copy per *block*; the state is linear in the blocks, so
+Every class is a product of copies of one convex set ``D``, one copy per *block*. The state is linear in the blocks, so
 the worst disturbance at a given index is found block by block: ``sigma = sum_b h_D(y_b)`` with ``h_D`` the support
 function of ``D`` (Rockafellar 1970, Corollary 16.4.1). It does not depend on the control: the disturbance is eliminated
 exactly.
@@ -25,15 +25,18 @@ from sparserob_core.sip.convex_set import Array, Box, ConvexSet
 
 @dataclass(frozen=True, eq=False)
 class DisturbanceModel:
-    """Blocks of the disturbance, from the weights ``y (..., L, mw)`` that a functional gives to the disturbance on
-    every grid piece.
+    """Blocks of the disturbance, from the weights ``y (..., L, mw)`` of a functional on the disturbance on every grid
+    piece.
 
-    ``basis (nb, L, q)`` lists for block ``b`` the grid-piece values of its ``q`` functions; a block is a vector of
-    ``q mw`` coefficients (channel-major) scaled by ``scale (mw,)``, and it ranges over ``set``. ``pieces`` is a
-    shortcut when the blocks are the pieces themselves. ``lasting``: of which components, and the first of the blocks
-    ``(g,)`` of each of their pieces, where some stay what they are for several blocks; what a functional gives to all
-    of these is then given to the first, whose value they have. Of ``several`` classes the ``classes`` of the parts of
-    ``bound`` are told; the blocks are then those of disturbances that are all constant on pieces, which are admissible.
+    Each block ranges over ``set``, in ``q`` dimensions. With ``starts (nb,)``, a block is the value of the disturbance
+    on several grid pieces, of which ``starts`` are the first. Otherwise a block holds coefficients of the ``functions
+    (N, L)`` on the grid pieces: one block of ``mw N`` coefficients, channel-major, or one block of ``N`` coefficients
+    for each channel, times its ``scale (mw,)``.
+
+    ``lasting``: components whose value is held over several blocks, and for each of their own pieces the number of its
+    first block, ``(g,)``. The weights on all of these blocks are added to the first, which has their value.
+    ``classes``: the classes of the parts of ``bound``, for a disturbance of ``several`` classes. The blocks are then
+    those of disturbances that are all constant on pieces, which are admissible.
     """
 
     kind: Literal["piecewise_constant", "measurable", "l1_ball", "several"]
@@ -48,18 +51,18 @@ class DisturbanceModel:
 
     @cached_property
     def on_blocks(self) -> DisturbanceModel | None:
-        """The model of those that blocks make, ``None`` where all are measurable."""
+        """Model of the disturbances that consist of blocks, ``None`` where all are measurable."""
         if self.kind == "measurable":
             return None
         if self.kind != "several":
             return self
-        held = apart(self.bound, self.classes, "piecewise_constant")
-        assert held is not None
-        return replace(self, kind="piecewise_constant", set=held, bound=held, classes=())
+        held_set = apart(self.bound, self.classes, "piecewise_constant")
+        assert held_set is not None
+        return replace(self, kind="piecewise_constant", set=held_set, bound=held_set, classes=())
 
     @cached_property
     def measurable(self) -> ConvexSet | None:
-        """The set of those that are measurable, ``None`` where there are none."""
+        """Set of the measurable disturbances, ``None`` where there are none."""
         return apart(self.bound, self.classes if self.kind == "several" else self.kind, "measurable")
 
     @property
@@ -76,7 +79,7 @@ class DisturbanceModel:
 
     @shaped
     def held(self, point: Float[Array, " mw"]) -> DisturbanceModel | None:
-        """The one disturbance that stays at a ``point (mw,)``; ``None`` where that is 0."""
+        """Return the model with a single disturbance, which stays at a ``point (mw,)``; ``None`` for the point 0."""
         if not point.any():
             return None
         single = Box(point, point)
@@ -84,13 +87,13 @@ class DisturbanceModel:
 
     @property
     def by_piece(self) -> bool:
-        """Whether the blocks are the pieces of the grid, one each, and no component stays longer what it is."""
+        """True where each block is one piece of the grid, and no component is held over several of them."""
         return self.starts is not None and self.starts.size == self.grid.pieces and not self.lasting
 
     @shaped
     def blocks(self, weights: Float[Array, "*k L mw"]) -> Float[Array, "*k nb q"]:
-        """The functional on every block, ``(..., nb, q)``, from weights ``(..., L, mw)``; linear, so it also serves
-        Taylor coefficients."""
+        """Return the weights of a functional on every block, ``(..., nb, q)``, from weights ``(..., L, mw)``. The map
+        is linear, so it also serves Taylor coefficients."""
         if self.by_piece:
             return weights
         if self.starts is not None:
@@ -102,23 +105,25 @@ class DisturbanceModel:
         return np.asarray(coefficients * self.scale[:, None])
 
     def _gathered(self, blocks: Array) -> Array:
-        """What is given to every block ``(..., nb, mw)``, of components that last longer given to the first."""
+        """Return the weights on every block, ``(..., nb, mw)``. Weights on components that are held over several blocks
+        are added to the first of these."""
         if not self.lasting:
             return blocks
-        found = blocks.copy()
+        gathered = blocks.copy()
         for columns, first in self.lasting:
-            found[..., columns] = 0.0
-            found[..., first, columns] = np.add.reduceat(blocks[..., columns], first, axis=-2)
-        return found
+            gathered[..., columns] = 0.0
+            gathered[..., first, columns] = np.add.reduceat(blocks[..., columns], first, axis=-2)
+        return gathered
 
     @shaped
     def support(self, weights: Float[Array, "*k L mw"]) -> Float[Array, " *k"]:
-        """``sigma (...,)``, the largest value of the functional over the admissible disturbances."""
+        """Return the support value ``sigma (...,)``: the largest value of the functional over the admissible
+        disturbances."""
         return self.pushed(self.blocks(weights))
 
     @shaped
     def pushed(self, blocks: Float[Array, "*k nb q"]) -> Float[Array, " *k"]:
-        """`support` of a functional that is given on every block ``(..., nb, q)``."""
+        """Return the support value of a functional with weights on every block, ``(..., nb, q)``."""
         if self._radii is None:
             answer: Array = self.set.support(blocks).sum(axis=-1)
             return answer
@@ -126,13 +131,14 @@ class DisturbanceModel:
 
     @cached_property
     def _radii(self) -> Array | None:
-        """Half the widths ``(q,)`` of a set that is a box about 0: then one product sums up all blocks."""
+        """Half the widths ``(q,)`` of a set that is a box about 0, otherwise ``None``; with them one product sums up
+        all blocks."""
         about = isinstance(self.set, Box) and self.set.is_bounded and np.array_equal(self.set.lower, -self.set.upper)
         return self.set.upper if isinstance(self.set, Box) and about else None
 
     @shaped
     def worst(self, weights: Float[Array, "*k L mw"]) -> Float[Array, "*k mw L"]:
-        """A disturbance ``(..., mw, L)`` on the grid's pieces that attains `support`."""
+        """Return a disturbance ``(..., mw, L)`` on the grid's pieces that attains `support`."""
         return self.signals(self.set.support_point(self.blocks(weights)))
 
     @property
@@ -144,16 +150,17 @@ class DisturbanceModel:
 
     @shaped
     def signals(self, points: Float[Array, "*k nb q"]) -> Float[Array, "*k mw L"]:
-        """Disturbances ``(..., mw, L)`` on the grid's pieces from one point of the set per block, ``(..., nb, q)``."""
+        """Return disturbances ``(..., mw, L)`` on the grid's pieces from one point of the set per block, ``(..., nb,
+        q)``."""
         if self.by_piece:
             return np.swapaxes(points, -1, -2)
         if self.starts is not None:
-            which = np.searchsorted(self.starts, np.arange(self.grid.pieces), side="right") - 1
-            found = points[..., which, :]
+            block_of_piece = np.searchsorted(self.starts, np.arange(self.grid.pieces), side="right") - 1
+            values = points[..., block_of_piece, :]
             for columns, first in self.lasting:
-                begun = first[np.searchsorted(first, which, side="right") - 1]
-                found[..., columns] = points[..., begun, columns]
-            return np.swapaxes(found, -1, -2)
+                first_blocks = first[np.searchsorted(first, block_of_piece, side="right") - 1]
+                values[..., columns] = points[..., first_blocks, columns]
+            return np.swapaxes(values, -1, -2)
         assert self.functions is not None
         coefficients = points if self.scale is not None else points.reshape(*points.shape[:-2], self.channels, -1)
         signal = np.einsum("...ij,jl->...il", coefficients, self.functions)
@@ -164,12 +171,12 @@ class DisturbanceModel:
 def disturbance_model(
     kind: Classes, bound: ConvexSet, dictionary: Dictionary, grid: TimeGrid, breakpoints: Breakpoints | None = None
 ) -> DisturbanceModel:
-    """The model of a disturbance class; ``breakpoints``: those of every part of a product, among those of the
-    dictionary.
+    """Return the model of a disturbance class.
 
     ``piecewise_constant``: every combination of the dictionary's functions whose values stay in ``bound`` on every
     piece; ``measurable``: every measurable function with values in ``bound``; ``l1_ball``: coefficients with
     ``||beta_i||_1 <= bound_i`` per channel (the paper's sufficient condition read as an uncertainty set, far smaller).
+    ``breakpoints``: the breakpoints of every part of a product; they are among those of the dictionary.
     """
     if kind == "measurable":
         return DisturbanceModel("measurable", bound, bound, grid, starts=np.arange(grid.pieces))
@@ -191,10 +198,10 @@ def disturbance_model(
         )
     merged = dictionary.merged()
     if dictionary.is_complete:
-        which = np.clip(
+        piece_indices = np.clip(
             np.searchsorted(merged.breakpoints, _middles(grid), side="right") - 1, 0, merged.breakpoints.size - 2
         )
-        starts = np.flatnonzero(np.diff(which, prepend=-1))
+        starts = np.flatnonzero(np.diff(piece_indices, prepend=-1))
         plain = DisturbanceModel("piecewise_constant", bound, bound, grid, starts=starts)
         if breakpoints is None:
             return plain
@@ -214,16 +221,16 @@ def disturbance_model(
 
 
 def _lasting(bound: ConvexSet, breakpoints: Breakpoints, middles: Array) -> tuple[tuple[slice, np.ndarray], ...]:
-    """`DisturbanceModel.lasting`, of blocks of which these are times that lie within them."""
-    found, column = list[tuple[slice, np.ndarray]](), 0
-    for part, times in zip(bound.factors, breakpoints, strict=True):
-        columns = slice(column, column + part.dimension)
+    """Return the field ``lasting`` of a `DisturbanceModel` for blocks that contain these ``middles``, one time each."""
+    held_components, column = list[tuple[slice, np.ndarray]](), 0
+    for factor, times in zip(bound.factors, breakpoints, strict=True):
+        columns = slice(column, column + factor.dimension)
         column = columns.stop
         assert times is not None
         first = np.flatnonzero(np.diff(np.searchsorted(times, middles), prepend=-1))
         if first.size < middles.size:
-            found.append((columns, first))
-    return tuple(found)
+            held_components.append((columns, first))
+    return tuple(held_components)
 
 
 def _middles(grid: TimeGrid) -> Array:

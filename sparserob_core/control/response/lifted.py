@@ -1,9 +1,9 @@
-"""An uncertain system over a cell of parameters, as one larger known system.
+"""Uncertain system over a cell of parameters, as one larger known system.
 
 With ``p = centre + radius delta`` and ``A(p) = sum_g A_g delta^g + remainder``, the Taylor coefficients of the state in
 ``delta`` obey ``x_a' = sum_{g + b = a} A_g x_b + B_a u``: a known linear system of dimension ``d M``, propagated
-exactly. What the truncation at degree ``q`` neglects, and what was rounded on the way to coordinates in which the modes
-are apart, obeys the same equation with a small drive, and is bounded by Gronwall's inequality, mode by mode. A known
+exactly. The truncation error at degree ``q``, and the rounding errors of the change to coordinates in which the modes
+are apart, obey the same equation with a small forcing. Both are bounded by Gronwall's inequality, mode by mode. A known
 system is the case ``M = 1`` without truncation.
 """
 
@@ -64,9 +64,12 @@ SPANS = 256  # of several pieces each, for which what is left out is bounded, wh
 
 @dataclass(frozen=True, eq=False)
 class Past:
-    """What went before a leg of a system that changes: the ``lifted`` leg before it, and ``turn (d, d)``, which takes
-    its coordinates to the new ones, within ``slip (d, d)`` entry by entry. ``starts (q,)``: where the blocks of the new
-    ones begin. ``carried`` remembers what the disturbance made of the state."""
+    """Phase before a phase of a switched system, with the change of coordinates between the two.
+
+    ``lifted``: the lifted system of the phase before. ``turn (d, d)``: the matrix from its coordinates to the new ones,
+    with an error of at most ``slip (d, d)`` entry by entry. ``starts (q,)``: the indices at which the blocks of the new
+    coordinates begin. ``carried``: remembered effects of the disturbance on the state.
+    """
 
     lifted: LiftedSystem
     turn: Array
@@ -83,19 +86,21 @@ class Past:
         )
 
     def rounded(self, sizes: Array) -> Array:
-        """What the turn may be off by, ``(q,)``, for vectors whose entries are at most ``sizes (d,)``."""
-        lost = (self.slip + rounding(self.turn.shape[0]) * np.abs(self.turn)) @ sizes
-        return np.asarray(block_norms(lost, self.starts))
+        """Return upper bounds ``(q,)`` of the error of the change of coordinates, for vectors whose entries are at most
+        ``sizes (d,)``."""
+        errors = (self.slip + rounding(self.turn.shape[0]) * np.abs(self.turn)) @ sizes
+        return np.asarray(block_norms(errors, self.starts))
 
 
 @dataclass(frozen=True, eq=False)
 class LiftedSystem:
-    """The Taylor models of a system over the cell ``centre +- radius`` (``(nu,)`` each) on a time grid, in the
-    coordinates ``x = T z`` of a `Decoupling` with ``q`` blocks.
+    """Taylor models of a system over the cell ``centre +- radius`` (``(nu,)`` each) on a time grid, in the coordinates
+    ``x = T z`` of a `Decoupling` with ``q`` blocks.
 
-    ``A (M, d, d)``, ``B (M, d, m)``, ``W (M, d, mw)`` are coefficients; ``slack_A (q, q)``, ``slack_B (q, m)``,
-    ``slack_W (q, mw)``, ``slack_x (q,)`` bound, block by block, what they and ``initial_state`` leave out.
-    ``past``: of a later leg of a system that changes, where it begins instead, which is then time 0.
+    ``A (M, d, d)``, ``B (M, d, m)``, ``W (M, d, mw)`` are the coefficients. ``slack_A (q, q)``, ``slack_B (q, m)``,
+    ``slack_W (q, mw)``, ``slack_x (q,)`` bound, block by block, the remainders of these and of ``initial_state``.
+    ``past``: for a later phase of a switched system, the phase before it, at whose end this one begins; time 0 is then
+    there.
     """
 
     space: TaylorSpace
@@ -113,22 +118,22 @@ class LiftedSystem:
 
     @property
     def first(self) -> int:
-        """How many pieces went before this leg."""
+        """Number of pieces before this phase."""
         return 0 if self.past is None else self.past.lifted.first + self.past.lifted.grid.pieces
 
     @property
     def turn(self) -> int:
-        """How many systems took their turns before this leg."""
+        """Number of phases before this one."""
         return 0 if self.past is None else self.past.lifted.turn + 1
 
     @property
     def transform(self) -> Array:
-        """``T (d, d)``, with ``x = T z``."""
+        """Matrix ``T (d, d)``, with ``x = T z``."""
         return self.decoupling.transform
 
     @property
     def starts(self) -> np.ndarray:
-        """Where the blocks of the coordinates begin, ``(q,)``."""
+        """Indices at which the blocks of the coordinates begin, ``(q,)``."""
         return self.decoupling.starts
 
     @property
@@ -137,15 +142,14 @@ class LiftedSystem:
 
     @cached_property
     def comparison(self) -> ComparisonSystem:
-        """Bounds of the lifted system: of its Taylor coefficients, the norms of every block summed over them."""
+        """Bounds of the lifted system: for its Taylor coefficients, the norms of every block summed over them."""
         sizes = block_sizes(self.A, self.starts)
-        rest = sizes[1:].sum(axis=0) + self.slack_A
-        return ComparisonSystem(comparison_matrix(self.A[0], self.starts) + rest, sizes[0] + rest)
+        variation = sizes[1:].sum(axis=0) + self.slack_A
+        return ComparisonSystem(comparison_matrix(self.A[0], self.starts) + variation, sizes[0] + variation)
 
     @cached_property
     def norm(self) -> float:
-        """An upper bound of the 2-norm of the lifted matrix, on columns and on rows (Golub and Van Loan 2013,
-        2.3.3)."""
+        """Upper bound of the 2-norm of the lifted matrix, on columns and on rows (Golub and Van Loan 2013, 2.3.3)."""
         size = max(
             np.abs(matrix).sum(axis=0).max() * np.abs(matrix).sum(axis=1).max()
             for matrix in (self.matrix, self.row_matrix)
@@ -154,19 +158,19 @@ class LiftedSystem:
 
     @cached_property
     def matrix(self) -> Array:
-        """The lifted matrix ``(M d, M d)`` that acts on columns: block (target, source) is ``A_g`` with
-        ``g + source = target``."""
+        """Lifted matrix ``(M d, M d)`` that acts on columns: block (target, source) is ``A_g`` with ``g + source =
+        target``."""
         return lifted_matrix(self.space, self.A, rows=False)
 
     @cached_property
     def row_matrix(self) -> Array:
-        """The lifted matrix that acts on rows from the right."""
+        """Lifted matrix that acts on rows from the right."""
         return lifted_matrix(self.space, self.A, rows=True)
 
     @cached_property
     def fine(self) -> TimeGrid:
-        """The grid with long pieces cut into equal parts: a norm bound over a part is only good if the modes grow
-        little on it."""
+        """Grid with long pieces cut into equal parts: a norm bound over a part is only good if the modes grow little on
+        it."""
         if not self.space.nu:  # without truncation there is little to bound
             return self.grid
         growth = float(np.abs(np.linalg.eigvals(self.comparison.rising)).max())
@@ -189,8 +193,8 @@ class LiftedSystem:
 
     @cached_property
     def spans(self) -> np.ndarray:
-        """The first piece of the fine grid in every span, ``(S,)``: what is left out is bounded span by span. For a
-        known system, of which nothing but rounding is left out, a span may be many pieces on which it moves little."""
+        """First piece of the fine grid in every span, ``(S,)``. Remainders are bounded span by span. For a known
+        system, whose remainder is rounding only, a span may be many pieces on which the system moves little."""
         pieces = self.fine.pieces
         if self.space.nu or pieces < 4 * SPANS:
             return np.arange(pieces)
@@ -200,13 +204,13 @@ class LiftedSystem:
 
     @cached_property
     def _block(self) -> int:
-        """How many pieces the states are computed in at once: a span begins where such a block does."""
+        """Number of pieces in which the states are computed at once; every span begins where such a block does."""
         forward = self.forward
         return forward.propagator.block(forward.steps(KNOWN)) if forward.uniform else 1
 
     @cached_property
     def span(self) -> np.ndarray:
-        """Which span every piece of the fine grid is of, ``(L',)``."""
+        """Span to which every piece of the fine grid belongs, ``(L',)``."""
         return np.repeat(np.arange(self.spans.size), self._counts)
 
     @cached_property
@@ -215,18 +219,18 @@ class LiftedSystem:
 
     @cached_property
     def _durations(self) -> Array:
-        """How long the spans are, ``(S,)``."""
+        """Durations of the spans, ``(S,)``."""
         return np.diff(self.fine.breakpoints[np.append(self.spans, self.fine.pieces)])
 
     @cached_property
     def ends(self) -> np.ndarray:
-        """Where the breakpoints of the grid are among those of the fine one, ``(L+1,)``."""
+        """Indices of the breakpoints of the grid among those of the fine grid, ``(L+1,)``."""
         return np.searchsorted(self.fine.breakpoints, self.grid.breakpoints)
 
     @cached_property
     def forward(self) -> Response:
-        """The lifted system as a response on the fine grid; its states are the Taylor coefficients of the state,
-        ``(M d,)``."""
+        """Lifted system as a response on the fine grid; its states are the Taylor coefficients of the state, ``(M
+        d,)``."""
         start = np.zeros(self.matrix.shape[0])
         start[: self.states] = self.initial_state
         drive = self.B.reshape(-1, self.B.shape[2])
@@ -234,7 +238,7 @@ class LiftedSystem:
 
     @cached_property
     def backward(self) -> Response:
-        """The adjoint of the lifted system; its functionals are Taylor coefficients of ``c'e^{A(p) t}``."""
+        """Adjoint of the lifted system; its functionals are Taylor coefficients of ``c'e^{A(p) t}``."""
         return self._adjoint_on(self.grid)
 
     @cached_property
@@ -250,60 +254,64 @@ class LiftedSystem:
         return LiftedExponentials(self, rows)
 
     def nodes(self, control: Array) -> Array:
-        """Taylor coefficients ``(L+1, M, d)`` of the state at the breakpoints, under ``control (m, K)``."""
+        """Return the Taylor coefficients ``(L+1, M, d)`` of the state at the breakpoints, under ``control (m, K)``."""
         path = self._path(control)
         return path if self.fine is self.grid else path[self.ends]
 
     def state_remainder(self, control: Array) -> tuple[Array, Array]:
-        """Norm bounds ``(L, q)``, per piece and block, of the part of the state that the Taylor models leave out,
-        rounding included; and of the Taylor models themselves, summed over their coefficients."""
+        """Return norm bounds ``(L, q)``, per piece and block, of the remainder of the Taylor models of the state,
+        rounding included; and norm bounds of the Taylor models themselves, summed over their coefficients."""
         left_out, sizes, _ = self._left_out(control)
         return left_out[self.shared], sizes[self.shared]
 
     def moved(self, within: Array, pieces: np.ndarray, begun: Array, inputs: Array) -> Array:
-        """`Motion.moved`."""
+        """Return the coefficients ``(k, M, d)`` at times ``within (k,)`` the ``pieces (k,)``, from those at their
+        beginning, ``begun (k, M, d)``, under ``inputs (k, m)``. Short steps use the exponential series, long ones
+        matrix exponentials."""
         start = begun.reshape(within.size, -1)
         size = self.norm * float(within.max(initial=0.0))
         if size < LONG_STEP:
-            found = self._by_series(start, start @ self.matrix.T + self._drive(inputs), within[:, None], size)
+            coefficients = self._by_series(start, start @ self.matrix.T + self._drive(inputs), within[:, None], size)
         else:
-            found = self._columns(start, self._drive(inputs), within)
-        return np.asarray(found.reshape(within.size, self.space.size, -1))
+            coefficients = self._columns(start, self._drive(inputs), within)
+        return np.asarray(coefficients.reshape(within.size, self.space.size, -1))
 
     def _columns(self, start: Array, drives: Array, within: Array) -> Array:
-        """By exponentials: ``(k, M d)`` after durations ``(k,)`` under ``drives (k, M d)``."""
+        """Return the coefficients ``(k, M d)`` after durations ``(k,)`` under the forcing ``drives (k, M d)``, by
+        matrix exponentials."""
         if not self.space.nu:
             return self.flows.columns(start, drives, within)
-        distinct, which = self.grid.distinct(within)
-        flow, driven = self.forward.flows(distinct)
-        found = np.einsum("kij,kj->ki", flow[which], start)
-        return np.asarray(found + np.einsum("kij,kj->ki", driven[which], drives))
+        distinct, indices = self.grid.distinct(within)
+        flow, integral = self.forward.flows(distinct)
+        coefficients = np.einsum("kij,kj->ki", flow[indices], start)
+        return np.asarray(coefficients + np.einsum("kij,kj->ki", integral[indices], drives))
 
     @cached_property
     def flows(self) -> Flows:
-        """The exponentials of a known system on vectors."""
+        """Exponentials of a known system on vectors."""
         return Flows(self.decoupling, self.A[0])
 
     def flown(self, rows: Array, durations: Array) -> tuple[Array, Array]:
-        """Lifted functionals ``(k, r, M d)`` backwards over durations ``(k,)``, and their integrals on the way."""
+        """Return lifted functionals ``(k, r, M d)`` propagated backwards over durations ``(k,)``, and their integrals
+        over these."""
         if not self.space.nu:
             return self.flows.rows(rows, durations)
-        distinct, which = self.grid.distinct(durations)
+        distinct, indices = self.grid.distinct(durations)
         key, size = distinct.tobytes(), distinct.size * self.row_matrix.size
-        known = self._flown.get(key)
-        if known is None:
-            known = self.backward.flows(distinct)
+        flows = self._flown.get(key)
+        if flows is None:
+            flows = self.backward.flows(distinct)
             if size <= FLOWN_SIZE:
-                remember(self._flown, key, known, max(1, FLOWN_SIZE // size))
-        flow, driven = known
-        return rows @ flow[which], rows @ driven[which]
+                remember(self._flown, key, flows, max(1, FLOWN_SIZE // size))
+        flow, integral = flows
+        return rows @ flow[indices], rows @ integral[indices]
 
     @cached_property
     def _flown(self) -> dict[bytes, tuple[Array, Array]]:
         return {}
 
     def _by_series(self, start: Array, slopes: Array, within: Array, size: float) -> Array:
-        """The exponential series, for short steps: no matrix is built."""
+        """Return the coefficients after short steps by the exponential series; no matrix is built."""
         total, term, order, bound = start + within * slopes, slopes, 1, size
         while bound > TAYLOR_TERMS:
             order += 1
@@ -313,46 +321,55 @@ class LiftedSystem:
         return total
 
     def _drive(self, inputs: Array) -> Array:
-        """What drives the Taylor coefficients under inputs ``(k, m)``, ``(k, M d)``."""
+        """Return the forcing of the Taylor coefficients, ``(k, M d)``, under inputs ``(k, m)``."""
         return np.asarray(inputs @ self.B.reshape(-1, self.B.shape[2]).T)
 
     def deviation(
         self, rows: Array, start: Array, width: Array, pieces: np.ndarray, states: Array, inputs: Array
     ) -> Array:
-        """`Motion.deviation`: by the second time derivative, or mode by mode by twice what it can move (as in
-        `DisturbanceSupport.deviation`)."""
+        """Return bounds ``(k, r)`` of the distance of rows of the state from their chords, summed over the Taylor
+        coefficients.
+
+        The smaller of two bounds is taken, mode by mode: by the second derivative in time, or twice the distance that
+        the state can move (as in `DisturbanceSupport.deviation`).
+        """
         slopes = states.reshape(start.size, -1) @ self.matrix.T + self._drive(inputs)
-        bent = (slopes @ self.matrix.T).reshape(states.shape)
-        along = np.abs(np.einsum("ri,kai->kra", rows, bent)).sum(axis=2)
-        once, twice = (block_norms(part.reshape(states.shape), self.starts).sum(axis=1) for part in (slopes, bent))
+        curvature = (slopes @ self.matrix.T).reshape(states.shape)
+        along = np.abs(np.einsum("ri,kai->kra", rows, curvature)).sum(axis=2)
+        slope_norms, curvature_norms = (
+            block_norms(derivative.reshape(states.shape), self.starts).sum(axis=1) for derivative in (slopes, curvature)
+        )
         reach = self.comparison.over(width, cells=True)
         square, norms = (width**2 / 8)[:, None], block_norms(rows, self.starts)
-        exact = square * (along + product(norms, reach.departure.on(twice).T).T)
-        by_mode = np.minimum(square * reach.peak.on(twice), 2.0 * reach.integral.on(once))
+        exact = square * (along + product(norms, reach.departure.on(curvature_norms).T).T)
+        by_mode = np.minimum(square * reach.peak.on(curvature_norms), 2.0 * reach.integral.on(slope_norms))
         return np.asarray(np.minimum(exact, product(norms, by_mode.T).T))
 
     @property
     def influence(self) -> Array:
-        """`Motion.influence`: the parameters' first-order part in the system."""
+        """Influence of every parameter on the remainder, ``(nu,)``: the size of its first-order part in the system."""
         if not self.space.degree:
             return np.ones(self.space.nu)
-        places = [self.space.index[tuple(unit)] for unit in np.eye(self.space.nu, dtype=int).tolist()]
-        return np.array([sum(float(np.linalg.norm(part[i])) for part in (self.A, self.B, self.W)) for i in places])
+        indices = [self.space.index[tuple(unit)] for unit in np.eye(self.space.nu, dtype=int).tolist()]
+        return np.array(
+            [sum(float(np.linalg.norm(coefficients[i])) for coefficients in (self.A, self.B, self.W)) for i in indices]
+        )
 
     @property
     def shared(self) -> np.ndarray | slice:
-        """Which of the bounds that `along` makes is of every piece of the grid."""
+        """Index of the bound of `along` that belongs to every piece of the grid."""
         return self.span if self.spans.size < self.fine.pieces else slice(None)
 
     def along(self, control: Array, rows: Array, others: Array) -> Array:
-        """Both of `state_remainder`, by the product with ``rows`` and ``others (r, q)``, added up: ``(r, L)``."""
+        """Return the two bounds of `state_remainder`, multiplied by ``rows`` and ``others (r, q)`` and added up: ``(r,
+        L)``."""
         left_out, sizes, _ = self._left_out(control)
         answer: Array = (product(rows, left_out.T) + product(others, sizes.T))[:, self.shared]
         return answer
 
     def _left_out(self, control: Array) -> tuple[Array, Array, Array]:
-        """`state_remainder` on the spans, where these are many pieces, and the first of both at the end, ``(q,)``;
-        remembered."""
+        """Return the two bounds of `state_remainder`, on the spans where these are many pieces, and the bound of the
+        remainder at the end, ``(q,)``; remembered."""
         key = control.tobytes()
         if key not in self._remainders:
             remember(self._remainders, key, self._remainder(control), PATHS_KEPT)
@@ -366,52 +383,55 @@ class LiftedSystem:
         inputs, slack = np.abs(self.fine.inputs(control)), self._slack(control)[None]
         size = np.abs(self.B).sum(axis=0)
         if self.spans.size < self.fine.pieces:
-            most = np.maximum.reduceat(inputs, self.spans, axis=1)
-            pushed, drive = block_norms((size @ most).T, self.starts), (self.slack_B @ most).T[None]
-            begin = block_norms(self._path(control)[self.spans, 0], self.starts)[None]
-            neglected, bounds, reached = self._neglected(
-                begin, pushed, drive, slack, rows=False, jumps=self._jumps(control, size)
+            largest_inputs = np.maximum.reduceat(inputs, self.spans, axis=1)
+            forcing_norms, drive = (
+                block_norms((size @ largest_inputs).T, self.starts),
+                (self.slack_B @ largest_inputs).T[None],
             )
-            return neglected[0], reached[0], bounds[0, -1]
-        driven = self.fine.inputs(control).T @ self.forward.steps(KNOWN).B[0].T
+            begin = block_norms(self._path(control)[self.spans, 0], self.starts)[None]
+            neglected, bounds, size_bounds = self._neglected(
+                begin, forcing_norms, drive, slack, rows=False, jumps=self._jumps(control, size)
+            )
+            return neglected[0], size_bounds[0], bounds[0, -1]
+        forcing = self.fine.inputs(control).T @ self.forward.steps(KNOWN).B[0].T
         nodes = self._path(control)[None]
-        sizes = self._sizes(nodes, driven, rows=False)
-        pushed, drive = block_norms((size @ inputs).T, self.starts), (self.slack_B @ inputs).T[None]
+        sizes = self._sizes(nodes, forcing, rows=False)
+        forcing_norms, drive = block_norms((size @ inputs).T, self.starts), (self.slack_B @ inputs).T[None]
         begin = block_norms(nodes[:, :-1], self.starts).sum(axis=2)
         residual = self._spilt(sizes, rows=False) + drive
-        neglected, bounds, _ = self._neglected(begin, pushed, residual, slack, rows=False)
+        neglected, bounds, _ = self._neglected(begin, forcing_norms, residual, slack, rows=False)
         first = self.ends[:-1]
         left_out: Array = np.maximum.reduceat(neglected[0], first, axis=0)
         return left_out, np.maximum.reduceat(sizes[0].sum(axis=1), first, axis=0), bounds[0, -1]
 
     def _jumps(self, control: Array, size: Array) -> Array:
-        """How much what drives each block jumps within each span, all its jumps added up, ``(S, q)``."""
+        """Return the sum of the jumps of the forcing of each block within each span, ``(S, q)``."""
         inputs = self.fine.inputs(control)
         jumps = np.abs(np.diff(inputs, axis=1, prepend=inputs[:, :1]))
         jumps[:, self.spans] = 0.0
         return block_norms((size @ np.add.reduceat(jumps, self.spans, axis=1)).T, self.starts)
 
     def _slack(self, control: Array) -> Array:
-        """What the Taylor models leave out at time 0, ``(q,)``."""
+        """Return bounds of the remainder of the Taylor models at time 0, ``(q,)``."""
         if self.past is None:
             return self.slack_x
-        before, ended = self.past.lifted, np.abs(self.past.lifted.nodes(control)[-1]).sum(axis=0)
+        before, final_sizes = self.past.lifted, np.abs(self.past.lifted.nodes(control)[-1]).sum(axis=0)
         return np.asarray(
-            product(self.past.blocks, before._left_out(control)[2][:, None])[:, 0] + self.past.rounded(ended)
+            product(self.past.blocks, before._left_out(control)[2][:, None])[:, 0] + self.past.rounded(final_sizes)
         )
 
     def _path(self, control: Array) -> Array:
-        """Taylor coefficients of the state at the breakpoints of the fine grid, remembered: all directions of a cell
-        share them."""
+        """Return the Taylor coefficients of the state at the breakpoints of the fine grid, remembered: all directions
+        of a cell share them."""
         key = control.tobytes()
         if key not in self._paths:
-            most = max(1, min(PATHS_KEPT, PATHS_SIZE // ((self.fine.pieces + 1) * self.matrix.shape[0])))
-            while len(self._paths) >= most:  # before the new one is made: either may be large
+            capacity = max(1, min(PATHS_KEPT, PATHS_SIZE // ((self.fine.pieces + 1) * self.matrix.shape[0])))
+            while len(self._paths) >= capacity:  # before the new one is made: either may be large
                 self._paths.pop(next(iter(self._paths)))
             forward = self.forward
             if self.past is not None:
-                ended = self.past.lifted.nodes(control)[-1]
-                forward = forward.from_state((ended @ self.past.turn.T).ravel())
+                final_coefficients = self.past.lifted.nodes(control)[-1]
+                forward = forward.from_state((final_coefficients @ self.past.turn.T).ravel())
             states = forward.states(control, KNOWN)[0]
             self._paths[key] = states.reshape(-1, self.space.size, self.states)
         return self._paths[key]
@@ -421,22 +441,25 @@ class LiftedSystem:
         return {}
 
     def row_bounds(self, directions: Array, by_age: bool = False) -> tuple[Array, Array]:
-        """For the Taylor models of ``c'e^{A(p) s}`` of ``directions (r, d)``, read backwards from ``t``: block norms
-        ``(r, S, M, q)`` of their coefficients, the largest on every span, and norm bounds ``(r, S, q)`` of what they
-        leave out; ``by_age``: what equal pieces make of them is computed by `Impulses`, with one length for all."""
-        nodes, still = self.row_nodes(directions), np.zeros((self.spans.size, self.starts.size))
-        begin, start = block_norms(nodes[:, :-1], self.starts).sum(axis=2), still[:1]
+        """Return bounds for the Taylor models of ``c'e^{A(p) s}``, of ``directions (r, d)``, read backwards from ``t``.
+
+        They are block norms ``(r, S, M, q)`` of the coefficients, the largest on every span, and norm bounds ``(r, S,
+        q)`` of the remainder. ``by_age``: true where the responses of equal pieces are computed by `Impulses`, with one
+        length for all.
+        """
+        nodes, zeros = self.row_nodes(directions), np.zeros((self.spans.size, self.starts.size))
+        begin, start = block_norms(nodes[:, :-1], self.starts).sum(axis=2), zeros[:1]
         if self.spans.size < self.fine.pieces:
-            neglected, _, reached = self._neglected(begin, still, still[None], start, rows=True, by_age=by_age)
+            neglected, _, size_bounds = self._neglected(begin, zeros, zeros[None], start, rows=True, by_age=by_age)
             if by_age:
                 propagator = self.backward.propagator
-                neglected = neglected + propagator.lateness[0] / float(propagator.lengths[0]) * reached
-            return reached[:, :, None], neglected
+                neglected = neglected + propagator.lateness[0] / float(propagator.lengths[0]) * size_bounds
+            return size_bounds[:, :, None], neglected
         sizes = self._sizes(nodes, np.zeros(1), rows=True)
-        return sizes, self._neglected(begin, still, self._spilt(sizes, rows=True), start, rows=True)[0]
+        return sizes, self._neglected(begin, zeros, self._spilt(sizes, rows=True), start, rows=True)[0]
 
     def row_nodes(self, directions: Array) -> Array:
-        """Taylor coefficients ``(r, S+1, M, d)`` of ``c'e^{A(p) s}`` at the ends ``s`` of the spans."""
+        """Return the Taylor coefficients ``(r, S+1, M, d)`` of ``c'e^{A(p) s}`` at the ends ``s`` of the spans."""
         response, count = self._backward_spans, self.spans.size
         steps = response.steps(KNOWN)
         rows = np.zeros((count + 1, directions.shape[0], self.row_matrix.shape[0]))
@@ -453,45 +476,51 @@ class LiftedSystem:
         return self._adjoint_on(TimeGrid(self.fine.breakpoints[ends], none, none, elapsed=self.fine.elapsed))
 
     def _sizes(self, nodes: Array, driven: Array, rows: bool) -> Array:
-        """Block norms ``(r, L', M, q)`` of Taylor coefficients ``(r, L'+1, M, d)``, the largest on every fine piece.
+        """Return block norms ``(r, L', M, q)`` of Taylor coefficients ``(r, L'+1, M, d)``, the largest on every fine
+        piece.
 
-        The least of three bounds: what lies at its ends and how far it is from the chord between them; where it
-        starts and how far it can go from there; where it starts, and what is driven.
+        They are the least of three bounds: the values at the ends plus the distance from the chord between them; the
+        value at the start plus the distance that it can move; the growth of the value at the start plus the effect of
+        the forcing.
         """
         matrix = self.row_matrix.T if rows else self.matrix
         lengths, shape = self.fine.lengths, (nodes.shape[0], nodes.shape[1] - 1, *nodes.shape[2:])
 
         flat = nodes[:, :-1].reshape(*shape[:2], -1)
         slopes = flat @ matrix.T + driven
-        bent = block_norms((slopes @ matrix.T).reshape(shape), self.starts)
+        curvature = block_norms((slopes @ matrix.T).reshape(shape), self.starts)
         ends = block_norms(nodes, self.starts)
         integral, peak = self._majorants(lengths, rows)
-        pushed = block_norms(np.broadcast_to(driven, flat.shape).reshape(shape), self.starts)
-        moved = _applied(integral, block_norms(slopes.reshape(shape), self.starts))
-        chord = np.maximum(ends[:, :-1], ends[:, 1:]) + (lengths**2 / 8)[:, None, None] * _applied(peak, bent)
+        forcing_norms = block_norms(np.broadcast_to(driven, flat.shape).reshape(shape), self.starts)
+        displacement = _applied(integral, block_norms(slopes.reshape(shape), self.starts))
+        chord = np.maximum(ends[:, :-1], ends[:, 1:]) + (lengths**2 / 8)[:, None, None] * _applied(peak, curvature)
         return np.minimum(
-            np.minimum(chord, ends[:, :-1] + moved), _applied(peak, ends[:, :-1]) + _applied(integral, pushed)
+            np.minimum(chord, ends[:, :-1] + displacement),
+            _applied(peak, ends[:, :-1]) + _applied(integral, forcing_norms),
         )
 
     def _majorants(self, lengths: Array, rows: bool) -> tuple[NormBounds, NormBounds]:
-        """What bounds ``int |e^{lifted s}| ds`` and ``|e^{lifted r}|`` on every fine piece, coefficient by coefficient,
-        matrices ``(M q, M q)``; as in `ComparisonSystem.over`."""
+        """Return bounds of ``int |e^{lifted s}| ds`` and ``|e^{lifted r}|`` on every fine piece, coefficient by
+        coefficient, matrices ``(M q, M q)``; as in `ComparisonSystem.over`."""
         if not self.space.nu:
             reach = self.comparison.over(lengths)
             return (reach.integral.transposed, reach.peak.transposed) if rows else (reach.integral, reach.peak)
         if rows not in self._majorised:
-            _, longest, which = alike(lengths, (self.space.size * self.starts.size) ** 2)
-            growths = block_sizes(self.A, self.starts)
-            growths[0] = comparison_matrix(self.A[0], self.starts)
-            grows = growths.copy()
-            grows[0] = rising(growths[0])
+            _, longest, indices = alike(lengths, (self.space.size * self.starts.size) ** 2)
+            majorant = block_sizes(self.A, self.starts)
+            majorant[0] = comparison_matrix(self.A[0], self.starts)
+            rising_majorant = majorant.copy()
+            rising_majorant[0] = rising(majorant[0])
             if rows:
-                growths, grows = np.swapaxes(growths, 1, 2), np.swapaxes(grows, 1, 2)
+                majorant, rising_majorant = np.swapaxes(majorant, 1, 2), np.swapaxes(rising_majorant, 1, 2)
             with np.errstate(over="ignore", invalid="ignore"):
-                integral = finite(flows_of(self.space, growths, longest)[1])
-                peak = finite(multiplied(self.space, np.broadcast_to(grows, integral.shape), integral))
+                integral = finite(flows_of(self.space, majorant, longest)[1])
+                peak = finite(multiplied(self.space, np.broadcast_to(rising_majorant, integral.shape), integral))
             peak[:, 0] += np.eye(self.starts.size)
-            both = (NormBounds(lifted_matrix(self.space, part, rows=False), which) for part in (integral, peak))
+            both = (
+                NormBounds(lifted_matrix(self.space, coefficients, rows=False), indices)
+                for coefficients in (integral, peak)
+            )
             self._majorised[rows] = (next(both), next(both))
         return self._majorised[rows]
 
@@ -500,10 +529,10 @@ class LiftedSystem:
         return {}
 
     def _spilt(self, sizes: Array, rows: bool) -> Array:
-        """The residual of the truncation on every fine piece, ``(r, L', q)``, by the ``sizes (r, L', M, q)`` of the
-        coefficients."""
-        spilt = self.spilt(block_sizes(self.A, self.starts))
-        return np.asarray(np.einsum("rlaj,aij->rli" if not rows else "rlai,aij->rlj", sizes, spilt))
+        """Return the residual of the truncation on every fine piece, ``(r, L', q)``, from the ``sizes (r, L', M, q)``
+        of the coefficients."""
+        residual_norms = self.spilt(block_sizes(self.A, self.starts))
+        return np.asarray(np.einsum("rlaj,aij->rli" if not rows else "rlai,aij->rlj", sizes, residual_norms))
 
     def _neglected(
         self,
@@ -515,105 +544,118 @@ class LiftedSystem:
         jumps: Array | float = 0.0,
         by_age: bool = False,
     ) -> tuple[Array, Array, Array]:
-        """Gronwall: ``|e|' <= M |e| + residual`` block by block, ``(r, S, q)``, from ``|e(0)| <= start (r, q)``; at
-        the ends of the spans, ``(r, S+1, q)``; and how large what it is an error of may become, ``(r, S, q)``.
+        """Return bounds of the error by Gronwall's inequality: ``|e|' <= M |e| + residual`` block by block, from
+        ``|e(0)| <= start (r, q)``.
 
-        Every span adds what the slack of ``A`` and rounding make of what it begins with, of block norms ``begin
-        (r, S, q)``, and of what drives it, at most ``driven (S, q)``, which ``jumps (S, q)`` on spans of many pieces.
+        The three results are the bounds on the spans, ``(r, S, q)``, the bounds at the ends of the spans, ``(r, S+1,
+        q)``, and bounds of the quantity of which ``e`` is the error, ``(r, S, q)``.
+
+        Every span adds the effects of the slack of ``A`` and of rounding on the values at its beginning, of block norms
+        ``begin (r, S, q)``, and on the forcing. The forcing is at most ``driven (S, q)``, and jumps by ``jumps (S, q)``
+        on spans of many pieces.
         """
         reach = self.comparison.over(self._durations)
-        flow, integral, peak = (part.transposed if rows else part for part in (reach.flow, reach.integral, reach.peak))
+        flow, integral, peak = (
+            norms.transposed if rows else norms for norms in (reach.flow, reach.integral, reach.peak)
+        )
         drives = np.broadcast_to(driven, begin.shape)
-        reached, grown = peak.on(begin) + integral.on(drives), flow
+        size_bounds, growth = peak.on(begin) + integral.on(drives), flow
         if self.spans.size < self.fine.pieces:
-            lost, late = self._lost(peak, rows, by_age)
-            whole = within = lost.on(reached) + late * peak.on(drives + jumps)
-            reached = reached + whole
+            error_gain, delay = self._lost(peak, rows, by_age)
+            end_rounding = inner_rounding = error_gain.on(size_bounds) + delay * peak.on(drives + jumps)
+            size_bounds = size_bounds + end_rounding
             if rows:  # what is computed piece by piece begins a span elsewhere, and its rounding is that of where it is
-                grown = NormBounds(flow.matrices + product(lost.matrices, peak.matrices), flow.which)
+                growth = NormBounds(flow.matrices + product(error_gain.matrices, peak.matrices), flow.which)
         else:
-            relative, speed = self._relative(self.fine.lengths)[:, None] * reached, self._speed(reached, driven, rows)
-            whole, within = (
-                relative + late * speed for late in (self._backward_fine if rows else self.forward).lateness
+            relative, speed = (
+                self._relative(self.fine.lengths)[:, None] * size_bounds,
+                self._speed(size_bounds, driven, rows),
             )
-            within = np.maximum(whole, within)  # the state at the end of a piece is the one that the next begins with
+            end_rounding, inner_rounding = (
+                relative + delay * speed for delay in (self._backward_fine if rows else self.forward).lateness
+            )
+            # the state at the end of a piece is the one that the next begins with
+            inner_rounding = np.maximum(end_rounding, inner_rounding)
 
         slack = self.slack_A.T if rows else self.slack_A
-        slipped, largest = (one.on(begin) + two.on(drives) for one, two in self._slips(rows))
-        largest = np.minimum(finite(largest), integral.on(product(reached, slack.T)))
+        end_slips, largest_slips = (
+            flow_slip.on(begin) + integral_slip.on(drives) for flow_slip, integral_slip in self._slips(rows)
+        )
+        largest_slips = np.minimum(finite(largest_slips), integral.on(product(size_bounds, slack.T)))
 
-        pushed = integral.on(residual)
-        added = pushed + whole + np.minimum(slipped, largest)
-        bounds = grown.summed(np.broadcast_to(start, begin[:, 0].shape), added)
-        carried = peak.on(bounds[:, :-1])
-        if grown is not flow:
-            carried = carried + lost.on(carried)
-            reached = reached + carried
-        return np.asarray(carried + pushed + within + largest), bounds, reached
+        residual_effect = integral.on(residual)
+        increments = residual_effect + end_rounding + np.minimum(end_slips, largest_slips)
+        bounds = growth.summed(np.broadcast_to(start, begin[:, 0].shape), increments)
+        propagated = peak.on(bounds[:, :-1])
+        if growth is not flow:
+            propagated = propagated + error_gain.on(propagated)
+            size_bounds = size_bounds + propagated
+        return np.asarray(propagated + residual_effect + inner_rounding + largest_slips), bounds, size_bounds
 
     def _lost(self, peak: NormBounds, rows: bool, by_age: bool) -> tuple[NormBounds, float]:
-        """How far, at most, what is computed piece by piece gets from the truth on spans of many pieces, by the sizes
-        that it would have; and a time, for which anything that drives it counts.
+        """Return bounds of the error of a piece-by-piece computation on spans of many pieces, relative to the exact
+        sizes; and a time, by which the forcing is multiplied for the error that it adds.
 
-        Every product loses a small share ``W`` of the sizes, and no more than the ``peak`` is made of that until the
-        end of the span; the sizes have to be the larger by this, and so on: ``peak + peak W peak + ... <= 2 peak``
-        where ``peak W peak`` is at most half of it. Of equal pieces it only counts how far a breakpoint is from where
-        they end: that moves what is reached by its speed, and is felt where an input jumps there (summation by parts
-        of what the durations are off by).
+        Every product loses a small share ``W`` of the sizes, and until the end of the span this error grows by at most
+        ``peak``. The sizes have to be larger by this error, and so on: ``peak + peak W peak + ... <= 2 peak`` where
+        ``peak W peak`` is at most half of ``peak``. For equal pieces only the distance of a breakpoint from the end of
+        its piece counts. This distance moves the value by its speed, and has an effect where an input jumps there
+        (summation by parts of the errors of the durations).
         """
         longest, count = np.maximum.reduceat(self.fine.lengths, self.spans), int(self._counts.max())
         propagator = (self._backward_fine if rows else self.forward).propagator
-        whole, within = propagator.lateness
+        piece_delay, inner_delay = propagator.lateness
         if by_age:  # a row and a column go through one transition for every bit of the age
             share = (self.fine.pieces.bit_length() + 4) * self._relative(self.fine.breakpoints[-1:])
-            late = 2.0 * propagator.drift + within
+            delay = 2.0 * propagator.drift + inner_delay
         elif rows or self._block == 1:
-            share, late = (count + 1) * self._relative(longest), count * whole + within
+            share, delay = (count + 1) * self._relative(longest), count * piece_delay + inner_delay
         else:
             share = propagator.products(count, self._block) * self._relative(self._block * longest)
-            late = 2.0 * propagator.drift + within
+            delay = 2.0 * propagator.drift + inner_delay
         if rows:  # the ends of the spans are computed by transitions of their own
             share = share + 2.0 * self._relative(self._durations)
-            late = late + 2.0 * self._backward_spans.lateness[0]
+            delay = delay + 2.0 * self._backward_spans.lateness[0]
         sizes = self.comparison.sizes.T if rows else self.comparison.sizes
-        once = product(peak.matrices, share.max() * np.eye(sizes.shape[0]) + late * sizes)
-        small = (product(once, peak.matrices) <= 0.5 * peak.matrices).all()
-        return NormBounds(np.where(small, 2.0 * once, np.inf), peak.which), 2.0 * late
+        first_order = product(peak.matrices, share.max() * np.eye(sizes.shape[0]) + delay * sizes)
+        is_small = (product(first_order, peak.matrices) <= 0.5 * peak.matrices).all()
+        return NormBounds(np.where(is_small, 2.0 * first_order, np.inf), peak.which), 2.0 * delay
 
     def _slips(self, rows: bool) -> tuple[tuple[NormBounds, NormBounds], tuple[NormBounds, NormBounds]]:
-        """`ComparisonSystem.slips` at the end of every span, and the largest on it; remembered."""
+        """Return the bounds `ComparisonSystem.slips` at the end of every span, and the largest on it; remembered."""
         if not rows:
             return self._slipping
         # e^{(A + S) r} - e^{A r} is what it is from either side
-        here, grown = (tuple(part.transposed for part in both) for both in self._slipping)
-        return (here[0], here[1]), (grown[0], grown[1])
+        at_end, largest = (tuple(norms.transposed for norms in pair) for pair in self._slipping)
+        return (at_end[0], at_end[1]), (largest[0], largest[1])
 
     @cached_property
     def _slipping(self) -> tuple[tuple[NormBounds, NormBounds], tuple[NormBounds, NormBounds]]:
         # where nothing decays, slips grow with the time, so that the last is the largest
-        grown = ComparisonSystem(self.comparison.rising, self.comparison.sizes)
+        majorant = ComparisonSystem(self.comparison.rising, self.comparison.sizes)
         slack, lengths = self.slack_A, self._durations
-        return self.comparison.slips(slack, lengths), grown.slips(slack, lengths)
+        return self.comparison.slips(slack, lengths), majorant.slips(slack, lengths)
 
     def _relative(self, lengths: Array) -> Array:
-        """What transitions over such ``lengths (S,)`` and a product with them may be off by, relative to the sizes."""
+        """Return the relative error of transitions over such ``lengths (S,)``, and of a product with them."""
         if self.space.nu:
             relative, terms = flows_rounding(self.space, self.A, lengths), self.A.shape[1]
         else:  # beyond the groups there are zeros, whose products and sums are exact
             relative = decoupled_rounding(self.decoupling, self.A[0], lengths)
-            terms = max(part.stop - part.start for part, _ in self.decoupling.parts)
+            terms = max(block.stop - block.start for block, _ in self.decoupling.parts)
         terms = terms * int(np.bincount(self.space.products[2]).max()) + max(self.B.shape[2], self.W.shape[2])
         return np.asarray(relative + rounding(terms))
 
     def _speed(self, reached: Array, driven: Array, rows: bool) -> Array:
-        """How fast anything of the sizes ``reached (r, S, q)`` moves, at most."""
+        """Return an upper bound of the speed of a quantity of the sizes ``reached (r, S, q)`` under the forcing
+        ``driven``."""
         return np.asarray(product(reached, self.comparison.sizes if rows else self.comparison.sizes.T) + driven)
 
     def spilt(self, coefficients: Array) -> Array:
-        """For every monomial, the sum of those norms ``(M, ...)`` of the coefficients of a factor that push its product
-        out of the space, ``(M, ...)``."""
-        leaves = self.space.degrees[:, None] + self.space.degrees[None, :] > self.space.degree
-        return np.asarray(np.tensordot(leaves.astype(float), coefficients, axes=1))
+        """Return, for every monomial, a sum of norms ``(M, ...)``: of those ``coefficients (M, ...)`` of a factor whose
+        product with the monomial is beyond the degree of the space."""
+        is_beyond = self.space.degrees[:, None] + self.space.degrees[None, :] > self.space.degree
+        return np.asarray(np.tensordot(is_beyond.astype(float), coefficients, axes=1))
 
 
 @dataclass(frozen=True, eq=False)
@@ -625,13 +667,13 @@ class LiftedExponentials:
     along_rows: bool
 
     def rows(self, rows: Array, durations: Array) -> tuple[Array, Array]:
-        """`Exponentials.rows`, of functionals."""
+        """Return ``c'e^{A r}`` and ``c'int_0^r e^{A s} ds`` of functionals (`Exponentials.rows`)."""
         assert self.along_rows
-        flown, driven = self.lifted.flown(rows[:, None], durations)
-        return flown[:, 0], driven[:, 0]
+        propagated, integral = self.lifted.flown(rows[:, None], durations)
+        return propagated[:, 0], integral[:, 0]
 
     def transitions(self, durations: Array) -> tuple[Array, Array]:
-        """`Exponentials.transitions`."""
+        """Return ``e^{A r}`` and ``int_0^r e^{A s} ds`` for durations (`Exponentials.transitions`)."""
         lifted = self.lifted
         if lifted.space.nu:
             return lifted_transitions(lifted.space, lifted.A, durations, rows=self.along_rows)
@@ -639,32 +681,33 @@ class LiftedExponentials:
 
 
 def _applied(bounds: NormBounds, norms: Array) -> Array:
-    """Bounds by matrices ``(M q, M q)`` on block norms ``(r, L', M, q)``."""
+    """Return bounds by matrices ``(M q, M q)`` on block norms ``(r, L', M, q)``."""
     return bounds.on(norms.reshape(*norms.shape[:2], -1)).reshape(norms.shape)
 
 
 def lift(phase: Phase, grid: TimeGrid, initial_state: Array, centre: Array, radius: Array) -> LiftedSystem:
-    """The lifted system over a cell, in the coordinates of `decoupled`; raises `NotEnclosable` when it has none."""
+    """Return the lifted system over a cell, in the coordinates of `decoupled`; raise `NotEnclosable` where there is
+    none."""
     space = _space(centre.size)
     A, slack_A, B, slack_B, W, slack_W = phase.taylor(space, centre, radius)
     basis = decoupled(A[0])
-    size, moved = np.abs(basis.inverse).astype(float), basis.matrix(A)
-    coefficients, rounded = moved[0].copy(), moved[1].sum(axis=0)
-    coefficients[0] = basis.normal_form(moved[0][0])
-    rounded = rounded + np.abs(coefficients[0] - moved[0][0])
+    size, transformed = np.abs(basis.inverse).astype(float), basis.matrix(A)
+    coefficients, rounded = transformed[0].copy(), transformed[1].sum(axis=0)
+    coefficients[0] = basis.normal_form(transformed[0][0])
+    rounded = rounded + np.abs(coefficients[0] - transformed[0][0])
     slack = (np.eye(size.shape[0]) + basis.defect) @ size
-    driven, state = [basis.vector(part) for part in (B, W)], basis.vector(initial_state[:, None])
+    inputs, state = [basis.vector(matrices) for matrices in (B, W)], basis.vector(initial_state[:, None])
     return LiftedSystem(
         space,
         grid,
         state[0][:, 0],
         coefficients,
-        driven[0][0],
-        driven[1][0],
+        inputs[0][0],
+        inputs[1][0],
         basis,
         block_sizes(rounded + slack @ slack_A @ np.abs(basis.transform), basis.starts),
-        _row_sizes(driven[0][1].sum(axis=0) + slack @ slack_B, basis.starts),
-        _row_sizes(driven[1][1].sum(axis=0) + slack @ slack_W, basis.starts),
+        _row_sizes(inputs[0][1].sum(axis=0) + slack @ slack_B, basis.starts),
+        _row_sizes(inputs[1][1].sum(axis=0) + slack @ slack_W, basis.starts),
         block_norms(state[1][:, 0], basis.starts),
     )
 
@@ -672,29 +715,30 @@ def lift(phase: Phase, grid: TimeGrid, initial_state: Array, centre: Array, radi
 def lift_legs(
     system: System, grid: TimeGrid, initial_state: Array, centre: Array, radius: Array
 ) -> tuple[LiftedSystem, ...]:
-    """The lifted systems of the modes that take turns, each from where it begins; one for a system that stays."""
+    """Return the lifted systems of the modes of a switched system, each from where it begins; a single one where the
+    system does not switch."""
     if grid.mode is None:
         return (lift(system.modes[0], grid, initial_state, centre, radius),)
-    legs: list[LiftedSystem] = []
+    lifted_phases: list[LiftedSystem] = []
     for number, mode in enumerate(system.modes):
-        leg = lift(mode, grid.leg(number), initial_state, centre, radius)
-        if legs:
-            turn, slip = leg.decoupling.vector(legs[-1].transform)
-            leg = replace(leg, past=Past(legs[-1], turn, slip, leg.starts))
-        legs.append(leg)
-    return tuple(legs)
+        lifted = lift(mode, grid.leg(number), initial_state, centre, radius)
+        if lifted_phases:
+            transform, slip = lifted.decoupling.vector(lifted_phases[-1].transform)
+            lifted = replace(lifted, past=Past(lifted_phases[-1], transform, slip, lifted.starts))
+        lifted_phases.append(lifted)
+    return tuple(lifted_phases)
 
 
 def _row_sizes(entries: Array, starts: np.ndarray) -> Array:
-    """Norms ``(q, m)`` of the blocks of columns ``(d, m)``."""
+    """Return the norms ``(q, m)`` of the blocks of columns ``(d, m)``."""
     return block_norms(entries.T, starts).T
 
 
 def frozen(phase: Phase, grid: TimeGrid, initial_state: Array, parameter: Array) -> LiftedSystem:
-    """The system at one parameter, without any expansion."""
+    """Return the system at one parameter, without any expansion."""
     A, B, W = phase.matrices(parameter[None])
     basis = identity(A.shape[1])
-    none_A, none_B, none_W = (np.zeros((A.shape[1], part.shape[2])) for part in (A, B, W))
+    none_A, none_B, none_W = (np.zeros((A.shape[1], matrix.shape[2])) for matrix in (A, B, W))
     return LiftedSystem(
         _space(0), grid, initial_state, A, B, W, basis, none_A, none_B, none_W, slack_x=np.zeros(A.shape[1])
     )

@@ -16,7 +16,7 @@ LATTICE = 4096  # points at most in the lattice over the parameters
 
 @dataclass(frozen=True, eq=False)
 class ParameterIndex:
-    """The part of an index that is the parameter ``p``; empty (``nu = 0``) for a known system."""
+    """Part of an index that is the parameter ``p``; empty (``nu = 0``) for a known system."""
 
     set: ConvexSet | None
 
@@ -36,20 +36,20 @@ class ParameterIndex:
         return np.zeros(0) if self.set is None else self.set.interior_point()
 
     def clamp(self, parameters: Array) -> Array:
-        """Points ``(k, nu)`` of the box mapped onto the set: kept where inside, else drawn along the ray to an interior
-        point."""
+        """Return points ``(k, nu)`` of the box mapped onto the set. Points of the set stay; others move along the ray
+        to an interior point."""
         if self.set is None or self.set.is_box:
             return parameters
         size, middle = self.set.gauge(parameters)[:, None], self.set.interior_point()
         return np.where(size <= 1.0, parameters, middle + (parameters - middle) / np.maximum(size, 1.0))
 
     def pulled_back(self, parameters: Array, slopes: Array) -> Array:
-        """Derivatives ``(k, nu)`` in the points of the box, from derivatives ``slopes (k, nu)`` in what `clamp` makes
-        of them.
+        """Return derivatives ``(k, nu)`` at the points of the box, from derivatives ``slopes (k, nu)`` at the points to
+        which `clamp` maps them.
 
-        A point ``p`` outside the set is drawn to ``middle + s (p - middle)`` on the boundary. With an outward normal
-        ``v`` there, the derivative of ``s`` is ``-s v / v'(p - middle)``. Points of the set stay where they are; at a
-        corner of the set one of its normals is taken.
+        A point ``p`` outside the set moves to ``middle + s (p - middle)`` on the boundary. With an outward normal ``v``
+        there, the derivative of ``s`` is ``-s v / v'(p - middle)``. Points of the set stay where they are; at a corner
+        of the set one of its normals is taken.
         """
         if self.set is None or self.set.is_box:
             return slopes
@@ -64,7 +64,8 @@ class ParameterIndex:
         return result
 
     def touches(self, lower: Array, upper: Array) -> np.ndarray:
-        """Whether cells ``[lower, upper]`` (``(k, nu)``) may meet the set; ``False`` only when they provably do not."""
+        """Return whether cells ``[lower, upper]`` (``(k, nu)``) may meet the set; ``False`` only where they provably do
+        not."""
         if self.set is None or self.set.is_box:
             return np.ones(lower.shape[0], dtype=bool)
         H, h = self._halfspaces(self.set, (lower + upper) / 2)
@@ -72,8 +73,8 @@ class ParameterIndex:
         return np.asarray((smallest <= h + TOUCHING * np.maximum(1.0, np.abs(h))).all(axis=1))
 
     def cuts(self, low: Array, high: Array) -> Cuts | None:
-        """What the set says about the parameters of a cell ``[low, high]``; ``None`` where all of the cell is in it, as
-        far as can be told."""
+        """Return valid inequalities of the set on a cell ``[low, high]``; ``None`` where the whole cell is in the set,
+        as far as the test can decide."""
         if self.set is None or self.set.is_box:
             return None
         centre, radius = (low + high) / 2, (high - low) / 2
@@ -88,16 +89,18 @@ class ParameterIndex:
             ball is None or np.linalg.norm(np.abs(ball[0]) + np.abs(ball[1]).sum(axis=1)) <= 1.0
         ):
             return None
-        bent = np.zeros(centre.size)
+        curvature = np.zeros(centre.size)
         if not flat:
             box = self.box
-            bent = float((h - H @ self.set.interior_point()).max()) * ((high - low) / (box.upper - box.lower)) ** 2 / 2
-        return Cuts(slopes[crossing], slack[crossing], ball, bent)
+            curvature = (
+                float((h - H @ self.set.interior_point()).max()) * ((high - low) / (box.upper - box.lower)) ** 2 / 2
+            )
+        return Cuts(slopes[crossing], slack[crossing], ball, curvature)
 
     @staticmethod
     def _halfspaces(convex_set: ConvexSet, points: Array) -> tuple[Array, Array]:
-        """Half-spaces ``H p <= h`` that contain the set: its own, or a tangent one on the ray to each of ``points``;
-        ``(k, q, nu), (k, q)``."""
+        """Return half-spaces ``H p <= h`` that contain the set, ``(k, q, nu), (k, q)``: its own sides, or a tangent one
+        on the ray to each of ``points``."""
         flat = convex_set.halfspaces()
         if flat is not None:
             return np.broadcast_to(flat[0], (points.shape[0], *flat[0].shape)), np.broadcast_to(
@@ -110,7 +113,8 @@ class ParameterIndex:
         return normals[:, None], convex_set.support(normals)[:, None]
 
     def lattice(self) -> tuple[Array, tuple[int, ...]]:
-        """A tensor lattice ``(v, nu)`` over the box (ends and middle included), clamped onto the set, and its shape."""
+        """Return a tensor lattice ``(v, nu)`` over the box (ends and middle included), clamped onto the set, and its
+        shape."""
         if self.set is None:
             return np.zeros((1, 0)), ()
         per_axis = next(n for n in (9, 5, 3, 2, 1) if n**self.count <= (125 if n > 3 else LATTICE) or n == 1)

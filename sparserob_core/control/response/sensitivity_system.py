@@ -28,11 +28,11 @@ POINTS_KEPT = 512  # parameters whose derivatives are remembered
 
 
 def tangent(response: Response) -> Response:
-    """The response whose functionals are ``c'x(t)`` and its derivatives in the ``nu`` parameters, for directions
+    """Return the response whose functionals are ``c'x(t)`` and its derivatives in the ``nu`` parameters, for directions
     ``(c, 0, ..., 0)``.
 
-    Its states are ``1 + nu`` blocks of ``d``; its ``B`` and ``E`` hold those of the system and their derivatives, block
-    below block. A known system is its own, and so is one that changes with time.
+    Its states are ``1 + nu`` blocks of ``d``. Its ``B`` and ``E`` hold those of the system and their derivatives, block
+    below block. The response of a known system, or of one that changes with time, is returned as it is.
     """
     system, blocks = response.system, 1 + response.system.parameter_count
     if blocks == 1 or system.varies:
@@ -69,7 +69,7 @@ class Derivatives:
     _known: dict[bytes, tuple[Array, Array, Array]] = field(default_factory=dict, repr=False)
 
     def __call__(self, parameter: Array) -> tuple[Array, Array, Array]:
-        """``A (1 + nu, d, d)``, ``B (1 + nu, d, m)``, ``E (1 + nu, d, mw)`` at ``parameter (nu,)``: values, then
+        """Return ``A (1 + nu, d, d)``, ``B (1 + nu, d, m)``, ``E (1 + nu, d, mw)`` at ``parameter (nu,)``: values, then
         derivatives."""
         key = np.asarray(parameter, dtype=float).tobytes()
         if key not in self._known:
@@ -94,9 +94,9 @@ class Derivatives:
         width = box.upper - box.lower
         radius = CELL * np.where(width > 0, width, 1.0 + np.abs(parameter))
         space = TaylorSpace(parameter.size, 1)
-        parts = self.phase.taylor(space, parameter, radius)
+        coefficients = self.phase.taylor(space, parameter, radius)
         linear = [space.index[tuple(exponents)] for exponents in np.eye(parameter.size, dtype=int).tolist()]
-        A, B, E = (parts[part][linear] / radius[:, None, None] for part in (0, 2, 4))
+        A, B, E = (coefficients[index][linear] / radius[:, None, None] for index in (0, 2, 4))
         return A, B, E
 
     def _differenced(self, parameter: Array) -> tuple[Array, Array, Array]:
@@ -107,14 +107,14 @@ class Derivatives:
             return np.hstack([matrix.reshape(points.shape[0], -1) for matrix in self.phase.matrices(points)])
 
         slopes = differences(entries, parameter[None], box.lower, box.upper)[0]
-        parts = np.split(slopes, np.cumsum([np.prod(shape) for shape in shapes])[:-1], axis=1)
-        A, B, E = (part.reshape(-1, *shape) for part, shape in zip(parts, shapes, strict=True))
+        blocks = np.split(slopes, np.cumsum([np.prod(shape) for shape in shapes])[:-1], axis=1)
+        A, B, E = (block.reshape(-1, *shape) for block, shape in zip(blocks, shapes, strict=True))
         return A, B, E
 
 
 def _acting_on_rows(A: Array) -> Array:
-    """``A (1 + nu, d, d)`` and its derivatives as the matrix ``((1 + nu) d, (1 + nu) d)`` of the rows
-    ``(r, r_1, ..., r_nu)``."""
+    """Return the matrix ``((1 + nu) d, (1 + nu) d)`` by which rows ``(r, r_1, ..., r_nu)`` are multiplied, from ``A``
+    and its derivatives, ``(1 + nu, d, d)``."""
     blocks, d = A.shape[:2]
     matrix = np.kron(np.eye(blocks), A[0])
     matrix[:d, d:] = A[1:].swapaxes(0, 1).reshape(d, -1)

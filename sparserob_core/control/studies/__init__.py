@@ -1,1 +1,1 @@
-"""What can be asked of a transcribed problem: worst cases, simulations, sets of initial states."""
+"""Studies of a transcribed problem: worst cases, simulations, and sets of initial states."""

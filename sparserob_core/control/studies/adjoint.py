@@ -50,7 +50,24 @@ class Adjoint:
 
     @staticmethod
     def of(A: Array, B: Array, c: Array, horizon: float) -> Adjoint:
-        """That of one row ``c (d,)``. Raises `NotEnclosable` for a system that is too fast for its horizon."""
+        """Compute the adjoint of one row over a horizon.
+
+        Parameters
+        ----------
+        A : ndarray, shape (d, d)
+            Matrix of the system.
+        B : ndarray, shape (d, q)
+            Matrix of the inputs.
+        c : ndarray, shape (d,)
+            The row.
+        horizon : float
+            Length of the horizon.
+
+        Raises
+        ------
+        NotEnclosable
+            If the system is too fast for its horizon.
+        """
         from scipy.linalg import matrix_balance
 
         balanced, (units, _) = matrix_balance(A, permute=False, separate=True)
@@ -65,12 +82,12 @@ class Adjoint:
         while rows.shape[0] < count:
             rows, power = np.vstack([rows, rows @ power]), power @ power
         rows = np.vstack([rows, rows[:1] @ power])
-        found = Adjoint(balanced, inputs, units, rows, np.zeros((1, B.shape[1])), step)
-        moved = step * np.einsum("kjq,j->kq", found.coefficients, 1.0 / np.arange(1, ORDER + 2))
-        return replace(found, driven=np.vstack([found.driven, np.cumsum(moved, axis=0)]))
+        adjoint = Adjoint(balanced, inputs, units, rows, np.zeros((1, B.shape[1])), step)
+        integrals = step * np.einsum("kjq,j->kq", adjoint.coefficients, 1.0 / np.arange(1, ORDER + 2))
+        return replace(adjoint, driven=np.vstack([adjoint.driven, np.cumsum(integrals, axis=0)]))
 
     def reversed(self) -> Adjoint:
-        """That of ``-c``."""
+        """Return the adjoint of ``-c``."""
         return replace(self, nodes=-self.nodes, driven=-self.driven)
 
     @cached_property
@@ -85,32 +102,34 @@ class Adjoint:
     @cached_property
     def coefficients(self) -> Array:
         """``l' B`` on every step in powers of the share of it that has passed, ``(N, p + 1, q)``."""
-        row, found = self.nodes[:-1], []
+        row, terms = self.nodes[:-1], []
         for order in range(ORDER + 1):
-            found.append(row @ self.B)
+            terms.append(row @ self.B)
             row = np.asarray(row @ self._products) * (self.step / (order + 1))
-        return np.stack(found, axis=1)
+        return np.stack(terms, axis=1)
 
     @cached_property
     def bends(self) -> tuple[Array, Array, Array]:
-        """On every step bounds of ``|l''|`` in the user's units, ``(N, d)``, of ``|l' A B|`` and ``|l' A^2 B|``,
-        ``(N, q)``."""
+        """Bounds of ``|l''|`` in the user's units, ``(N, d)``, and of ``|l' A B|`` and ``|l' A^2 B|``, ``(N, q)`` each,
+        on every step."""
         d, h = self.A.shape[0], self.step
-        found = [np.zeros((self.nodes.shape[0] - 1, n)) for n in (d, self.B.shape[1], self.B.shape[1])]
+        bounds = [np.zeros((self.nodes.shape[0] - 1, n)) for n in (d, self.B.shape[1], self.B.shape[1])]
         row = np.asarray(self.nodes[:-1] @ self._products)
         for order in range(BENDING + 1):
-            found[1] += np.abs(row @ self.B) * h**order / FACTORIALS[order]
+            bounds[1] += np.abs(row @ self.B) * h**order / FACTORIALS[order]
             row = np.asarray(row @ self._products)
-            found[0] += np.abs(row) * h**order / FACTORIALS[order]
-            found[2] += np.abs(row @ self.B) * h**order / FACTORIALS[order]
+            bounds[0] += np.abs(row) * h**order / FACTORIALS[order]
+            bounds[2] += np.abs(row @ self.B) * h**order / FACTORIALS[order]
         # Lagrange's remainder of all three, by norms in balanced units
         short = self.speed * h
-        left = np.linalg.norm(row, axis=1, keepdims=True) * h ** (BENDING + 1) * np.exp(short) / FACTORIALS[BENDING + 1]
+        remainder = (
+            np.linalg.norm(row, axis=1, keepdims=True) * h ** (BENDING + 1) * np.exp(short) / FACTORIALS[BENDING + 1]
+        )
         sizes = np.linalg.norm(self.B, axis=0)
         return (
-            (found[0] + left * self.speed) / self.units,
-            found[1] + left * sizes,
-            found[2] + left * self.speed * sizes,
+            (bounds[0] + remainder * self.speed) / self.units,
+            bounds[1] + remainder * sizes,
+            bounds[2] + remainder * self.speed * sizes,
         )
 
     def placed(self, times: Array) -> tuple[np.ndarray, Array]:
@@ -121,18 +140,18 @@ class Adjoint:
     def rows(self, times: Array) -> Array:
         """``l`` at times ``(k,)``, ``(k, d)``, in the user's units."""
         steps, shares = self.placed(times)
-        found, several = np.empty((times.size, self.A.shape[0])), max(1, ROWS // self.A.shape[0])
-        for start in range(0, times.size, several):
-            part = slice(start, start + several)
-            row, total = self.nodes[steps[part]], np.zeros((steps[part].size, self.A.shape[0]))
-            moving = np.flatnonzero(shares[part])
+        values, batch_size = np.empty((times.size, self.A.shape[0])), max(1, ROWS // self.A.shape[0])
+        for start in range(0, times.size, batch_size):
+            batch = slice(start, start + batch_size)
+            row, total = self.nodes[steps[batch]], np.zeros((steps[batch].size, self.A.shape[0]))
+            moving = np.flatnonzero(shares[batch])
             total[:] = row
             row = row[moving]
             for order in range(1, ORDER + 1):
-                row = np.asarray(row @ self._products) * (self.step * shares[part][moving] / order)[:, None]
+                row = np.asarray(row @ self._products) * (self.step * shares[batch][moving] / order)[:, None]
                 total[moving] += row
-            found[part] = total
-        return found / self.units
+            values[batch] = total
+        return values / self.units
 
     def integrals(self, times: Array) -> Array:
         """``int_0^s l'B dr`` at times ``(...)``, ``(..., q)``; 0 before time 0."""
@@ -160,8 +179,11 @@ def tidy(times: Array, horizon: float) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class Pushes:
-    """What disturbances ``w(t)`` in ``bound`` add: constant between the times ``changes (M + 1,)``, or, without these,
-    measurable. ``inputs``: which of the adjoint's they enter by."""
+    """Disturbances ``w(t)`` in a set ``bound``.
+
+    They are constant between the times ``changes (M + 1,)`` or, without these, measurable. They enter by the columns
+    ``inputs`` of the adjoint's ``B``.
+    """
 
     bound: ConvexSet
     inputs: slice
@@ -170,11 +192,26 @@ class Pushes:
 
 @dataclass(frozen=True, eq=False)
 class WorstRow:
-    """The largest ``c'(x(t) - r(t)) + g'u(t)`` over all disturbances and initial states.
+    """Largest value of ``c'(x(t) - r(t)) + g'u(t)`` over all disturbances and initial states.
 
-    ``centre (d,)`` and the deviations from it ``begun``; ``drives (q', L)`` on pieces of ``grid (L + 1,)``: what is
-    known of the first inputs; ``pushes`` of the others. ``beside``: ``g'u`` on the pieces of the control, between its
-    own breakpoints; ``moving``: times and values of ``c'r``.
+    Parameters
+    ----------
+    adjoint : Adjoint
+        Adjoint of ``c``.
+    centre : ndarray, shape (d,)
+        Centre of the initial states.
+    begun : ConvexSet or None
+        Deviations of the initial state from the centre.
+    grid : ndarray, shape (L + 1,)
+        Ends of the pieces.
+    drives : ndarray, shape (q', L)
+        Known values of the first inputs on the pieces.
+    pushes : Pushes or None
+        Disturbances, which are the other inputs.
+    beside : tuple of ndarray, optional
+        Breakpoints of the control, and ``g'u`` on the pieces between them.
+    moving : tuple of ndarray, optional
+        Times and values of ``c'r``.
     """
 
     adjoint: Adjoint
@@ -188,12 +225,12 @@ class WorstRow:
 
     def cuts(self) -> Array:
         """Times between which the row is smooth but for disturbances about to switch, increasing."""
-        parts: list[Array] = [self.grid if self.drives.any() else self.grid[[0, -1]]]
-        parts += [] if self.pushes is None or self.pushes.changes is None else [self.pushes.changes]
-        parts += [] if self.beside is None else [self.beside[0]]
-        parts += [] if self.moving is None else [self.moving[0]]
-        parts += [np.asarray(np.arange(self.adjoint.nodes.shape[0]) * self.adjoint.step, dtype=float)]
-        return np.unique(np.concatenate(parts))
+        cuts: list[Array] = [self.grid if self.drives.any() else self.grid[[0, -1]]]
+        cuts += [] if self.pushes is None or self.pushes.changes is None else [self.pushes.changes]
+        cuts += [] if self.beside is None else [self.beside[0]]
+        cuts += [] if self.moving is None else [self.moving[0]]
+        cuts += [np.asarray(np.arange(self.adjoint.nodes.shape[0]) * self.adjoint.step, dtype=float)]
+        return np.unique(np.concatenate(cuts))
 
     def at(self, times: Array, inside: Array | None = None) -> tuple[Array, Array]:
         """Bounds ``(k,)`` of the largest value at ``times (k,)``: one that is reached, and one that is not exceeded but
@@ -206,12 +243,12 @@ class WorstRow:
             low = low - np.interp(times, *self.moving)
         if self.beside is not None:
             breaks, values = self.beside
-            held = np.searchsorted(breaks, times if inside is None else inside, side="right") - 1
-            low = low + values[np.clip(held, 0, values.size - 1)]
+            pieces = np.searchsorted(breaks, times if inside is None else inside, side="right") - 1
+            low = low + values[np.clip(pieces, 0, values.size - 1)]
         if self.pushes is None:
             return low, low
-        pushed = self._pushed(times)
-        return low + pushed[:, 0], low + pushed[:, 1]
+        support_values = self._pushed(times)
+        return low + support_values[:, 0], low + support_values[:, 1]
 
     def _driven(self, times: Array) -> Array:
         if not self.drives.any():
@@ -226,16 +263,16 @@ class WorstRow:
         )
 
     def _between(self, times: Array, start: float, stop: float) -> Array:
-        """What an input of 1 from ``start`` to ``stop`` adds to the row at every time, ``(k, q)``."""
+        """Return the contribution of an input of 1 from ``start`` to ``stop`` to the row at every time, ``(k, q)``."""
         return self.adjoint.integrals(times - start) - self.adjoint.integrals(times - stop)
 
     def _pushed(self, times: Array) -> Array:
         assert self.pushes is not None
-        bound, mine = self.pushes.bound, self.pushes.inputs
+        bound, columns = self.pushes.bound, self.pushes.inputs
         if self.pushes.changes is not None:
             total = np.zeros(times.size)
             for a, b in pairwise(self.pushes.changes):
-                total += bound.support(self._between(times, a, b)[:, mine])
+                total += bound.support(self._between(times, a, b)[:, columns])
             return np.stack([total, total], axis=1)
         steps, shares = self.adjoint.placed(times)
         inside = self._integrated(steps, shares)
@@ -263,10 +300,13 @@ class WorstRow:
 
     @cached_property
     def lost(self) -> float:
-        """What rounding, and the rest of the expansions, may change of any value, at most: the roundings of rows that
-        are doubled again and again, and of the transition over a step, which every squaring doubles, in the largest sum
-        of absolute values that is met (Higham 2002, section 3.1). An estimate where products grow in between; the
-        checker derives every bound anew in ball arithmetic."""
+        """Bound of the rounding error and the truncation error of any value of the row.
+
+        It counts the rounding of rows that are doubled again and again, and that of the transition over a step, which
+        every squaring doubles. Both are relative to the largest sum of absolute values that occurs (Higham 2002,
+        section 3.1). The bound is an estimate where products grow in between; the checker derives every bound anew in
+        ball arithmetic.
+        """
         steps = self.adjoint.nodes.shape[0]
         terms = 2 * self.adjoint.A.shape[0] * (ceil(log2(steps)) + 2) + ORDER + 8 + ROUNDED * steps
         size = float((np.abs(self.adjoint.nodes / self.adjoint.units) @ self._far).max())
@@ -275,51 +315,53 @@ class WorstRow:
         size += 0.0 if self.moving is None else float(np.abs(self.moving[1]).max())
         norms = np.linalg.norm(self.adjoint.nodes, axis=1)
         inputs = float(np.linalg.norm(self.adjoint.B, axis=0) @ self._inputs_far) * self.adjoint.step
-        rest = (SHORT ** (ORDER + 1)) * np.exp(SHORT) / FACTORIALS[ORDER + 1]
-        rest *= float(norms.max() * np.linalg.norm(self._far / self.adjoint.units) + norms.sum() * inputs)
-        return float(rounding(terms) * size + rest)
+        truncation = (SHORT ** (ORDER + 1)) * np.exp(SHORT) / FACTORIALS[ORDER + 1]
+        truncation *= float(norms.max() * np.linalg.norm(self._far / self.adjoint.units) + norms.sum() * inputs)
+        return float(rounding(terms) * size + truncation)
 
     @cached_property
     def _far(self) -> Array:
-        """How far initial states are from 0, ``(d,)``."""
-        far = np.abs(self.centre)
-        return far if self.begun is None else far + self.begun.reach(np.eye(far.size))
+        """Largest absolute values of the initial states, ``(d,)``."""
+        magnitudes = np.abs(self.centre)
+        return magnitudes if self.begun is None else magnitudes + self.begun.reach(np.eye(magnitudes.size))
 
     @cached_property
     def _inputs_far(self) -> Array:
-        """The same of the inputs, ``(q,)``."""
-        far = np.zeros(self.adjoint.B.shape[1])
-        far[: self.drives.shape[0]] = np.abs(self.drives).max(axis=1, initial=0.0)
+        """Largest absolute values of the inputs, ``(q,)``."""
+        magnitudes = np.zeros(self.adjoint.B.shape[1])
+        magnitudes[: self.drives.shape[0]] = np.abs(self.drives).max(axis=1, initial=0.0)
         if self.pushes is not None:
-            far[self.pushes.inputs] = self.pushes.bound.reach(np.eye(self.pushes.bound.dimension))
-        return far
+            magnitudes[self.pushes.inputs] = self.pushes.bound.reach(np.eye(self.pushes.bound.dimension))
+        return magnitudes
 
     @cached_property
     def _bent(self) -> Array:
-        """On every step a bound of what, times an eighth of the square of a cell's width, the row is above its chord by
-        there, ``(N,)``."""
-        states, once, twice = self.adjoint.bends
-        far = self._inputs_far.copy()
-        bent = states @ self._far
+        """Bounds ``(N,)`` of the curvature of the row on every step: times an eighth of the square of a cell's width
+        they bound its excess over the chord."""
+        state_bounds, first_bounds, second_bounds = self.adjoint.bends
+        magnitudes = self._inputs_far.copy()
+        curvature = state_bounds @ self._far
         if self.pushes is not None and self.pushes.changes is None:  # the slope of an integral that is a support
-            bent = bent + once[:, self.pushes.inputs] @ far[self.pushes.inputs]
-            far[self.pushes.inputs] = 0.0
+            curvature = curvature + first_bounds[:, self.pushes.inputs] @ magnitudes[self.pushes.inputs]
+            magnitudes[self.pushes.inputs] = 0.0
         # of inputs on pieces: the change of l' A B from one end of a piece to the other, summed, and that at the last
-        total = self.adjoint.step * (twice @ far).sum() + (once @ far).max(initial=0.0)
-        return np.asarray(bent + total)
+        total = self.adjoint.step * (second_bounds @ magnitudes).sum() + (first_bounds @ magnitudes).max(initial=0.0)
+        return np.asarray(curvature + total)
 
     def enclosed(self, lower: Array, upper: Array) -> Array:
         """Proven upper bounds ``(k,)`` on cells of times ``(k,)``, each between two `cuts`."""
-        ends, which = np.unique(np.concatenate([lower, upper]), return_inverse=True)
+        ends, indices = np.unique(np.concatenate([lower, upper]), return_inverse=True)
         count, middles = lower.size, (lower + upper) / 2
         if self.beside is None:
-            high = self.at(ends)[1][which]
+            high = self.at(ends)[1][indices]
         else:
             high = self.at(np.concatenate([lower, upper]), np.tile(middles, 2))[1]
         first, last = (np.clip((at / self.adjoint.step).astype(int), 0, self._bent.size - 1) for at in (lower, upper))
-        bent = np.maximum(self._bent[first], self._bent[last])
-        bent = np.maximum(bent, self._bent[np.clip((middles / self.adjoint.step).astype(int), 0, self._bent.size - 1)])
-        return np.asarray(np.maximum(high[:count], high[count:]) + (upper - lower) ** 2 / 8 * bent + self.lost)
+        curvature = np.maximum(self._bent[first], self._bent[last])
+        curvature = np.maximum(
+            curvature, self._bent[np.clip((middles / self.adjoint.step).astype(int), 0, self._bent.size - 1)]
+        )
+        return np.asarray(np.maximum(high[:count], high[count:]) + (upper - lower) ** 2 / 8 * curvature + self.lost)
 
     def witness(self, time: float) -> tuple[Array, Array, Array | None]:
         """The deviation ``(d,)`` of the initial state that is worst at a time, and a disturbance ``(mw, M)`` between
@@ -328,55 +370,60 @@ class WorstRow:
         state = np.zeros(row.size) if self.begun is None else within(self.begun, self.begun.support_point(row))
         if self.pushes is None:
             return state, self.grid[[0, -1]], None
-        bound, mine = self.pushes.bound, self.pushes.inputs
+        bound, columns = self.pushes.bound, self.pushes.inputs
         changes = self._switches(time) if self.pushes.changes is None else self.pushes.changes
-        gains = np.stack([self._between(np.array([time]), a, b)[0, mine] for a, b in pairwise(changes)])
+        gains = np.stack([self._between(np.array([time]), a, b)[0, columns] for a, b in pairwise(changes)])
         values = np.where(
             np.abs(gains).max(axis=1)[:, None] > 0.0, within(bound, bound.support_point(gains)), bound.interior_point()
         )
         if self.pushes.changes is None:
-            new = np.concatenate([[True], (np.diff(values, axis=0) != 0).any(axis=1)])
-            changes, values = np.append(changes[:-1][new], changes[-1]), values[new]
+            is_change = np.concatenate([[True], (np.diff(values, axis=0) != 0).any(axis=1)])
+            changes, values = np.append(changes[:-1][is_change], changes[-1]), values[is_change]
         return state, changes, values.T
 
     def reached(self, time: float, deviation: Array, changes: Array, disturbance: Array | None) -> float:
         """The value of the row at a time from the centre and one deviation, and under one disturbance, as of `witness`,
         but for rounding, and with the control of the piece that begins last where it jumps."""
         times = np.array([time])
-        calm = replace(self, centre=self.centre + deviation, begun=None, pushes=None)
-        value = float(calm.at(times)[0][0])
+        deterministic = replace(self, centre=self.centre + deviation, begun=None, pushes=None)
+        value = float(deterministic.at(times)[0][0])
         if self.pushes is not None and disturbance is not None:
-            mine, ends = self.pushes.inputs, np.minimum(changes, time)
-            moved = -np.diff(self.adjoint.integrals(time - ends)[:, mine], axis=0)
-            value += float((moved * disturbance.T).sum())
+            columns, ends = self.pushes.inputs, np.minimum(changes, time)
+            gains = -np.diff(self.adjoint.integrals(time - ends)[:, columns], axis=0)
+            value += float((gains * disturbance.T).sum())
         return value
 
     def _switches(self, time: float) -> Array:
         """Times between which one value of a measurable disturbance is best for the row at ``time``: the ends of the
         steps before it, and where the best value changes within one."""
         assert self.pushes is not None
-        bound, mine = self.pushes.bound, self.pushes.inputs
+        bound, columns = self.pushes.bound, self.pushes.inputs
         ends = np.append(np.arange(0.0, time, self.adjoint.step), time)
         start, stop = ends[:-1], ends[1:]
 
         def best(times: Array) -> Array:
             steps, shares = self.adjoint.placed(times)
             powers = shares[:, None] ** np.arange(ORDER + 1)
-            return bound.support_point(np.einsum("kjq,kj->kq", self.adjoint.coefficients[steps][:, :, mine], powers))
+            return bound.support_point(np.einsum("kjq,kj->kq", self.adjoint.coefficients[steps][:, :, columns], powers))
 
-        left, right = best(start), best(stop)
+        left_values, right_values = best(start), best(stop)
         for _ in range(HALVED):
-            apart = np.asarray(left != right).any(axis=1)
-            start, stop, left, right = start[apart], stop[apart], left[apart], right[apart]
+            is_switch = np.asarray(left_values != right_values).any(axis=1)
+            start, stop, left_values, right_values = (
+                start[is_switch],
+                stop[is_switch],
+                left_values[is_switch],
+                right_values[is_switch],
+            )
             middle = (start + stop) / 2
             centre = best(middle)
-            lower = (centre != left).any(axis=1)
-            both = lower & (centre != right).any(axis=1) & (start.size < MOST_SWITCHES)
-            start, stop, left, right = (
-                np.concatenate([np.where(lower, start, middle), middle[both]]),
-                np.concatenate([np.where(lower, middle, stop), stop[both]]),
-                np.concatenate([np.where(lower[:, None], left, centre), centre[both]]),
-                np.concatenate([np.where(lower[:, None], centre, right), right[both]]),
+            is_lower = (centre != left_values).any(axis=1)
+            is_double = is_lower & (centre != right_values).any(axis=1) & (start.size < MOST_SWITCHES)
+            start, stop, left_values, right_values = (
+                np.concatenate([np.where(is_lower, start, middle), middle[is_double]]),
+                np.concatenate([np.where(is_lower, middle, stop), stop[is_double]]),
+                np.concatenate([np.where(is_lower[:, None], left_values, centre), centre[is_double]]),
+                np.concatenate([np.where(is_lower[:, None], centre, right_values), right_values[is_double]]),
             )
         points = np.unique(np.concatenate([ends, (start + stop) / 2]))
         forward = tidy(np.maximum(time - points[::-1], 0.0), float(self.grid[-1]))

@@ -59,8 +59,11 @@ class Adversary:
 
 def find_adversaries(model: Transcription, decision: Array) -> list[Adversary]:
     """The worst case of every constraint on the state of a problem, as far as there is one."""
-    every = [find_adversary(one, decision, model.feedback, model.program.own_units) for one in model.constraints]
-    return [one for one in every if one is not None]
+    adversaries = [
+        find_adversary(constraint, decision, model.feedback, model.program.own_units)
+        for constraint in model.constraints
+    ]
+    return [adversary for adversary in adversaries if adversary is not None]
 
 
 def find_adversary(
@@ -71,12 +74,14 @@ def find_adversary(
     has looked at every sample before, it is sought there."""
     if feedback is not None:
         return _of_loop(constraint, decision, feedback.loop)
-    found = constraint.worst(decision) if own is None else _sought(constraint, decision, own)
-    if not found.violations.size:
+    separation = constraint.worst(decision) if own is None else _sought(constraint, decision, own)
+    if not separation.violations.size:
         return None
-    row = int(found.rows[0])
-    times, directions, parameters, bounds = (part[row] for part in constraint.functionals_at(found.indices[:1]))
-    time, direct = float(times), constraint.direct(found.indices[:1, 0])
+    row = int(separation.rows[0])
+    times, directions, parameters, bounds = (
+        values[row] for values in constraint.functionals_at(separation.indices[:1])
+    )
+    time, direct = float(times), constraint.direct(separation.indices[:1, 0])
     bounds = bounds if direct is None else bounds - direct[row] @ decision
     breakpoints, disturbance = worst_signal(constraint.functionals, time, directions, parameters)
     return Adversary(
@@ -86,7 +91,7 @@ def find_adversary(
         direction=directions,
         bound=float(bounds),
         parameter=parameters,
-        violation=float(found.violations[0]),
+        violation=float(separation.violations[0]),
         breakpoints=breakpoints,
         disturbance=disturbance,
         initial_state=constraint.functionals.response.initial_state
@@ -101,20 +106,20 @@ def _sought(constraint: StateConstraint, decision: Array, own: OwnUnits) -> Sepa
     source, rows, begins = family.source, family.row_units, family.index_units
     assert isinstance(source, StateConstraint) and rows is not None and begins is not None
     looked_at = source if (rows == rows[0]).all() else source.looked_at_in(1.0 / rows)  # one row may be in metres
-    found = looked_at.worst(decision / own.decision[: decision.size])
-    place, row = found.indices[:1] * begins, found.rows[:1]
-    return Separation(place, row, constraint.violations(decision, place, row))
+    separation = looked_at.worst(decision / own.decision[: decision.size])
+    indices, row = separation.indices[:1] * begins, separation.rows[:1]
+    return Separation(indices, row, constraint.violations(decision, indices, row))
 
 
 def _of_loop(constraint: StateConstraint, decision: Array, loop: ClosedLoop) -> Adversary:
     from sparserob_core.control.constraints.feedback_curved import of_state
 
-    held = of_state(constraint, loop)
-    worst = held.worst(decision)
+    robust_constraint = of_state(constraint, loop)
+    worst = robust_constraint.worst(decision)
     row, time = int(worst.rows[0]), float(worst.indices[0, 0])
     _, directions, _, bounds = constraint.functionals_at(worst.indices[:1])
     response, direction = constraint.functionals.response, directions[row]
-    deviation, beside, acting = held.against(decision, worst.indices[0], row)
+    deviation, offset, acting = robust_constraint.against(decision, worst.indices[0], row)
     breakpoints, disturbance = response.grid.breakpoints, None
     if constraint.functionals.disturbance is not None:
         breakpoints, disturbance = loop.signal(deviation, time, direction, acting)
@@ -123,7 +128,7 @@ def _of_loop(constraint: StateConstraint, decision: Array, loop: ClosedLoop) -> 
         row=row,
         time=time,
         direction=direction,
-        bound=float(bounds[row]) - beside,
+        bound=float(bounds[row]) - offset,
         parameter=np.zeros(0),
         initial_state=loop.begun(deviation),
         violation=float(worst.violations[0]),
@@ -149,39 +154,53 @@ def worst_signal(functionals: WorstCase, time: float, direction: Array, paramete
     flow = _way(functionals.response, parameter, time, direction)
     starts = np.concatenate(
         [
-            left + (right - left) * np.arange(PARTS) / PARTS
-            for left, right in pairwise(functionals.response.propagator.marks if grid.varying else grid.breakpoints)
+            begin + (end - begin) * np.arange(PARTS) / PARTS
+            for begin, end in pairwise(functionals.response.propagator.marks if grid.varying else grid.breakpoints)
         ]
     )
     ends = np.append(starts[1:], grid.breakpoints[-1])
-    past = starts < time
-    starts, ends = _halved(bound, flow, (starts[past], np.minimum(ends[past], time)), float(grid.breakpoints[-1]))
+    is_past = starts < time
+    starts, ends = _halved(bound, flow, (starts[is_past], np.minimum(ends[is_past], time)), float(grid.breakpoints[-1]))
     values = bound.support_point(flow.gains(starts, ends))
     if time < grid.breakpoints[-1]:  # afterwards nothing matters
         starts, values = np.append(starts, time), np.vstack([values, bound.interior_point()])
     points, signal = _merged(starts, values, grid.breakpoints)
     if model.on_blocks is not None:  # of other columns
         weights = functionals.response.weights(np.array([time]), direction[None], parameter[None]).disturbance
-        held = model.on_blocks.worst(weights)[0]
-        signal = signal + held[:, grid.locate((points[:-1] + points[1:]) / 2)]
+        block_signal = model.on_blocks.worst(weights)[0]
+        signal = signal + block_signal[:, grid.locate((points[:-1] + points[1:]) / 2)]
     return points, signal
 
 
 def pushed_by(
     functionals: WorstCase, time: float, direction: Array, parameter: Array, signal: tuple[Array, Array]
 ) -> float:
-    """What a disturbance ``(mw, L)`` between breakpoints ``(L + 1,)``, among which are those of the grid, adds to
-    ``direction'x(time)``."""
+    """Return the contribution of a disturbance to ``direction'x(time)``.
+
+    The ``signal`` consists of breakpoints ``(L + 1,)``, among which are those of the grid, and values ``(mw, L)``
+    between them.
+    """
     ends, values = signal
-    past = ends[:-1] < time
+    is_past = ends[:-1] < time
     flow = _way(functionals.response, parameter, time, direction)
-    return float((flow.gains(ends[:-1][past], np.minimum(ends[1:][past], time)) * values.T[past]).sum())
+    return float((flow.gains(ends[:-1][is_past], np.minimum(ends[1:][is_past], time)) * values.T[is_past]).sum())
 
 
 @dataclass(frozen=True, eq=False)
 class _Way:
-    """What the systems that take turns make of a functional at a time, read backwards: of each where its turn ends,
-    ``ends (J,)``, or where the functional is, the ``rows (J, d)`` there, its `Leaps` and its ``E``."""
+    """Adjoint of a functional ``direction'x(time)``, propagated backwards through the phases of a switched system.
+
+    Parameters
+    ----------
+    ends : ndarray, shape (J,)
+        End of each phase, or the time of the functional where that is earlier.
+    rows : ndarray, shape (J, d)
+        Adjoint at these ends.
+    leaps : list of Leaps
+        Powers of the transition matrix of each phase.
+    E : list of ndarray
+        Matrix of the disturbance in each phase.
+    """
 
     ends: Array
     rows: Array
@@ -190,21 +209,23 @@ class _Way:
 
     @staticmethod
     def of(response: Response, parameter: Array, time: float, direction: Array) -> _Way:
-        """That of a functional at a ``time`` with a ``direction (d,)``."""
-        every = [[part[0] for part in mode.matrices(parameter[None])] for mode in response.system.modes]
-        leaps, begins = [Leaps(A) for A, _, _ in every], np.array([0.0, *response.system.switches])
+        """Compute the adjoint of a functional at a ``time`` with a ``direction (d,)``."""
+        matrices = [[matrix[0] for matrix in mode.matrices(parameter[None])] for mode in response.system.modes]
+        leaps, begins = [Leaps(A) for A, _, _ in matrices], np.array([0.0, *response.system.switches])
         ends = np.minimum(np.append(begins[1:], response.grid.breakpoints[-1]), time)
         rows = np.tile(direction, (ends.size, 1))
         for mode in range(ends.size - 1, 0, -1):
             rows[mode - 1] = leaps[mode].rows(rows[[mode]], ends[[mode]] - ends[[mode - 1]])[0][0]
-        return _Way(ends, rows, leaps, [E for _, _, E in every])
+        return _Way(ends, rows, leaps, [E for _, _, E in matrices])
 
     def at(self, times: Array, inside: Array) -> Array:
-        """``E' Phi(time, s)' direction`` at ``times (k,)``, with the system that acts ``inside (k,)``: ``(k, mw)``."""
-        return self._over(times, inside, lambda leaps, rows, which: rows)
+        """Return ``E' Phi(time, s)' direction`` at ``times (k,)``, in the phases that hold the times ``inside (k,)``:
+        ``(k, mw)``."""
+        return self._over(times, inside, lambda leaps, rows, indices: rows)
 
     def gains(self, starts: Array, ends: Array) -> Array:
-        """Its integrals from ``starts (k,)`` to ``ends (k,)``, of which each is within one turn, ``(k, mw)``."""
+        """Return the integrals of ``E' Phi(time, s)' direction`` from ``starts (k,)`` to ``ends (k,)``, each within one
+        phase: ``(k, mw)``."""
 
         def integrated(leaps: Leaps, rows: Array, which: np.ndarray) -> Array:
             return leaps.rows(rows, (ends - starts)[which])[1]
@@ -212,44 +233,46 @@ class _Way:
         return self._over(ends, (starts + ends) / 2, integrated)
 
     def _over(self, times: Array, inside: Array, made: Callable[[Leaps, Array, np.ndarray], Array]) -> Array:
-        found, modes = np.zeros((times.size, self.E[0].shape[1])), np.searchsorted(self.ends[:-1], inside)
+        values, modes = np.zeros((times.size, self.E[0].shape[1])), np.searchsorted(self.ends[:-1], inside)
         for mode in np.unique(modes):
-            which = np.flatnonzero(modes == mode)
-            rows = self.leaps[mode].orbits(self.rows[[mode]], self.ends[mode] - times[which])[0][:, 0]
-            found[which] = made(self.leaps[mode], rows, which) @ self.E[mode]
-        return found
+            indices = np.flatnonzero(modes == mode)
+            rows = self.leaps[mode].orbits(self.rows[[mode]], self.ends[mode] - times[indices])[0][:, 0]
+            values[indices] = made(self.leaps[mode], rows, indices) @ self.E[mode]
+        return values
 
 
 @dataclass(frozen=True, eq=False)
 class _VaryingWay:
-    """`_Way` of a system that changes with time: of the ``row (d,)`` of a functional at its ``time``."""
+    """Adjoint of a functional with the ``row (d,)`` at its ``time``, propagated backwards through a system that changes
+    with time."""
 
     motion: VaryingMotion
     row: Array
     time: float
 
     def at(self, times: Array, inside: Array) -> Array:
-        """`_Way.at`."""
-        place = np.minimum(self.motion.place(inside), self.motion.origin.size - 1)
-        inputs = self.motion.law(times, place)[0][:, :, self.motion.states :]
+        """Return ``E' Phi(time, s)' row`` at ``times (k,)``, on the pieces that hold the times ``inside (k,)``:
+        ``(k, mw)``."""
+        pieces = np.minimum(self.motion.place(inside), self.motion.origin.size - 1)
+        inputs = self.motion.law(times, pieces)[0][:, :, self.motion.states :]
         return np.asarray((self._rows(times)[:, None] @ inputs)[:, 0, self.motion.expansion.channels[0] :])
 
     def gains(self, starts: Array, ends: Array) -> Array:
-        """`_Way.gains`."""
-        pushed = self.motion.expansion.flow(starts, ends).disturbance
-        return np.asarray((self._rows(ends)[:, None] @ pushed)[:, 0])
+        """Return the integrals of ``E' Phi(time, s)' row`` from ``starts (k,)`` to ``ends (k,)``: ``(k, mw)``."""
+        input_response = self.motion.expansion.flow(starts, ends).disturbance
+        return np.asarray((self._rows(ends)[:, None] @ input_response)[:, 0])
 
     def _rows(self, times: Array) -> Array:
-        """What the functional is at earlier ``times (k,)``, ``(k, d)``."""
+        """Return the functional propagated backwards to earlier ``times (k,)``: ``(k, d)``."""
         ends, rows = self._ahead
-        place = np.minimum(self.motion.place(times), ends.size - 1)
-        state = self.motion.expansion.flow(times, ends[place]).state
-        return np.asarray((rows[place][:, None] @ state)[:, 0])
+        pieces = np.minimum(self.motion.place(times), ends.size - 1)
+        state = self.motion.expansion.flow(times, ends[pieces]).state
+        return np.asarray((rows[pieces][:, None] @ state)[:, 0])
 
     @cached_property
     def _ahead(self) -> tuple[Array, Array]:
-        """Where the pieces between marks end, up to that which holds the time, which is its end, ``(K,)``; and what
-        the functional is there, ``(K, d)``."""
+        """Ends of the pieces between marks, up to the piece that holds the time of the functional, ``(K,)``, and the
+        functional there, ``(K, d)``. The last end is the time itself."""
         motion, marks = self.motion, self.motion.grid.breakpoints
         last = max(0, int(np.searchsorted(marks, self.time)) - 1)
         ends, rows = np.append(marks[1 : last + 1], self.time), np.tile(self.row, (last + 1, 1))
@@ -274,39 +297,39 @@ def _halved(bound: ConvexSet, flow: Way, parts: tuple[Array, Array], horizon: fl
     """The parts, halved wherever the best constant on one is not the best at both of its ends; the most lossy of them
     when they are too many."""
     starts, ends = parts
-    here = np.arange(starts.size)
+    active = np.arange(starts.size)
     for _ in range(HALVINGS):
-        lost, size = _lost(bound, flow, starts[here], ends[here])
+        loss, size = _lost(bound, flow, starts[active], ends[active])
         allowed = LOST * size * horizon
-        middles = (starts[here] + ends[here]) / 2
-        open_ = np.flatnonzero((lost > allowed) & (middles > starts[here]) & (middles < ends[here]))
-        open_ = open_[np.argsort(-lost[open_], kind="stable")][: max(0, SIGNAL - starts.size)]
+        middles = (starts[active] + ends[active]) / 2
+        open_ = np.flatnonzero((loss > allowed) & (middles > starts[active]) & (middles < ends[active]))
+        open_ = open_[np.argsort(-loss[open_], kind="stable")][: max(0, SIGNAL - starts.size)]
         if not open_.size:
             break
-        split, middles = here[open_], middles[open_]
+        split, middles = active[open_], middles[open_]
         starts, ends = np.concatenate([starts, middles]), np.concatenate([ends, ends[split]])
         ends[split] = middles
-        here = np.concatenate([split, np.arange(starts.size - split.size, starts.size)])
+        active = np.concatenate([split, np.arange(starts.size - split.size, starts.size)])
     order = np.argsort(starts)
     return starts[order], ends[order]
 
 
 def _lost(bound: ConvexSet, flow: Way, starts: Array, ends: Array) -> tuple[Array, float]:
-    """What the best constant on each part misses at its two ends, times the part's length, ``(k,)``, and the largest
-    that is there."""
+    """Return the loss of the best constant on each part against the best values at its two ends, times the part's
+    length, ``(k,)``, and the largest absolute support value there."""
     best = bound.support_point(flow.gains(starts, ends))
-    missed, largest = np.zeros(starts.size), 0.0
+    loss, largest = np.zeros(starts.size), 0.0
     for times in (starts, ends):
         rows = flow.at(times, (starts + ends) / 2)
         height = bound.support(rows)
-        missed += (ends - starts) * (height - (best * rows).sum(axis=1))
+        loss += (ends - starts) * (height - (best * rows).sum(axis=1))
         largest = max(largest, float(np.abs(height).max(initial=0.0)))
-    return missed, largest
+    return loss, largest
 
 
 def _merged(starts: Array, values: Array, breakpoints: Array) -> tuple[Array, Array]:
     """Parts with the same value as one, but for the breakpoints of the grid, which all stay."""
     changes = np.concatenate([[True], (np.diff(values, axis=0) != 0).any(axis=1)])
     points = np.unique(np.concatenate([breakpoints, starts[changes]]))
-    which = np.searchsorted(starts, (points[:-1] + points[1:]) / 2, side="right") - 1
-    return points, values[which].T
+    indices = np.searchsorted(starts, (points[:-1] + points[1:]) / 2, side="right") - 1
+    return points, values[indices].T

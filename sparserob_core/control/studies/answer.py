@@ -52,9 +52,18 @@ class Signal:
 @final
 @dataclass(frozen=True, eq=False)
 class Tube:
-    """Where the states are at ``times (T,)``: the ``nominal`` ones, at the centre of every uncertainty set, and the
-    least and largest values that any disturbance brings them to, ``lower`` and ``upper``, ``(d, T)`` each, at the
-    parameters of a lattice; of parameters beside the time at all of them."""
+    """Range of the states over all disturbances and initial states, at given times.
+
+    Parameters
+    ----------
+    times : ndarray, shape (T,)
+        Times.
+    nominal : ndarray, shape (d, T)
+        States at the centre of every uncertainty set.
+    lower, upper : ndarray, shape (d, T)
+        Least and largest values of the states, at the parameters of a lattice. For a system that depends on the time
+        and on parameters, all parameters are covered.
+    """
 
     times: Array
     nominal: Array
@@ -79,8 +88,8 @@ class ControlResult(Result):
     @staticmethod
     def of(result: Result, model: Transcription, causal: CausalBound | None = None) -> ControlResult:
         """The result with its problem."""
-        known = {one.name: getattr(result, one.name) for one in fields(Result)}
-        return ControlResult(**known, model=model, causal=causal)
+        values = {entry.name: getattr(result, entry.name) for entry in fields(Result)}
+        return ControlResult(**values, model=model, causal=causal)
 
     @property
     def _unit(self) -> str:
@@ -89,8 +98,8 @@ class ControlResult(Result):
 
     @property
     def plain(self) -> Result:
-        """The same result without its problem."""
-        return Result(**{one.name: getattr(self, one.name) for one in fields(Result)})
+        """Result without its problem."""
+        return Result(**{entry.name: getattr(self, entry.name) for entry in fields(Result)})
 
     @property
     def problem(self) -> OptimalControlProblem:
@@ -110,14 +119,16 @@ class ControlResult(Result):
     def adversary(self, constraint: str) -> Adversary:
         """The worst case of the constraint of that name: time, parameter and disturbance, as arrays. Raises
         `InputError` for a name that no constraint on the state has."""
-        named = {one.name: one for one in self.model.constraints}
+        named = {entry.name: entry for entry in self.model.constraints}
         if constraint not in named:
-            known = ", ".join(named) or "none on the state"
-            raise InputError(path="constraint", expected=f"one of {known}", got=f"{constraint!r}")
-        found = find_adversary(named[constraint], self._decided(), self.model.feedback, self.model.program.own_units)
-        if found is None:
+            names = ", ".join(named) or "none on the state"
+            raise InputError(path="constraint", expected=f"one of {names}", got=f"{constraint!r}")
+        worst_case = find_adversary(
+            named[constraint], self._decided(), self.model.feedback, self.model.program.own_units
+        )
+        if worst_case is None:
             raise InputError(f"the constraint {constraint} has no worst case at this decision")
-        return found
+        return worst_case
 
     def _decided(self) -> Array:
         if self.decision is None:
@@ -126,8 +137,8 @@ class ControlResult(Result):
 
     def __reduce__(self) -> tuple[Callable[..., Any], tuple[Any, ...]]:
         model = self.model
-        given = (model.problem, model.control, model.disturbance, model.formulation, model.policy)
-        return _read, (self.plain, *given, self.causal)
+        arguments = (model.problem, model.control, model.disturbance, model.formulation, model.policy)
+        return _read, (self.plain, *arguments, self.causal)
 
 
 def _read(
@@ -153,8 +164,8 @@ def tube(model: Transcription, theta: Array, times: Array, states: Sequence[int]
         return Tube(times, axes @ model.feedback.loop.states(theta, times)[:, :, 0].T, lower, upper)
     bound = model.problem.system.parameters
     middle = np.tile(np.zeros(0) if bound is None else nominal_point(bound), (times.size, 1))
-    known = model.functionals.central()
-    nominal = [known.values(theta, times, np.tile(axis, (times.size, 1)), middle) for axis in axes]
+    central = model.functionals.central()
+    nominal = [central.values(theta, times, np.tile(axis, (times.size, 1)), middle) for axis in axes]
     return Tube(times, np.array(nominal), lower, upper)
 
 
@@ -166,17 +177,17 @@ def supports(model: Transcription, theta: Array, times: Array, directions: Array
     lattice, _ = model.parameters.lattice()
     if len(lattice) > PARAMETERS:
         lattice = lattice[np.unique(np.linspace(0, len(lattice) - 1, PARAMETERS).round().astype(int))]
-    rows, every = model.problem.names.corners.everywhere(directions)
-    count, found = len(every) * len(lattice), np.full((len(directions), times.size), -np.inf)
-    along, p = np.repeat(every, len(lattice), axis=0), np.tile(lattice, (len(every), 1))
+    rows, all_directions = model.problem.names.corners.everywhere(directions)
+    count, largest = len(all_directions) * len(lattice), np.full((len(directions), times.size), -np.inf)
+    along, p = np.repeat(all_directions, len(lattice), axis=0), np.tile(lattice, (len(all_directions), 1))
     size = max(1, INSTANTS // count)
     for start in range(0, times.size, size):
-        part = slice(start, start + size)
-        now = times[part].size
-        at = np.tile(times[part], count), np.repeat(along, now, axis=0), np.repeat(p, now, axis=0)
-        values = model.functionals.values(theta, *at).reshape(len(every), len(lattice), now).max(axis=1)
-        np.maximum.at(found[:, part], rows, values)
-    return found
+        batch = slice(start, start + size)
+        time_count = times[batch].size
+        at = np.tile(times[batch], count), np.repeat(along, time_count, axis=0), np.repeat(p, time_count, axis=0)
+        values = model.functionals.values(theta, *at).reshape(len(all_directions), len(lattice), time_count).max(axis=1)
+        np.maximum.at(largest[:, batch], rows, values)
+    return largest
 
 
 def _times(time: npt.ArrayLike, horizon: float) -> Array:

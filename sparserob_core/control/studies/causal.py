@@ -54,11 +54,26 @@ class Weighed:
 @final
 @dataclass(frozen=True, eq=False)
 class CausalBound:
-    """What no causal policy can do: cost less than ``lower``; infinite: exist at all; ``-inf`` where nothing was
-    proven. ``signals``: values ``(mw, blocks)`` of the disturbance, ``rows``: constraints under them whose multipliers
-    prove it. ``ended``: why no more was sought. ``shares``: with the cost ``worst`` what the effort under every signal
-    counts, no more than 1 together. Of outputs that a noise hides, ``outputs (K, p)``: what is measured under every
-    signal beside the nominal one, and ``begun (d,)``: where it begins."""
+    """Lower bound of the cost of every causal policy, with the signals and constraints that prove it.
+
+    Parameters
+    ----------
+    lower : float
+        Proven lower bound of the cost. It is infinite where no causal policy exists, and ``-inf`` where nothing was
+        proven.
+    signals : tuple of ndarray, shape (mw, blocks)
+        Values of the disturbance.
+    rows : tuple of Weighed
+        Constraints under the signals, whose multipliers prove the bound.
+    ended : str
+        Reason why the search ended.
+    shares : tuple of float
+        Weight of the effort under every signal, with the cost ``worst``; at most 1 together.
+    outputs : tuple of ndarray, shape (K, p)
+        Measured outputs under every signal, relative to the nominal ones, where a noise hides outputs.
+    begun : tuple of ndarray, shape (d,)
+        Initial state of every signal, where a noise hides outputs.
+    """
 
     lower: float
     signals: tuple[Array, ...] = ()
@@ -71,8 +86,19 @@ class CausalBound:
 
 @final
 class Limits:
-    """When a search ends: at so many ``signals`` beside those at hand, after so much ``work`` (a count, the same on
-    every machine), and, as a brake, after ``seconds`` or when the time of the run has ``passed``."""
+    """Limits at which a search ends.
+
+    Parameters
+    ----------
+    signals : int
+        Largest number of signals, in addition to those at hand.
+    work : float
+        Largest work, a count that is the same on every machine.
+    seconds : float
+        Longest time, as a brake.
+    passed : callable
+        Function that says whether the time of the run is over.
+    """
 
     def __init__(self, signals: int, work: float, seconds: float, passed: Callable[[], bool]) -> None:
         self.work, self._most, self._passed = work, signals, passed
@@ -82,26 +108,28 @@ class Limits:
 
     @staticmethod
     def of(charge: Charge, results: Sequence[Result], columns: int, passed: Callable[[], bool]) -> Limits:
-        """In proportion to what the policy's own ``results`` took, with ``columns`` of their programs."""
+        """Return limits that are proportional to the work for the policy's own ``results``, with ``columns`` of their
+        programs."""
         programs = sum(result.counts.get("relaxed_programs", 0) for result in results)
         return Limits(charge.causal_signals, WORK + programs * (EACH + PER * columns), charge.causal_seconds, passed)
 
     @property
     def seconds(self) -> float:
-        """That are left."""
+        """Number of seconds that are left."""
         return max(0.0, self._until - time.perf_counter())
 
     def passed(self) -> bool:
-        """Whether its time, or that of the run, is over."""
+        """Return whether the time of the search, or that of the run, is over."""
         return not self.seconds or self._passed()
 
     def over(self, tree: Tree, idle: int = 0) -> bool:
-        """Whether the search for a tree ends after so many ``idle`` rounds, and why."""
+        """Return whether the search for a tree ends after so many ``idle`` rounds, and record the reason in
+        ``ended``."""
         s = tree.sampled
-        most = CELLS / max(1, s.T.shape[0] * max(s.N.shape[1], s.T.shape[1] * s.T.shape[2]))
+        signal_limit = CELLS / max(1, s.T.shape[0] * max(s.N.shape[1], s.T.shape[1] * s.T.shape[2]))
         if self.passed():
             self.ended = "seconds"
-        elif tree.work + tree.knowledge.work > self.work or len(tree.signals) > most:
+        elif tree.work + tree.knowledge.work > self.work or len(tree.signals) > signal_limit:
             self.ended = "work"
         elif not self.room(tree):
             self.ended = "signals"
@@ -111,17 +139,18 @@ class Limits:
         return over
 
     def begin(self, tree: Tree) -> None:
-        """The signals that are at hand do not count."""
+        """Exclude the signals that the tree already holds from the count."""
         self._beside = len(tree.signals)
 
     def again(self) -> None:
-        """Another tree: signals and work count anew, time that is over is over."""
+        """Start the limits anew for another tree: signals and work count from 0, but the time goes on."""
         self._beside = 0
         if self.ended != "seconds":
             self.ended = "settled"
 
     def room(self, tree: Tree) -> int:
-        """How many signals may be added to the tree; before the search begins: as many as there are."""
+        """Return the number of signals that may still be added to the tree; before the search begins always 1, so that
+        there is no limit."""
         return self._most + self._beside - len(tree.signals) if self._beside else 1
 
 
@@ -134,15 +163,17 @@ class CausalSearch:
         self, model: Transcription, decision: Array | None, active: Sequence[tuple[str, float, Array | None]]
     ) -> None:
         self.model, self.loop, self.decision = model, model.answering.loop, decision
-        flat = [one for one in model.constraints if isinstance(one, FlatConstraint)]
+        flat = [constraint for constraint in model.constraints if isinstance(constraint, FlatConstraint)]
         # a bound of fewer constraints is one still
-        self.constraints = [one for one in flat if one.gains is None and not one.reference.moves]
+        self.constraints = [
+            constraint for constraint in flat if constraint.gains is None and not constraint.reference.moves
+        ]
         grid, disturbance = model.response.grid, model.functionals.disturbance
         places = np.zeros(0, dtype=int) if disturbance is None or disturbance.starts is None else disturbance.starts
         self.starts = grid.breakpoints[places]
         self.spread = Spread(() if disturbance is None else self.loop.spread.sets[:1])
-        asked = [(one.H, one.h, self._times(one, active)) for one in self.constraints]
-        self.sampled = Sampled.of(self.loop, asked)
+        requests = [(constraint.H, constraint.h, self._times(constraint, active)) for constraint in self.constraints]
+        self.sampled = Sampled.of(self.loop, requests)
         self._active = active
 
     def _times(self, one: FlatConstraint, active: Sequence[tuple[str, float, Array | None]]) -> Array:
@@ -157,11 +188,13 @@ class CausalSearch:
         """A tree of the nominal signal and those that the policy's bound rests on, of which a control knows all that
         the disturbance does until the last measurement that is known: outputs tell no more."""
         points, measured, s = self.model.control.breakpoints, self.model.problem.measurements, self.sampled
-        seen = np.searchsorted(self.starts, points[:-1] if measured is None else measured.latest(points))
+        known_counts = np.searchsorted(self.starts, points[:-1] if measured is None else measured.latest(points))
         N = s.N[:, : self.spread.size]
-        width, begun = self.spread.size // max(1, self.starts.size), np.searchsorted(self.starts, s.time)
-        known = [extreme(self.spread, z) for _, _, z in self._active if z is not None and z.any()]
-        return self._planted(OfDisturbances(N, self.spread, width, seen, begun), known, limits, highest)
+        width, block_counts = self.spread.size // max(1, self.starts.size), np.searchsorted(self.starts, s.time)
+        signals = [extreme(self.spread, z) for _, _, z in self._active if z is not None and z.any()]
+        return self._planted(
+            OfDisturbances(N, self.spread, width, known_counts, block_counts), signals, limits, highest
+        )
 
     def hiding(self, limits: Limits, beside: tuple[Tree, Grown] | None, highest: float | None = None) -> Tree | None:
         """A tree of signals that a noise hides, with those that have a multiplier in one ``beside`` it; ``None`` where
@@ -169,13 +202,13 @@ class CausalSearch:
         points, measured, s = self.model.control.breakpoints, self.model.problem.measurements, self.sampled
         if measured is None:
             return None
-        seen, share = measured.known(points).sum(axis=1), 1.0 if highest is None else 1.0 / highest
-        knowledge = OfOutputs.of(self.loop, s.N, s.time, points[:-1], seen, share)
+        known_counts, share = measured.known(points).sum(axis=1), 1.0 if highest is None else 1.0 / highest
+        knowledge = OfOutputs.of(self.loop, s.N, s.time, points[:-1], known_counts, share)
         if knowledge is None:
             return None
         knowledge.limit, knowledge.passed = limits.work, limits.passed
-        known = [beside[0].signals[one] for one in np.unique(beside[1].signals)] if beside is not None else []
-        return self._planted(knowledge, known, limits, highest)
+        signals = [beside[0].signals[index] for index in np.unique(beside[1].signals)] if beside is not None else []
+        return self._planted(knowledge, signals, limits, highest)
 
     def _planted(self, knowledge: Knowledge, known: list[Array], limits: Limits, highest: float | None) -> Tree:
         problem, feedback = self.model.problem, self.model.answering
@@ -194,14 +227,14 @@ class CausalSearch:
         """The tree that was found, its multipliers, and whether they prove that no causal policy exists; ``cost``: of
         the policy, an upper bound of what the tree can prove, infinite where none is known. First as if no noise hid
         anything, and then, where it ``hides``, with what that took to prove."""
-        found = self._least_cost(self.tree(limits), cost, limits)
-        if not hides or (found is not None and found[2]):
-            return found
-        tree = self.hiding(limits, None if found is None else found[:2])
+        best = self._least_cost(self.tree(limits), cost, limits)
+        if not hides or (best is not None and best[2]):
+            return best
+        tree = self.hiding(limits, None if best is None else best[:2])
         better = None if tree is None else self._least_cost(tree, cost, limits)
-        if found is None or (better is not None and (better[2] or better[1].value > found[1].value)):
+        if best is None or (better is not None and (better[2] or better[1].value > best[1].value)):
             return better
-        return found
+        return best
 
     def _least_cost(self, tree: Tree, cost: float, limits: Limits) -> tuple[Tree, Grown, bool] | None:
         best, idle = tree.least(), 0
@@ -223,23 +256,23 @@ class CausalSearch:
 
     @staticmethod
     def _refused(tree: Tree) -> Grown | None:
-        found = tree.relaxed()
-        return found if found is not None and found.value > NONE else None
+        multipliers = tree.relaxed()
+        return multipliers if multipliers is not None and multipliers.value > NONE else None
 
     def largest_factor(self, highest: float, limits: Limits) -> tuple[Tree, Grown] | None:
         """The largest factor of all deviations for which the tree is feasible, with its multipliers. Of outputs with a
         noise first as if it hid nothing, and then below the factor that was found, for which it hides its share."""
-        found = self._largest_factor(self.tree(limits, highest), limits)
-        for _ in range(AGAIN if found is not None else 0):
-            assert found is not None
-            tree = self.hiding(limits, found, found[1].value * (1.0 + NARROWER))
+        best = self._largest_factor(self.tree(limits, highest), limits)
+        for _ in range(AGAIN if best is not None else 0):
+            assert best is not None
+            tree = self.hiding(limits, best, best[1].value * (1.0 + NARROWER))
             better = None if tree is None else self._largest_factor(tree, limits)
-            if better is None or better[1].value >= found[1].value:
+            if better is None or better[1].value >= best[1].value:
                 break
-            narrower, found = better[1].value < found[1].value * (1.0 - NARROWER), better
+            narrower, best = better[1].value < best[1].value * (1.0 - NARROWER), better
             if not narrower:
                 break
-        return found
+        return best
 
     def _largest_factor(self, tree: Tree, limits: Limits) -> tuple[Tree, Grown] | None:
         best, idle = tree.least(), 0
@@ -254,29 +287,34 @@ class CausalSearch:
         return None if best is None else (tree, best)
 
     def _grow(self, tree: Tree, centre: Grown, most: int, idle: int) -> bool:
-        """Signals that are the worst if the control answers a share of what the policy does, that of so many ``idle``
-        rounds; whether there are new ones."""
+        """Add signals that are the worst if the control answers a share of what the policy answers, and return whether
+        there are new ones.
+
+        The share is that of so many ``idle`` rounds; the other shares follow where it gives nothing new.
+        """
         shares = ANSWERED if self.decision is not None else (0.0,)
         at = min(idle, len(shares) - 1)
         return any(self._sought(tree, centre, most, share) for share in dict.fromkeys((*shares[at:], *shares[:at])))
 
     def _sought(self, tree: Tree, centre: Grown, most: int, share: float) -> bool:
-        """Signals that leave one of the tree at a report and are the worst for a row from there on, if the control
-        answers them by this ``share`` of what the policy does: those that exceed it most, no two of one signal and
-        report; whether there are.
+        """Add signals that depart from a signal of the tree at a report and are the worst for a row from there on, and
+        return whether there are new ones.
+
+        The control is assumed to answer them by this ``share`` of what the policy answers. The signals with the largest
+        excess are added, at most one for each signal of the tree and report.
         """
         effects = None if self.decision is None else share * self.loop.effects(self.decision)
         own = np.einsum("rmk,smk->sr", self.sampled.T, centre.u) - self.sampled.b
         scale = 1.0 if tree.priced else max(centre.x[0], NONE)
         answered = None if effects is None else np.einsum("rmk,kmq->rq", self.sampled.T, effects)
-        taken, z = set[tuple[int, int]](), np.array(tree.signals)
+        departures, z = set[tuple[int, int]](), np.array(tree.signals)
         tree.work += z.shape[0] * (self.sampled.N.size + self.sampled.T.size)
         for signal, report, child in tree.knowledge.leaving(z, own, answered, scale, tree.units):
-            if len(taken) >= min(AT_ONCE, most):
+            if len(departures) >= min(AT_ONCE, most):
                 break
-            if (signal, report) not in taken and tree.add(child):
-                taken.add((signal, report))
-        return bool(taken)
+            if (signal, report) not in departures and tree.add(child):
+                departures.add((signal, report))
+        return bool(departures)
 
     def bound(
         self,
@@ -289,29 +327,29 @@ class CausalSearch:
     ) -> CausalBound:
         """The signals in the set of the ``disturbance``, with deviations times ``scale``, and the constraints that have
         a multiplier."""
-        numbers, every, rows = dict[bytes, int](), list[Array](), list[Weighed]()
+        numbers, deviations, rows = dict[bytes, int](), list[Array](), list[Weighed]()
 
         def number(z: Array) -> int:
-            found = numbers.setdefault(z.tobytes(), len(numbers))
-            every.extend([z * scale] * (found == len(every)))
-            return found
+            position = numbers.setdefault(z.tobytes(), len(numbers))
+            deviations.extend([z * scale] * (position == len(deviations)))
+            return position
 
         for signal, row, report, y in zip(found.signals, found.rows, found.reports, found.multipliers, strict=True):
-            which = number(tree.changed(int(signal), int(row), int(report)))
-            one, s = self.constraints[self.sampled.constraint[row]], self.sampled
-            rows.append(Weighed(which, one.name, float(s.time[row]), one.H[s.side[row]], float(y)))
-        held = dict[int, float]()
+            index = number(tree.changed(int(signal), int(row), int(report)))
+            constraint, s = self.constraints[self.sampled.constraint[row]], self.sampled
+            rows.append(Weighed(index, constraint.name, float(s.time[row]), constraint.H[s.side[row]], float(y)))
+        weights = dict[int, float]()
         for signal in np.flatnonzero(found.shares).tolist() if np.isfinite(lower) else ():
-            which = number(tree.signals[signal])
-            held[which] = held.get(which, 0.0) + float(found.shares[signal])
-        whole = max(1.0, sum(held.values())) / SHARED
-        shares = tuple(held.get(which, 0.0) / whole for which in range(len(every)) if held)
-        signals = tuple(_values(z[: self.spread.size], disturbance, self.starts.size) for z in every)
+            index = number(tree.signals[signal])
+            weights[index] = weights.get(index, 0.0) + float(found.shares[signal])
+        total = max(1.0, sum(weights.values())) / SHARED
+        shares = tuple(weights.get(index, 0.0) / total for index in range(len(deviations)) if weights)
+        signals = tuple(_values(z[: self.spread.size], disturbance, self.starts.size) for z in deviations)
         if not isinstance(tree.knowledge, OfOutputs):
             return CausalBound(lower, signals, tuple(rows), ended, shares)
-        outputs = tuple(tree.knowledge.outputs(z) for z in every)
-        begun = tuple(self._begun(z[self.spread.size : self.sampled.N.shape[1]]) for z in every)
-        return CausalBound(lower, signals, tuple(rows), ended, shares, outputs, begun)
+        outputs = tuple(tree.knowledge.outputs(z) for z in deviations)
+        initial_states = tuple(self._begun(z[self.spread.size : self.sampled.N.shape[1]]) for z in deviations)
+        return CausalBound(lower, signals, tuple(rows), ended, shares, outputs, initial_states)
 
     def _begun(self, z: Array) -> Array:
         """The initial state of deviations, certainly in its set."""

@@ -1,9 +1,10 @@
-"""No control is feasible at any horizon of an interval: one set of multipliers, proven with the horizon as a parameter.
+"""Proofs that no control is feasible at any horizon of an interval: one set of multipliers, with the horizon as a
+parameter.
 
 In the time ``s = t / T`` of a dictionary whose pieces are fixed shares of the horizon ``T``, a system obeys
-``dx/ds = T (A x + B u + E w + c)``: ``T`` is a parameter of the system, and what multipliers make of its constraints is
-a Taylor model in it. Windows of the path begin at absolute times, so a row there is taken no earlier than its window
-begins at the shortest horizon of the interval.
+``dx/ds = T (A x + B u + E w + c)``. So ``T`` is a parameter of the system, and the weighted sum of its constraints is a
+Taylor model in ``T``. Windows of the path begin at absolute times. A row of such a window is therefore taken no earlier
+than the window begins at the shortest horizon of the interval.
 """
 
 from __future__ import annotations
@@ -108,9 +109,14 @@ def stretched(dictionary: Dictionary, horizon: float) -> Dictionary:
 @final
 @dataclass(frozen=True, eq=False)
 class Horizons:
-    """All horizons of one problem, whose dictionaries have the same pieces as shares of the horizon. Raises
-    `InputError` where the pieces of the system do not move with the horizon, or a control of the dictionary cannot take
-    any values on its pieces."""
+    """Range of horizons of one problem, whose dictionaries have the same pieces as shares of the horizon.
+
+    Raises
+    ------
+    InputError
+        If the pieces of the system do not move with the horizon, or if a control of the dictionary cannot take any
+        values on its pieces.
+    """
 
     problem: OptimalControlProblem
     control: Dictionary
@@ -140,23 +146,23 @@ class Horizons:
         """A proven lower bound of the weighted sum of violations, over all controls and all horizons in
         ``[low, high]``: where it is positive, none of them is feasible (Farkas). Rows whose window begins after ``low``
         count for nothing; ``-inf`` where nothing can be enclosed."""
-        rows = [one for one in multipliers if np.isfinite(one.share_from(low))]
-        size = sum(abs(one.weight) for one in rows)
+        rows = [multiplier for multiplier in multipliers if np.isfinite(multiplier.share_from(low))]
+        size = sum(abs(multiplier.weight) for multiplier in rows)
         if not size > 0.0 or high > self.changes:
             return -np.inf
         lifted: dict[bytes, LiftedSystem] = {}
         total = None
-        for one in rows:
-            key = one.parameter.tobytes()
+        for multiplier in rows:
+            key = multiplier.parameter.tobytes()
             try:
                 if key not in lifted:
-                    lifted[key] = self._lifted(one.parameter, low / self._units.time, high / self._units.time)
-                share = one.share_from(low)
+                    lifted[key] = self._lifted(multiplier.parameter, low / self._units.time, high / self._units.time)
+                share = multiplier.share_from(low)
                 with np.errstate(over="ignore", invalid="ignore"):
-                    part = self._part(one, lifted[key], share, one.highest(share, low, high))
+                    summand = self._part(multiplier, lifted[key], share, multiplier.highest(share, low, high))
             except NotEnclosable:
                 return -np.inf
-            scaled = part.times(one.weight / size)
+            scaled = summand.times(multiplier.weight / size)
             total = scaled if total is None else total.plus(scaled)
         assert total is not None
         answer = total.least(self._own.control)
@@ -178,40 +184,40 @@ class Horizons:
         piece = int(self._grid.locate(at)[0])
         coefficients = np.zeros(lifted.space.size)
         coefficients[0] = -limit
-        begun = own.initial_set
-        around = np.zeros(own.system.states) if begun is None else extent(begun)
-        initial = InitialSupport(lifted, Box(self._start - around, self._start + around), rows)
+        initial_set = own.initial_set
+        radius = np.zeros(own.system.states) if initial_set is None else extent(initial_set)
+        initial = InitialSupport(lifted, Box(self._start - radius, self._start + radius), rows)
         weights = initial.blocks(at)[0, 0]
         start = self._start
-        if begun is not None and one.uncertain:
-            start = start + begun.support_point(weights[:1])[0]
+        if initial_set is not None and one.uncertain:
+            start = start + initial_set.support_point(weights[:1])[0]
         coefficients += weights @ start
-        sizes = abs(limit) + abs(one.limit) + float((np.abs(weights) @ (np.abs(self._start) + around)).sum())
-        lost = float(initial.neglected[0, piece])
+        sizes = abs(limit) + abs(one.limit) + float((np.abs(weights) @ (np.abs(self._start) + radius)).sum())
+        error = float(initial.neglected[0, piece])
         if self._noise is not None and one.uncertain:
-            found = DisturbanceSupport(lifted, self._noise, rows)
-            blocks = found.blocks(at)[0, 0]
+            support = DisturbanceSupport(lifted, self._noise, rows)
+            blocks = support.blocks(at)[0, 0]
             worst = self._noise.set.support_point(blocks[0])
             coefficients += np.einsum("bq,abq->a", worst, blocks)
             sizes += float(np.einsum("bq,abq->", np.abs(worst), np.abs(blocks)))
-            lost += float(found.neglected[0, piece])
+            error += float(support.neglected[0, piece])
         if lifted.B.shape[2] > m:  # a drift, whose input is always 1
             ones = Box(np.ones(lifted.B.shape[2] - m), np.ones(lifted.B.shape[2] - m))
-            whole = DisturbanceModel("piecewise_constant", ones, ones, self._grid, starts=np.zeros(1, dtype=int))
-            found = DisturbanceSupport(_driven(lifted, slice(m, None)), whole, rows)
-            blocks = found.blocks(at)[0, 0].sum(axis=(1, 2))
+            drift_model = DisturbanceModel("piecewise_constant", ones, ones, self._grid, starts=np.zeros(1, dtype=int))
+            support = DisturbanceSupport(_driven(lifted, slice(m, None)), drift_model, rows)
+            blocks = support.blocks(at)[0, 0].sum(axis=(1, 2))
             coefficients += blocks
             sizes += float(np.abs(blocks).sum())
-            lost += float(found.neglected[0, piece])
+            error += float(support.neglected[0, piece])
         acting = DisturbanceSupport(_driven(lifted, slice(0, m)), self._acting, rows)
         blocks = acting.blocks(at)[0, 0]
         if one.gain is not None:
             ends = stretched(self.control, 1.0).breakpoints
             blocks[0, np.searchsorted(ends, sum(one.piece) / 2) - 1] += one.gain * self._units.controls
         sizes += float(own.control.reach(blocks).sum())
-        lost += float(acting.neglected[0, piece])
+        error += float(acting.neglected[0, piece])
         terms = rounding(2 * own.system.states + lifted.space.size + self._grid.pieces)
-        return _Sum(lifted, coefficients, blocks, lost + terms * sizes)
+        return _Sum(lifted, coefficients, blocks, error + terms * sizes)
 
     @cached_property
     def _units(self) -> Units:
@@ -234,9 +240,9 @@ class Horizons:
     @cached_property
     def _grid(self) -> TimeGrid:
         """The merged grid in the time ``s``, from 0 to 1."""
-        both = [stretched(one, 1.0).breakpoints for one in (self.control, self.disturbance)]
+        breakpoints = [stretched(dictionary, 1.0).breakpoints for dictionary in (self.control, self.disturbance)]
         forced = self._own.system.forced
-        return merge_grids(both[0], both[1], 0.0, None, forced.controls - self._own.system.controls)
+        return merge_grids(breakpoints[0], breakpoints[1], 0.0, None, forced.controls - self._own.system.controls)
 
     @cached_property
     def _noise(self) -> DisturbanceModel | None:
@@ -267,11 +273,11 @@ class _Sum:
     lost: float
 
     def times(self, factor: float) -> _Sum:
-        """A multiple."""
+        """Return the sum multiplied by ``factor``."""
         return _Sum(self.lifted, factor * self.coefficients, factor * self.weights, abs(factor) * self.lost)
 
     def plus(self, other: _Sum) -> _Sum:
-        """The sum of two."""
+        """Return the sum of two."""
         return _Sum(
             self.lifted,
             self.coefficients + other.coefficients,
@@ -281,9 +287,9 @@ class _Sum:
 
     def least(self, control: ConvexSet) -> float:
         """A lower bound of the least value over every control and every horizon of the interval."""
-        pushed = summed(control, -self.weights[None, None], None)[0, 0].sum(axis=0)
-        above, _ = polynomial_bound(self.lifted.space, (pushed[:-1] - self.coefficients)[None])
-        return -float(above[0] + pushed[-1] + self.lost * (1.0 + 1e-12))
+        support_values = summed(control, -self.weights[None, None], None)[0, 0].sum(axis=0)
+        above, _ = polynomial_bound(self.lifted.space, (support_values[:-1] - self.coefficients)[None])
+        return -float(above[0] + support_values[-1] + self.lost * (1.0 + 1e-12))
 
 
 def _driven(lifted: LiftedSystem, columns: slice) -> LiftedSystem:

@@ -57,7 +57,7 @@ class InitialPlane:
 
     @cached_property
     def free(self) -> InitialPlane:
-        """The same plane where nothing has a price that needs variables of its own."""
+        """Plane of the same problem without prices that need variables of their own."""
         model = self.model.acting.free(self.model)
         return self if model is self.model else InitialPlane(model, self.states, self.centre, self.radius)
 
@@ -70,7 +70,7 @@ class InitialPlane:
         return np.asarray((points - self.centre) / self.radius)
 
     def resized(self, lower: Array, upper: Array) -> InitialPlane:
-        """The same plane with another box of coordinates."""
+        """Return the plane with the box of coordinates from ``lower (2,)`` to ``upper (2,)``."""
         return InitialPlane(self.model, self.states, (lower + upper) / 2, (upper - lower) / 2)
 
     def at(self, z: Array) -> SemiInfiniteProgram:
@@ -78,9 +78,9 @@ class InitialPlane:
         them."""
         key = z.tobytes()
         if key not in self._programs:
-            moved = from_state(self.centred, self._state(z)).program
+            program = from_state(self.centred, self._state(z)).program
             A, b = self._equalities(z)
-            remember(self._programs, key, replace(moved, A=A, b=b), PROGRAMS_KEPT)
+            remember(self._programs, key, replace(program, A=A, b=b), PROGRAMS_KEPT)
         return self._programs[key]
 
     def rounded(self, z: Array, result: Result) -> Result:
@@ -95,28 +95,31 @@ class InitialPlane:
         return replace(result, lower_bound=bound)
 
     def weakened(self, result: Result) -> Result:
-        """The result of a `support` with a lower bound, or a proof that nothing is feasible, that holds for the true
-        steps of a system which changes with time.
+        """Return the result of a `support` with a lower bound, or a proof of infeasibility, that holds for the true
+        steps of a system that changes with time.
 
-        Rows say so themselves. An equality of the true steps is one of the computed ones up to what these may be off
-        by, wherever in the plane it begins: two inequalities that are so much wider, of the same multipliers. What is
-        infeasible by more than that of the norm of its rows is so with these too.
+        Rows already contain the error of the steps. An equality of the true steps is an equality of the computed ones
+        up to an error bound, from any initial state of the plane. It is thus two inequalities that are wider by this
+        bound, with the same multipliers. A program whose infeasibility exceeds the error bounds, relative to the norms
+        of its rows, is infeasible for the true steps too.
         """
         if self.model.response.propagator.expansion is None:
             return result
-        lost = sum(cut.multiplier * self._off_at(cut) for cut in result.dual.cuts)
+        error = sum(cut.multiplier * self._off_at(cut) for cut in result.dual.cuts)
         if result.status != "infeasible":
-            lost += float(np.abs(result.dual.mu) @ self._off_at_ends[: result.dual.mu.size])
-            return replace(result, lower_bound=result.lower_bound - lost)
-        if result.dual.bound > max(lost, self._off_at_most):
+            error += float(np.abs(result.dual.mu) @ self._off_at_ends[: result.dual.mu.size])
+            return replace(result, lower_bound=result.lower_bound - error)
+        if result.dual.bound > max(error, self._off_at_most):
             return result
         message = "nothing seems feasible, by no more than what steps of the system may be off by"
         return replace(result, status="undecided", message=message, lower_bound=-np.inf)
 
     def off(self, times: Array, directions: Array, parameters: Array) -> Array:
-        """What rows ``c'x(t)``, ``directions (k, d)``, may be off by, wherever in the plane they begin, ``(k,)``: by
-        rounding, what steps of a system that changes with time are, and what its law leaves out of its series in the
-        parameters; 0 for a system that does not change with time."""
+        """Bound the error of rows ``c'x(t)``, ``directions (k, d)``, from any initial state of the plane: ``(k,)``.
+
+        It consists of rounding errors, errors of the steps of a system that changes with time, and the remainder of its
+        law's series in the parameters. It is 0 for a system that does not change with time.
+        """
         response = self.centred.response
         if not response.system.varies or not times.size:
             return np.zeros(times.size)
@@ -125,54 +128,58 @@ class InitialPlane:
         return np.asarray((SHARE + response.propagator.slack) * sizes + np.abs(directions) @ self.beyond)
 
     def _off_at(self, cut: Cut) -> float:
-        """What a row that holds with equality may be off by, under feedback; 0 for others, which are wider by that."""
+        """Return the error bound of a row that holds with equality, under feedback; 0 for other rows, which are wider
+        by their bound."""
         constraint = self.centred.constraint(self._base.family(cut.family))
-        if constraint is None or any(constraint is one for one in self.centred.constraints):
+        if constraint is None or any(constraint is entry for entry in self.centred.constraints):
             return 0.0
         times, directions, parameters, _ = constraint.functionals_at(cut.index[None, :1])
         return float(self.off(times, directions, parameters)[cut.row])
 
     @cached_property
     def _off_at_ends(self) -> Array:
-        """What equalities may be off by, in their units, ``(e,)``."""
+        """Error bounds of the equalities, in their units, ``(e,)``."""
         axes, middle = fixed(self.model.held)[0], self.model.parameters.middle
         times = np.full(axes.shape[0], self.model.problem.horizon)
         return self.off(times, axes, np.tile(middle, (times.size, 1))) / self._end_units
 
     @cached_property
     def _off_at_most(self) -> float:
-        """The largest share of the norm of an equality that it may be off by; of one without entries 0 where it is
-        missed by more."""
-        base, off = self._base.finite, self._off_at_ends
+        """Largest error bound of an equality as a share of the norm of its row.
+
+        An equality without entries counts 0 where its residual exceeds the bound, and ``inf`` elsewhere.
+        """
+        base, errors = self._base.finite, self._off_at_ends
         if not base.b.size:
             return 0.0
         norms = np.linalg.norm(np.hstack([base.A, self._columns]), axis=1)
-        bare = np.where(np.abs(base.b) > off, 0.0, np.inf)
-        return float(np.where(norms > 0.0, off / np.where(norms > 0.0, norms, 1.0), bare).max())
+        empty_row_share = np.where(np.abs(base.b) > errors, 0.0, np.inf)
+        return float(np.where(norms > 0.0, errors / np.where(norms > 0.0, norms, 1.0), empty_row_share).max())
 
     @cached_property
     def strip(self) -> float:
         """The area, in coordinates ``z``, of what is left of the plane by an equality that no control enters, up to
         what it may be off by; 0 where there is none."""
         lengths = np.linalg.norm(self._columns, axis=1)
-        pinned = ~self._base.finite.A.any(axis=1) & (lengths > 0.0)
-        across = 2.0 * self._off_at_ends[pinned] / lengths[pinned]
-        return float(2.0 * np.sqrt(2.0) * across.max(initial=0.0))
+        is_pinned = ~self._base.finite.A.any(axis=1) & (lengths > 0.0)
+        widths = 2.0 * self._off_at_ends[is_pinned] / lengths[is_pinned]
+        return float(2.0 * np.sqrt(2.0) * widths.max(initial=0.0))
 
     @cached_property
     def _end_units(self) -> Array:
-        """What equalities are divided by, ``(e,)``."""
+        """Divisors of the equalities, ``(e,)``."""
         count = fixed(self.model.held)[1].size
         return np.ones(count) if self.model.rows is None else self.model.rows.fixed[:count]
 
     def _needed(self, z: Array) -> np.ndarray:
-        """Which equalities ``(e,)`` the program at ``z`` has: not one that no control moves and that holds there but
-        for rounding."""
+        """Return which equalities ``(e,)`` the program at ``z`` has: all but those that no control enters and that hold
+        there but for rounding."""
         base = self._base.finite
         return np.asarray(base.A.any(axis=1) | (np.abs(base.b - self._columns @ z) > TOLERANCE))
 
     def _equalities(self, z: Array) -> tuple[Array | None, Array | None]:
-        """Those of the program at ``z``."""
+        """Return the matrix and the right-hand sides of the equalities of the program at ``z``, ``None`` each where
+        there are none."""
         base, needed = self._base.finite, self._needed(z)
         return (base.A[needed], (base.b - self._columns @ z)[needed]) if needed.any() else (None, None)
 
@@ -230,10 +237,10 @@ class InitialPlane:
     def _rows(self, cuts: Sequence[Cut]) -> tuple[Array | None, Array | None]:
         if not cuts:
             return None, None
-        parts = [next(f for f in self._families if f.name == cut.family).rows(cut.index[None]) for cut in cuts]
+        rows = [next(f for f in self._families if f.name == cut.family).rows(cut.index[None]) for cut in cuts]
         return (
-            np.stack([G[0, cut.row] for (G, _), cut in zip(parts, cuts, strict=True)]),
-            np.array([h[0, cut.row] for (_, h), cut in zip(parts, cuts, strict=True)]),
+            np.stack([G[0, cut.row] for (G, _), cut in zip(rows, cuts, strict=True)]),
+            np.array([h[0, cut.row] for (_, h), cut in zip(rows, cuts, strict=True)]),
         )
 
     @cached_property
@@ -251,8 +258,8 @@ class InitialPlane:
         at_centre = self._base.b
         if at_centre is None:
             return np.zeros((0, 2))
-        moved = [from_state(self.model, self._state(z)).program.b for z in np.eye(2)]
-        return np.stack([at_centre - np.asarray(b) for b in moved], axis=1)
+        right_hand_sides = [from_state(self.model, self._state(z)).program.b for z in np.eye(2)]
+        return np.stack([at_centre - np.asarray(b) for b in right_hand_sides], axis=1)
 
     @cached_property
     def centred(self) -> Transcription:
@@ -261,12 +268,13 @@ class InitialPlane:
 
     @cached_property
     def beyond(self) -> Array:
-        """What a law leaves out of its series in the parameters, of any state, ``(d,)``, from anywhere in the plane."""
-        far = np.abs(self._state(np.zeros(2)))
-        far[list(self.states)] += np.abs(self.radius)
+        """Bounds ``(d,)`` of the remainder of a law's series in the parameters, for every state, from any initial state
+        of the plane."""
+        magnitudes = np.abs(self._state(np.zeros(2)))
+        magnitudes[list(self.states)] += np.abs(self.radius)
         control = self.model.problem.control
         reach = control.reach(np.eye(control.dimension))
-        return self.centred.functionals.from_state(far).beyond(reach)
+        return self.centred.functionals.from_state(magnitudes).beyond(reach)
 
     def _state(self, z: Array) -> Array:
         state = np.array(self.model.problem.initial_state, dtype=float)
@@ -275,11 +283,11 @@ class InitialPlane:
 
 
 def check_states(states: object, count: int) -> tuple[int, int]:
-    """Two different states, counted from 0; raises `InputError`."""
-    given = tuple(states) if isinstance(states, Sequence | np.ndarray) else ()
-    if len(given) != 2 or any(isinstance(one, bool) or not isinstance(one, int | np.integer) for one in given):
+    """Return the two different states in ``states``, counted from 0; raise `InputError` for anything else."""
+    pair = tuple(states) if isinstance(states, Sequence | np.ndarray) else ()
+    if len(pair) != 2 or any(isinstance(entry, bool) or not isinstance(entry, int | np.integer) for entry in pair):
         raise InputError(path="states", expected="two different states, counted from 0", got=repr(states))
-    a, b = (int(one) for one in given)
+    a, b = (int(entry) for entry in pair)
     if a == b or not (0 <= a < count and 0 <= b < count):
         raise InputError(
             path="states", expected=f"two different states of the {count}, counted from 0", got=f"{a} and {b}"
@@ -289,7 +297,7 @@ def check_states(states: object, count: int) -> tuple[int, int]:
 
 @dataclass(frozen=True, eq=False)
 class _OfPlane:
-    """One family of the ordinary program, whose initial state is the end ``z (2,)`` of the decision."""
+    """Family of the ordinary program with the initial state at the coordinates ``z (2,)``, which end the decision."""
 
     plane: InitialPlane
     base: ConstraintFamily
@@ -311,9 +319,12 @@ class _OfPlane:
         return self._at(x).allowed(x[:-2]) / TOLERANCE
 
     def explain(self, index: Array, row: int) -> Explanation:
-        """The constraint for people, without what the initial state gives: it is free."""
-        said = self.plane.model.program.family(self.base.name).explanation(index[: self.base.index_set.dimension], row)
-        return said.from_any_state() if isinstance(said, TimedExplanation) else said
+        """Return the description of the constraint for a reader, without the value from the initial state, which is
+        free."""
+        explanation = self.plane.model.program.family(self.base.name).explanation(
+            index[: self.base.index_set.dimension], row
+        )
+        return explanation.from_any_state() if isinstance(explanation, TimedExplanation) else explanation
 
     def _at(self, x: Array) -> ConstraintFamily:
         return self.plane.at(x[-2:]).family(self.base.name)
@@ -322,7 +333,7 @@ class _OfPlane:
 @final
 @dataclass(frozen=True, eq=False)
 class _Joined(_OfPlane):
-    """One family of the ordinary program as a family in ``(theta, z)``."""
+    """Family of the ordinary program, as a family in ``(theta, z)``."""
 
     def family(self) -> ConstraintFamily:
         offers = self.base.enclosure is not None
@@ -343,9 +354,11 @@ class _Joined(_OfPlane):
         )
 
     def rows(self, indices: Array) -> tuple[Array, Array]:
-        """The rows at the centre, and two columns more: ``c'e^{A(p)t}`` at the two coordinates. Of a system that
-        changes with time they are met by all that meets the true ones: by what steps may be off, and an expansion in
-        the parameters leaves out, wherever in the plane it begins, and by what rounding is."""
+        """Return the rows at the centre with two more columns, ``c'e^{A(p)t}`` at the two coordinates.
+
+        For a system that changes with time the rows are wider by the error bound `InitialPlane.off`, so that every
+        decision that meets the true rows meets them.
+        """
         G, h = self.base.rows(indices)
         constraint = self.plane.centred.constraint(self.base)
         if constraint is None:
@@ -360,14 +373,16 @@ class _Joined(_OfPlane):
 @final
 @dataclass(frozen=True, eq=False)
 class _JoinedUncertain(_OfPlane):
-    """One family of the ordinary program under feedback as a family in ``(v, M, z)``: at every deviation its rows are
-    affine in the initial state, which enters their right-hand sides alone."""
+    """Family of the ordinary program under feedback, as a family in ``(v, M, z)``.
+
+    At every deviation its rows are affine in the initial state, which enters only their right-hand sides.
+    """
 
     def family(self, known: Sequence[Cut]) -> ConstraintFamily:
         base = self.base
         assert base.start is not None
         d = base.index_set.dimension
-        begun = [cut.index[:d] for cut in known if cut.family == base.name]
+        start_indices = [cut.index[:d] for cut in known if cut.family == base.name]
         family = ConstraintFamily(
             name=base.name,
             index_set=base.index_set,
@@ -375,7 +390,7 @@ class _JoinedUncertain(_OfPlane):
             scale=self.scale,
             uncertain=self.uncertain,
             excess=self.excess,
-            start=np.unique(np.vstack([base.start, *begun]), axis=0),
+            start=np.unique(np.vstack([base.start, *start_indices]), axis=0),
             worst=self.worst,
             cells=base.cells,
             enclosure=self.enclosure,
@@ -394,18 +409,18 @@ class _JoinedUncertain(_OfPlane):
         may be off by, as without feedback, but for those that hold with equality (`InitialPlane.weakened`)."""
         from scipy.sparse import csr_array, hstack
 
-        one, *others = (
-            each.uncertain for each in (self.base, *(end.family(self.base.name) for end in self.plane.ends))
+        at_centre, *at_ends = (
+            family.uncertain for family in (self.base, *(end.family(self.base.name) for end in self.plane.ends))
         )
-        assert one is not None
-        rows = one(index)
-        moved = np.stack([rows.h - other(index).h for other in others if other is not None], axis=1)
+        assert at_centre is not None
+        rows = at_centre(index)
+        columns = np.stack([rows.h - at_end(index).h for at_end in at_ends if at_end is not None], axis=1)
         n = rows.g.shape[1] + 2
-        wider = tuple(csr_array((C.data, C.indices, C.indptr), shape=(C.shape[0], n)) for C in rows.C)
+        padded = tuple(csr_array((C.data, C.indices, C.indptr), shape=(C.shape[0], n)) for C in rows.C)
         constraint, h = self.plane.centred.constraint(self.base), rows.h
         if constraint is not None and not rows.exact:
             h = h + self.plane.off(*constraint.functionals_at(index[None, : self.base.index_set.dimension])[:3])
-        return replace(rows, g=csr_array(hstack([rows.g, csr_array(moved)])), h=h, C=wider)
+        return replace(rows, g=csr_array(hstack([rows.g, csr_array(columns)])), h=h, C=padded)
 
     def excess(self, x: Array, indices: Array) -> Array:
         """The violations from that initial state."""

@@ -31,11 +31,20 @@ NEAR = 0.1  # how far the parameter of a neighbour is drawn towards a random one
 
 @dataclass(frozen=True, eq=False)
 class Uncertainty:
-    """What is uncertain in a system: the disturbance (``None``: nothing), the parameters and the initial state, and the
-    worst cases found of them.
+    """Uncertain quantities of a system: the disturbance (``None``: no disturbance), the parameters and the initial
+    state, with the worst cases that were found.
 
-    ``worst``: times ``(k,)``, directions ``(k, d)`` and parameters ``(k, nu)`` of functionals whose worst disturbances
-    are known to matter.
+    Parameters
+    ----------
+    functionals : WorstCase
+        Functionals of the system.
+    parameters : ParameterIndex
+        Set of the parameters.
+    constraints : sequence of StateConstraint
+        Constraints whose worst cases are drawn from.
+    worst : tuple of ndarray
+        Times ``(k,)``, directions ``(k, d)`` and parameters ``(k, nu)`` of functionals whose worst disturbances are
+        known to matter.
     """
 
     functionals: WorstCase
@@ -48,7 +57,7 @@ class Uncertainty:
         return rng.integers(0, self._bases[2].shape[0], size=count) if law == "neighbours" else None
 
     def directions(self, bases: np.ndarray) -> Array:
-        """Those of these worst cases, ``(k, d)``."""
+        """Return the directions ``(k, d)`` of the worst cases with the numbers ``bases (k,)``."""
         return np.asarray(self._bases[1][bases])
 
     def draw(
@@ -78,8 +87,8 @@ class Uncertainty:
         pieces, m = command.shape[1], execution.shares.size
         if law == "neighbours":
             base = rng.integers(0, self._bases[2].shape[0], size=count)
-            found = worst_errors(self.functionals.response, execution, command, self._bases)[:, :, base]
-            return np.asarray(found * np.where(rng.uniform(size=found.shape) < FLIPPED / pieces, -1.0, 1.0))
+            worst = worst_errors(self.functionals.response, execution, command, self._bases)[:, :, base]
+            return np.asarray(worst * np.where(rng.uniform(size=worst.shape) < FLIPPED / pieces, -1.0, 1.0))
         if law == "slow":
             breaks = self.functionals.response.grid.breakpoints
             hats = _hats((breaks[:-1] + breaks[1:]) / (2 * breaks[-1]), KNOTS)
@@ -112,11 +121,11 @@ class Uncertainty:
         signal = np.empty((count, middles.size, model.channels))
         knots = rng.integers(1, KNOTS + 1, size=count)
         for number in range(1, KNOTS + 1):
-            here = np.flatnonzero(knots == number)
-            if not here.size:
+            indices = np.flatnonzero(knots == number)
+            if not indices.size:
                 continue
-            points = model.bound.sample_extreme(here.size * number, rng).reshape(here.size, number, -1)
-            signal[here] = np.einsum("lk,nki->nli", _hats(middles, number), points)
+            points = model.bound.sample_extreme(indices.size * number, rng).reshape(indices.size, number, -1)
+            signal[indices] = np.einsum("lk,nki->nli", _hats(middles, number), points)
         if model.starts is not None:
             return signal[:, model.starts]
         coefficients = np.einsum("nli,lj->nij", signal, np.linalg.pinv(np.asarray(model.functions)))
@@ -142,14 +151,14 @@ class Uncertainty:
         bases, count = self._bases, base.size
         parameters = bases[2][base]
         if self.parameters.set is not None:
-            near = rng.uniform(0.0, NEAR, size=(count, 1))
-            parameters = parameters + near * (self.parameters.set.sample(count, rng) - parameters)
+            share = rng.uniform(0.0, NEAR, size=(count, 1))
+            parameters = parameters + share * (self.parameters.set.sample(count, rng) - parameters)
         model = self.functionals.disturbance
         if model is None:
             return None, parameters
         blocks, size = self._worst_blocks[base], model.block_count
         flips = min(FLIPPED, size)
-        which = rng.integers(0, size, size=(count, flips))
+        flipped = rng.integers(0, size, size=(count, flips))
         drawn = rng.integers(1, flips + 1, size=(count, 1)) > np.arange(flips)
         step = drawn[..., None] * (
             np.ones((count, flips, 1)) if size > FLIPPED else rng.uniform(0.0, MIXED, size=(count, flips, 1))
@@ -157,24 +166,24 @@ class Uncertainty:
         extreme = model.set.sample_extreme(count * flips, rng).reshape(count, flips, -1)
         trajectory = np.arange(count)
         for flip in range(flips):
-            place = which[:, flip]
-            before = blocks[trajectory, place]
-            blocks[trajectory, place] = before + step[:, flip] * (extreme[:, flip] - before)
+            positions = flipped[:, flip]
+            before = blocks[trajectory, positions]
+            blocks[trajectory, positions] = before + step[:, flip] * (extreme[:, flip] - before)
         return model.signals(blocks), parameters
 
     @cached_property
     def _bases(self) -> tuple[Array, Array, Array]:
         """The known worst cases, and random ones: always the same, whatever is drawn from them."""
         rng = np.random.default_rng(0)
-        found = [self.worst]
+        bases = [self.worst]
         for constraint in self.constraints:
             box, number = constraint.index_set, -(-BASES // len(self.constraints))
             times, directions, parameters, _ = constraint.functionals_at(
                 rng.uniform(box.lower, box.upper, size=(number, box.dimension))
             )
-            pick = np.arange(number) * (times.size // number) + rng.integers(0, times.size // number, size=number)
-            found.append((times[pick], directions[pick], parameters[pick]))
-        times, directions, parameters = (np.concatenate(parts) for parts in zip(*found, strict=True))
+            chosen = np.arange(number) * (times.size // number) + rng.integers(0, times.size // number, size=number)
+            bases.append((times[chosen], directions[chosen], parameters[chosen]))
+        times, directions, parameters = (np.concatenate(columns) for columns in zip(*bases, strict=True))
         return times, directions, parameters
 
     @cached_property
@@ -188,8 +197,11 @@ class Uncertainty:
 
 @dataclass(frozen=True, eq=False)
 class ParametersInTime:
-    """Parameters beside the time, in a ``box``, of a problem whose states hold what each of them adds (`superposed`):
-    ``every``: the stated states at each corner of the box, ``(d, size)`` each."""
+    """Parameters of a system that depends on the time and on parameters, in a ``box``.
+
+    The state of such a problem also holds further states, by which the parameters act (`superposed`). ``every`` gives
+    the states of the user at each corner of the box, as rows ``(d, size)``.
+    """
 
     box: Box
     depends: Dependence
@@ -197,42 +209,48 @@ class ParametersInTime:
 
     @staticmethod
     def of(problem: OptimalControlProblem) -> ParametersInTime | None:
-        """Those of a problem as it was stated; ``None`` where it has none."""
-        every, system = at_corners(problem), in_time(problem).system
-        if every is None or system.dependence is None:
+        """Return the parameters of a problem as the user gave it; ``None`` unless its system depends on the time and on
+        parameters."""
+        corners, system = at_corners(problem), in_time(problem).system
+        if corners is None or system.dependence is None:
             return None
-        return ParametersInTime(system.box, system.dependence, every)
+        return ParametersInTime(system.box, system.dependence, corners)
 
     def draw(self, law: LawName, count: int, directions: Array | None, rng: np.random.Generator) -> Array:
-        """``count`` of them as rows on all states, ``(count, d, size)``: those of neighbours are near the corners that
-        the ``directions (count, size or more)`` look at, each that of a row."""
+        """Draw ``count`` parameters as rows on all states, ``(count, d, size)``.
+
+        Neighbours are near the corners that belong to the ``directions (count, size or more)``, one row each.
+        """
         drawn, units = (_extreme if law == "vertices" else _uniform)(self.box, count, rng), self.depends.units
         shares = (drawn - self.depends.centre) / np.where(units > 0.0, units, 1.0)
-        found = np.stack([self.depends.rows(one) for one in shares])
+        rows = np.stack([self.depends.rows(share) for share in shares])
         if directions is None:
-            return found
-        looked = np.stack([self.seen(one) for one in directions])
-        return np.asarray(looked + rng.uniform(0.0, NEAR, size=(count, 1, 1)) * (found - looked))
+            return rows
+        corner_rows = np.stack([self.seen(direction) for direction in directions])
+        return np.asarray(corner_rows + rng.uniform(0.0, NEAR, size=(count, 1, 1)) * (rows - corner_rows))
 
     def seen(self, direction: Array) -> Array:
-        """The corner, as rows ``(d, size)``, that a ``direction (size or more,)`` on all states looks at; any of those
-        that it does not tell apart."""
+        """Return the corner, as rows ``(d, size)``, that belongs to a ``direction (size or more,)`` on all states; any
+        one of the corners that the direction does not distinguish."""
         d, size = self.every[0].shape
-        missed = [np.abs(direction[:d] @ one - direction[:size]).max() for one in self.every]
-        return self.every[int(np.argmin(missed))]
+        residuals = [np.abs(direction[:d] @ corner - direction[:size]).max() for corner in self.every]
+        return self.every[int(np.argmin(residuals))]
 
     def at(self, states: Array, rows: Array) -> Array:
-        """All ``states (size or more, n)`` at parameters, ``rows (n or 1, d, size)``: nothing is left for these to add,
-        so that every corner sees the same states. What is integrated of them stays that of the corners."""
+        """Return all ``states (size or more, n)`` at parameters, given as ``rows (n or 1, d, size)``.
+
+        The further states, by which the parameters act, become 0, so that all corners have the same states. Integrals
+        of the states stay those of the corners.
+        """
         d, size = self.every[0].shape
-        found = states.copy()
-        found[:d], found[d:size] = (rows @ states[:size].T[:, :, None])[:, :, 0].T, 0.0
-        return found
+        all_states = states.copy()
+        all_states[:d], all_states[d:size] = (rows @ states[:size].T[:, :, None])[:, :, 0].T, 0.0
+        return all_states
 
 
 def admissibility(model: DisturbanceModel, signals: Array) -> Array:
-    """By how much disturbances ``(n, mw, L)`` on the merged grid miss being admissible, ``(n,)``; at most rounding when
-    they are."""
+    """Return the residual ``(n,)`` by which disturbances ``(n, mw, L)`` on the merged grid fail to be admissible; at
+    most rounding where they are admissible."""
     if model.starts is not None:
         values = signals.swapaxes(1, 2)
         uneven = np.abs(signals - model.signals(values[:, model.starts])).max(axis=(1, 2))

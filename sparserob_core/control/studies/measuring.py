@@ -20,10 +20,20 @@ if TYPE_CHECKING:
 @final
 @dataclass(eq=False)
 class Measuring:
-    """Of many systems at once, what acts on each piece of the grid, from the states at the control's breakpoints.
+    """Inputs of many systems at once on each piece of the grid, computed from the states at the control's breakpoints.
 
-    ``nominal (m, K)``, ``gains (K, K, m, p)``; ``noises (K, p, n)``: those of what is measured, their middle unless
-    given. Pieces are asked for in order; piece 0 begins anew.
+    The pieces must be asked for in order; piece 0 begins anew.
+
+    Parameters
+    ----------
+    model : Transcription
+        The problem.
+    nominal : ndarray, shape (m, K)
+        Nominal control.
+    gains : ndarray, shape (K, K, m, p)
+        Gains of the innovations.
+    noises : ndarray, shape (K, p, n), optional
+        Noises of the measurements; their middle by default.
     """
 
     model: Transcription
@@ -36,24 +46,28 @@ class Measuring:
 
     @staticmethod
     def of(model: Transcription, decision: Array, noises: Array | None = None) -> Measuring:
-        """The control of a decision."""
+        """Return the control of a decision."""
         return Measuring(model, model.pieces(decision), model.answering.loop.gains(decision), noises)
 
     def seen(self, measured: Array) -> list[Array]:
-        """The innovations ``(p,)`` so far, when ``measured (p,)`` is what is seen as the next piece begins; nothing is
-        changed."""
-        return [*(one[:, 0] for one in self._innovations), self._new(measured[:, None], self._observed())[:, 0]]
+        """Return all innovations ``(p,)`` so far, if ``measured (p,)`` is the measurement as the next piece begins,
+        without changing the state of this object."""
+        return [
+            *(innovation[:, 0] for innovation in self._innovations),
+            self._new(measured[:, None], self._observed())[:, 0],
+        ]
 
     def _loop(self) -> ClosedLoop:
         return self.model.answering.loop
 
     def outputs(self, k: int, state: Array) -> Array:
-        """What is measured of states ``(d, n)`` as piece ``k`` of the control begins, ``(p, n)``."""
+        """Return the measurements ``(p, n)`` of states ``(d, n)`` as piece ``k`` of the control begins."""
         observer = self._loop().observer
         return state if observer is None else observer.outputs(state, None if self.noises is None else self.noises[k])
 
     def _new(self, measured: Array, predicted: Array) -> Array:
-        """What is new in what is measured ``(p, n)`` as the next piece begins, where ``(d, n)`` is ``predicted``."""
+        """Return the innovations ``(p, n)`` of the measurements ``(p, n)`` as the next piece begins, where the states
+        ``(d, n)`` are ``predicted``."""
         loop = self._loop()
         if loop.observer is not None:
             return measured - loop.observer.outputs(predicted)
@@ -62,7 +76,7 @@ class Measuring:
         return measured - predicted
 
     def _observed(self) -> Array:
-        """What the state ``(d, n)`` is predicted to be as the next piece begins."""
+        """Return the prediction of the states ``(d, n)`` as the next piece begins."""
         observer = self._loop().observer
         if self._predicted is None:
             return self._loop().start[:, None]
@@ -71,7 +85,8 @@ class Measuring:
         return np.asarray(self._predicted + observer.L[len(self._innovations) - 1] @ self._innovations[-1])
 
     def predicted(self) -> Array:
-        """What is measured, ``(p, n)``, as the next piece begins where nothing is new in it."""
+        """Return the prediction of the measurements ``(p, n)`` as the next piece begins, at which the innovation is
+        0."""
         observer, state = self._loop().observer, self._observed()
         return state if observer is None else observer.outputs(state)
 
@@ -80,12 +95,13 @@ class Measuring:
         return self._commands[k]
 
     def __call__(self, piece: int, state: Array) -> Array:
-        """What acts through the columns of ``B`` on a piece of the grid that begins in ``state (d, n)``: ``(mc,
-        n)``."""
+        """Return the inputs ``(mc, n)`` through the columns of ``B`` on a piece of the grid that begins in
+        ``state (d, n)``."""
         return self.after(piece, lambda k: self.outputs(k, state))
 
     def after(self, piece: int, measured: Callable[[int], Array]) -> Array:
-        """The same of what is ``measured (p, n)`` as a piece of the control begins."""
+        """Return the inputs ``(mc, n)`` on a piece of the grid, from the measurements ``(p, n)`` that ``measured``
+        gives as a piece of the control begins."""
         response, loop = self.model.response, self._loop()
         grid, steps = response.grid, response.steps(KNOWN)
         commanded, acting = self.commanded, int(grid.control_piece[piece])
@@ -115,5 +131,5 @@ class Measuring:
 
     @cached_property
     def commanded(self) -> np.ndarray:
-        """Which piece of the control is commanded on every piece of the grid, ``(L,)``."""
+        """Piece of the control that is commanded on every piece of the grid, ``(L,)``."""
         return self.model.response.grid.commanded(self.model.control.breakpoints)

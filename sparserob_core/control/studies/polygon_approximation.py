@@ -19,8 +19,19 @@ THIN = 1e-12  # of the box, a distance that is rounding
 @final
 @dataclass(frozen=True, eq=False)
 class Support:
-    """What is known in one ``direction (2,)``: the set lies in ``direction'z <= bound``, and ``point (2,)`` is the best
-    point that was found, in the set for certain where it is ``proven``."""
+    """Support of a planar set in one direction: an upper bound, and the best point that was found.
+
+    Parameters
+    ----------
+    direction : ndarray, shape (2,)
+        The direction.
+    bound : float
+        Upper bound: the set lies in ``direction'z <= bound``.
+    point : ndarray, shape (2,), optional
+        Best point that was found.
+    proven : bool, default False
+        Whether the point is certainly in the set.
+    """
 
     direction: Array
     bound: float
@@ -39,7 +50,10 @@ def sandwich(ask: Callable[[Array], Support], known: Sequence[Support], count: i
     """
     supports = sorted(known, key=_angle)
     while len(supports) < count:
-        wedges = [_wedge(one, other) for one, other in zip(supports, [*supports[1:], supports[0]], strict=True)]
+        wedges = [
+            _wedge(support, neighbour)
+            for support, neighbour in zip(supports, [*supports[1:], supports[0]], strict=True)
+        ]
         area, direction = max(wedges, key=lambda wedge: wedge[0])
         total = polygon_area(outer_polygon(supports))
         if area <= 0.0 or direction is None or sum(wedge[0] for wedge in wedges) <= gap * total:
@@ -83,7 +97,7 @@ def polygon_area(vertices: Array) -> float:
 
 
 def inside(polygon: Array, points: Array) -> np.ndarray:
-    """Which of ``points (n, 2)`` lie in a convex polygon ``(k, 2)`` with interior, given anticlockwise."""
+    """Return which of ``points (n, 2)`` lie in a convex polygon ``(k, 2)`` with interior, given anticlockwise."""
     edges = np.roll(polygon, -1, axis=0) - polygon
     offsets = points[:, None] - polygon
     return np.asarray((edges[:, 0] * offsets[..., 1] - edges[:, 1] * offsets[..., 0] >= 0.0).all(axis=1))
@@ -130,10 +144,10 @@ def _clipped(polygon: Array, direction: Array, bound: float) -> Array:
     heights = polygon @ direction - bound
     kept: list[Array] = []
     for k in range(heights.size):
-        here, there = heights[k - 1], heights[k]
-        if (here > 0.0) != (there > 0.0):
-            kept.append(polygon[k - 1] + (polygon[k] - polygon[k - 1]) * (here / (here - there)))
-        if there <= 0.0:
+        previous, current = heights[k - 1], heights[k]
+        if (previous > 0.0) != (current > 0.0):
+            kept.append(polygon[k - 1] + (polygon[k] - polygon[k - 1]) * (previous / (previous - current)))
+        if current <= 0.0:
             kept.append(polygon[k])
     return np.array(kept).reshape(-1, 2)
 

@@ -1,4 +1,4 @@
-"""Many trajectories at once, exactly: matrix exponentials of the pieces, no time stepping."""
+"""Exact simulation of many trajectories at once: matrix exponentials of the pieces, no time stepping."""
 
 from __future__ import annotations
 
@@ -37,8 +37,8 @@ def fine_times(response: Response, parameters: ParameterIndex, more: Array) -> A
     rate = max(pace(A) for mode in response.system.modes for A in mode.matrices(points)[0])
     fewest = INSIDE + 1 if grid.pieces < MANY else 1
     counts = np.clip(np.ceil(rate * grid.lengths / SMOOTH), fewest, MOST_INSIDE).astype(int)
-    place = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
-    inside = np.repeat(grid.breakpoints[:-1], counts) + np.repeat(grid.lengths, counts) * place / np.repeat(
+    index = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
+    inside = np.repeat(grid.breakpoints[:-1], counts) + np.repeat(grid.lengths, counts) * index / np.repeat(
         counts, counts
     )
     return distinct_times(np.concatenate([inside, more, grid.breakpoints[-1:]]), float(grid.breakpoints[-1]))
@@ -51,7 +51,7 @@ def finer(grid: TimeGrid, times: Array) -> TimeGrid:
 
 
 class Motion(Protocol):
-    """What a system does on a piece, on which its inputs are constant, in coordinates of its own."""
+    """Motion of a system on a piece with constant inputs, in internal coordinates of the system."""
 
     def enter(self, states: Array) -> Array:
         """The coordinates of ``states (n, d)``."""
@@ -81,29 +81,32 @@ def walk(
     grid, motion = response.grid, _motion(response, parameters)
     if initial_states is None:
         initial_states = np.repeat(response.initial_state[None], parameters.shape[0], axis=0)
-    none = np.broadcast_to(0.0, (1, response.system.disturbances, grid.disturbance_piece.max() + 1))
-    signal = np.ascontiguousarray((none if disturbances is None else disturbances).transpose(2, 1, 0))
+    zero_signal = np.broadcast_to(0.0, (1, response.system.disturbances, grid.disturbance_piece.max() + 1))
+    signal = np.ascontiguousarray((zero_signal if disturbances is None else disturbances).transpose(2, 1, 0))
     state = motion.enter(initial_states)
-    now = motion.leave(state)
-    yield now
-    decided, before = np.zeros(0), -1
-    for piece, (acting, pushing) in enumerate(
+    states = motion.leave(state)
+    yield states
+    acting_control, last_index = np.zeros(0), -1
+    for piece, (control_index, disturbance_index) in enumerate(
         zip(grid.control_piece.tolist(), grid.disturbance_piece.tolist(), strict=True)
     ):
-        if acting != before:
-            decided, before = control(acting, now) if callable(control) else control[:, acting, None], acting
-        state = motion.step(piece, state, decided, signal[pushing])
-        now = motion.leave(state)
-        yield now
+        if control_index != last_index:
+            acting_control, last_index = (
+                control(control_index, states) if callable(control) else control[:, control_index, None],
+                control_index,
+            )
+        state = motion.step(piece, state, acting_control, signal[disturbance_index])
+        states = motion.leave(state)
+        yield states
 
 
 def _motion(response: Response, parameters: Array) -> Motion:
-    """The way to follow a system that takes the least: ``parameters (n, nu)`` are those of the trajectories."""
+    """Return the motion that takes the least work; ``parameters (n, nu)`` are those of the trajectories."""
     grid, system = response.grid, response.system
     if grid.varying:
         return _InTime(response, parameters)
-    many = grid.distinct(grid.lengths)[0].size * 4 * system.states**2 > HELD
-    if many and not parameters.shape[1] and grid.mode is None:
+    is_large = grid.distinct(grid.lengths)[0].size * 4 * system.states**2 > HELD
+    if is_large and not parameters.shape[1] and grid.mode is None:
         return _Apart(response)
     return _ByMatrices(response, parameters)
 
@@ -145,7 +148,7 @@ class _Apart:
     is held for a length."""
 
     def __init__(self, response: Response) -> None:
-        A, B, W = (part[0] for part in response.system.modes[0].matrices(np.zeros((1, 0))))
+        A, B, W = (matrix[0] for matrix in response.system.modes[0].matrices(np.zeros((1, 0))))
         self.lengths, self.basis = response.grid.lengths, decoupled(A)
         self.flows = Flows(self.basis, self.basis.normal_form(self.basis.matrix(A)[0]))
         self.inverse = self.basis.inverse.astype(float)
@@ -167,11 +170,11 @@ class _InTime:
     """A system that changes with time: the transitions of the pieces, of each trajectory at its parameters."""
 
     def __init__(self, response: Response, parameters: Array) -> None:
-        each = parameters.shape[1] > 0
-        steps, self.lengths = response.steps(parameters if each else parameters[:1]), response.grid.lengths
+        by_trajectory = parameters.shape[1] > 0
+        steps, self.lengths = response.steps(parameters if by_trajectory else parameters[:1]), response.grid.lengths
         inputs, m = steps.inputs, response.system.controls
         self.Phi, self.B, self.E = (
-            [np.moveaxis(one, 0, -1) if each else one[0] for one in np.moveaxis(table, 1, 0)]
+            [np.moveaxis(matrix, 0, -1) if by_trajectory else matrix[0] for matrix in np.moveaxis(table, 1, 0)]
             for table in (steps.Phi, inputs[..., :m], inputs[..., m:])
         )
 
@@ -187,13 +190,13 @@ class _InTime:
 
 
 def delivered(command: Array, errors: Array) -> Callable[[int, Array], Array]:
-    """What `walk` drives a system with where a ``command (m + constants, L)`` is missed by ``errors (L, m, n)``, as
-    shares of it, in ``n`` trajectories."""
+    """Return a function that gives `walk` the delivered control: a ``command (m + constants, L)`` with
+    ``errors (L, m, n)``, as shares of it, in ``n`` trajectories."""
 
     def acting(piece: int, state: Array) -> Array:
-        now = np.repeat(command[:, piece, None], state.shape[1], axis=1)
-        now[: errors.shape[1]] *= 1.0 + errors[piece]
-        return now
+        inputs = np.repeat(command[:, piece, None], state.shape[1], axis=1)
+        inputs[: errors.shape[1]] *= 1.0 + errors[piece]
+        return inputs
 
     return acting
 
@@ -206,7 +209,7 @@ def worst_errors(response: Response, execution: Execution, command: Array, at: t
 
 
 def trajectories_at_once(response: Response, uncertain: bool) -> int:
-    """How many trajectories are held in memory together."""
+    """Return the number of trajectories that are held in memory together, between 16 and 4096."""
     grid, system = response.grid, response.system
     signals = HELD // (max(1, system.disturbances) * (int(grid.disturbance_piece.max()) + 1))
     kinds = grid.pieces if grid.varying else grid.distinct(grid.lengths)[0].size

@@ -66,7 +66,7 @@ class Row:
 
     @property
     def sign(self) -> float:
-        """What the quantity is of the row."""
+        """Factor from the row to its quantity: 1 for ``sup``, -1 for ``inf``."""
         return 1.0 if self.sense == "sup" else -1.0
 
     def quantity(self, problem: OptimalControlProblem) -> str:
@@ -94,34 +94,36 @@ def rows_of(problem: OptimalControlProblem) -> list[Row]:
     """The rows of the constraints with flat sides, on the path and at the end, integrals being states; of a problem
     that has none the outputs that are measured, each way, and where there are none the states. Fixed final states are
     no rows. Raises `InputError` where all constraints are curved."""
-    found: list[Row] = []
+    rows: list[Row] = []
     curved: list[str] = []
 
     for name, entry in windows_of(problem):
         if isinstance(entry, Return):
             continue
-        sides, moved = entry.set.halfspaces(), entry.relative_to
+        sides, reference_points = entry.set.halfspaces(), entry.relative_to
         if sides is None:
             curved.append(name)
             continue
-        reference = None if moved is None else np.asarray(moved, dtype=float)
+        reference = None if reference_points is None else np.asarray(reference_points, dtype=float)
         stop = problem.horizon if entry.stop is None else entry.stop
-        found += [
+        rows += [
             Row(name, direction, float(wall), entry.start, stop, reference)
             for direction, wall in zip(*sides, strict=True)
             if np.isfinite(wall)
         ]
-    if found:
-        return found
+    if rows:
+        return rows
     if curved:
         raise InputError(
             f"{', '.join(curved)}: expected a constraint with flat sides, whose rows have a worst case each, got only"
             " curved ones"
         )
-    name, every = STATE, np.eye(problem.system.states)
+    name, directions = STATE, np.eye(problem.system.states)
     if problem.measurements is not None:
-        name, every = OUTPUT, np.asarray(problem.measurements.C, dtype=float)
-    return [Row(name, sign * direction, np.inf, 0.0, problem.horizon) for direction in every for sign in (1.0, -1.0)]
+        name, directions = OUTPUT, np.asarray(problem.measurements.C, dtype=float)
+    return [
+        Row(name, sign * direction, np.inf, 0.0, problem.horizon) for direction in directions for sign in (1.0, -1.0)
+    ]
 
 
 @final
@@ -168,9 +170,9 @@ def bound_row(
     """Enclose the worst case of a row at the control ``theta (m, N)``, to a ``tolerance`` relative to it, or to `LEAST`
     of the largest value that the row has anywhere in its window, or of its unit where that is 0 but for rounding.
     Dictionaries are those of control and disturbance."""
-    known = followed(problem, dictionaries, theta, row)
-    if known is not None:
-        return _of_known(known, row, tolerance, notify, deadline)
+    worst = followed(problem, dictionaries, theta, row)
+    if worst is not None:
+        return _of_known(worst, row, tolerance, notify, deadline)
     return _of_program(problem, dictionaries, theta, row, tolerance, notify, deadline)
 
 
@@ -182,9 +184,9 @@ def followed(
     control, disturbance = dictionaries
     system, d = problem.system, problem.system.states
     classes = problem.classes
-    alike = len(classes) <= 1 and problem.disturbance_breakpoints is None
-    erring = problem.execution is not None and theta.any()  # what stands still is delivered as it is commanded
-    if not system.is_constant or system.parameter_count or not alike or erring:
+    is_one_class = len(classes) <= 1 and problem.disturbance_breakpoints is None
+    has_errors = problem.execution is not None and theta.any()  # what stands still is delivered as it is commanded
+    if not system.is_constant or system.parameter_count or not is_one_class or has_errors:
         return None
     changes: Array | None = None
     if classes == {"piecewise_constant"}:
@@ -194,13 +196,13 @@ def followed(
         changes = disturbance.breakpoints[[0, *jumps, -1]]
     elif problem.disturbance is not None and (classes != {"measurable"} or problem.disturbance.halfspaces() is None):
         return None
-    A, B, E = (part[0] for part in system.forced.phases[0].matrices(np.zeros((1, 0))))
+    A, B, E = (matrix[0] for matrix in system.forced.phases[0].matrices(np.zeros((1, 0))))
     grid = grid_of(problem, control.breakpoints, disturbance.breakpoints)
     pieces = control.control(theta)
     inputs = np.hstack([B, E]) if problem.disturbance is not None else B
     state, gains = row.direction[:d], row.direction[d:]
     adjoint = Adjoint.of(np.asarray(A, dtype=float), inputs, state, problem.horizon)
-    moving = None if row.relative_to is None else (row.relative_to[:, 0], row.relative_to[:, 1:] @ state)
+    reference = None if row.relative_to is None else (row.relative_to[:, 0], row.relative_to[:, 1:] @ state)
     return WorstRow(
         adjoint,
         np.asarray(problem.initial_state, dtype=float),
@@ -211,7 +213,7 @@ def followed(
         if problem.disturbance is None
         else Pushes(problem.disturbance, slice(B.shape[1], inputs.shape[1]), changes),
         (control.breakpoints, gains @ pieces) if gains.size else None,
-        moving,
+        reference,
     )
 
 
@@ -229,19 +231,19 @@ def _of_known(worst: WorstRow, row: Row, tolerance: float, notify: Notify, deadl
         cells=(cells[0][:, None], cells[1][:, None]),
     )
     times = np.linspace(row.start, row.stop, LOOKS)
-    looked = worst.at(times)[0]
-    found = supremum(family, np.zeros(1), tolerance, LEAST * float(np.abs(looked).max()), notify, deadline=deadline)
+    samples = worst.at(times)[0]
+    bounds = supremum(family, np.zeros(1), tolerance, LEAST * float(np.abs(samples).max()), notify, deadline=deadline)
     # cells are probed in their middles, and what grows until the end of its window is largest there
-    best = float(times[looked.argmax()]) if looked.max() > found.lower else float(found.index[0])
+    best = float(times[samples.argmax()]) if samples.max() > bounds.lower else float(bounds.index[0])
     tidied = float(tidy(np.array([best]), float(worst.grid[-1]))[0])
     time = tidied if row.start <= tidied <= row.stop else best
     state, changes, disturbance = worst.witness(time)
     edges, middles = _bins(row)
-    lost = LOST * max(float(np.abs(looked).max()), abs(found.lower)) + worst.lost
+    rounding_error = LOST * max(float(np.abs(samples).max()), abs(bounds.lower)) + worst.lost
     return BoundedRow(
         row,
-        worst.reached(time, state, changes, disturbance) - lost,
-        found.upper + lost,
+        worst.reached(time, state, changes, disturbance) - rounding_error,
+        bounds.upper + rounding_error,
         time,
         np.zeros(0),
         state,
@@ -249,9 +251,9 @@ def _of_known(worst: WorstRow, row: Row, tolerance: float, notify: Notify, deadl
         disturbance,
         edges,
         worst.at(middles)[0] - worst.lost,
-        _over(edges, found),
-        found.cells,
-        found.reason,
+        _over(edges, bounds),
+        bounds.cells,
+        bounds.reason,
     )
 
 
@@ -278,7 +280,7 @@ def _of_program(
     notify: Notify,
     deadline: Deadline | None,
 ) -> BoundedRow:
-    """By the enclosures of the program that the row alone would make, whose wall is 0."""
+    """Bound a row by the enclosures of the program whose only constraint is the row, with the wall at 0."""
     d = problem.system.states
     path: list[PathConstraint | MixedConstraint] = []
     end: list[ConvexSet] = []
@@ -289,59 +291,59 @@ def _of_program(
         end = [Polytope(row.direction[None], wall)]
     else:
         path = [PathConstraint(Polytope(row.direction[None], wall), row.start, row.stop, relative_to=row.relative_to)]
-    alone = replace(problem, path=path, terminal=end, control_step=None, repeat=False)
-    model = prepare(alone, *dictionaries)
+    single_row = replace(problem, path=path, terminal=end, control_step=None, repeat=False)
+    model = prepare(single_row, *dictionaries)
     own = model.program.own_units
     assert own is not None
     family, decision = own.program.families[0], model.functionals.decided_by(theta) / own.decision
     units, unit = np.asarray(family.index_units), family.row_unit(0)
     middle = (family.index_set.lower + family.index_set.upper) / 2
     times = np.linspace(family.index_set.lower[0], family.index_set.upper[0], LOOKS)
-    looked = family.violations(decision, np.hstack([times[:, None], np.tile(middle[1:], (LOOKS, 1))]))
+    samples = family.violations(decision, np.hstack([times[:, None], np.tile(middle[1:], (LOOKS, 1))]))
     parameter = model.parameters.clamp((middle * units)[None, 1:])
-    added = _added(model.functionals, theta, row.direction[:d], times * units[0], parameter)
-    met = float(np.abs(looked).max())
-    size = met if max(met, added / unit) > NOTHING else 1.0
+    magnitude = _added(model.functionals, theta, row.direction[:d], times * units[0], parameter)
+    largest = float(np.abs(samples).max())
+    size = largest if max(largest, magnitude / unit) > NOTHING else 1.0
     try:
-        found = supremum(family, decision, tolerance, LEAST * size, notify, deadline=deadline)
+        bounds = supremum(family, decision, tolerance, LEAST * size, notify, deadline=deadline)
     except NotEnclosable as error:
-        index = np.append(times[looked[:, 0].argmax()], middle[1:])
-        nowhere = (family.index_set.lower[None], family.index_set.upper[None], np.full(1, np.inf))
-        found = Supremum(float(looked.max()), np.inf, index, 0, 0, nowhere, str(error))
-    index, functionals, bound = found.index * units, model.functionals, problem.system.parameters
+        index = np.append(times[samples[:, 0].argmax()], middle[1:])
+        leaves = (family.index_set.lower[None], family.index_set.upper[None], np.full(1, np.inf))
+        bounds = Supremum(float(samples.max()), np.inf, index, 0, 0, leaves, str(error))
+    index, functionals, bound = bounds.index * units, model.functionals, problem.system.parameters
     time, parameter = float(index[0]), model.parameters.clamp(index[None, 1:])[0]
     parameter = parameter if bound is None else within(bound, parameter)
     at = np.array([time]), row.direction[None, :d], parameter[None]
-    deviation, begun = functionals.worst_deviations(*at)[0], problem.initial_set
+    deviation, initial_set = functionals.worst_deviations(*at)[0], problem.initial_set
     of_state = time, row.direction[:d], parameter
     changes, disturbance = worst_signal(functionals, *of_state)
-    missed = 0.0
+    shortfall = 0.0
     if disturbance is not None and problem.disturbance is not None:
         disturbance = within(problem.disturbance, disturbance.T).T
         if functionals.measurable is not None:  # whose worst signal is found to rounding, or less
             support = float(functionals.offsets(*at)[0]) - functionals.parts(*of_state).begun
-            missed = max(0.0, support - pushed_by(functionals, *of_state, (changes, disturbance)))
+            shortfall = max(0.0, support - pushed_by(functionals, *of_state, (changes, disturbance)))
     edges, middles = _bins(row)
     low = np.full(middles.size, -np.inf)
-    for p in (found.index[1:], middle[1:]):
-        tried = np.hstack([(middles / units[0])[:, None], np.tile(p, (middles.size, 1))])
-        low = np.maximum(low, family.violations(decision, tried)[:, 0] if middles.size else low)
-    lost = max(LOST * max(size, abs(found.lower)), SUMMED * added / unit)
+    for p in (bounds.index[1:], middle[1:]):
+        indices = np.hstack([(middles / units[0])[:, None], np.tile(p, (middles.size, 1))])
+        low = np.maximum(low, family.violations(decision, indices)[:, 0] if middles.size else low)
+    rounding_error = max(LOST * max(size, abs(bounds.lower)), SUMMED * magnitude / unit)
     own_edges = edges / units[0]
     return BoundedRow(
         row,
-        unit * (found.lower - lost) - missed,
-        unit * (found.upper + lost),
+        unit * (bounds.lower - rounding_error) - shortfall,
+        unit * (bounds.upper + rounding_error),
         time,
         parameter,
-        deviation if begun is None else within(begun, deviation),
+        deviation if initial_set is None else within(initial_set, deviation),
         changes,
         disturbance,
         edges,
-        unit * (low - lost),
-        unit * (_over(own_edges, found) + lost),
-        found.cells,
-        found.reason,
+        unit * (low - rounding_error),
+        unit * (_over(own_edges, bounds) + rounding_error),
+        bounds.cells,
+        bounds.reason,
     )
 
 
@@ -349,10 +351,10 @@ def _added(functionals: WorstCase, theta: Array, state: Array, times: Array, par
     """The largest sum of the sizes of what makes a row ``state (d,)`` beside the disturbance, at ``times (k,)`` and
     ``parameter (1, nu)``: so much is rounded where the row itself is near 0."""
     at = times, np.tile(state, (times.size, 1)), np.repeat(parameter, times.size, axis=0)
-    known, response = functionals.response.weights(*at), functionals.response
-    begun = np.abs(known.free) @ np.abs(response.initial_state)
-    driven = np.einsum("klm,ml->k", np.abs(known.control), np.abs(functionals.on_grid(theta.ravel())))
-    return float((begun + driven).max())
+    weights, response = functionals.response.weights(*at), functionals.response
+    initial_effect = np.abs(weights.free) @ np.abs(response.initial_state)
+    control_effect = np.einsum("klm,ml->k", np.abs(weights.control), np.abs(functionals.on_grid(theta.ravel())))
+    return float((initial_effect + control_effect).max())
 
 
 Told: TypeAlias = Callable[[str, int, int], None]
@@ -367,8 +369,9 @@ def bound_rows(
     notify: Notify = ignore,
     deadline: Deadline | None = None,
 ) -> list[BoundedRow]:
-    """`bound_row` of all `rows_of` a problem; ``told`` what is bounded next, its number, and of how many."""
-    rows, found = rows_of(problem), []
+    """Bound all rows of a problem (`rows_of`) by `bound_row`; before each row, ``told`` receives its description, its
+    number, and the number of rows."""
+    rows, bounds = rows_of(problem), []
     for i, row in enumerate(rows):
         at = problem.names.corners.at(row.direction)
         told(
@@ -376,5 +379,5 @@ def bound_rows(
             i,
             len(rows),
         )
-        found.append(bound_row(problem, dictionaries, theta, row, tolerance, notify, deadline))
-    return found
+        bounds.append(bound_row(problem, dictionaries, theta, row, tolerance, notify, deadline))
+    return bounds

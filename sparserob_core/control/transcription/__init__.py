@@ -1,1 +1,1 @@
-"""From a control problem to its semi-infinite program, and the record that links the two."""
+"""Transcription of a control problem into its semi-infinite program, and the record that links the two."""

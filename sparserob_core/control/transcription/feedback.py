@@ -1,4 +1,5 @@
-"""From a problem whose control answers what it measures to a program, exactly: nominal control and gains together."""
+"""Exact transcription of a problem whose control answers measurements: one program for the nominal control and the
+gains."""
 
 from __future__ import annotations
 
@@ -50,13 +51,15 @@ FINER = 2.0**-11  # of the numbers that are added up, the unit of an equality: i
 @final
 @dataclass(frozen=True, eq=False)
 class Seen:
-    """What a control sees and answers, in one set of units: the coordinates of its ``answers``; the ``pieces`` on which
-    measurable disturbances are the deviations, and the ``observer`` of outputs, where there are such; the terminal
-    equalities, ``fixed``, as rows ``H x(T) <= h``, the second half of them the opposites of the first. ``still (Q,)``:
-    which entries of the deviations do no more than doubles resolve.
+    """Measurements that a control answers, in one set of units.
 
-    In own units ``deviations (Q,)``, what one of each is in the user's, and ``steps (r,)``, what the rows of the
-    control's steps are divided by.
+    ``answers``: the coordinates of the gains. ``pieces``: the pieces on which measurable disturbances are the
+    deviations, ``None`` without such disturbances. ``observer``: the observer of outputs, ``None`` where the state is
+    measured. ``fixed``: the terminal equalities as rows ``H x(T) <= h``; the second half of the rows are the opposites
+    of the first. ``still (Q,)``: true for entries of the deviations whose effect double precision does not resolve.
+
+    In own units there are two more fields. ``deviations (Q,)``: one unit of each deviation, in the user's units.
+    ``steps (r,)``: the divisors of the rows of the control's steps.
     """
 
     answers: Answers
@@ -71,58 +74,64 @@ class Seen:
 @final
 @dataclass(frozen=True, eq=False)
 class Answering(Acting):
-    """A control that answers what it measures by a ``policy``, which answers what ``mask (K, K)`` says and is charged
-    ``charge``: its constraints, and terminal equalities, hold for every deviation that is ``seen`` or not."""
+    """Control that answers measurements by a ``policy``. ``mask (K, K)`` says which piece answers which measurement,
+    and ``charge`` says which cost the policy is chosen by. The constraints and terminal equalities hold for every
+    deviation, whether it is measured or not."""
 
     policy: Policy
     mask: np.ndarray
     charge: Charge
     seen: Seen
     first: tuple[Posed, Seen]
-    """The problem in the own units in which this was seen first, and what was seen there."""
+    """Problem in the own units in which the measurements were computed first, and these measurements."""
     formulation: Formulation = "reduced"
 
     @property
     def answers_by(self) -> Policy:
-        """Its own."""
+        """Policy by which the control answers measurements."""
         return self.policy
 
     def in_own(self, theirs: Posed, own: Posed, units: Units) -> Answering:
-        """With what is seen in own units."""
-        seen = self.first[1] if own is self.first[0] else _seen(self.mask, theirs, own, units)[0]
-        return replace(self, seen=seen)
+        """Return this control with its measurements in the problem's ``own`` units."""
+        measurements = self.first[1] if own is self.first[0] else _seen(self.mask, theirs, own, units)[0]
+        return replace(self, seen=measurements)
 
     def from_state(self, model: Transcription, begun: Posed) -> Transcription:
-        """With what is seen shared."""
-        made = transcribed(begun, self)
+        """Return the program of the same problem from another initial state; it shares the record of the measurements,
+        and the explanations of the families, with the program of ``model``."""
+        transcription = transcribed(begun, self)
         named = {family.name: family for family in model.program.families}
         families = [
             replace(
-                one,
-                explain=told.explain,
-                row_units=told.row_units,
-                index_units=told.index_units,
-                measured=told.measured,
-                along=told.along,
+                family,
+                explain=source.explain,
+                row_units=source.row_units,
+                index_units=source.index_units,
+                measured=source.measured,
+                along=source.along,
             )
-            for one, told in ((one, named.get(one.name, one)) for one in made.program.families)
+            for family, source in (
+                (family, named.get(family.name, family)) for family in transcription.program.families
+            )
         ]
-        return replace(made, program=replace(made.program, families=families, cost_unit=model.program.cost_unit))
+        return replace(
+            transcription, program=replace(transcription.program, families=families, cost_unit=model.program.cost_unit)
+        )
 
     def free(self, model: Transcription) -> Transcription:
-        """Charged the nominal control alone."""
+        """Return the program in which only the nominal control is charged."""
         if self.charge.cost == "nominal":
             return model
         charge = replace(self.charge, cost="nominal", among=None)
         return replace(replace(self, charge=charge).from_state(model, model), given=model.given)
 
     def telling(self, own: Posed, units: Units) -> Telling:
-        """With the deviations, which a literal index holds."""
+        """Return the conversion to the user's units, with the units of the deviations that end a literal index."""
         assert self.seen.deviations is not None
         return Telling(units, deviations=self.seen.deviations)
 
     def units_beside(self, own: Posed, units: Units) -> Array:
-        """Those of the gains and of what is charged."""
+        """Return one unit of each gain, and of each variable that is charged, in the user's units."""
         answers, deviations = self.seen.answers, self.seen.deviations
         assert deviations is not None
         peaks = np.repeat(units.controls, own.control.pieces)
@@ -130,30 +139,31 @@ class Answering(Acting):
         return np.concatenate([units.controls[answers.channel] / deviations[answers.entry], charged])
 
     def part(self, posed: Posed) -> Part:
-        """Families that hold for every deviation, gains, and what bounds the charge."""
+        """Return the families that hold for every deviation, the gains with their bounds, and the variables that bound
+        the charge."""
         functionals, problem, pieces = posed.functionals, posed.problem, posed.control.pieces
-        seen, gains, charge = self.seen, self.seen.answers, self.charge
+        measurements, gains, charge = self.seen, self.seen.answers, self.charge
         nominal, first = functionals.variables, functionals.variables + gains.variables
         size = first + {"nominal": 0, "peak": nominal, "worst": 1}[charge.cost]
         loop = ClosedLoop(
             functionals,
             gains,
-            _spread(posed, seen.pieces, seen.still),
+            _spread(posed, measurements.pieces, measurements.still),
             size,
-            seen.pieces,
-            seen.observer,
+            measurements.pieces,
+            measurements.observer,
             anew=_begins_anew(posed),
         )
         system, horizon = functionals.response.system, problem.horizon
         families = [of_state(constraint, loop).family() for constraint in posed.constraints]
-        settled: list[Callable[[Array], Array]] = []
-        if seen.fixed[1].size:
+        settle_functions: list[Callable[[Array], Array]] = []
+        if measurements.fixed[1].size:
             ends = (problem.horizon, problem.horizon)
             equal = FeedbackConstraint(
-                FlatConstraint(EQUALS, functionals, *seen.fixed, *ends, posed.parameters), loop, exact=True
+                FlatConstraint(EQUALS, functionals, *measurements.fixed, *ends, posed.parameters), loop, exact=True
             )
             families.append(equal.family())
-            settled.append(equal.met)
+            settle_functions.append(equal.met)
         breakpoints = posed.control.breakpoints
         for name, convex, places in held_at(problem, breakpoints, answering=True):
             flat = convex.halfspaces()
@@ -161,40 +171,42 @@ class Answering(Acting):
                 families.append(FeedbackCurvedControl(loop, convex, name, places).family())
                 continue
             H, h = flat
-            if places.steps and seen.steps is not None:
-                H, h = H / seen.steps[:, None], h / seen.steps
+            if places.steps and measurements.steps is not None:
+                H, h = H / measurements.steps[:, None], h / measurements.steps
             families.append(FeedbackControl(name, loop, places, H, h).family())
         axes, (low, high) = np.eye(problem.system.controls), ranges(problem.control)
-        most = gains.share * (high - low)[gains.channel] / loop.spread.chords[gains.entry]
-        far = np.repeat(np.maximum(np.abs(low), np.abs(high)), pieces)
-        lower, upper, weights, largest = -most, most, None, None
+        gain_bounds = gains.share * (high - low)[gains.channel] / loop.spread.chords[gains.entry]
+        magnitudes = np.repeat(np.maximum(np.abs(low), np.abs(high)), pieces)
+        lower, upper, weights, largest = -gain_bounds, gain_bounds, None, None
         prices, peak = problem.prices(breakpoints).ravel(), replace(self, charge=replace(charge, cost="peak"))
         guide, among = None, None
         if charge.cost == "peak":
-            both, every = np.vstack([axes, -axes]), Places.of_values(breakpoints, len(axes))
-            peaks = FeedbackControl(PEAK, loop, every, both, np.zeros(len(both)), first)
+            directions, all_places = np.vstack([axes, -axes]), Places.of_values(breakpoints, len(axes))
+            peaks = FeedbackControl(PEAK, loop, all_places, directions, np.zeros(len(directions)), first)
             families.append(peaks.family())
-            settled.append(peaks.settled)
+            settle_functions.append(peaks.settled)
             weights = np.concatenate([np.zeros(first), prices])
-            lower, upper = np.append(lower, np.zeros(nominal)), np.append(upper, far)
+            lower, upper = np.append(lower, np.zeros(nominal)), np.append(upper, magnitudes)
         elif charge.cost == "worst":
             effort = FeedbackEffort(EFFORT, loop, prices, first)
             families.append(effort.family())
-            settled.append(effort.settled)
+            settle_functions.append(effort.settled)
             guide = (transcribed(posed, peak).program, first)
             weights = np.append(np.zeros(first), 1.0)
-            largest = float(prices @ far)
+            largest = float(prices @ magnitudes)
             lower, upper = np.append(lower, 0.0), np.append(upper, 2.0 * largest)
         elif charge.among == "peak" and problem.cost.is_linear:
             among = (transcribed(posed, peak).program, first)
         return Part(
-            families=[replace(one, hindrance=lambda low, high: hindrance(system, horizon)) for one in families],
+            families=[replace(family, hindrance=lambda low, high: hindrance(system, horizon)) for family in families],
             lower=lower,
             upper=upper,
             weights=weights,
             largest=largest,
             spread=loop.spread,
-            settle=None if not settled else lambda x: reduce(lambda at, settle: settle(at), settled, x),
+            settle=None
+            if not settle_functions
+            else lambda x: reduce(lambda at, settle: settle(at), settle_functions, x),
             guide=guide,
             among=among,
             feedback=Feedback(self.policy, self.mask, charge, loop),
@@ -202,24 +214,29 @@ class Answering(Acting):
 
 
 def answering(policy: Policy, mask: np.ndarray, posed: Posed, own: Posed, units: Units) -> Answering:
-    """How a control acts by a policy in the user's units, from what it sees in its ``own`` ones."""
+    """Return the control that acts by a policy in the user's units, from its measurements in the problem's ``own``
+    units."""
     scaled, outputs = _seen(mask, posed, own, units)
     assert scaled.deviations is not None
     pieces, observer = scaled.pieces, scaled.observer
-    seen = Seen(
+    measurements = Seen(
         answers=_in_users(scaled.answers, outputs, scaled.deviations),
         pieces=None if pieces is None else pieces.in_units_of(posed.functionals, units.states, units.disturbances),
         observer=None if observer is None else observer.in_units(units.states, outputs),
         fixed=_equal(*fixed(posed.problem)),
         still=scaled.still,
     )
-    return Answering(policy, mask, policy.charge, seen, (own, scaled))
+    return Answering(policy, mask, policy.charge, measurements, (own, scaled))
 
 
 def _seen(mask: np.ndarray, theirs: Posed, own: Posed, units: Units) -> tuple[Seen, Array]:
-    """What a control sees in ``own`` units, of a problem that is ``theirs`` in the user's, and what one of each of its
-    outputs is in these."""
-    problem, disturbance, begins = own.problem, own.functionals.disturbance, own.problem.initial_set is not None
+    """Return the measurements that a control answers, in ``own`` units, and one unit of each measured output in the
+    user's units. ``theirs`` is the problem in the user's units."""
+    problem, disturbance, has_initial_set = (
+        own.problem,
+        own.functionals.disturbance,
+        own.problem.initial_set is not None,
+    )
     pieces = measurable_pieces(own.functionals)
     spread = _spread(own, pieces, None)
     still: np.ndarray = read_only(_still(own, spread))
@@ -227,26 +244,29 @@ def _seen(mask: np.ndarray, theirs: Posed, own: Posed, units: Units) -> tuple[Se
     blocks = 0 if disturbance is None else disturbance.block_count
     deviations = np.tile(units.disturbances[: problem.system.disturbances], blocks)
     deviations = deviations if pieces is None else np.ones(pieces.size)
-    seen = innovations_seen(own.response, own.control, disturbance, begins, pieces)
-    outputs, observer, begun = units.states, None, units.states[: len(units.states) * begins]
+    innovations = innovations_seen(own.response, own.control, disturbance, has_initial_set, pieces)
+    output_units, observer, initial_units = units.states, None, units.states[: len(units.states) * has_initial_set]
     if problem.measurements is not None and theirs.problem.measurements is not None:
-        outputs = theirs.problem.measurements.units(units.states)
-        radii = np.delete(spread.radii, np.arange(deviations.size, spread.size - begun.size))
-        observer = Observer.of(problem.measurements, seen, between(own.response, own.control), radii)
-        deviations = np.append(deviations, np.tile(outputs, own.control.pieces if observer.noisy else 0))
-    anew = _begins_anew(own)
-    deviations = np.concatenate([deviations, begun, *[begun] * anew])
-    seen = innovations_of(seen, begun.size, observer, anew) * (spread.radii > 0.0)
-    coordinates, (H, h) = answers(spread.within(seen), mask, problem.system.controls, seen), fixed(problem)
-    small = (spread.radii > 0.0) & (spread.radii < SMALL)
-    coordinates = coordinates.on(power_of_two(np.where(small, spread.radii, 1.0)))
-    finer = FINER * power_of_two(np.maximum(added_up(problem, own.functionals), np.abs(h)))
-    ends = _equal(H / finer[:, None], h / finer)
-    return Seen(coordinates, pieces, observer, ends, still, deviations, _step_units(problem)), outputs
+        output_units = theirs.problem.measurements.units(units.states)
+        radii = np.delete(spread.radii, np.arange(deviations.size, spread.size - initial_units.size))
+        observer = Observer.of(problem.measurements, innovations, between(own.response, own.control), radii)
+        deviations = np.append(deviations, np.tile(output_units, own.control.pieces if observer.noisy else 0))
+    begins_anew = _begins_anew(own)
+    deviations = np.concatenate([deviations, initial_units, *[initial_units] * begins_anew])
+    innovations = innovations_of(innovations, initial_units.size, observer, begins_anew) * (spread.radii > 0.0)
+    coordinates, (H, h) = (
+        answers(spread.within(innovations), mask, problem.system.controls, innovations),
+        fixed(problem),
+    )
+    is_small = (spread.radii > 0.0) & (spread.radii < SMALL)
+    coordinates = coordinates.on(power_of_two(np.where(is_small, spread.radii, 1.0)))
+    equality_units = FINER * power_of_two(np.maximum(added_up(problem, own.functionals), np.abs(h)))
+    ends = _equal(H / equality_units[:, None], h / equality_units)
+    return Seen(coordinates, pieces, observer, ends, still, deviations, _step_units(problem)), output_units
 
 
 def _equal(H: Array, h: Array) -> tuple[Array, Array]:
-    """Equalities as twice as many rows."""
+    """Return equalities ``H x = h`` as twice as many inequalities."""
     return np.vstack([H, -H]), np.append(h, -h)
 
 
@@ -258,12 +278,12 @@ def refuse(
     paths, classes = problem.windows, problem.classes
     sets = [entry.set for entry in paths] + problem.terminal_sets
     steps = [] if problem.control_step is None else [problem.control_step]
-    curved = [one.kind for one in (*sets, problem.control, *steps) if one.halfspaces() is None]
+    curved = [convex.kind for convex in (*sets, problem.control, *steps) if convex.halfspaces() is None]
     named = [entry.name for entry in paths if entry.name in (of_control(problem), PEAK, EFFORT, EQUALS, STEP)]
     bound, measurable = problem.disturbance, classes == {"measurable"}
-    uncertainty = [one for one in (None if measurable else bound, problem.initial_set) if one is not None]
-    slanted = [one.kind for one in uncertainty if _is_slanted(one)]
-    leaning = [one.kind for one in uncertainty if fixed(problem)[1].size and Spread(((1, one),)).leans]
+    uncertainty = [convex for convex in (None if measurable else bound, problem.initial_set) if convex is not None]
+    slanted = [convex.kind for convex in uncertainty if _is_slanted(convex)]
+    leaning = [convex.kind for convex in uncertainty if fixed(problem)[1].size and Spread(((1, convex),)).leans]
     reasons = {
         "control that can have any value on every piece: an answer to a measurement does not reach back before it": (
             not control.is_indicators
@@ -309,90 +329,99 @@ def refuse(
 
 
 def _is_slanted(convex: ConvexSet) -> bool:
-    """Whether a set has no length along an axis within its span, though it deviates along it: then no gain on that
-    entry of a deviation is bounded."""
+    """Return whether a set has no length along an axis through its middle although its entry on this axis deviates.
+    Then no gain on that entry of a deviation is bounded."""
     spread = Spread(((1, convex),))
     return bool(((spread.chords <= 0.0) & (spread.radii > 0.0)).any())
 
 
 def _in_users(own: Answers, measured: Array, deviations: Array) -> Answers:
-    """The same coordinates of gains in the user's units, in which one of what is ``measured (d,)`` and of the
-    ``deviations (Q,)`` is that; powers of two change no number but its exponent."""
+    """Return the same coordinates of gains in the user's units. ``measured (d,)`` and ``deviations (Q,)`` are one unit
+    of each measured quantity and of each deviation there. The factors are powers of two and change only the exponents
+    of numbers."""
     _, _, Q, d = own.shape
-    at, which, value = own.effect
-    effect = (at, which, value * deviations[own.entry[which]] / deviations[at % Q])
-    at, which, value = own.gain
-    gain = (at, which, value * deviations[own.entry[which]] / measured[at % d])
+    at, indices, value = own.effect
+    effect = (at, indices, value * deviations[own.entry[indices]] / deviations[at % Q])
+    at, indices, value = own.gain
+    gain = (at, indices, value * deviations[own.entry[indices]] / measured[at % d])
     return replace(own, effect=effect, gain=gain)
 
 
 def _spread(posed: Posed, acting: MeasurablePieces | None, still: np.ndarray | None) -> Spread:
-    """The deviations of a problem's disturbance and of its initial state, of which some entries are ``still (Q,)``."""
+    """Return the deviations of the disturbance, of the noise of measurements, and of the initial state of a problem.
+    Some entries of these are ``still (Q,)``."""
     problem, disturbance, periods = posed.problem, posed.functionals.disturbance, 1 + _begins_anew(posed)
     if acting is not None:
         sets = (*acting.sets, *deviations_of(None, 0, problem.initial_set, periods=periods).sets)
         return Spread(sets, MISSED, still)
     blocks = 0 if disturbance is None else disturbance.block_count
     noise = None if problem.measurements is None else problem.measurements.noise
-    found = deviations_of(problem.disturbance, blocks, problem.initial_set, noise, posed.control.pieces, periods)
-    return replace(found, still=still)
+    spread = deviations_of(problem.disturbance, blocks, problem.initial_set, noise, posed.control.pieces, periods)
+    return replace(spread, still=still)
 
 
 def _still(own: Posed, spread: Spread) -> np.ndarray:
-    """Which entries ``(Q,)`` of the disturbance, and of the initial state, do no more to any row than doubles resolve
-    of what the row keeps (decision 0088): gains on these would be without measure. All of a set, or of a box a
-    coordinate, at all times: beside one that is answered others like it count. None beside fixed final states, which
-    hold at every deviation."""
-    found, model = np.zeros(spread.size, dtype=bool), own.functionals.disturbance
+    """Return which entries ``(Q,)`` of the disturbance and of the initial state have no effect on any row that double
+    precision resolves, relative to the size of the row (decision 0088). Gains on such entries would be unbounded.
+
+    All entries of one coordinate of a box are in the list together; of another set, all entries at all. Where one of
+    them is answered, the similar ones count too. With fixed final states the list is empty, since these hold at every
+    deviation.
+    """
+    is_still, model = np.zeros(spread.size, dtype=bool), own.functionals.disturbance
     if fixed(own.problem)[1].size:
-        return found
-    held = None if model is None or model.kind != "piecewise_constant" else own.problem.disturbance
-    sets = [held, own.problem.initial_set]
-    far, begun = (np.zeros(0) if one is None else one.width(np.eye(one.dimension)) for one in sets)
+        return is_still
+    bound = None if model is None or model.kind != "piecewise_constant" else own.problem.disturbance
+    sets = [bound, own.problem.initial_set]
+    disturbance_widths, initial_widths = (
+        np.zeros(0) if convex is None else convex.width(np.eye(convex.dimension)) for convex in sets
+    )
     rows = _rows_in_sizes(own.constraints, own.problem.system.states)
-    still = unfelt(own.response, None if held is None else model, far, begun, rows, STILL)
-    if held is not None and model is not None:
-        entries = _at_all_times(held, still[: still.size - begun.size])
-        found[: still.size - begun.size] = np.tile(entries, model.block_count)
+    is_unfelt = unfelt(own.response, None if bound is None else model, disturbance_widths, initial_widths, rows, STILL)
+    if bound is not None and model is not None:
+        entries = _at_all_times(bound, is_unfelt[: is_unfelt.size - initial_widths.size])
+        is_still[: is_unfelt.size - initial_widths.size] = np.tile(entries, model.block_count)
     if own.problem.initial_set is not None:
         periods = 1 + _begins_anew(own)
-        entries = _at_all_times(own.problem.initial_set, still[still.size - begun.size :])
-        found[spread.size - begun.size * periods :] = np.tile(entries, periods)
-    return found
+        entries = _at_all_times(own.problem.initial_set, is_unfelt[is_unfelt.size - initial_widths.size :])
+        is_still[spread.size - initial_widths.size * periods :] = np.tile(entries, periods)
+    return is_still
 
 
 def _at_all_times(convex: ConvexSet, still: np.ndarray) -> np.ndarray:
-    """Which coordinates ``(q,)`` of points of a set are still where their entries are, one point after another; of a
-    set that is no box all of them or none."""
+    """Return which coordinates ``(q,)`` of the points of a set are ``still`` in every point, where the points follow
+    one another. For a set that is no box the answer is the same for all coordinates."""
     entries = np.asarray(still.reshape(-1, convex.dimension).all(axis=0))
     return entries if convex.is_box else np.full(convex.dimension, entries.all())
 
 
 def _rows_in_sizes(constraints: Sequence[StateConstraint], d: int) -> Array:
-    """Rows ``(k, d)`` on the state, in multiples of what a user reads of them: the larger of bound and width, of a
-    curved set those along the axes. Whose size is 0 alone stands in its unit."""
-    found = [np.zeros((0, d))]
-    for one in constraints:
-        if one.sides is not None:
-            normals, (H, h) = one.sides[0], constraint_sides(one)
+    """Return rows ``(k, d)`` on the state in multiples of the size that a user reads from them: the larger of bound and
+    width. A curved set has one row for each axis. A row with size 0 stays in its own unit."""
+    rows = [np.zeros((0, d))]
+    for constraint in constraints:
+        if constraint.sides is not None:
+            normals, (H, h) = constraint.sides[0], constraint_sides(constraint)
             width = widths(H, h)
             sizes = np.maximum(np.abs(h), np.where(np.isfinite(width), width, 0.0))
         else:
-            assert one.shape is not None
-            normals = np.eye(one.shape.dimension)
-            sizes = np.maximum(extent(one.shape), one.shape.width(normals))
-        found.append(normals / np.where(sizes > 0.0, sizes, 1.0)[:, None])
-    return np.vstack(found)
+            assert constraint.shape is not None
+            normals = np.eye(constraint.shape.dimension)
+            sizes = np.maximum(extent(constraint.shape), constraint.shape.width(normals))
+        rows.append(normals / np.where(sizes > 0.0, sizes, 1.0)[:, None])
+    return np.vstack(rows)
 
 
 def _begins_anew(posed: Posed) -> bool:
-    """Whether the initial state of the next period is seen in this one's program: by the step across the seam."""
+    """Return whether this period's program contains the initial state of the next period: for the step between the
+    periods."""
     problem = posed.problem
     return problem.control_step is not None and bool(problem.repeat) and problem.initial_set is not None
 
 
 def _step_units(problem: OptimalControlProblem) -> Array | None:
-    """The units ``(r,)`` of the rows of the control's steps; ``None`` where these are free, or their set is curved."""
+    """Return the units ``(r,)`` of the rows of the control's steps; ``None`` where these are free, or their set is
+    curved."""
     step = problem.control_step
     flat = None if step is None else step.halfspaces()
     return None if step is None or flat is None else units_of_steps(step, *flat, problem.control)

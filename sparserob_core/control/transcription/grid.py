@@ -1,4 +1,4 @@
-"""The grid of a problem: what its system, its delay and the control before time 0 make of its pieces."""
+"""Grid of a problem: its pieces with the system, the delay and the control before time 0."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from sparserob_core.sip.convex_set import Array
 
 
 def grid_of(problem: OptimalControlProblem, control: Array, disturbance: Array) -> TimeGrid:
-    """The merged grid of a problem whose control and whose disturbance change at ``control (K + 1,)`` and at
-    ``disturbance (M + 1,)``; where nobody says what the control was before time 0, it was 0."""
+    """Return the merged grid of a problem whose control and disturbance change at ``control (K + 1,)`` and at
+    ``disturbance (M + 1,)``. Where no control before time 0 is given, it is 0."""
     system, before = problem.system, problem.initial_control
     return merge_grids(
         control,

@@ -1,4 +1,4 @@
-"""The cost of a problem in its program: that of the control, which under feedback is the nominal one."""
+"""Cost of a problem in its program: the cost of the control, or under feedback of the nominal control."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 class Quadratics(TypedDict, total=False):
-    """What the quadratic terms of a cost are in a program."""
+    """Fields of a program that hold the quadratic terms of a cost."""
 
     P: csc_array
     q: Array
@@ -26,15 +26,16 @@ class Quadratics(TypedDict, total=False):
 
 
 class Objective(Quadratics):
-    """All that a cost is in a program."""
+    """Fields of a program that hold the whole cost."""
 
     weights: Array
     blocks: Array | None
 
 
 def objective(problem: OptimalControlProblem, dictionary: Dictionary, images: int, variables: int) -> Objective:
-    """The cost of a program with so many ``images`` and ``variables``, which begin with the values of the control on
-    its pieces, ``(m K,)``, and with its coefficients, ``(m N,)``; the others cost nothing."""
+    """Return the cost of a program with so many ``images`` and ``variables``. The images begin with the values of the
+    control on its pieces, ``(m K,)``, and the variables with its coefficients, ``(m N,)``; all other entries cost
+    nothing."""
     weights = problem.prices(dictionary.breakpoints).ravel()
     weights = np.append(weights, np.zeros(images - weights.size))
     return {
@@ -45,7 +46,7 @@ def objective(problem: OptimalControlProblem, dictionary: Dictionary, images: in
 
 
 def _blocks(problem: OptimalControlProblem, dictionary: Dictionary, images: int) -> Array | None:
-    """The number of the group and piece of every image; ``None`` where every channel counts alone."""
+    """Return the number of the group and piece of every image; ``None`` where every channel counts alone."""
     if not problem.cost.blocks:
         return None
     number = np.full((problem.system.controls, dictionary.pieces), -1)
@@ -56,8 +57,9 @@ def _blocks(problem: OptimalControlProblem, dictionary: Dictionary, images: int)
 
 
 def quadratics(problem: OptimalControlProblem, dictionary: Dictionary, variables: int) -> Quadratics:
-    """The quadratic terms of the cost, and what a gap is relative to: the largest cost of the absolute values, and the
-    largest of the quadratic terms at a control that stays 0, or stays at one end of one channel."""
+    """Return the quadratic terms of the cost, and the size to which a gap is relative. This size is the largest cost of
+    the absolute values, plus the largest value of the quadratic terms at a control that stays 0, or at one end of one
+    channel."""
     if not problem.cost.is_quadratic:
         return {}
     from scipy.sparse import block_diag, csc_array
@@ -67,7 +69,7 @@ def quadratics(problem: OptimalControlProblem, dictionary: Dictionary, variables
     reach = problem.control.reach(axes)
     prices = problem.prices(np.array([0.0, problem.horizon]))[:, 0]
     largest = float(prices @ reach) + on_pieces.largest(reach)
-    more = variables - terms.q.size
-    P = csc_array(block_diag([terms.P, csc_array((more, more))])) if more else terms.P
+    extra = variables - terms.q.size
+    P = csc_array(block_diag([terms.P, csc_array((extra, extra))])) if extra else terms.P
     P = convex_by_construction(P)
-    return {"P": P, "q": np.append(terms.q, np.zeros(more)), "constant": terms.constant, "largest": largest}
+    return {"P": P, "q": np.append(terms.q, np.zeros(extra)), "constant": terms.constant, "largest": largest}

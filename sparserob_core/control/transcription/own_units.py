@@ -34,7 +34,8 @@ CHAINED = 1e150  # a state that a chain of couplings might bring beyond this is 
 
 
 def rough_units(problem: OptimalControlProblem) -> Units:
-    """Units from products of the problem's numbers alone: what one coupling after the other may bring into each state.
+    """Return units from products of the problem's numbers alone: estimates of each state by one coupling after the
+    other.
 
     Every step is a product or a maximum, so a change of units by powers of two changes them by exactly that.
     """
@@ -45,21 +46,22 @@ def rough_units(problem: OptimalControlProblem) -> Units:
         disturbances = power_of_two(extent(bound))
     index = ParameterIndex(system.parameters)
     parameters = np.ones(0) if system.parameters is None else power_of_two(_widths(system.parameters))
-    every = [mode.matrices(looked_at(index)) for mode in system.forced.modes]
-    A, B, E = _largest(every)
+    matrices = [mode.matrices(looked_at(index)) for mode in system.forced.modes]
+    A, B, E = _largest(matrices)
     # a fast system is coupled through for a time of about 1/norm only; the eigenvalues do not depend on the units
-    fastest = max(float(np.abs(np.linalg.eigvals(one[0])).max()) for one in every)  # LAPACK balances
-    lasting = float(power_of_two(np.array(min(time, 1.0 / fastest if fastest > 0.0 else np.inf))))
+    # (LAPACK balances)
+    fastest = max(float(np.abs(np.linalg.eigvals(mode_matrices[0])).max()) for mode_matrices in matrices)
+    coupling_time = float(power_of_two(np.array(min(time, 1.0 / fastest if fastest > 0.0 else np.inf))))
     inputs = controls if problem.initial_control is None else np.maximum(controls, np.abs(problem.initial_control))
     inputs = np.concatenate([inputs, np.ones(B.shape[1] - inputs.size)])  # that of a drift is 1
-    begun = np.abs(np.asarray(problem.initial_state))
+    initial_sizes = np.abs(np.asarray(problem.initial_state))
     if problem.initial_set is not None:
-        begun = np.maximum(begun, extent(problem.initial_set))
-    reach = np.maximum(begun, time * (B * inputs).max(axis=1, initial=0.0))
+        initial_sizes = np.maximum(initial_sizes, extent(problem.initial_set))
+    reach = np.maximum(initial_sizes, time * (B * inputs).max(axis=1, initial=0.0))
     if bound is not None:
         reach = np.maximum(reach, time * (E * disturbances).max(axis=1, initial=0.0))
     for _ in range(system.states - 1):
-        reach = np.maximum(reach, lasting * (A * reach).max(axis=1))
+        reach = np.maximum(reach, coupling_time * (A * reach).max(axis=1))
     reach = np.where(reach < CHAINED, reach, 0.0)
     return Units(
         time, power_of_two(np.where(reach > 0.0, reach, walls(problem))), controls, disturbances, parameters, 1.0
@@ -67,8 +69,8 @@ def rough_units(problem: OptimalControlProblem) -> Units:
 
 
 def own_units(problem: OptimalControlProblem, rough: Units, functionals: WorstCase, control: ConvexSet) -> Units:
-    """The units of a problem, from how far its states reach: ``functionals`` and the set of the ``control`` are those
-    of the problem in rough units."""
+    """Return the units of a problem, from the largest distance of its states from 0. ``functionals`` and the set of the
+    ``control`` are those of the problem in rough units."""
     axes, parameters = np.eye(problem.system.states), ParameterIndex(functionals.response.system.parameters)
     functionals = functionals.coarser(LOOKED_AT)
     times = window_times(functionals, 0.0, float(functionals.response.grid.breakpoints[-1]))
@@ -81,7 +83,8 @@ def own_units(problem: OptimalControlProblem, rough: Units, functionals: WorstCa
 
 
 def _control_units(problem: OptimalControlProblem) -> Array:
-    """A unit for every control, ``(m,)``; one for all of a group, whose norm is that of one vector."""
+    """Return a unit for every control, ``(m,)``. Controls of one group share a unit, since their norm is the norm of
+    one vector."""
     size = extent(problem.control)
     for block in problem.cost.blocks:
         size[list(block)] = size[list(block)].max()
@@ -89,79 +92,89 @@ def _control_units(problem: OptimalControlProblem) -> Array:
 
 
 def _cost_per_time(problem: OptimalControlProblem, states: Array, time: float) -> float:
-    """The largest cost per time, where states are as large as their units or their references."""
+    """Return the largest cost per time, where states are as large as their units or their references."""
     size = extent(problem.control)
     total = float((problem.prices(np.array([0.0, problem.horizon]))[:, 0] * size).sum()) / problem.horizon
     state, control, final = problem.cost.terms
     for term, reach, over in ((state, states, 1.0), (control, size, 1.0), (final, states, time)):
         if term is not None:
-            far = reach + np.abs(term.reference)
-            total += float(far @ np.abs(term.Q) @ far) / over
+            largest = reach + np.abs(term.reference)
+            total += float(largest @ np.abs(term.Q) @ largest) / over
     return total
 
 
 def row_units(constraint: StateConstraint, control: ConvexSet) -> Array:
-    """The unit ``(r,)`` of each row of a constraint: see `units_of_sides`; of a curved set, whose rows are in multiples
-    of its gauge, 1, or what double precision resolves of that; of one that is a point to rounding, how far it reaches
-    in these multiples."""
+    """Return the unit ``(r,)`` of each row of a constraint (`units_of_sides`).
+
+    The rows of a curved set are multiples of its gauge. Their unit is 1, or the resolution of double precision where
+    that is larger. For a set that is a point to rounding, the unit is the reach of the row in these multiples.
+    """
     functionals, sides = constraint.functionals.coarser(LOOKED_AT), constraint.sides
     times = window_times(functionals, constraint.start, constraint.stop)
-    moved = constraint.reference
+    reference = constraint.reference
     if sides is not None:
-        beside = Moving(moved, sides[0]).at(times) if moved.moves else None
-        found = reaches(functionals, constraint.parameters, control, sides[0], times, beside, constraint.gains)
+        offsets = Moving(reference, sides[0]).at(times) if reference.moves else None
+        reach_and_sums = reaches(
+            functionals, constraint.parameters, control, sides[0], times, offsets, constraint.gains
+        )
         H, h = constraint_sides(constraint)
         size = np.abs(H).sum(axis=1)
-        used = (size > 0.0) & np.isfinite(h)
-        place = float((np.abs(h[used]) / size[used]).max(initial=0.0))
-        near = size * max(place, _driven(functionals, constraint.parameters))
-        return units_of_sides(H, h, *found, near)
+        is_used = (size > 0.0) & np.isfinite(h)
+        position = float((np.abs(h[is_used]) / size[is_used]).max(initial=0.0))
+        near = size * max(position, _driven(functionals, constraint.parameters))
+        return units_of_sides(H, h, *reach_and_sums, near)
     box = constraint.index_set
     z = sampled(box.dimension - 1 - constraint.parameters.count)
     indices = np.hstack([np.tile(box.lower[: box.dimension - z.shape[1]], (z.shape[0], 1)), z])
     _, directions, _, heights = constraint.functionals_at(indices)
-    _, added = reaches(functionals, constraint.parameters, control, np.eye(directions.shape[1]), times)
-    added = added + moved.size
-    if (np.abs(directions) @ added).max() <= 1.0 / RESOLVED:  # a sum along c is at most |c| times those along the axes
+    _, sums = reaches(functionals, constraint.parameters, control, np.eye(directions.shape[1]), times)
+    sums = sums + reference.size
+    if (np.abs(directions) @ sums).max() <= 1.0 / RESOLVED:  # a sum along c is at most |c| times those along the axes
         return np.ones(1)
-    reach, added = reaches(functionals, constraint.parameters, control, directions, times)
-    added = added + moved.reach(directions)
+    reach, sums = reaches(functionals, constraint.parameters, control, directions, times)
+    sums = sums + reference.reach(directions)
     near = max(
         np.abs(heights).max(), np.abs(directions).sum(axis=1).max() * _driven(functionals, constraint.parameters)
     )
-    if (THIN * np.minimum(added, near) > 1.0).all():
-        reach = reach + moved.reach(directions)
-        return np.maximum(1.0, power_of_two(np.array([POINT * reach[reach > 0.0].min(initial=added.max())])))
-    return np.maximum(1.0, power_of_two(np.array([RESOLVED * added.max()])))
+    if (THIN * np.minimum(sums, near) > 1.0).all():
+        reach = reach + reference.reach(directions)
+        return np.maximum(1.0, power_of_two(np.array([POINT * reach[reach > 0.0].min(initial=sums.max())])))
+    return np.maximum(1.0, power_of_two(np.array([RESOLVED * sums.max()])))
 
 
 def shortfall(constraints: Sequence[StateConstraint]) -> float:
-    """Of constraints that are divided by their units, the smallest bound or width of a slab that is not 0, in the
-    row's unit, where that is below 1: the unit is then what double precision resolves of a control that goes as far as
-    it may. Else 1."""
+    """Return the smallest bound or width of a slab that is not 0, in the unit of its row, over constraints that are
+    divided by their units; 1 where this is not below 1.
+
+    A value below 1 means that the unit is the resolution of double precision for a control that uses its whole range.
+    """
     least = 1.0
-    for one in constraints:
-        if one.sides is not None:
-            H, h = constraint_sides(one)
+    for constraint in constraints:
+        if constraint.sides is not None:
+            H, h = constraint_sides(constraint)
             sizes = np.minimum(np.where(h != 0.0, np.abs(h), np.inf), np.where((w := widths(H, h)) > 0.0, w, np.inf))
             least = min(least, float(sizes.min(initial=1.0)))
     return least
 
 
 def constraint_sides(constraint: StateConstraint) -> tuple[Array, Array]:
-    """The rows of a constraint with flat sides, those of a mixed one with their part on the control."""
+    """Return the rows of a constraint with flat sides; for a mixed constraint with their part on the control."""
     assert constraint.sides is not None
     H, h = constraint.sides
     return (H if constraint.gains is None else np.hstack([H, constraint.gains])), h
 
 
 def units_of_sides(H: Array, h: Array, reach: Array, added: Array, driven: Array | float = np.inf) -> Array:
-    """The unit ``(r,)`` of rows ``H x <= h``: the least of ``reach (r,)``, ``|h|`` and the width to the opposite row,
-    those of them that are not 0, nor `THIN` beside the sums ``added (r,)``, or beside what these are without growth
-    and control, ``driven (r,)``; of a row whose width is, ``reach`` alone, since nothing is left to keep
-    away from it. No less than what double precision resolves of these. A power of two, 1.2 to 2.5 times below that."""
-    beside = np.minimum(added, driven)
-    across, thin = widths(H, h), np.where(np.isfinite(added), THIN * beside, 0.0)
+    """Return the unit ``(r,)`` of rows ``H x <= h``: the least of ``reach (r,)``, ``|h|`` and the width to the opposite
+    row.
+
+    The result is a power of two, 1.2 to 2.5 times below this value. The value is never below the resolution of double
+    precision for the sums ``added (r,)``. Left out are numbers that are 0, or below `THIN` times ``added``, or below
+    `THIN` times the sums without growth and control, ``driven (r,)``. For a row whose width is that small, only
+    ``reach`` counts, since nothing is left to keep away from the row.
+    """
+    least_sums = np.minimum(added, driven)
+    across, thin = widths(H, h), np.where(np.isfinite(added), THIN * least_sums, 0.0)
     near = np.where(across > thin, np.stack([np.abs(h), across]), 0.0)
     reach = np.where(across > thin, 1.0, POINT) * reach
     sizes = np.vstack([reach[None], np.where(near > thin, near, 0.0)])
@@ -172,9 +185,9 @@ def units_of_sides(H: Array, h: Array, reach: Array, added: Array, driven: Array
 
 
 def units_of_steps(step: ConvexSet, H: Array, h: Array, control: ConvexSet) -> Array:
-    """The unit ``(r,)`` of each side ``H a <= h`` of the steps of a control in its set: see `units_of_sides`."""
-    far = 2.0 * np.abs(H) @ extent(control)
-    return units_of_sides(H, h, np.minimum(step.reach(H), far), far)
+    """Return the unit ``(r,)`` of each side ``H a <= h`` of the steps of a control in its set (`units_of_sides`)."""
+    largest_steps = 2.0 * np.abs(H) @ extent(control)
+    return units_of_sides(H, h, np.minimum(step.reach(H), largest_steps), largest_steps)
 
 
 def reaches(
@@ -186,37 +199,64 @@ def reaches(
     beside: Array | None = None,
     G: Array | None = None,
 ) -> tuple[Array, Array]:
-    """How far the quantities ``H x(t)`` come from 0 at some times, over the control's set, the worst disturbance and
-    the worst initial state, ``(r,)``, and the largest sum of absolute values from which they are computed, ``(r,)``.
-    ``beside (times, r)`` is added to them, and ``G u`` of any control where there is ``G (r, m)``."""
+    """Return the largest distance of ``H x(t)`` from 0 at some times, and the largest sum of absolute values from which
+    it is computed.
+
+    The largest values are taken over the control's set, the worst disturbance, the worst initial state and the
+    parameters of `looked_at`.
+
+    Parameters
+    ----------
+    functionals : WorstCase
+        The worst-case functionals of the problem.
+    parameters : ParameterIndex
+        The set of the parameters.
+    control : ConvexSet
+        The set of the control.
+    H : array (r, d)
+        The rows on the state.
+    times : array (T,)
+        The times.
+    beside : array (T, r), optional
+        Numbers that are added to ``H x(t)``.
+    G : array (r, m), optional
+        Rows on the control: ``G u`` of any control is added.
+
+    Returns
+    -------
+    reach : array (r,)
+        The largest distances from 0.
+    added : array (r,)
+        The largest sums of absolute values.
+    """
     points, r = looked_at(parameters), H.shape[0]
     shape = (points.shape[0], r, times.size)
     at, p = np.tile(times, shape[0] * r), np.repeat(points, r * times.size, axis=0)
     directions = np.tile(np.repeat(H, times.size, axis=0), (shape[0], 1))
-    up, down, added = (np.zeros(at.size) for _ in range(3))
+    up, down, magnitudes = (np.zeros(at.size) for _ in range(3))
     size = max(1, AT_ONCE // functionals.response.numbers(p.shape[1]))
     for begin in range(0, at.size, size):
-        part = slice(begin, begin + size)
-        free, every, on_noise = functionals.response.weights(at[part], directions[part], p[part])
-        on_control, known = functionals.decided(every), functionals.given(every)
-        rest = free @ functionals.response.initial_state + known
-        up[part], down[part] = (
-            rest + control.support(on_control).sum(axis=1),
-            control.support(-on_control).sum(axis=1) - rest,
+        batch = slice(begin, begin + size)
+        free, on_inputs, on_noise = functionals.response.weights(at[batch], directions[batch], p[batch])
+        on_control, known_effect = functionals.decided(on_inputs), functionals.given(on_inputs)
+        offset = free @ functionals.response.initial_state + known_effect
+        up[batch], down[batch] = (
+            offset + control.support(on_control).sum(axis=1),
+            control.support(-on_control).sum(axis=1) - offset,
         )
-        added[part] = np.abs(free) @ np.abs(functionals.response.initial_state)
-        added[part] += np.einsum("klm,ml->k", np.abs(every), np.abs(functionals.known))
-        added[part] += np.abs(on_control @ np.diag(extent(control))).sum(axis=(1, 2))
+        magnitudes[batch] = np.abs(free) @ np.abs(functionals.response.initial_state)
+        magnitudes[batch] += np.einsum("klm,ml->k", np.abs(on_inputs), np.abs(functionals.known))
+        magnitudes[batch] += np.abs(on_control @ np.diag(extent(control))).sum(axis=(1, 2))
         model, initial = functionals.disturbance, functionals.initial
         if initial is not None:
-            up[part] += initial.support(free)
-            down[part] += initial.support(-free)
-            added[part] += np.abs(free) @ extent(initial)
+            up[batch] += initial.support(free)
+            down[batch] += initial.support(-free)
+            magnitudes[batch] += np.abs(free) @ extent(initial)
         if model is not None:
-            up[part] += model.support(on_noise)
-            down[part] += model.support(-on_noise)
-            added[part] += np.abs(on_noise @ np.diag(extent(model.bound))).sum(axis=(1, 2))
-    high, low, sums = (one.reshape(shape).swapaxes(1, 2) for one in (up, down, added))
+            up[batch] += model.support(on_noise)
+            down[batch] += model.support(-on_noise)
+            magnitudes[batch] += np.abs(on_noise @ np.diag(extent(model.bound))).sum(axis=(1, 2))
+    high, low, sums = (values.reshape(shape).swapaxes(1, 2) for values in (up, down, magnitudes))
     if beside is not None:
         high, low, sums = high + beside, low - beside, sums + np.abs(beside)
     if G is not None:
@@ -227,28 +267,29 @@ def reaches(
 
 
 def _driven(functionals: WorstCase, parameters: ParameterIndex) -> float:
-    """How far any state comes from 0 in the whole horizon, in own units, by where it begins, by drift and disturbance,
-    and by one coupling: what no instability has amplified, and no control that need not act."""
+    """Return the largest distance of any state from 0 over the whole horizon, in own units, due to the initial state,
+    drift, disturbance and one coupling. Amplification by an instability is left out, and so is the control, which need
+    not act."""
     response, time = functionals.response, float(functionals.response.grid.breakpoints[-1])
     system = response.system
     A, B, E = _largest([mode.matrices(looked_at(parameters)) for mode in system.forced.modes])
-    far = np.abs(response.initial_state) + time * B[:, system.controls :].sum(axis=1)
+    distances = np.abs(response.initial_state) + time * B[:, system.controls :].sum(axis=1)
     if functionals.initial is not None:
-        far = far + extent(functionals.initial)
+        distances = distances + extent(functionals.initial)
     if functionals.disturbance is not None:
-        far = far + time * E @ extent(functionals.disturbance.bound)
-    return float((far + time * A @ far).max())
+        distances = distances + time * E @ extent(functionals.disturbance.bound)
+    return float((distances + time * A @ distances).max())
 
 
 def _largest(every: Sequence[tuple[Array, Array, Array]]) -> list[Array]:
-    """The absolute entries of ``A``, ``B`` and ``E``, with the drift as one more column of ``B``, at the largest of
-    some parameters and in any of the phases."""
-    return [np.abs(np.concatenate([one[part] for one in every])).max(axis=0) for part in range(3)]
+    """Return the largest absolute entries of ``A``, ``B`` and ``E`` over some parameters and all phases; the drift is a
+    further column of ``B``."""
+    return [np.abs(np.concatenate([matrices[index] for matrices in every])).max(axis=0) for index in range(3)]
 
 
 def fixed(problem: OptimalControlProblem) -> tuple[Array, Array]:
-    """The unit vectors ``(e, d)`` of the states that the terminal equalities fix, in the order of their rows, and the
-    values ``(e,)`` of these states."""
+    """Return the unit vectors ``(e, d)`` of the states that the terminal equalities fix, in the order of their rows,
+    and the values ``(e,)`` of these states."""
     ends = problem.terminal_equalities
     states = np.array([state for end in ends for state in end.fixed], dtype=int)
     values = np.concatenate([np.zeros(0), *(end.values[end.fixed] for end in ends)])
@@ -256,17 +297,17 @@ def fixed(problem: OptimalControlProblem) -> tuple[Array, Array]:
 
 
 def added_up(problem: OptimalControlProblem, functionals: WorstCase) -> Array:
-    """The largest sums ``(e,)`` of absolute numbers from which the fixed states are computed."""
-    H, known = fixed(problem)[0], ParameterIndex(None)
+    """Return the largest sums ``(e,)`` of absolute numbers from which the fixed states are computed."""
+    H, no_parameters = fixed(problem)[0], ParameterIndex(None)
     if not H.size:
         return np.zeros(0)
     nominal = functionals if functionals.response.system.parameters is None else functionals.nominal()
-    _, added = reaches(nominal, known, problem.control, H, np.array([problem.horizon]))
-    return added
+    _, sums = reaches(nominal, no_parameters, problem.control, H, np.array([problem.horizon]))
+    return sums
 
 
 def looked_at(parameters: ParameterIndex) -> Array:
-    """A middle parameter and support points along the axes, ``(v, nu)``."""
+    """Return a middle parameter, and support points along the axes and the diagonal, ``(v, nu)``."""
     if parameters.set is None:
         return np.zeros((1, 0))
     axes = np.eye(parameters.count)[: (PARAMETERS - 1) // 2]
@@ -277,12 +318,12 @@ def looked_at(parameters: ParameterIndex) -> Array:
 
 
 def extent(convex: ConvexSet) -> Array:
-    """How far each component of a bounded set comes from 0, ``(d,)``."""
+    """Return the largest absolute value of each component of a bounded set, ``(d,)``."""
     return convex.reach(np.eye(convex.dimension))
 
 
 def window_times(functionals: WorstCase, start: float, stop: float) -> Array:
-    """The ends of a window and some breakpoints between them."""
+    """Return the ends of a window and some breakpoints between them."""
     breaks = functionals.response.grid.breakpoints
     inside = breaks[(breaks > start) & (breaks < stop)]
     chosen = np.unique(np.linspace(0, inside.size - 1, min(inside.size, TIMES - 2)).round().astype(int))
@@ -290,20 +331,21 @@ def window_times(functionals: WorstCase, start: float, stop: float) -> Array:
 
 
 def _widths(convex: ConvexSet) -> Array:
-    """The width of each component of a bounded set; where that is 0, its distance from 0."""
+    """Return the width of each component of a bounded set, or its distance from 0 where the width is 0."""
     axes = np.eye(convex.dimension)
     width = convex.width(axes)
     return np.where(width > 0.0, width, convex.reach(axes))
 
 
 def walls(problem: OptimalControlProblem) -> Array:
-    """The least bound other than 0 that a row or an equality on it alone gives each state; 1 without one."""
+    """Return the least bound other than 0 that a row or an equality gives each state by itself; 1 for a state without
+    one."""
     least = np.full(problem.system.states, np.inf)
-    every = [np.abs(np.where(np.isnan(end.values), 0.0, end.values)) for end in problem.terminal_equalities]
+    bounds = [np.abs(np.where(np.isnan(end.values), 0.0, end.values)) for end in problem.terminal_equalities]
     axes = np.eye(problem.system.states)
     for convex in (*(entry.set for entry in problem.of_states), *problem.terminal_sets):
         with np.errstate(invalid="ignore"):
-            every.append(np.minimum(np.abs(convex.support(axes)), np.abs(convex.support(-axes))))
-    for sizes in every:
+            bounds.append(np.minimum(np.abs(convex.support(axes)), np.abs(convex.support(-axes))))
+    for sizes in bounds:
         least = np.minimum(least, np.where(sizes > 0.0, sizes, np.inf))
     return np.where(np.isfinite(least), least, 1.0)

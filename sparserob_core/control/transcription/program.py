@@ -1,4 +1,4 @@
-"""The program of a posed problem, exactly, whatever its control answers; to answer nothing is the least of it."""
+"""Exact program of a posed problem, whatever its control answers; open loop is the simplest case."""
 
 from __future__ import annotations
 
@@ -49,41 +49,42 @@ IDLE = 1e-15  # of the numbers that are added up, an entry of a row that is roun
 @final
 @dataclass(frozen=True, eq=False)
 class OpenLoop(Acting):
-    """A control that answers nothing: its families have rows of the decision."""
+    """Open-loop control, which answers no measurement: its families have rows of the decision."""
 
     formulation: Formulation = "reduced"
 
     @property
     def answers_by(self) -> None:
-        """None."""
+        """``None``: no policy answers measurements."""
 
     def in_own(self, theirs: Posed, own: Posed, units: Units) -> OpenLoop:
-        """The same: it sees nothing."""
+        """Return this control, which is the same in all units since it uses no measurements."""
         return self
 
     def part(self, posed: Posed) -> Part:
-        """The families of the constraints, and of the sets of controls without flat sides."""
+        """Return the families of the constraints, and of the sets of controls without flat sides."""
         problem, control, functionals = posed.problem, posed.control, posed.functionals
         families = [family_of(constraint) for constraint in posed.constraints]
-        beside = functionals.variables - functionals.coefficients
+        extra = functionals.variables - functionals.coefficients
         for name, convex, places in held_at(problem, control.breakpoints, answering=False):
             if convex.halfspaces() is None:  # sides are rows of the image
-                families.append(ControlConstraint.of(name, convex, places, control, beside).family())
+                families.append(ControlConstraint.of(name, convex, places, control, extra).family())
         if self.formulation == "literal":
             families = [family.literal or family for family in families]
         return Part(families=families, activity=np.outer(problem.counts, control.lengths).ravel())
 
     def from_state(self, model: Transcription, begun: Posed) -> Transcription:
-        """With what does not depend on the state shared, and the families' reduced form alone."""
-        moved = {
-            one.name: replace(_reduced(one), row_units=told.row_units, index_units=told.index_units)
-            for one, told in zip(begun.constraints, model.program.families, strict=False)
+        """Return the program of the same problem from another initial state. Everything that does not depend on this
+        state is shared, and the families are in their reduced form only."""
+        reduced_families = {
+            constraint.name: replace(_reduced(constraint), row_units=family.row_units, index_units=family.index_units)
+            for constraint, family in zip(begun.constraints, model.program.families, strict=False)
         }
         A, b = _equalities(begun)
         program = replace(
             model.program,
             **quadratics(begun.problem, model.control, begun.functionals.variables),
-            families=[moved.get(family.name, family) for family in model.program.families],
+            families=[reduced_families.get(family.name, family) for family in model.program.families],
             A=A if b.size else None,
             b=b if b.size else None,
             errors=final_errors(begun) if b.size else None,
@@ -91,40 +92,41 @@ class OpenLoop(Acting):
         return begun.became(OpenLoop(), program)
 
     def free(self, model: Transcription) -> Transcription:
-        """The same: all that costs is the control itself."""
+        """Return the program as it is: only the control itself has a cost."""
         return model
 
     def telling(self, own: Posed, units: Units) -> Telling:
-        """With the coefficients of the disturbance, which a literal index holds."""
+        """Return the conversion to the user's units, with the units of the disturbance's coefficients that a literal
+        index holds."""
         model = own.functionals.disturbance
         return Telling(units, blocks=np.zeros(0) if model is None else _block_units(model, units))
 
     def units_beside(self, own: Posed, units: Units) -> Array:
-        """None."""
+        """Return an empty array: the decision has no entries after the nominal ones."""
         return np.zeros(0)
 
 
 def transcribed(posed: Posed, acting: Acting) -> Transcription:
-    """The program of a posed problem, without a twin: nominal entries with their cost, bounds and equalities, and the
-    part that it owes to how the control is ``acting``."""
-    problem, control, functionals, part = posed.problem, posed.control, posed.functionals, acting.part(posed)
+    """Return the program of a posed problem, without a twin. It has the nominal entries with their cost, bounds and
+    equalities, and the part that depends on how the control is ``acting``."""
+    problem, control, functionals, acting_part = posed.problem, posed.control, posed.functionals, acting.part(posed)
     A, b = _equalities(posed)
     if posed.rows is not None:
         b = np.where(A.any(axis=1) | (np.abs(b) > TOLERANCE), b, 0.0)  # no control enters, and rounding is missing
     S, lower, upper = _image(posed.held, control, posed.rows)
     if functionals.execution is not None:
         S, lower, upper = _with_sizes(S, lower, upper, functionals)
-    lower, upper = np.concatenate([lower, part.lower]), np.concatenate([upper, part.upper])
-    n = functionals.variables + part.lower.size
+    lower, upper = np.concatenate([lower, acting_part.lower]), np.concatenate([upper, acting_part.upper])
+    n = functionals.variables + acting_part.lower.size
     priced = objective(problem, control, lower.size, n)
-    if part.weights is not None:
-        priced["weights"] = part.weights
-    if part.largest is not None:
-        priced.setdefault("largest", part.largest)
+    if acting_part.weights is not None:
+        priced["weights"] = acting_part.weights
+    if acting_part.largest is not None:
+        priced.setdefault("largest", acting_part.largest)
     errors = None if not b.size else final_errors(posed)
     program = SemiInfiniteProgram(
         n=n,
-        families=part.families,
+        families=acting_part.families,
         errors=errors,
         **priced,
         S=S,
@@ -134,13 +136,13 @@ def transcribed(posed: Posed, acting: Acting) -> Transcription:
         b=b if b.size else None,
         channels=problem.system.controls,
         lengths=np.tile(control.lengths, problem.system.controls),
-        activity=part.activity,
-        spread=part.spread,
-        settle=part.settle,
-        guide=part.guide,
-        among=part.among,
+        activity=acting_part.activity,
+        spread=acting_part.spread,
+        settle=acting_part.settle,
+        guide=acting_part.guide,
+        among=acting_part.among,
     )
-    return posed.became(acting, program, part.feedback)
+    return posed.became(acting, program, acting_part.feedback)
 
 
 def final_errors(posed: Posed) -> Callable[[Array], EqualityErrors]:
@@ -158,56 +160,60 @@ def final_errors(posed: Posed) -> Callable[[Array], EqualityErrors]:
         sizes = np.maximum(np.abs(values), nominal_sizes(nominal, x, H))
         share = np.where(sizes > 0.0, sizes, 1.0)
         rows, heights = H / share[:, None], values / share
-        both = np.vstack([rows, -rows]), np.append(heights, -heights)
-        constraint = FlatConstraint(EQUALS, nominal, *both, *ends, ParameterIndex(None))
-        missed = float(constraint.enclosure(x, horizon[None], horizon[None]).bounds[0])
-        missed = missed if (sizes > 0.0).any() else 0.0
+        sides = np.vstack([rows, -rows]), np.append(heights, -heights)
+        constraint = FlatConstraint(EQUALS, nominal, *sides, *ends, ParameterIndex(None))
+        error = float(constraint.enclosure(x, horizon[None], horizon[None]).bounds[0])
+        error = error if (sizes > 0.0).any() else 0.0
         system, end = posed.functionals.response.system, posed.problem.horizon
         advice = (
-            f"the fixed final states may be missed by up to {missed:.1e} of their sizes, {TOLERANCE:g} is excused;"
+            f"the fixed final states may be missed by up to {error:.1e} of their sizes, {TOLERANCE:g} is excused;"
             f" {hindrance(system, end) or 'wider final sets would help'}"
         )
-        return EqualityErrors(missed * sizes / unit, TOLERANCE * sizes / unit, advice)
+        return EqualityErrors(error * sizes / unit, TOLERANCE * sizes / unit, advice)
 
     return errors
 
 
 def held_nominally(problem: OptimalControlProblem) -> OptimalControlProblem:
-    """A problem with the ranges of its controls alone, of all that its own or their final values are held in: what
-    else is asked of a control that answers is asked of it for every deviation."""
+    """Return a problem in which the ranges of the controls are the only bounds of the control, and terminal sets
+    without equalities the only ones of the final state. All other requirements on a control that answers hold for every
+    deviation."""
     ranged = Box(*ranges(problem.control))
     return replace(problem, control=ranged, control_step=None, terminal=problem.terminal_sets)
 
 
 def way_back(theirs: Posed, own: Transcription, units: Units) -> tuple[Array, Array, Array]:
-    """What one of every entry of a decision ``(n,)``, of its image ``(k,)`` and of every equality ``(e,)`` in own units
-    is in the user's."""
+    """Return the factors from own units to the user's units for every entry of a decision ``(n,)``, of its image
+    ``(k,)``, and for every equality ``(e,)``."""
     rows, pieces, controls = own.rows, own.control.pieces, units.controls
     assert rows is not None
-    slants, slanting = (slanted(one.held.control)[0] for one in (theirs, own))
+    slants, slanting = (slanted(posed.held.control)[0] for posed in (theirs, own))
     sides = ratios(slants, slanting / rows.sides[:, None], controls)
-    steps, mine = (Steps.of(one.held, one.control) for one in (theirs, own))
-    changes = np.repeat(ratios(steps.H, mine.divided(rows.steps).H, controls), steps.times.size)
-    beside = own.acting.units_beside(own, units)
+    steps, own_steps = (Steps.of(posed.held, posed.control) for posed in (theirs, own))
+    changes = np.repeat(ratios(steps.H, own_steps.divided(rows.steps).H, controls), steps.times.size)
+    extra_units = own.acting.units_beside(own, units)
     sizes = [] if own.functionals.execution is None else [np.repeat(controls, pieces)]  # bounded from both sides
-    decision = np.concatenate([np.repeat(controls, own.control.functions), *sizes, beside])
-    image = np.concatenate([np.repeat(np.concatenate([controls, sides]), pieces), changes, *2 * sizes, beside])
+    decision = np.concatenate([np.repeat(controls, own.control.functions), *sizes, extra_units])
+    image = np.concatenate([np.repeat(np.concatenate([controls, sides]), pieces), changes, *2 * sizes, extra_units])
     return decision, image, fixed(theirs.held)[0] @ units.states * rows.fixed
 
 
 def held_units(posed: Posed, ranged: ConvexSet) -> RowUnits:
-    """The units of the rows of the nominal decision, where the control is ``ranged`` in a set. Equalities hold to
-    rounding only: where no control enters a row, what is missing is compared with what double precision resolves."""
-    added = added_up(replace(posed.held, control=ranged), posed.functionals)
-    entered = np.abs(_ends(posed.held, posed.functionals, posed.parameters)[0]).max(axis=1, initial=0.0) > IDLE * added
+    """Return the units of the rows of the nominal decision, where the control is ``ranged`` in a set. Equalities hold
+    up to rounding only: where no control enters a row, its residual is compared with the resolution of double
+    precision."""
+    sums = added_up(replace(posed.held, control=ranged), posed.functionals)
+    is_controlled = (
+        np.abs(_ends(posed.held, posed.functionals, posed.parameters)[0]).max(axis=1, initial=0.0) > IDLE * sums
+    )
     H, h = slanted(ranged)
     sides = units_of_sides(H, h, ranged.reach(H), np.abs(H) @ extent(ranged)) if h.size else h
-    ends = power_of_two(np.where(entered, 1.0, RESOLVED) * added)
-    return RowUnits(sides, _step_units(posed.held, ranged), ends, entered)
+    ends = power_of_two(np.where(is_controlled, 1.0, RESOLVED) * sums)
+    return RowUnits(sides, _step_units(posed.held, ranged), ends, is_controlled)
 
 
 def _step_units(problem: OptimalControlProblem, ranged: ConvexSet) -> Array:
-    """The unit ``(r,)`` of every row of the control's steps, the least of those of its two sides."""
+    """Return the unit ``(r,)`` of every row of the control's steps: the smaller one of the units of its two sides."""
     H, lower, upper = paired(problem.control_step, problem.system.controls)
     if problem.control_step is None or not upper.size:
         return upper
@@ -216,7 +222,7 @@ def _step_units(problem: OptimalControlProblem, ranged: ConvexSet) -> Array:
 
 
 def _block_units(model: DisturbanceModel, units: Units) -> Array:
-    """What one of every coefficient of a disturbance's blocks is in the user's units."""
+    """Return one unit of every coefficient of a disturbance's blocks, in the user's units."""
     if model.scale is not None:
         return np.ones(model.block_count * model.set.dimension)
     return np.tile(np.repeat(units.disturbances, model.set.dimension // model.channels), model.block_count)
@@ -225,8 +231,9 @@ def _block_units(model: DisturbanceModel, units: Units) -> Array:
 def _image(
     problem: OptimalControlProblem, dictionary: Dictionary, rows: RowUnits | None
 ) -> tuple[csc_array | None, Array, Array]:
-    """The control on every piece, its bounds, one more image per piece and side of a polytope, and one per
-    step and side of the set of its changes."""
+    """Return the matrix of the image, and its bounds. The image is the control on every piece, then one entry per piece
+    and side of a polytope, and one per step and side of the set of its changes. The matrix is ``None`` where it is the
+    identity."""
     from scipy.sparse import csc_array, eye_array, kron, vstack
 
     bound, channels = problem.control, problem.system.controls
@@ -246,63 +253,63 @@ def _image(
     blocks += [kron(csc_array(H), values)] if h.size else []
     blocks += [steps.rows] if steps.count else []
     S = csc_array(vstack(blocks))
-    extra, (least, most) = np.repeat(h, dictionary.pieces), steps.bounds()
+    extra, (step_lower, step_upper) = np.repeat(h, dictionary.pieces), steps.bounds()
     return (
         S,
-        np.concatenate([lower, np.full(extra.size, -np.inf), least]),
-        np.concatenate([upper, extra, most]),
+        np.concatenate([lower, np.full(extra.size, -np.inf), step_lower]),
+        np.concatenate([upper, extra, step_upper]),
     )
 
 
 def _with_sizes(
     S: csc_array | None, lower: Array, upper: Array, functionals: WorstCase
 ) -> tuple[csc_array, Array, Array]:
-    """The images of `_image` where the decision goes on with a bound ``a`` of the size of every value ``s`` of the
-    control, and those that make it one: ``0 <= a - s``, ``0 <= a + s``, neither more than twice as far as ``s`` goes,
-    which ``a = |s|`` is not."""
+    """Return the images of `_image` for a decision that continues with a bound ``a`` of the size of every value ``s``
+    of the control. Further images hold ``0 <= a - s`` and ``0 <= a + s``. Both are at most twice the largest ``|s|``,
+    which ``a = |s|`` never exceeds."""
     from scipy.sparse import block_array, csc_array, eye_array
 
     assert functionals.execution is not None
     image = eye_array(functionals.coefficients, format="csc") if S is None else S
     values, sizes = image[: functionals.execution.size], eye_array(functionals.execution.size, format="csc")
-    far = 2.0 * np.maximum(np.abs(lower), np.abs(upper))[: functionals.execution.size]
-    none = np.zeros(far.size)
+    limits = 2.0 * np.maximum(np.abs(lower), np.abs(upper))[: functionals.execution.size]
+    none = np.zeros(limits.size)
     return (
         csc_array(block_array([[image, None], [-values, sizes], [values, sizes]])),
         np.concatenate([lower, none, none]),
-        np.concatenate([upper, far, far]),
+        np.concatenate([upper, limits, limits]),
     )
 
 
 def ranges(bound: ConvexSet) -> tuple[Array, Array]:
-    """Between what every control ``(m,)`` of a set of them lies."""
+    """Return the least and the largest value of each control in a set of controls, ``(m,)`` each."""
     axes = np.eye(bound.dimension)
     return -bound.support(-axes), bound.support(axes)
 
 
 def slanted(bound: ConvexSet) -> tuple[Array, Array]:
-    """The sides ``(H (r, m), h (r,))`` of a set of controls that bound several of them together; none for a box or a
-    curved set."""
+    """Return the sides ``(H (r, m), h (r,))`` of a set of controls that bound several controls together; none for a box
+    or a curved set."""
     flat = bound.halfspaces()
     if flat is None:
         return np.zeros((0, bound.dimension)), np.zeros(0)
-    several = np.count_nonzero(flat[0], axis=1) > 1
-    return flat[0][several], flat[1][several]
+    is_slanted = np.count_nonzero(flat[0], axis=1) > 1
+    return flat[0][is_slanted], flat[1][is_slanted]
 
 
 def _equalities(posed: Posed) -> tuple[Array, Array]:
-    """Terminal equalities as rows of the decision, in their units."""
+    """Return the terminal equalities as rows of the decision, in their units."""
     A, b = _ends(posed.held, posed.functionals, posed.parameters)
     return (A, b) if posed.rows is None else posed.rows.equalities(A, b)
 
 
 def _ends(problem: OptimalControlProblem, functionals: WorstCase, parameters: ParameterIndex) -> tuple[Array, Array]:
-    """Terminal equalities as rows; refused where the uncertainty reaches the state, since nothing could then satisfy
-    them."""
+    """Return the terminal equalities as rows of the decision. Raise `InputError` where the uncertainty reaches a fixed
+    state, since no control could then satisfy the equality."""
     A, b = [np.zeros((0, functionals.variables))], [np.zeros(0)]
     middle = parameters.middle[None]
-    (directions, values), added = fixed(problem), added_up(problem, functionals)
-    for up, value, size in zip(directions, values, added, strict=True):
+    (directions, values), sums = fixed(problem), added_up(problem, functionals)
+    for up, value, size in zip(directions, values, sums, strict=True):
         time = np.array([problem.horizon])
         G, offset = functionals.rows(time, up[None], middle)
         sigma = functionals.offsets(time, up[None], middle) + functionals.offsets(time, -up[None], middle)
@@ -318,30 +325,30 @@ def _ends(problem: OptimalControlProblem, functionals: WorstCase, parameters: Pa
 
 
 def _reached(problem: OptimalControlProblem, parameters: ParameterIndex, state: int) -> bool:
-    """Whether an uncertain entry of the system may reach a state: follow the entries of ``A`` that are not exactly 0,
-    over all parameters."""
+    """Return whether an uncertain entry of the system may reach a state, over all parameters. The function follows the
+    entries of ``A`` that are not exactly 0."""
     if parameters.set is None:
         return False
     system, box = problem.system.forced, parameters.box
     try:
         middle, radius = (box.lower + box.upper) / 2, (box.upper - box.lower) / 2
-        every = [mode.taylor(TaylorSpace(parameters.count, 1), middle, radius) for mode in system.modes]
+        expansions = [mode.taylor(TaylorSpace(parameters.count, 1), middle, radius) for mode in system.modes]
     except NotEnclosable:
         return True
-    counted = (0, 2) if problem.disturbance is None else (0, 2, 4)
-    rows, linked = np.zeros(system.states, dtype=bool), np.zeros((system.states,) * 2, dtype=bool)
-    for parts in every:  # of systems that take turns, whatever any of them links
-        for k in counted:
-            rows |= np.any(parts[k][1:] != 0, axis=(0, 2)) | np.any(parts[k + 1] != 0, axis=1)
-        linked |= np.any(parts[0] != 0, axis=0) | (parts[1] != 0)
-    reaching = np.arange(system.states) == state
+    indices = (0, 2) if problem.disturbance is None else (0, 2, 4)
+    is_uncertain, is_linked = np.zeros(system.states, dtype=bool), np.zeros((system.states,) * 2, dtype=bool)
+    for expansion in expansions:  # of systems that take turns, whatever any of them links
+        for k in indices:
+            is_uncertain |= np.any(expansion[k][1:] != 0, axis=(0, 2)) | np.any(expansion[k + 1] != 0, axis=1)
+        is_linked |= np.any(expansion[0] != 0, axis=0) | (expansion[1] != 0)
+    is_reaching = np.arange(system.states) == state
     for _ in range(system.states):
-        reaching = reaching | linked[reaching].any(axis=0)
-    return bool(rows[reaching].any())
+        is_reaching = is_reaching | is_linked[is_reaching].any(axis=0)
+    return bool(is_uncertain[is_reaching].any())
 
 
 def family_of(constraint: StateConstraint) -> ConstraintFamily:
-    """The family of a constraint with its other forms: without the uncertainty, for sampled ones, and with the
+    """Return the family of a constraint with its other forms: without the uncertainty, with samples of it, and with the
     disturbance as an index."""
 
     def sample(count: int, rng: np.random.Generator) -> ConstraintFamily:
@@ -357,10 +364,10 @@ def family_of(constraint: StateConstraint) -> ConstraintFamily:
         )
 
         disturbances = None if model is None else sample_disturbances(model, count, rng)
-        drawn = sample_parameters(constraint.parameters.set, count, rng)
+        parameters = sample_parameters(constraint.parameters.set, count, rng)
         bound = constraint.functionals.initial
-        begun = None if bound is None else bound.sample(count, rng)
-        return ScenarioConstraint(constraint, *sides, disturbances, drawn, begun).family()
+        initial_states = None if bound is None else bound.sample(count, rng)
+        return ScenarioConstraint(constraint, *sides, disturbances, parameters, initial_states).family()
 
     model, reduced = constraint.functionals.disturbance, _reduced(constraint)
     literal = reduced if model is None else LiteralConstraint(constraint, model).family(reduced)

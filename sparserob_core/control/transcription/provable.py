@@ -1,4 +1,4 @@
-"""What stands against a proof, in words: known before anything is solved, or seen where a proof does not advance."""
+"""Obstacles to a proof, in words: known before anything is solved, or noticed where a proof does not advance."""
 
 from __future__ import annotations
 
@@ -24,17 +24,21 @@ NOTABLE = 10.0  # logarithm of a growth from which rounding may be what hinders 
 
 
 def unprovable(problem: OptimalControlProblem) -> str | None:
-    """Why no control of a problem can ever be certified, whatever the method; ``None`` where nothing is known to stand
-    against it.
+    """Return the reason why no control of a problem can ever be certified, whatever the method; ``None`` where no
+    obstacle is known.
 
     Nothing is solved: this takes milliseconds.
     """
     problem = superposed(problem)  # parameters beside the time are no obstacle
     if problem.measurable is not None and problem.system.parameter_count:
         paths = [entry.set for entry in problem.windows]
-        far = not problem.system.varies
-        if far or any(one.halfspaces() is None for one in (*paths, *problem.terminal_sets)):
-            over = f"uncertain parameters out of reach ({within_reach(problem)})" if far else "sets with curved sides"
+        is_out_of_reach = not problem.system.varies
+        if is_out_of_reach or any(convex.halfspaces() is None for convex in (*paths, *problem.terminal_sets)):
+            over = (
+                f"uncertain parameters out of reach ({within_reach(problem)})"
+                if is_out_of_reach
+                else "sets with curved sides"
+            )
             return (
                 f"{WITHOUT_PROOF}; this problem has {over}. With disturbance_class piecewise_constant it can be proven"
             )
@@ -52,30 +56,32 @@ def unprovable(problem: OptimalControlProblem) -> str | None:
 
 
 def announced(why: str, limited: bool) -> str:
-    """What is said at the beginning of a run that cannot end with a certificate."""
+    """Return the message at the beginning of a run that cannot end with a certificate."""
     ends = "" if limited else f"; the search for a witness ends after {SECONDS:g} s, unless limits.seconds is given"
     return f"{why}{ends}"
 
 
 def remarked(problem: OptimalControlProblem, result: Result, feedback: bool = False) -> Result:
-    """The same result with a word on what its claim rests on that is not proven; nothing is added where there is no
-    claim, or nothing of the kind."""
-    rests = remark(problem, feedback)
-    if not rests or rests in result.message or result.status not in ("certified", "verified"):
+    """Return the same result with a note on the unproven assumptions of its claim. Nothing is added where there is no
+    claim, or no such assumption."""
+    assumptions = remark(problem, feedback)
+    if not assumptions or assumptions in result.message or result.status not in ("certified", "verified"):
         return result
-    return replace(result, message=f"{result.message}; {rests}")
+    return replace(result, message=f"{result.message}; {assumptions}")
 
 
 def remark(problem: OptimalControlProblem, feedback: bool = False) -> str:
-    """What a claim about a problem rests on that is not proven: what sets of others say of themselves, and integrals
-    over the set of measurable disturbances, unless they are enclosed. Empty where there is nothing of the kind."""
-    kinds = sorted({one.kind for one in strangers(problem)})
-    said = f"what sets of the kind {', '.join(kinds)} say of themselves is believed" if kinds else ""
-    return "; ".join(filter(None, [said, _of_integrals(problem, feedback)]))
+    """Return the unproven assumptions of a claim about a problem; empty where there are none. They are the properties
+    that sets of plugins state of themselves, and the accuracy of integrals over the set of measurable disturbances,
+    unless these are enclosed."""
+    kinds = sorted({convex.kind for convex in strangers(problem)})
+    assumption = f"what sets of the kind {', '.join(kinds)} say of themselves is believed" if kinds else ""
+    return "; ".join(filter(None, [assumption, _of_integrals(problem, feedback)]))
 
 
 def _of_integrals(problem: OptimalControlProblem, feedback: bool) -> str:
-    """That of the integrals over measurable disturbances. Under ``feedback`` the checker proves it."""
+    """Return the assumption about the integrals over measurable disturbances. Under ``feedback`` the checker proves
+    it."""
     if problem.measurable is None:
         return ""
     if feedback:
@@ -92,16 +98,16 @@ def _of_integrals(problem: OptimalControlProblem, feedback: bool) -> str:
 
 
 def growth(system: System, horizon: float) -> float:
-    """By which power of ``e`` the state can grow over the horizon: the largest real part of an eigenvalue of ``A(p)``,
-    at a lattice of parameters, times the horizon; 0 where nothing grows."""
+    """Return the exponent of ``e`` by which the state can grow over the horizon: the largest real part of an eigenvalue
+    of ``A(p)``, at a lattice of parameters, times the horizon; 0 where nothing grows."""
     points = ParameterIndex(system.parameters).lattice()[0]
     rate = max(float(np.linalg.eigvals(mode.matrices(points)[0]).real.max()) for mode in system.modes)
     return max(0.0, rate * horizon)
 
 
 def hindrance(system: System, horizon: float) -> str:
-    """What of a system keeps the bounds of a cell wide however small the cell is, and what would help; empty where it
-    is not the system."""
+    """Return the property of a system that keeps the bounds of a cell wide however small the cell is, and what would
+    help; empty where the system is not the cause."""
     exponent = growth(system, horizon)
     if exponent < NOTABLE:
         return ""

@@ -32,14 +32,14 @@ SHORT = 0.5  # the norm of F h up to which W is read off one exponential
 
 @dataclass(frozen=True, eq=False)
 class QuadraticCost:
-    """``u'P u / 2 + q'u + constant`` in the control's values on its pieces, channel-major ``(m K,)``."""
+    """Quadratic cost ``u'P u / 2 + q'u + constant`` in the control's values on its pieces, channel-major ``(m K,)``."""
 
     P: csc_array
     q: Array
     constant: float
 
     def on(self, dictionary: Dictionary) -> QuadraticCost:
-        """The same cost in the coefficients of a dictionary, ``(m N,)``."""
+        """Return the same cost in the coefficients of a dictionary, ``(m N,)``."""
         if dictionary.is_indicators:
             return self
         from scipy.sparse import csc_array, eye_array, kron
@@ -49,18 +49,25 @@ class QuadraticCost:
         return QuadraticCost(csc_array((P + P.T) / 2), np.asarray(V @ self.q), self.constant)
 
     def largest(self, reach: Array) -> float:
-        """Its largest value at a control that stays 0, or stays at ``+-reach_i`` in one of the ``m`` channels."""
-        held = np.kron(np.diag(reach), np.ones(self.q.size // reach.size))
-        bent, slope = np.einsum("ik,ik->i", held, held @ self.P) / 2, np.abs(held @ self.q)
-        return float(max(self.constant, self.constant + (bent + slope).max()))
+        """Return the largest value of the cost at a control that stays 0, or stays at ``+-reach_i`` in one of the ``m``
+        channels."""
+        held_controls = np.kron(np.diag(reach), np.ones(self.q.size // reach.size))
+        quadratic, slope = (
+            np.einsum("ik,ik->i", held_controls, held_controls @ self.P) / 2,
+            np.abs(held_controls @ self.q),
+        )
+        return float(max(self.constant, self.constant + (quadratic + slope).max()))
 
 
 @dataclass(frozen=True, eq=False)
 class NominalPieces:
-    """What every piece of time does to the nominal ``z = (x - r, 1, u)``, one of ``q`` different pieces each:
-    ``which (L,)``, ``acts (L,)`` the piece of the control that acts on it, -1 where none does yet,
-    ``flow (q, d + 1 + m, d + 1 + m)`` and ``weight`` of the same shape, the matrix ``W``. ``start (d + 1,)``;
-    ``end (d + 1, d + 1)``: the cost of the final state."""
+    """Effect of every piece of time on the nominal ``z = (x - r, 1, u)``, for ``q`` different pieces.
+
+    ``which (L,)``: the kind of each piece of time. ``acts (L,)``: the piece of the control that acts on it, -1 where
+    none acts yet. ``flow (q, d + 1 + m, d + 1 + m)``: the transition of ``z``; ``weight``, of the same shape: the
+    matrix ``W``. ``start (d + 1,)``: the initial ``(x - r, 1)``. ``end (d + 1, d + 1)``: the matrix of the cost of the
+    final state.
+    """
 
     which: np.ndarray
     acts: np.ndarray
@@ -71,10 +78,10 @@ class NominalPieces:
 
 
 def nominal_pieces(problem: OptimalControlProblem, breakpoints: Array) -> NominalPieces:
-    """The nominal trajectory of a problem whose control changes at ``breakpoints (K + 1,)``, and what it costs."""
+    """Return the nominal trajectory of a problem whose control changes at ``breakpoints (K + 1,)``, and its cost."""
     system, (state, _, final) = problem.system, problem.cost.terms
     d, m, horizon = system.states, system.controls, float(breakpoints[-1])
-    given = np.zeros(m) if problem.initial_control is None else np.asarray(problem.initial_control, dtype=float)
+    first_control = np.zeros(m) if problem.initial_control is None else np.asarray(problem.initial_control, dtype=float)
     grid = grid_of(problem, breakpoints, np.array([0.0, horizon]))
     parameter = np.zeros(0) if system.parameters is None else nominal_point(system.parameters)
     modes = [[matrix[0] for matrix in mode.matrices(parameter[None])] for mode in system.forced.modes]
@@ -85,33 +92,38 @@ def nominal_pieces(problem: OptimalControlProblem, breakpoints: Array) -> Nomina
         M[:d, :d] = state.Q
     if system.varies:
         propagator = Propagator(system.at(parameter).forced, grid)
-        which, (flows, weights) = np.arange(grid.pieces), _in_time(propagator, reference, noise, given, M)
+        kind_of_piece, (flows, weights) = (
+            np.arange(grid.pieces),
+            _in_time(propagator, reference, noise, first_control, M),
+        )
     else:
-        which, flows, weights = _by_kind(grid, modes, reference, noise, given, M)
+        kind_of_piece, flows, weights = _by_kind(grid, modes, reference, noise, first_control, M)
     end = np.zeros((d + 1, d + 1))
     if final is not None:
-        away = np.hstack([np.eye(d), (reference - final.reference)[:, None]])
-        end = away.T @ final.Q @ away
+        final_deviation = np.hstack([np.eye(d), (reference - final.reference)[:, None]])
+        end = final_deviation.T @ final.Q @ final_deviation
     begin = np.asarray(problem.initial_state, dtype=float)
     if problem.initial_set is not None:
         begin = begin + nominal_point(problem.initial_set)
     start = np.append(begin - reference, 1.0)
-    return NominalPieces(which, grid.control_piece, flows, weights, start, end)
+    return NominalPieces(kind_of_piece, grid.control_piece, flows, weights, start, end)
 
 
 def _by_kind(
     grid: TimeGrid, modes: Sequence[Sequence[Array]], reference: Array, noise: Array, given: Array, M: Array
 ) -> tuple[np.ndarray, Array, Array]:
-    """Which of a few kinds every piece is of, ``(L,)``, and the flows and weights of these, `NominalPieces`."""
+    """Return the kind of every piece ``(L,)``, and the flows and weights of each kind (`NominalPieces`). Pieces of one
+    kind have the same length and the same phase, and the control acts on all of them or on none."""
     d, m = reference.size, given.size
     decided, mode = grid.control_piece >= 0, grid.modes
-    kinds, which = np.unique(
+    kinds, kind_of_piece = np.unique(
         np.column_stack([np.round(grid.lengths / float(grid.breakpoints[-1]), 13), decided, mode]),
         axis=0,
         return_inverse=True,
     )
-    which = which.reshape(-1)
-    means = np.bincount(which, grid.lengths) / np.bincount(which)  # the rounding of equal pieces must not add up
+    kind_of_piece = kind_of_piece.reshape(-1)
+    # the rounding of equal pieces must not add up
+    means = np.bincount(kind_of_piece, grid.lengths) / np.bincount(kind_of_piece)
     flows, weights = [], []
     for length, (_, acting, number) in zip(means, kinds, strict=True):
         F, (A, B, E) = np.zeros_like(M), modes[int(number)]
@@ -121,24 +133,28 @@ def _by_kind(
         flow, weight = _integrated(F, M, float(length))
         flows.append(flow)
         weights.append(weight)
-    return which, np.stack(flows), np.stack(weights)
+    return kind_of_piece, np.stack(flows), np.stack(weights)
 
 
 def _in_time(propagator: Propagator, reference: Array, noise: Array, given: Array, M: Array) -> tuple[Array, Array]:
-    """Flows and weights of every piece of a system that changes with time, ``(L, ...)`` each: the integrals by Gauss'
-    rule between the times at which it is another polynomial."""
+    """Return the flows and weights of every piece of a system that changes with time, ``(L, ...)`` each. The integrals
+    use Gauss' rule between the times at which the system becomes another polynomial."""
     grid, expansion, d = propagator.grid, propagator.expansion, reference.size
     assert expansion is not None
     m = M.shape[0] - d - 1
 
     def moved(pieces: np.ndarray, stops: Array) -> Array:
         flow, decided = expansion.flow(grid.breakpoints[pieces], stops), grid.control_piece[pieces] >= 0
-        found = np.tile(np.eye(M.shape[0]), (stops.size, 1, 1))
+        transitions = np.tile(np.eye(M.shape[0]), (stops.size, 1, 1))
         drift = flow.state @ reference - reference + flow.control[:, :, m:].sum(axis=2) + flow.disturbance @ noise
         drift[~decided] += (flow.control[:, :, :m] @ given)[~decided]
-        found[:, :d, :d], found[:, :d, d], found[:, :d, d + 1 :] = flow.state, drift, flow.control[:, :, :m]
-        found[~decided, :d, d + 1 :] = 0.0
-        return found
+        transitions[:, :d, :d], transitions[:, :d, d], transitions[:, :d, d + 1 :] = (
+            flow.state,
+            drift,
+            flow.control[:, :, :m],
+        )
+        transitions[~decided, :d, d + 1 :] = 0.0
+        return transitions
 
     points, shares = np.polynomial.legendre.leggauss(POINTS)
     half = np.diff(propagator.marks)[:, None] / 2
@@ -150,7 +166,8 @@ def _in_time(propagator: Propagator, reference: Array, noise: Array, given: Arra
 
 
 def quadratic_cost(problem: OptimalControlProblem, breakpoints: Array) -> QuadraticCost:
-    """The quadratic terms of a problem's cost as one quadratic in the control's values on its pieces."""
+    """Return the quadratic terms of a problem's cost as one quadratic function of the control's values on its
+    pieces."""
     from scipy.sparse import csc_array, diags_array, kron
 
     (state, control, final), m = problem.cost.terms, problem.system.controls
@@ -171,11 +188,11 @@ def quadratic_cost(problem: OptimalControlProblem, breakpoints: Array) -> Quadra
 
 
 def _of_the_state(pieces: NominalPieces, m: int, size: int) -> tuple[Array, Array, float]:
-    """``P (m K, m K)``, ``q (m K,)`` and the constant of the cost of the state.
+    """Return ``P (m K, m K)``, ``q (m K,)`` and the constant of the cost of the state.
 
-    ``V`` is what the free motion from the start of a piece ``l`` of time costs. Then the whole is
-    ``x_0'V_0 x_0 + sum_l 2 x_l'H_l u_l + u_l'U_l u_l`` with the state ``x_l`` there, by telescoping, and
-    ``x_l = f_l + X_l u`` for the free motion ``f`` and the response ``X`` to the controls before.
+    ``V`` is the cost of the free motion from the start of a piece ``l`` of time. By telescoping, the whole cost is
+    ``x_0'V_0 x_0 + sum_l 2 x_l'H_l u_l + u_l'U_l u_l`` with the state ``x_l`` at the start of piece ``l``. There ``x_l
+    = f_l + X_l u`` for the free motion ``f`` and the response ``X`` to the controls before.
     """
     L, e, K = pieces.which.size, pieces.start.size, size // m
     free, forced = pieces.flow[:, :e, :e], pieces.flow[:, :e, e:]
@@ -209,7 +226,7 @@ def _of_the_state(pieces: NominalPieces, m: int, size: int) -> tuple[Array, Arra
 
 
 def _integrated(F: Array, M: Array, length: float) -> tuple[Array, Array]:
-    """``e^{F h}`` and ``int_0^h e^{F't} M e^{Ft} dt``."""
+    """Return ``e^{F h}`` and ``int_0^h e^{F't} M e^{Ft} dt``."""
     from scipy.linalg import expm
 
     size = F.shape[0]
@@ -217,9 +234,9 @@ def _integrated(F: Array, M: Array, length: float) -> tuple[Array, Array]:
     short = length / 2.0**doublings
     block = np.zeros((2 * size, 2 * size))
     block[:size, :size], block[:size, size:], block[size:, size:] = -F.T, M, F
-    found = expm(block * short)
-    flow = found[size:, size:]
-    weight = flow.T @ found[:size, size:]
+    exponential = expm(block * short)
+    flow = exponential[size:, size:]
+    weight = flow.T @ exponential[:size, size:]
     weight = (weight + weight.T) / 2
     for _ in range(doublings):
         weight = weight + flow.T @ weight @ flow

@@ -33,8 +33,8 @@ if TYPE_CHECKING:
 @final
 @dataclass(frozen=True, eq=False)
 class Feedback:
-    """How the control of a transcribed problem answers what it measures: its ``policy``, what that answers here,
-    ``answers (K, K)``, what it is charged, and the closed ``loop``."""
+    """Feedback of the control of a transcribed problem: its ``policy``, the measurements that each piece answers,
+    ``answers (K, K)``, the cost by which it is chosen, ``charge``, and the closed ``loop``."""
 
     policy: Policy
     answers: np.ndarray
@@ -44,9 +44,9 @@ class Feedback:
 
 @dataclass(frozen=True, eq=False)
 class RowUnits:
-    """What the rows of a program in own units were divided by, beside those of its constraints: the slanted ``sides``
-    of the controls, those of their ``steps``, and the terminal equalities, ``fixed (e,)``. ``entered (e,)``: whether a
-    control enters that."""
+    """Divisors of the rows of a program in own units, except for the rows of its constraints: of the ``sides`` that
+    bound several controls together, of the control's ``steps``, and of the terminal equalities, ``fixed (e,)``.
+    ``entered (e,)``: true where the control enters the equality."""
 
     sides: Array
     steps: Array
@@ -54,18 +54,18 @@ class RowUnits:
     entered: Array
 
     def equalities(self, A: Array, b: Array) -> tuple[Array, Array]:
-        """``A x = b`` in these units, without entries that are rounding."""
+        """Return ``A x = b`` in these units. Rows of ``A`` that the control enters by rounding only are set to 0."""
         return np.where(self.entered[:, None], A, 0.0) / self.fixed[:, None], b / self.fixed
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Posed:
-    """A problem on its dictionaries, with what its state does, before it is a program.
+    """Problem on its dictionaries, with the responses of its state, before it becomes a program.
 
-    ``held``: the same problem with those bounds and equalities alone that are rows of the nominal decision, whatever
-    the control answers. ``constraints`` are the path and terminal constraints, named and ordered as the families of
-    the program will be; terminal equalities are not among them. ``functionals`` are what every family is built from.
-    ``rows``: what rows are divided by, in own units.
+    ``held``: the same problem with only those bounds and equalities that become rows of the nominal decision, whatever
+    the control answers. ``constraints`` are the path and terminal constraints, named and ordered as the families of the
+    program will be; terminal equalities are not among them. ``functionals``: the worst-case functionals from which
+    every family is built. ``rows``: the divisors of rows, in own units.
     """
 
     problem: OptimalControlProblem
@@ -83,16 +83,20 @@ class Posed:
         return self.functionals.response
 
     def became(self, acting: Acting, program: SemiInfiniteProgram, feedback: Feedback | None = None) -> Transcription:
-        """The program that it became, by a control that acts so."""
-        parts = {each.name: getattr(self, each.name) for each in fields(Posed)}
-        return Transcription(**parts, acting=acting, program=program, feedback=feedback)
+        """Return the transcription of this problem: the ``program`` that it became for a control that is ``acting``
+        so."""
+        values = {entry.name: getattr(self, entry.name) for entry in fields(Posed)}
+        return Transcription(**values, acting=acting, program=program, feedback=feedback)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Part:
-    """What a program owes to how its control acts: the ``families``, and entries of the decision beside the nominal
-    ones, with their bounds ``lower`` and ``upper (k,)``. ``weights (n,)`` are the prices where other entries than the
-    nominal ones are charged, ``largest`` is then the largest cost; the rest is as in a `SemiInfiniteProgram`."""
+    """Part of a program that depends on how its control acts: the ``families``, and further entries of the decision
+    after the nominal ones, with their bounds ``lower`` and ``upper (k,)``.
+
+    ``weights (n,)`` are the prices where other entries than the nominal ones are charged, and ``largest`` is then the
+    largest cost. The other fields are as in a `SemiInfiniteProgram`.
+    """
 
     families: Sequence[ConstraintFamily]
     lower: Array = field(default_factory=lambda: np.zeros(0))
@@ -108,47 +112,50 @@ class Part:
 
 
 class Acting(ABC):
-    """How a control acts: it answers what it measures, or nothing, which is the least of it. In one set of units."""
+    """Law by which a control acts, in one set of units: feedback from measurements, or open loop, the simplest case."""
 
     formulation: Formulation
-    """What the indices of the families are."""
+    """Formulation that the indices of the families belong to."""
 
     @property
     @abstractmethod
     def answers_by(self) -> Policy | None:
-        """The policy by which it answers; ``None`` where that is nothing."""
+        """Policy by which the control answers measurements; ``None`` in open loop."""
 
     @abstractmethod
     def in_own(self, theirs: Posed, own: Posed, units: Units) -> Acting:
-        """The same in the problem's ``own`` units."""
+        """Return this law in the problem's ``own`` units."""
 
     @abstractmethod
     def part(self, posed: Posed) -> Part:
-        """What the program of a posed problem in these units owes to it."""
+        """Return the part of the program of a posed problem, in these units, that depends on this law."""
 
     @abstractmethod
     def from_state(self, model: Transcription, begun: Posed) -> Transcription:
-        """The program of the same problem from another initial state, told as that of the ``model`` is."""
+        """Return the program of the same problem from another initial state, explained as the program of ``model``
+        is."""
 
     @abstractmethod
     def free(self, model: Transcription) -> Transcription:
-        """The program of a ``model`` that acts so where nothing has a price that needs variables of its own."""
+        """Return the program of a ``model`` with this law in which nothing has a price that needs variables of its
+        own."""
 
     @abstractmethod
     def telling(self, own: Posed, units: Units) -> Telling:
-        """How families in own units are told in the user's."""
+        """Return the conversion of families in own units to the user's units."""
 
     @abstractmethod
     def units_beside(self, own: Posed, units: Units) -> Array:
-        """What one of every entry of a decision that comes after the nominal ones is in the user's units."""
+        """Return one unit of every entry of a decision after the nominal entries, in the user's units."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Transcription(Posed):
-    """A problem on its dictionaries and the semi-infinite program that it became by how its control is ``acting``.
+    """Problem on its dictionaries, with the semi-infinite program into which it was transcribed by how its control is
+    ``acting``.
 
-    ``given``: the problem as it was stated, with its integrals, which are states of ``problem``. ``feedback``: how the
-    control answers what it measures; the decision then begins with the nominal control.
+    ``given``: the problem as the user stated it, with its integrals, which are states of ``problem``. ``feedback``: the
+    feedback of the control, ``None`` in open loop; with feedback, the decision begins with the nominal control.
     """
 
     acting: Acting
@@ -162,9 +169,13 @@ class Transcription(Posed):
     __repr__ = noun
 
     def explained(self, cuts: Sequence[Cut]) -> list[TimedExplanation | None]:
-        """The constraints of a result in numbers, one for each; ``None`` for one whose index does not say them, such as
-        the number of a sample. Made once: what a bound rests on is asked for by whoever rounds it, derives it, seeks
-        another, and writes it down, and a disturbance that does what a measurable one may takes long to compose."""
+        """Return the constraints of a result in numbers, one explanation for each cut; ``None`` for a cut whose index
+        does not contain these numbers, such as the number of a sample.
+
+        Explanations are computed once and remembered. Several callers need the same ones: those that round a bound,
+        derive it, seek another bound, and write it down. To compose a disturbance that has the effect of a measurable
+        one may take long.
+        """
         keys = [(cut.family, cut.formulation, cut.row, cut.index.tobytes()) for cut in cuts]
         fresh = {key: cut for key, cut in zip(keys, cuts, strict=True) if key not in self._explained}
         loop = None if self.feedback is None else self.feedback.loop
@@ -177,51 +188,52 @@ class Transcription(Posed):
 
     @property
     def stated(self) -> OptimalControlProblem:
-        """The problem as it was stated; its states come first among those of ``problem``."""
+        """Problem as the user stated it; its states come first among the states of ``problem``."""
         return self.given or self.problem
 
     @property
     def formulation(self) -> Formulation:
-        """What the indices of the families are."""
+        """Formulation that the indices of the families belong to."""
         return self.acting.formulation
 
     @property
     def policy(self) -> Policy | None:
-        """The policy by which the control answers what it measures; ``None`` for one that answers nothing."""
+        """Policy by which the control answers measurements; ``None`` in open loop."""
         return self.acting.answers_by
 
     @property
     def answering(self) -> Feedback:
-        """The feedback of a control that answers, which is asked for where there is one."""
+        """Feedback of a control that answers measurements; only for a transcription with feedback."""
         assert self.feedback is not None
         return self.feedback
 
     @property
     def observer(self) -> Observer | None:
-        """What makes innovations of outputs; ``None`` where states are measured, or nothing is."""
+        """Observer that makes innovations of outputs; ``None`` where states are measured, or nothing is."""
         return None if self.feedback is None else self.feedback.loop.observer
 
     @property
     def noise(self) -> ConvexSet | None:
-        """The set of the noise of what the control measures and answers; ``None`` where there is none."""
+        """Set of the noise of the measurements that the control answers; ``None`` where there is none."""
         measured = None if self.feedback is None else self.problem.measurements
         return None if measured is None else measured.noise
 
     def pieces(self, theta: Array) -> Array:
-        """The control ``(m, K)`` on the pieces of its dictionary, of a decision ``theta (m, N)`` or ``(m N,)``; under
-        feedback the nominal one."""
+        """Return the control ``(m, K)`` on the pieces of its dictionary, of a decision ``theta (m, N)`` or ``(m N,)``;
+        under feedback the nominal control."""
         return self.control.control(self.nominal(theta))
 
     def nominal(self, decision: Array) -> Array:
-        """The coefficients ``(m N,)`` of the control, or under feedback of the nominal one, in a decision."""
+        """Return the coefficients ``(m N,)`` of the control in a decision, or under feedback those of the nominal
+        control."""
         return np.asarray(decision, dtype=float).ravel()[: self.problem.system.controls * self.control.functions]
 
     def family(self, constraint: StateConstraint) -> ConstraintFamily:
-        """The family of the program that was made of one of the constraints."""
+        """Return the family of the program that was made of one of the constraints."""
         return next(family for family in self.program.families if family.source is constraint)
 
     def constraint(self, family: ConstraintFamily) -> StateConstraint | None:
-        """The constraint on the state that a family was made of, in any formulation, also of an equality that must hold
-        for every deviation; ``None`` for one on the control."""
-        found = family.source.of_state if isinstance(family.source, Source) else None
-        return found if isinstance(found, StateConstraint) else None
+        """Return the constraint on the state from which a family was made, in any formulation, also for an equality
+        that must hold for every deviation; ``None`` for a constraint on the control."""
+        source = family.source.of_state if isinstance(family.source, Source) else None
+        return source if isinstance(source, StateConstraint) else None

@@ -1,5 +1,8 @@
-"""What rounding may do to a lower bound: subtracted before the bound is told, so that whoever derives it anew from its
-multipliers never finds less."""
+"""Effect of rounding on a lower bound.
+
+An upper bound of this effect is subtracted before the bound is reported. A later derivation of the bound from its
+multipliers then never finds a smaller one.
+"""
 
 from __future__ import annotations
 
@@ -25,28 +28,30 @@ UNPROVEN = "nothing is feasible, but the signals that were found for the worst d
 
 
 def rounded_down(model: Transcription, result: Result, tolerance: float | None, prices: Array | None = None) -> Result:
-    """The same result with a lower bound that rounding cannot have raised; no longer ``certified`` where that opens the
-    gap beyond the relative ``tolerance``.
+    """Return the same result with a lower bound that rounding cannot have raised. The result is no longer ``certified``
+    where this opens the gap beyond the relative ``tolerance``.
 
-    A row ``c'x(t) <= b`` is a sum of what the initial state, every piece of the control and every piece of the
-    disturbance bring to ``c'x(t)``. The absolute values of these, at their largest, times the multipliers of the rows
-    and `SHARE`, bound what the rounding of all of them does to the bound (Higham 2002, section 3.1). A piece of the
-    control whose push is below its price by more than that is 0 in the bound, whatever is rounded (`_pushed`). What a
-    multiplier of the wrong sign may be off by is subtracted too (`_neglected`). Transitions are off by a share of their
-    own (`_moving`), and by what a law leaves out of its series in the parameters (`_beyond`). With fewer functions than
-    pieces multipliers of the pieces are off by rounding too (`_slipped`). Signals of measurable disturbances under
-    feedback prove what they lead to, not what they were composed for (`_missed`); where they do not prove that nothing
-    is feasible, that is not claimed. ``prices (n,)`` are those of the decision, where the bound is one of what its
-    sizes cost at them.
+    A row ``c'x(t) <= b`` is a sum of the contributions of the initial state, every piece of the control and every piece
+    of the disturbance to ``c'x(t)``. The absolute values of these contributions, at their largest, times the
+    multipliers of the rows and `SHARE`, bound the effect of all their rounding on the bound (Higham 2002, section 3.1).
+    A piece of the control whose switching function is below its price by more than that contributes 0 to the bound,
+    whatever is rounded (`_pushed`).
+
+    Further errors are subtracted as well. A multiplier of the wrong sign has an error (`_neglected`). Transitions have
+    a relative error (`_moving`), and the truncation error of a law as a series in the parameters (`_beyond`). With
+    fewer functions than pieces, multipliers of the pieces have rounding errors too (`_slipped`). Signals of measurable
+    disturbances under feedback prove only the deviations that they attain, not those that they were composed for
+    (`_missed`); where these do not prove that nothing is feasible, the result does not claim it. ``prices (n,)`` are
+    the prices of the decision, where the bound is the least cost of the sizes of its entries at these prices.
     """
     if result.status == "infeasible" and np.subtract(*_missed(model, result)) >= 0.0:
         return replace(result, status="failed", message=UNPROVEN, infeasible=None, lower_bound=-np.inf)
     if not np.isfinite(result.lower_bound) or result.lower_bound <= 0.0:  # without multipliers 0 is exact
         return result
     share = SHARE + _moving(model)
-    lost = share * (_added(model, result, share, prices) + _quadratic(model, result) + result.lower_bound)
-    lost += _neglected(model, result) + _beyond(model, result) + _missed(model, result)[0] + _slipped(model, result)
-    lowered = max(0.0, result.lower_bound - lost)
+    error = share * (_added(model, result, share, prices) + _quadratic(model, result) + result.lower_bound)
+    error += _neglected(model, result) + _beyond(model, result) + _missed(model, result)[0] + _slipped(model, result)
+    lowered = max(0.0, result.lower_bound - error)
     dual = replace(result.dual, bound=min(result.dual.bound, lowered))
     answer = replace(result, lower_bound=lowered, dual=dual)
     if answer.status != "certified" or tolerance is None or answer.gap <= tolerance + SMALL_GAP:
@@ -56,10 +61,13 @@ def rounded_down(model: Transcription, result: Result, tolerance: float | None, 
 
 
 def _moving(model: Transcription) -> float:
-    """The share that transitions may be off by: of a system that changes with time, what their expansion leaves out;
-    else a rounding for every time in which the system moves by its size, since those over a long time are squares of
-    those over a short one (Moler and Van Loan 2003, method 3). Those of a known one are rounded once, but what rows go
-    through after may cancel as much."""
+    """Return the relative error of transitions. For a system that changes with time it is the truncation error of their
+    expansion.
+
+    Otherwise there is one rounding for every time in which the system moves by its size. Transitions over a long time
+    are squares of transitions over a short one (Moler and Van Loan 2003, method 3). The transitions of a known system
+    are rounded once, but later products with rows may cancel as much.
+    """
     if model.response.system.varies:
         return model.response.propagator.slack
     middle = np.zeros(0) if model.parameters.set is None else model.parameters.set.interior_point()
@@ -68,20 +76,20 @@ def _moving(model: Transcription) -> float:
 
 
 def _added(model: Transcription, result: Result, share: float, prices: Array | None) -> float:
-    """The sum over all rows with a multiplier of multiplier times the numbers that are added up to the row, of which a
-    ``share`` may be lost; ``prices`` as in `rounded_down`."""
+    """Return the sum over all rows with a multiplier of the multiplier times the absolute numbers that are added up to
+    the row. A ``share`` of this sum may be lost by rounding; ``prices`` as in `rounded_down`."""
     middle = model.parameters.middle
-    rows, besides, whole = [], 0.0, prices is not None
-    for cut, said in zip(result.dual.cuts, model.explained(result.dual.cuts), strict=True):
+    rows, extra, uses_prices = [], 0.0, prices is not None
+    for cut, explanation in zip(result.dual.cuts, model.explained(result.dual.cuts), strict=True):
         constraint = model.constraint(model.program.family(cut.family))
-        if said is not None and constraint is not None and cut.multiplier > 0.0:
-            rows.append((cut.multiplier, said.time, said.direction, said.parameter_or(middle)))
-            if said.gain is not None:
-                besides += cut.multiplier * float(np.abs(said.gain) @ _far(model.problem.control))
-            besides += cut.multiplier * float(constraint.reference.reach(said.direction))
-            whole = whole and said.gain is None
+        if explanation is not None and constraint is not None and cut.multiplier > 0.0:
+            rows.append((cut.multiplier, explanation.time, explanation.direction, explanation.parameter_or(middle)))
+            if explanation.gain is not None:
+                extra += cut.multiplier * float(np.abs(explanation.gain) @ _far(model.problem.control))
+            extra += cut.multiplier * float(constraint.reference.reach(explanation.direction))
+            uses_prices = uses_prices and explanation.gain is None
         elif cut.multiplier > 0.0:
-            whole = False
+            uses_prices = False
     for axis, price in zip(fixed(model.problem)[0], result.dual.mu, strict=False):
         rows.append((float(price), model.problem.horizon, axis, middle))
     if not rows:
@@ -90,61 +98,68 @@ def _added(model: Transcription, result: Result, share: float, prices: Array | N
     times, directions, parameters = indices[0], indices[1], indices[2].reshape(len(rows), -1)
     weights = model.response.weights(times, directions, parameters)
     sizes = np.abs(multipliers) @ _beside_control(model, weights, times, directions, parameters)
-    prices = prices if whole and _plain(model, result) else None
-    return float(sizes) + besides + _pushed(model, prices, weights.control, multipliers, share)
+    prices = prices if uses_prices and _plain(model, result) else None
+    return float(sizes) + extra + _pushed(model, prices, weights.control, multipliers, share)
 
 
 def _plain(model: Transcription, result: Result) -> bool:
-    """Whether nothing but rows, the box of every entry of the decision and its price makes the bound."""
+    """Return whether the bound depends only on rows, and on the box and the price of every entry of the decision."""
     finite, m = model.program.finite, model.problem.system.controls
-    whole = finite.S is None and finite.P is None and finite.blocks is None and not finite.q.any()
-    return whole and result.dual.z is None and finite.n == m * model.control.pieces
+    is_plain = finite.S is None and finite.P is None and finite.blocks is None and not finite.q.any()
+    return is_plain and result.dual.z is None and finite.n == m * model.control.pieces
 
 
 def _pushed(model: Transcription, prices: Array | None, weights: Array, multipliers: Array, share: float) -> float:
-    """The numbers that are added up to what rows with ``multipliers (k,)``, of ``weights (k, L, m)``, make of the
-    control, at its largest.
+    """Return the largest sum of absolute contributions of the control to rows with ``multipliers (k,)`` and ``weights
+    (k, L, m)``.
 
-    The bound is the least of ``sum_j (w_j |u_j| + r_j u_j)`` over a box, ``w`` the ``prices`` and ``r`` the sum of the
-    rows. Where it holds 0 it is attained at ``u_j = 0`` for every ``|r_j| <= w_j``: so only entries count whose
-    ``|r_j|`` is not below ``w_j`` by more than a ``share`` of the largest numbers of any in their channel. All of them
-    do where the bound is one of something else, and there are no prices.
+    The bound is the least value of ``sum_j (w_j |u_j| + r_j u_j)`` over a box, with the ``prices`` ``w`` and the sum
+    ``r`` of the rows. Where the box contains 0, the least value is attained at ``u_j = 0`` for every ``|r_j| <= w_j``.
+    So the sum has only entries whose ``|r_j|`` is not below ``w_j`` by more than a ``share`` of the largest numbers in
+    their channel. All entries count where the bound is of another form, and there are no prices.
     """
     sizes = np.tensordot(np.abs(multipliers), _controlled(model, weights), 1)
     if prices is not None:
         grid, finite = model.response.grid, model.program.finite
         functionals, m = model.functionals, model.problem.system.controls
-        push = multipliers @ functionals.on_decision(weights)
-        off = np.abs(multipliers) @ functionals.on_decision(np.abs(weights))
-        off = np.repeat(off.reshape(m, -1).max(axis=1, initial=0.0), model.control.pieces)
-        clear = (np.abs(push) + share * off < prices) & (finite.lower <= 0.0) & (finite.upper >= 0.0)
-        sizes[clear.reshape(m, -1)[:, grid.control_piece[grid.decided]].T] = 0.0
+        switching = multipliers @ functionals.on_decision(weights)
+        magnitudes = np.abs(multipliers) @ functionals.on_decision(np.abs(weights))
+        magnitudes = np.repeat(magnitudes.reshape(m, -1).max(axis=1, initial=0.0), model.control.pieces)
+        is_zero = (np.abs(switching) + share * magnitudes < prices) & (finite.lower <= 0.0) & (finite.upper >= 0.0)
+        sizes[is_zero.reshape(m, -1)[:, grid.control_piece[grid.decided]].T] = 0.0
     return float(sizes.sum())
 
 
 def _beyond(model: Transcription, result: Result) -> float:
-    """What a law leaves out of its series in the parameters, of all rows with a multiplier, at most."""
-    off, lost = model.functionals.beyond(_far(model.problem.control)), 0.0
-    if off.any():
-        for cut, said in zip(result.dual.cuts, model.explained(result.dual.cuts), strict=True):
-            lost += 0.0 if said is None else abs(cut.multiplier) * float(np.abs(said.direction[: off.size]) @ off)
-    return lost
+    """Return an upper bound of the truncation error of a law as a series in the parameters, over all rows with a
+    multiplier."""
+    truncation, error = model.functionals.beyond(_far(model.problem.control)), 0.0
+    if truncation.any():
+        for cut, explanation in zip(result.dual.cuts, model.explained(result.dual.cuts), strict=True):
+            error += (
+                0.0
+                if explanation is None
+                else abs(cut.multiplier) * float(np.abs(explanation.direction[: truncation.size]) @ truncation)
+            )
+    return error
 
 
 def _missed(model: Transcription, result: Result) -> tuple[float, float]:
-    """By how much less the multipliers prove, at most, at the signals of measurable disturbances than at the deviations
-    that these stand for: of every row multiplier times what its signal misses, times what that does to the row, gains
-    at their largest; and what they prove at these deviations of the sum of the rows, without the cost. Without such
-    disturbances, and where rows are samples, 0 and ``inf``.
+    """Return how much the bound falls, at most, at the signals of measurable disturbances instead of the deviations
+    that these signals represent; and the bound that the rows prove at these deviations, without the cost.
 
-    What is missed is not summed with its signs: whoever derives the bound counts gains in other ways.
+    The first number is a sum over rows of the multiplier, times the residual of the row's signal, times the effect of
+    this residual on the row, with gains at their largest. Without such disturbances, and where rows are samples, the
+    numbers are 0 and ``inf``.
+
+    Residuals are not summed with their signs: other derivations of the bound count gains in other ways.
     """
     loop, cuts, finite = None if model.feedback is None else model.feedback.loop, result.dual.cuts, model.program.finite
-    whole = all(cut.formulation == "literal" for cut in cuts)
-    if loop is None or loop.measurable is None or not cuts or not whole:
+    is_literal = all(cut.formulation == "literal" for cut in cuts)
+    if loop is None or loop.measurable is None or not cuts or not is_literal:
         return 0.0, np.inf
     model.explained(cuts)  # all signals are composed at once
-    far, size, lost = np.maximum(np.abs(finite.lower), np.abs(finite.upper)), loop.measurable.size, 0.0
+    magnitudes, size, loss = np.maximum(np.abs(finite.lower), np.abs(finite.upper)), loop.measurable.size, 0.0
     blocks, multipliers, deviations = [], [], []
     for cut in cuts:
         index, w = np.split(cut.index, [cut.index.size - loop.spread.size])
@@ -154,30 +169,35 @@ def _missed(model: Transcription, result: Result) -> tuple[float, float]:
         blocks.append(rows)
         multipliers.append(np.where(np.arange(rows.h.size) == cut.row, cut.multiplier, 0.0))
         deviations.append(np.tile(w, (rows.h.size, 1)))
-        part = int(rows.part[cut.row])
-        off = cut.multiplier * abs(float(rows.factor[cut.row])) * np.abs(w[:size] - loop.measurable.attained(w[:size]))
-        lost += float(off @ (np.abs(rows.d[part]) + abs(rows.C[part]) @ far)[:size])
-    given = finite, blocks, np.concatenate(multipliers), np.vstack(deviations), result.dual.mu
-    bound, added = robust_bound(*given, priced=False)
-    return lost, bound - SHARE * added
+        number = int(rows.part[cut.row])
+        residual = (
+            cut.multiplier * abs(float(rows.factor[cut.row])) * np.abs(w[:size] - loop.measurable.attained(w[:size]))
+        )
+        loss += float(residual @ (np.abs(rows.d[number]) + abs(rows.C[number]) @ magnitudes)[:size])
+    arguments = finite, blocks, np.concatenate(multipliers), np.vstack(deviations), result.dual.mu
+    bound, sums = robust_bound(*arguments, priced=False)
+    return loss, bound - SHARE * sums
 
 
 def added_up(model: Transcription, times: Array, directions: Array, parameters: Array) -> Array:
-    """The numbers ``(k,)`` that are added up to rows ``c'x(t)``, ``directions (k, d)``, at their largest."""
+    """Return the largest sums ``(k,)`` of absolute numbers that are added up to rows ``c'x(t)``, ``directions (k,
+    d)``."""
     weights = model.response.weights(times, directions, parameters)
-    others = _beside_control(model, weights, times, directions, parameters)
-    return np.asarray(others + _controlled(model, weights.control).sum(axis=(1, 2)))
+    sums = _beside_control(model, weights, times, directions, parameters)
+    return np.asarray(sums + _controlled(model, weights.control).sum(axis=(1, 2)))
 
 
 def _controlled(model: Transcription, weights: Array) -> Array:
-    """Those ``(k, J, m)`` that every piece of the control brings, by ``weights (k, L, m)``."""
+    """Return the largest absolute contributions ``(k, J, m)`` of every piece of the control to rows with ``weights (k,
+    L, m)``."""
     return np.asarray(np.abs(model.functionals.decided(weights)) * _far(model.problem.control))
 
 
 def _beside_control(
     model: Transcription, weights: Weights, times: Array, directions: Array, parameters: Array
 ) -> Array:
-    """Those ``(k,)`` beside what the control brings."""
+    """Return the largest sums ``(k,)`` of absolute contributions to rows ``c'x(t)``, without the contribution of the
+    control."""
     functionals, free = model.functionals, np.abs(weights.free)
     sizes = free @ np.abs(model.response.initial_state)
     if model.problem.initial_set is not None:
@@ -190,7 +210,8 @@ def _beside_control(
 
 
 def _disturbing(model: Transcription, on_noise: Array, times: Array, directions: Array, parameters: Array) -> Array:
-    """The numbers ``(k,)`` that are added up to what disturbances do, from the weights ``on_noise (k, L, mw)``."""
+    """Return the largest sums ``(k,)`` of absolute contributions of disturbances, from the weights ``on_noise (k, L,
+    mw)``."""
     if model.problem.disturbance is None:
         return np.zeros(times.size)
     sizes: Array = (np.abs(on_noise) @ _far(model.problem.disturbance)).sum(axis=1)
@@ -201,18 +222,19 @@ def _disturbing(model: Transcription, on_noise: Array, times: Array, directions:
 
 
 def _quadratic(model: Transcription, result: Result) -> float:
-    """The numbers that are added up to the tangent of the quadratic terms, at its largest: where the slope ``P at`` is
-    small because they cancel, as along a flat direction of ``P``, their rounding is not."""
+    """Return the largest sum of absolute numbers that are added up to the tangent of the quadratic terms. The slope ``P
+    at`` may be small because these numbers cancel, as along a flat direction of ``P``; their rounding does not become
+    small."""
     finite, at = model.program.finite, result.dual.at
     if finite.P is None or at is None:
         return 0.0
-    far = _coefficients(model)
-    bent, at, q = (np.abs(model.nominal(each)) for each in (np.asarray(abs(finite.P) @ np.abs(at)), at, finite.q))
-    return float(abs(finite.constant) + 0.5 * at @ bent + (q + bent) @ far)
+    magnitudes = _coefficients(model)
+    slopes, at, q = (np.abs(model.nominal(values)) for values in (np.asarray(abs(finite.P) @ np.abs(at)), at, finite.q))
+    return float(abs(finite.constant) + 0.5 * at @ slopes + (q + slopes) @ magnitudes)
 
 
 def _coefficients(model: Transcription) -> Array:
-    """How far the coefficients of the control come from 0, ``(m N,)``."""
+    """Return the largest absolute value of each coefficient of the control, ``(m N,)``."""
     reach = model.problem.control.reach(np.eye(model.problem.system.controls))
     if model.program.finite.S is None:
         return np.repeat(reach, model.control.pieces)
@@ -220,8 +242,9 @@ def _coefficients(model: Transcription) -> Array:
 
 
 def _slipped(model: Transcription, result: Result) -> float:
-    """What multipliers of the image may be off the slopes that they stand for, times the largest coefficients: the
-    rounding of each sum that makes one of the other (Higham 2002, section 3.1)."""
+    """Return an upper bound of the effect of errors in the multipliers of the image: their difference from the slopes
+    that they represent, times the largest coefficients. The difference is the rounding of the sums that convert one
+    into the other (Higham 2002, section 3.1)."""
     S, z = model.program.finite.S, result.dual.z
     if S is None or z is None:
         return 0.0
@@ -231,31 +254,34 @@ def _slipped(model: Transcription, result: Result) -> float:
 
 
 def _neglected(model: Transcription, result: Result) -> float:
-    """What multipliers of the wrong sign cost on slanted sides ``H u <= h`` of the controls' set, and of that of their
-    steps, at most, with the rounding of what is added up to them.
+    """Return an upper bound of the effect of multipliers of the wrong sign on slanted sides ``H u <= h`` of the
+    controls' set and of the set of their steps, with the rounding of the sums with these multipliers.
 
-    To the program ``s = H u`` has no lower bound, so that only ``z >= 0`` proves anything of ``-z s``; a negative ``z``
-    within its own rounding counts as 0 there. On the set ``-z s`` is at least ``z`` times the largest ``-H u``.
+    In the program, ``s = H u`` has no lower bound, so only ``z >= 0`` proves anything about ``-z s``. A negative ``z``
+    within its own rounding counts as 0 there. On the set, ``-z s`` is at least ``z`` times the largest ``-H u``.
     """
     if result.dual.z is None:
         return 0.0
     (H, h), bound = slanted(model.problem.control), model.problem.control
     controls, pieces = model.problem.system.controls, model.control.pieces
-    sides, others = np.split(result.dual.z[controls * pieces :], [h.size * pieces])
-    lost = float(np.maximum(-sides, 0.0).reshape(h.size, pieces).sum(axis=1) @ np.maximum(bound.support(-H), 0.0))
+    sides, remaining = np.split(result.dual.z[controls * pieces :], [h.size * pieces])
+    error = float(np.maximum(-sides, 0.0).reshape(h.size, pieces).sum(axis=1) @ np.maximum(bound.support(-H), 0.0))
     # of opposite sides of a set without interior multipliers may be as large as they like
-    lost += SHARE * float(np.abs(sides).reshape(h.size, pieces).sum(axis=1) @ (np.abs(H) @ _far(bound)))
+    error += SHARE * float(np.abs(sides).reshape(h.size, pieces).sum(axis=1) @ (np.abs(H) @ _far(bound)))
     steps = Steps.of(model.problem, model.control)
     if steps.count:
-        own = others[: steps.upper.size * steps.times.size]  # what follows bounds sizes from both sides
-        table, far = own.reshape(steps.upper.size, steps.times.size), 2.0 * np.abs(steps.H) @ _far(bound)
-        wrong = np.where(np.isfinite(steps.upper), 0.0, np.maximum(table, 0.0).sum(axis=1))
-        wrong += np.where(np.isfinite(steps.lower), 0.0, np.maximum(-table, 0.0).sum(axis=1))
-        lost += float((wrong + SHARE * np.abs(table).sum(axis=1)) @ far)
-    return lost
+        own = remaining[: steps.upper.size * steps.times.size]  # what follows bounds sizes from both sides
+        step_multipliers, magnitudes = (
+            own.reshape(steps.upper.size, steps.times.size),
+            2.0 * np.abs(steps.H) @ _far(bound),
+        )
+        wrong_signs = np.where(np.isfinite(steps.upper), 0.0, np.maximum(step_multipliers, 0.0).sum(axis=1))
+        wrong_signs += np.where(np.isfinite(steps.lower), 0.0, np.maximum(-step_multipliers, 0.0).sum(axis=1))
+        error += float((wrong_signs + SHARE * np.abs(step_multipliers).sum(axis=1)) @ magnitudes)
+    return error
 
 
 def _far(convex: ConvexSet) -> Array:
-    """How far each component of a bounded set comes from 0, ``(d,)``."""
+    """Return the largest absolute value of each component of a bounded set, ``(d,)``."""
     axes = np.eye(convex.dimension)
     return np.maximum(np.abs(convex.support(axes)), np.abs(convex.support(-axes)))

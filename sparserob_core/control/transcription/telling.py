@@ -1,4 +1,4 @@
-"""What is said in a problem's own units, told in the user's (decision 0016)."""
+"""Reports in the user's units of families in a problem's own units (decision 0016)."""
 
 from __future__ import annotations
 
@@ -16,10 +16,11 @@ from sparserob_core.sip.program import ConstraintFamily, Explanation
 @final
 @dataclass(frozen=True, eq=False)
 class Telling:
-    """How families in own ``units`` are told in the user's, of a control that answers or of one that does not.
+    """Conversion of families in own ``units`` to the user's units, of a control with feedback or in open loop.
 
-    ``blocks``: what one of every coefficient of the disturbance's blocks is in the user's units, which come after the
-    time of a literal index; ``deviations (Q,)``: the same of what answers are to, which end one.
+    ``blocks``: one unit of every coefficient of the disturbance's blocks, in the user's units; these coefficients
+    follow the time in a literal index. ``deviations (Q,)``: one unit of each deviation that the control answers, in the
+    user's units; the deviations are the last entries of a literal index.
     """
 
     units: Units
@@ -27,11 +28,11 @@ class Telling:
     deviations: Array = field(default_factory=lambda: np.zeros(0))
 
     def family(self, own: ConstraintFamily, theirs: ConstraintFamily) -> ConstraintFamily:
-        """A family in own units, in all its forms, that is explained as the user's is."""
+        """Return a family in own units, in all its forms, with the explanations of the user's family."""
         source, user = own.source, theirs.source
         assert isinstance(source, Source) and isinstance(user, Source)
-        (normals, _), (mine, coordinates) = user.normals_in(self.units), source.normals_in(self.units)
-        rows, begins = ratios(normals, mine, coordinates), source.index_units(self.units)
+        (normals, _), (own_normals, coordinates) = user.normals_in(self.units), source.normals_in(self.units)
+        rows, begins = ratios(normals, own_normals, coordinates), source.index_units(self.units)
 
         def told(one: ConstraintFamily, as_theirs: ConstraintFamily) -> ConstraintFamily:
             return self._explained(one, as_theirs, rows, begins)
@@ -41,22 +42,22 @@ class Telling:
             drawn = draw(count, rng)
             if drawn.formulation != "sampled":
                 return told(drawn, theirs)
-            middle, said = (theirs.index_set.lower + theirs.index_set.upper) / 2.0, theirs.explanation
+            middle, explanation = (theirs.index_set.lower + theirs.index_set.upper) / 2.0, theirs.explanation
 
             def explain(index: Array, row: int) -> Explanation:
-                return said(np.append(index[0] * begins[0], middle[1:]), row).of_sample(round(float(index[1])))
+                return explanation(np.append(index[0] * begins[0], middle[1:]), row).of_sample(round(float(index[1])))
 
             return replace(told(drawn, drawn), explain=explain)
 
         def form(one: ConstraintFamily | None, as_theirs: ConstraintFamily | None) -> ConstraintFamily | None:
             return None if one is None or as_theirs is None else told(one, as_theirs)
 
-        draw, whole = own.sample, told(own, theirs)
+        draw, converted = own.sample, told(own, theirs)
         literal = form(own.literal, theirs.literal)
         if literal is not None and literal.reduced is not None:
-            literal = replace(literal, reduced=whole)
+            literal = replace(literal, reduced=converted)
         return replace(
-            whole,
+            converted,
             nominal=form(own.nominal, theirs.nominal),
             literal=literal,
             reduced=form(own.reduced, theirs.reduced),
@@ -66,7 +67,8 @@ class Telling:
     def _explained(
         self, own: ConstraintFamily, theirs: ConstraintFamily, rows: Array, begins: Array
     ) -> ConstraintFamily:
-        """One form of a family, with units of its rows ``rows (r,)`` and of what its reduced indices begin with."""
+        """Return one form of a family, with units of its rows, ``rows (r,)``, and units of the first coordinates of its
+        reduced indices, ``begins``."""
         scale, explain, hindered = self._index(own, begins), theirs.explain, theirs.hindrance
         return replace(
             own,
@@ -79,13 +81,13 @@ class Telling:
         )
 
     def _index(self, own: ConstraintFamily, begins: Array) -> Array:
-        """What one of each coordinate of an index is in the user's units; directions, signs and the numbers of samples
-        have none."""
-        begun, ended = {
+        """Return one unit of each coordinate of an index, in the user's units. Directions, signs and the numbers of
+        samples have no unit: their factor is 1."""
+        leading, trailing = {
             "reduced": (begins, np.zeros(0)),
             "nominal": (begins[:1], np.zeros(0)),
             "literal": (np.concatenate([begins[:1], self.blocks, begins[1:]]), self.deviations),
             "sampled": (begins[:1], np.zeros(0)),
         }[own.formulation]
-        between = np.ones(own.index_set.dimension - begun.size - ended.size)
-        return np.concatenate([begun, between, ended])
+        between = np.ones(own.index_set.dimension - leading.size - trailing.size)
+        return np.concatenate([leading, between, trailing])

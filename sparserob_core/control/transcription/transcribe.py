@@ -1,4 +1,4 @@
-"""From an optimal control problem and two dictionaries to a convex semi-infinite program, exactly."""
+"""Exact transcription of an optimal control problem and two dictionaries into a convex semi-infinite program."""
 
 from __future__ import annotations
 
@@ -44,14 +44,30 @@ def transcribe(
     formulation: Literal["reduced", "literal"] = "reduced",
     policy: Policy | None = None,
 ) -> SemiInfiniteProgram:
-    """The convex semi-infinite program of a problem (the paper's (7)).
+    """Return the convex semi-infinite program of a problem (the paper's (7)).
 
-    The decision is ``theta (m, N)`` raveled; its image ``S theta`` is the control on every piece, channel-major
-    ``(m K,)``. ``disturbance`` defaults to the control's dictionary. ``formulation``: ``reduced`` eliminates the
-    disturbance exactly, by support functions; ``literal`` keeps its coefficients as part of the index. ``policy``: one
-    that answers what is measured, such as an `AffinePolicy`, has its gains after ``theta`` in the decision. The program
-    remembers what it is of, so that `solve` gives it a result like that of its problem; one in which something is
-    replaced does not. Raises `InputError` when a dictionary does not span the horizon.
+    The decision is ``theta (m, N)`` raveled; its image ``S theta`` is the control on every piece, channel-major ``(m
+    K,)``. The program remembers its problem, so that `solve` gives it a result like that of the problem; a program in
+    which something is replaced does not.
+
+    Parameters
+    ----------
+    problem : OptimalControlProblem
+        The problem.
+    control : Dictionary
+        The dictionary of the control.
+    disturbance : Dictionary, optional
+        The dictionary of the disturbance; the control's dictionary by default.
+    formulation : str
+        ``reduced`` eliminates the disturbance exactly, by support functions. ``literal`` keeps its coefficients as part
+        of the index.
+    policy : Policy, optional
+        A policy that answers measurements, such as an `AffinePolicy`. Its gains follow ``theta`` in the decision.
+
+    Raises
+    ------
+    InputError
+        Where a dictionary does not span the horizon.
     """
     if formulation not in ("reduced", "literal"):
         raise InputError(f"formulation: expected reduced or literal, got {formulation!r}")
@@ -73,10 +89,12 @@ def prepare(
     formulation: Literal["reduced", "literal"] = "reduced",
     policy: Policy | None = None,
 ) -> Transcription:
-    """The program of a problem on its dictionaries, with everything that it was made of. Raises `InputError` when a
-    dictionary does not span the horizon, for terminal equalities that no control can meet, or steps that none can take,
-    and for a policy that does not say what it answers, or answers what it cannot know; one that answers nothing is an
-    open loop, as none is."""
+    """Return the transcription of a problem on its dictionaries: its program with everything that it was made of.
+
+    A policy that answers nothing is open loop, as is ``None``. Raises `InputError` where a dictionary does not span the
+    horizon, for terminal equalities that no control can meet, and for steps that no control can take. The error is also
+    raised for a policy that does not say which measurements it answers, or that answers what it cannot know.
+    """
     for name, dictionary in (("control", control), ("disturbance", disturbance)):
         _require_dictionary(name, dictionary)
         if abs(dictionary.horizon - problem.horizon) > 1e-12 * problem.horizon:
@@ -96,7 +114,7 @@ def prepare(
     if problem.execution is not None and mask.any():
         expected = "none under feedback, where the size of the control, and with it that of its error, answers too"
         raise InputError(path="execution", expected=expected, got=f"{np.asarray(problem.execution).tolist()}")
-    held = problem
+    nominal_problem = problem
     if policy is not None and mask.any():
         from sparserob_core.control.transcription import feedback
 
@@ -106,8 +124,8 @@ def prepare(
             raise InputError(
                 f"formulation: expected reduced with a policy that answers what is measured, got {formulation!r}"
             )
-        held = held_nominally(problem)
-    posed = _posed(problem, held, control, disturbance)
+        nominal_problem = held_nominally(problem)
+    posed = _posed(problem, nominal_problem, control, disturbance)
     own = cache(lambda: _in_units(posed))
     acting: Acting = OpenLoop(formulation)
     if policy is not None and mask.any():
@@ -117,9 +135,9 @@ def prepare(
 
 
 def _on_one_grid(problem: OptimalControlProblem, disturbance: Dictionary) -> tuple[OptimalControlProblem, Dictionary]:
-    """The problem with the breakpoints of every disturbance of a list where one has its own, and indicators of the
-    pieces on which all of them are constant; raises `InputError` for a dictionary with fewer functions than pieces
-    beside them."""
+    """Return the problem with the breakpoints of every disturbance of a list, where one has its own, and indicators of
+    the pieces on which all of them are constant. Raise `InputError` for a dictionary with fewer functions than pieces
+    together with such disturbances."""
     if problem.disturbance_breakpoints is None:
         return problem, disturbance
     if not disturbance.is_complete:
@@ -127,8 +145,8 @@ def _on_one_grid(problem: OptimalControlProblem, disturbance: Dictionary) -> tup
             "dictionaries.disturbance: fewer functions than pieces are not proven beside disturbances that have"
             " breakpoints of their own"
         )
-    plain = disturbance.merged().breakpoints
-    own = tuple(plain if times is None else times for times in problem.disturbance_breakpoints)
+    common = disturbance.merged().breakpoints
+    own = tuple(common if times is None else times for times in problem.disturbance_breakpoints)
     joint = distinct_times(np.concatenate(own), problem.horizon)
     return replace(problem, disturbance_breakpoints=own), Dictionary.indicators(joint)
 
@@ -141,7 +159,7 @@ def _functionals(
     if problem.disturbance is not None:
         bound, breakpoints = problem.disturbance, problem.disturbance_breakpoints
         model = disturbance_model(problem.disturbance_class, bound, disturbance, grid, breakpoints)
-    response, begun = Response(system, grid, np.asarray(problem.initial_state, dtype=float)), problem.initial_set
+    response, initial_set = Response(system, grid, np.asarray(problem.initial_state, dtype=float)), problem.initial_set
     execution: Execution | None = None
     if problem.execution is not None:
         from sparserob_core.control.reach.execution import Execution
@@ -149,16 +167,17 @@ def _functionals(
 
         shares, felt = np.asarray(problem.execution), np.ones(problem.system.states)
         felt[list(problem.commanded)] = 0.0
-        given = response, control.breakpoints, shares, felt
-        execution = followed(VaryingExecution(*given)) if system.varies else Execution(*given)
-    functionals = WorstCase(response, control, model, names=problem.names, initial=begun, execution=execution)
+        arguments = response, control.breakpoints, shares, felt
+        execution = followed(VaryingExecution(*arguments)) if system.varies else Execution(*arguments)
+    functionals = WorstCase(response, control, model, names=problem.names, initial=initial_set, execution=execution)
     return functionals, ParameterIndex(problem.system.parameters)
 
 
 def _posed(
     problem: OptimalControlProblem, held: OptimalControlProblem, control: Dictionary, disturbance: Dictionary
 ) -> Posed:
-    """A problem on its dictionaries, in its units, of which so much is ``held`` by rows of the nominal decision."""
+    """Return a problem on its dictionaries, in its units; ``held`` is the part that becomes rows of the nominal
+    decision."""
     functionals, parameters = _functionals(problem, control, disturbance)
     return Posed(
         problem=problem,
@@ -172,78 +191,82 @@ def _posed(
 
 
 def _in_units(posed: Posed, wide: bool = False) -> tuple[Posed, Units]:
-    """The same problem in its own units (decision 0016), every row divided by its own, and these units.
+    """Return the same problem in its own units (decision 0016), with every row divided by its own unit, and these
+    units.
 
-    Where a control may go so far that double precision does not resolve the walls beside it, the units are those of a
-    control that goes as far as that allows, ``wide`` asks for those of its whole range nonetheless.
+    For a control of very large range, double precision may not resolve the bounds of the state. The units are then
+    those of a control with the largest range for which it does. With ``wide`` they are those of the whole range
+    nonetheless.
     """
     controls = np.ones(posed.problem.system.controls)
     own, units = _scaled(posed, controls)
-    short = shortfall(own.constraints)
-    if wide or short >= 1.0:
+    least_share = shortfall(own.constraints)
+    if wide or least_share >= 1.0:
         return own, units
-    share = float(np.exp2(np.floor(np.log2(short)))) / 2.0
+    share = float(np.exp2(np.floor(np.log2(least_share)))) / 2.0
     ranged = _scaled(posed, share * controls)
     if shortfall(ranged[0].constraints) < 1.0:  # what is too fine is so without a control
         return own, units
     for channel in range(controls.size if controls.size > 1 else 0):
         chosen = np.where(np.arange(controls.size) == channel, 1.0, ranged[1].controls / units.controls)
-        fewer = _scaled(posed, chosen)
-        ranged = fewer if shortfall(fewer[0].constraints) >= 1.0 else ranged
+        candidate = _scaled(posed, chosen)
+        ranged = candidate if shortfall(candidate[0].constraints) >= 1.0 else ranged
     return ranged
 
 
 def _scaled(posed: Posed, shares: Array) -> tuple[Posed, Units]:
-    """The problem in the units that it has where every channel goes as far as the share ``(m,)`` of its range; the
-    range stays as it is."""
+    """Return the problem in the units that it would have if every channel used only the share ``(m,)`` of its range,
+    and these units; the range itself does not change."""
     problem = posed.problem
     ranged = replace(problem, control=problem.control.in_units(1.0 / shares), control_step=None)
     ranged = problem if (shares == 1.0).all() else ranged
     rough, dictionaries = rough_units(ranged), (posed.control, posed.disturbance)
-    moved = rough.of_problem(ranged)
-    reaching, _ = _functionals(moved, *(rough.of_dictionary(one) for one in dictionaries))
-    units = own_units(ranged, rough, reaching, moved.control)
-    control, disturbance = (units.of_dictionary(one) for one in dictionaries)
+    rough_problem = rough.of_problem(ranged)
+    reaching, _ = _functionals(rough_problem, *(rough.of_dictionary(dictionary) for dictionary in dictionaries))
+    units = own_units(ranged, rough, reaching, rough_problem.control)
+    control, disturbance = (units.of_dictionary(dictionary) for dictionary in dictionaries)
     scaled = units.of_problem(problem)
-    held = scaled if posed.held is problem else held_nominally(scaled)
-    own = _posed(scaled, held, control, disturbance)
-    far, held_far = (one.control.in_units(1.0 / shares) for one in (scaled, held))
-    constraints = tuple(one.divided(row_units(one, far)) for one in own.constraints)
-    return replace(own, constraints=constraints, rows=held_units(own, held_far)), units
+    nominal_problem = scaled if posed.held is problem else held_nominally(scaled)
+    own = _posed(scaled, nominal_problem, control, disturbance)
+    control_range, held_range = (variant.control.in_units(1.0 / shares) for variant in (scaled, nominal_problem))
+    constraints = tuple(constraint.divided(row_units(constraint, control_range)) for constraint in own.constraints)
+    return replace(own, constraints=constraints, rows=held_units(own, held_range)), units
 
 
 def in_own_units(model: Transcription, wide: bool = False) -> tuple[Transcription, Units]:
-    """The transcription of the same problem in its own units, and these (`_in_units`); its families are explained in
-    the user's."""
+    """Return the transcription of the same problem in its own units, and these units (`_in_units`). Its families are
+    explained in the user's units."""
     return _told(model, *_in_units(model, wide))
 
 
 def _told(model: Transcription, posed: Posed, units: Units) -> tuple[Transcription, Units]:
-    """What a problem that is ``posed`` in its own units is as a program, its families explained in the user's."""
+    """Return the transcription of a problem that is ``posed`` in its own units, with families that are explained in the
+    user's units, and these own units."""
     own = transcribed(posed, model.acting.in_own(model, posed, units))
     telling = own.acting.telling(own, units)
     families = [
-        telling.family(one, theirs) for one, theirs in zip(own.program.families, model.program.families, strict=True)
+        telling.family(family, theirs)
+        for family, theirs in zip(own.program.families, model.program.families, strict=True)
     ]
     return replace(own, program=replace(own.program, families=families, cost_unit=units.cost)), units
 
 
 def like(own: Transcription, problem: OptimalControlProblem) -> SemiInfiniteProgram:
-    """The program of another problem on the dictionaries of ``own``, with its rows divided by what those of ``own`` are
-    divided by, and told as these are: for problems that differ from it in numbers on the right-hand sides only."""
+    """Return the program of another problem on the dictionaries of ``own``, with the row units and the explanations of
+    ``own``. The two problems may differ only in numbers on the right-hand sides."""
     posed = _posed(problem, problem, own.control, own.disturbance)
     pairs = zip(posed.constraints, own.constraints, strict=True)
-    constraints = tuple(one.divided(_shares(one, other)) for one, other in pairs)
+    constraints = tuple(constraint.divided(_shares(constraint, own_constraint)) for constraint, own_constraint in pairs)
     program = transcribed(replace(posed, constraints=constraints, rows=own.rows), own.acting).program
     families = [
-        replace(one, explain=told.explain, row_units=told.row_units, index_units=told.index_units)
-        for one, told in zip(program.families, own.program.families, strict=True)
+        replace(family, explain=own_family.explain, row_units=own_family.row_units, index_units=own_family.index_units)
+        for family, own_family in zip(program.families, own.program.families, strict=True)
     ]
     return replace(program, families=families)
 
 
 def _twin(model: Transcription, posed: Posed, units: Units) -> OwnUnits:
-    """The program of a problem that is ``posed`` in its own units, and the way back."""
+    """Return the program of a problem that is ``posed`` in its own units, and the factors back to the user's units."""
     own, _ = _told(model, posed, units)
     decision, image, equalities = way_back(model, own, units)
 
@@ -262,45 +285,47 @@ def _twin(model: Transcription, posed: Posed, units: Units) -> OwnUnits:
 
 
 def _shares(one: StateConstraint, other: StateConstraint) -> Array:
-    """What the rows ``(r,)`` of a constraint are of those of another one, whose directions are the same."""
-    theirs, ours = (each.normals_at(each.index_set.lower) for each in (one, other))
+    """Return the ratios ``(r,)`` of the rows of a constraint to those of another constraint with the same
+    directions."""
+    theirs, ours = (constraint.normals_at(constraint.index_set.lower) for constraint in (one, other))
     return ratios(theirs, ours, np.ones(ours.shape[1]))
 
 
 def from_state(model: Transcription, initial_state: Array) -> Transcription:
-    """The reduced program of the same problem from another initial state ``(d,)``; what does not depend on it is
-    shared."""
-    begun = replace(
+    """Return the reduced program of the same problem from another initial state ``(d,)``; everything that does not
+    depend on this state is shared."""
+    posed = replace(
         model,
         problem=replace(model.problem, initial_state=initial_state),
         held=replace(model.held, initial_state=initial_state),
         functionals=model.functionals.from_state(initial_state),
-        constraints=tuple(one.from_state(initial_state) for one in model.constraints),
+        constraints=tuple(constraint.from_state(initial_state) for constraint in model.constraints),
     )
-    return replace(model.acting.from_state(model, begun), given=model.given)
+    return replace(model.acting.from_state(model, posed), given=model.given)
 
 
 def _state_constraints(
     problem: OptimalControlProblem, functionals: WorstCase, parameters: ParameterIndex
 ) -> tuple[StateConstraint, ...]:
-    """The path and terminal constraints as they stand in the program; equalities are not among them."""
-    found: list[StateConstraint] = []
+    """Return the path and terminal constraints in the form that the program uses; equalities are not among them."""
+    constraints: list[StateConstraint] = []
     for name, entry in windows_of(problem):
         stop = problem.horizon if entry.stop is None else entry.stop
-        rows, window, moved = entry.flat, (entry.start, stop), Reference.of(entry.relative_to)
+        rows, window, reference = entry.flat, (entry.start, stop), Reference.of(entry.relative_to)
         if rows is None:
             from sparserob_core.control.constraints.curved import CurvedConstraint
 
-            found.append(CurvedConstraint(name, functionals, entry.set, *window, parameters, reference=moved))
+            constraints.append(CurvedConstraint(name, functionals, entry.set, *window, parameters, reference=reference))
         elif rows[-1].size:
-            found.append(FlatConstraint.of(name, functionals, rows, window, parameters, moved))
-    return tuple(found)
+            constraints.append(FlatConstraint.of(name, functionals, rows, window, parameters, reference))
+    return tuple(constraints)
 
 
 def windows_of(problem: OptimalControlProblem) -> list[tuple[str, PathConstraint | MixedConstraint]]:
-    """The path and terminal constraints with the names of their families; a terminal one has the window of one time."""
+    """Return the path and terminal constraints with the names of their families. The window of a terminal constraint is
+    the horizon alone."""
     end, ends = problem.horizon, problem.terminal_sets
-    finals = [(_name("terminal", i, len(ends)), PathConstraint(one, end, end)) for i, one in enumerate(ends)]
+    finals = [(_name("terminal", i, len(ends)), PathConstraint(convex, end, end)) for i, convex in enumerate(ends)]
     return [*zip(problem.called("path"), problem.windows, strict=True), *finals]
 
 

@@ -1,9 +1,10 @@
-"""What entries of a system leave out of their power series in the parameters, by Cauchy's bound on discs.
+"""Bounds of the truncation error of power series in the parameters, for the entries of a system, by Cauchy's bound on
+discs.
 
 An entry ``f(t, delta)`` along the line ``z delta`` through the centre of the box is a function of one complex number.
-Where it is analytic for ``|z| <= R`` and at most ``M`` from a constant there, its power series up to a degree ``D``
-misses at most ``M R^-D / (R - 1)`` at ``z = 1``, whatever the parameter. Values are enclosed by discs around real
-numbers, at all times of a cell and for many radii ``R`` at once.
+Let it be analytic for ``|z| <= R``, and at most ``M`` from a constant there. Then its power series up to a degree ``D``
+has an error of at most ``M R^-D / (R - 1)`` at ``z = 1``, whatever the parameter. Values are enclosed by discs around
+real numbers, at all times of a cell and for many radii ``R`` at once.
 """
 
 from __future__ import annotations
@@ -42,17 +43,17 @@ _ROUNDED = 16.0 * EPSILON  # of a value, more than what a function of numpy is o
 
 @final
 class Discs:
-    """Discs of the plane around real numbers: ``middle`` and ``radius``, arrays of one shape; infinite where nothing is
-    known. Knows the arithmetic and the functions of expressions."""
+    """Discs of the plane around real numbers: ``middle`` and ``radius``, arrays of one shape; the radius is infinite
+    where nothing is known. The class has the arithmetic and the functions of expressions."""
 
     __slots__ = ("middle", "radius")
 
     def __init__(self, middle: Array, radius: Array) -> None:
         with np.errstate(all="ignore"):
             radius = (radius + _ROUNDED * np.abs(middle)) * OUTWARD
-        known = np.isfinite(middle) & np.isfinite(radius)
-        self.middle: Array = np.where(known, middle, 0.0)
-        self.radius: Array = np.where(known, radius, np.inf)
+        is_finite = np.isfinite(middle) & np.isfinite(radius)
+        self.middle: Array = np.where(is_finite, middle, 0.0)
+        self.radius: Array = np.where(is_finite, radius, np.inf)
 
     @staticmethod
     def _like(other: object) -> tuple[Array, Array]:
@@ -80,11 +81,11 @@ class Discs:
     def __mul__(self, other: object) -> Discs:
         middle, radius = self._like(other)
         with np.errstate(all="ignore"):
-            off = np.abs(self.middle) * radius + self.radius * (np.abs(middle) + radius)
-        return Discs(self.middle * middle, off)
+            distance = np.abs(self.middle) * radius + self.radius * (np.abs(middle) + radius)
+        return Discs(self.middle * middle, distance)
 
     def reciprocal(self) -> Discs:
-        """``1 / z``: a disc again, of discs without 0."""
+        """Return ``1 / z``, which is a disc again for discs without 0."""
         a, r = self.middle, self.radius
         with np.errstate(all="ignore"):
             under = (np.abs(a) - r) * (np.abs(a) + r)
@@ -106,14 +107,14 @@ class Discs:
         power = float(other)  # type: ignore[arg-type]  # a number then
         if not power.is_integer() or abs(power) > LARGEST_POWER:
             return self._raised(power)
-        found, base = Discs(np.ones(self.middle.shape), np.zeros(self.middle.shape)), self
+        product, base = Discs(np.ones(self.middle.shape), np.zeros(self.middle.shape)), self
         for _ in range(abs(int(power))):
-            found = found * base
-        return found if power >= 0 else found.reciprocal()
+            product = product * base
+        return product if power >= 0 else product.reciprocal()
 
     def __rpow__(self, other: object) -> Discs:
-        found: Discs = (self * np.log(np.asarray(other, dtype=float))).exp()
-        return found
+        power: Discs = (self * np.log(np.asarray(other, dtype=float))).exp()
+        return power
 
     __radd__, __rmul__ = __add__, __mul__
 
@@ -122,78 +123,89 @@ class Discs:
         return Discs(np.where(known, middle, 0.0), np.where(known, radius, np.inf))
 
     def _raised(self, power: float) -> Discs:
-        """A power of discs to the right of 0, from ``|(1 + w)^a - 1| <= (1 - |w|)^-|a| - 1``, and ``(1 + |w|)^a + 1``
-        where ``a`` is positive; of a root ``1 - (1 - |w|)^a``, whose coefficients are the same but for signs."""
+        """Return a power of discs to the right of 0.
+
+        The bound is ``|(1 + w)^a - 1| <= (1 - |w|)^-|a| - 1``, and ``(1 + |w|)^a + 1`` where ``a`` is positive. For a
+        root it is ``1 - (1 - |w|)^a``, whose coefficients are the same except for signs.
+        """
         a, share = self.middle, self.radius / np.where(self.middle > 0.0, self.middle, 1.0)
         with np.errstate(all="ignore"):
-            middle, rest = a**power, np.log1p(-np.minimum(share, 1.0))
-            off = -np.expm1(power * rest) if 0.0 < power <= 1.0 else np.expm1(-abs(power) * rest)
-            off = np.minimum(off, (1.0 + share) ** power + 1.0) if power > 0.0 else off
-        return self._where((a > 0.0) & (share < 1.0), middle, middle * off)
+            middle, logarithm = a**power, np.log1p(-np.minimum(share, 1.0))
+            distance = -np.expm1(power * logarithm) if 0.0 < power <= 1.0 else np.expm1(-abs(power) * logarithm)
+            distance = np.minimum(distance, (1.0 + share) ** power + 1.0) if power > 0.0 else distance
+        return self._where((a > 0.0) & (share < 1.0), middle, middle * distance)
 
     def sqrt(self) -> Discs:
-        """The square root."""
+        """Return the square root."""
         return self._raised(0.5)
 
     def log(self) -> Discs:
-        """The natural logarithm, of discs to the right of 0."""
+        """Return the natural logarithm, of discs to the right of 0."""
         a, share = self.middle, self.radius / np.where(self.middle > 0.0, self.middle, 1.0)
-        known = (a > 0.0) & (share < 1.0)
-        return self._where(known, np.log(np.where(known, a, 1.0)), -np.log1p(-np.where(known, share, 0.0)))
+        is_positive = (a > 0.0) & (share < 1.0)
+        return self._where(
+            is_positive, np.log(np.where(is_positive, a, 1.0)), -np.log1p(-np.where(is_positive, share, 0.0))
+        )
 
     def exp(self) -> Discs:
-        """The exponential."""
+        """Return the exponential."""
         with np.errstate(all="ignore"):
             middle = np.exp(self.middle)
             return Discs(middle, middle * np.expm1(self.radius))
 
     def sin(self) -> Discs:
-        """The sine, from its sum ``sin a cos z + cos a sin z``."""
+        """Return the sine, from its sum ``sin a cos z + cos a sin z``."""
         return self._turned(np.sin(self.middle), np.cos(self.middle))
 
     def cos(self) -> Discs:
-        """The cosine."""
+        """Return the cosine."""
         return self._turned(np.cos(self.middle), np.sin(self.middle))
 
     def _turned(self, value: Array, other: Array) -> Discs:
         with np.errstate(all="ignore"):
             r = self.radius
-            off = np.abs(value) * (np.cosh(r) - 1.0) + (np.abs(other) + _ROUNDED) * np.sinh(r)
-        return Discs(value, off + _ROUNDED * np.where(np.isfinite(r), r, 0.0) + _ROUNDED)
+            distance = np.abs(value) * (np.cosh(r) - 1.0) + (np.abs(other) + _ROUNDED) * np.sinh(r)
+        return Discs(value, distance + _ROUNDED * np.where(np.isfinite(r), r, 0.0) + _ROUNDED)
 
     def tan(self) -> Discs:
-        """The tangent, from that of a sum; ``|tan z| <= tan |z|``."""
+        """Return the tangent, from that of a sum; ``|tan z| <= tan |z|``."""
         return self._tangent(np.tan(self.middle), 1.0)
 
     def tanh(self) -> Discs:
-        """The hyperbolic tangent, in the same way; ``|tanh z| <= tan |z|``."""
+        """Return the hyperbolic tangent, in the same way; ``|tanh z| <= tan |z|``."""
         return self._tangent(np.tanh(self.middle), -1.0)
 
     def _tangent(self, value: Array, sign: float) -> Discs:
         with np.errstate(all="ignore"):
-            far = np.tan(np.minimum(self.radius, 1.57))
-            under = 1.0 - np.abs(value) * far
+            tangent = np.tan(np.minimum(self.radius, 1.57))
+            under = 1.0 - np.abs(value) * tangent
             return self._where(
-                (self.radius < 1.57) & (under > 1e-6), value, ((1.0 + sign * value**2) + _ROUNDED) * far / under
+                (self.radius < 1.57) & (under > 1e-6), value, ((1.0 + sign * value**2) + _ROUNDED) * tangent / under
             )
 
     def kepler(self, eccentricity: float) -> Discs:
-        """The ``E`` with ``E - e sin E = M``: within the smallest circle that Rouche's theorem allows. On ``|E - E_0| =
-        R`` the anomaly differs from its tangent by at most ``e (|sin E_0| (cosh R - 1) + |cos E_0| (sinh R - R))``."""
+        """Return the ``E`` with ``E - e sin E = M``, within the smallest circle that Rouche's theorem allows.
+
+        On ``|E - E_0| = R`` the anomaly differs from its tangent by at most ``e (|sin E_0| (cosh R - 1) + |cos E_0|
+        (sinh R - R))``.
+        """
         e, E = eccentricity, np.asarray(eccentric_anomaly(self.middle, eccentricity))
-        slope, found = 1.0 - e * np.cos(E), np.full(E.shape, np.inf)
+        slope, radius = 1.0 - e * np.cos(E), np.full(E.shape, np.inf)
         for step in range(2 * KEPLER_CIRCLES):
             R = 4.0 * 0.85**step
-            bent = e * (np.abs(np.sin(E)) * (np.cosh(R) - 1.0) + np.abs(np.cos(E)) * (np.sinh(R) - R))
-            found = np.where(R * slope - bent - 1e-9 * R > self.radius, R, found)  # what is rounded is far less
-        return Discs(E, found + _ROUNDED * (np.abs(self.middle) + 1.0) / slope)
+            curvature = e * (np.abs(np.sin(E)) * (np.cosh(R) - 1.0) + np.abs(np.cos(E)) * (np.sinh(R) - R))
+            radius = np.where(R * slope - curvature - 1e-9 * R > self.radius, R, radius)  # what is rounded is far less
+        return Discs(E, radius + _ROUNDED * (np.abs(self.middle) + 1.0) / slope)
 
 
 @final
 @dataclass(frozen=True, eq=False)
 class Cauchy:
-    """The entries of a system on discs over cells of time: ``far (s, r, d, d + n)``, how far those of ``[A B c E]`` are
-    from a constant, between ``ends (s + 1,)`` and for all `RADII`; ``sizes (d, d + n)``: about how large they are."""
+    """Entries of a system on discs over cells of time, between ``ends (s + 1,)``.
+
+    ``far (s, r, d, d + n)``: the largest distance of the entries of ``[A B c E]`` from a constant, for all `RADII`.
+    ``sizes (d, d + n)``: estimates of their absolute values.
+    """
 
     system: System
     ends: Array
@@ -201,49 +213,49 @@ class Cauchy:
     sizes: Array
 
     def left(self, degree: int) -> Left:
-        """What is beyond a degree, of entries that are no polynomials of it."""
+        """Return bounds of the terms beyond a degree, of entries that are no polynomials of this degree."""
         sizes = _least(self.far, degree)
         sizes[:, ~beyond(self.system, degree)] = 0.0
         return Left(self.ends, sizes)
 
     def share(self, degree: int, units: Array) -> float:
-        """About what `left` makes of states in ``units (d,)``: of ``A`` over the horizon, of inputs as a share of what
-        they do."""
+        """Return an estimate of the effect of `left` on states in ``units (d,)``: of ``A`` over the horizon, of inputs
+        relative to their own effect."""
         d, sizes = units.size, self.left(degree).sizes / units[:, None]
         A = (sizes[:, :, :d] * units).sum(axis=2).max(axis=1) @ np.diff(self.ends)
-        inputs, whole = sizes[:, :, d:].max(axis=(0, 1)), (self.sizes[:, d:] / units[:, None]).max(axis=0)
-        return float(A + (inputs / np.where(whole > 0.0, whole, 1.0)).max(initial=0.0))
+        inputs, input_sizes = sizes[:, :, d:].max(axis=(0, 1)), (self.sizes[:, d:] / units[:, None]).max(axis=0)
+        return float(A + (inputs / np.where(input_sizes > 0.0, input_sizes, 1.0)).max(initial=0.0))
 
 
 def cauchy(system: System) -> Cauchy:
-    """The entries of a system with parameters on discs; raises `InputError`, which names an entry, a time and
-    parameters, where one has a pole or is no real number."""
-    wanted, ends, found, sizes = beyond(system, 0), [0.0], list[Array](), list[Array]()
+    """Return the entries of a system with parameters on discs. Raise `InputError`, which names an entry, a time and
+    parameters, where an entry has a pole or is no real number."""
+    wanted, ends, distances, sizes = beyond(system, 0), [0.0], list[Array](), list[Array]()
     for law in system.phases:
         count = max(1, int(np.ceil(FIRST * (law.until - law.begin) / system.horizon)))
-        for _, stop, far, size in _Law(system, law).cells(np.linspace(law.begin, law.until, count + 1), wanted):
+        for _, stop, distance, size in _Law(system, law).cells(np.linspace(law.begin, law.until, count + 1), wanted):
             ends.append(stop)
-            found.append(far)
-            sizes.append(size + far[0])
-    return Cauchy(system, np.array(ends), np.array(found), np.max(sizes, axis=0))
+            distances.append(distance)
+            sizes.append(size + distance[0])
+    return Cauchy(system, np.array(ends), np.array(distances), np.max(sizes, axis=0))
 
 
 @final
 @dataclass(frozen=True, eq=False)
 class _Law:
-    """``[A B c E]`` of one law of a system."""
+    """Matrix ``[A B c E]`` of one law of a system."""
 
     system: System
     law: Phase
 
     @cached_property
     def places(self) -> list[tuple[str, int]]:
-        """Of which matrix every column is, and which of its columns."""
+        """Matrix of which every column is a column, and its number there."""
         shapes = {name: self.law._shape(name) for name in NAMES if self.law.entry(name) is not None}
         return [(name, j) for name, (_, columns) in shapes.items() for j in range(columns)]
 
     def on(self, time: Discs, parameters: list[Discs]) -> tuple[Array, Array]:
-        """The entries' discs, ``(..., d, d + n)`` each."""
+        """Return the middles and the radii of the entries' discs, ``(..., d, d + n)`` each."""
         shape, d = time.middle.shape, self.law.states
         p = np.empty(1 + len(parameters), dtype=object)
         p[0], p[1:] = time, parameters
@@ -255,42 +267,52 @@ class _Law:
                 continue
             with np.errstate(all="ignore"):
                 table = np.asarray(entry(p) if callable(entry) else entry, dtype=object)
-            for (i, j), one in np.ndenumerate(table):
-                part = (..., i, column + j)
-                middle[part], radius[part] = (one.middle, one.radius) if isinstance(one, Discs) else (float(one), 0.0)
+            for (i, j), value in np.ndenumerate(table):
+                index = (..., i, column + j)
+                middle[index], radius[index] = (
+                    (value.middle, value.radius) if isinstance(value, Discs) else (float(value), 0.0)
+                )
             column += table.shape[1]
         return middle, radius
 
     def over(self, starts: Array, stops: Array) -> tuple[Array, Array]:
-        """How large entries are in the middle, ``(s, d, d + n)``, and how far from there, ``(s, r, d, d + n)``, at
-        all times of cells and on all `RADII`."""
+        """Return the absolute values of the entries in the middle, ``(s, d, d + n)``, and their largest distance from
+        there, ``(s, r, d, d + n)``, at all times of cells and on all `RADII`."""
         centre, units = self.system.deviations
         middles = (starts + stops) / 2
         halves = np.maximum(stops - middles, middles - starts)
-        time = Discs(*(np.repeat(one[:, None], RADII.size, axis=1) for one in (middles, halves)))
-        none = np.zeros(time.middle.shape)
-        middle, radius = self.on(time, [Discs(none + c, none + u * RADII) for c, u in zip(centre, units, strict=True)])
+        time = Discs(*(np.repeat(values[:, None], RADII.size, axis=1) for values in (middles, halves)))
+        zeros = np.zeros(time.middle.shape)
+        middle, radius = self.on(
+            time, [Discs(zeros + c, zeros + u * RADII) for c, u in zip(centre, units, strict=True)]
+        )
         return np.abs(middle).max(axis=1), radius
 
     def cells(self, cuts: Array, wanted: np.ndarray) -> Iterator[tuple[float, float, Array, Array]]:
-        """Cells of time between the ``cuts``, one after another, with how far entries are from a constant there; halved
-        where those that are ``wanted (d, d + n)`` leave much more than in the middle of a cell."""
-        starts, stops, done = cuts[:-1], cuts[1:], list[tuple[float, float, Array, Array]]()
+        """Yield cells of time between the ``cuts``, one after another, with the distance of the entries from a constant
+        there.
+
+        A cell is halved where the truncation errors of entries that are ``wanted (d, d + n)`` are much larger than at
+        its middle.
+        """
+        starts, stops, accepted = cuts[:-1], cuts[1:], list[tuple[float, float, Array, Array]]()
         while starts.size:
             middles = (starts + stops) / 2
-            sizes, wide = self.over(starts, stops)
-            there = self.over(middles, middles)[1]
-            good = np.ones(starts.size, dtype=bool)
+            sizes, distances = self.over(starts, stops)
+            middle_distances = self.over(middles, middles)[1]
+            is_good = np.ones(starts.size, dtype=bool)
             for degree in DEGREES:
-                mine, least = (_least(one, degree)[:, wanted] for one in (wide, there))
-                for k in np.flatnonzero(~np.isfinite(least).all(axis=1)):
+                cell_bounds, middle_bounds = (
+                    _least(distance, degree)[:, wanted] for distance in (distances, middle_distances)
+                )
+                for k in np.flatnonzero(~np.isfinite(middle_bounds).all(axis=1)):
                     self._without_pole(float(starts[k]), float(stops[k]), wanted)
-                good &= (mine <= AS_GOOD * least + NOTHING * sizes[:, wanted]).all(axis=1)
-            good |= len(done) + 2 * starts.size > MOST_CELLS
-            done += [(float(starts[k]), float(stops[k]), wide[k], sizes[k]) for k in np.flatnonzero(good)]
-            halved = [(starts[~good], middles[~good]), (middles[~good], stops[~good])]
-            starts, stops = (np.concatenate([one[side] for one in halved]) for side in range(2))
-        yield from sorted(done, key=lambda one: one[0])
+                is_good &= (cell_bounds <= AS_GOOD * middle_bounds + NOTHING * sizes[:, wanted]).all(axis=1)
+            is_good |= len(accepted) + 2 * starts.size > MOST_CELLS
+            accepted += [(float(starts[k]), float(stops[k]), distances[k], sizes[k]) for k in np.flatnonzero(is_good)]
+            halved = [(starts[~is_good], middles[~is_good]), (middles[~is_good], stops[~is_good])]
+            starts, stops = (np.concatenate([pair[side] for pair in halved]) for side in range(2))
+        yield from sorted(accepted, key=lambda cell: cell[0])
 
     def _without_pole(self, start: float, stop: float, wanted: np.ndarray) -> None:
         """Raise `InputError` where an entry that is ``wanted`` has a pole, or is no real number, at a time and
@@ -303,21 +325,21 @@ class _Law:
                 return
             low, high = todo.pop()
             middle = (low + high) / 2
-            every = [
+            discs = [
                 Discs(np.array(m), np.array(r))
                 for m, r in zip(middle, np.maximum(high - middle, middle - low), strict=True)
             ]
-            lost = ~np.isfinite(self.on(every[0], every[1:])[1]) & wanted
-            if not lost.any():
+            is_unbounded = ~np.isfinite(self.on(discs[0], discs[1:])[1]) & wanted
+            if not is_unbounded.any():
                 continue
             shares = (high - low) / widths
             if shares.max() <= TINIEST:
-                raise self._has_pole(np.argwhere(lost)[0], middle)
+                raise self._has_pole(np.argwhere(is_unbounded)[0], middle)
             axis = int(shares.argmax())
             for side in range(2):
-                part = low.copy(), high.copy()
-                part[1 - side][axis] = middle[axis]
-                todo.append(part)
+                half = low.copy(), high.copy()
+                half[1 - side][axis] = middle[axis]
+                todo.append(half)
 
     def _has_pole(self, place: np.ndarray, at: Array) -> InputError:
         row, column = place.tolist()
@@ -326,33 +348,34 @@ class _Law:
         text = entry.entries[row][j].text if isinstance(entry, ExpressionMatrix) else "a function of them"
         phases = self.system.phases
         where = f"system.pieces.{phases.index(self.law)}" if len(phases) > 1 else "system"
-        told = self.system.describe(at[1:])
+        parameters = self.system.describe(at[1:])
         return InputError(
             path=where,  # the entry tells itself where it is: a drift may be one more column of B by now
             expected="entries that are real numbers at all times of the horizon and all parameters, without a pole",
-            got=f"{text}, which has a pole or is no real number near t = {at[0]:.6g}, {told}",
+            got=f"{text}, which has a pole or is no real number near t = {at[0]:.6g}, {parameters}",
         )
 
 
 def _least(far: Array, degree: int) -> Array:
-    """What is beyond a degree by the best of the `RADII`, ``(s, d, d + n)``, of entries that go so ``far (s, r, d, d +
-    n)`` from a constant."""
+    """Return the bound of the terms beyond a degree by the best of the `RADII`, ``(s, d, d + n)``, from the largest
+    distances ``far (s, r, d, d + n)`` of the entries from a constant."""
     with np.errstate(all="ignore"):
-        found = far * (RADII ** -float(degree) / (RADII - 1.0))[:, None, None]
-    return np.asarray(found.min(axis=1) * OUTWARD)
+        bounds = far * (RADII ** -float(degree) / (RADII - 1.0))[:, None, None]
+    return np.asarray(bounds.min(axis=1) * OUTWARD)
 
 
 def beyond(system: System, degree: int) -> np.ndarray:
-    """Which entries of ``[A B c E]`` are no polynomials of so high a degree at most, ``(d, d + n)``."""
+    """Return which entries of ``[A B c E]`` are not polynomials of at most this degree in the parameters, ``(d, d +
+    n)``."""
     tables = []
     for law in system.phases:
-        parts = []
+        blocks = []
         for name in NAMES:
             if law.entry(name) is not None:
-                found = np.zeros(law._shape(name), dtype=bool)
+                is_beyond = np.zeros(law._shape(name), dtype=bool)
                 split = Split.of(law.entry(name), AnyNumber(), *system.deviations, degree)
-                for place in split.beyond:
-                    found[place] = True
-                parts.append(found)
-        tables.append(np.hstack(parts))
+                for index in split.beyond:
+                    is_beyond[index] = True
+                blocks.append(is_beyond)
+        tables.append(np.hstack(blocks))
     return np.asarray(np.any(tables, axis=0))

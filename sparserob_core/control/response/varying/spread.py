@@ -1,5 +1,5 @@
-"""The law of a system that changes with time as a polynomial in its parameters: how far it is expanded, and on which
-parts of their box. States are expanded on cells of these, each by itself (`Expansion.on_cell`)."""
+"""Law of a system that changes with time as a polynomial in its parameters: its degree, and the parts of the
+parameters' box. States are expanded on cells of these parts, each by itself (`Expansion.on_cell`)."""
 
 from __future__ import annotations
 
@@ -37,51 +37,55 @@ _KNOWN: WeakKeyDictionary[Phase, dict[tuple[object, ...], Parts]] = WeakKeyDicti
 @final
 @dataclass(frozen=True, eq=False)
 class Parts:
-    """A box of parameters in parts, and how the law depends on the parameters of each: ``every`` of them, how, and
-    the known system of all coefficients. ``edges``: where the parts of every parameter begin and end; the parts are
-    all their products, those of the last parameter one after another. All have the same polynomials."""
+    """Box of parameters in parts, with the parametric expansion of the law on each.
+
+    ``edges``: the ends of the parts of every parameter. The parts are all their products, those of the last parameter
+    one after another. ``every``: for each part, the parametric expansion and the known system of all coefficients. All
+    parts have the same polynomials.
+    """
 
     edges: tuple[Array, ...]
     every: tuple[tuple[Spread, System], ...]
 
     def of(self, parameters: Array) -> np.ndarray:
-        """The part that each of ``parameters (k, nu)`` is in, ``(k,)``; at an edge any one that has it."""
-        places = [
+        """Return the part that contains each of ``parameters (k, nu)``, ``(k,)``; at an edge, one of the parts that it
+        belongs to."""
+        indices = [
             np.clip(np.searchsorted(edges, p, side="right") - 1, 0, edges.size - 2)
             for edges, p in zip(self.edges, parameters.T, strict=True)
         ]
-        return np.asarray(np.ravel_multi_index(places, [edges.size - 1 for edges in self.edges]))
+        return np.asarray(np.ravel_multi_index(indices, [edges.size - 1 for edges in self.edges]))
 
     def holding(self, low: Array, high: Array) -> int | None:
-        """The part that holds a cell ``[low, high]``, ``(nu,)`` each; ``None`` where none does."""
+        """Return the part that contains a cell ``[low, high]``, ``(nu,)`` each; ``None`` where no part does."""
         part = int(self.of(((low + high) / 2)[None])[0])
         ends = self.ends(part)
         return part if (ends[0] <= low).all() and (high <= ends[1]).all() else None
 
     def ends(self, part: int) -> tuple[Array, Array]:
-        """From where to where a part goes, ``(nu,)`` each."""
-        places = np.unravel_index(part, [edges.size - 1 for edges in self.edges])
-        both = [(edges[i], edges[i + 1]) for edges, i in zip(self.edges, places, strict=True)]
-        return np.array([low for low, _ in both]), np.array([high for _, high in both])
+        """Return the ends of a part, the least and the largest parameters, ``(nu,)`` each."""
+        indices = np.unravel_index(part, [edges.size - 1 for edges in self.edges])
+        intervals = [(edges[i], edges[i + 1]) for edges, i in zip(self.edges, indices, strict=True)]
+        return np.array([low for low, _ in intervals]), np.array([high for _, high in intervals])
 
     def cut(self, lower: Array, upper: Array) -> tuple[Array, Array]:
-        """Cells ``(k, 1 + nu)`` of times and parameters, cut where parts end."""
+        """Return cells ``(k, 1 + nu)`` of times and parameters, cut at the ends of the parts."""
         if len(self.every) == 1:
             return lower, upper
-        found = [lower[:0]], [upper[:0]]
+        cells = [lower[:0]], [upper[:0]]
         for part in range(len(self.every)):
             low, high = self.ends(part)
             a, b = lower.copy(), upper.copy()
             a[:, 1 : 1 + low.size] = np.maximum(a[:, 1 : 1 + low.size], low)
             b[:, 1 : 1 + low.size] = np.minimum(b[:, 1 : 1 + low.size], high)
-            thick = ((a < b) | (lower == upper)).all(axis=1) & (a <= b).all(axis=1)
-            found[0].append(a[thick])
-            found[1].append(b[thick])
-        return np.concatenate(found[0]), np.concatenate(found[1])
+            is_nonempty = ((a < b) | (lower == upper)).all(axis=1) & (a <= b).all(axis=1)
+            cells[0].append(a[is_nonempty])
+            cells[1].append(b[is_nonempty])
+        return np.concatenate(cells[0]), np.concatenate(cells[1])
 
     @cached_property
     def expansions(self) -> tuple[Expansion, ...]:
-        """The law on each part, as polynomials in time and parameters."""
+        """Law on each part, as polynomials in time and parameters."""
         return tuple(Expansion.of(system) for _, system in self.every)
 
     def on_cell(self, low: Array, high: Array) -> Expansion:
@@ -100,7 +104,7 @@ class Parts:
         return self.expansions[part].at_point(self.every[part][0], parameter)
 
     def over(self, starts: Array, stops: Array, points: Array) -> tuple[Array, Array]:
-        """Return what intervals make of the state and of inputs at every one of several parameters.
+        """Return the responses over intervals to the state and to inputs, at every one of several parameters.
 
         Parameters
         ----------
@@ -112,152 +116,173 @@ class Parts:
         Returns
         -------
         Array, Array
-            The transitions ``(v, k, d, d)``; and what inputs that stay the same bring, those of the disturbance after
-            the others, ``(v, k, d, m + mw)``. Nothing is proven by them.
+            The transitions ``(v, k, d, d)``; and the responses to constant inputs, those to the disturbance after the
+            others, ``(v, k, d, m + mw)``. Nothing is proven by them.
         """
-        found = [(here, of.at_parameters(starts, stops, powers[:, None])) for here, of, powers in self._apart(points)]
-        state, inputs = _joined_parts(found)
+        tables = [
+            (indices, expansion.at_parameters(starts, stops, powers[:, None]))
+            for indices, expansion, powers in self._apart(points)
+        ]
+        state, inputs = _joined_parts(tables)
         return state, inputs
 
     def along(self, starts: Array, stops: Array, parameters: Array) -> tuple[Array, Array]:
-        """`over` of intervals each at its own of the ``parameters (k, nu)``, ``(k, d, d)`` and ``(k, d, m + mw)``."""
-        found = []
-        for here, of, powers in self._apart(parameters):
-            both = of.at_parameters(starts[here], stops[here], powers[None])
-            found.append((here, (both[0][0], both[1][0])))
-        state, inputs = _joined_parts(found)
+        """Return the responses of `over` with one of the ``parameters (k, nu)`` for each interval, ``(k, d, d)`` and
+        ``(k, d, m + mw)``."""
+        tables = []
+        for indices, expansion, powers in self._apart(parameters):
+            responses = expansion.at_parameters(starts[indices], stops[indices], powers[None])
+            tables.append((indices, (responses[0][0], responses[1][0])))
+        state, inputs = _joined_parts(tables)
         return state, inputs
 
     def entries(self, times: Array, parameters: Array) -> tuple[Array, Array]:
         """Return ``A (k, d, d)`` and ``[B E] (k, d, m + mw)`` at times ``(k,)`` and ``parameters (k, nu)``; nothing is
         proven by them."""
-        found, d = [], self.every[0][0].d
-        for here, of, powers in self._apart(parameters):
-            both = (one.reshape(here.size, -1, d, one.shape[2]) for one in of.at(times[here]))
-            A, inputs = (np.einsum("ka,kaij->kij", powers, one) for one in both)
-            found.append((here, (A, inputs)))
-        A, inputs = _joined_parts(found)
+        tables, d = [], self.every[0][0].d
+        for indices, expansion, powers in self._apart(parameters):
+            both = (table.reshape(indices.size, -1, d, table.shape[2]) for table in expansion.at(times[indices]))
+            A, inputs = (np.einsum("ka,kaij->kij", powers, table) for table in both)
+            tables.append((indices, (A, inputs)))
+        A, inputs = _joined_parts(tables)
         return A, inputs
 
     def averages(self, breaks: Array, points: Array) -> Array:
-        """About what ``A`` is between ``breaks (L + 1,)`` at parameters ``(v, nu)``, ``(v, L, d, d)``."""
-        d, found = self.every[0][0].d, []
-        for here, of, powers in self._apart(points):
-            first = of.average(breaks).reshape(breaks.size - 1, -1, d, d)
-            found.append((here, (np.einsum("va,kaij->vkij", powers, first),)))
-        return _joined_parts(found)[0]
+        """Return estimates of ``A`` between ``breaks (L + 1,)`` at parameters ``(v, nu)``, ``(v, L, d, d)``."""
+        d, tables = self.every[0][0].d, []
+        for indices, expansion, powers in self._apart(points):
+            averages = expansion.average(breaks).reshape(breaks.size - 1, -1, d, d)
+            tables.append((indices, (np.einsum("va,kaij->vkij", powers, averages),)))
+        return _joined_parts(tables)[0]
 
     def left_out(self, part: int, begun: Array, inputs: Array, growth: float) -> Array:
-        """Return what the law leaves out of any state at any parameter of a part, ``(d,)``, at most.
+        """Return upper bounds ``(d,)`` of the effect of the law's truncation error on any state at any parameter of a
+        part.
 
         Parameters
         ----------
         part : int
             The part of the parameters.
         begun, inputs : Array
-            How large the initial state ``(d,)`` and the inputs ``(m + mw,)`` are at most.
+            Upper bounds of the initial state ``(d,)`` and of the inputs ``(m + mw,)``.
         growth : float
-            How far states grow between two times at most, in the units of the part.
+            Upper bound of the growth of states between two times, in the units of the part.
         """
-        how, law = self.every[part][0], self.expansions[part]
-        left, d = how.left, how.d
-        assert left is not None
-        units, pushes = law.units[:d], law.largest_inputs(how) @ inputs / law.units[:d]
-        state = growth * (float((begun / units).max()) + float(np.diff(law.ends) @ pushes.max(axis=1)))
-        A = (left.sizes[:, :, :d] * units).sum(axis=2) / units
-        entered = left.sizes[:, :, d:] @ inputs / units
-        rate = state * A.max(axis=1) + entered.max(axis=1)
-        return np.asarray(growth * float(np.diff(left.ends) @ rate) * units * (1.0 + 1e-9))
+        spread, law = self.every[part][0], self.expansions[part]
+        truncation, d = spread.left, spread.d
+        assert truncation is not None
+        units, forcing = law.units[:d], law.largest_inputs(spread) @ inputs / law.units[:d]
+        state = growth * (float((begun / units).max()) + float(np.diff(law.ends) @ forcing.max(axis=1)))
+        A = (truncation.sizes[:, :, :d] * units).sum(axis=2) / units
+        input_error = truncation.sizes[:, :, d:] @ inputs / units
+        rate = state * A.max(axis=1) + input_error.max(axis=1)
+        return np.asarray(growth * float(np.diff(truncation.ends) @ rate) * units * (1.0 + 1e-9))
 
     def _apart(self, points: Array) -> Iterator[tuple[np.ndarray, Expansion, Array]]:
-        """Of parameters ``(v, nu)`` the numbers of those in every part, the law there, and their monomials."""
-        which = self.of(points)
-        for part in np.unique(which).tolist():
-            here, how = np.flatnonzero(which == part), self.every[part][0]
-            yield here, self.expansions[part], how.space.monomials(how.shares(points[here]))
+        """Yield the indices of the parameters ``(v, nu)`` in every part, the law there, and their monomials."""
+        part_of_point = self.of(points)
+        for part in np.unique(part_of_point).tolist():
+            indices, spread = np.flatnonzero(part_of_point == part), self.every[part][0]
+            yield indices, self.expansions[part], spread.space.monomials(spread.shares(points[indices]))
 
 
 def _joined_parts(found: Sequence[tuple[np.ndarray, Sequence[Array]]]) -> list[Array]:
-    """Tables that were made of some of all indices each, ``(numbers (k,), tables)``, as those of all of them."""
+    """Return tables of all indices from tables of some of them each, ``(numbers (k,), tables)``."""
     order = np.argsort(np.concatenate([numbers for numbers, _ in found]))
-    return [np.concatenate(one)[order] for one in zip(*(tables for _, tables in found), strict=True)]
+    return [np.concatenate(blocks)[order] for blocks in zip(*(tables for _, tables in found), strict=True)]
 
 
 def law_of(system: System) -> Parts:
-    """Return how the law of a system depends on its parameters, on parts of their box.
+    """Return the parametric expansion of the law of a system, on parts of the box of parameters.
 
-    Of entries that are polynomials there is one part, and nothing is left out. Others are power series, and parts are
-    as small as these need to be. Raises `InputError` where that takes too many parts.
+    Entries that are polynomials need one part and have no truncation error. Other entries are power series, and the
+    parts are as small as these need to be. Raises `InputError` where that takes too many parts.
     """
-    first, *others = system.phases
+    first, *later_phases = system.phases
     kept, box = _KNOWN.setdefault(first, {}), system.box
-    key = system.horizon, box.lower.tobytes(), box.upper.tobytes(), *((phase.begin, ref(phase)) for phase in others)
+    key = (
+        system.horizon,
+        box.lower.tobytes(),
+        box.upper.tobytes(),
+        *((phase.begin, ref(phase)) for phase in later_phases),
+    )
     if key not in kept:
         kept[key] = _made(system) if system.stated is system else _in_units(system)
     return kept[key]
 
 
 def _made(system: System) -> Parts:
-    """`law_of` a system in the units that it is stated in."""
-    edges, looks, degree = _parted(system)
-    every = []
-    for part, look in zip(_boxes(system, edges), looks, strict=True):
-        centre, units = part.deviations
-        left = None if look is None else look.left(degree)
-        how = Spread(system.states, taylor_space(centre.size, degree), centre, units, left)
-        every.append((how, part.superposed(how)))
-    return Parts(edges, tuple(every))
+    """Return the law (`law_of`) of a system in the units of the user."""
+    edges, series_bounds, degree = _parted(system)
+    laws = []
+    for part_system, series_bound in zip(_boxes(system, edges), series_bounds, strict=True):
+        centre, units = part_system.deviations
+        truncation = None if series_bound is None else series_bound.left(degree)
+        spread = Spread(system.states, taylor_space(centre.size, degree), centre, units, truncation)
+        laws.append((spread, part_system.superposed(spread)))
+    return Parts(edges, tuple(laws))
 
 
 def _in_units(system: System) -> Parts:
-    """`law_of` a system in its own units, which are powers of two: the same polynomials, in these units."""
+    """Return the law (`law_of`) of a system in its own units, which are powers of two: the same polynomials, in these
+    units."""
     law = system.phases[0]
     assert isinstance(law, PhaseInUnits)
     time, units = law.clock, law.units[1:]
-    known, every = law_of(system.stated), list[tuple[Spread, System]]()
-    of = {name: law.factors[name] * np.ones(law._shape(name)) for name in NAMES if law.entry(name) is not None}
-    for how, part in known.every:
-        size, left = how.space.size, how.left
-        if left is not None:
-            left = Left(left.ends / time, left.sizes * np.abs(np.hstack(list(of.values()))))
-        whole = [np.tile(of[name], (size, size if name == "A" else 1)) for name in ("A", "B", "E")]
-        drift = np.tile(of["c"], (size, 1)) if "c" in of else 1.0
-        scaled = part.in_units(whole[0], whole[1], whole[2], np.zeros(0), drift, time)
-        every.append((replace(how, centre=how.centre / units, units=how.units / units, left=left), scaled))
-    edges = tuple(ends / one for ends, one in zip(known.edges, units, strict=True))
-    return Parts(edges, tuple(every))
+    user_law, laws = law_of(system.stated), list[tuple[Spread, System]]()
+    factors = {name: law.factors[name] * np.ones(law._shape(name)) for name in NAMES if law.entry(name) is not None}
+    for spread, part_system in user_law.every:
+        size, truncation = spread.space.size, spread.left
+        if truncation is not None:
+            truncation = Left(truncation.ends / time, truncation.sizes * np.abs(np.hstack(list(factors.values()))))
+        tiled = [np.tile(factors[name], (size, size if name == "A" else 1)) for name in ("A", "B", "E")]
+        drift = np.tile(factors["c"], (size, 1)) if "c" in factors else 1.0
+        scaled = part_system.in_units(tiled[0], tiled[1], tiled[2], np.zeros(0), drift, time)
+        laws.append(
+            (replace(spread, centre=spread.centre / units, units=spread.units / units, left=truncation), scaled)
+        )
+    edges = tuple(ends / unit for ends, unit in zip(user_law.edges, units, strict=True))
+    return Parts(edges, tuple(laws))
 
 
 def _boxes(system: System, edges: tuple[Array, ...]) -> list[System]:
-    """The system with its parameters in every part of their box."""
-    ends = [list(pairwise(one.tolist())) for one in edges]
-    corners = [np.array(one).T for one in product(*ends)]
+    """Return the system with its parameters in every part of their box."""
+    ends = [list(pairwise(breaks.tolist())) for breaks in edges]
+    corners = [np.array(intervals).T for intervals in product(*ends)]
     return [system] if len(corners) == 1 else [system.with_parameters(Box(low, high)) for low, high in corners]
 
 
 def _parted(system: System) -> tuple[tuple[Array, ...], list[Cauchy | None], int]:
-    """Where the parts of every parameter begin and end, what bounds the rest of the series of their entries, and the
-    degree of these: of 1, 2, 4, ... parts, halved along the parameter in which that leaves least."""
+    """Return the edges of the parts of every parameter, the bounds of the truncation errors of the entries' series, and
+    the degree of the series.
+
+    There are 1, 2, 4, ... parts: their number doubles along the parameter for which the truncation error is then least.
+    """
     box, powers, d = system.box, system.powers, system.states
     assert powers is not None
     nu, counts, lowest = box.dimension, np.ones(box.dimension, dtype=int), max(1, powers)
     scale = _scale(system)
-    far = _exponent(system, scale)
-    if far > FAR:
+    exponent = _exponent(system, scale)
+    if exponent > FAR:
         raise InputError(
             path="system.parameters",
             expected="a box, beside the time t and in A, over which the state has an expansion in double precision:"
             " smaller intervals, or a shorter horizon",
-            got=f"parameters that move the state by up to e^{far:.2g}",
+            got=f"parameters that move the state by up to e^{exponent:.2g}",
         )
     degrees = [n for n in range(lowest, MOST_TERMS + 1) if d * comb(nu + n, nu) <= NUMBERS]
     while degrees and counts.prod() <= MOST_PARTS:
-        edges, looks = _looked(system, counts)
-        for left, degree in product(LEFT, degrees):
-            if all(_share(one, degree, scale) <= left for one in looks):
-                return edges, looks, degree
-        finer = [counts * (1 + one) for one in np.eye(nu, dtype=int)]
-        counts = min(finer, key=lambda one: max(_share(look, degrees[-1], scale) for look in _looked(system, one)[1]))
+        edges, series_bounds = _looked(system, counts)
+        for tolerance, degree in product(LEFT, degrees):
+            if all(_share(series_bound, degree, scale) <= tolerance for series_bound in series_bounds):
+                return edges, series_bounds, degree
+        candidates = [counts * (1 + direction) for direction in np.eye(nu, dtype=int)]
+        counts = min(
+            candidates,
+            key=lambda numbers: max(
+                _share(series_bound, degrees[-1], scale) for series_bound in _looked(system, numbers)[1]
+            ),
+        )
     raise InputError(
         path="system.parameters",
         expected="a box, beside the time t, on which the entries are power series in the parameters of at most"
@@ -268,40 +293,46 @@ def _parted(system: System) -> tuple[tuple[Array, ...], list[Cauchy | None], int
 
 
 def _looked(system: System, counts: np.ndarray) -> tuple[tuple[Array, ...], list[Cauchy | None]]:
-    """The ends of so many parts of every parameter, and what bounds the rest of the series of entries on each part."""
+    """Return the edges of so many parts of every parameter, and the bounds of the truncation errors of the entries'
+    series on each part."""
     box, powers = system.box, system.powers
     assert powers is not None
     ends = zip(box.lower.tolist(), box.upper.tolist(), counts.tolist(), strict=True)
-    edges = tuple(_edges(*one) for one in ends)
-    return edges, [cauchy(part) if beyond(part, powers).any() else None for part in _boxes(system, edges)]
+    edges = tuple(_edges(*interval) for interval in ends)
+    return edges, [
+        cauchy(part_system) if beyond(part_system, powers).any() else None for part_system in _boxes(system, edges)
+    ]
 
 
 def _scale(system: System) -> Array:
-    """Units of the states, ``(d,)``, in which no entry of ``A`` at the middle of the parameters is large."""
-    A = np.max([np.abs(np.asarray(one.A, dtype=float)) for one in system.at(system.deviations[0]).modes], axis=0)
+    """Return units of the states, ``(d,)``, in which no entry of ``A`` at the middle of the parameters is large."""
+    A = np.max([np.abs(np.asarray(mode.A, dtype=float)) for mode in system.at(system.deviations[0]).modes], axis=0)
     return balanced(A, system.horizon)
 
 
 def _exponent(system: System, scale: Array) -> float:
-    """By which exponent parameters may move the state: the integral of the norms of all coefficients of ``A`` but the
-    constant one."""
-    (centre, units), found = system.deviations, 0.0
+    """Return the exponent by which parameters may move the state: the integral of the norms of all coefficients of
+    ``A`` except the constant one."""
+    (centre, units), exponent = system.deviations, 0.0
     for law in system.phases:
         for time in np.linspace(law.begin, law.until, LOOKS).tolist():
-            parts = Split.of(law.entry("A"), time, centre, units, DEGREE).parts
-            sizes = [np.abs(table.astype(float)) * scale / scale[:, None] for key, table in parts.items() if any(key)]
-            rate = sum(float(one.sum(axis=1).max()) for one in sizes)
-            found += rate * (law.until - law.begin) / LOOKS
-    return found
+            coefficients = Split.of(law.entry("A"), time, centre, units, DEGREE).parts
+            sizes = [
+                np.abs(table.astype(float)) * scale / scale[:, None] for key, table in coefficients.items() if any(key)
+            ]
+            rate = sum(float(size.sum(axis=1).max()) for size in sizes)
+            exponent += rate * (law.until - law.begin) / LOOKS
+    return exponent
 
 
 def _share(look: Cauchy | None, degree: int, scale: Array) -> float:
-    """About what series leave of states in units ``scale (d,)``, as a share; nothing of polynomials."""
+    """Return an estimate of the relative truncation error of series for states in units ``scale (d,)``; 0 for
+    polynomials."""
     return 0.0 if look is None else (degree + 1) * look.share(degree, scale)
 
 
 def _edges(low: float, high: float, count: int) -> Array:
-    """The ends of ``count`` equal parts of an interval."""
-    found = np.linspace(low, high, count + 1)
-    found[0], found[-1] = low, high
-    return found
+    """Return the ends of ``count`` equal parts of an interval."""
+    edges = np.linspace(low, high, count + 1)
+    edges[0], edges[-1] = low, high
+    return edges

@@ -1,5 +1,5 @@
-"""Systems that take turns, what acts late, and parameters, as one system that changes with time, where errors of
-execution or measurable disturbances need that."""
+"""Switched systems, delays and parameters as one system that changes with time, where errors of execution or measurable
+disturbances need it."""
 
 from __future__ import annotations
 
@@ -21,12 +21,14 @@ _KNOWN: WeakKeyDictionary[OptimalControlProblem, OptimalControlProblem] = WeakKe
 
 
 def in_time(problem: OptimalControlProblem) -> OptimalControlProblem:
-    """The same problem with a system that changes with time, where it has errors of execution beside pieces of the
-    system, a delay or parameters, or measurable disturbances beside parameters: the integrals over pieces of the
-    command, which are not of its age alone, are those of such a system (`VaryingExecution`), and so are those of
-    measurable disturbances, over all parameters (`VaryingMeasurable`); those that the state is an affine function of
-    become states (`superposed`). Measurable disturbances beside parameters that are not within reach stay as they are:
-    of these nothing is proven."""
+    """Return the same problem with a system that changes with time, where the method needs one.
+
+    This is the case for errors of execution with phases of the system, a delay or parameters, and for measurable
+    disturbances with parameters. The integrals over pieces of the command do not depend on its age alone. They are
+    integrals of such a system (`VaryingExecution`), and so are those of measurable disturbances, over all parameters
+    (`VaryingMeasurable`). Parameters of which the state is an affine function become states (`superposed`). Measurable
+    disturbances with parameters that are not within reach stay as they are: nothing is proven for them.
+    """
     system = problem.system
     if system.varies:
         return problem
@@ -36,17 +38,17 @@ def in_time(problem: OptimalControlProblem) -> OptimalControlProblem:
     if problem.measurable is None or not system.parameter_count:
         return problem
     if problem not in _KNOWN:
-        found = within_reach(problem)
-        _KNOWN[problem] = problem if isinstance(found, str) else found
+        converted = within_reach(problem)
+        _KNOWN[problem] = problem if isinstance(converted, str) else converted
     return _KNOWN[problem]
 
 
 def within_reach(problem: OptimalControlProblem) -> OptimalControlProblem | str:
-    """A problem with parameters with a system that changes with time, whose state can be followed over all of them; or
-    why it cannot."""
+    """Return the problem with a system that changes with time, whose state can be followed over all parameters; or, as
+    a string, the reason why it cannot."""
     try:
         system = problem.system.in_time(problem.horizon)
-        found, depends = replace(problem, system=system), system.dependence
+        converted, depends = replace(problem, system=system), system.dependence
         if system.powers is not None:
             for _, law in law_of(system.forced).every:
                 Expansion.of(law)
@@ -57,15 +59,17 @@ def within_reach(problem: OptimalControlProblem) -> OptimalControlProblem | str:
         return str(error)
     except (TypeError, ValueError):  # of a function that asks how large a parameter is, or multiplies whole matrices
         return "their entries are no arithmetic, entry by entry, in single parameters"
-    return found
+    return converted
 
 
 def corners_of_box(depends: Dependence) -> list[Array]:
-    """The corners of the box of parameters as shares of what these may deviate from its middle by, of those that reach
-    a state; raises `InputError` where there are too many."""
+    """Return the corners of the box of parameters as shares of their deviation from its middle; only parameters that
+    reach a state vary. Raise `InputError` where there are more than `CORNERS`."""
     moves = depends.reached.any(axis=1) & (depends.units > 0.0)
     count = 2 ** int(moves.sum())
     if count > CORNERS:
         expected = f"a box with at most {CORNERS} corners beside the time t"
         raise InputError(path="system.parameters", expected=expected, got=f"{count}")
-    return [np.array(one) for one in every_choice(*((-1.0, 1.0) if one else (0.0,) for one in moves.tolist()))]
+    return [
+        np.array(corner) for corner in every_choice(*((-1.0, 1.0) if varies else (0.0,) for varies in moves.tolist()))
+    ]

@@ -1,4 +1,4 @@
-"""A problem of which there are more states: they follow its own, begin at 0, are not measured, and cost nothing."""
+"""Problem with further states, which follow its own, begin at 0, are not measured and cost nothing."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ from sparserob_core.sip.convex_set import Box
 
 
 def larger(problem: OptimalControlProblem, more: int, **told: Any) -> OptimalControlProblem:
-    """The problem with so many ``more`` states; its system, constraints and names are ``told``."""
-    d, zeros, begun = problem.system.states, np.zeros(more), problem.initial_set
-    measured, (state, _, final) = problem.measurements or Measurements(np.eye(d)), problem.cost.terms
+    """Return the problem with ``more`` further states; ``told`` holds its new system, constraints and names."""
+    d, zeros, initial_set = problem.system.states, np.zeros(more), problem.initial_set
+    measurements, (state, _, final) = problem.measurements or Measurements(np.eye(d)), problem.cost.terms
     return replace(
         problem,
         initial_state=np.append(np.asarray(problem.initial_state), zeros),
-        initial_set=begun if begun is None or not more else product([begun, Box(zeros, zeros)]),
+        initial_set=initial_set if initial_set is None or not more else product([initial_set, Box(zeros, zeros)]),
         cost=replace(problem.cost, state=_costing(state, more), final=_costing(final, more)),
-        measurements=replace(measured, C=columns(measured.C, d + more)),
+        measurements=replace(measurements, C=columns(measurements.C, d + more)),
         **told,
     )
 

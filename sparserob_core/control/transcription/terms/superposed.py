@@ -1,5 +1,5 @@
-"""Parameters beside the time as states: a problem whose state is an affine function of them, as one of a known system,
-of which every bound of the state is one for each corner of their box."""
+"""Parameters of a system that also depends on time, as states. The state is an affine function of such parameters. The
+larger system is known, and every bound of the state becomes one bound for each corner of the parameters' box."""
 
 from __future__ import annotations
 
@@ -20,11 +20,12 @@ from sparserob_core.sip.convex_set import Array
 
 
 def superposed(problem: OptimalControlProblem) -> OptimalControlProblem:
-    """The same problem without parameters beside the time. The states of one in the middle of their box stay the first
-    ones, after which comes what each parameter adds, per half of its interval; both obey known equations. A bound of
-    the state holds for all parameters where it holds at the corners; a curved one is one constraint for each of them.
-    Halves of intervals are rounded outwards. Beside errors of execution, or measurable disturbances, parameters of any
-    system are such (`in_time`).
+    """Return the same problem without parameters of a system that also depends on time.
+
+    The states at the middle of the box of parameters stay the first ones. The contribution of each parameter follows,
+    per half of its interval; both obey known equations. A bound of the state holds for all parameters where it holds at
+    the corners. A curved bound becomes one constraint for each corner. Halves of intervals are rounded outwards. With
+    errors of execution, or measurable disturbances, parameters of any system are treated so (`in_time`).
     """
     problem = in_time(problem)
     system = problem.system
@@ -36,14 +37,14 @@ def superposed(problem: OptimalControlProblem) -> OptimalControlProblem:
         depends.states - system.states,
         system=system.superposed(depends),
         path=[
-            one
+            constraint
             for entry, name in zip(problem.windows, problem.called("path"), strict=True)
-            for one in entry.everywhere(rows, name)
+            for constraint in entry.everywhere(rows, name)
         ],
         terminal=[
-            one
+            terminal
             for end in problem.terminal
-            for one in ([cylinder(end, depends.states)] if isinstance(end, Equality) else everywhere(end, rows))
+            for terminal in ([cylinder(end, depends.states)] if isinstance(end, Equality) else everywhere(end, rows))
         ],
         integral=[entry.everywhere(rows) for entry in problem.integral],
         names=replace(_names(problem.names, system, depends), corners=corners_of(problem)),
@@ -51,39 +52,41 @@ def superposed(problem: OptimalControlProblem) -> OptimalControlProblem:
 
 
 def at_corners(problem: OptimalControlProblem) -> list[Array] | None:
-    """The stated states at every corner of the box of parameters beside the time, as rows ``(d, size)`` on those of one
-    in the middle and on what the parameters add; ``None`` where there are none that the state is an affine function
-    of."""
+    """Return one matrix ``(d, size)`` for each corner of the box of parameters. It gives the states of the user from
+    the states at the middle and the contributions of the parameters. ``None`` where the state is not an affine function
+    of parameters."""
     depends = in_time(problem).system.dependence
     return None if depends is None else [depends.rows(corner) for corner in corners_of_box(depends)]
 
 
 def corners_of(problem: OptimalControlProblem) -> Corners:
-    """The corners of a problem as it is stated; none where it has no parameters beside the time."""
+    """Return the corners of a problem as the user stated it; without entries where the state is not an affine function
+    of parameters."""
     system, rows = in_time(problem).system, at_corners(problem)
     if rows is None or system.dependence is None:
         return Corners()
-    box, reached = system.box, system.dependence.reached
+    box, is_reached = system.box, system.dependence.reached
     ends = [
-        sorted({low, high}) if any(one) else [low]
-        for low, high, one in zip(box.lower.tolist(), box.upper.tolist(), reached, strict=True)
+        sorted({low, high}) if any(row) else [low]
+        for low, high, row in zip(box.lower.tolist(), box.upper.tolist(), is_reached, strict=True)
     ]
     return Corners(rows, np.array(list(every_choice(*ends))), system.names)
 
 
 def _names(names: Names, system: System, depends: Dependence) -> Names:
-    """Those of the states, and of what a parameter adds to one per unit of it."""
-    added = [
+    """Return the names and units of the states, and those of the contribution of each parameter to a state, per unit of
+    the parameter."""
+    contributions = [
         (i, name)
-        for name, reached in zip(system.names, depends.reached, strict=True)
-        for i in np.flatnonzero(reached).tolist()
+        for name, is_reached in zip(system.names, depends.reached, strict=True)
+        for i in np.flatnonzero(is_reached).tolist()
     ]
-    units = [names.state_units[i] for i, _ in added] if names.state_units else []
+    units = [names.state_units[i] for i, _ in contributions] if names.state_units else []
     return replace(
         names,
         states=[
             *(names.state(i) for i in range(system.states)),
-            *(f"{names.state(i)} per {name}" for i, name in added),
+            *(f"{names.state(i)} per {name}" for i, name in contributions),
         ],
         state_units=[*names.state_units, *units],
     )
