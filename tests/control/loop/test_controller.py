@@ -386,6 +386,37 @@ def test_a_disturbance_that_is_not_one_of_the_set_is_told_at_the_next_step() -> 
         assert controller.covered is covered
 
 
+@pytest.mark.parametrize("disturbed", [{}, {"disturbance": {"box": [1e-3, 1e-3]}}])
+def test_a_control_that_is_delivered_with_an_admissible_error_is_covered(disturbed: dict[str, object]) -> None:
+    problem = {name: value for name, value in BASE["problem"].items() if name != "disturbance"}
+    controller = sr.controller({**BASE, "problem": {**problem, **disturbed, "execution": [0.05]}})
+    A, B = np.array([[0, 1], [-2, -0.5]]), np.array([0.0, 1.0])
+    state, moved = np.array([-1.0, 1.0]), 0.0
+    for k in range(12):
+        u = controller.step(k * 0.25, state)
+        moved = max(moved, abs(u[0]))
+        block = np.zeros((3, 3))
+        block[:2, :2], block[:2, 2] = A, B * 1.05 * u[0]
+        state = (expm(block * 0.25) @ np.append(state, 1.0))[:2]
+    assert moved > 0.1  # there was an error
+    assert controller.covered and not controller.ever_uncovered
+
+
+@pytest.mark.parametrize("bound", [{"norm": {"p": 1.5, "radius": 1.0}}, {"ellipsoid": {"shape": [[1, 0.5], [0.5, 1]]}}])
+def test_a_state_from_nowhere_is_answered_within_a_curved_set_of_controls(bound: dict[str, object]) -> None:
+    changed = {"system": {**BASE["problem"]["system"], "B": [[0, 0.2], [1, 0.3]]}, "control": bound}
+    controller = sr.controller({**GAINS, "problem": {**BASE["problem"], **changed}})
+    controls, state, outside = controller.plan.model.problem.control, np.array([-1.0, 1.0]), 0
+    for k in range(12):
+        nominal = controller.plan.model.pieces(controller.plan.decision)[:, k]
+        u = controller.step(k * 0.25, state)
+        assert float(controls.violation(u)) <= 1e-12
+        outside += float(controls.violation(nominal + 1.01 * (u - nominal))) > 0.0
+        state = np.array([9.0, -9.0])
+    assert not controller.covered
+    assert outside  # a control at the edge: as much of the answer as there is room for
+
+
 def test_a_disturbance_that_changes_within_its_own_piece_is_told() -> None:
     pieces = {"control": 12, "disturbance": 6}
     coarse = {**GAINS, "dictionaries": {k: {"name": "piecewise_constant", "pieces": n} for k, n in pieces.items()}}
