@@ -12,8 +12,8 @@ import sparserob_core as sr
 
 
 class Clarabel(sr.Solver, sr.Options):
-    """Robust and precise; slower than PIQP on programs with few rows. Gives a Farkas ray when a program is
-    infeasible."""
+    """Interior-point solver for conic programs, robust and precise; slower than PIQP on programs with few rows. Gives a
+    Farkas ray when a program is infeasible."""
 
     sparse: ClassVar[bool] = True
     conic: ClassVar[bool] = True
@@ -26,25 +26,33 @@ class Clarabel(sr.Solver, sr.Options):
         from scipy.sparse import csc_array, csc_matrix, eye_array, triu, vstack
 
         n, e, r = program.q.size, program.b.size, program.h.size
-        above, below = np.flatnonzero(np.isfinite(program.upper)), np.flatnonzero(np.isfinite(program.lower))
+        bounded_above, bounded_below = (
+            np.flatnonzero(np.isfinite(program.upper)),
+            np.flatnonzero(np.isfinite(program.lower)),
+        )
         identity = eye_array(n, format="csr")
-        inside = np.concatenate([np.zeros(0, dtype=int), *program.cones])  # variables, cone after cone
-        held = csc_array((-np.ones(inside.size), (np.arange(inside.size), inside)), shape=(inside.size, n))
-        rows = csc_matrix(vstack([program.A, program.G, identity[above], -identity[below], held], format="csc"))
-        rhs = np.concatenate([program.b, program.h, program.upper[above], -program.lower[below]])
+        cone_variables = np.concatenate([np.zeros(0, dtype=int), *program.cones])  # variables, cone after cone
+        cone_rows = csc_array(
+            (-np.ones(cone_variables.size), (np.arange(cone_variables.size), cone_variables)),
+            shape=(cone_variables.size, n),
+        )
+        rows = csc_matrix(
+            vstack([program.A, program.G, identity[bounded_above], -identity[bounded_below], cone_rows], format="csc")
+        )
+        rhs = np.concatenate([program.b, program.h, program.upper[bounded_above], -program.lower[bounded_below]])
         cones = [clarabel.ZeroConeT(e), clarabel.NonnegativeConeT(rhs.size - e)]
         cones += [clarabel.SecondOrderConeT(cone.size) for cone in program.cones]
-        rhs = np.concatenate([rhs, np.zeros(inside.size)])
+        rhs = np.concatenate([rhs, np.zeros(cone_variables.size)])
         solver = clarabel.DefaultSolver(
             csc_matrix(triu(program.P, format="csc")), program.q, rows, rhs, cones, self._settings(program, accuracy)
         )
         solution = solver.solve()
         dual, z_box = np.array(solution.z), np.zeros(n)
-        z_box[above] = dual[e + r : e + r + above.size]
-        z_box[below] -= dual[e + r + above.size : rhs.size - inside.size]
-        kinds: dict[Any, Literal["solved", "infeasible"]] = {"Solved": "solved", "PrimalInfeasible": "infeasible"}
+        z_box[bounded_above] = dual[e + r : e + r + bounded_above.size]
+        z_box[bounded_below] -= dual[e + r + bounded_above.size : rhs.size - cone_variables.size]
+        statuses: dict[Any, Literal["solved", "infeasible"]] = {"Solved": "solved", "PrimalInfeasible": "infeasible"}
         claim = sr.Claim(
-            kinds.get(str(solution.status), "failed"),
+            statuses.get(str(solution.status), "failed"),
             np.array(solution.x),
             dual[e : e + r],
             dual[:e],

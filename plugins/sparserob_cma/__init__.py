@@ -41,7 +41,8 @@ class CMA(sr.Maximiser, sr.Options):
     """The factor by which the population grows at a restart."""
 
     def search(self, objective: sr.Objective, rng: np.random.Generator) -> float:
-        """See `sparserob_core.Maximiser`."""
+        """Search until the budget is spent and return ``inf``, as no upper bound is proven; see
+        `sparserob_core.Maximiser`."""
         strategies = 0
 
         def create(dimension: int, budget: int, rng: np.random.Generator) -> _Strategy:
@@ -58,7 +59,7 @@ class CMA(sr.Maximiser, sr.Options):
 
 
 class _Strategy:
-    """One descent in the unit box; its warnings, such as that all losses are equal, are nobody's concern."""
+    """Descent of CMA-ES in the unit box; its warnings, such as that all losses are equal, are nobody's concern."""
 
     def __init__(
         self, objective: sr.Objective, start: np.ndarray, sigma: float, population: int, rng: np.random.Generator

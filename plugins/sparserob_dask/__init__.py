@@ -55,7 +55,7 @@ class Dask(sr.ExecutorFactory, sr.Options):
 
     @contextmanager
     def open(self) -> Iterator[Executor]:
-        """See `sparserob_core.ExecutorFactory`."""
+        """Return a context that yields the workers of the cluster; see `sparserob_core.ExecutorFactory`."""
         from sparserob_dask.cluster import connected, started
 
         with sr.one_thread():  # here, too: what this process adds up, it adds up as the workers do

@@ -37,7 +37,7 @@ SETTINGS = {
 
 @contextmanager
 def started(workers: int | None, host: str, timeout: float) -> Iterator[Executor]:
-    """A cluster of this machine, which ends with the context."""
+    """Start a cluster on this machine, which ends with the context; yield its executor."""
     with _event_loop(timeout) as loop:
         count = workers or sr.processors()
         with (
@@ -64,15 +64,15 @@ def started(workers: int | None, host: str, timeout: float) -> Iterator[Executor
 
 @contextmanager
 def connected(address: str, timeout: float) -> Iterator[Executor]:
-    """The workers of the cluster whose scheduler listens at ``address``."""
+    """Connect to the cluster whose scheduler listens at ``address``; yield its executor."""
     with _event_loop(timeout) as loop, _connected(address, timeout, loop, breaks=False) as executor:
         yield executor
 
 
 @contextmanager
 def _event_loop(timeout: float) -> Iterator[IOLoop]:
-    """The loop on which dask works, in a thread of its own; the one that dask would start by itself is given ten
-    seconds, whatever is asked for, and then fails without a word."""
+    """Run the event loop of dask in a thread of its own. The loop that dask would start by itself is given ten seconds,
+    whatever is asked for, and then fails without a word."""
     ready: Future[tuple[IOLoop, asyncio.Event]] = Future()
 
     async def work() -> None:
@@ -109,7 +109,8 @@ def _event_loop(timeout: float) -> Iterator[IOLoop]:
 
 @contextmanager
 def _connected(address: str, timeout: float, loop: IOLoop, breaks: bool) -> Iterator[Executor]:
-    """The same; ``breaks``: whether a worker that dies ends the executor."""
+    """Connect to the scheduler at ``address`` through ``loop``; with ``breaks``, a worker that dies ends the
+    executor."""
     try:
         with _telling(f"for the scheduler at {address} to answer", timeout):
             client = _Client(address, timeout=timeout, set_as_default=False, loop=loop)
@@ -142,7 +143,7 @@ def _connected(address: str, timeout: float, loop: IOLoop, breaks: bool) -> Iter
 
 @contextmanager
 def _telling(what: str, timeout: float) -> Iterator[None]:
-    """Say on the standard error stream what is waited for, if it lasts."""
+    """Write to the standard error stream what is waited for, if waiting takes longer than `SILENT`."""
     timer = threading.Timer(SILENT, sys.stderr.write, [f"dask: waiting up to {timeout:g} s {what}\n"])
     timer.daemon = True
     timer.start()
@@ -154,7 +155,7 @@ def _telling(what: str, timeout: float) -> Iterator[None]:
 
 @final
 class _Cluster(Executor):
-    """Hands out one call for each thread of the workers; the others wait here."""
+    """Executor that hands out one call for each thread of the workers; the other calls wait in this process."""
 
     def __init__(self, client: Client, breaks: bool) -> None:
         self._client, self._breaks = client, breaks
@@ -194,10 +195,10 @@ class _Cluster(Executor):
                     self._waiting.popleft()[0].cancel()
             while wait and (self._waiting or self._running):
                 self._changed.wait(1.0)
-                self._waiting = deque(one for one in self._waiting if not one[0].cancelled())
+                self._waiting = deque(entry for entry in self._waiting if not entry[0].cancelled())
 
     def abandon(self, why: str) -> None:
-        """End everything that is not done: what waits is cancelled, what has begun is a `BrokenExecutor`."""
+        """Cancel the calls that wait, and end those that have begun with a `BrokenExecutor`."""
         with self._changed:
             self._closed = True
             waiting, running = list(self._waiting), dict(self._running)
@@ -206,8 +207,8 @@ class _Cluster(Executor):
             self._changed.notify_all()
         for future, _ in waiting:
             future.cancel()
-        for future, there in running.items():
-            there.cancel()
+        for future, remote in running.items():
+            remote.cancel()
             future.set_exception(BrokenExecutor(why))
 
     def _send(self) -> None:
@@ -215,13 +216,13 @@ class _Cluster(Executor):
             while self._waiting and len(self._running) < self._threads:
                 future, call = self._waiting.popleft()
                 if future.set_running_or_notify_cancel():
-                    there = self._client.submit(_called, call, pure=False)
-                    self._running[future] = there
-                    self._client.loop.add_callback(self._follow, future, there)
+                    remote = self._client.submit(_called, call, pure=False)
+                    self._running[future] = remote
+                    self._client.loop.add_callback(self._follow, future, remote)
             self._changed.notify_all()
 
     async def _follow(self, future: Future[Any], there: Any) -> None:
-        """In the thread of dask's own loop: pass an answer on, and send the next call."""
+        """Pass on an answer and send the next call, in the thread of dask's own loop."""
         answer: object = None
         failure: BaseException | None = None
         try:
@@ -231,12 +232,12 @@ class _Cluster(Executor):
         except BaseException as error:  # noqa: BLE001  it is raised again where the result is asked for
             failure = error
         with self._changed:
-            mine = self._running.pop(future, None) is not None
-        if mine and isinstance(failure, BrokenExecutor) and self._breaks:
+            is_running = self._running.pop(future, None) is not None
+        if is_running and isinstance(failure, BrokenExecutor) and self._breaks:
             self._break(str(failure))
-        if mine and failure is None:
+        if is_running and failure is None:
             future.set_result(answer)
-        elif mine:
+        elif is_running:
             future.set_exception(failure)
         self._send()
 
@@ -250,14 +251,15 @@ class _Cluster(Executor):
                 future.set_exception(BrokenExecutor(why))
 
     def _count_threads(self) -> None:
-        """Workers of a cluster come and go: ask now and then."""
+        """Ask for the number of threads every ten seconds, as workers of a cluster come and go."""
         if time.monotonic() - self._asked > 10.0:
             self._asked = time.monotonic()
             self._threads = max(1, sum(self._client.nthreads().values()))
 
 
 def _called(call: bytes) -> bytes:
-    """On a worker: make a call; its answer as bytes, so that what cannot be sent is an error here."""
+    """Make a call on a worker and return the answer as bytes, so that an answer that cannot be sent is an error
+    here."""
     fn, args, kwargs = cloudpickle.loads(call)
     answer = fn(*args, **kwargs)
     try:
@@ -269,14 +271,14 @@ def _called(call: bytes) -> bytes:
 
 @final
 class _Client(Client):  # type: ignore[misc]
-    """Closes itself if it cannot begin.
+    """Client that closes itself if it cannot begin.
 
     Dask leaves that to the collection of garbage, which comes in whatever thread it likes: in that of another loop that
     is just beginning, it waits for the lock that is held until this loop has begun.
     """
 
     def start(self, **options: Any) -> None:
-        """See dask."""
+        """Start as dask does; close the client where that fails."""
         try:
             super().start(**options)
         except BaseException:
@@ -286,18 +288,18 @@ class _Client(Client):  # type: ignore[misc]
 
 @final
 class _LeavesInterrupts(WorkerPlugin):  # type: ignore[misc]
-    """Workers leave Ctrl-C to the process that has started them."""
+    """Plugin by which workers leave Ctrl-C to the process that has started them."""
 
     name = "sparserob-leaves-interrupts"
 
     def setup(self, worker: Any) -> None:
-        """On each worker, in its main thread."""
+        """Ignore Ctrl-C in the main thread of a worker."""
         signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
 @final
 class _Mortal(Nanny):  # type: ignore[misc]
-    """Starts its worker once: another one would begin with the script that is run here."""
+    """Supervisor that starts its worker once: another worker would begin with the script that is run here."""
 
     begun = False
 

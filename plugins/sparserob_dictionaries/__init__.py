@@ -17,7 +17,7 @@ MOST_OF_HAAR = 2**17  # pieces, on each of which log2 of them and one functions 
 
 @final
 class PiecewiseConstant(sr.DictionaryFactory, sr.Options):
-    """One indicator function per piece; the pieces are equal, or as the breakpoints say."""
+    """Indicator functions, one per piece; the pieces are equal, or as the breakpoints say."""
 
     pieces: int | None = Field(default=None, ge=1, le=MOST_PIECES)
     """Number of equal pieces; 100 unless ``pieces``, ``step`` or ``breakpoints`` is given."""
@@ -32,16 +32,16 @@ class PiecewiseConstant(sr.DictionaryFactory, sr.Options):
     """Number of functions, at most the number of pieces; fewer join neighbouring pieces as evenly as possible."""
 
     def build(self, horizon: float) -> sr.Dictionary:
-        """The dictionary on ``[0, horizon]``; raises `InputError` when the options do not fit it."""
+        """Build the dictionary on ``[0, horizon]``; raises `InputError` when the options do not fit it."""
         times = self._times(horizon)
         pieces = times.size - 1
         functions = _functions(self.functions, pieces)
         return sr.Dictionary.indicators(times, np.arange(pieces) * functions // pieces)
 
     def _times(self, horizon: float) -> sr.Array:
-        given = [name for name in ("pieces", "step", "breakpoints") if getattr(self, name) is not None]
-        if len(given) > 1:
-            raise sr.InputError(f"expected one of pieces, step and breakpoints, got {' and '.join(given)}")
+        options = [name for name in ("pieces", "step", "breakpoints") if getattr(self, name) is not None]
+        if len(options) > 1:
+            raise sr.InputError(f"expected one of pieces, step and breakpoints, got {' and '.join(options)}")
         if self.breakpoints is not None:
             return _checked(self.breakpoints, horizon)
         pieces = self.pieces or 100
@@ -65,19 +65,19 @@ class Haar(sr.DictionaryFactory, sr.Options):
     """Number of functions, at most the number of pieces; all unless given."""
 
     def build(self, horizon: float) -> sr.Dictionary:
-        """The dictionary on ``[0, horizon]``; raises `InputError` when the options do not fit together."""
+        """Build the dictionary on ``[0, horizon]``; raises `InputError` when the options do not fit together."""
         from scipy.sparse import csr_array
 
         K = _power_of_two(self.pieces)
         N = _functions(self.functions, K)
-        number = np.arange(K)
-        rows, columns, data = [np.zeros(K, dtype=int)], [number], [np.ones(K)]
+        pieces = np.arange(K)
+        rows, columns, data = [np.zeros(K, dtype=int)], [pieces], [np.ones(K)]
         scale = 1
         while scale < N:  # functions scale, scale + 1, ... are 1 on half of K / scale pieces, and -1 on the other half
             length = K // scale
-            rows.append(scale + number // length)
-            columns.append(number)
-            data.append(np.where(number % length < length // 2, 1.0, -1.0))
+            rows.append(scale + pieces // length)
+            columns.append(pieces)
+            data.append(np.where(pieces % length < length // 2, 1.0, -1.0))
             scale *= 2
         entries = np.concatenate(data), (np.concatenate(rows), np.concatenate(columns))
         values = csr_array(entries, shape=(max(scale, 1), K))[:N]
@@ -96,14 +96,14 @@ class Walsh(sr.DictionaryFactory, sr.Options):
     """Number of functions, at most the number of pieces; all unless given."""
 
     def build(self, horizon: float) -> sr.Dictionary:
-        """The dictionary on ``[0, horizon]``; raises `InputError` when the options do not fit together."""
+        """Build the dictionary on ``[0, horizon]``; raises `InputError` when the options do not fit together."""
         K = _power_of_two(self.pieces)
         functions = _functions(self.functions, K)
         values = np.ones((1, 1))
         while values.shape[0] < K:
             values = np.block([[values, values], [values, -values]])
-        changes = np.count_nonzero(np.diff(values, axis=1), axis=1)
-        return sr.Dictionary(np.linspace(0.0, horizon, K + 1), values[np.argsort(changes)][:functions])
+        sign_changes = np.count_nonzero(np.diff(values, axis=1), axis=1)
+        return sr.Dictionary(np.linspace(0.0, horizon, K + 1), values[np.argsort(sign_changes)][:functions])
 
 
 def _functions(functions: int | None, pieces: int) -> int:
@@ -134,7 +134,7 @@ def _checked(breakpoints: list[float], horizon: float) -> sr.Array:
 
 @sr.hookimpl
 def sparserob_dictionaries() -> Iterator[sr.DictionaryPlugin]:
-    """The shipped dictionaries."""
+    """Offer the shipped dictionaries."""
     yield sr.DictionaryPlugin(
         name="piecewise_constant", factory=PiecewiseConstant, summary="One indicator function per piece of time."
     )

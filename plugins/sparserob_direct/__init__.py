@@ -37,7 +37,8 @@ class Direct(sr.Maximiser, sr.Options):
     """Divide at most one rectangle of each size per iteration: faster when the maxima are few."""
 
     def search(self, objective: sr.Objective, rng: np.random.Generator) -> float:
-        """See `sparserob_core.Maximiser`."""
+        """Search until the budget is spent and return ``inf``, as no upper bound is proven; see
+        `sparserob_core.Maximiser`."""
         division = Division(objective, self.locally_biased)
         while chosen := division.promising(self.eps):
             division.divide(chosen)
@@ -47,8 +48,8 @@ class Direct(sr.Maximiser, sr.Options):
 
 
 class Division:
-    """The rectangles: their ``centres (n, d)`` in the unit box, how often each side was cut, ``levels (n, d)``, and the
-    ``losses (n,)`` at the centres, of which there are ``count``."""
+    """Division of the unit box into ``count`` rectangles. ``centres (n, d)`` and the cuts of each side,
+    ``levels (n, d)``, describe them; ``losses (n,)`` are the values at the centres, negated."""
 
     def __init__(self, objective: sr.Objective, biased: bool) -> None:
         self.objective, self.biased, self.count = objective, biased, 0
@@ -65,38 +66,38 @@ class Division:
         losses = np.array([self.waiting[size][0][0] for size in sizes])
         losses[np.isinf(losses)] = self.worst if np.isfinite(self.worst) else 0.0
         chosen = list[int]()
-        for at in best_for_some_slope(np.array([self._width(size) for size in sizes]), losses, eps):
-            rectangles = self.waiting[sizes[at]]
-            loss, first = heappop(rectangles)
-            chosen.append(first)
+        for index in best_for_some_slope(np.array([self._width(size) for size in sizes]), losses, eps):
+            rectangles = self.waiting[sizes[index]]
+            loss, rectangle = heappop(rectangles)
+            chosen.append(rectangle)
             while not self.biased and rectangles and rectangles[0][0] == loss:
                 chosen.append(heappop(rectangles)[1])
         return chosen
 
     def divide(self, chosen: list[int]) -> None:
-        """Evaluate the new centres in these rectangles, and cut them."""
-        longest = [np.flatnonzero(self.levels[one] == self.levels[one].min()) for one in chosen]
+        """Evaluate the new centres in the chosen rectangles, and cut these."""
+        longest = [np.flatnonzero(self.levels[rectangle] == self.levels[rectangle].min()) for rectangle in chosen]
         parents = np.repeat(chosen, [2 * axes.size for axes in longest])
         axes = np.repeat(np.concatenate(longest), 2)
-        steps = 3.0 ** -(self.levels[parents, axes].astype(float) + 1.0)
-        steps[1::2] *= -1.0
-        first, rows = self.count, max(1, NUMBERS_AT_ONCE // self.centres.shape[1])
-        for begin in range(0, parents.size, rows):
-            part = slice(begin, begin + rows)
-            centres = self.centres[parents[part]]
-            centres[np.arange(len(centres)), axes[part]] += steps[part]
-            self._add(centres, self.levels[parents[part]])
+        offsets = 3.0 ** -(self.levels[parents, axes].astype(float) + 1.0)
+        offsets[1::2] *= -1.0
+        first_child, batch_size = self.count, max(1, NUMBERS_AT_ONCE // self.centres.shape[1])
+        for start in range(0, parents.size, batch_size):
+            batch = slice(start, start + batch_size)
+            centres = self.centres[parents[batch]]
+            centres[np.arange(len(centres)), axes[batch]] += offsets[batch]
+            self._add(centres, self.levels[parents[batch]])
         for rectangle, sides in zip(chosen, longest, strict=True):
-            pairs = self.losses[first : first + 2 * sides.size].reshape(-1, 2).min(axis=1)
-            for place in np.argsort(pairs, kind="stable").tolist():  # a side that is cut first leaves larger thirds
-                self.levels[rectangle, sides[place]] += 1
-                self.levels[first + 2 * place : first + 2 * place + 2] = self.levels[rectangle]
-            for one in (rectangle, *range(first, first + 2 * sides.size)):
-                self._wait(one)
-            first += 2 * sides.size
+            losses = self.losses[first_child : first_child + 2 * sides.size].reshape(-1, 2).min(axis=1)
+            for position in np.argsort(losses, kind="stable").tolist():  # a side that is cut first leaves larger thirds
+                self.levels[rectangle, sides[position]] += 1
+                self.levels[first_child + 2 * position : first_child + 2 * position + 2] = self.levels[rectangle]
+            for index in (rectangle, *range(first_child, first_child + 2 * sides.size)):
+                self._wait(index)
+            first_child += 2 * sides.size
 
     def boxes(self) -> tuple[np.ndarray, np.ndarray]:
-        """Lower and upper corners ``(k, d)``, of the best rectangles first."""
+        """Return the lower and upper corners ``(k, d)``, of the best rectangles first."""
         order = np.argsort(self.losses[: self.count], kind="stable")[:MOST_SHOWN]
         half = 0.5 / 3.0 ** self.levels[order].astype(float)
         return self._placed(self.centres[order] - half), self._placed(self.centres[order] + half)
@@ -105,10 +106,10 @@ class Division:
         losses = -self.objective.evaluate(self._placed(centres))
         end = self.count + len(centres)
         if end > len(self.losses):
-            more = max(end, 2 * self.count)
+            capacity = max(end, 2 * self.count)
             self.centres, self.levels, self.losses = (
-                np.concatenate([kept[: self.count], np.empty((more - self.count, *kept.shape[1:]), kept.dtype)])
-                for kept in (self.centres, self.levels, self.losses)
+                np.concatenate([array[: self.count], np.empty((capacity - self.count, *array.shape[1:]), array.dtype)])
+                for array in (self.centres, self.levels, self.losses)
             )
         self.centres[self.count : end], self.levels[self.count : end] = centres, levels
         self.losses[self.count : end], self.count = losses, end
@@ -122,7 +123,7 @@ class Division:
             heappush(self.waiting.setdefault(size, []), (float(self.losses[rectangle]), rectangle))
 
     def _width(self, size: tuple[int, int]) -> float:
-        """The longest side with the local bias, else the diagonal."""
+        """Return the longest side with the local bias, else the diagonal."""
         level, shorter = size
         if self.biased:
             return float(3.0**-level)
@@ -134,16 +135,16 @@ class Division:
 
 
 def best_for_some_slope(widths: np.ndarray, losses: np.ndarray, eps: float) -> Iterator[int]:
-    """The places ``j`` at which a slope ``K > 0`` makes ``losses[j] - K widths[j]`` the least of all, and less than the
-    least loss by the share ``eps`` of it; ``widths (k,)`` decrease."""
+    """Yield the indices ``j`` at which a slope ``K > 0`` makes ``losses[j] - K widths[j]`` the least of all, and less
+    than the least loss by the share ``eps`` of it; ``widths (k,)`` decrease."""
     least = losses.min(initial=np.inf)
-    for at, (width, loss) in enumerate(zip(widths.tolist(), losses.tolist(), strict=True)):
+    for index, (width, loss) in enumerate(zip(widths.tolist(), losses.tolist(), strict=True)):
         with np.errstate(over="ignore"):  # a slope beyond all doubles is no slope
-            steepest = float(((losses[:at] - loss) / (widths[:at] - width)).min(initial=np.inf))
-            flattest = float(((loss - losses[at + 1 :]) / (width - widths[at + 1 :])).max(initial=0.0))
+            steepest = float(((losses[:index] - loss) / (widths[:index] - width)).min(initial=np.inf))
+            flattest = float(((loss - losses[index + 1 :]) / (width - widths[index + 1 :])).max(initial=0.0))
         gains = steepest == np.inf or loss - steepest * width <= least - eps * abs(least)
         if steepest > 0.0 and flattest <= steepest and gains:
-            yield at
+            yield index
 
 
 @sr.hookimpl

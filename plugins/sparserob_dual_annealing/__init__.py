@@ -47,14 +47,15 @@ class DualAnnealing(sr.Maximiser, sr.Options):
     """Annealing only."""
 
     def search(self, objective: sr.Objective, rng: np.random.Generator) -> float:
-        """See `sparserob_core.Maximiser`."""
+        """Search until the budget is spent and return ``inf``, as no upper bound is proven; see
+        `sparserob_core.Maximiser`."""
         from scipy.optimize import dual_annealing
 
         lower, upper = SPAN * objective.domain.lower, SPAN * objective.domain.upper
         start = SPAN * objective.best_point if objective.evaluations else None
         # scipy renamed the argument (1.15), and knows no end but a count of its iterations: the objective ends the
         # search.
-        seeded: dict[str, Any] = {"rng" if "rng" in inspect.signature(dual_annealing).parameters else "seed": rng}
+        seed_option: dict[str, Any] = {"rng" if "rng" in inspect.signature(dual_annealing).parameters else "seed": rng}
         minima = _Found(objective)
         while objective.remaining:
             dual_annealing(
@@ -68,27 +69,27 @@ class DualAnnealing(sr.Maximiser, sr.Options):
                 no_local_search=self.no_local_search,
                 x0=start,
                 callback=minima.found,
-                **seeded,
+                **seed_option,
             )
         return float("inf")
 
 
 class _Found:
-    """The points where scipy says that the best so far was found, by annealing or by a local search."""
+    """Record of the points where scipy says that the best so far was found, by annealing or by a local search."""
 
     def __init__(self, objective: sr.Objective) -> None:
         self.objective, self.points = objective, list[np.ndarray]()
 
     def found(self, point: np.ndarray, energy: float, context: int) -> None:
-        """See scipy's ``callback``: no answer, so that the search goes on."""
+        """Record a point and return ``None``, as scipy's ``callback`` must for the search to go on."""
         domain = self.objective.domain
         self.points.append(np.clip(point / SPAN, domain.lower, domain.upper))
         self.objective.sketch("the best in turn", np.array(self.points[-60:]))
 
 
 class _Energy:
-    """The negated objective at one point; where the objective is ``-inf``, which
-    scipy's differences cannot rank, the worst finite value that was seen."""
+    """The negated objective at one point. Where the objective is ``-inf``, which scipy's differences cannot rank, it is
+    the worst finite value that was seen."""
 
     def __init__(self, objective: sr.Objective) -> None:
         self.objective, self.worst = objective, -np.inf

@@ -1,4 +1,4 @@
-"""Where independent work is done: here, one after the other, or in processes of this machine."""
+"""Executors: calls are made one after the other in this process, or in processes of this machine."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ Answer = TypeVar("Answer")
 
 
 class Serial(sr.ExecutorFactory, sr.Options):
-    """Every call is made when it is submitted, in order; what it raises is raised by ``Future.result``. An interrupt
-    from the keyboard goes through at once. Linear algebra has one thread until the executor is closed, as it has in the
-    workers of other executors: sums are then added up in the same order everywhere."""
+    """Executor that makes every call when it is submitted, in order; what a call raises is raised by ``Future.result``.
+    An interrupt from the keyboard goes through at once. Linear algebra has one thread until the executor is closed, as
+    it has in the workers of other executors: sums are then added up in the same order everywhere."""
 
     @property
     def parallel(self) -> bool:
-        """Nothing is made side by side."""
+        """Always false: no two calls run at the same time."""
         return False
 
     @contextmanager
     def open(self) -> Iterator[Executor]:
-        """See `sparserob_core.ExecutorFactory`."""
+        """Return a context that yields the executor; see `sparserob_core.ExecutorFactory`."""
         with sr.one_thread(), _Now() as executor:
             yield executor
 
@@ -47,7 +47,7 @@ class Processes(sr.ExecutorFactory, sr.Options):
 
     @contextmanager
     def open(self) -> Iterator[Executor]:
-        """See `sparserob_core.ExecutorFactory`."""
+        """Return a context that yields the pool; see `sparserob_core.ExecutorFactory`."""
         from sparserob_executors.processes import Pool
 
         with sr.one_thread(), Pool(self.workers or sr.processors()) as executor:

@@ -26,7 +26,7 @@ _starting = threading.Lock()
 
 @final
 class Pool(ProcessPoolExecutor):
-    """Workers; leaving the context by an exception abandons what is running."""
+    """Pool of worker processes; leaving the context by an exception abandons the calls that are running."""
 
     def __init__(self, workers: int) -> None:
         self._context = _Context()
@@ -35,13 +35,14 @@ class Pool(ProcessPoolExecutor):
     def submit(
         self, fn: Callable[Arguments, Answer], /, *args: Arguments.args, **kwargs: Arguments.kwargs
     ) -> Future[Answer]:
-        """Send a call to a worker; what cannot be sent is a `pickle.PicklingError` of the future, with its name."""
+        """Send a call to a worker; a call that cannot be sent becomes a `pickle.PicklingError` of the future, with its
+        name."""
         try:
             call = bytes(ForkingPickler.dumps((fn, args, kwargs)))
         except Exception as error:  # noqa: BLE001  it is raised again where the result is asked for
-            failed: Future[Answer] = Future()
-            failed.set_exception(_unsent(f"the call of {_name(fn)}", error))
-            return failed
+            future: Future[Answer] = Future()
+            future.set_exception(_unsent(f"the call of {_name(fn)}", error))
+            return future
         return cast("Future[Answer]", super().submit(_called, call))
 
     def __exit__(
@@ -54,7 +55,7 @@ class Pool(ProcessPoolExecutor):
 
 
 def _called(call: bytes) -> object:
-    """Make a call in a worker; what cannot be sent back, result or error, becomes an error that can."""
+    """Make a call in a worker; a result or an error that cannot be sent back becomes an error that can."""
     try:
         fn, args, kwargs = pickle.loads(call)  # noqa: S301  the parent's own call
     except Exception as error:  # noqa: BLE001  whatever the class of an argument does
@@ -91,7 +92,7 @@ def _name(fn: Callable[..., object]) -> str:
 
 
 def _begin() -> None:
-    """In a worker, before its first call: leave Ctrl-C to the parent, and end when the parent has ended."""
+    """Leave Ctrl-C to the parent, and end when the parent has ended; called in a worker before its first call."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     if hasattr(signal, "pthread_sigmask"):
         signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
@@ -123,7 +124,7 @@ def _plain() -> SpawnProcess:
 
 @final
 class _Context(SpawnContext):
-    """Keeps the workers that it has started."""
+    """Context that keeps the workers that it has started."""
 
     def __init__(self) -> None:
         self.workers: list[SpawnProcess] = []
@@ -136,12 +137,12 @@ class _Context(SpawnContext):
 
 @contextmanager
 def _without_interrupt() -> Iterator[None]:
-    """A process that is started meanwhile has Ctrl-C blocked; one that arrives here meanwhile is taken afterwards."""
+    """Block Ctrl-C in a process that is started meanwhile; one that arrives here meanwhile is taken afterwards."""
     if not hasattr(signal, "pthread_sigmask"):
         yield
         return
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    previous_mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield
     finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+        signal.pthread_sigmask(signal.SIG_SETMASK, previous_mask)

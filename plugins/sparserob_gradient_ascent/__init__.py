@@ -42,7 +42,8 @@ class GradientAscent(sr.Maximiser, sr.Options):
     """Evaluations of one ascent at most."""
 
     def search(self, objective: sr.Objective, rng: np.random.Generator) -> float:
-        """See `sparserob_core.Maximiser`."""
+        """Search until the budget is spent and return ``inf``, as no upper bound is proven; see
+        `sparserob_core.Maximiser`."""
         climb = _Climb(objective)
         start = objective.best_point if objective.evaluations else climb.uniform(rng)
         if objective.linear is not None:
@@ -63,25 +64,25 @@ class _Climb:
         self.slope, self.at, self.worst, self.ascent = np.zeros(objective.domain.dimension), np.zeros(0), np.inf, 0
 
     def uniform(self, rng: np.random.Generator) -> sr.Array:
-        """A uniform point of the box."""
+        """Draw a uniform point of the box."""
         return self.place(SCALE * rng.random(self.width.size))
 
     def redrawn(self, rng: np.random.Generator) -> sr.Array:
-        """The best point, with the blocks anew in which the last gradient there was zero."""
-        point, fresh = self.objective.best_point.copy(), self.uniform(rng)
+        """Return the best point, with the blocks drawn anew in which the last gradient there was zero."""
+        point, uniform_point = self.objective.best_point.copy(), self.uniform(rng)
         if not (np.isfinite(point).all() and np.array_equal(point, self.at)):
-            return fresh
-        still = ~self.slope.reshape(-1, self.objective.block).any(axis=1)
-        idle = np.repeat(still, self.objective.block)
-        point[idle] = fresh[idle]
-        return point if idle.any() else fresh
+            return uniform_point
+        is_flat = ~self.slope.reshape(-1, self.objective.block).any(axis=1)
+        is_idle = np.repeat(is_flat, self.objective.block)
+        point[is_idle] = uniform_point[is_idle]
+        return point if is_idle.any() else uniform_point
 
     def place(self, scaled: sr.Array) -> sr.Array:
-        """The point of the box."""
+        """Return the point of the box at the coordinates ``scaled (d,)``."""
         return np.clip(self.domain.lower + scaled / SCALE * self.width, self.domain.lower, self.domain.upper)
 
     def run(self, start: sr.Array, steps: int) -> None:
-        """One ascent; a value of ``-inf`` is shown to the local method as the worst that was seen."""
+        """Run one ascent; a value of ``-inf`` is shown to the local method as the worst that was seen."""
         from scipy.optimize import minimize
 
         self.ascent += 1
@@ -96,7 +97,7 @@ class _Climb:
         )
 
     def descent(self, scaled: sr.Array) -> tuple[float, sr.Array]:
-        """The negated objective and its gradient."""
+        """Return the negated objective and its gradient at ``scaled (d,)``."""
         point = self.place(scaled)
         value, slope = (
             self.objective.value_and_gradient(point) if self.objective.differentiable else self.differences(point)
@@ -106,22 +107,23 @@ class _Climb:
         if np.array_equal(point, self.objective.best_point):
             self.slope, self.at = slope, point
         self.objective.note(ascent=self.ascent, slope=float(np.abs(slope * self.width).max()))
-        shown = value if np.isfinite(value) else (self.worst if np.isfinite(self.worst) else 0.0)
-        return -shown, -slope * self.width / SCALE
+        finite_value = value if np.isfinite(value) else (self.worst if np.isfinite(self.worst) else 0.0)
+        return -finite_value, -slope * self.width / SCALE
 
     def differences(self, point: sr.Array) -> tuple[float, sr.Array]:
-        """One-sided differences, inwards, in batches that fit into memory; 0 where a value is not finite."""
+        """Return the value and one-sided differences, taken inwards in batches that fit into memory; 0 where a value is
+        not finite."""
         value, slope = float(self.objective.evaluate(point[np.newaxis])[0]), np.zeros(point.size)
-        inside = point + STEP * self.width <= self.domain.upper
-        moved = np.clip(point + np.where(inside, STEP, -STEP) * self.width, self.domain.lower, self.domain.upper)
+        is_inside = point + STEP * self.width <= self.domain.upper
+        shifted = np.clip(point + np.where(is_inside, STEP, -STEP) * self.width, self.domain.lower, self.domain.upper)
         batch = max(1, NUMBERS // point.size)
         for first in range(0, point.size if np.isfinite(value) else 0, batch):
             axes = np.arange(first, min(first + batch, point.size))
-            beside = np.repeat(point[np.newaxis], axes.size, axis=0)
-            beside[np.arange(axes.size), axes] = moved[first : first + batch]
-            values, run = self.objective.evaluate(beside), moved[first : first + batch] - point[axes]
-            usable = np.isfinite(values) & (run != 0.0)
-            slope[axes[usable]] = (values[usable] - value) / run[usable]
+            points = np.repeat(point[np.newaxis], axes.size, axis=0)
+            points[np.arange(axes.size), axes] = shifted[first : first + batch]
+            values, steps = self.objective.evaluate(points), shifted[first : first + batch] - point[axes]
+            is_usable = np.isfinite(values) & (steps != 0.0)
+            slope[axes[is_usable]] = (values[is_usable] - value) / steps[is_usable]
         return value, slope
 
 

@@ -40,11 +40,12 @@ class Lipo(sr.Maximiser, sr.Options):
 
     @property
     def polished(self) -> float:
-        """Nothing: its evaluations make the upper bound."""
+        """Share of the budget for a local method: none, as the evaluations make the upper bound."""
         return 0.0
 
     def search(self, objective: sr.Objective, rng: np.random.Generator) -> float:
-        """See `sparserob_core.Maximiser`."""
+        """Search until the budget is spent and return an upper bound, ``inf`` without a constant; see
+        `sparserob_core.Maximiser`."""
         walk = Walk(objective, rng, uniform_scale=True)
         if self.constant is None:
             while objective.remaining:
@@ -86,7 +87,8 @@ class AdaLipo(sr.Maximiser, sr.Options):
     experiments."""
 
     def search(self, objective: sr.Objective, rng: np.random.Generator) -> float:
-        """See `sparserob_core.Maximiser`."""
+        """Search until the budget is spent and return ``inf``, as no upper bound is proven; see
+        `sparserob_core.Maximiser`."""
         walk = Walk(objective, rng, uniform_scale=False)
         ratio = math.log1p(self.growth or 0.01 / walk.dimension)
         unit = 0.0
@@ -102,12 +104,13 @@ class AdaLipo(sr.Maximiser, sr.Options):
 
 
 def _power_of_two(slope: float) -> float:
-    """The power of two next below a slope, which is the unit of its grid; 0 for a slope of 0 or beyond all numbers."""
+    """Return the power of two next below a slope, which is the unit of its grid; 0 for a slope of 0 or beyond all
+    numbers."""
     return math.ldexp(1.0, math.frexp(slope)[1] - 1) if 0.0 < slope < math.inf else 0.0
 
 
 def _on_grid(slope: float, ratio: float) -> float:
-    """The smallest ``exp(ratio i)``, ``i`` an integer, that is not below the slope; 0 for a slope of 0."""
+    """Return the smallest ``exp(ratio i)``, ``i`` an integer, that is not below the slope; 0 for a slope of 0."""
     if slope == 0.0:
         return 0.0
     return max(slope, math.exp(min(ratio * math.ceil(math.log(slope) / ratio), 709.0)))

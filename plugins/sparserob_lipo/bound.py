@@ -16,8 +16,8 @@ ROUNDING: Final = 1e-12
 
 
 def lipschitz_bound(evaluated: Evaluated, constant: float, sides: np.ndarray) -> float:
-    """An upper bound, over the box ``0 <= z <= sides (d,)``, of every function with this Lipschitz constant and the
-    evaluated values.
+    """Return an upper bound, over the box ``0 <= z <= sides (d,)``, of every function with this Lipschitz constant and
+    the evaluated values.
 
     ``U(z) = min_i value_i + constant |z - z_i|`` bounds the function and has the constant itself, so on a cell with
     centre ``c`` and half sides ``h`` nothing exceeds ``U(c) + constant |h|``. The cells with the highest bounds are
@@ -36,15 +36,16 @@ def lipschitz_bound(evaluated: Evaluated, constant: float, sides: np.ndarray) ->
         top = bounds.max(initial=best)
         if top - best <= ROUNDING * max(abs(top), abs(best)):
             break
-        worst = np.argsort(bounds)[-CELLS_AT_ONCE:]
-        kept = np.setdiff1d(np.arange(len(bounds)), worst)
-        inner, narrow = _halved(centres[worst], halves[worst])
-        fresh = np.minimum(_cell_bounds(evaluated, constant, inner, narrow), np.tile(bounds[worst], 2))
+        highest = np.argsort(bounds)[-CELLS_AT_ONCE:]
+        unsplit = np.setdiff1d(np.arange(len(bounds)), highest)
+        new_centres, new_halves = _halved(centres[highest], halves[highest])
+        new_bounds = np.minimum(_cell_bounds(evaluated, constant, new_centres, new_halves), np.tile(bounds[highest], 2))
         centres, halves, bounds = (
-            np.concatenate(pair) for pair in ((centres[kept], inner), (halves[kept], narrow), (bounds[kept], fresh))
+            np.concatenate(pair)
+            for pair in ((centres[unsplit], new_centres), (halves[unsplit], new_halves), (bounds[unsplit], new_bounds))
         )
-        open_still = bounds > best
-        centres, halves, bounds = centres[open_still], halves[open_still], bounds[open_still]
+        is_open = bounds > best
+        centres, halves, bounds = centres[is_open], halves[is_open], bounds[is_open]
     return float(bounds.max(initial=best)) + allowance
 
 
@@ -54,10 +55,10 @@ def _cell_bounds(evaluated: Evaluated, constant: float, centres: np.ndarray, hal
 
 
 def _halved(centres: np.ndarray, halves: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Both halves of each cell: all left ones, then all right ones."""
+    """Cut each cell in half; return the centres and half sides of all left halves, then of all right ones."""
     rows, longest = np.arange(len(centres)), np.argmax(halves, axis=1)
-    narrow = halves.copy()
-    narrow[rows, longest] *= 0.5
+    new_halves = halves.copy()
+    new_halves[rows, longest] *= 0.5
     shift = np.zeros_like(halves)
-    shift[rows, longest] = narrow[rows, longest]
-    return np.concatenate([centres - shift, centres + shift]), np.concatenate([narrow, narrow])
+    shift[rows, longest] = new_halves[rows, longest]
+    return np.concatenate([centres - shift, centres + shift]), np.concatenate([new_halves, new_halves])

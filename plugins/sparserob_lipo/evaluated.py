@@ -1,4 +1,4 @@
-"""What has been evaluated, lowest value first, and what a Lipschitz constant then excludes."""
+"""Evaluated points, lowest value first, and the balls that a Lipschitz constant excludes."""
 
 from __future__ import annotations
 
@@ -32,21 +32,21 @@ class Evaluated:
 
     @property
     def values(self) -> np.ndarray:
-        """All values, the lowest first."""
+        """Values ``(n,)``, the lowest first."""
         return self._values[: self.count]
 
     @property
     def best_point(self) -> np.ndarray:
-        """Where the last of `values` was found."""
+        """Point ``(d,)`` of the last of `values`."""
         best: np.ndarray = self._points[self._order[self.count - 1]]
         return best
 
     def balls(self, constant: float, most: int) -> tuple[np.ndarray, np.ndarray]:
-        """What the constant excludes: the ``most`` largest of the balls, of centres ``(k, d)`` and radii ``(k,)``, the
-        largest first."""
+        """Return the balls that the constant excludes: the ``most`` largest, of centres ``(k, d)`` and radii ``(k,)``,
+        the largest first."""
         radii = (self.values[-1] - self.values[:most]) / constant
-        several = int(np.searchsorted(-radii, 0.0))
-        return self._points[self._order[:several]], radii[:several]
+        count = int(np.searchsorted(-radii, 0.0))
+        return self._points[self._order[:count]], radii[:count]
 
     def add(self, point: np.ndarray, value: float) -> None:
         """Remember a finite value; one pass over the points updates the slope."""
@@ -54,19 +54,19 @@ class Evaluated:
         self._points[row], self._of_row[row] = point, value
         if count:
             self.slope = max(self.slope, self._steepest(point, value))
-        place = int(np.searchsorted(self._values[:count], value, side="right"))
+        position = int(np.searchsorted(self._values[:count], value, side="right"))
         for array, entry in ((self._values, value), (self._order, row)):
-            array[place + 1 : count + 1] = array[place:count]
-            array[place] = entry
+            array[position + 1 : count + 1] = array[position:count]
+            array[position] = entry
         self.count = count + 1
         if self.count > self.capacity:
-            for kept in (self._values, self._order):
-                kept[count - 1], kept[count] = kept[count], kept[count - 1]
+            for entries in (self._values, self._order):
+                entries[count - 1], entries[count] = entries[count], entries[count - 1]
             self.count = count
 
     def first_possible(self, candidates: np.ndarray, constant: float) -> int | None:
-        """The first of the candidates ``(m, d)`` whose value can still reach the best,
-        ``value_i + constant |x - x_i| >= best`` for all ``i``."""
+        """Return the index of the first of the candidates ``(m, d)`` whose value can still reach the best,
+        ``value_i + constant |x - x_i| >= best`` for all ``i``; ``None`` if there is none."""
         radii = self._radii(constant)
         with np.errstate(over="ignore"):
             squares = np.square(radii[: int(np.searchsorted(-radii, 0.0))])
@@ -83,8 +83,8 @@ class Evaluated:
     def _outside(
         self, candidates: np.ndarray, alive: np.ndarray, squares: np.ndarray, start: int, size: int
     ) -> np.ndarray:
-        """Those of the candidates that are alive which lie in none of the balls from ``start`` on (of the first
-        ``FRONT`` only when it is 0)."""
+        """Return those of the indices ``alive`` whose candidates lie in none of the balls from ``start`` on (of the
+        first ``FRONT`` only when it is 0)."""
         from scipy.spatial.distance import cdist
 
         last = len(squares) if start else min(FRONT, len(squares))
@@ -96,20 +96,19 @@ class Evaluated:
         return alive
 
     def bounds(self, places: np.ndarray, constant: float) -> np.ndarray:
-        """The Lipschitz bound ``min_i value_i + constant |x - x_i|`` at places ``(m, d)``."""
+        """Return the Lipschitz bound ``min_i value_i + constant |x - x_i|`` at places ``(m, d)``."""
         from scipy.spatial.distance import cdist
 
         lowest = np.full(len(places), np.inf)
         for start in range(0, self.count, self.part):
             rows = self._order[start : min(self.count, start + self.part)]
             with np.errstate(over="ignore"):
-                above = self._values[start : start + len(rows)] + constant * cdist(places, self._points[rows])
-            lowest = np.minimum(lowest, above.min(axis=1))
+                cones = self._values[start : start + len(rows)] + constant * cdist(places, self._points[rows])
+            lowest = np.minimum(lowest, cones.min(axis=1))
         return lowest
 
     def refutes(self, constant: float, allowance: float) -> bool:
-        """Whether two of the values differ by more than the constant permits, and more than the allowance for rounding
-        beyond that."""
+        """Return whether two values differ by more than the constant permits, beyond the allowance for rounding."""
         for start in range(0, self.count, self.part):
             stop = min(self.count, start + self.part)
             bounds = self.bounds(self._points[self._order[start:stop]], constant)
@@ -128,18 +127,16 @@ class Evaluated:
         from scipy.spatial.distance import cdist
 
         steepest = 0.0
-        used = self.count + (
-            self.count == self.capacity
-        )  # the free row, which holds the point itself, is among them then
-        for start in range(
-            0, used, self.part
-        ):  # in the order of the memory: to gather rows takes several times as long
-            rows = slice(start, min(used, start + self.part))
+        # the free row, which holds the point itself, is among them where the capacity is reached
+        row_count = self.count + (self.count == self.capacity)
+        # in the order of the memory: to gather rows takes several times as long
+        for start in range(0, row_count, self.part):
+            rows = slice(start, min(row_count, start + self.part))
             distances = cdist(point[np.newaxis], self._points[rows])[0]
-            apart = distances > 0
-            others = self._of_row[rows][apart]
+            is_distinct = distances > 0
+            other_values = self._of_row[rows][is_distinct]
             with np.errstate(over="ignore"):
-                rise = np.abs(others - value) - ROUNDED * np.maximum(np.abs(others), abs(value))
-                slopes = rise / distances[apart]
+                rise = np.abs(other_values - value) - ROUNDED * np.maximum(np.abs(other_values), abs(value))
+                slopes = rise / distances[is_distinct]
             steepest = max(steepest, float(slopes.max(initial=0.0)))
         return min(steepest, float(np.finfo(float).max))

@@ -1,5 +1,5 @@
-"""The search that both methods share: draw candidates until one can still beat the best value, evaluate it, and learn
-from it."""
+"""Search that both methods share: draw candidates until one can still beat the best value, evaluate it, and learn from
+it."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ WORK: Final = 2**31  # differences of coordinates that the candidates of one eva
 
 
 class Walk:
-    """Evaluates one point after the other, in coordinates ``z = (x - lower) / scale``.
+    """Search that evaluates one point after the other, in coordinates ``z = (x - lower) / scale``.
 
     ``scale`` is the length of the longest side, or ``(d,)`` that of each: then ``z`` lies in the unit cube. Values of
     ``-inf`` are counted, and take no part in slopes and exclusions.
@@ -45,54 +45,55 @@ class Walk:
         self._evaluate(self._inside(self.rng.random(self.dimension)))
 
     def exploit(self, constant: float) -> None:
-        """Evaluate the first candidate that the constant does not exclude, or, where all are, that of the highest bound
-        among the last."""
+        """Evaluate the first candidate that the constant does not exclude. Where it excludes all, evaluate that of the
+        highest bound among the last."""
         if not self.evaluated.count:
             self.explore()
             return
         drawn, size = 0, self._last
-        most = min(MOST_DRAWS, max(2 * FEWEST, WORK // (self.evaluated.count * self.dimension)))
+        max_draws = min(MOST_DRAWS, max(2 * FEWEST, WORK // (self.evaluated.count * self.dimension)))
         while True:
-            size = max(1, min(size, most - drawn, MOST_AT_ONCE, BLOCK_NUMBERS // self.dimension))
+            size = max(1, min(size, max_draws - drawn, MOST_AT_ONCE, BLOCK_NUMBERS // self.dimension))
             points = self._candidates(drawn, size)
             scaled = self._scaled(points)
             first = self.evaluated.first_possible(scaled, constant)
-            if first is not None or drawn + size >= most:
+            if first is not None or drawn + size >= max_draws:
                 break
             drawn, size = drawn + size, 2 * size
         chosen = int(np.argmax(self.evaluated.bounds(scaled, constant))) if first is None else first
-        tried = drawn + (size if first is None else first + 1)
-        self.drawn, self.rejected = self.drawn + tried, self.rejected + tried - (first is not None)
-        self._last = max(FEWEST, tried)
+        draw_count = drawn + (size if first is None else first + 1)
+        self.drawn, self.rejected = self.drawn + draw_count, self.rejected + draw_count - (first is not None)
+        self._last = max(FEWEST, draw_count)
         # towards boxes half as deep as the last that were needed
-        self._skipped = (self._skipped + max(0, tried - FAIR_DRAWS)) // 2
+        self._skipped = (self._skipped + max(0, draw_count - FAIR_DRAWS)) // 2
         self._evaluate(points[chosen])
 
     def note(self, constant: float) -> None:
         """Note the constant in use, in units of the value per unit of ``z``, and the share of candidates that it has
-        excluded; show now and then the largest of the balls that it excludes."""
-        shown = self.objective.observed and self.objective.evaluations % SHOWN_EVERY == 0
-        if shown and constant > 0.0 and self.evaluated.count:
+        excluded. Show now and then the largest of the balls that it excludes."""
+        is_shown = self.objective.observed and self.objective.evaluations % SHOWN_EVERY == 0
+        if is_shown and constant > 0.0 and self.evaluated.count:
             centres, radii = self.evaluated.balls(constant, SHOWN)
             middles, reach = self.lower + self.scale * centres, radii[:, np.newaxis] * self.scale
             self.objective.sketch("excluded", middles - reach, middles + reach, rounded=True)
         self.objective.note(constant=constant, rejected=self.rejected / max(1, self.drawn))
 
     def _candidates(self, drawn: int, count: int) -> np.ndarray:
-        """Candidates number ``drawn, ...``: uniform ones, number 0 among them, and others in ever smaller boxes around
-        the best point."""
-        number = np.arange(drawn, drawn + count)
+        """Draw the candidates number ``drawn, ...``: uniform ones, number 0 among them, and others in ever smaller
+        boxes around the best point."""
+        numbers = np.arange(drawn, drawn + count)
         points = self._inside(self.rng.random((count, self.dimension)))
-        near = np.where(number < FAIR_DRAWS, number % 2, number % 8) > 0
-        if near.any():
-            late = np.maximum(number - FAIR_DRAWS, 0)
-            step = np.minimum(number, FAIR_DRAWS) // 2 + late - (late + 7) // 8  # candidates in boxes before this one
-            step = np.minimum(step + np.where(late > 0, self._skipped, 0), MOST_HALVINGS * DRAWS_PER_HALVING)
-            reach = np.exp2(-step[near] / DRAWS_PER_HALVING)[:, np.newaxis] * self.sides
+        is_near = np.where(numbers < FAIR_DRAWS, numbers % 2, numbers % 8) > 0
+        if is_near.any():
+            late_numbers = np.maximum(numbers - FAIR_DRAWS, 0)
+            # candidates in boxes before this one
+            steps = np.minimum(numbers, FAIR_DRAWS) // 2 + late_numbers - (late_numbers + 7) // 8
+            steps = np.minimum(steps + np.where(late_numbers > 0, self._skipped, 0), MOST_HALVINGS * DRAWS_PER_HALVING)
+            reach = np.exp2(-steps[is_near] / DRAWS_PER_HALVING)[:, np.newaxis] * self.sides
             best = self.lower + self.scale * self.evaluated.best_point
             low, high = np.maximum(best - reach, self.lower), np.minimum(best + reach, self.upper)
             share = self.rng.random((len(reach), self.dimension))
-            points[near] = np.clip(low + share * (high - low), self.lower, self.upper)
+            points[is_near] = np.clip(low + share * (high - low), self.lower, self.upper)
         return points
 
     def _inside(self, unit: np.ndarray) -> np.ndarray:

@@ -57,22 +57,27 @@ class MaxLIPO(sr.Maximiser, sr.Options):
     """Whether every other step is local."""
 
     def search(self, objective: sr.Objective, rng: np.random.Generator) -> float:
-        """See `sparserob_core.Maximiser`."""
+        """Search until the budget is spent and return ``inf``, as no upper bound is proven; see
+        `sparserob_core.Maximiser`."""
         steps = _Steps(objective, rng)
         steps.begin()
-        waited = 0
+        global_steps = 0
         while objective.remaining:
-            if self.trust_region and waited >= (SECONDARY if steps.ascents.secondary else 1) and steps.step_locally():
-                waited = 0
+            if (
+                self.trust_region
+                and global_steps >= (SECONDARY if steps.ascents.secondary else 1)
+                and steps.step_locally()
+            ):
+                global_steps = 0
             else:
                 steps.step_globally(self.candidates, self.uniform)
-                waited += 1
-            steps.note(local=waited == 0)
+                global_steps += 1
+            steps.note(local=global_steps == 0)
         return float("inf")
 
 
 class _Steps:
-    """One search: what was evaluated, in the unit box, and the two kinds of step."""
+    """State of one search: the evaluated points in the unit box, and the two kinds of step."""
 
     def __init__(self, objective: sr.Objective, rng: np.random.Generator) -> None:
         self.objective, self.rng, self.dimension = objective, rng, objective.domain.dimension
@@ -81,7 +86,8 @@ class _Steps:
         self.ascents, self.reach = Ascents(self.slopes), 0.1
 
     def begin(self) -> None:
-        """The centre, or what an earlier search has found, then uniform points up to ``max(3, d)``, at most thirty."""
+        """Evaluate the centre, or take over the point that an earlier search has found; then evaluate uniform points up
+        to ``max(3, d)``, at most thirty."""
         domain, objective = self.objective.domain, self.objective
         if objective.evaluations and np.isfinite(objective.best_value):
             unit = (objective.best_point - domain.lower) / (domain.upper - domain.lower)
@@ -99,7 +105,7 @@ class _Steps:
         return value
 
     def note(self, local: bool) -> None:
-        """Note what the last step was, and how far the local ones go from the best point."""
+        """Note which kind the last step was, and how far the local ones go from the best point."""
         fitted = self.dimension <= MODELLED
         reach = self.ascents.radius if fitted else self.reach
         self.objective.note(local=float(local), **{"radius" if fitted else "reach": reach})
@@ -111,7 +117,7 @@ class _Steps:
             self.objective.sketch(role, lower[np.newaxis], upper[np.newaxis], rounded=fitted)
 
     def step_locally(self) -> bool:
-        """Whether there was a local step to make."""
+        """Make a local step; return whether there was one to make."""
         if not np.isfinite(self.slopes.best):
             return False
         if self.dimension > MODELLED:
@@ -124,29 +130,30 @@ class _Steps:
         return True
 
     def step_globally(self, candidates: int, uniform: float) -> None:
-        seen = self.slopes
-        if self.rng.random() < uniform or not np.isfinite(seen.best):
+        slopes = self.slopes
+        if self.rng.random() < uniform or not np.isfinite(slopes.best):
             point = self.rng.random(self.dimension)
         else:
             count = min(candidates, max(10, NUMBERS // self.dimension))
-            point = self.ceiling.highest(seen, self.rng.random((count, self.dimension)))
+            point = self.ceiling.highest(slopes, self.rng.random((count, self.dimension)))
         value = self.evaluate(point)
         if self.dimension <= MODELLED:
             self.ascents.note_global(point, value)
 
     def _change_blocks(self) -> None:
-        """Beyond what can be modelled: a step of one or few blocks from the best point, adapted to success."""
-        seen, rng = self.slopes, self.rng
-        trials, blocks = np.repeat(seen.top[np.newaxis], 32, axis=0), int(self.blocks[-1]) + 1
+        """Evaluate a change of one or few blocks of the best point, adapted to success, where there are too many
+        coordinates for a model."""
+        slopes, rng = self.slopes, self.rng
+        trials, blocks = np.repeat(slopes.top[np.newaxis], 32, axis=0), int(self.blocks[-1]) + 1
         for trial in trials:
-            moved = np.zeros(blocks, dtype=bool)
-            moved[rng.integers(blocks, size=rng.integers(1, 4))] = True
-            changed = moved[self.blocks]
-            trial[changed] += self.reach * rng.standard_cauchy(int(changed.sum()))
+            is_moved = np.zeros(blocks, dtype=bool)
+            is_moved[rng.integers(blocks, size=rng.integers(1, 4))] = True
+            is_changed = is_moved[self.blocks]
+            trial[is_changed] += self.reach * rng.standard_cauchy(int(is_changed.sum()))
         trials = 1.0 - np.abs(1.0 - np.abs(trials) % 2.0)
-        best = seen.best
-        gained = self.evaluate(self.ceiling.highest(seen, trials)) > best
-        self.reach = min(0.5, 1.5 * self.reach) if gained else max(1e-6, 0.93 * self.reach)
+        best = slopes.best
+        is_better = self.evaluate(self.ceiling.highest(slopes, trials)) > best
+        self.reach = min(0.5, 1.5 * self.reach) if is_better else max(1e-6, 0.93 * self.reach)
 
 
 @sr.hookimpl

@@ -1,4 +1,4 @@
-"""The least slopes under which no evaluated value lies above the bound that the others put on it."""
+"""Least slopes under which no evaluated value lies above the bound that the other values put on it."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class Pairs(NamedTuple):
         return Pairs(self.squares[which], self.lower[which], self.rise[which])
 
     def join(self, other: Pairs) -> Pairs:
-        return Pairs(*(np.concatenate(parts) for parts in zip(self, other, strict=True)))
+        return Pairs(*(np.concatenate(arrays) for arrays in zip(self, other, strict=True)))
 
 
 class Slopes:
@@ -62,32 +62,32 @@ class Slopes:
 
     @property
     def points(self) -> np.ndarray:
-        """``(n, d)``."""
+        """Evaluated points ``(n, d)`` of the unit box."""
         return self._points[: self.count]
 
     @property
     def raw(self) -> np.ndarray:
-        """The values ``(n,)`` as evaluated."""
+        """Values ``(n,)`` as evaluated."""
         return self._raw[: self.count]
 
     @property
     def noise(self) -> np.ndarray:
-        """``(n,)``."""
+        """Noise ``(n,)`` of each point, in squared units."""
         return self._noise[: self.count]
 
     @property
     def best(self) -> float:
-        """The best value."""
+        """Best value."""
         return float(self.raw.max())
 
     @property
     def top(self) -> np.ndarray:
-        """The best point ``(d,)``."""
+        """Best point ``(d,)``."""
         return np.asarray(self.points[self.raw.argmax()])
 
     @property
     def heights(self) -> np.ndarray:
-        """The values ``(n,)`` below the best one, in units; ``-inf`` counts as the lowest that is finite."""
+        """Values ``(n,)`` below the best one, in units; ``-inf`` counts as the lowest that is finite."""
         finite = np.isfinite(self.raw)
         unit = self.unit or 1.0
         return np.where(finite, self.raw, self.raw[finite].min()) / unit - self.best / unit
@@ -117,7 +117,7 @@ class Slopes:
             self.active = active.take(np.flatnonzero(active.rise > NEGLIGIBLE**2))
 
     def _refit(self) -> None:
-        """Slopes from scratch, by adding the pairs that are violated most."""
+        """Fit the slopes from scratch, by adding the pairs that are violated most."""
         heights = self.heights
         slope, noise = np.zeros_like(self.slope), np.zeros(self.count)
         if self.active.rise.size:
@@ -133,75 +133,75 @@ class Slopes:
         self.slope, self._noise[: self.count] = slope, noise + missing
 
     def _extend(self) -> None:
-        """Slopes that also hold for the pairs of the last point, and are nowhere smaller than before."""
+        """Raise the slopes so that they also hold for the pairs of the last point; none gets smaller."""
         last, heights = self.count - 1, self.heights
         rise = heights[:last] - heights[last]
-        counts = np.isfinite(self.raw[:last]) & (np.abs(rise) > NEGLIGIBLE)
+        is_relevant = np.isfinite(self.raw[:last]) & (np.abs(rise) > NEGLIGIBLE)
         lower = np.where(rise > 0, last, np.arange(last))
         squares = self.points[:last] - self.points[last]
         pairs = Pairs(np.square(squares, out=squares), lower, rise**2)
-        pairs = pairs if counts.all() else pairs.take(counts)
+        pairs = pairs if is_relevant.all() else pairs.take(is_relevant)
         slope, noise = self.slope, self.noise.copy()
         for _ in range(ROUNDS):
-            plain = pairs.squares @ slope
-            reached = plain + noise[pairs.lower]
-            worst = _worst(reached / pairs.rise, pairs.squares)
+            slope_terms = pairs.squares @ slope
+            left_sides = slope_terms + noise[pairs.lower]
+            worst = _worst(left_sides / pairs.rise, pairs.squares)
             if not worst.size:
                 break
             self.active = self.active.join(pairs.take(worst))
-            fitted, noisy = self._solve()
-            slope, noise = np.maximum(slope, fitted), np.maximum(noise, noisy)
+            new_slope, new_noise = self._solve()
+            slope, noise = np.maximum(slope, new_slope), np.maximum(noise, new_noise)
         else:
-            plain = pairs.squares @ slope
-        np.maximum.at(noise, pairs.lower, pairs.rise - plain)
+            slope_terms = pairs.squares @ slope
+        np.maximum.at(noise, pairs.lower, pairs.rise - slope_terms)
         self.slope, self._noise[: self.count] = slope, noise
 
     def _all_pairs(self, heights: np.ndarray, slope: np.ndarray, noise: np.ndarray) -> tuple[np.ndarray, Pairs]:
-        """The noise ``(n,)`` that would still be missing, and the pairs that ask for more slope."""
+        """Return the noise ``(n,)`` that is still missing, and the pairs that ask for more slope."""
         order = np.flatnonzero(np.isfinite(self.raw))
         order = order[np.argsort(heights[order], kind="stable")]
         points, heights, noise = self.points[order], heights[order], noise[order]
         missing, partner, ratio = np.zeros(order.size), np.zeros(order.size, dtype=int), np.full(order.size, np.inf)
         for start in range(0, order.size, ROWS):
-            low = slice(start, start + ROWS)
-            rise = np.maximum(heights - heights[low, np.newaxis], 0.0) ** 2
-            reached = _squares(points[low] * np.sqrt(slope), points * np.sqrt(slope)) + noise[low, np.newaxis]
-            missing[low] = np.maximum((rise - reached).max(axis=1), 0.0)
-            counts = rise > NEGLIGIBLE**2
-            counts &= _squares(points[low], points) > NEAR
-            ratios = np.where(counts, reached, np.inf) / np.where(counts, rise, 1.0)
-            partner[low], ratio[low] = ratios.argmin(axis=1), ratios.min(axis=1)
+            rows = slice(start, start + ROWS)
+            rise = np.maximum(heights - heights[rows, np.newaxis], 0.0) ** 2
+            left_sides = _squares(points[rows] * np.sqrt(slope), points * np.sqrt(slope)) + noise[rows, np.newaxis]
+            missing[rows] = np.maximum((rise - left_sides).max(axis=1), 0.0)
+            is_relevant = rise > NEGLIGIBLE**2
+            is_relevant &= _squares(points[rows], points) > NEAR
+            ratios = np.where(is_relevant, left_sides, np.inf) / np.where(is_relevant, rise, 1.0)
+            partner[rows], ratio[rows] = ratios.argmin(axis=1), ratios.min(axis=1)
         squares = (points - points[partner]) ** 2
         worst = _worst(ratio, squares)
-        spread = np.zeros(self.count)
-        spread[order] = missing
-        return spread, Pairs(squares, order, (heights - heights[partner]) ** 2).take(worst)
+        all_missing = np.zeros(self.count)
+        all_missing[order] = missing
+        return all_missing, Pairs(squares, order, (heights - heights[partner]) ** 2).take(worst)
 
     def _solve(self) -> tuple[np.ndarray, np.ndarray]:
-        """The least slopes and noise for the active pairs, of which the slack ones are dropped (Lawson and Hanson 1974,
-        section 23.4)."""
+        """Return the least slopes and noise for the active pairs, of which the slack ones are dropped (Lawson and
+        Hanson 1974, section 23.4)."""
         from scipy.optimize import nnls
 
         pairs = self.active
-        noisy, column = np.unique(pairs.lower, return_inverse=True)
-        rows = np.hstack([pairs.squares, NOISE_PRICE * (column[:, np.newaxis] == np.arange(noisy.size))])
-        least = rows.T / pairs.rise
-        scale = np.sqrt((least**2).sum(axis=0))
-        target = np.zeros(len(least) + 1)
+        noisy_points, column = np.unique(pairs.lower, return_inverse=True)
+        rows = np.hstack([pairs.squares, NOISE_PRICE * (column[:, np.newaxis] == np.arange(noisy_points.size))])
+        constraints = rows.T / pairs.rise
+        scale = np.sqrt((constraints**2).sum(axis=0))
+        target = np.zeros(len(constraints) + 1)
         target[-1] = 1.0
-        dual, _ = nnls(np.vstack([least / scale, 1.0 / scale]), target)
-        found = least @ (dual / scale)
+        dual, _ = nnls(np.vstack([constraints / scale, 1.0 / scale]), target)
+        solution = constraints @ (dual / scale)
         # The residual's last entry is a positive multiple of the squared norm; what rounding loses, the caller adds as
         # noise.
-        found /= max(1.0 - float((dual / scale).sum()), np.finfo(float).tiny)
+        solution /= max(1.0 - float((dual / scale).sum()), np.finfo(float).tiny)
         self.active = pairs.take(np.flatnonzero(dual > 0.0)[:ACTIVE])
         noise = np.zeros(self.count)
-        noise[noisy] = NOISE_PRICE * found[self.slope.size :]
-        return found[: self.slope.size], noise
+        noise[noisy_points] = NOISE_PRICE * solution[self.slope.size :]
+        return solution[: self.slope.size], noise
 
 
 def _squares(one: np.ndarray, other: np.ndarray) -> np.ndarray:
-    """Squared distances ``(k, n)``."""
+    """Return the squared distances ``(k, n)`` of two sets of points."""
     inner = one @ other.T
     inner *= -2.0
     inner += np.einsum("ij,ij->i", other, other)
@@ -210,8 +210,8 @@ def _squares(one: np.ndarray, other: np.ndarray) -> np.ndarray:
 
 
 def _worst(ratio: np.ndarray, squares: np.ndarray) -> np.ndarray:
-    """The handful of pairs, of ``squares (m, d)``, that are satisfied least, of those that are not near: near ones cost
-    less as noise than as slope."""
-    short = np.flatnonzero(ratio < SHORTFALL)
-    short = short[squares[short].sum(axis=1) > NEAR]
-    return np.asarray(short[np.argsort(ratio[short], kind="stable")[:AT_ONCE]])
+    """Return the indices of the handful of pairs, of ``squares (m, d)``, that are satisfied least. Near pairs are left
+    out: they cost less as noise than as slope."""
+    violated = np.flatnonzero(ratio < SHORTFALL)
+    violated = violated[squares[violated].sum(axis=1) > NEAR]
+    return np.asarray(violated[np.argsort(ratio[violated], kind="stable")[:AT_ONCE]])

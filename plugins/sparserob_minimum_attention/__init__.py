@@ -30,116 +30,123 @@ class MinimumAttention(sr.LinearKeys):
     """Control at time 0, one number per control; a number serves every control."""
 
     def build(self) -> sr.OptimalControlProblem:
-        """The problem of the augmented system; raises `InputError` that begins with the key at fault."""
+        """Build the problem of the augmented system; raises `InputError` that begins with the key at fault."""
         if self.system.delay:
             raise sr.InputError(
                 path="system.delay",
                 expected="none: minimum_attention makes the control a state, which acts without delay",
                 got=f"{self.system.delay:g}",
             )
-        plain = self.system.build(self.horizon)
-        d, m = plain.states, plain.controls
-        path = [_extended_window(item, m) for item in self.windows(d)]
+        original = self.system.build(self.horizon)
+        d, m = original.states, original.controls
+        path = [_extended_window(window, m) for window in self.windows(d)]
         ends = [sr.cylinder(end, d + m) for end in self.ends(d)]
-        listed = self.disturbances(plain, below=m)
-        width = sum(one.set.dimension for one in listed) if listed else plain.disturbances
-        free = sr.OptimalControlProblem(
+        disturbances = self.disturbances(original, below=m)
+        width = (
+            sum(disturbance.set.dimension for disturbance in disturbances) if disturbances else original.disturbances
+        )
+        problem = sr.OptimalControlProblem(
             system=self._augmented(d, m),
             horizon=self.horizon,
             initial_state=self.initial(d) + self._initial_control(m),
             initial_set=self._deviations(d, m),
             control=self.rate.build("rate", m),
             weights=self.weights,
-            disturbance=self.noise(plain),
+            disturbance=self.noise(original),
             disturbance_class=self.disturbance_class,
-            disturbances=listed,
+            disturbances=disturbances,
             path=[*path, *self._bounds(d, m)],
             integral=[_integral(f"integral.{i}", entry.build(), d, m) for i, entry in enumerate(self.integral)],
             terminal=[*ends, sr.Equality(np.append(np.full(d, np.nan), np.zeros(m)))],
             names=_names(self.names.build().fitting(d, m, width), d, m),
         )
-        return replace(free, cost=self._cost(d, m, np.asarray(free.weights)))
+        return replace(problem, cost=self._cost(d, m, np.asarray(problem.weights)))
 
     def _cost(self, d: int, m: int, weights: sr.Array) -> sr.Cost:
-        """The cost of the augmented problem: absolute values and norms are those of the rate, quadratic terms those of
-        the state and of the control, which is a part of it."""
+        """Build the cost of the augmented problem. Absolute values and norms are those of the rate; quadratic terms are
+        those of the state and of the control, which is a part of it."""
         try:
-            plain = self.cost.build(d).checked(d, m, weights)
+            original = self.cost.build(d).checked(d, m, weights)
         except sr.InputError as error:
             raise error if error.path[:1] == ("cost",) else error.under("cost") from None
-        (state, control, final), both = plain.terms, None
+        (state, control, final), joint = original.terms, None
         if state is not None or control is not None:
             Q, r = np.zeros((d + m, d + m)), np.zeros(d + m)
             if state is not None:
                 Q[:d, :d], r[:d] = state.Q, state.reference
             if control is not None:
                 Q[d:, d:] = control.Q
-            both = {"Q": Q, "reference": r}
-        last = None
+            joint = {"Q": Q, "reference": r}
+        terminal = None
         if final is not None:
             Q = np.zeros((d + m, d + m))
             Q[:d, :d] = final.Q
-            last = {"Q": Q, "reference": np.append(final.reference, np.zeros(m))}
-        return sr.Cost(l1=plain.l1, group=plain.group, state=both, final=last)
+            terminal = {"Q": Q, "reference": np.append(final.reference, np.zeros(m))}
+        return sr.Cost(l1=original.l1, group=original.group, state=joint, final=terminal)
 
     def _augmented(self, d: int, m: int) -> sr.System:
-        """``A = [[A, B], [0, 0]]``, ``B = [0; I]``, ``E = [E; 0]``, ``c = [c; 0]``, still in expressions of the
+        """Build ``A = [[A, B], [0, 0]]``, ``B = [0; I]``, ``E = [E; 0]``, ``c = [c; 0]``, still in expressions of the
         parameters, piece by piece."""
         system = self.system
-        made = []
+        augmented_pieces = []
         for _, until, (A, B, E, c) in system.matrices():
             drive, rows = np.eye(d).tolist() if E is None else E, [[*a, *b] for a, b in zip(A, B, strict=True)]
-            larger = {
+            augmented = {
                 "A": rows + np.zeros((m, d + m)).tolist(),
                 "B": np.eye(d + m, m, -d).tolist(),
                 "E": drive + np.zeros((m, len(drive[0]))).tolist(),
                 "c": None if c is None else [*c, *np.zeros(m).tolist()],
             }
-            made.append(larger if until is None else {"until": until, **larger})
+            augmented_pieces.append(augmented if until is None else {"until": until, **augmented})
         if system.pieces is None:
-            return system.model_copy(update=made[0]).build(self.horizon)
-        pieces = [piece.model_copy(update=one) for piece, one in zip(system.pieces, made, strict=True)]
+            return system.model_copy(update=augmented_pieces[0]).build(self.horizon)
+        pieces = [
+            piece.model_copy(update=update) for piece, update in zip(system.pieces, augmented_pieces, strict=True)
+        ]
         return system.model_copy(update={"pieces": pieces}).build(self.horizon)
 
     def _initial_control(self, m: int) -> list[float]:
-        given = self.initial_control if isinstance(self.initial_control, list) else [self.initial_control] * m
-        if len(given) != m:
-            raise sr.InputError(f"initial_control: expected {m} numbers, one per control, got {len(given)}")
-        return given
+        values = self.initial_control if isinstance(self.initial_control, list) else [self.initial_control] * m
+        if len(values) != m:
+            raise sr.InputError(f"initial_control: expected {m} numbers, one per control, got {len(values)}")
+        return values
 
     def _deviations(self, d: int, m: int) -> sr.Box | None:
-        """Those of the augmented state: the control at time 0 is known."""
-        bound = self.deviations(d)
-        if bound is None:
+        """Build the deviations of the augmented initial state; the control at time 0 is known, so it has none."""
+        deviations = self.deviations(d)
+        if deviations is None:
             return None
-        if not bound.is_box:
+        if not deviations.is_box:
             raise sr.InputError("initial_state: minimum_attention takes a box of initial states, got another set")
-        box, known = bound.bounding_box(), np.zeros(m)
-        return sr.Box(np.append(box.lower, known), np.append(box.upper, known))
+        box, fixed = deviations.bounding_box(), np.zeros(m)
+        return sr.Box(np.append(box.lower, fixed), np.append(box.upper, fixed))
 
     def _bounds(self, d: int, m: int) -> list[sr.PathConstraint]:
-        """The bounds of ``u`` as path constraints; flat ones only, since they act on the last coordinates of the
-        state."""
+        """Write the bounds of ``u`` as path constraints. They must be flat, since they act on the last coordinates of
+        the state."""
         if self.control is None:
             return []
-        bound = self.control.build("control", m)
-        flat = bound.halfspaces()
-        if flat is None:
+        control_set = self.control.build("control", m)
+        halfspaces = control_set.halfspaces()
+        if halfspaces is None:
             raise sr.InputError("control: expected a set with flat sides (box, polytope, norm with p = 1 or inf)")
         return [
-            sr.PathConstraint(sr.Polytope(np.hstack([np.zeros((len(flat[0]), d)), flat[0]]), flat[1]), name="control")
+            sr.PathConstraint(
+                sr.Polytope(np.hstack([np.zeros((len(halfspaces[0]), d)), halfspaces[0]]), halfspaces[1]),
+                name="control",
+            )
         ]
 
 
 def _names(given: sr.Names, d: int, m: int) -> sr.Names:
-    """The control is a state of the augmented system, and its rate the control."""
-    called = [given.control(channel) for channel in range(m)]
+    """Name the states, which the control joins, and the controls, which are its rates."""
+    control_names = [given.control(channel) for channel in range(m)]
     per = f"/{given.time}" if given.time else ""
     rates = [f"{unit}{per}" if unit and per else "" for unit in given.control_units]
     units = [*(given.state_units or [""] * d), *(given.control_units or [""] * m)]
     return sr.Names(
-        states=[*(given.state(state) for state in range(d)), *called],
-        controls=[f"{name}'" for name in called],
+        states=[*(given.state(state) for state in range(d)), *control_names],
+        controls=[f"{name}'" for name in control_names],
         disturbances=given.disturbances,
         state_units=units,
         control_units=rates,
@@ -150,38 +157,40 @@ def _names(given: sr.Names, d: int, m: int) -> sr.Names:
 
 
 def _extended_window(item: sr.PathConstraint | sr.MixedConstraint, m: int) -> sr.PathConstraint:
-    """A window of ``x``, or of ``x`` and ``u`` together, as one of the augmented state ``(x, u)``."""
+    """Write a window of ``x``, or of ``x`` and ``u`` together, as one of the augmented state ``(x, u)``."""
     if isinstance(item, sr.MixedConstraint):
         H, G = (np.atleast_2d(np.asarray(rows, dtype=float)) for rows in (item.H, item.G))
         if len(H) != len(G) or G.shape[1] != m:
             raise sr.InputError(f"path: mixed: expected as many rows in G as in H, {m} numbers in each")
         return sr.PathConstraint(sr.Polytope(np.hstack([H, G]), np.asarray(item.h)), item.start, item.stop, item.name)
-    moved = item.relative_to
-    if moved is not None:
-        rows = np.asarray(moved, dtype=float)
-        moved = np.hstack([rows, np.zeros((len(rows), m))])
-    return sr.PathConstraint(sr.cylinder(item.set, item.set.dimension + m), item.start, item.stop, item.name, moved)
+    relative_to = item.relative_to
+    if relative_to is not None:
+        rows = np.asarray(relative_to, dtype=float)
+        relative_to = np.hstack([rows, np.zeros((len(rows), m))])
+    return sr.PathConstraint(
+        sr.cylinder(item.set, item.set.dimension + m), item.start, item.stop, item.name, relative_to
+    )
 
 
 def _integral(where: str, item: sr.IntegralConstraint, d: int, m: int) -> sr.IntegralConstraint:
-    """An integral of ``x`` and ``u`` as one of the augmented state ``(x, u)``."""
-    given = {"H": (item.H, d, "state"), "G": (item.G, m, "control")}
-    rows = {key: np.atleast_2d(np.asarray(value, dtype=float)) for key, (value, _, _) in given.items() if value}
+    """Write an integral of ``x`` and ``u`` as one of the augmented state ``(x, u)``."""
+    entries = {"H": (item.H, d, "state"), "G": (item.G, m, "control")}
+    rows = {key: np.atleast_2d(np.asarray(value, dtype=float)) for key, (value, _, _) in entries.items() if value}
     for key, matrix in rows.items():
-        _, width, of = given[key]
+        _, width, variable = entries[key]
         if matrix.shape[1] != width:
-            expected = f"rows of {width} numbers, one per {of}"
+            expected = f"rows of {width} numbers, one per {variable}"
             raise sr.InputError(path=f"{where}.{key}", expected=expected, got=f"{matrix.shape[1]} in each")
     if len({len(matrix) for matrix in rows.values()}) > 1:
         raise sr.InputError(f"{where}: expected as many rows in G as in H")
     count = max((len(matrix) for matrix in rows.values()), default=0)
-    both = [rows.get(key, np.zeros((count, width))) for key, (_, width, _) in given.items()]
-    return replace(item, H=np.hstack(both) if count else None, G=None)
+    blocks = [rows.get(key, np.zeros((count, width))) for key, (_, width, _) in entries.items()]
+    return replace(item, H=np.hstack(blocks) if count else None, G=None)
 
 
 @sr.hookimpl
 def sparserob_problems() -> Iterator[sr.ProblemPlugin]:
-    """The minimum attention problem."""
+    """Offer ``minimum_attention``."""
     yield sr.ProblemPlugin(
         name="minimum_attention",
         factory=MinimumAttention,

@@ -17,8 +17,8 @@ SHOWN_EVERY = 16  # evaluations
 
 
 class Nevergrad(sr.Maximiser, sr.Options):
-    """Any optimiser of nevergrad's registry (Rapin and Teytaud 2018): evolution strategies, differential evolution,
-    particle swarms, and portfolios of them such as NGOpt, which chooses by dimension and budget.
+    """Optimiser of nevergrad's registry, any of them (Rapin and Teytaud 2018): evolution strategies, differential
+    evolution, particle swarms, and portfolios of them such as NGOpt, which chooses by dimension and budget.
 
     An optional extra: ``pip install nevergrad``. It works in the unit box, one point at a time, with its
     random numbers drawn from the generator of the search and the global ones left as they were. Some of nevergrad's
@@ -45,7 +45,8 @@ class Nevergrad(sr.Maximiser, sr.Options):
     """The optimiser that goes on when the first one raises; none: the search ends there, with what was found."""
 
     def search(self, objective: sr.Objective, rng: np.random.Generator) -> float:
-        """See `sparserob_core.Maximiser`."""
+        """Search until the budget is spent and return ``inf``, as no upper bound is proven; see
+        `sparserob_core.Maximiser`."""
         import warnings
 
         registry = _registry()
@@ -55,16 +56,16 @@ class Nevergrad(sr.Maximiser, sr.Options):
             if name
         ]
         walk = _AskAndTell(objective, rng)
-        for name, following in zip(names, [*names[1:], None], strict=True):
+        for name, next_name in zip(names, [*names[1:], None], strict=True):
             try:
                 walk.run(Guarded(registry[name], objective.domain.dimension, objective.remaining, rng))
             except Failed as failure:
                 reason = (
                     f"nevergrad's {name} failed after {objective.evaluations} evaluations ({failure}); the search "
-                    + (f"goes on with {following}" if following else "ends here")
+                    + (f"goes on with {next_name}" if next_name else "ends here")
                 )
                 warnings.warn(reason, stacklevel=2)
-                if following is None:
+                if next_name is None:
                     raise _ended(objective, reason) from failure
             else:
                 break
@@ -72,7 +73,7 @@ class Nevergrad(sr.Maximiser, sr.Options):
 
 
 class _AskAndTell:
-    """The points and losses so far, in the unit box."""
+    """Record of the points and losses so far, in the unit box."""
 
     def __init__(self, objective: sr.Objective, rng: np.random.Generator) -> None:
         self.objective, self.lower, self.upper = objective, objective.domain.lower, objective.domain.upper
@@ -100,7 +101,7 @@ class _AskAndTell:
             optimiser.close()
 
     def _show(self, units: np.ndarray) -> None:
-        """Of an optimiser with a population, where it is."""
+        """Show where the population is, for an optimiser that has one."""
         if len(units):
             self.objective.sketch("population", self.lower + units * self.width)
 
@@ -110,8 +111,8 @@ class _AskAndTell:
     def _spread(self, unit: np.ndarray) -> float:
         if self.objective.best_value != self.top or np.isnan(self.best[0]):
             self.best, self.top = self._unit(self.objective.best_point), self.objective.best_value
-        apart = unit - self.best
-        return math.sqrt(float(apart @ apart) / apart.size)
+        deviation = unit - self.best
+        return math.sqrt(float(deviation @ deviation) / deviation.size)
 
 
 def _loss(value: float) -> float:
@@ -119,7 +120,7 @@ def _loss(value: float) -> float:
 
 
 def _ended(objective: sr.Objective, reason: str) -> Exception:
-    """With something found, the end of the search; with nothing, the fault of the plugin."""
+    """Return the end of the search if something was found, else the fault of the plugin."""
     return sr.SearchEnded(reason) if objective.evaluations else sr.PluginError(reason)
 
 
@@ -145,7 +146,7 @@ def _registry() -> Any:
 
 
 def _number(value: Any) -> float:
-    """The only entry of an array, or the number itself, as a float."""
+    """Return the only entry of an array, or the number itself, as a float."""
     return float(np.asarray(value).item()) if isinstance(value, np.ndarray) else float(value)
 
 

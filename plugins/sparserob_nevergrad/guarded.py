@@ -1,5 +1,4 @@
-"""One of nevergrad's optimisers, kept from warning, from failing unnoticed, and from touching the global random
-numbers."""
+"""Optimiser of nevergrad, kept from warning, from failing unnoticed, and from touching the global random numbers."""
 
 from __future__ import annotations
 
@@ -20,7 +19,7 @@ WORDS = 4 * (624 + 1)
 
 
 class Failed(Exception):
-    """The optimiser raised; the text says what."""
+    """Error of an optimiser; the text says what was raised."""
 
 
 class Guarded:
@@ -40,8 +39,8 @@ class Guarded:
         self._whole: tuple[Any, bytes] | None = None  # the global generator, last seen with no number waiting
 
     def learn(self, told: Sequence[tuple[np.ndarray, float]]) -> None:
-        """Create the optimiser, and tell it of points and losses from before; it is shown the best where it takes none
-        that it has not asked."""
+        """Create the optimiser and tell it points and losses from before. An optimiser that takes none that it has not
+        asked is shown the best."""
         with self._guard():
             import nevergrad as ng
 
@@ -57,7 +56,7 @@ class Guarded:
                 self._optimiser.suggest(min(told, key=lambda pair: pair[1])[0])
 
     def next(self, loss: float | None) -> np.ndarray:
-        """The next point ``(d,)`` after the loss at the one before; ``None`` at first.
+        """Return the next point ``(d,)`` after the loss at the one before; ``None`` at first.
 
         Telling and asking are one step, so that an optimiser which thinks in a thread of its own rests while the
         function is evaluated.
@@ -72,14 +71,14 @@ class Guarded:
             return within(unit, 0.0, 1.0)
 
     def population(self) -> np.ndarray:
-        """The individuals ``(k, d)`` of an optimiser that keeps them by name, as differential evolution and particle
-        swarms do; none of another."""
-        kept = getattr(self._optimiser, "population", None)
-        if not isinstance(kept, dict):
+        """Return the individuals ``(k, d)`` of an optimiser that keeps them by name, as differential evolution and
+        particle swarms do; none of another."""
+        individuals = getattr(self._optimiser, "population", None)
+        if not isinstance(individuals, dict):
             return np.zeros((0, *self._shape))
-        values = [np.array(individual.value, dtype=float) for individual in kept.values()]
-        fitting = [np.clip(value, 0.0, 1.0) for value in values if value.shape == self._shape]
-        return np.array(fitting).reshape(-1, *self._shape)
+        values = [np.array(individual.value, dtype=float) for individual in individuals.values()]
+        points = [np.clip(value, 0.0, 1.0) for value in values if value.shape == self._shape]
+        return np.array(points).reshape(-1, *self._shape)
 
     def close(self) -> None:
         """Let go of the optimiser: some of them run in a thread, which ends with them."""
@@ -87,8 +86,8 @@ class Guarded:
 
     @contextmanager
     def _guard(self) -> Iterator[None]:
-        generator, waiting = mtrand.get_bit_generator(), self._waiting()
-        outside = self._outside.read()
+        generator, waiting_state = mtrand.get_bit_generator(), self._waiting()
+        outside_state = self._outside.read()
         self._python.install()
         mtrand.set_bit_generator(self._numpy)  # a hundredth of the time that it takes to write its state
         try:
@@ -99,15 +98,15 @@ class Guarded:
             raise Failed(f"{type(error).__name__}: {str(error).partition(chr(10))[0]}") from error
         finally:
             self._python.read()
-            outside.install()
+            outside_state.install()
             mtrand.set_bit_generator(generator)
-            if waiting is not None:
-                np.random.set_state(waiting)  # noqa: NPY002
+            if waiting_state is not None:
+                np.random.set_state(waiting_state)  # noqa: NPY002
 
     def _waiting(self) -> dict[str, Any] | None:
-        """The state of numpy's global random numbers where the second number of a normal pair waits in it, which is not
-        the generator's and is lost when that is exchanged. It is not asked for while the generator stands where it was
-        when no number waited, for drawing a pair moves it."""
+        """Return the state of numpy's global random numbers where the second number of a normal pair waits in it. That
+        number is not the generator's and is lost when the generator is exchanged. The state is not asked for while the
+        generator stands where it was when no number waited, for drawing a pair moves it."""
         generator = mtrand.get_bit_generator()
         words = None
         if type(generator) is np.random.MT19937:
@@ -120,29 +119,29 @@ class Guarded:
 
 
 def within(points: np.ndarray, lower: Any, upper: Any) -> np.ndarray:
-    """Points moved into a box; a fifth of the time of `numpy.clip` for a few numbers."""
+    """Return points moved into a box; a fifth of the time of `numpy.clip` for a few numbers."""
     return np.asarray(np.minimum(np.maximum(points, lower), upper))
 
 
 class _PythonState:
-    """A state of Python's global random numbers, as it lies in memory where that is known (`_place`): written out as
-    numbers, and made of them, it takes as long as an optimiser takes for a tenth of a step."""
+    """State of Python's global random numbers, as it lies in memory where that is known (`_place`). To write it out as
+    numbers, and to make it of them, takes as long as an optimiser takes for a tenth of a step."""
 
     def __init__(self, state: Any = None) -> None:
         self._state = state  # as `random.getstate` has it, until it was read for the first time
         self._words, self._pair = b"", None
 
     def read(self) -> _PythonState:
-        """Take over the present state; returns itself."""
-        place, shared = _place(), _shared()
-        if place:
-            self._state, self._words, self._pair = None, ctypes.string_at(place, WORDS), shared.gauss_next
+        """Take over the present state; return itself."""
+        address, shared = _place(), _shared()
+        if address:
+            self._state, self._words, self._pair = None, ctypes.string_at(address, WORDS), shared.gauss_next
         else:
             self._state = random.getstate()
         return self
 
     def install(self) -> None:
-        """Make it the present state."""
+        """Make this state the present one."""
         if self._state is not None:
             random.setstate(self._state)
         else:
@@ -151,22 +150,22 @@ class _PythonState:
 
 
 def _shared() -> Any:
-    """Python's global generator."""
+    """Return Python's global generator."""
     draw: Any = random.random
     return draw.__self__
 
 
 @cache
 def _place() -> int:
-    """Where the state of Python's global generator lies in memory, which is where another generator of the same class
-    has it, at the same distance; 0 where that was tried and found not to be so."""
+    """Return the address of the state of Python's global generator. It lies where another generator of the same class
+    has it, at the same distance; 0 where a trial has found that not to be so."""
     shared = _shared()
     head = object.__basicsize__  # which counts references
     if sys.implementation.name != "cpython" or type(shared) is not random.Random:
         return 0
     if random.Random.__basicsize__ < head + WORDS:
         return 0
-    one, other = random.Random(1), random.Random(2)
-    other.random()  # not at its first number
-    ctypes.memmove(id(one) + head, ctypes.string_at(id(other) + head, WORDS), WORDS)
-    return id(shared) + head if one.getstate() == other.getstate() else 0
+    first, second = random.Random(1), random.Random(2)
+    second.random()  # not at its first number
+    ctypes.memmove(id(first) + head, ctypes.string_at(id(second) + head, WORDS), WORDS)
+    return id(shared) + head if first.getstate() == second.getstate() else 0

@@ -11,7 +11,7 @@ import sparserob_core as sr
 
 
 class Piqp(sr.Solver, sr.Options):
-    """Fast on small and medium sparse programs, and precise; whom `auto` asks."""
+    """Solver that `auto` asks: fast on small and medium sparse programs, and precise."""
 
     sparse: ClassVar[bool] = True
 
@@ -31,12 +31,12 @@ class Piqp(sr.Solver, sr.Options):
         )
         status = solver.solve()
         result = solver.result
-        kinds: dict[Any, Literal["solved", "infeasible"]] = {
+        statuses: dict[Any, Literal["solved", "infeasible"]] = {
             piqp.PIQP_SOLVED: "solved",
             piqp.PIQP_PRIMAL_INFEASIBLE: "infeasible",
         }
         claim = sr.Claim(
-            kinds.get(status, "failed"),
+            statuses.get(status, "failed"),
             result.x,
             result.z_u,
             result.y,

@@ -1,4 +1,4 @@
-"""Registers the policies, whose mathematics is the core's: the checker needs it too."""
+"""Registration of the policies, whose mathematics is the core's: the checker needs it too."""
 
 from __future__ import annotations
 

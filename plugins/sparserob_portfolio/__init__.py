@@ -1,4 +1,4 @@
-"""A few maximisers try, and the one that comes farthest goes on."""
+"""Portfolio: a few maximisers try, and the one that comes farthest goes on."""
 
 from __future__ import annotations
 
@@ -13,7 +13,8 @@ import sparserob_core as sr
 
 
 class Portfolio(sr.Maximiser, sr.Options):
-    """Some maximisers, each with a part of the budget; then the one that has found the best value, with the rest.
+    """Portfolio of maximisers, each with a part of the budget; then the one that has found the best value, with the
+    rest.
 
     Nobody knows beforehand which search suits a function: trees find narrow hills in few coordinates, walks that move
     one coordinate at a time cross a separable landscape, evolution strategies follow ridges. Each member tries on its
@@ -35,29 +36,30 @@ class Portfolio(sr.Maximiser, sr.Options):
 
     @property
     def whole(self) -> bool:  # type: ignore[override]
-        """Whether every member makes sense of whole numbers."""
+        """True where every member makes sense of whole numbers."""
         return all(member.whole for member in self._resolved if not isinstance(member, sr.UnknownPluginError))
 
     def search(self, objective: sr.Objective, rng: np.random.Generator) -> float:
-        """See `sparserob_core.Maximiser`."""
+        """Search until the budget is spent and return ``inf``, as no upper bound is proven; see
+        `sparserob_core.Maximiser`."""
         members = self._built()
-        known = objective.known()
-        each = int(self.trial * objective.remaining / len(members))
-        parts = list[sr.SearchPart]()
+        evaluated = objective.known()
+        trial_budget = int(self.trial * objective.remaining / len(members))
+        trials = list[sr.SearchPart]()
         for number, member in enumerate(members, 1):
-            if each:
+            if trial_budget:
                 objective.note(member=float(number))
-                parts.append(sr.SearchPart(objective, each, *known))
-                parts[-1].run(member, rng)
-        winner = int(np.argmax([part.best_value for part in parts])) if parts else 0
+                trials.append(sr.SearchPart(objective, trial_budget, *evaluated))
+                trials[-1].run(member, rng)
+        winner = int(np.argmax([trial.best_value for trial in trials])) if trials else 0
         objective.note(member=winner + 1.0)
-        known = _joined(known, *(batch for part in parts for batch in part.found))
-        idle = 0  # members that found nothing left to gain, one after the other
-        while objective.remaining and idle < len(members):
-            rest = sr.SearchPart(objective, objective.remaining, *known)
-            rest.run(members[(winner + idle) % len(members)], rng)
-            known = _joined(known, *rest.found)
-            idle = 0 if rest.found else idle + 1
+        evaluated = _joined(evaluated, *(batch for trial in trials for batch in trial.found))
+        idle_count = 0  # members that found nothing left to gain, one after the other
+        while objective.remaining and idle_count < len(members):
+            remainder = sr.SearchPart(objective, objective.remaining, *evaluated)
+            remainder.run(members[(winner + idle_count) % len(members)], rng)
+            evaluated = _joined(evaluated, *remainder.found)
+            idle_count = 0 if remainder.found else idle_count + 1
         return float("inf")
 
     @model_validator(mode="after")
@@ -69,12 +71,12 @@ class Portfolio(sr.Maximiser, sr.Options):
         return self
 
     def _built(self) -> list[sr.Maximiser]:
-        built = list[sr.Maximiser]()
+        members = list[sr.Maximiser]()
         for member in self._resolved:
             if isinstance(member, sr.UnknownPluginError):
                 raise member
-            built.append(member)
-        return built
+            members.append(member)
+        return members
 
 
 def _usual() -> Sequence[str]:
@@ -87,10 +89,10 @@ def _member(registry: Any, entry: str | Mapping[str, Any]) -> sr.Maximiser | sr.
         raise sr.InputError(f"members: expected the name of a maximiser in each mapping, got {entry!r}")
     options = {} if isinstance(entry, str) else {key: value for key, value in entry.items() if key != "name"}
     try:
-        built: sr.Maximiser = registry.build("maximiser", name, options)
+        member: sr.Maximiser = registry.build("maximiser", name, options)
     except sr.UnknownPluginError as error:
         return error
-    return built
+    return member
 
 
 def _joined(*batches: tuple[np.ndarray, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:

@@ -1,5 +1,4 @@
-"""Shows the progress of a run: a live block on a terminal, plain lines anywhere else, nothing for a
-short run."""
+"""Progress of a run: a live block on a terminal, plain lines anywhere else, nothing for a short run."""
 
 from __future__ import annotations
 
@@ -16,8 +15,8 @@ SHOWN = (sr.RoundFinished, sr.EvaluationsFinished, sr.ProofProgress, sr.StagePro
 
 
 class ProgressObserver(sr.Observer, sr.Options):
-    """The phase, bounds, round, worst violation, what is proven, the search with its best value, rate and time left,
-    and the proof, on the standard error stream.
+    """Observer that shows a run on the standard error stream: the phase, bounds, round, worst violation, what is
+    proven, the search with its best value, rate and time left, and the proof.
 
     Nothing is shown for a quiet run, nor before ``patience`` seconds have passed. On a terminal the lines are renewed
     in place and disappear when the run is over; anywhere else one line is written every five seconds.
@@ -33,7 +32,7 @@ class ProgressObserver(sr.Observer, sr.Options):
     _screen: Screen | None = PrivateAttr(default=None)
 
     def receive(self, event: sr.Event) -> None:
-        """See `sparserob_core.Observer`."""
+        """Take note of an event and show the progress; see `sparserob_core.Observer`."""
         if isinstance(event, sr.RunStarted) and not event.quiet:
             self._status = Status(event.title)
             if event.unprovable:

@@ -1,4 +1,4 @@
-"""Where the progress is shown: a block of lines that renews itself on a terminal, a plain line now and then anywhere
+"""Display of the progress: a block of lines that renews itself on a terminal, a plain line now and then anywhere
 else."""
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ LONGEST_GOODBYE: Final = 2.0  # a terminal that takes nothing any more shall not
 
 
 class Screen:
-    """A thread that shows a `Status` after ``patience`` seconds, and again and again, so that the solver never waits
-    for the terminal."""
+    """Thread that shows a `Status` after ``patience`` seconds, and again and again, so that the solver never waits for
+    the terminal."""
 
     def __init__(self, status: Status, patience: float, stream: TextIO) -> None:
         self.status, self.patience, self.stream = status, patience, stream
@@ -64,18 +64,18 @@ class Screen:
 
 
 def is_terminal(stream: TextIO) -> bool:
-    """Whether lines can be written over."""
+    """Return whether lines can be written over."""
     return stream.isatty() and os.environ.get("TERM", "") not in ("", "dumb")
 
 
 def block(status: Status) -> Text:
-    """The title with the time, and one line for each part."""
+    """Return the title with the time, and one line for each part."""
     from rich.text import Text
 
     text = Text(no_wrap=True, overflow="ellipsis")
     text.append(status.title, "bold")
     text.append(f"  {duration(status.elapsed)}")
-    for label, said in status.parts():
+    for label, content in status.parts():
         text.append(f"\n{label:<{LABEL}}", "dim")
-        text.append(said)
+        text.append(content)
     return text

@@ -1,4 +1,4 @@
-"""How a run stands, gathered from its events, and what is said of it."""
+"""Status of a run, gathered from its events, and the lines that report it."""
 
 from __future__ import annotations
 
@@ -60,27 +60,27 @@ class Status:
         self.proven = result.upper_bound
 
     def parts(self) -> list[tuple[str, str]]:
-        """What is known, as labels and texts of less than 70 characters."""
-        parts = [("phase", self.phase)] if self.phase else []
+        """Return what is known, as labels and texts of less than 70 characters."""
+        lines = [("phase", self.phase)] if self.phase else []
         if self.round or self.searched or self.result:
-            parts.append(("bounds", _bounds(self.lower, self.upper, self.gap, self.proven)))
+            lines.append(("bounds", _bounds(self.lower, self.upper, self.gap, self.proven)))
         if self.round is not None:
-            parts += [("round", _round(self.round)), ("", _work(self.round))]
+            lines += [("round", _round(self.round)), ("", _work(self.round))]
             if self.result is None and math.isfinite(self.proven):
-                parts.append(("proven", f"a control of cost {_number(self.proven)}; a better one is sought"))
+                lines.append(("proven", f"a control of cost {_number(self.proven)}; a better one is sought"))
         if self.searched is not None:
-            parts.append(("search", _search(self.searched)))
+            lines.append(("search", _search(self.searched)))
             notes = _notes(self.searched)
-            parts += [("", notes)] if notes else []
+            lines += [("", notes)] if notes else []
         if self.proving is not None:
-            parts.append(("proof", _proof(self.proving)))
-            parts += [("stuck", self.proving.hindrance)] if self.proving.hindrance else []
+            lines.append(("proof", _proof(self.proving)))
+            lines += [("stuck", self.proving.hindrance)] if self.proving.hindrance else []
         if self.now:
-            parts.append(("now", self.now))
-        return parts
+            lines.append(("now", self.now))
+        return lines
 
     def last(self, event: sr.Event) -> str:
-        """One event in one line."""
+        """Return one event in one line."""
         match event:
             case sr.RoundFinished():
                 bounds = _bounds(event.lower_bound, event.upper_bound, event.gap, event.proven)
@@ -96,25 +96,25 @@ class Status:
                 return type(event).__name__
 
     def line(self) -> str:
-        """All of it in one line."""
-        said = "; ".join(f"{label} {text}".strip() for label, text in self.parts())
-        return f"{duration(self.elapsed)}  {said}"
+        """Return the whole status in one line."""
+        summary = "; ".join(f"{label} {text}".strip() for label, text in self.parts())
+        return f"{duration(self.elapsed)}  {summary}"
 
 
 def duration(seconds: float) -> str:
-    """A time in three figures or so: 12.3 s, 4 min 05 s, 2 h 03 min."""
+    """Write a time in three figures or so: 12.3 s, 4 min 05 s, 2 h 03 min."""
     if seconds < 60.0:
         return f"{seconds:.1f} s"
-    minutes, rest = divmod(round(seconds), 60)
-    return f"{minutes} min {rest:02d} s" if minutes < 60 else f"{minutes // 60} h {minutes % 60:02d} min"
+    minutes, remainder = divmod(round(seconds), 60)
+    return f"{minutes} min {remainder:02d} s" if minutes < 60 else f"{minutes // 60} h {minutes % 60:02d} min"
 
 
 def _bounds(lower: float, upper: float, gap: float, proven: float) -> str:
     if not (math.isfinite(lower) and math.isfinite(upper)):
         return f"lower {_number(lower)}  upper {_number(upper)}"
-    closing = f"  gap {gap:.1e}" if math.isfinite(gap) else ""
+    gap_text = f"  gap {gap:.1e}" if math.isfinite(gap) else ""
     standing = "proven" if proven <= upper else "to be proven"
-    return f"lower {_number(lower)}  upper {_number(upper)} ({standing}){closing}"
+    return f"lower {_number(lower)}  upper {_number(upper)} ({standing}){gap_text}"
 
 
 def _round(event: sr.RoundFinished) -> str:
@@ -131,18 +131,21 @@ def _work(event: sr.RoundFinished) -> str:
 
 
 def _search(event: sr.EvaluationsFinished) -> str:
-    what = (
+    subject = (
         f"of {event.family}  largest violation"
         if event.family
         else f"{event.round}{_stage(event)}  best g"
         if event.round
         else "  best"
     )
-    of = f" of {event.budget}" if event.budget else ""
-    said = f"{what} {_number(event.best_value)}  {event.total}{of} evaluations  {_rate(event.total, event.seconds)}/s"
+    limit = f" of {event.budget}" if event.budget else ""
+    text = (
+        f"{subject} {_number(event.best_value)}  {event.total}{limit} evaluations  "
+        f"{_rate(event.total, event.seconds)}/s"
+    )
     if event.budget and event.total and event.seconds > 0.0:
-        said += f"  {duration(max(0.0, event.budget / event.total - 1.0) * event.seconds)} left"
-    return said.strip()
+        text += f"  {duration(max(0.0, event.budget / event.total - 1.0) * event.seconds)} left"
+    return text.strip()
 
 
 def _stage(event: sr.EvaluationsFinished) -> str:
@@ -151,24 +154,27 @@ def _stage(event: sr.EvaluationsFinished) -> str:
 
 
 def _notes(event: sr.EvaluationsFinished) -> str:
-    """The scalars that the maximiser has noted since the last event; of what a walk accepted, the share of the moves
-    that changed the value."""
-    said = []
+    """Return the scalars that the maximiser has noted since the last event; of what a walk accepted, the share of the
+    moves that changed the value."""
+    notes = []
     for name, rows in event.batch.notes.items():
         if name == "accepted":
             share = event.batch.acceptance
-            said += [] if math.isnan(share) else [f"accepted {share:.0%}"]
+            notes += [] if math.isnan(share) else [f"accepted {share:.0%}"]
         elif name not in UNSAID:
-            said.append(f"{name} {rows[-1][1]:.3g}")
-    return "  ".join(said)
+            notes.append(f"{name} {rows[-1][1]:.3g}")
+    return "  ".join(notes)
 
 
 def _proof(event: sr.ProofProgress) -> str:
     rate = f" at {_rate(event.examined, event.seconds)}/s" if event.examined and event.seconds > 0.0 else ""
-    seen = f"  {event.examined} examined{rate}" if event.examined else ""
-    before = "" if math.isnan(event.bound_before) else f", half a minute ago {event.bound_before:.1e}"
+    examined = f"  {event.examined} examined{rate}" if event.examined else ""
+    earlier_bound = "" if math.isnan(event.bound_before) else f", half a minute ago {event.bound_before:.1e}"
     unit = f" {event.measured}" if event.measured else ""
-    return f"of {event.family}  cells open {event.cells}{seen}  violation not excluded {event.bound:.1e}{unit}{before}"
+    return (
+        f"of {event.family}  cells open {event.cells}{examined}  "
+        f"violation not excluded {event.bound:.1e}{unit}{earlier_bound}"
+    )
 
 
 def _rate(count: int, seconds: float) -> str:

@@ -12,8 +12,8 @@ import sparserob_core as sr
 
 
 class ProxQp(sr.Solver, sr.Options):
-    """Precise on strictly convex programs; slow, and given to false claims of infeasibility, when the curvature is
-    small."""
+    """Solver that is precise on strictly convex programs; slow, and given to false claims of infeasibility, when the
+    curvature is small."""
 
     sparse: ClassVar[bool] = True
 
@@ -60,12 +60,12 @@ class ProxQp(sr.Solver, sr.Options):
             )
         solver.solve()
         result, status = solver.results, solver.results.info.status
-        kinds: dict[Any, Literal["solved", "infeasible"]] = {
+        statuses: dict[Any, Literal["solved", "infeasible"]] = {
             proxqp.PROXQP_SOLVED: "solved",
             proxqp.PROXQP_PRIMAL_INFEASIBLE: "infeasible",
         }
         claim = sr.Claim(
-            kinds.get(status, "failed"),
+            statuses.get(status, "failed"),
             np.array(result.x),
             np.array(result.z[:r]),
             np.array(result.y),

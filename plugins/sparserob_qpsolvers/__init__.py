@@ -1,4 +1,4 @@
-"""Every solver that qpsolvers knows (Caron and others 2016-2026), under its own name and with its own settings.
+"""Solvers that qpsolvers knows (Caron and others 2016-2026), under their own names and with their own settings.
 
 Nothing of qpsolvers is imported before a solver is used: importing it imports every solver that is installed.
 """
@@ -21,12 +21,12 @@ def sparserob_solvers() -> Iterator[sr.SolverPlugin]:
         needs=("qpsolvers", "qpsolvers"),
         open=True,
     )
-    for name, known in SOLVERS.items():
+    for name, solver in SOLVERS.items():
         if name not in NATIVE:
             yield sr.SolverPlugin(
                 name=name,
                 factory=f"sparserob_qpsolvers.through:{name}",
-                summary=f"{known.summary} (through qpsolvers)",
-                needs=(known.package, known.package if known.pip is None else known.pip),
+                summary=f"{solver.summary} (through qpsolvers)",
+                needs=(solver.package, solver.package if solver.pip is None else solver.pip),
                 open=True,
             )

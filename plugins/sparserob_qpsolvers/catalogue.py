@@ -1,5 +1,5 @@
-"""The solvers that qpsolvers knows: the package of each, how it is asked for an accuracy, and where it says what its
-settings are."""
+"""Catalogue of the solvers that qpsolvers knows: the package of each, how it is asked for an accuracy, and where it
+says what its settings are."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from typing import Any, TypeAlias, final
 Settings: TypeAlias = Mapping[str, Any]
 
 NATIVE = frozenset({"piqp", "proxqp", "clarabel"})
-"""These have adapters of their own; through qpsolvers they are ``{name: qpsolvers, solver: piqp}``."""
+"""Solvers with adapters of their own; through qpsolvers they are ``{name: qpsolvers, solver: piqp}``."""
 
 
 @final
@@ -40,28 +40,34 @@ class Known:
 
 
 def _attributes(place: str) -> Callable[[], Settings]:
-    """The settings are the attributes of what a constructor, ``package.module:Name``, makes."""
+    """Return a function that reads the settings as the attributes of what a constructor, ``package.module:Name``,
+    makes."""
 
     def read() -> Settings:
         module, _, name = place.partition(":")
-        made = getattr(import_module(module), name)()
-        return {key: getattr(made, key) for key in _public(made)}
+        settings = getattr(import_module(module), name)()
+        return {key: getattr(settings, key) for key in _public(settings)}
 
     return read
 
 
 def _signature(place: str, *program: str) -> Callable[[], Settings]:
-    """The settings are the keywords of a function, but for those that are the ``program``."""
+    """Return a function that reads the settings as the keywords of a function, but for those that are the
+    ``program``."""
 
     def read() -> Settings:
         import inspect
 
         module, _, name = place.partition(":")
-        made: Any = import_module(module)
-        for part in name.split("."):
-            made = getattr(made, part)
-        parameters = inspect.signature(made).parameters.values()
-        return {one.name: one.default for one in parameters if one.name not in {"self", "verbose", *program}}
+        target: Any = import_module(module)
+        for attribute in name.split("."):
+            target = getattr(target, attribute)
+        parameters = inspect.signature(target).parameters.values()
+        return {
+            parameter.name: parameter.default
+            for parameter in parameters
+            if parameter.name not in {"self", "verbose", *program}
+        }
 
     return read
 
@@ -74,22 +80,22 @@ def _public(made: object) -> Iterator[str]:
 
 def _of_osqp() -> Settings:
     extension = import_module("osqp.ext_builtin")
-    made = extension.OSQPSettings()
-    extension.osqp_set_default_settings(made)
-    return {key: getattr(made, key) for key in _public(made)}
+    settings = extension.OSQPSettings()
+    extension.osqp_set_default_settings(settings)
+    return {key: getattr(settings, key) for key in _public(settings)}
 
 
 def _of_piqp() -> Settings:
-    made = import_module("piqp").SparseSolver().settings
-    return {"backend": None, **{key: getattr(made, key) for key in _public(made)}}
+    settings = import_module("piqp").SparseSolver().settings
+    return {"backend": None, **{key: getattr(settings, key) for key in _public(settings)}}
 
 
 def _of_proxqp() -> Settings:
-    """Its signature is text: ``name: type = default``."""
+    """Read the settings of ProxQP, whose signature is text: ``name: type = default``."""
     text = str(import_module("proxsuite").proxqp.dense.solve.__doc__).partition("\n")[0]
-    made = import_module("proxsuite").proxqp.Settings()
-    named = re.findall(r"(\w+): [^,=]*= ", text)
-    return {"backend": None, **{key: getattr(made, key, 0.0) for key in named if key not in {*"xyz", "verbose"}}}
+    settings = import_module("proxsuite").proxqp.Settings()
+    names = re.findall(r"(\w+): [^,=]*= ", text)
+    return {"backend": None, **{key: getattr(settings, key, 0.0) for key in names if key not in {*"xyz", "verbose"}}}
 
 
 _OF_THE_PROGRAM = ("H", "f", "A", "bupper", "blower", "sense", "break_points", "is_avi", "primal_start", "dual_start")

@@ -1,4 +1,4 @@
-"""A solver of qpsolvers behind this package's `Solver`; for each of them, a class whose options are its own settings.
+"""Solvers of qpsolvers behind this package's `Solver`; for each of them, a class whose options are its own settings.
 
 `__getattr__` makes the class of a solver when it is first asked for, here by name: ``through:osqp``.
 """
@@ -28,8 +28,8 @@ Duals: TypeAlias = tuple[sr.Array, sr.Array, sr.Array]
 
 
 class Through(sr.Solver, sr.Options):
-    """A solver of qpsolvers. What is not given keeps the solver's own default, but for its tolerances, which follow the
-    accuracy that is asked of it."""
+    """Solver of qpsolvers. Settings that are not given keep the solver's own defaults, but for its tolerances, which
+    follow the accuracy that is asked of it."""
 
     model_config = ConfigDict(use_attribute_docstrings=False)  # there is no source of a class that is made here
 
@@ -41,35 +41,37 @@ class Through(sr.Solver, sr.Options):
         return {key: value for key, value in plain(self).items() if key in self.model_fields_set and value is not None}
 
     def solve(self, program: sr.QuadraticProgram, accuracy: float) -> sr.Claim:
-        given = {key: getattr(self, key) for key in self.model_fields_set}
-        return claimed(self.called, program, accuracy, {key: it for key, it in given.items() if it is not None})
+        settings = {key: getattr(self, key) for key in self.model_fields_set}
+        return claimed(
+            self.called, program, accuracy, {key: value for key, value in settings.items() if value is not None}
+        )
 
 
 class Unchecked(Through):
-    """A solver that does not say what its settings are: all that is given is passed on."""
+    """Solver that does not say what its settings are: all that is given is passed on."""
 
     model_config = ConfigDict(extra="allow")
 
 
 class Qpsolvers(sr.Solver, sr.Options):
-    """Any solver that qpsolvers finds, native adapter or not. Importing qpsolvers imports every solver that is
-    installed."""
+    """Solver of qpsolvers by name, any that it finds, native adapter or not. Importing qpsolvers imports every solver
+    that is installed."""
 
     model_config = ConfigDict(extra="allow")
 
     solver: str = Field(min_length=1)
-    """Its name in qpsolvers, such as ``piqp``; further keys are its own settings."""
+    """Name of the solver in qpsolvers, such as ``piqp``; further keys are its own settings."""
 
     _chosen: Through = PrivateAttr()
 
     @property
     def delegate(self) -> str:
-        """The solver that was chosen."""
+        """Name of the solver that was chosen."""
         return self.solver
 
     @property
     def aborts(self) -> bool:  # type: ignore[override]
-        """Whether the solver that was chosen does."""
+        """True where the solver that was chosen ends the process on some programs."""
         return self._chosen.aborts
 
     @field_validator("solver")
@@ -80,14 +82,14 @@ class Qpsolvers(sr.Solver, sr.Options):
 
     @model_validator(mode="after")
     def _choose(self) -> Qpsolvers:
-        given = dict(self.model_extra or {})
+        settings = dict(self.model_extra or {})
         kind = _class_of(self.solver)
-        unknown = () if issubclass(kind, Unchecked) else given.keys() - kind.model_fields.keys()
+        unknown = () if issubclass(kind, Unchecked) else settings.keys() - kind.model_fields.keys()
         for key in sorted(unknown):
-            near = get_close_matches(key, kind.model_fields, 1, 0.0)
-            hint = f"; the nearest is {near[0]!r}" if near else ", which has no settings"
+            nearest = get_close_matches(key, kind.model_fields, 1, 0.0)
+            hint = f"; the nearest is {nearest[0]!r}" if nearest else ", which has no settings"
             raise sr.InputError(f"there is no setting {key!r} of {self.solver}{hint}")
-        self._chosen = kind(**given)
+        self._chosen = kind(**settings)
         return self
 
     def solve(self, program: sr.QuadraticProgram, accuracy: float) -> sr.Claim:
@@ -95,17 +97,21 @@ class Qpsolvers(sr.Solver, sr.Options):
 
 
 def claimed(name: str, program: sr.QuadraticProgram, accuracy: float, given: Mapping[str, Any]) -> sr.Claim:
-    """What qpsolvers' solver of that name says of a program."""
+    """Return the claim of qpsolvers' solver of that name about a program."""
     import qpsolvers
 
     _require(name)
-    known = SOLVERS.get(name, UNKNOWN)
-    settings = {**known.fixed, **{key: factor * accuracy for key, factor in known.asked.items()}, **_own(known, given)}
-    posed, recover = _posed(program, dense=name not in qpsolvers.sparse_solvers)
+    solver = SOLVERS.get(name, UNKNOWN)
+    settings = {
+        **solver.fixed,
+        **{key: factor * accuracy for key, factor in solver.asked.items()},
+        **_own(solver, given),
+    }
+    problem, recover = _posed(program, dense=name not in qpsolvers.sparse_solvers)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         try:
-            solution = _apart(partial(qpsolvers.solve_problem, posed, name, **settings), known)
+            solution = _apart(partial(qpsolvers.solve_problem, problem, name, **settings), solver)
         except (
             qpsolvers.exceptions.QPError,
             ValueError,
@@ -113,19 +119,19 @@ def claimed(name: str, program: sr.QuadraticProgram, accuracy: float, given: Map
             RuntimeError,
             np.linalg.LinAlgError,
         ) as error:
-            nothing = np.full(program.q.size, np.nan)
-            return sr.Claim("failed", nothing, 0 * program.h, 0 * program.b, nothing, f"{name}: {error}")
-    said = _status(solution.extras)
+            no_values = np.full(program.q.size, np.nan)
+            return sr.Claim("failed", no_values, 0 * program.h, 0 * program.b, no_values, f"{name}: {error}")
+    outcome = _status(solution.extras)
     # Whether a program is infeasible qpsolvers does not say; where it is, the elastic program will prove it.
     status: Literal["solved", "failed"] = "solved" if solution.found else "failed"
     z, y, z_box = recover(solution)
-    claim = sr.Claim(status, _vector(solution.x, program.q.size), z, y, z_box, f"{name}: {said or status}")
+    claim = sr.Claim(status, _vector(solution.x, program.q.size), z, y, z_box, f"{name}: {outcome or status}")
     return claim.judged(program, accuracy)
 
 
 def _apart(solve: Callable[[], Any], known: Known) -> Any:
-    """What the solver answers; one with a scheduler of threads (HiGHS) is asked in a new thread. Each thread has a
-    scheduler of its own, and refuses every number of threads but the one with which it was begun."""
+    """Return the answer of the solver; one with a scheduler of threads (HiGHS) is asked in a new thread. Each thread
+    has a scheduler of its own, which refuses every number of threads but the one with which it was begun."""
     if not known.scheduler:
         return solve()
     with ThreadPoolExecutor(1) as thread, sr.silent():
@@ -144,7 +150,7 @@ def _require(name: str) -> None:
 
 
 def _posed(program: sr.QuadraticProgram, dense: bool) -> tuple[Any, Callable[[Any], Duals]]:
-    """The program as qpsolvers takes it, and the way back for multipliers ``z, y, z_box``.
+    """Return the program as qpsolvers takes it, and a function that recovers the multipliers ``z, y, z_box``.
 
     Where every bound is finite and leaves room, bounds stay bounds. Otherwise they become rows, those of a variable
     with a single value an equality: some solvers make rows of infinite bounds, or have no interior between equal ones.
@@ -154,57 +160,60 @@ def _posed(program: sr.QuadraticProgram, dense: bool) -> tuple[Any, Callable[[An
 
     n, r, e = program.q.size, program.h.size, program.b.size
     lower, upper = program.lower, program.upper
-    fixed = lower == upper
-    boxed = bool(np.isfinite(lower).all() and np.isfinite(upper).all() and not fixed.any())
+    is_fixed = lower == upper
+    keeps_bounds = bool(np.isfinite(lower).all() and np.isfinite(upper).all() and not is_fixed.any())
     G, h, A, b = program.G, program.h, program.A, program.b
-    above, below = (np.flatnonzero(np.isfinite(bound) & ~fixed) for bound in (upper, lower))
-    held = np.flatnonzero(fixed)
-    if not boxed:
+    bounded_above, bounded_below = (np.flatnonzero(np.isfinite(bound) & ~is_fixed) for bound in (upper, lower))
+    fixed_indices = np.flatnonzero(is_fixed)
+    if not keeps_bounds:
         identity = eye_array(n, format="csr")
-        G, h = vstack([G, identity[above], -identity[below]]), np.concatenate([h, upper[above], -lower[below]])
-        A, b = vstack([A, identity[held]]), np.concatenate([b, lower[held]])
+        G, h = (
+            vstack([G, identity[bounded_above], -identity[bounded_below]]),
+            np.concatenate([h, upper[bounded_above], -lower[bounded_below]]),
+        )
+        A, b = vstack([A, identity[fixed_indices]]), np.concatenate([b, lower[fixed_indices]])
 
     def matrix(rows: csc_array) -> Any:
         return rows.toarray(order="C") if dense else csc_matrix(rows)  # some factorise Fortran's order in place
 
-    posed = Problem(
+    problem = Problem(
         matrix(program.P),
         program.q,
         matrix(G) if h.size else None,
         h if h.size else None,
         matrix(A) if b.size else None,
         b if b.size else None,
-        lower if boxed else None,
-        upper if boxed else None,
+        lower if keeps_bounds else None,
+        upper if keeps_bounds else None,
     )
 
     def recover(solution: Any) -> Duals:
         z, y = _vector(solution.z, h.size), _vector(solution.y, b.size)
-        if boxed:
+        if keeps_bounds:
             return z, y, _vector(solution.z_box, n)
         z_box = np.zeros(n)
-        z_box[above] = z[r : r + above.size]
-        z_box[below] -= z[r + above.size :]
-        z_box[held] = y[e:]
+        z_box[bounded_above] = z[r : r + bounded_above.size]
+        z_box[bounded_below] -= z[r + bounded_above.size :]
+        z_box[fixed_indices] = y[e:]
         return z[:r], y[:e], z_box
 
-    return posed, recover
+    return problem, recover
 
 
 def _vector(found: Any, size: int) -> sr.Array:
-    """What a solver has found, or NaN where it has found nothing of that size."""
+    """Return the vector that a solver has found, or NaN where it has found none of that size."""
     vector = np.asarray([] if found is None else found, dtype=float).ravel()
     return vector if vector.size == size else np.full(size, np.nan)
 
 
 def _status(extras: Mapping[str, Any]) -> str:
-    """How the solver itself calls the outcome, where it says so."""
-    told = [extras.get("status"), getattr(extras.get("info"), "status", None), extras.get("infostring")]
-    return next((str(getattr(one, "name", one)) for one in told if one is not None), "")
+    """Return the solver's own name of the outcome, where it gives one."""
+    candidates = [extras.get("status"), getattr(extras.get("info"), "status", None), extras.get("infostring")]
+    return next((str(getattr(status, "name", status)) for status in candidates if status is not None), "")
 
 
 def _own(known: Known, given: Mapping[str, Any]) -> Mapping[str, Any]:
-    """Settings as the solver takes them: names of an enumeration become its members."""
+    """Return the settings as the solver takes them: names of an enumeration become its members."""
     if known.settings is None or not given:
         return given
     own = known.settings()
@@ -212,32 +221,32 @@ def _own(known: Known, given: Mapping[str, Any]) -> Mapping[str, Any]:
 
 
 def _members(default: object) -> Mapping[str, Any]:
-    """The members of the enumeration that a default belongs to, by name; none where it is no enumeration."""
+    """Return the members of the enumeration that a default belongs to, by name; none where it is no enumeration."""
     return dict(getattr(type(default), "__members__", {}))
 
 
 def _class_of(name: str) -> type[Through]:
     if name not in globals():
         globals()[name] = _made(name)
-    made: type[Through] = globals()[name]
-    return made
+    solver_class: type[Through] = globals()[name]
+    return solver_class
 
 
 def _made(name: str) -> type[Through]:
-    known = SOLVERS.get(name, UNKNOWN)
-    settings = None if known.settings is None else known.settings()
+    solver = SOLVERS.get(name, UNKNOWN)
+    settings = None if solver.settings is None else solver.settings()
     fields: dict[str, Any] = {
-        key: (_type(default, known.flags) | None, _field(name, key, default))
+        key: (_type(default, solver.flags) | None, _field(name, key, default))
         for key, default in (settings or {}).items()
         if not hasattr(Through, key)
     }
     parent: type[Through] = Unchecked if settings is None else Through
-    made: Any = create_model(
+    model: Any = create_model(
         name, __base__=parent, __module__=__name__, __doc__=f"{name}, through qpsolvers.", **fields
     )
-    made.called, made.aborts = name, known.aborts
-    kind: type[Through] = made
-    return kind
+    model.called, model.aborts = name, solver.aborts
+    solver_class: type[Through] = model
+    return solver_class
 
 
 def _type(default: object, flags: bool) -> Any:
@@ -249,15 +258,15 @@ def _type(default: object, flags: bool) -> Any:
 
 
 def _field(name: str, key: str, default: object) -> Any:
-    """None: nothing is given to the solver; its own default is shown where there is a way to write it. A tolerance or a
-    number of iterations that is positive by default is not negative: solvers answer that each in their own way, one
-    with an error, one as if nothing were wrong."""
-    own = getattr(default, "name", default)
-    written = isinstance(own, bool | int | str) or (isinstance(own, float) and np.isfinite(own))
-    shown: Any = {"default": own} if written else {}
-    counts = isinstance(own, int | float) and not isinstance(own, bool) and own > 0 and MEASURES.search(key)
-    least = (1 if isinstance(own, int) else 0) if counts else None
-    return Field(default=None, ge=least, description=f"Setting of {name} itself.", json_schema_extra=shown)
+    """Make the option of a setting; with ``None`` nothing is given to the solver. Its own default is shown where there
+    is a way to write it. A tolerance or a number of iterations that is positive by default may not be negative: solvers
+    answer that each in their own way, one with an error, one as if nothing were wrong."""
+    value = getattr(default, "name", default)
+    is_writable = isinstance(value, bool | int | str) or (isinstance(value, float) and np.isfinite(value))
+    extra: Any = {"default": value} if is_writable else {}
+    is_positive = isinstance(value, int | float) and not isinstance(value, bool) and value > 0 and MEASURES.search(key)
+    lower_limit = (1 if isinstance(value, int) else 0) if is_positive else None
+    return Field(default=None, ge=lower_limit, description=f"Setting of {name} itself.", json_schema_extra=extra)
 
 
 def __getattr__(name: str) -> type[Through]:

@@ -20,11 +20,12 @@ class RandomSearch(sr.Maximiser, sr.Options):
 
     @property
     def polished(self) -> float:
-        """Nothing: it is a yardstick."""
+        """Share of the budget for a local method: none, as this search is a yardstick."""
         return 0.0
 
     def search(self, objective: sr.Objective, rng: np.random.Generator) -> float:
-        """See `sparserob_core.Maximiser`."""
+        """Search until the budget is spent and return ``inf``, as no upper bound is proven; see
+        `sparserob_core.Maximiser`."""
         lower, upper = objective.domain.lower, objective.domain.upper
         while objective.remaining:
             unit = rng.random((min(BATCH, objective.remaining), lower.size))
@@ -46,11 +47,12 @@ class Sobol(sr.Maximiser, sr.Options):
 
     @property
     def polished(self) -> float:
-        """Nothing: it is a yardstick."""
+        """Share of the budget for a local method: none, as this search is a yardstick."""
         return 0.0
 
     def search(self, objective: sr.Objective, rng: np.random.Generator) -> float:
-        """See `sparserob_core.Maximiser`."""
+        """Search until the budget is spent and return ``inf``, as no upper bound is proven; see
+        `sparserob_core.Maximiser`."""
         from scipy.stats import qmc
 
         lower, upper = objective.domain.lower, objective.domain.upper
@@ -60,8 +62,8 @@ class Sobol(sr.Maximiser, sr.Options):
                 "random_search has no such limit"
             )
         # scipy renamed the argument in 1.15.
-        seeded: dict[str, Any] = {"rng" if "rng" in inspect.signature(qmc.Sobol).parameters else "seed": rng}
-        sequence = qmc.Sobol(lower.size, scramble=self.scramble, **seeded)
+        seed_option: dict[str, Any] = {"rng" if "rng" in inspect.signature(qmc.Sobol).parameters else "seed": rng}
+        sequence = qmc.Sobol(lower.size, scramble=self.scramble, **seed_option)
         # Powers of two, as the balance of the sequence wants it; what exceeds the budget is drawn and not used.
         batch = min(BATCH, 2 ** max(0, (NUMBERS // lower.size).bit_length() - 1))
         while objective.remaining:

@@ -21,7 +21,7 @@ class Ridge(sr.Regulariser, sr.Options):
     """``1/2 |theta|^2``: the sum of the squared coefficients."""
 
     def quadratic(self, image: sr.ControlImage) -> tuple[csc_array, sr.Array]:
-        """Identity and zero."""
+        """Return the identity and zero."""
         from scipy.sparse import eye_array
 
         n = image.S.shape[1]
@@ -36,7 +36,7 @@ class WeightedRidge(sr.Regulariser, sr.Options):
     """Weight of every control; a number serves every control."""
 
     def quadratic(self, image: sr.ControlImage) -> tuple[csc_array, sr.Array]:
-        """``S' diag(weights * lengths) S`` and zero; positive definite, since a dictionary's functions are
+        """Return ``S' diag(weights * lengths) S`` and zero; positive definite, since a dictionary's functions are
         independent."""
         from scipy.sparse import csc_array, diags_array
 
@@ -52,7 +52,8 @@ class Smoothness(sr.Regulariser, sr.Options):
     """Factor of the squared coefficients, which make it strictly convex."""
 
     def quadratic(self, image: sr.ControlImage) -> tuple[csc_array, sr.Array]:
-        """``(D S)' (D S) + ridge I`` with ``D`` the differences of neighbouring pieces of each control, and zero."""
+        """Return ``(D S)' (D S) + ridge I`` with ``D`` the differences of neighbouring pieces of each control, and
+        zero."""
         from scipy.sparse import csc_array, diags_array, eye_array, kron
 
         n, pieces = image.S.shape[1], image.pieces
@@ -62,15 +63,15 @@ class Smoothness(sr.Regulariser, sr.Options):
 
 
 def _per_channel(weights: float | list[float], channels: int) -> sr.Array:
-    given = weights if isinstance(weights, list) else [weights] * channels
-    if len(given) != channels:
-        raise sr.InputError(f"weights: expected {channels} numbers, one per control, got {len(given)}")
-    return np.array(given)
+    values = weights if isinstance(weights, list) else [weights] * channels
+    if len(values) != channels:
+        raise sr.InputError(f"weights: expected {channels} numbers, one per control, got {len(values)}")
+    return np.array(values)
 
 
 @sr.hookimpl
 def sparserob_regularisers() -> Iterator[sr.RegulariserPlugin]:
-    """The shipped regularisers."""
+    """Offer the shipped regularisers."""
     yield sr.RegulariserPlugin(name="ridge", factory=Ridge, summary="Sum of the squared coefficients.")
     yield sr.RegulariserPlugin(
         name="weighted_ridge", factory=WeightedRidge, summary="Energy of the control, weighted by channel."

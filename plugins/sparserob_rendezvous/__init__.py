@@ -31,7 +31,7 @@ class Orbit(sr.Options):
 
     @property
     def mean_motion(self) -> float:
-        """Radians per second, on average."""
+        """Mean motion in radians per second."""
         return float(np.sqrt(self.mu / self.semi_major_axis**3))
 
     @property
@@ -42,7 +42,8 @@ class Orbit(sr.Options):
         return float(E - e * np.sin(E))
 
     def laws(self) -> dict[str, str | float]:
-        """Expressions in ``t`` by name: ``k = mu / r^3`` and ``w``, ``dw``, the angular velocity and its derivative."""
+        """Return expressions in ``t`` by name: ``k = mu / r^3`` and ``w``, ``dw``, the angular velocity and its
+        derivative."""
         e = self.eccentricity
         return {
             "n": self.mean_motion,
@@ -69,7 +70,7 @@ class Rendezvous(sr.ControlKeys):
     z``. A disturbance is an acceleration along the same axes, unless a list says how it enters."""
 
     def build(self) -> sr.OptimalControlProblem:
-        """The problem; raises `InputError` that begins with the key at fault."""
+        """Build the problem; raises `InputError` that begins with the key at fault."""
         return self.problem(self._system(), self._names())
 
     def _system(self) -> sr.System:
@@ -91,8 +92,8 @@ class Rendezvous(sr.ControlKeys):
         ahead: str | float,
         back: str | float,
     ) -> list[list[str | float]]:
-        """``A`` of these entries: what pulls along each axis, how ``x`` and ``z`` turn into each other, and Coriolis'
-        terms."""
+        """Return ``A`` of these entries: what pulls along each axis, how ``x`` and ``z`` turn into each other, and
+        Coriolis' terms."""
         if self.motion == "planar":
             return [[0, 0, 1, 0], [0, 0, 0, 1], [along, raised, 0, ahead], [lowered, inward, back, 0]]
         return [
@@ -105,24 +106,24 @@ class Rendezvous(sr.ControlKeys):
         ]
 
     def _names(self) -> sr.Names:
-        """Those that are given, and the usual ones and SI units where none are."""
-        axes, given = AXES[self.motion], self.names.build()
-        states = given.states or [*axes, *(f"v{axis}" for axis in axes)]
+        """Return the names that are given, and the usual ones and SI units where none are."""
+        axes, names = AXES[self.motion], self.names.build()
+        states = names.states or [*axes, *(f"v{axis}" for axis in axes)]
         return sr.Names(
             states=states,
-            controls=given.controls or [f"a{axis}" for axis in axes],
-            disturbances=given.disturbances,
-            state_units=given.state_units or [unit for unit in ("m", "m/s") for _ in axes],
-            control_units=given.control_units or ["m/s^2" for _ in axes],
-            disturbance_units=given.disturbance_units,
-            time=given.time or "s",
-            plane=given.plane or (states[0], states[len(axes) - 1]),
+            controls=names.controls or [f"a{axis}" for axis in axes],
+            disturbances=names.disturbances,
+            state_units=names.state_units or [unit for unit in ("m", "m/s") for _ in axes],
+            control_units=names.control_units or ["m/s^2" for _ in axes],
+            disturbance_units=names.disturbance_units,
+            time=names.time or "s",
+            plane=names.plane or (states[0], states[len(axes) - 1]),
         )
 
 
 @sr.hookimpl
 def sparserob_problems() -> Iterator[sr.ProblemPlugin]:
-    """The problem of rendezvous."""
+    """Offer ``rendezvous``."""
     yield sr.ProblemPlugin(
         name="rendezvous",
         factory=Rendezvous,

@@ -1,5 +1,5 @@
-"""Streams a run into Rerun while it runs: the search, the landscape of g, the physics, the bounds, to a viewer, a
-browser or a file."""
+"""Recording of a run in Rerun while it runs: the search, the landscape of g, the physics and the bounds go to a viewer,
+a browser or a file."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ class Rerun(sr.Observer, sr.Options):
         return text
 
     def receive(self, event: sr.Event) -> None:
-        """See `sparserob_core.Observer`."""
+        """Pass an event on to the recording; the first event begins it. See `sparserob_core.Observer`."""
         if isinstance(event, sr.RunStarted | sr.SweepStarted):
             self._begin(event)
         elif (outlet := self._outlet) is not None:  # one look: pydantic takes longer for it than the rest
@@ -73,17 +73,17 @@ class Rerun(sr.Observer, sr.Options):
             if isinstance(event, sr.RunFinished | sr.SweepFinished):
                 self._pressed = event.pressed
                 if self.serve and self.keep and not event.pressed:
-                    over = f"run is over: {event.status}" if isinstance(event, sr.RunFinished) else "study is over"
-                    logger.warning("rerun: the %s; its page stays until Ctrl-C", over)
+                    ending = f"run is over: {event.status}" if isinstance(event, sr.RunFinished) else "study is over"
+                    logger.warning("rerun: the %s; its page stays until Ctrl-C", ending)
                 self.close()
 
     @property
     def incomplete(self) -> str:
-        """See `sparserob_core.Observer`."""
+        """Reason why the recording is not complete, empty where it is; see `sparserob_core.Observer`."""
         return self._incomplete
 
     def close(self) -> None:
-        """See `sparserob_core.Observer`: the recording is complete afterwards."""
+        """End the recording, which is complete afterwards; see `sparserob_core.Observer`."""
         outlet, self._outlet = self._outlet, None
         if outlet is not None:
             for line in outlet.close(0.0 if self._pressed else self.keep):  # who ends a run wants no page of it

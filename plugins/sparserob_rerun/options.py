@@ -1,4 +1,4 @@
-"""The options of the landscape."""
+"""Options of the landscape."""
 
 from __future__ import annotations
 

@@ -50,15 +50,16 @@ class SequOOL(sr.Maximiser, sr.Options):
     ``null``: the largest ``hmax`` whose evaluations fit the budget."""
 
     def search(self, objective: sr.Objective, rng: np.random.Generator) -> float:
-        """See `sparserob_core.Maximiser`."""
+        """Search until the budget is spent and return ``inf``, as no upper bound is proven; see
+        `sparserob_core.Maximiser`."""
         hmax = _paper(self.openings) if self.openings else _fill(objective.remaining)
         _Tree(objective, hmax + 1).grow(_schedule(hmax))
         return float("inf")
 
 
 class _Tree:
-    """The cells of one depth that can still be opened: centres ``(k, c)`` in the coordinates that are ever cut, and
-    values ``(k,)``, best first."""
+    """Cells of one depth that can still be opened: centres ``(k, c)`` in the coordinates that are ever cut, and values
+    ``(k,)``, best first."""
 
     def __init__(self, objective: sr.Objective, depths: int) -> None:
         domain = objective.domain
@@ -83,7 +84,7 @@ class _Tree:
             self.objective.note(depth=depth, openings=opened, hmax=hmax)
 
     def _show(self, centres: np.ndarray) -> None:
-        """The cells that are opened; a coordinate that is never cut is as wide as the box."""
+        """Show the cells that are opened; a coordinate that is never cut is as wide as the box."""
         lower, upper = (
             np.tile(edge, (len(centres), 1)) for edge in (self.objective.domain.lower, self.objective.domain.upper)
         )
@@ -97,22 +98,22 @@ class _Tree:
         k, d = centres.shape
         children = np.empty((k, CHILDREN, d))
         children[:] = centres[:, np.newaxis]
-        line = centres[:, across]
-        children[:, 0, across] = np.maximum(line - step, self.lower[across])
-        children[:, 1, across] = np.minimum(line + step, self.upper[across])
+        coordinates = centres[:, across]
+        children[:, 0, across] = np.maximum(coordinates - step, self.lower[across])
+        children[:, 1, across] = np.minimum(coordinates + step, self.upper[across])
         self.thirds[across] = step / CHILDREN
-        found = np.empty((k, CHILDREN))
-        found[:, :2] = self._values(children[:, :2].reshape(-1, d)).reshape(-1, 2)
-        found[:, 2] = values
-        return children.reshape(-1, d), found.ravel()
+        child_values = np.empty((k, CHILDREN))
+        child_values[:, :2] = self._values(children[:, :2].reshape(-1, d)).reshape(-1, 2)
+        child_values[:, 2] = values
+        return children.reshape(-1, d), child_values.ravel()
 
     def _values(self, centres: np.ndarray) -> np.ndarray:
         d = self.root.size
         if centres.shape[1] == d and centres.size <= NUMBERS_AT_ONCE:
             return self.objective.evaluate(centres)
-        rows = max(1, NUMBERS_AT_ONCE // d)
+        batch_size = max(1, NUMBERS_AT_ONCE // d)
         return np.concatenate(
-            [self._values_at(centres[start : start + rows]) for start in range(0, len(centres), rows)]
+            [self._values_at(centres[start : start + batch_size]) for start in range(0, len(centres), batch_size)]
         )
 
     def _values_at(self, centres: np.ndarray) -> np.ndarray:
@@ -122,14 +123,14 @@ class _Tree:
 
 
 def _schedule(hmax: int) -> np.ndarray:
-    """Cells to be opened at depths ``0, ..., hmax``."""
+    """Return the numbers of cells to be opened at depths ``0, ..., hmax``."""
     depth = np.arange(1, hmax + 1)
     existing = CHILDREN ** np.minimum(depth, 39)  # 3^39 is the largest power in 64 bits
     return np.concatenate([[1], np.minimum(hmax // depth, existing)])
 
 
 def _fill(budget: int) -> int:
-    """The largest ``hmax`` whose evaluations fit; 0 when not even the root can be opened."""
+    """Return the largest ``hmax`` whose evaluations fit; 0 when not even the root can be opened."""
     fits, exceeds = 0, 1
     while _cost(exceeds) <= budget:
         fits, exceeds = exceeds, 2 * exceeds
@@ -147,7 +148,7 @@ def _cost(hmax: int) -> int:
 
 
 def _paper(openings: int) -> int:
-    """The ``hmax`` of the paper for ``n`` openings."""
+    """Return the ``hmax`` of the paper for ``n`` openings."""
     return int(openings / (1.0 / np.arange(1, openings + 1)).sum())
 
 

@@ -12,7 +12,7 @@ KINDS = "sparserob_core.experiment.config.set_kinds"
 
 @sr.hookimpl
 def sparserob_sets() -> Iterator[sr.SetPlugin]:
-    """The shipped kinds of sets."""
+    """Offer the shipped kinds of sets."""
     yield sr.SetPlugin(name="box", factory=f"{KINDS}:BoxFactory", summary="Bounds on every coordinate.")
     yield sr.SetPlugin(name="polytope", factory=f"{KINDS}:PolytopeFactory", summary="Half-spaces: H x <= h.")
     yield sr.SetPlugin(

@@ -22,7 +22,7 @@ class ZonotopeFactory(sr.SetFactory, sr.Options):
     """Centre; a number serves every coordinate."""
 
     def build(self, dimension: int) -> sr.Zonotope:
-        """The zonotope; raises `InputError` when the numbers are not as many as coordinates."""
+        """Build the zonotope; raises `InputError` when the numbers are not as many as coordinates."""
         if {len(row) for row in self.generators} != {dimension}:
             lengths = [len(row) for row in self.generators]
             raise sr.InputError(f"every generator must have {dimension} numbers, got rows of {lengths}")
@@ -33,7 +33,7 @@ class ZonotopeFactory(sr.SetFactory, sr.Options):
 
     @staticmethod
     def options_of(convex: sr.ConvexSet) -> Mapping[str, Any] | None:
-        """The options that build a zonotope; the centre only where it is not the origin."""
+        """Return the options that build a zonotope; the centre only where it is not the origin."""
         if not isinstance(convex, sr.Zonotope):
             return None
         centre = {"centre": convex.centre.tolist()} if convex.centre.any() else {}

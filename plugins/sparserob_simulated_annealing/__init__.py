@@ -116,7 +116,8 @@ class SimulatedAnnealing(sr.Maximiser, sr.Options):
         return self
 
     def search(self, objective: sr.Objective, rng: np.random.Generator) -> float:
-        """See `sparserob_core.Maximiser`."""
+        """Search until the budget is spent and return ``inf``, as no upper bound is proven; see
+        `sparserob_core.Maximiser`."""
         moves = Moves(self, objective, rng)
         walk = _Walk(objective, rng, moves)
         start = first_temperature(self, walk.begin(self._uniform(objective, moves)))
@@ -135,8 +136,8 @@ class SimulatedAnnealing(sr.Maximiser, sr.Options):
 
 
 class _Walk:
-    """Where the walk stands: a point, its value, and the number of the evaluation that it is from (0: of one before the
-    search); the same of the best."""
+    """State of the walk: a point, its value, and the number of the evaluation that it is from (0: of one before the
+    search). ``best`` is that number of the best point."""
 
     def __init__(self, objective: sr.Objective, rng: np.random.Generator, moves: Moves) -> None:
         self.objective, self.rng, self.moves = objective, rng, moves
@@ -146,7 +147,7 @@ class _Walk:
         self.told = getattr(objective, "acting", None)  # an objective of somebody else may not have it
 
     def begin(self, points: np.ndarray) -> np.ndarray:
-        """Evaluate the first points, and stand at the best that is known; returns their values."""
+        """Evaluate the first points, and stand at the best that is known; return their values."""
         values = self._sampled(points)
         self._to_best()
         return values
@@ -157,25 +158,30 @@ class _Walk:
         if points is None or not self.objective.remaining:
             self._to_best()
             return
-        before = self.objective.evaluations
+        evaluations = self.objective.evaluations
         values = self._sampled(points)
-        top = int(np.argmax(values))
-        self.point, self.value, self.number, self.acting = points[top], float(values[top]), before + top + 1, None
+        best = int(np.argmax(values))
+        self.point, self.value, self.number, self.acting = (
+            points[best],
+            float(values[best]),
+            evaluations + best + 1,
+            None,
+        )
 
     def go(self, cooling: Cooling) -> None:
-        """One cycle of the walk."""
+        """Run one cycle of the walk."""
         objective = self.objective
         for k in range(cooling.length):
             temperature = cooling.temperature(k, objective.best_value - self.value)
             candidate, record = self.moves.candidate(self.point, self.acting), objective.best_value
-            found = float(objective.evaluate(candidate[np.newaxis])[0])
-            if found > record:
+            value = float(objective.evaluate(candidate[np.newaxis])[0])
+            if value > record:
                 self.best = objective.evaluations
             # There is nothing to lose where the function has no value, and a rule cannot be asked about -inf less -inf.
-            accepted = self.value == -np.inf or objective.accepts(self.value, found, temperature, self.rng)
+            accepted = self.value == -np.inf or objective.accepts(self.value, value, temperature, self.rng)
             self.moves.learn(accepted)
             if accepted:
-                self.point, self.value, self.number = candidate, found, objective.evaluations
+                self.point, self.value, self.number = candidate, value, objective.evaluations
                 self.acting = None if self.told is None else np.flatnonzero(self.told())
             objective.note(
                 temperature=temperature,
@@ -187,10 +193,10 @@ class _Walk:
             )
 
     def _sampled(self, points: np.ndarray) -> np.ndarray:
-        before, record = self.objective.evaluations, self.objective.best_value
+        evaluations, record = self.objective.evaluations, self.objective.best_value
         values = self.objective.evaluate(points)
-        if values.max() > record or not before:
-            self.best = before + int(values.argmax()) + 1
+        if values.max() > record or not evaluations:
+            self.best = evaluations + int(values.argmax()) + 1
         return values
 
     def _to_best(self) -> None:

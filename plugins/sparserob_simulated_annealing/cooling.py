@@ -12,8 +12,8 @@ if TYPE_CHECKING:
 
 
 def first_temperature(options: SimulatedAnnealing, values: np.ndarray) -> float:
-    """The given one, or ``temperature_share`` times the median distance of the finite values from their median; the
-    size of the first of them if they are all equal, and 1 if that is 0."""
+    """Return the given temperature, or ``temperature_share`` times the median distance of the finite values from their
+    median. If these are all equal, return the size of the first of them, and 1 if that is 0."""
     if options.initial_temperature is not None:
         return options.initial_temperature
     finite = values[np.isfinite(values)]
@@ -38,7 +38,8 @@ class Cooling:
         self.decay = log(min(1.0, max(lowest / start, 1e-300))) / max(1, length)
 
     def temperature(self, k: int, gap: float) -> float:
-        """At evaluation ``k = 0, 1, ...`` of the cycle of a walk that is ``gap >= 0`` below its record."""
+        """Return the temperature at evaluation ``k = 0, 1, ...`` of the cycle of a walk that is ``gap >= 0`` below its
+        record."""
         if self.options.cooling == "logarithmic":
             return self.start * log(2.0) / log(k + 2.0)
         level = self.start * float(np.exp(self.decay * k))

@@ -21,7 +21,7 @@ VISITS = 20  # evaluations per scale that are needed to adapt it
 
 
 class Moves:
-    """Draws a candidate near a point, and learns from whether it was accepted.
+    """Source of candidates near a point, which learns from whether they are accepted.
 
     A step is noise times a scale times the width of the box, so that the units of the coordinates do not matter. In a
     space of tuples (``block > 1``) the scale of a coordinate is that of its place within its block. ``scale`` is that
@@ -35,8 +35,8 @@ class Moves:
         self.dimension, self.widths = domain.dimension, domain.upper - domain.lower
         self.block = objective.block if objective.block < self.dimension else 1
         self.places = self.block if self.block > 1 else self.dimension
-        each = options.adapt == "coordinate" and self.places * VISITS <= objective.remaining
-        self.several = self.places if each else 1
+        per_coordinate = options.adapt == "coordinate" and self.places * VISITS <= objective.remaining
+        self.several = self.places if per_coordinate else 1
         self.uniforms = _stream(rng.random)
         self.normals = _stream(rng.standard_normal)
         kinds = (options.one, options.few, options.full)
@@ -54,14 +54,14 @@ class Moves:
         self._rests = True
 
     def uniform(self, count: int) -> np.ndarray:
-        """``count`` points drawn uniformly from the box, ``(count, d)``."""
+        """Draw ``count`` points uniformly from the box, ``(count, d)``."""
         points = self.rng.random((count, self.dimension))
         points *= self.widths
         points += self.lower
         return np.clip(points, self.lower, self.upper, out=points)
 
     def candidate(self, current: np.ndarray, acting: np.ndarray | None = None) -> np.ndarray:
-        """A candidate ``(d,)`` for a walk that is at ``current (d,)``; only one array of this size is made.
+        """Draw a candidate ``(d,)`` for a walk that is at ``current (d,)``; only one array of this size is made.
 
         ``acting``: the blocks on which the value there rests, by their numbers, as far as that is known; the share of
         the moves that is theirs (``acting`` of the options) changes one of them.
@@ -70,24 +70,24 @@ class Moves:
         if next(self.uniforms) < self.options.exploration:
             self._moved, self.scale, self.kind = "", 1.0, UNIFORM
             return np.asarray(self.uniform(1)[0])
-        moved = current.copy()
+        point = current.copy()
         kind = next(self.uniforms)
         coarse = next(self.uniforms) < self.options.coarse
         if kind < self.until_one or self.dimension == 1:
             self.kind = ONE
-            self._one(moved, coarse)
-            return moved
+            self._one(point, coarse)
+            return point
         few = kind < self.until_few and (self.block > 1 or self.dimension > FEW)
         self.kind = SEVERAL if few else FULL
         if self.block > 1:
-            self._blocks(moved, "few" if few else "full", coarse)
+            self._blocks(point, "few" if few else "full", coarse)
         else:
-            self._coordinates(moved, "few" if few else "full", coarse)
-        return moved
+            self._coordinates(point, "few" if few else "full", coarse)
+        return point
 
     def learn(self, accepted: bool) -> None:
-        """Widen the steps of the kind that was taken last if it was accepted, narrow them if not. Of a move of what
-        the value does not rest on nothing is learnt: it would be accepted at any width."""
+        """Widen the steps of the kind that was taken last if it was accepted, narrow them if not. Nothing is learnt of
+        a move of coordinates on which the value does not rest: it would be accepted at any width."""
         if self._moved and self._rests and self.options.adapt != "none":
             change = exp(self.options.adaptation * (float(accepted) - self.options.acceptance))
             if self._moved == "one":
@@ -96,20 +96,20 @@ class Moves:
                 self.factors[self._moved] = min(10.0, max(1e-6, self.factors[self._moved] * change))
 
     def _one(self, moved: np.ndarray, coarse: bool) -> None:
-        at = self._random_coordinate()
-        self._place = at % self.places if self.several > 1 else 0
+        coordinate = self._random_coordinate()
+        self._place = coordinate % self.places if self.several > 1 else 0
         self.scale, self._moved = (self.options.initial_scale, "") if coarse else (self.scales[self._place], "one")
-        self._shift(moved, at, self.scale)
+        self._shift(moved, coordinate, self.scale)
 
     def _coordinates(self, moved: np.ndarray, kind: str, coarse: bool) -> None:
         factor, self._moved = (1.0, "") if coarse else (self.factors[kind], kind)
         if kind == "few":
             for _ in range(2 + int(next(self.uniforms) * (FEW - 1))):
-                at = self._random_coordinate()
+                coordinate = self._random_coordinate()
                 self.scale = factor * (
-                    self.options.initial_scale if coarse else self.scales[at if self.several > 1 else 0]
+                    self.options.initial_scale if coarse else self.scales[coordinate if self.several > 1 else 0]
                 )
-                self._shift(moved, at, self.scale)
+                self._shift(moved, coordinate, self.scale)
         else:
             self._shift_part(moved, slice(0, self.dimension), factor, coarse)
 
@@ -118,24 +118,24 @@ class Moves:
         self._moved = "" if coarse else kind
         for _ in range(count):
             first = self._random_coordinate() // self.block * self.block
-            part = slice(first, first + self.block)
+            block = slice(first, first + self.block)
             if coarse:
                 self.scale = 1.0
-                drawn = self.lower[part] + self.rng.random(self.block) * self.widths[part]
-                moved[part] = np.clip(drawn, self.lower[part], self.upper[part])
+                values = self.lower[block] + self.rng.random(self.block) * self.widths[block]
+                moved[block] = np.clip(values, self.lower[block], self.upper[block])
             else:
-                self._shift_part(moved, part, self.factors[kind], coarse)
+                self._shift_part(moved, block, self.factors[kind], coarse)
 
     def _random_coordinate(self) -> int:
         if self.acting is None or not self.acting.size:
             return int(next(self.uniforms) * self.dimension)
         if next(self.uniforms) < self.options.acting:
             self._rests = True
-            place = next(self.uniforms) * self.acting.size
-            return int(self.acting[int(place)]) * self.block + int(place % 1.0 * self.block)
-        at = int(next(self.uniforms) * self.dimension)
-        self._rests = self._rests or bool((self.acting == at // self.block).any())
-        return at
+            position = next(self.uniforms) * self.acting.size
+            return int(self.acting[int(position)]) * self.block + int(position % 1.0 * self.block)
+        coordinate = int(next(self.uniforms) * self.dimension)
+        self._rests = self._rests or bool((self.acting == coordinate // self.block).any())
+        return coordinate
 
     def _shift(self, moved: np.ndarray, at: int, scale: float) -> None:
         """Move one coordinate, in place."""
@@ -148,7 +148,7 @@ class Moves:
         moved[at] = shifted
 
     def _shift_part(self, moved: np.ndarray, part: slice, factor: float, coarse: bool) -> None:
-        """Move all coordinates of a part, in place."""
+        """Move all coordinates of ``part``, in place."""
         lower, upper, widths = self.lower[part], self.upper[part], self.widths[part]
         scales = (
             np.array(self.scales)
@@ -172,6 +172,6 @@ class Moves:
 
 
 def _stream(draw: Callable[[int], np.ndarray]) -> Iterator[float]:
-    """Numbers one at a time, drawn many at a time: a tenth of the cost."""
+    """Yield numbers one at a time, drawn many at a time: a tenth of the cost."""
     while True:
         yield from draw(CHUNK).tolist()

@@ -1,1 +1,1 @@
-"""What every panel is drawn with: lines and axes, colours, timelines."""
+"""Drawing tools of all panels: lines and axes, colours, timelines."""

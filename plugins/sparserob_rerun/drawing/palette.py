@@ -66,36 +66,36 @@ def _luminance(colour: Floats) -> float:
 
 @cache
 def legible(colour: Colour) -> Colour:
-    """A colour for lines on a ground that may be dark or light: no brighter than `LEGIBLE`."""
-    parts = np.array(colour[:3], dtype=float)
-    red, green, blue = np.rint(parts * min(1.0, LEGIBLE / _luminance(parts)) ** (1.0 / 2.2)).astype(int).tolist()
+    """Return a colour for lines on a ground that may be dark or light: no brighter than `LEGIBLE`."""
+    rgb = np.array(colour[:3], dtype=float)
+    red, green, blue = np.rint(rgb * min(1.0, LEGIBLE / _luminance(rgb)) ** (1.0 / 2.2)).astype(int).tolist()
     return red, green, blue, colour[3]
 
 
 @cache
 def worded(colour: Colour) -> Colour:
-    """A colour for words: mixed with so much white that it is `BRIGHT`."""
-    parts = np.array(colour[:3], dtype=float)
+    """Return a colour for words: mixed with so much white that it is `BRIGHT`."""
+    rgb = np.array(colour[:3], dtype=float)
     shares = np.linspace(0.0, 1.0, 101)
-    share = next(share for share in shares if _luminance(parts + share * (255.0 - parts)) >= BRIGHT)
-    red, green, blue = np.rint(parts + share * (255.0 - parts)).astype(int).tolist()
+    share = next(share for share in shares if _luminance(rgb + share * (255.0 - rgb)) >= BRIGHT)
+    red, green, blue = np.rint(rgb + share * (255.0 - rgb)).astype(int).tolist()
     return red, green, blue, 255
 
 
 def sequential(values: Floats) -> npt.NDArray[np.uint8]:
-    """Viridis: colours ``(..., 4)`` of values ``(...)`` between 0 and 1; NaN is transparent."""
+    """Return the Viridis colours ``(..., 4)`` of values ``(...)`` between 0 and 1; NaN is transparent."""
     return _graded(values, _VIRIDIS)
 
 
 def diverging(values: Floats) -> npt.NDArray[np.uint8]:
-    """Blue below 0, red above, for values ``(...)`` between -1 and 1; NaN is transparent."""
+    """Return colours, blue below 0 and red above, of values ``(...)`` between -1 and 1; NaN is transparent."""
     return _graded((values + 1.0) / 2.0, _DIVERGING)
 
 
 def _graded(values: Floats, stops: Floats) -> npt.NDArray[np.uint8]:
-    known = np.isfinite(values)
-    place = np.clip(np.where(known, values, 0.0), 0.0, 1.0) * (len(stops) - 1)
-    below = np.minimum(place.astype(int), len(stops) - 2)
-    share = (place - below)[..., np.newaxis]
+    is_finite = np.isfinite(values)
+    position = np.clip(np.where(is_finite, values, 0.0), 0.0, 1.0) * (len(stops) - 1)
+    below = np.minimum(position.astype(int), len(stops) - 2)
+    share = (position - below)[..., np.newaxis]
     rgb = stops[below] * (1.0 - share) + stops[below + 1] * share
-    return np.concatenate([rgb, np.where(known, 255.0, 0.0)[..., np.newaxis]], axis=-1).astype(np.uint8)
+    return np.concatenate([rgb, np.where(is_finite, 255.0, 0.0)[..., np.newaxis]], axis=-1).astype(np.uint8)

@@ -1,4 +1,4 @@
-"""Where a run stands on the three timelines of a recording: ``evaluation``, ``round`` and ``time``."""
+"""Position of a run on the three timelines of a recording: ``evaluation``, ``round`` and ``time``."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ from sparserob_rerun.drawing.palette import Floats
 
 @final
 class Timelines:
-    """Evaluations of ``g`` so far (relaxed programs, for a method that does not search), the round, and the seconds
-    since the start."""
+    """Timelines of a run: evaluations of ``g`` so far (relaxed programs, for a method that does not search), the round,
+    and the seconds since the start."""
 
     def __init__(self, rr: Any, stream: Any) -> None:
         self.rr, self.stream = rr, stream
         self.evaluation, self.round, self.seconds = 0, 0, 0.0
 
     def move(self, evaluation: int | None = None, number: int | None = None, seconds: float | None = None) -> None:
-        """Go on, never back, and log what follows there."""
+        """Move the timelines forward, never back; later rows are logged at the new position."""
         self.evaluation = max(self.evaluation, evaluation or 0)
         self.round = max(self.round, number or 0)
         self.seconds = max(self.seconds, seconds or 0.0)
@@ -28,8 +28,8 @@ class Timelines:
         self.stream.set_time("time", duration=self.seconds)
 
     def columns(self, evaluations: np.ndarray, seconds: Floats, number: int) -> list[Any]:
-        """The timelines of rows, one for each of the evaluations ``(k,)`` at these seconds ``(k,)`` of the run, all in
-        one round."""
+        """Return the timelines of rows, one for each of the evaluations ``(k,)`` at these seconds ``(k,)`` of the run,
+        all in one round."""
         rr = self.rr
         rounds = np.full(evaluations.size, max(number, self.round))
         return [

@@ -1,4 +1,4 @@
-"""The two bounds with the gap between them shaded, and below them how the gap and the violation fall."""
+"""Picture of the two bounds with the gap between them shaded; below them, how the gap and the violation fall."""
 
 from __future__ import annotations
 
@@ -26,22 +26,22 @@ FEWEST = 5.0  # rounds on the axis at least
 
 @final
 class Bounds:
-    """Draws below ``/rounds/picture``; it keeps the rounds that it has seen."""
+    """Picture of the bounds below ``/rounds/picture``, with all rounds so far."""
 
     def __init__(self, rr: Any, stream: Any) -> None:
         self.rr, self.stream = rr, stream
         self.rows: list[tuple[float, float, float, float, float]] = []
 
     def add(self, event: sr.RoundFinished) -> None:
-        """One more round: all of them are drawn anew. What is an upper bound of a program with less uncertainty only is
-        none; the cost of a decision that was proven is one."""
+        """Add a round and draw all of them anew. The upper bound of a program with less uncertainty only is none; the
+        cost of a decision that was proven is one."""
         upper = min(np.inf if event.simplified else event.upper_bound, event.proven)
         self.rows.append((float(event.round), event.lower_bound, upper, event.gap, event.violation))
         self._draw(np.array(self.rows))
 
     def end(self, lower: float, upper: float, gap: float) -> None:
-        """The bounds that the run ended with, and their gap: rounding, and what was proven last, have moved them. A run
-        that was stopped in its first round has no other ones."""
+        """Draw the bounds that the run ended with, and their gap: rounding, and what was proven last, have moved them.
+        A run that was stopped in its first round has no other ones."""
         if np.isfinite(lower):
             number, *_, violation = self.rows.pop() if self.rows else (1.0, np.nan)
             self.rows.append((number, lower, upper, gap, violation))
@@ -59,49 +59,53 @@ class Bounds:
     def _bounds(
         self, drawing: Drawing, across: tuple[float, float], rounds: Floats, lower: Floats, upper: Floats
     ) -> None:
-        known, best = lower[np.isfinite(lower)], float(upper.min())
-        shown = np.concatenate([known, upper[np.isfinite(upper)]])
-        high = float(shown.max()) if shown.size else 1.0
+        finite_lower, best = lower[np.isfinite(lower)], float(upper.min())
+        finite_values = np.concatenate([finite_lower, upper[np.isfinite(upper)]])
+        high = float(finite_values.max()) if finite_values.size else 1.0
         low = (
-            max(float(shown.min()), high - VIEW * abs(high)) if shown.size and high else float(min(known, default=0.0))
+            max(float(finite_values.min()), high - VIEW * abs(high))
+            if finite_values.size and high
+            else float(min(finite_lower, default=0.0))
         )
-        least = (LEAST * abs(high) - (high - low)) / 2.0  # a gap of 1e-8 is a line, and no panel full of it
-        margin = max(0.1 * (high - low), least) if high > low else 0.5 * max(1.0, abs(high))
+        least_margin = (LEAST * abs(high) - (high - low)) / 2.0  # a gap of 1e-8 is a line, and no panel full of it
+        margin = max(0.1 * (high - low), least_margin) if high > low else 0.5 * max(1.0, abs(high))
         axes = Axes(LEFT, 0.0, WIDTH, HEIGHT, across, (low - margin, high + margin))
-        said = f"{_number(lower.max())} ≤ J* ≤ {_number(best)}"
-        there, closes = np.isfinite(lower), bool(np.isfinite(best))
-        shades = closes and there.sum() > 1
+        interval = f"{_number(lower.max())} ≤ J* ≤ {_number(best)}"
+        is_finite, has_upper = np.isfinite(lower), bool(np.isfinite(best))
+        is_shaded = has_upper and is_finite.sum() > 1
         drawing.frame(axes, "", "round", room=ROOM)
-        caption = f"proven: {said}{'; the gap is shaded' if shades else ''}"
+        caption = f"proven: {interval}{'; the gap is shaded' if is_shaded else ''}"
         drawing.text(axes.left + axes.width / 2, axes.top - ABOVE, caption)
-        if closes:
+        if has_upper:
             drawing.line("marks", axes.at(np.array(across), np.full(2, best)), ink.VERMILLION, 1.0)
-        if shades:
-            drawing.band("tube", axes, rounds[there], lower[there], np.full(int(there.sum()), best), ink.TUBE)
+        if is_shaded:
+            drawing.band(
+                "tube", axes, rounds[is_finite], lower[is_finite], np.full(int(is_finite.sum()), best), ink.TUBE
+            )
         for values, colour in ((lower, ink.GREEN), (upper, ink.VERMILLION)):
-            there = np.isfinite(values)
-            if there.any():
-                drawing.line("curve", axes.at(rounds[there], values[there]), colour, 2.0)
-                drawing.dot(axes.at(rounds[there], values[there]), colour, 4.0)
+            is_finite = np.isfinite(values)
+            if is_finite.any():
+                drawing.line("curve", axes.at(rounds[is_finite], values[is_finite]), colour, 2.0)
+                drawing.dot(axes.at(rounds[is_finite], values[is_finite]), colour, 4.0)
 
     def _gaps(
         self, drawing: Drawing, across: tuple[float, float], rounds: Floats, gap: Floats, violation: Floats
     ) -> None:
         falls = {"violation": (violation, ink.ORANGE), "relative gap": (gap, ink.SKY)}
         logs = {name: _decades(values) for name, (values, _) in falls.items()}
-        known = np.concatenate([values[np.isfinite(values)] for values in logs.values()])
-        low, high = (float(known.min()), float(known.max())) if known.size else (-6.0, 0.0)
+        finite_logs = np.concatenate([values[np.isfinite(values)] for values in logs.values()])
+        low, high = (float(finite_logs.min()), float(finite_logs.max())) if finite_logs.size else (-6.0, 0.0)
         axes = Axes(LEFT, HEIGHT + GAP, WIDTH, HEIGHT, across, (np.floor(low - 0.3), np.ceil(high + 0.3)))
         drawing.frame(axes, "relative gap (blue) and worst violation (yellow)", "round", decades=True)
         for name, (_, colour) in falls.items():
-            there = np.isfinite(logs[name])
-            if there.any():
-                drawing.line("curve", axes.at(rounds[there], logs[name][there]), colour, 2.0)
-                drawing.dot(axes.at(rounds[there], logs[name][there]), colour, 4.0)
+            is_finite = np.isfinite(logs[name])
+            if is_finite.any():
+                drawing.line("curve", axes.at(rounds[is_finite], logs[name][is_finite]), colour, 2.0)
+                drawing.dot(axes.at(rounds[is_finite], logs[name][is_finite]), colour, 4.0)
 
 
 def _decades(values: Floats) -> Floats:
-    """Decimal logarithms, NaN where there is nothing to see: not positive, or not finite."""
+    """Return decimal logarithms, NaN where there is nothing to see: not positive, or not finite."""
     shown = np.where(np.isfinite(values) & (values > 0.0), values, np.nan)
     return np.log10(np.maximum(shown, SMALLEST))
 

@@ -1,5 +1,5 @@
-"""Why nothing is feasible: every quantity of the reason between its walls, where the control can bring it, and what the
-worst disturbance makes of its best."""
+"""Picture of why nothing is feasible: every quantity of the reason between its walls, where the control can bring it,
+and what the worst disturbance makes of its best."""
 
 from __future__ import annotations
 
@@ -22,20 +22,20 @@ the panel is wide; more of them are smaller, and their words are not."""
 
 
 def extent(strips: Sequence[sr.Strip]) -> tuple[float, float, float, float]:
-    """Left, right, top and bottom of the drawing."""
+    """Return left, right, top and bottom of the drawing."""
     return 0.0, LEFT + WIDTH + 40.0, -64.0, max(len(strips), 1) * (HEIGHT + GAP)
 
 
 def draw_clash(rr: Any, stream: Any, strips: Sequence[sr.Strip]) -> None:
     """Draw the strips below ``/clash``, each on an axis of its own."""
     drawing = Drawing()
-    for place, strip in enumerate(strips):
-        _strip(drawing, place, strip, max(1.0, len(strips) / 3.0))
+    for position, strip in enumerate(strips):
+        _strip(drawing, position, strip, max(1.0, len(strips) / 3.0))
     drawing.log(rr, stream, "clash", layers=("hatch", "frame", "marks", "reach", "worst", "curve", "wall"))
 
 
 def _strip(drawing: Drawing, place: int, strip: sr.Strip, size: float) -> None:
-    """One strip; ``size``: of its words, in those that three strips have."""
+    """Draw one strip; ``size``: that of its words, relative to those of three strips."""
     worst = (strip.best - strip.sigma_low, strip.best + strip.sigma_high)
     axes = Axes(LEFT, place * (HEIGHT + GAP), WIDTH, HEIGHT, strip.view, (0.0, 3.0))
     (left, top), (right, bottom) = axes.at(axes.x[0], 3.0)[0], axes.at(axes.x[1], 0.0)[0]
@@ -44,8 +44,10 @@ def _strip(drawing: Drawing, place: int, strip: sr.Strip, size: float) -> None:
     drawing.line("frame", np.array([[left, bottom], [right, bottom]]), ink.GREY, 1.0)
     walls = sorted({v for v in (strip.low, strip.high) if np.isfinite(v)})
     words = [f"{value:.4g}" for value in walls]
-    for x, said in zip(_beside([float(axes.at(value, 0.0)[0, 0]) for value in walls], words, size), words, strict=True):
-        drawing.text(x, bottom + 16.0, said, ink.VERMILLION)
+    for x, label in zip(
+        _beside([float(axes.at(value, 0.0)[0, 0]) for value in walls], words, size), words, strict=True
+    ):
+        drawing.text(x, bottom + 16.0, label, ink.VERMILLION)
     for edge, end in ((strip.low, axes.x[0]), (strip.high, axes.x[1])):
         if np.isfinite(edge):
             drawing.hatched("hatch", axes, (min(edge, end), max(edge, end)), (0.0, 3.0), ink.HATCH)
@@ -63,7 +65,7 @@ def _strip(drawing: Drawing, place: int, strip: sr.Strip, size: float) -> None:
 
 
 def _beside(places: list[float], words: list[str], size: float) -> list[float]:
-    """Where the labels of one or two walls have their middle: below them, or as far apart as the words are wide."""
+    """Return the middles of the labels of one or two walls: below these, or as far apart as the words are wide."""
     if len(places) < 2:
         return places
     missing = size * (CHARACTER * sum(map(len, words)) / 2.0 + MARGIN) - (places[1] - places[0])
@@ -72,9 +74,12 @@ def _beside(places: list[float], words: list[str], size: float) -> list[float]:
 
 def _said(strip: sr.Strip) -> str:
     down, up = f"{strip.sigma_low:.4g}", f"{strip.sigma_high:.4g}"
-    moved = down if up in ("0", down) else up if down == "0" else f"{down} downwards and {up} upwards"
+    shift = down if up in ("0", down) else up if down == "0" else f"{down} downwards and {up} upwards"
     unit = f" {strip.unit}" if strip.unit else ""
-    alone = f"the disturbance alone moves it by {moved}{unit}; " if moved != "0" else ""
+    disturbance_text = f"the disturbance alone moves it by {shift}{unit}; " if shift != "0" else ""
     if strip.short > 0.0:
-        return f"{alone}the best that the control does, {strip.best:.4g}{unit}, still misses by {strip.short:.4g}{unit}"
-    return f"{alone}it can be met, but not together with the others"
+        return (
+            f"{disturbance_text}the best that the control does, {strip.best:.4g}{unit}, "
+            f"still misses by {strip.short:.4g}{unit}"
+        )
+    return f"{disturbance_text}it can be met, but not together with the others"

@@ -34,42 +34,43 @@ SERIES = {
 
 
 def extent(families: int, shared: bool, unit: str = "") -> tuple[float, float, float, float]:
-    """Left, right, top and bottom of the violation plots; ``shared``: over one axis, that of time, in its ``unit``."""
+    """Return left, right, top and bottom of the violation plots; ``shared``: over one axis, that of time, in its
+    ``unit``."""
     bottom = max(1, min(FAMILIES, families)) * _below(shared) - (GAP if shared else GAP + NUMBERS)
     letters = len(_named(shared, unit)) - 1
     return -42.0, LEFT + WIDTH + 76.0 + LETTER * letters, -40.0, bottom + 60.0
 
 
 def _named(shared: bool, unit: str) -> str:
-    """The name of the axis across."""
+    """Return the name of the axis across."""
     return ("t" + (f" in {unit}" if unit else "")) if shared else "index"
 
 
 def extent_of_maps(maps: int) -> tuple[float, float, float, float]:
-    """Left, right, top and bottom of so many maps above one another."""
+    """Return left, right, top and bottom of so many maps above one another."""
     return -MARGIN, ACROSS * INSTANTS + MARGIN, -WORDS, maps * MAP - WORDS + MARGIN
 
 
 def mapped(program: sr.SemiInfiniteProgram) -> int:
-    """How many families have a map: those whose first two coordinates both move."""
+    """Count the families that have a map: those whose first two coordinates both move."""
     boxes = [family.index_set for family in shown_families(program)[:FAMILIES] if family.index_set.dimension > 1]
     return sum(bool((box.upper[:2] > box.lower[:2]).all()) for box in boxes)
 
 
 def _below(shared: bool) -> float:
-    """How far one plot is below the other."""
+    """Return the distance from the top of one plot to the top of the next below it."""
     return HEIGHT + GAP + (0.0 if shared else NUMBERS)
 
 
 def shown_families(program: sr.SemiInfiniteProgram) -> list[sr.ConstraintFamily]:
-    """The families that constrain, without those that only say what the cost is."""
+    """Return the families that constrain, without those that only say what the cost is."""
     return [family for family in program.families if not family.defines]
 
 
 @final
 @dataclass(frozen=True)
 class Worst:
-    """What is known of the worst violation of a constraint: its ``value`` and where (``at``), NaN where that is not
+    """Worst violation of a constraint, as far as it is known: its ``value`` and where (``at``), NaN where that is not
     known, and whether it is ``proven`` that nothing counts as violated."""
 
     value: float
@@ -79,7 +80,7 @@ class Worst:
 
 @final
 class Rounds:
-    """Logs rounds below ``/rounds`` and ``/violation``."""
+    """Pictures and series of the rounds, below ``/rounds`` and ``/violation``."""
 
     def __init__(self, rr: Any, stream: Any, inspection: sr.Inspection | None) -> None:
         self.rr, self.stream, self.inspection = rr, stream, inspection
@@ -94,7 +95,7 @@ class Rounds:
             )
 
     def bounds(self, event: sr.RoundFinished) -> None:
-        """The numbers of one round."""
+        """Log the numbers of one round."""
         self.picture.add(event)
         upper = np.inf if event.simplified else event.upper_bound
         rr, shown = self.rr, [value if np.isfinite(value) else np.nan for value in (event.lower_bound, upper)]
@@ -106,25 +107,25 @@ class Rounds:
     def violations(
         self, decision: Floats, cuts: Sequence[sr.Cut], added: Sequence[sr.Cut], told: Mapping[str, Worst]
     ) -> None:
-        """The violation of every family at a decision over its first index, and over the second as a map. ``told``:
-        what a search or a proof says of the worst of it, which a picture on a grid does not know."""
+        """Draw the violation of every family at a decision over its first index, and over the second as a map.
+        ``told``: what a search or a proof reports of the worst violation, which a picture on a grid does not know."""
         if self.inspection is None:
             return
         drawing, families, maps = Drawing(), shown_families(self.inspection.program), 0
-        for place, family in enumerate(families[:FAMILIES]):
+        for position, family in enumerate(families[:FAMILIES]):
             across, along, field = violation_field(family, decision)
-            last = place == min(len(families), FAMILIES) - 1
+            last = position == min(len(families), FAMILIES) - 1
             words = self._words(family, told.get(family.name), (across, along, field))
             if last and len(families) > FAMILIES:
                 words += f" ({len(families) - FAMILIES} more constraints are not shown)"
-            self._plot(drawing, (place, last), family, (across, along, field), (cuts, added), words)
+            self._plot(drawing, (position, last), family, (across, along, field), (cuts, added), words)
             if along.size > 1 and across.size > 1:
                 self._map(maps, family, (across, along, field))
                 maps += 1
         drawing.log(self.rr, self.stream, "violation/plots", layers=("hatch", "frame", "marks", "curve"))
 
     def _words(self, family: sr.ConstraintFamily, known: Worst | None, found: tuple[Floats, Floats, Floats]) -> str:
-        """One constraint in words: as search and proof know it, else as the grid shows it."""
+        """Describe one constraint in words: as search and proof know it, else as the grid shows it."""
         assert self.inspection is not None
         across, _, field = found
         worst = field.max(axis=1)
@@ -156,9 +157,9 @@ class Rounds:
             ends = (ends[0] - 1.0, ends[1] + 1.0)
         low = float(np.quantile(worst, 0.02))
         reach = max(abs(low), abs(float(worst.max())), 1e-9)
-        shared, (place, last) = problem is not None, where
+        shared, (position, last) = problem is not None, where
         limits = (-reach, max(0.35 * reach, 1.15 * float(worst.max())))
-        axes = Axes(LEFT, place * _below(shared), WIDTH, HEIGHT, ends, limits)
+        axes = Axes(LEFT, position * _below(shared), WIDTH, HEIGHT, ends, limits)
         unit = "" if problem is None else problem.names.time
         drawing.frame(axes, words, _named(shared, unit), last or not shared, room=ROOM)
         drawing.hatched("hatch", axes, axes.x, (0.0, axes.y[1]), ink.HATCH)
@@ -173,7 +174,7 @@ class Rounds:
                 drawing.dot(axes.at(times, 0.0), colour, size)
 
     def _map(self, number: int, family: sr.ConstraintFamily, found: tuple[Floats, Floats, Floats]) -> None:
-        """Time from left to right, the first parameter upwards; red is violated."""
+        """Draw a map of the violation: time from left to right, the first parameter upwards; red is violated."""
         assert self.inspection is not None
         across, along, field = found
         rr, reach, top = self.rr, max(float(np.abs(field).max()), SMALLEST), number * MAP
@@ -182,10 +183,10 @@ class Rounds:
         self.stream.log(
             path, rr.Transform3D(translation=(0.0, top, 0.0), scale=(ACROSS, UPWARDS, 1.0)), rr.Image(image)
         )
-        one, other = self.inspection.names(family.index_set.dimension)[:2]
+        first_name, second_name = self.inspection.names(family.index_set.dimension)[:2]
         words = (
-            f"{family.name}: {one} from {across[0]:.4g} to {across[-1]:.4g}, "
-            f"upwards {other} from {along[0]:.4g} to {along[-1]:.4g}"
+            f"{family.name}: {first_name} from {across[0]:.4g} to {across[-1]:.4g}, "
+            f"upwards {second_name} from {along[0]:.4g} to {along[-1]:.4g}"
         )
         self.stream.log(
             f"violation/names/{number}",
@@ -200,46 +201,47 @@ class Rounds:
 
 
 def told_by_round(event: sr.RoundFinished) -> dict[str, Worst]:
-    """What the searches of a round found."""
+    """Return the worst violations that the searches of a round found, by family."""
     return {
-        name: Worst(float(one.violations[0]), float(one.indices[0, 0]))
-        for name, one in event.separations.items()
-        if one.violations.size and one.indices.size
+        name: Worst(float(separation.violations[0]), float(separation.indices[0, 0]))
+        for name, separation in event.separations.items()
+        if separation.violations.size and separation.indices.size
     }
 
 
 def told_by_result(result: sr.Result) -> dict[str, Worst]:
-    """What a result says: what its proofs exclude, and the worst constraint that it names."""
-    found = {proof.family: Worst(np.nan, np.nan, True) for proof in result.proofs if proof.verdict == "proven"}
+    """Return what a result reports by family: what its proofs exclude, and the worst constraint that it names."""
+    by_family = {proof.family: Worst(np.nan, np.nan, True) for proof in result.proofs if proof.verdict == "proven"}
     worst = result.worst
     if worst is not None and worst.constraint:
         time = worst.time if isinstance(worst, sr.Witness) else worst.index[0] if worst.index.size else None
-        proven = worst.constraint in found
-        found[worst.constraint] = Worst(worst.violation, np.nan if time is None else float(time), proven)
-    return found
+        proven = worst.constraint in by_family
+        by_family[worst.constraint] = Worst(worst.violation, np.nan if time is None else float(time), proven)
+    return by_family
 
 
 def violation_field(family: sr.ConstraintFamily, decision: Floats) -> tuple[Floats, Floats, Floats]:
-    """Values of the first index coordinate ``(k,)`` and of the second ``(l,)``, and the largest violation ``(k, l)`` of
-    all rows there, over a coarse lattice of the other coordinates: a picture, not a proof."""
+    """Return values of the first index coordinate ``(k,)`` and of the second ``(l,)``, and the largest violation
+    ``(k, l)`` of all rows there, over a coarse lattice of the other coordinates. The field is a picture, not a
+    proof."""
     box = family.index_set
     across = np.linspace(box.lower[0], box.upper[0], INSTANTS if box.upper[0] > box.lower[0] else 1)
-    wide = box.dimension > 1 and box.upper[1] > box.lower[1]
+    has_second = box.dimension > 1 and box.upper[1] > box.lower[1]
     along = (
         np.linspace(box.lower[1], box.upper[1], PARAMETERS)
-        if wide
+        if has_second
         else np.array(box.lower[1:2] if box.dimension > 1 else [0.0])
     )
-    others = _lattice(box.lower[2:], box.upper[2:])
+    lattice = _lattice(box.lower[2:], box.upper[2:])
     field = np.full((across.size, along.size), -np.inf)
-    for rest in others:
-        grid = np.array([[a, *([b] if box.dimension > 1 else []), *rest] for a, b in product(across, along)])
+    for point in lattice:
+        grid = np.array([[a, *([b] if box.dimension > 1 else []), *point] for a, b in product(across, along)])
         field = np.maximum(field, family.violations(decision, grid).max(axis=1).reshape(field.shape))
     return across, along, field
 
 
 def _lattice(lower: Floats, upper: Floats) -> list[Floats]:
-    """The corners and the middle of a box, or its middle alone where the corners are too many."""
+    """Return the corners and the middle of a box, or its middle alone where the corners are too many."""
     middle = (lower + upper) / 2
     if 2**lower.size > LATTICE:
         return [middle]

@@ -1,1 +1,1 @@
-"""What the system does: control, states, the reason of every switch, the state space."""
+"""Pictures of the system: control, states, the reason of every switch, the state space."""

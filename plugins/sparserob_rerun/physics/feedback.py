@@ -1,5 +1,5 @@
-"""A control that answers what it measures: its gains, and what every innovation moved in the worst case, as pictures;
-how large the control is under random disturbances, as series."""
+"""Pictures of a control that answers what it measures: its gains, and what every innovation moved in the worst case.
+The size of the control under random disturbances is drawn as series."""
 
 from __future__ import annotations
 
@@ -28,22 +28,22 @@ Black is what is not measured yet: a control answers what was seen before it. Wh
 
 
 def extent(channels: int, states: int) -> tuple[float, float, float, float]:
-    """Left, right, top and bottom of the pictures: a row for each channel, one picture for each state and one for the
-    answers."""
+    """Return left, right, top and bottom of the pictures: a row for each channel, one picture for each state and one
+    for the answers."""
     across, down = min(states, STATES) + 1, min(channels, CHANNELS)
     return 0.0, LEFT + across * (SIDE + GAP), 0.0, TOP + down * (SIDE + GAP)
 
 
 def draw_feedback(rr: Any, stream: Any, data: sr.FigureData) -> None:
-    """The gains below ``/feedback/gains``, the answers below ``/feedback/answers``, both with the time of an innovation
-    across and that of the control upwards; blue adds less than nothing, red more."""
+    """Draw the gains below ``/feedback/gains`` and the answers below ``/feedback/answers``. Both have the time of an
+    innovation across and that of the control upwards; blue adds less than nothing, red more."""
     drawing, ends = Drawing(), data.breakpoints
     span = (float(ends[0]), float(ends[-1]))
-    for path, place, title, table in pictures(data):
-        left, top = LEFT + place[1] * (SIDE + GAP), TOP + place[0] * (SIDE + GAP)
-        most = float(np.abs(table).max())
-        drawing.frame(Axes(left, top, SIDE, SIDE, span, span), f"{title}: up to {most:.3g}")
-        shown = diverging(spread_out(table / (most or 1.0), ends))
+    for path, cell, title, table in pictures(data):
+        left, top = LEFT + cell[1] * (SIDE + GAP), TOP + cell[0] * (SIDE + GAP)
+        largest = float(np.abs(table).max())
+        drawing.frame(Axes(left, top, SIDE, SIDE, span, span), f"{title}: up to {largest:.3g}")
+        shown = diverging(spread_out(table / (largest or 1.0), ends))
         stream.log(
             path,
             rr.Transform3D(translation=(left, top, 0.0), scale=SIDE / PIXELS),
@@ -56,7 +56,7 @@ def draw_feedback(rr: Any, stream: Any, data: sr.FigureData) -> None:
 
 
 def pictures(data: sr.FigureData) -> Iterator[tuple[str, tuple[int, int], str, Floats]]:
-    """Entity, row and column, title and table ``(K, K)`` of every picture."""
+    """Yield entity, row and column, title and table ``(K, K)`` of every picture."""
     assert data.gains is not None
     _, _, channels, states = data.gains.shape
     for channel in range(min(channels, CHANNELS)):
@@ -66,27 +66,28 @@ def pictures(data: sr.FigureData) -> Iterator[tuple[str, tuple[int, int], str, F
             title = f"gain of {u} on {f'y{state + 1}' if data.outputs is not None else data.names.state(state)}"
             yield path, (channel, state), title, data.gains[:, :, channel, state]
         if data.answers is not None:
-            place = (channel, min(states, STATES))
+            cell = (channel, min(states, STATES))
             path = f"feedback/answers/u{channel + 1}"
-            yield path, place, f"what moved {u} in the worst case", data.answers[:, :, channel]
+            yield path, cell, f"what moved {u} in the worst case", data.answers[:, :, channel]
 
 
 def spread_out(table: Floats, ends: Floats) -> Floats:
-    """A table of pieces as a picture over time, the first piece at the bottom; what is not measured yet is NaN."""
+    """Return a table of pieces as a picture over time, the first piece at the bottom; NaN where nothing is measured
+    yet."""
     K = table.shape[0]
     shown = np.where(np.tril(np.ones((K, K))) > 0, table, np.nan)
     times = ends[0] + (ends[-1] - ends[0]) * (np.arange(PIXELS) + 0.5) / PIXELS
-    which = np.clip(np.searchsorted(ends, times, side="right") - 1, 0, K - 1)
-    return np.asarray(shown[np.ix_(which[::-1], which)])
+    pieces = np.clip(np.searchsorted(ends, times, side="right") - 1, 0, K - 1)
+    return np.asarray(shown[np.ix_(pieces[::-1], pieces)])
 
 
 def send_effort(rr: Any, stream: Any, data: sr.FigureData) -> None:
-    """Series on the timeline ``t``: least and most of the control under any disturbance, with the control itself; and
-    how large it is under random ones."""
+    """Send series on the timeline ``t``: least and most of the control under any disturbance, with the control itself;
+    and how large the control is under random disturbances."""
     assert data.control_least is not None and data.control_most is not None
-    at = [rr.TimeColumn("t", duration=data.breakpoints[:-1])]
+    time_columns = [rr.TimeColumn("t", duration=data.breakpoints[:-1])]
     pieces = data.breakpoints.size - 1
-    most = np.maximum(np.abs(data.control_least), np.abs(data.control_most))
+    largest = np.maximum(np.abs(data.control_least), np.abs(data.control_most))
     for channel in range(data.control.shape[0]):
         name = data.names.control(channel)
         series = {f"signals/control/range{channel + 1}": (
@@ -95,9 +96,9 @@ def send_effort(rr: Any, stream: Any, data: sr.FigureData) -> None:
         )}  # fmt: skip
         if data.effort is not None:
             names = [f"|{name}|, 5 % of draws", f"|{name}|, median", f"|{name}|, 95 % of draws", f"|{name}| at most"]
-            values = np.concatenate([data.effort[:, channel].T, most[channel][:, None]], axis=1)
+            values = np.concatenate([data.effort[:, channel].T, largest[channel][:, None]], axis=1)
             series[f"signals/effort/u{channel + 1}"] = (names, values)
         for path, (names, values) in series.items():
             stream.log(path, rr.SeriesLines(names=names, interpolation_mode="StepAfter"), static=True)
             rows = rr.Scalars.columns(scalars=values.ravel()).partition([values.shape[1]] * pieces)
-            stream.send_columns(path, at, rows)
+            stream.send_columns(path, time_columns, rows)

@@ -1,5 +1,5 @@
-"""Where the system moves: the plane that its problem names, or else its state space, a plane for two states, space
-for three; the first states of more."""
+"""Picture of where the system moves: the plane that its problem names, or else its state space. That is a plane for two
+states, space for three, and of more the first states."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ COLUMNS, WIDE = 2, 400.0  # of words below one, which have the width of the pane
 
 
 def draw_phase(rr: Any, stream: Any, data: sr.FigureData, worst: Mapping[str, Any]) -> None:
-    """The nominal trajectory, the worst ones, slices of the tube and the terminal set below ``/physics/phase``; nothing
-    for a single state."""
+    """Draw the nominal trajectory, the worst ones, slices of the tube and the terminal set below ``/physics/phase``;
+    nothing for a single state."""
     if data.plane is not None:
         moved(data, worst).log(rr, stream, "physics/phase", layers=LAYERS)
     elif len(data.state) == 2:
@@ -38,12 +38,12 @@ def draw_phase(rr: Any, stream: Any, data: sr.FigureData, worst: Mapping[str, An
 
 
 def pair_of(problem: sr.OptimalControlProblem) -> tuple[int, int] | None:
-    """The two states that are drawn across and upwards; ``None`` where there are more, in space."""
+    """Return the two states that are drawn across and upwards; ``None`` where there are more, in space."""
     return problem.names.in_plane or ((0, 1) if problem.system.states == 2 else None)
 
 
 def moved(data: sr.FigureData, worst: Mapping[str, Any]) -> Drawing:
-    """The path in the plane as it is, one unit as long upwards as across, and where the control acts on it."""
+    """Draw the path in the plane as it is, one unit as long upwards as across, and where the control acts on it."""
     plane = data.plane
     assert plane is not None
     (low, high), (across, up) = plane.view(data.path), plane.states
@@ -51,42 +51,42 @@ def moved(data: sr.FigureData, worst: Mapping[str, Any]) -> Drawing:
     scale = (LENGTH if wide else SIDE) / float((high - low).max())
     width, height = (scale * (high - low)).tolist()
     axes = Axes(60.0, 0.0, width, height, (low[0], high[0]), (low[1], high[1]))
-    drawing, drawn = Drawing(), [("dot: x(0)", ink.INK)]
+    drawing, legend = Drawing(), [("dot: x(0)", ink.INK)]
     drawing.frame(axes, "", data.names.state(across), room=ROOM)
     frame = np.array([low, [high[0], low[1]], high, [low[0], high[1]]])
     if (data.tube_upper > data.tube_lower)[[across, up]].any():
-        for place in plane.places[np.unique(np.linspace(0, data.times.size - 1, SLICES).astype(int))]:
-            drawing.line("slices", axes.at(*np.vstack([place, place[:1]]).T), ink.TUBE, 1.0)
-        drawn.append(("worst case", ink.SKY))
+        for slice_corners in plane.places[np.unique(np.linspace(0, data.times.size - 1, SLICES).astype(int))]:
+            drawing.line("slices", axes.at(*np.vstack([slice_corners, slice_corners[:1]]).T), ink.TUBE, 1.0)
+        legend.append(("worst case", ink.SKY))
     for wall in plane.walls:
         for corners in wall.beyond(frame):
             drawing.forbidden("hatch", axes, axes.at(*corners.T), ink.HATCH)
-    drawn += [_outlined(drawing, axes, *one) for one in plane.outlined(frame) if len(one[1])]
+    legend += [_outlined(drawing, axes, *outline) for outline in plane.outlined(frame) if len(outline[1])]
     for path in worst.get("states", ()):
         drawing.line("worst", axes.at(path[across], path[up]), ink.ORANGE, 1.2)
     if len(worst.get("states", ())):
-        drawn.append(("worst cases", ink.ORANGE))
+        legend.append(("worst cases", ink.ORANGE))
     drawing.line("curve", axes.at(*data.path.T), ink.SKY, 2.0)
     for arc in data.arcs:
         drawing.line("arcs", axes.at(*arc.T), ink.SKY, 6.0)
     if data.arcs:
-        drawn.append(("thick: the control acts", ink.SKY))
+        legend.append(("thick: the control acts", ink.SKY))
     drawing.dot(axes.at(*data.path[0]), ink.INK, 5.0)
-    _named(drawing, axes, drawn, wide)
+    _named(drawing, axes, legend, wide)
     return drawing
 
 
 def _outlined(drawing: Drawing, axes: Axes, limit: Any, allowed: Floats) -> tuple[str, Colour]:
-    """Outline what is ``allowed`` for a while, or as the goal; returns what to say of it."""
-    places = axes.at(*np.vstack([allowed, allowed[:1]]).T)
-    if np.ptp(places, axis=0).max() < POINT:  # a mark around a goal that is too small to be seen
-        places = places.mean(axis=0) + POINT / 2 * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1], [-1, -1]])
-    drawing.line("wall", places, ink.VERMILLION, 2.0 if limit.is_final else 1.0)
+    """Outline what is ``allowed`` for a while, or as the goal; return its entry in the legend."""
+    points = axes.at(*np.vstack([allowed, allowed[:1]]).T)
+    if np.ptp(points, axis=0).max() < POINT:  # a mark around a goal that is too small to be seen
+        points = points.mean(axis=0) + POINT / 2 * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1], [-1, -1]])
+    drawing.line("wall", points, ink.VERMILLION, 2.0 if limit.is_final else 1.0)
     return ("terminal set" if limit.is_final else limit.name), ink.VERMILLION
 
 
 def _named(drawing: Drawing, axes: Axes, drawn: list[tuple[str, Colour]], below: bool = False) -> None:
-    """What is drawn, beside the plot or ``below`` it, where no curve is."""
+    """Write the legend beside the plot or ``below`` it, where no curve is."""
     left, top, columns, wide, line = axes.left + axes.width, 0.0, 1, ENTRY, ROOM * LINE
     if below:
         columns, wide = COLUMNS, WIDE
@@ -97,32 +97,32 @@ def _named(drawing: Drawing, axes: Axes, drawn: list[tuple[str, Colour]], below:
 
 
 def _slices(data: sr.FigureData) -> Floats:
-    """Boxes ``(k, d, 2)`` that hold every state at some times."""
-    which = np.unique(np.linspace(0, data.times.size - 1, SLICES).astype(int))
-    return np.stack([data.tube_lower[:, which].T, data.tube_upper[:, which].T], axis=-1)
+    """Return boxes ``(k, d, 2)`` that hold every state at some times."""
+    indices = np.unique(np.linspace(0, data.times.size - 1, SLICES).astype(int))
+    return np.stack([data.tube_lower[:, indices].T, data.tube_upper[:, indices].T], axis=-1)
 
 
 def _plane(data: sr.FigureData, worst: Mapping[str, Any]) -> Drawing:
     axes = Axes(60.0, 0.0, SIDE, SIDE, _limits(data, 0), _limits(data, 1))
-    drawing, drawn = Drawing(), [("dot: x(0)", ink.INK), ("worst-case boxes", ink.SKY)]
+    drawing, legend = Drawing(), [("dot: x(0)", ink.INK), ("worst-case boxes", ink.SKY)]
     drawing.frame(axes, "", data.names.state(0), room=ROOM)
     for box in _slices(data):
         (a, b), (c, d) = box
         drawing.line("slices", axes.at(np.array([a, b, b, a, a]), np.array([c, c, d, d, c])), ink.TUBE, 1.0)
     if _walls(drawing, axes, data):
-        drawn.append(("terminal set", ink.VERMILLION))
+        legend.append(("terminal set", ink.VERMILLION))
     for path in worst.get("states", ()):
         drawing.line("worst", axes.at(path[0], path[1]), ink.ORANGE, 1.2)
     if len(worst.get("states", ())):
-        drawn.append(("worst cases", ink.ORANGE))
+        legend.append(("worst cases", ink.ORANGE))
     drawing.line("curve", axes.at(data.state[0], data.state[1]), ink.SKY, 2.0)
     drawing.dot(axes.at(data.state[0, 0], data.state[1, 0]), ink.INK, 5.0)
-    _named(drawing, axes, drawn)
+    _named(drawing, axes, legend)
     return drawing
 
 
 def _walls(drawing: Drawing, axes: Axes, data: sr.FigureData) -> bool:
-    """Draw what the states are held in; returns whether there is a terminal set."""
+    """Draw the walls of the states; return whether there is a terminal set."""
     end = [wall for wall in data.walls if wall.start == wall.end]
     if end:
         limits = [axes.x, axes.y]
@@ -180,7 +180,7 @@ def _space(rr: Any, stream: Any, data: sr.FigureData, worst: Mapping[str, Any]) 
     stream.log(
         "physics/phase/labels",
         rr.Points3D(
-            [start, *(place for place, _ in corners)],
+            [start, *(point for point, _ in corners)],
             labels=["x(0)", *(words for _, words in corners)],
             colors=[ink.INK],
             radii=rr.Radius.ui_points(3.0),
@@ -205,13 +205,16 @@ def _space(rr: Any, stream: Any, data: sr.FigureData, worst: Mapping[str, Any]) 
 
 
 def _cage(ends: list[tuple[float, float]]) -> list[Floats]:
-    """The twelve edges of a box."""
+    """Return the twelve edges of a box."""
     edges = []
     for axis in range(3):
-        others = [k for k in range(3) if k != axis]
+        other_axes = [k for k in range(3) if k != axis]
         for sides in product((0, 1), repeat=2):
             points = np.zeros((2, 3))
             points[:, axis] = ends[axis]
-            points[:, others[0]], points[:, others[1]] = ends[others[0]][sides[0]], ends[others[1]][sides[1]]
+            points[:, other_axes[0]], points[:, other_axes[1]] = (
+                ends[other_axes[0]][sides[0]],
+                ends[other_axes[1]][sides[1]],
+            )
             edges.append(points)
     return edges

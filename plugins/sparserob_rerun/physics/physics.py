@@ -1,4 +1,4 @@
-"""The control, what pushes it, and every state between its walls, against the time of the system."""
+"""Pictures of the control, of what pushes it, and of every state between its walls, against the time of the system."""
 
 from __future__ import annotations
 
@@ -22,27 +22,27 @@ LAYERS = ("hatch", "tube", "frame", "marks", "worst", "curve", "wall")
 
 
 ASPECT = {True: 1.75, False: 0.78}
-"""How many times as wide as high the panel of the first page is, in the arrangement of a search and in the others."""
+"""Width over height of the panel of the first page, in the arrangement of a search and in the others."""
 LOWEST = 40.0  # a plot that is lower has no room for two numbers
 
 
 def height(count: int, searches: bool) -> float:
-    """How high each of ``count`` plots of the first page is, so that they fill their panel."""
+    """Return how high each of ``count`` plots of the first page is, so that they fill their panel."""
     left, right, top, bottom = extent(0, 0.0)
     return max(LOWEST, ((right - left) / ASPECT[searches] - (bottom - top)) / count - GAP)
 
 
 def extent(count: int, each: float = HEIGHT) -> tuple[float, float, float, float]:
-    """Left, right, top and bottom of ``count`` plots above one another, each so high."""
+    """Return left, right, top and bottom of ``count`` plots above one another, each so high."""
     return -32.0, LEFT + WIDTH + 76.0, -36.0, count * (each + GAP) + 8.0
 
 
 @final
 class Physics:
-    """Draws one decision after the other below ``/physics``."""
+    """Pictures of one decision after the other, below ``/physics``."""
 
     def __init__(self, rr: Any, stream: Any, view: sr.Inspection, searches: bool = False) -> None:
-        """``searches``: whether the first page is arranged for a search."""
+        """Keep the program and its problem; with ``searches`` the first page is arranged for a search."""
         self.searches, self.each = searches, HEIGHT
         self.rr, self.stream, self.view = rr, stream, view
         self.switching = sr.Switching(view.program, view.row)
@@ -50,14 +50,15 @@ class Physics:
         self.problem = view.problem
 
     def draw(self, decision: Floats, cuts: Sequence[sr.Cut], mu: Floats | None, proven: Sequence[sr.Cut] = ()) -> None:
-        """One decision with the constraints that carry a multiplier; ``mu`` are the multipliers of the equalities, if
-        they are known. ``proven``: those of a lower bound, which of a policy say the deviation, too."""
+        """Draw one decision with the constraints that carry a multiplier; ``mu`` are the multipliers of the equalities,
+        if they are known. ``proven``: the constraints of a lower bound, which under a policy also give the
+        deviation."""
         from sparserob_rerun.physics.phase import draw_phase
 
         active = [cut for cut in cuts if cut.multiplier > 0.0]
         # what only says how large the control is, at every piece, is no constraint that decides
-        shown = [cut for cut in active if not self.view.program.family(cut.family).defines]
-        data = self.view.picture(decision, shown)
+        deciding = [cut for cut in active if not self.view.program.family(cut.family).defines]
+        data = self.view.picture(decision, deciding)
         worst = self.view.worst_cases(decision)
         push = self.switching.push(active, mu)
         if push is None and proven:
@@ -65,21 +66,21 @@ class Physics:
         for number, page in enumerate(pages(self.problem)):
             drawing = Drawing()
             self.each = HEIGHT if number else height(len(page.plots), self.searches)
-            for top, (kind, place) in enumerate(page.plots):
+            for top, (kind, index) in enumerate(page.plots):
                 last = top == len(page.plots) - 1
                 if kind == "control":
-                    self._control(drawing, self._axes(top, data, _control_limits(data, place)), data, place, last)
+                    self._control(drawing, self._axes(top, data, _control_limits(data, index)), data, index, last)
                 elif kind == "push":
-                    self._push(drawing, self._axes(top, data, (-2.0, 2.0)), data, push, place, last)
+                    self._push(drawing, self._axes(top, data, (-2.0, 2.0)), data, push, index, last)
                 else:
-                    self._state(drawing, self._axes(top, data, _state_limits(data, place)), data, worst, place, last)
+                    self._state(drawing, self._axes(top, data, _state_limits(data, index)), data, worst, index, last)
             self._marks(drawing, data, page.plots)
             drawing.log(self.rr, self.stream, page.path, layers=LAYERS)
         draw_phase(self.rr, self.stream, data, worst)
 
     def signals(self, decision: Floats) -> None:
-        """The final control and states as series on a timeline of their own, ``t``: the time of the system in
-        seconds; under feedback what it answers, too."""
+        """Send the final control and states as series on a timeline of their own, ``t``: the time of the system in
+        seconds; under feedback draw its answers, too."""
         from sparserob_rerun.physics.feedback import DRAWS, draw_feedback, send_effort
 
         rr, data = self.rr, self.view.picture(decision, draws=DRAWS)
@@ -87,7 +88,7 @@ class Physics:
             draw_feedback(rr, self.stream, data)
             send_effort(rr, self.stream, data)
         self._bars(data)
-        at = [rr.TimeColumn("t", duration=data.breakpoints[:-1])]
+        time_columns = [rr.TimeColumn("t", duration=data.breakpoints[:-1])]
         channels = len(data.control)
         names = [data.names.control(channel) for channel in range(channels)]
         colours = [ink.legible(SHADES[channel % len(SHADES)]) for channel in range(channels)]
@@ -97,8 +98,8 @@ class Physics:
             static=True,
         )
         rows = rr.Scalars.columns(scalars=data.control.T.ravel()).partition([channels] * data.control.shape[1])
-        self.stream.send_columns("signals/control", at, rows)
-        at = [rr.TimeColumn("t", duration=data.times)]
+        self.stream.send_columns("signals/control", time_columns, rows)
+        time_columns = [rr.TimeColumn("t", duration=data.times)]
         for state in self.problem.names.corners.own(self.problem.system.states):
             name, colour = data.names.state(state), ink.legible(SHADES[state % len(SHADES)])
             pale = (*colour[:3], 110)
@@ -113,10 +114,11 @@ class Physics:
             )
             values = np.stack([data.state[state], data.tube_lower[state], data.tube_upper[state]], axis=1)
             rows = rr.Scalars.columns(scalars=values.ravel()).partition([3] * len(values))
-            self.stream.send_columns(f"signals/states/x{state + 1}", at, rows)
+            self.stream.send_columns(f"signals/states/x{state + 1}", time_columns, rows)
 
     def _bars(self, data: sr.FigureData) -> None:
-        """The nominal control and states as bars over the time of the system, which are there on every timeline."""
+        """Draw the nominal control and states as bars over the time of the system, which are there on every
+        timeline."""
         rr, middles = self.rr, (data.breakpoints[:-1] + data.breakpoints[1:]) / 2
         widths = np.diff(data.breakpoints)
         for channel, values in enumerate(data.control):
@@ -172,8 +174,8 @@ class Physics:
         edges = data.breakpoints
         middles = (edges[:-1] + edges[1:]) / 2
         for side in (1.0, -1.0):
-            beyond = np.where(side * values > 1.0, values, side)
-            drawing.band("tube", axes, middles, np.full(middles.size, side), beyond, ink.TUBE)
+            outer = np.where(side * values > 1.0, values, side)
+            drawing.band("tube", axes, middles, np.full(middles.size, side), outer, ink.TUBE)
         drawing.line("curve", axes.at(middles, values), ink.PURPLE, 2.0)
 
     def _state(
@@ -199,11 +201,11 @@ class Physics:
         return Axes(LEFT, position * (self.each + GAP), WIDTH, self.each, ends, limits)
 
     def _marks(self, drawing: Drawing, data: sr.FigureData, plots: Sequence[tuple[str, int]]) -> None:
-        """The times of the active constraints, through the plots of the control and of what pushes it, and as dots on
-        the time axis; in the plot of a state those of the constraints that bound it."""
-        for position, (kind, place) in enumerate(plots):
+        """Mark the times of the active constraints through the plots of the control and of what pushes it, and as dots
+        on the time axis. In the plot of a state, mark those of the constraints that bound it."""
+        for position, (kind, index) in enumerate(plots):
             axes = self._axes(position, data, (0.0, 1.0))
-            times = data.active.on(place) if kind == "state" else data.active.times
+            times = data.active.on(index) if kind == "state" else data.active.times
             for time in times:
                 drawing.dashed("marks", axes.at(np.full(2, time), np.array([0.0, 1.0])), ink.PURPLE)
             if times.size:
@@ -230,15 +232,17 @@ def _wall(drawing: Drawing, axes: Axes, wall: sr.Wall) -> None:
 
 
 def _fill(edges: Floats, steps: Floats) -> tuple[Floats, Floats, Floats]:
-    """The steps as a curve with all but upright flanks."""
-    inside = 1e-9 * (edges[-1] - edges[0])
-    places, values = np.stack([edges[:-1] + inside, edges[1:] - inside], axis=1).ravel(), np.repeat(steps, 2)
-    return places, np.minimum(values, 0.0), np.maximum(values, 0.0)
+    """Return the steps as a curve with all but upright flanks."""
+    margin = 1e-9 * (edges[-1] - edges[0])
+    times, values = np.stack([edges[:-1] + margin, edges[1:] - margin], axis=1).ravel(), np.repeat(steps, 2)
+    return times, np.minimum(values, 0.0), np.maximum(values, 0.0)
 
 
 def _control_limits(data: sr.FigureData, channel: int) -> tuple[float, float]:
-    known = [float(value) for value in (data.control_lower[channel], data.control_upper[channel]) if np.isfinite(value)]
-    return _padded([*known, 0.0, float(data.control[channel].min()), float(data.control[channel].max())])
+    bounds = [
+        float(value) for value in (data.control_lower[channel], data.control_upper[channel]) if np.isfinite(value)
+    ]
+    return _padded([*bounds, 0.0, float(data.control[channel].min()), float(data.control[channel].max())])
 
 
 def _state_limits(data: sr.FigureData, state: int) -> tuple[float, float]:

@@ -1,1 +1,1 @@
-"""The process that records: events in, what is on the screen, and where it goes."""
+"""Process that records: events in, what is on the screen, and where it goes."""

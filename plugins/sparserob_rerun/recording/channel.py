@@ -1,4 +1,4 @@
-"""The way of the events from the run to the process that records: a pipe, with a thread at either end that waits for
+"""Channel of the events from the run to the process that records: a pipe, with a thread at either end that waits for
 it, so that neither side ever does."""
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ DRAINING = 0.1
 
 @final
 class Sender:
-    """The run's end: takes a message in microseconds; a thread of its own writes it into the pipe.
+    """Run's end of the channel, which takes a message in microseconds; a thread of its own writes it into the pipe.
 
     At most as many messages wait as there is ``room`` (a semaphore of both processes). Events that ``follow`` one
     another are collected for a moment; ``packed``, of one event or of several, makes a message, and is called by the
@@ -71,7 +71,8 @@ class Sender:
             self.changed.notify()
 
     def close(self) -> None:
-        """Write what is waiting, and end; what cannot be written within a second is lost, for nobody reads."""
+        """Write what is waiting, and end; a message that cannot be written within a second is lost, for nobody
+        reads."""
         with self.changed:
             self.over = True
             self.changed.notify()
@@ -91,7 +92,7 @@ class Sender:
                 self.room.release()
 
     def _next(self) -> list[Any] | None:
-        """The oldest messages, once nothing can be added to them; ``None`` at the end."""
+        """Return the oldest messages, once nothing can be added to them; ``None`` at the end."""
         with self.changed:
             while True:
                 if not self.waiting:
@@ -100,24 +101,25 @@ class Sender:
                     self.changed.wait()
                     continue
                 due, group = self.waiting[0]
-                rest = due - time.monotonic()
-                alone = len(self.waiting) == 1 and not self.over
-                if alone and rest > 0.0 and _collects(group[0]):
-                    self.changed.wait(rest)
+                remaining = due - time.monotonic()
+                is_last = len(self.waiting) == 1 and not self.over
+                if is_last and remaining > 0.0 and _collects(group[0]):
+                    self.changed.wait(remaining)
                     continue
                 self.waiting.popleft()
                 return group
 
 
 def _collects(event: Any) -> bool:
-    """Whether more like it is worth waiting for: not at the beginning of a search, which has no landscape yet."""
+    """Return whether it is worth waiting for more events of the search; false at its beginning, when it has no
+    landscape yet."""
     return isinstance(event, sr.EvaluationsFinished) and event.total > event.count
 
 
 @final
 class Receiver:
-    """The recorder's end. A thread reads the pipe as soon as something is in it: what the run has sent is here when the
-    run dies, however far behind the recording is, and half a message holds up nobody."""
+    """Recorder's end of the channel. A thread reads the pipe as soon as something is in it: what the run has sent is
+    here when the run dies, however far behind the recording is, and half a message holds up nobody."""
 
     def __init__(self, pipe: Connection, room: Any, parent: int) -> None:
         self.pipe, self.room, self.parent = pipe, room, parent
@@ -129,8 +131,8 @@ class Receiver:
 
     @property
     def orphaned(self) -> bool:
-        """Whether the run is gone, or counts as gone. Another process of the run may hold the pipe open, so its end is
-        not enough."""
+        """True where the run is gone, or counts as gone. Another process of the run may hold the pipe open, so its end
+        is not enough."""
         return self.ended or os.getppid() != self.parent or time.monotonic() - self.told > TOLD
 
     def tell(self) -> None:
@@ -139,12 +141,12 @@ class Receiver:
 
     @property
     def empty(self) -> bool:
-        """Whether nothing waits."""
+        """True where no message waits."""
         return self.inbox.empty()
 
     def get(self, seconds: float) -> Any:
-        """The next message, or `queue.Empty` after some seconds; `EOFError` where the run is gone and nothing is
-        left."""
+        """Return the next message, or raise `queue.Empty` after some seconds; raise `EOFError` where the run is gone
+        and nothing is left."""
         end = time.monotonic() + seconds
         while True:
             gone = self.orphaned

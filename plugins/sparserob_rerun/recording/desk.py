@@ -1,5 +1,5 @@
-"""The process that records: it takes events from a queue, logs them, and works on the landscape while there are
-none."""
+"""Main loop of the process that records: it takes events from a queue, logs them, and works on the landscape while
+there are none."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ from sparserob_rerun.study.recorder import StudyOpening, StudyRecorder
 from sparserob_rerun.study.recorder import layout as study_layout
 
 QUIET = "info,re_perf_telemetry=off,re_log_encoding=off,re_sdk::recording_stream=off"
-"""What the viewer's library logs: not what happens to a file, which `broken` tells in one line."""
+"""Log levels of the viewer's library: it does not log what happens to a file, which `broken` tells in one line."""
 IDLE = 0.5  # seconds between two looks at whether the run is still alive
 
 
 @final
 @dataclass(frozen=True)
 class Ending:
-    """The last message: how many events were dropped before it, and for how many seconds a browser is served from then
+    """Last message: how many events were dropped before it, and for how many seconds a browser is served from then
     on."""
 
     dropped: int = 0
@@ -43,7 +43,7 @@ class Ending:
 @final
 @dataclass(frozen=True)
 class Account:
-    """What the process says of itself at the end."""
+    """Report of the process at its end."""
 
     wrong: list[str] = field(default_factory=list)
     broke_off: str = ""
@@ -59,9 +59,9 @@ def record(
     chosen: Destinations,
     name: str,
 ) -> None:
-    """The whole life of the process. Nothing that it does can reach the run: neither its signals nor its failures.
-    ``theirs``: the run's end of the pipe, where this process has got a copy of it, with which it would keep itself
-    alive."""
+    """Run the recording process from its beginning to its end. Nothing that it does can reach the run: neither its
+    signals nor its failures. ``theirs``: the run's end of the pipe, where this process has got a copy of it, with which
+    it would keep itself alive."""
     if theirs is not None:
         theirs.close()
     messages = Receiver(pipe, room, os.getppid())
@@ -144,8 +144,8 @@ def _look_on(keep: float, messages: Receiver) -> None:
 
 
 def _listen(messages: Receiver, recorder: Recorder | StudyRecorder, guard: Guard, wrong: list[str]) -> Ending:
-    """Log whatever comes until the run is over, or gone, or nothing can be written any more; an event that cannot be
-    drawn is left out, and the first of them is shown."""
+    """Log all events until the run is over, or gone, or nothing can be written any more. An event that cannot be drawn
+    is left out, and the first such error is shown."""
     while not guard.lost:
         try:
             message = messages.get(min(IDLE, recorder.rest))
@@ -176,10 +176,11 @@ def _receive(message: Any, recorder: Recorder | StudyRecorder, wrong: list[str])
 
 @final
 class _WithoutPandas(MetaPathFinder):
-    """pyarrow imports pandas where it is installed, for seconds and 50 MB; nothing here needs it."""
+    """Finder that hides pandas: pyarrow imports it where it is installed, for seconds and 50 MB; nothing here needs
+    it."""
 
     def find_spec(self, fullname: str, path: object = None, target: object = None) -> None:
-        """Nothing, but for pandas an error."""
+        """Raise an error for pandas; find nothing else."""
         if fullname == "pandas":
             raise ModuleNotFoundError("pandas is left out", name=fullname)
 

@@ -1,4 +1,4 @@
-"""What keeps a recording whole from beside it: what was logged goes to the disk every moment, and the file is ended
+"""Guard that keeps a recording whole from outside: what was logged goes to the disk every moment, and the file is ended
 properly whatever becomes of the run, and whatever the recorder is at."""
 
 from __future__ import annotations
@@ -34,9 +34,9 @@ SPARE = 1 << 16
 
 @final
 class Guard:
-    """Looks after one open ``stream`` into a ``file`` (if any): a thread that flushes, and that ends the process where
-    the run is gone and the recorder does not end by itself. ``orphaned`` says whether the run is gone; ``leave`` ends
-    what else was started."""
+    """Guard of one open ``stream`` into a ``file`` (if any): a thread that flushes, and that ends the process where the
+    run is gone and the recorder does not end by itself. ``orphaned`` says whether the run is gone; ``leave`` ends what
+    else was started."""
 
     def __init__(self, file: Path | None, orphaned: Callable[[], bool], leave: Callable[[], None]) -> None:
         self.file, self.orphaned, self.leave = file, orphaned, leave
@@ -51,7 +51,7 @@ class Guard:
         self.alone, self.stream = alone, stream
 
     def flush(self, seconds: float) -> bool:
-        """Send what was logged; returns whether it arrived, with all that was late before."""
+        """Send what was logged; return whether it arrived, with all that was late before."""
         try:
             self.stream.flush(timeout_sec=seconds)
         except RuntimeError as error:
@@ -63,7 +63,7 @@ class Guard:
         return True
 
     def close(self, seconds: float = ENDING) -> str:
-        """End the stream and its files, once; returns why the file is not complete, if it is not."""
+        """End the stream and its files, once; return why the file is not complete, if it is not."""
         with self.once:
             if self.stream is not None and not self.closed:
                 self.closed = True
@@ -75,7 +75,7 @@ class Guard:
         return broken(self.file) or (halted if self.lost else "")
 
     def done(self) -> None:
-        """The recorder has ended by itself."""
+        """Note that the recorder has ended by itself."""
         self.over.set()
 
     def _watch(self) -> None:
@@ -93,7 +93,7 @@ class Guard:
 
     @property
     def _full(self) -> bool:
-        """Whether the disk has no room for more of the file."""
+        """True where the disk has no room for more of the file."""
         with suppress(OSError):
             return self.file is not None and shutil.disk_usage(self.file.parent).free < SPARE
         return False
@@ -108,8 +108,8 @@ class Guard:
 
 
 def within(seconds: float, task: Callable[[], None]) -> bool:
-    """Do something that a file that cannot be written may hold up for ever; returns whether it was done in some
-    seconds. Raises what it raised."""
+    """Run a task that a file that cannot be written may hold up for ever; return whether it was done in some seconds.
+    An error of the task is raised."""
     errors = list[Exception]()
 
     def run() -> None:
@@ -127,7 +127,7 @@ def within(seconds: float, task: Callable[[], None]) -> bool:
 
 
 def broken(file: Path) -> str:
-    """Why a file is no complete recording; empty where it is one. A file that is no ordinary one is believed."""
+    """Say why a file is no complete recording; empty where it is one. A file that is no ordinary one is believed."""
     try:
         if file.exists() and not file.is_file():
             return ""

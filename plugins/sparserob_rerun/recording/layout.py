@@ -1,4 +1,4 @@
-"""What is on the screen when a recording is opened: nothing is left to the viewer's guesses."""
+"""Arrangement of the screen when a recording is opened: nothing is left to the viewer's guesses."""
 
 from __future__ import annotations
 
@@ -19,21 +19,21 @@ if TYPE_CHECKING:
 
 
 WIDE = 2.0
-"""How many times as wide as high a drawing is that has the whole width of the screen. With ten times as much a single
-strip fills half of its panel; with a tenth many strips are narrow and high above the words."""
+"""Width over height of a drawing that has the whole width of the screen. With ten times as much a single strip fills
+half of its panel; with a tenth many strips are narrow and high above the words."""
 PHASE = (-40.0, 790.0, -24.0, 530.0)  # left, right, top and bottom of the phase plane
 
 
 @final
 @dataclass(frozen=True)
 class Shown:
-    """What a run has to show: its problem, if it is one of control, how many families, whether tuples are searched, and
-    the landscape; of a search what the maximiser has ``told`` of itself, the coordinates that have ``moved``, and of
-    every search, once all are over (``stages``), the evaluations before it, its weight epsilon and the seconds before
-    it; ``budget``: the evaluations of one, 0 where that is not known.
-    ``clash``, once a run is infeasible: the limits of the drawing of what clashes, empty where it cannot be drawn;
-    ``drawn``: whether there were decisions before that; ``maps``: how many families have a map of their violation;
-    ``answers``: whether the control answers what it measures; ``verdict``: how it ended, once it has."""
+    """Contents of a recording: the run's problem, if it is one of control, how many families, whether tuples are
+    searched, and the landscape. Of a search: what the maximiser has ``told`` of itself, and the coordinates that have
+    ``moved``. ``stages``: of every search, once all are over, the evaluations before it, its weight epsilon and the
+    seconds before it. ``budget``: the evaluations of one, 0 where that is not known. ``clash``, once a run is
+    infeasible: the limits of the drawing of what clashes, empty where it cannot be drawn. ``drawn``: whether there were
+    decisions before that. ``maps``: how many families have a map of their violation. ``answers``: whether the control
+    answers what it measures. ``verdict``: how the run ended, once it has."""
 
     problem: sr.OptimalControlProblem | None
     families: int
@@ -56,19 +56,19 @@ class Shown:
 
     @property
     def application(self) -> str:
-        """The name of the viewer's application: it keeps one arrangement for each, so that what is arranged otherwise
-        has another one."""
+        """Name of the viewer's application: it keeps one arrangement for each, so that what is arranged otherwise has
+        another one."""
         kind = "search" if self.searches else "feedback" if self.answers else "exchange"
         problem = self.problem
-        parts: list[Any] = [self.families, self.maps, self.landscape]
+        features: list[Any] = [self.families, self.maps, self.landscape]
         if problem is not None:
-            parts += [problem.system.controls, problem.system.states, heading(problem), problem.names.in_plane]
-            parts += [pages(problem), problem.names.state_units, problem.names.time]
-        return f"sparserob {kind} {crc32(repr(parts).encode()):08x}"
+            features += [problem.system.controls, problem.system.states, heading(problem), problem.names.in_plane]
+            features += [pages(problem), problem.names.state_units, problem.names.time]
+        return f"sparserob {kind} {crc32(repr(features).encode()):08x}"
 
 
 def layout(shown: Shown) -> Any:
-    """The blueprint: an overview first, then a tab for each part of the story."""
+    """Build the blueprint: an overview first, then a tab for each part of the story."""
     import rerun.blueprint as rrb
 
     columns, shares = _columns(rrb, shown)
@@ -97,7 +97,7 @@ def layout(shown: Shown) -> Any:
 
 
 def _columns(rrb: Any, shown: Shown) -> tuple[list[Any], list[int]]:
-    """The panels of the first screen in columns, and how wide these are."""
+    """Return the panels of the first screen in columns, and how wide these are."""
     words = [rrb.TextDocumentView(origin="/verdict", name="What is known")]
     plane = [_phase(rrb, shown.problem)] if shown.problem is not None and shown.problem.system.states > 1 else []
     map_words = [rrb.TextDocumentView(origin="/landscape/words", name="What the map shows")] if shown.landscape else []
@@ -126,14 +126,14 @@ def _plots(problem: sr.OptimalControlProblem, searches: bool) -> Any:
 
 
 def _lane(rrb: Any, shown: Shown) -> Any:
-    """The lane of states, from the beginning of the run on whatever timeline is shown. The verdict, which comes at its
-    end, has no width there, and is in its name."""
+    """Return the lane of states, from the beginning of the run on whatever timeline is shown. The verdict, which comes
+    at the end of the run, has no width there, and is in the name of the lane."""
     from rerun.encodings import TimeRange
 
     everything = rrb.TimeRangeBoundary.infinite()
-    whole = rrb.TimeAxis(view_range=TimeRange(start=everything, end=everything))
+    time_axis = rrb.TimeAxis(view_range=TimeRange(start=everything, end=everything))
     name = f"{shown.verdict}: what went on" if shown.verdict else "What is going on"
-    return rrb.StateTimelineView(origin="/state", name=name, time_view=whole)
+    return rrb.StateTimelineView(origin="/state", name=name, time_view=time_axis)
 
 
 def _terrain(shown: Shown) -> Any:
@@ -141,7 +141,7 @@ def _terrain(shown: Shown) -> Any:
 
 
 def _room(shown: Shown) -> int:
-    """The height of the plots of violation, as much for one as for another."""
+    """Return the height of the plots of violation, as much for one as for another."""
     return 2 + 3 * max(1, min(shown.families, rounds.FAMILIES))
 
 
@@ -164,7 +164,7 @@ def _phase(rrb: Any, problem: sr.OptimalControlProblem) -> Any:
     if pair is not None:
         kind = "Phase plane" if problem.names.in_plane is None else "Plane"
         units = problem.names.state_units or [""] * problem.system.states
-        across, up = (f"{problem.names.state(one)} in {units[one]}".removesuffix(" in ") for one in pair)
+        across, up = (f"{problem.names.state(state)} in {units[state]}".removesuffix(" in ") for state in pair)
         return view("/physics/phase", f"{kind}: {up} over {across}", PHASE)
     states = problem.system.states
     name = (
@@ -176,11 +176,13 @@ def _phase(rrb: Any, problem: sr.OptimalControlProblem) -> Any:
 
 
 def _further(rrb: Any, problem: sr.OptimalControlProblem) -> Any:
-    """The controls and states that the first screen has no room for."""
-    more = [
+    """Return a tab of the controls and states that the first screen has no room for."""
+    views = [
         view(f"/{page.path}", page.name(problem.names), physics.extent(len(page.plots))) for page in pages(problem)[1:]
     ]
-    return rrb.Horizontal(*more, name="Further signals") if len(more) < 4 else rrb.Grid(*more, name="Further signals")
+    return (
+        rrb.Horizontal(*views, name="Further signals") if len(views) < 4 else rrb.Grid(*views, name="Further signals")
+    )
 
 
 def _feedback(rrb: Any, problem: sr.OptimalControlProblem) -> Any:
@@ -211,7 +213,7 @@ def _signals(rrb: Any, answers: bool) -> Any:
 
 
 def _infeasible(rrb: Any, shown: Shown, clash: tuple[float, ...]) -> Any:
-    """Instead of a control that there is not: why there is none."""
+    """Return the tab that says why there is no control, in the place of one that shows it."""
     words = [rrb.TextDocumentView(origin="/verdict", name="What is known"), _decisions(rrb)]
     if not clash:
         return rrb.Horizontal(rrb.Vertical(*words, row_shares=[3, 2]), name="Overview")
@@ -246,8 +248,8 @@ def _exchange(rrb: Any, shown: Shown) -> Any:
         f"Numbers of active indices and of new cuts, after every {'search' if shown.searches else 'round'}",
         legend="left",
     )
-    both = view("/rounds/picture", "Bounds on the cost, the gap and the violation, round by round", bounds.BOTH)
-    left = rrb.Vertical(both, counts, row_shares=[2, 1])
+    pictures = view("/rounds/picture", "Bounds on the cost, the gap and the violation, round by round", bounds.BOTH)
+    left = rrb.Vertical(pictures, counts, row_shares=[2, 1])
     right = [_violation(rrb, shown)]
     if shown.problem is not None and shown.problem.system.parameter_count and shown.maps:
         name = "Violation over time and the first parameter: red is forbidden"

@@ -1,4 +1,4 @@
-"""The run's end of a recording: a queue that takes an event in microseconds, and never makes the solver wait."""
+"""Run's end of a recording: a queue that takes an event in microseconds, and never makes the solver wait."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ START = "fork" if sys.platform.startswith("linux") else "spawn"
 
 @final
 class Outlet:
-    """One process that records one run, or one study. Everything about it may fail, and the run does not notice."""
+    """Process that records one run, or one study. Everything about it may fail, and the run does not notice."""
 
     def __init__(self, opening: Opening | StudyOpening, chosen: Destinations, capacity: int = CAPACITY) -> None:
         context: Any = multiprocessing.get_context(START)
@@ -45,20 +45,28 @@ class Outlet:
         self.dropped, self.dead = 0, False
         self.waits = opening.waits
         room, (reader, writer) = context.BoundedSemaphore(capacity), context.Pipe(duplex=False)
-        self.report, theirs = context.Pipe(duplex=False)
-        sent = opening
+        self.report, report_writer = context.Pipe(duplex=False)
+        child_opening = opening
         if START != "fork" and isinstance(opening, Opening):
-            sent = replace(opening, inspection=None)
+            child_opening = replace(opening, inspection=None)
         self.process = context.Process(
             target=record,
-            args=(reader, writer if START == "fork" else None, room, theirs, sent, chosen, uuid.uuid4().hex),
+            args=(
+                reader,
+                writer if START == "fork" else None,
+                room,
+                report_writer,
+                child_opening,
+                chosen,
+                uuid.uuid4().hex,
+            ),
             daemon=True,
         )
         with warnings.catch_warnings():
             # of a fork beside other threads: the child uses none of them
             warnings.simplefilter("ignore", DeprecationWarning)
             self.process.start()
-        for end in (theirs, reader):
+        for end in (report_writer, reader):
             end.close()
         self.sender = Sender(writer, room, follows, packed)
         atexit.register(self.sender.close)  # before Python waits for processes that end with this pipe
@@ -79,7 +87,7 @@ class Outlet:
         self.dropped += 1
 
     def close(self, keep: float = 0.0) -> list[str]:
-        """End the recording; returns what there is to complain about, and keeps in ``incomplete`` why the recording is
+        """End the recording; return what there is to complain about, and keep in ``incomplete`` why the recording is
         not whole, if it is not. An interrupt ends the waiting, not more."""
         wrong = []
         try:
@@ -122,23 +130,23 @@ class Outlet:
 
 
 def packed(events: Sequence[Any]) -> Any:
-    """What is sent of successive events: of evaluated tuples only what may be drawn."""
+    """Return what is sent of successive events: of evaluated tuples only what may be drawn."""
     return thin(joined(events)) if isinstance(events[0], sr.EvaluationsFinished) else events[0]
 
 
 def follows(before: Any, event: Any) -> bool:
-    """Whether an event goes on where another one of the same search ended."""
+    """Return whether an event goes on where another one of the same search ended."""
     if not isinstance(before, sr.EvaluationsFinished) or not isinstance(event, sr.EvaluationsFinished):
         return False
-    same = (event.family, event.round, event.phase) == (before.family, before.round, before.phase)
-    return same and event.total - event.count == before.total
+    is_same_search = (event.family, event.round, event.phase) == (before.family, before.round, before.phase)
+    return is_same_search and event.total - event.count == before.total
 
 
 def joined(parts: Sequence[sr.EvaluationsFinished]) -> sr.EvaluationsFinished:
-    """Successive events of one search as one."""
+    """Join successive events of one search."""
     if len(parts) == 1:
         return parts[0]
-    first, batches = parts[0].batch, [part.batch for part in parts]
+    first, batches = parts[0].batch, [event.batch for event in parts]
     notes: dict[str, list[tuple[float, float]]] = {}
     for batch in batches:
         for name, rows in batch.notes.items():
@@ -146,8 +154,8 @@ def joined(parts: Sequence[sr.EvaluationsFinished]) -> sr.EvaluationsFinished:
     points = [piece for batch in batches for piece in batch.points]
     values = [piece for batch in batches for piece in batch.values]
     moments = [moment for batch in batches for moment in batch.moments]
-    whole = replace(first, points=points, values=values, moments=moments, notes=notes)
-    sketches = {role: sketch for part in parts for role, sketch in part.sketches.items()}
-    deciding = np.concatenate([part.deciding for part in parts])
-    count = sum(part.count for part in parts)
-    return replace(parts[-1], count=count, batch=whole, sketches=sketches, deciding=deciding)
+    joined_batch = replace(first, points=points, values=values, moments=moments, notes=notes)
+    sketches = {role: sketch for event in parts for role, sketch in event.sketches.items()}
+    deciding = np.concatenate([event.deciding for event in parts])
+    count = sum(event.count for event in parts)
+    return replace(parts[-1], count=count, batch=joined_batch, sketches=sketches, deciding=deciding)

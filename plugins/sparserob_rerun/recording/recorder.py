@@ -1,4 +1,4 @@
-"""From events to a recording: what happens in the process that does all the work."""
+"""Recorder of a run, which turns events into a recording, in the process that does all the work."""
 
 from __future__ import annotations
 
@@ -57,9 +57,9 @@ SLOTS = 16  # active constraints at most that make the tuple of a method without
 @final
 @dataclass(frozen=True, eq=False)
 class Opening:
-    """What a recording knows of its run at the beginning. Without an ``inspection`` it is read from the ``directory``,
-    if there is one. ``waits``: the run is over, and waits for its recording; else it ``began`` at
-    this moment of the machine's clock."""
+    """Facts about a run that its recording knows at the beginning. Without an ``inspection`` it is read from the
+    ``directory``, if there is one. ``waits``: the run is over, and waits for its recording; else it ``began`` at this
+    moment of the machine's clock."""
 
     title: str
     directory: Path | None
@@ -69,7 +69,7 @@ class Opening:
     began: float = field(default_factory=time.monotonic)
 
     def answers(self) -> sr.Inspection | None:
-        """Who answers questions about the run."""
+        """Return the inspection that answers questions about the run."""
         if self.inspection is not None or self.directory is None:
             return self.inspection
         return sr.Inspection.read(self.directory)
@@ -77,7 +77,7 @@ class Opening:
 
 @final
 class Recorder:
-    """Logs the events of one run to a stream that is already open."""
+    """Recorder of the events of one run in a stream that is already open."""
 
     def __init__(self, rr: Any, stream: Any, opening: Opening, shown: Shown, inspection: sr.Inspection | None) -> None:
         self.rr, self.stream, self.opening, self.inspection = rr, stream, opening, inspection
@@ -119,24 +119,24 @@ class Recorder:
     def _describe(self, title: str) -> None:
         """Give the recording its name, and say of what it is. The name begins with what two runs of one problem differ
         in, because a list of recordings shows its first words."""
-        known: dict[str, Any] = {"title": [title]}
+        properties: dict[str, Any] = {"title": [title]}
         if self.inspection is None:
             self.stream.send_recording_name(title)
         else:
             config = self.inspection.config
-            by, seed = config["maximiser" if self.searches else "method"]["name"], config.get("seed", 0)
-            self.stream.send_recording_name(f"{by}, seed {seed}: {title}")
-            known |= {"config": [json.dumps(config, default=str)], "seed": [seed]}
-        self.stream.send_property("run", self.rr.AnyValues(**known))
+            searcher, seed = config["maximiser" if self.searches else "method"]["name"], config.get("seed", 0)
+            self.stream.send_recording_name(f"{searcher}, seed {seed}: {title}")
+            properties |= {"config": [json.dumps(config, default=str)], "seed": [seed]}
+        self.stream.send_property("run", self.rr.AnyValues(**properties))
 
     def _conclude(self, event: sr.RunFinished) -> None:
         """Say how the run has ended."""
         self.concluded, self.shown = True, replace(self.shown, verdict=event.status)
-        result, known = event.result, dict[str, Any](status=[event.status], seconds=[event.seconds])
+        result, properties = event.result, dict[str, Any](status=[event.status], seconds=[event.seconds])
         if result is not None:
-            known |= {"lower_bound": [result.lower_bound], "upper_bound": [result.upper_bound]}
-            known |= {"cost": [float(result.cost)]} if result.decision is not None else {}
-        self.stream.send_property("result", self.rr.AnyValues(**known))
+            properties |= {"lower_bound": [result.lower_bound], "upper_bound": [result.upper_bound]}
+            properties |= {"cost": [float(result.cost)]} if result.decision is not None else {}
+        self.stream.send_property("result", self.rr.AnyValues(**properties))
 
     def receive(self, event: sr.Event) -> None:
         """Log one event; one of evaluated tuples is a thin one (`thin`)."""
@@ -179,7 +179,7 @@ class Recorder:
                 self.explorer.left = 0
 
     def say(self, line: str, level: str = "INFO") -> None:
-        """A line of the log."""
+        """Write a line of the log."""
         self.stream.log("log", self.rr.TextLog(line, level=level))
         if level != "TRACE":  # the log cuts off what is longer than its column; this page does not
             if self.said and line.startswith(PROOF) and self.said[0].startswith(PROOF):
@@ -193,8 +193,8 @@ class Recorder:
         landscape = self.terrain.known
         if landscape is None or self.exact is None:
             return
-        same = abs(landscape.value - self.exact) <= VISIBLE * max(1.0, abs(self.exact))
-        if same or self.explorer.landscape is landscape:
+        is_same = abs(landscape.value - self.exact) <= VISIBLE * max(1.0, abs(self.exact))
+        if is_same or self.explorer.landscape is landscape:
             share = ", with the regulariser's share" if landscape.epsilon > 0.0 else ""
             self.draw(LANDSCAPE, self.terrain.mark, f"proven to be the highest: {self.exact:.6g}{share}")
 
@@ -218,7 +218,7 @@ class Recorder:
             self._way()
 
     def _stage(self, event: sr.EvaluationsFinished) -> Stage:
-        """The search that an event belongs to; a new one where it is the first of it."""
+        """Return the search that an event belongs to; a new one where it is the first of it."""
         if not self.stages or event.total == event.count or self.stages[-1].number != event.round:
             if self.stages:
                 self._way()
@@ -245,9 +245,11 @@ class Recorder:
             self._arrange(stage)
         weight = f"epsilon = {stage.epsilon:.3g}, " if np.isfinite(stage.epsilon) else ""
         if not self.exact:
-            done = self.timelines.evaluation - stage.base
-            of = f" of {stage.budget}" if stage.budget else ""
-            line = f"search {max(1, stage.number)}: {weight}evaluation {done}{of}; best g {stage.best_value:.8g}"
+            evaluations = self.timelines.evaluation - stage.base
+            limit = f" of {stage.budget}" if stage.budget else ""
+            line = (
+                f"search {max(1, stage.number)}: {weight}evaluation {evaluations}{limit}; best g {stage.best_value:.8g}"
+            )
             self.lower = max(self.lower, stage.lower_bound)
             self._page("solving", [line])
         self.next = time.monotonic() + max(PICTURE_EVERY, SPARE * (time.thread_time() - began))
@@ -265,17 +267,17 @@ class Recorder:
             self.relaxed = key, self.inspection.relaxed_value(*key)
         self.optimal, g = aim, self.relaxed[1]
         g.at(slots)
-        known = g.optimum()
-        if known is not None:
-            self.physics.draw(*known, None)
+        optimum = g.optimum()
+        if optimum is not None:
+            self.physics.draw(*optimum, None)
 
     def _arrange(self, stage: Stage) -> None:
         """Give what the search has told since the last arrangement its panels."""
-        told, moved = frozenset(self.search.notes), frozenset(self.search.moved)
-        begun = tuple((one.base, one.epsilon, one.began) for one in self.stages) if self.concluded else ()
-        if not (told <= self.shown.told and moved <= self.shown.moved and begun == self.shown.stages):
-            told, moved = self.shown.told | told, self.shown.moved | moved
-            self.shown = replace(self.shown, told=told, moved=moved, stages=begun, budget=stage.budget)
+        notes, coordinates = frozenset(self.search.notes), frozenset(self.search.moved)
+        stages = tuple((entry.base, entry.epsilon, entry.began) for entry in self.stages) if self.concluded else ()
+        if not (notes <= self.shown.told and coordinates <= self.shown.moved and stages == self.shown.stages):
+            notes, coordinates = self.shown.told | notes, self.shown.moved | coordinates
+            self.shown = replace(self.shown, told=notes, moved=coordinates, stages=stages, budget=stage.budget)
             self.draw("the arrangement of the search", self.stream.send_blueprint, self.arrangement)
 
     def _landscape(self, landscape: sr.Landscape, aim: Aim) -> None:
@@ -289,7 +291,8 @@ class Recorder:
             self.terrain.visit(self.stages[-1])
 
     def _moving(self, width: int) -> dict[int, str]:
-        """The coordinates of an index whose moves are drawn, with their names: neither disturbance nor direction."""
+        """Return the coordinates of an index whose moves are drawn, with their names: neither disturbance nor
+        direction."""
         if self.inspection is None:
             return {}
         named = zip(self.inspection.names(width), self.inspection.kinds(width), strict=True)
@@ -303,7 +306,7 @@ class Recorder:
 
     @property
     def arrangement(self) -> Any:
-        """How everything is arranged now."""
+        """Present arrangement of all panels."""
         return layout(self.shown)
 
     @property
@@ -319,24 +322,24 @@ class Recorder:
 
     @property
     def urgent(self) -> bool:
-        """Whether the landscape does not wait for a moment without events."""
+        """True where the landscape does not wait for a moment without events."""
         return self.explorer.urgent
 
     def finish(self) -> None:
-        """A run waits for the landscape of its last tuple, to be as fine as there is time for; one that broke off does
-        not wait."""
+        """Work on the landscape of the last tuple, so that it is as fine as there is time for. A run that broke off
+        does not wait for it."""
         explorer = self.explorer
         if self.opening.landscape is not None and self.over >= 0.0:
             waits = self.opening.waits
             # of a run that is shown again every landscape may take as long; another one wants to end
-            left = self.patience if waits else self.patience - max(0.0, time.monotonic() - self.ended)
-            self.draw(LANDSCAPE, explorer.finish, left)
+            seconds = self.patience if waits else self.patience - max(0.0, time.monotonic() - self.ended)
+            self.draw(LANDSCAPE, explorer.finish, seconds)
             if explorer.waiting is not None or explorer.urgent:
-                left = self.patience if waits else self.patience - max(0.0, time.monotonic() - self.ended)
-                self.draw(LANDSCAPE, explorer.finish, left, 16, COARSE)  # any level is one
+                seconds = self.patience if waits else self.patience - max(0.0, time.monotonic() - self.ended)
+                self.draw(LANDSCAPE, explorer.finish, seconds, 16, COARSE)  # any level is one
             self.mark()
-            none = self.shown.landscape and self.terrain.known is None and self.shown.clash is None
-            if none and (self.shown.answers or explorer.wrong):
+            is_missing = self.shown.landscape and self.terrain.known is None and self.shown.clash is None
+            if is_missing and (self.shown.answers or explorer.wrong):
                 if not explorer.wrong:
                     self.say(f"no landscape: {PATIENT if self.answerable else KEPT}")
                 self.shown = replace(self.shown, landscape=False)
@@ -359,18 +362,18 @@ class Recorder:
         cuts, self.drawn = active(event.imposed, event.multipliers), True
         if self.physics is not None:
             self.draw(CONTROL, self.physics.draw, event.decision, cuts, None)
-        told = told_by_round(event)
-        self.draw(VIOLATIONS, self.rounds.violations, event.decision, cuts, event.added, told)
+        worst = told_by_round(event)
+        self.draw(VIOLATIONS, self.rounds.violations, event.decision, cuts, event.added, worst)
 
     def _late(self, seconds: float) -> bool:
-        """Whether the recording is so far behind the run that its pictures have to wait for the last one."""
+        """Return whether the recording is so far behind the run that its pictures have to wait for the last one."""
         now = time.monotonic()
         late = now - self.opening.began - seconds > LATE or now - self.ended > CATCHING_UP
         return late and not self.opening.waits
 
     def _aim(self, event: sr.RoundFinished) -> None:
-        """The tuple whose surroundings are worth a look after a round: the best of the search, or the constraints that
-        are active. A run that is over waits for the one of each search."""
+        """Aim the landscape after a round at the tuple whose surroundings are worth a look: the best of the search, or
+        the constraints that are active. A run that is over waits for the landscape of each search."""
         if self.searches and self.stages and self.stages[-1].best.size:
             self.explorer.aim(self._best(self.stages[-1], event.round))
             if self.opening.waits:
@@ -399,12 +402,12 @@ class Recorder:
                 self.draw(BOUNDS, self.rounds.picture.end, result.lower_bound, result.upper_bound, result.gap)
             self.draw(CLASH, self._clash, result)
             if result.decision is not None and self.physics is not None:
-                known = (result.decision, result.indices, result.dual.mu, result.dual.cuts)
-                self.draw(CONTROL, self.physics.draw, *known)
+                optimum = (result.decision, result.indices, result.dual.mu, result.dual.cuts)
+                self.draw(CONTROL, self.physics.draw, *optimum)
                 self.draw("the signals", self.physics.signals, result.decision)
             if result.decision is not None:
-                told = told_by_result(result)
-                self.draw(VIOLATIONS, self.rounds.violations, result.decision, result.indices, (), told)
+                worst = told_by_result(result)
+                self.draw(VIOLATIONS, self.rounds.violations, result.decision, result.indices, (), worst)
             # a run that is shown again
             if self.explorer.landscape is None and self.explorer.waiting is None and result.indices:
                 if self.shown.answers:  # the rows that prove the bound of a policy, each at its deviation
@@ -431,19 +434,21 @@ class Recorder:
         self._page(event.status, lines)
 
     def _clash(self, result: sr.Result) -> None:
-        """Of an infeasible run: what clashes in the place of a control that there is not."""
+        """Draw what clashes, for an infeasible run, in the place of a control that there is not."""
         strips = [] if self.inspection is None else self.inspection.clash(result)
         if strips:
             draw_clash(self.rr, self.stream, strips)
         if result.status == "infeasible":
             drawn = self.drawn or bool(self.stages)
-            seen = self.shown.landscape and self.terrain.known is not None
-            self.shown = replace(self.shown, clash=extent(strips) if strips else (), drawn=drawn, landscape=seen)
+            has_landscape = self.shown.landscape and self.terrain.known is not None
+            self.shown = replace(
+                self.shown, clash=extent(strips) if strips else (), drawn=drawn, landscape=has_landscape
+            )
             self.stream.send_blueprint(self.arrangement)
 
     @property
     def _formulation(self) -> str:
-        """What the indices of the landscape say."""
+        """Formulation of the indices of the landscape, ``literal`` or ``reduced``."""
         return "literal" if self.inspection is not None and self.inspection.literal else "reduced"
 
     def _page(self, status: str, lines: list[str]) -> None:
@@ -452,7 +457,7 @@ class Recorder:
 
 
 def shown_of(inspection: sr.Inspection | None, landscape: LandscapeOptions | None) -> Shown:
-    """What a run has to show."""
+    """Return the contents of the recording of a run."""
     if inspection is None:
         return Shown(None, 0, True, False)
     program, answers = inspection.program, inspection.problem is not None and inspection.program.spread is not None
@@ -468,19 +473,20 @@ def shown_of(inspection: sr.Inspection | None, landscape: LandscapeOptions | Non
 
 
 def active(cuts: Any, multipliers: Floats) -> list[sr.Cut]:
-    """The cuts that carry a multiplier, with it."""
+    """Return the cuts that carry a multiplier, with it."""
     return [replace(cut, multiplier=float(m)) for cut, m in zip(cuts, multipliers, strict=True) if m > 0.0]
 
 
 def slots_of(cuts: list[sr.Cut], formulation: str, most: int = SLOTS) -> Floats:
-    """The distinct indices of cuts as a tuple ``(D, width)``, ``most`` of them, the one with the largest multiplier
-    first; of an index of another formulation the first coordinate only, the time, which all of them have."""
+    """Return the distinct indices of cuts as a tuple ``(D, width)``, ``most`` of them, the one with the largest
+    multiplier first. An index of another formulation gives its first coordinate only, the time, which all of them
+    have."""
     ordered = sorted(cuts, key=lambda cut: -cut.multiplier)
     indices = [cut.index if cut.formulation == formulation else cut.index[:1] for cut in ordered]
     width = max(map(len, indices), default=0)
-    found: dict[bytes, Floats] = {}
+    slots: dict[bytes, Floats] = {}
     for index in indices:
         slot = np.zeros(width)
         slot[: len(index)] = index
-        found.setdefault(np.round(slot, 9).tobytes(), slot)
-    return np.array(list(found.values())[:most]).reshape(-1, width) if found else np.zeros((0, 0))
+        slots.setdefault(np.round(slot, 9).tobytes(), slot)
+    return np.array(list(slots.values())[:most]).reshape(-1, width) if slots else np.zeros((0, 0))

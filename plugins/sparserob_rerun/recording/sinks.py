@@ -1,5 +1,5 @@
-"""Where a recording goes: a file, a viewer that listens, a viewer that is started, a browser; and what to do where one
-is missing."""
+"""Destinations of a recording: a file, a viewer that listens, a viewer that is started, a browser; and what to do where
+one is missing."""
 
 from __future__ import annotations
 
@@ -30,9 +30,9 @@ MEMORY = "25%"  # of the machine's, for a viewer that is started
 @final
 @dataclass(frozen=True)
 class Destinations:
-    """What is left of the wishes after looking at the machine: ``save`` a file, ``connect`` a host and port where a
-    viewer listens, ``spawn`` a viewer, ``serve`` to a browser through this port, from a page at the port ``web``;
-    ``missing`` says in words what could not be had."""
+    """Wishes that can be fulfilled on this machine: ``save`` a file, ``connect`` a host and port where a viewer
+    listens, ``spawn`` a viewer, ``serve`` to a browser through this port, from a page at the port ``web``; ``missing``
+    says in words what could not be had."""
 
     save: Path | None
     connect: tuple[str, int] | None
@@ -43,18 +43,18 @@ class Destinations:
 
     @property
     def any(self) -> bool:
-        """Whether there is anywhere to record to."""
+        """True where there is anywhere to record to."""
         return self.save is not None or self.connect is not None or self.spawn or self.serve is not None
 
     @property
     def page(self) -> str:
-        """The page that a browser is to open."""
+        """Page that a browser is to open."""
         source = f"rerun%2Bhttp%3A%2F%2F127.0.0.1%3A{self.serve}%2Fproxy"
         return f"http://127.0.0.1:{self.web}/?url={source}&hide_welcome_screen=1&theme=dark"
 
 
 def look(save: Path | None, connect: str | None, spawn: bool, serve: bool) -> Destinations:
-    """Which of the wishes can be fulfilled; every other is a sentence in ``missing``."""
+    """Find out which of the wishes can be fulfilled; every other is a sentence in ``missing``."""
     missing = []
     if find_spec("rerun") is None or find_spec("rerun_bindings") is None:
         return Destinations(None, None, False, None, (sr.not_installed("rerun-sdk"),))
@@ -82,7 +82,7 @@ def look(save: Path | None, connect: str | None, spawn: bool, serve: bool) -> De
 
 
 def address_of(text: str) -> tuple[str, int]:
-    """Host and port of ``host``, ``host:port`` or a Rerun address ``rerun+http://host:port/proxy``; raises
+    """Return host and port of ``host``, ``host:port`` or a Rerun address ``rerun+http://host:port/proxy``; raises
     `ValueError`."""
     plain = text.split("://", 1)[-1].split("/", 1)[0]
     host, colon, port = plain.rpartition(":")
@@ -94,7 +94,7 @@ def address_of(text: str) -> tuple[str, int]:
 
 
 def listens(address: tuple[str, int], seconds: float) -> bool:
-    """Whether somebody accepts connections there."""
+    """Return whether somebody accepts connections at an address."""
     try:
         with socket.create_connection(address, timeout=seconds):
             return True
@@ -103,7 +103,7 @@ def listens(address: tuple[str, int], seconds: float) -> bool:
 
 
 def viewer() -> Path:
-    """The viewer itself: the ``rerun`` script is a wrapper that would leave it behind."""
+    """Return the path of the viewer itself: the ``rerun`` script is a wrapper that would leave it behind."""
     spec = find_spec("rerun_cli")
     name = "rerun.exe" if sys.platform == "win32" else "rerun"
     return Path(spec.origin).parent / name if spec is not None and spec.origin else Path(name)
@@ -124,12 +124,12 @@ def start(chosen: Destinations) -> Started:
 
 
 def servers(chosen: Destinations, started: Started) -> list[subprocess.Popen[bytes]]:
-    """Those that end with the recording: a viewer stays."""
+    """Return the processes that end with the recording: a viewer stays."""
     return [process for port, process in started.items() if process is not None and port == chosen.serve]
 
 
 def sinks_of(rr: Any, chosen: Destinations, started: Started) -> tuple[list[Any], list[str]]:
-    """Where a stream is to be sent, and what went wrong."""
+    """Return where a stream is to be sent, and what went wrong."""
     sinks: list[Any] = [] if chosen.save is None else [rr.FileSink(str(chosen.save))]
     addresses, wrong = [] if chosen.connect is None else [chosen.connect], []
     for port, process in started.items():
@@ -149,8 +149,8 @@ def compact(file: Path, arrangement: Any) -> None:
 
     if not file.is_file():
         return
-    parts = [file.with_name(f".{file.name}.{part}") for part in ("joined", "chunks", "arrangement")]
-    joined, chunks, screen = parts
+    temporaries = [file.with_name(f".{file.name}.{suffix}") for suffix in ("joined", "chunks", "arrangement")]
+    joined, chunks, screen = temporaries
     try:
         reader = RrdReader(str(file))
         (store,) = reader.recordings()
@@ -162,9 +162,9 @@ def compact(file: Path, arrangement: Any) -> None:
         joined.replace(file)
     except Exception:  # a large recording is better than none
         logger.debug("the chunks of %s could not be joined", file, exc_info=True)
-    for part in parts:
+    for temporary in temporaries:
         with suppress(OSError):
-            part.unlink(missing_ok=True)
+            temporary.unlink(missing_ok=True)
 
 
 def _unwritable(file: Path) -> str:
@@ -177,7 +177,7 @@ def _unwritable(file: Path) -> str:
 
 
 def _started(port: int, extra: list[str]) -> subprocess.Popen[bytes]:
-    """A viewer that outlives the run, and takes connections from this machine only."""
+    """Start a viewer that outlives the run, and takes connections from this machine only."""
     command = [
         str(viewer()),
         "--bind",
@@ -204,6 +204,6 @@ def _waited(address: tuple[str, int], process: subprocess.Popen[bytes] | None) -
 
 
 def _free_port() -> int:
-    with socket.socket() as one:
-        one.bind(("127.0.0.1", 0))
-        return int(one.getsockname()[1])
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])

@@ -1,4 +1,4 @@
-"""What a panel says before there is anything in it."""
+"""Words in a panel before there is anything in it."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ VIOLATIONS, BOUNDS, CLASH = "the violations", "the bounds", "what clashes"
 
 @final
 class Waiting:
-    """Writes into every panel of a run that is still empty what it waits for, and takes the words away again when the
+    """Words in every panel of a run that is still empty, which say what it waits for; they are taken away when the
     panel has a picture (`arrived`)."""
 
     def __init__(self, rr: Any, stream: Any, shown: Shown) -> None:
@@ -27,14 +27,14 @@ class Waiting:
         self.places = dict[str, list[str]]()
         first = "the first search ends" if shown.searches else "the first round ends"
         if shown.problem is not None:
-            drawn = "the first tuple is evaluated" if shown.searches else first
+            event = "the first tuple is evaluated" if shown.searches else first
             for number, page in enumerate(pages(shown.problem)):
                 count = len(page.plots)
-                each = physics.HEIGHT if number else physics.height(count, shown.searches)
-                words = f"the control and the states are drawn when {drawn}"
-                self._write(CONTROL, page.path, physics.extent(count, each), words)
+                plot_height = physics.HEIGHT if number else physics.height(count, shown.searches)
+                words = f"the control and the states are drawn when {event}"
+                self._write(CONTROL, page.path, physics.extent(count, plot_height), words)
             if pair_of(shown.problem) is not None:
-                self._write(CONTROL, "physics/phase", PHASE, f"drawn when {drawn}")
+                self._write(CONTROL, "physics/phase", PHASE, f"drawn when {event}")
         if shown.landscape:
             tuples = "the first tuple is evaluated" if shown.searches else "the first constraints are active"
             self._write(LANDSCAPE, "landscape/map", views.EXTENT, f"the landscape of g is drawn when {tuples}")
@@ -50,13 +50,13 @@ class Waiting:
         self._write(BOUNDS, "rounds/picture/bounds", bounds.ONE, f"no bound yet: {first} with the first one")
 
     def arrived(self, panel: str) -> None:
-        """A panel has its first picture."""
+        """Take away the words of a panel, which has its first picture."""
         for path in self.places.pop(panel, ()):
             self.stream.log(path, self.rr.Clear(recursive=True))
 
     def _write(self, panel: str, path: str, extent: tuple[float, float, float, float], words: str) -> None:
         left, right, top, bottom = extent
-        drawing, place = Drawing(), f"{path.strip('/')}/waiting"
+        drawing, entity = Drawing(), f"{path.strip('/')}/waiting"
         drawing.text((left + right) / 2, (top + bottom) / 2, words, ink.GREY)
-        drawing.log(self.rr, self.stream, place)
-        self.places.setdefault(panel, []).append(place)
+        drawing.log(self.rr, self.stream, entity)
+        self.places.setdefault(panel, []).append(entity)

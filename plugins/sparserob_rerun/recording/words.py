@@ -1,4 +1,4 @@
-"""The log of decisions, and the page that says what is known and what the colours mean."""
+"""Texts of a recording: the log of decisions, and the page that says what is known and what the colours mean."""
 
 from __future__ import annotations
 
@@ -40,11 +40,12 @@ STATES: dict[str, Colour] = {
     "refuted": ink.VERMILLION,
     "failed": ink.VERMILLION,
 }
-"""What a run may be at, or may have ended with, and the colour of each."""
+"""States of a run and statuses at its end, with the colour of each."""
 
 
 def state_of(event: sr.Event, before: str) -> str:
-    """What a run is at when an event of it comes; what it was at ``before``, where the event says nothing of it."""
+    """Return the state of a run when an event of it comes, or the state ``before``, where the event says nothing of
+    it."""
     match event:
         case sr.EvaluationsFinished():
             return "violations" if event.family else "polish" if event.phase == "polish" else "search"
@@ -58,23 +59,27 @@ def state_of(event: sr.Event, before: str) -> str:
 
 
 def round_lines(event: sr.RoundFinished, inspection: sr.Inspection | None) -> list[str]:
-    """One round in words: its bounds, what is violated, and the cuts that come of it."""
-    known = inspection is not None and any(family.name == event.worst_family for family in inspection.program.families)
-    tolerance = inspection.tolerance(event.worst_family) if inspection is not None and known else 0.0
+    """Describe one round in words: its bounds, what is violated, and the cuts that come of it."""
+    is_known = inspection is not None and any(
+        family.name == event.worst_family for family in inspection.program.families
+    )
+    tolerance = inspection.tolerance(event.worst_family) if inspection is not None and is_known else 0.0
     unit = f" {event.measured}" if event.measured else ""
     if event.violation > tolerance:
-        violated = f"{event.worst_family} is violated by {event.violation:.2e}{unit}"
+        violation = f"{event.worst_family} is violated by {event.violation:.2e}{unit}"
     elif event.violation > 0.0:
-        violated = f"every constraint holds, {event.worst_family} to within {event.violation:.1e}{unit}"
+        violation = f"every constraint holds, {event.worst_family} to within {event.violation:.1e}{unit}"
     else:
-        violated = f"every constraint holds with {-event.violation:.2e}{unit} to spare"
+        violation = f"every constraint holds with {-event.violation:.2e}{unit} to spare"
     if event.simplified:
-        violated += ", with some of the uncertainty only"
-    above = math.inf if event.simplified else event.upper_bound
-    bound = f"lower bound {event.lower_bound:.7g}" + (f", upper bound {above:.7g}" if math.isfinite(above) else "")
-    if event.proven < above:
+        violation += ", with some of the uncertainty only"
+    upper_bound = math.inf if event.simplified else event.upper_bound
+    bound = f"lower bound {event.lower_bound:.7g}" + (
+        f", upper bound {upper_bound:.7g}" if math.isfinite(upper_bound) else ""
+    )
+    if event.proven < upper_bound:
         bound += f", proven: a control of cost {event.proven:.7g}"
-    lines = [f"round {event.round}: {bound}; {violated}; epsilon {event.epsilon:.1e}"]
+    lines = [f"round {event.round}: {bound}; {violation}; epsilon {event.epsilon:.1e}"]
     for word, cuts in (("+", event.added), ("-", event.dropped)):
         lines += [f"{word} {cut_words(cut, inspection)}" for cut in cuts[:CUTS]]
         if len(cuts) > CUTS:
@@ -83,9 +88,11 @@ def round_lines(event: sr.RoundFinished, inspection: sr.Inspection | None) -> li
 
 
 def cut_words(cut: sr.Cut, inspection: sr.Inspection | None) -> str:
-    """A constraint at an index, as its family tells it: ``path: x1(1.55) <= 0.7``."""
+    """Describe a constraint at an index, as its family reports it: ``path: x1(1.55) <= 0.7``."""
     families = () if inspection is None else inspection.program.families
-    family = next((one.formulated(cut.formulation) for one in families if one.name == cut.family), None)
+    family = next(
+        (candidate.formulated(cut.formulation) for candidate in families if candidate.name == cut.family), None
+    )
     if family is not None and family.explain is not None:
         return family.explanation(cut.index, cut.row).short()
     if cut.formulation == "sampled" and len(cut.index) > 1:
@@ -95,15 +102,15 @@ def cut_words(cut: sr.Cut, inspection: sr.Inspection | None) -> str:
 
 
 def page(title: str, status: str, lower: float, upper: float, more: list[str]) -> str:
-    """The page in Markdown."""
+    """Return the page in Markdown."""
     if status == "infeasible":
         bounds = "no control meets the constraints, so there is no J*"
     elif math.isfinite(lower) or math.isfinite(upper):
         bounds = f"{_number(lower)} ≤ J* ≤ {_number(upper)}"
     else:
         bounds = "no bound yet" if status == "solving" else "no bound is known"
-    known = math.isfinite(lower) and math.isfinite(upper) and status != "infeasible"
-    gap = f"; {(upper - lower) / max(abs(upper), 1e-12):.2g} of it apart" if known and upper > lower else ""
+    is_bounded = math.isfinite(lower) and math.isfinite(upper) and status != "infeasible"
+    gap = f"; {(upper - lower) / max(abs(upper), 1e-12):.2g} of it apart" if is_bounded and upper > lower else ""
     return "\n\n".join(
         [f"**{status}**: {bounds}{gap}", *more, f"*{title}*", CLASHES if status == "infeasible" else LEGEND]
     )
@@ -118,7 +125,7 @@ def _number(value: float) -> str:
 
 
 def verdict_lines(event: sr.RunFinished) -> list[str]:
-    """What the run ended with."""
+    """Describe in words how the run ended."""
     lines = [event.message] if event.message else []
     result = event.result
     if result is not None and result.decision is not None:
@@ -130,7 +137,7 @@ def verdict_lines(event: sr.RunFinished) -> list[str]:
 
 
 def _worst_words(result: sr.Result, worst: Any) -> str:
-    """The worst case, in agreement with what was proven of it."""
+    """Describe the worst case, in agreement with what was proven of it."""
     at = f" at t = {worst.time:.5g}" if isinstance(worst, sr.Witness) and worst.time is not None else ""
     proven = any(proof.family == worst.constraint and proof.verdict == "proven" for proof in result.proofs)
     if worst.violation <= 0.0:

@@ -1,1 +1,1 @@
-"""A search as it climbs: its evaluations, its way, and the landscape of g around it."""
+"""Pictures of a search as it climbs: its evaluations, its path, and the landscape of g around it."""

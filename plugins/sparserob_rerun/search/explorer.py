@@ -1,4 +1,4 @@
-"""Decides which landscape is evaluated next, and how far: the background work of a recording."""
+"""Choice of the landscape that is evaluated next, and how far: the background work of a recording."""
 
 from __future__ import annotations
 
@@ -15,11 +15,12 @@ from sparserob_rerun.options import LandscapeOptions
 
 SLICE = 0.02  # seconds of processor time between two looks at the queue
 LARGE = 0.02
-"""Of the height of a landscape: a gain after which it is drawn anew at once. Ten times as much, and the search is seen
-to be elsewhere than where it is; a tenth, and no landscape is ever refined."""
+"""Gain, as a share of the height of a landscape, after which it is drawn anew at once. Ten times as much, and the
+search is seen to be elsewhere than where it is; a tenth, and no landscape is ever refined."""
 SAME = 1e-3
-"""Of the same height: a smaller gain is not to be seen in the colours. Ten times as much, and landscapes that look
-different are seconds old; a tenth, and the last digits of a polished search begin them anew for ever."""
+"""Gain, as a share of the same height, below which nothing is to be seen in the colours. Ten times as much, and
+landscapes that look different are seconds old; a tenth, and the last digits of a polished search begin them anew for
+ever."""
 STALE = 1.0
 """Seconds after which any gain that is to be seen is enough. Ten times as many, and what is drawn is of ten seconds
 ago; with a tenth a landscape that a slow climb renews is never refined."""
@@ -30,8 +31,8 @@ HELD = 0.8
 """Seconds for which a new landscape may wait until it is as fine as the one that is shown, which is of the same weight
 and nearly as high. Ten times as many, and what is drawn is too old; a tenth, and fine drawings flicker."""
 REFINING = 1 / 3
-"""Of the share of a core, what finer grids may take; the rest is kept for the coarse one after the next gain. With a
-tenth of it no map of a short search is ever fine; with all of it, what is drawn after a gain is seconds old."""
+"""Part of the share of a core that finer grids may take; the rest is kept for the coarse one after the next gain. With
+a tenth of it no map of a short search is ever fine; with all of it, what is drawn after a gain is seconds old."""
 VISIBLE = 1e-6  # of g: what two solvers make of one value differs by less, and what is seen by more
 RESERVE = 0.25  # of the evaluations, for which landscapes stay coarse
 
@@ -39,7 +40,7 @@ RESERVE = 0.25  # of the evaluations, for which landscapes stay coarse
 @final
 @dataclass(frozen=True, eq=False)
 class Aim:
-    """A tuple ``(D, width)`` whose surroundings are worth a look, with the ``value`` that the search has for it.
+    """Tuple ``(D, width)`` whose surroundings are worth a look, with the ``value`` that the search has for it.
     ``round``: the round that it is of, 0 for none; ``pair``: which two indices decide most, where that is known."""
 
     slots: Floats
@@ -50,13 +51,13 @@ class Aim:
     pair: tuple[int, ...] = ()
 
     def exceeds(self, other: Aim) -> bool:
-        """Return whether its value is visibly above another one of the same weight, or either is not known."""
+        """Return whether the value is visibly above another one of the same weight, or either is not known."""
         return self.epsilon != other.epsilon or not self.value - other.value <= VISIBLE * max(1.0, abs(self.value))
 
 
 @final
 class Explorer:
-    """Draws one landscape after the other, each through the best tuple that is known when it is begun.
+    """Evaluation of one landscape after the other, each through the best tuple that is known when it is begun.
 
     A landscape of another weight epsilon is given up at once, for a coarse one of the new weight, which waits for
     nothing. After a gain of `LARGE` a coarse one follows, as soon as the share of a core that the options allow has
@@ -84,12 +85,12 @@ class Explorer:
 
     @property
     def busy(self) -> bool:
-        """Whether there is something left to evaluate."""
+        """True where there is something left to evaluate."""
         return self.left > 0 and (self.waiting is not None or (self.aimed is not None and not self._finished))
 
     @property
     def urgent(self) -> bool:
-        """Whether a first, coarse landscape is wanted: the first of a weight."""
+        """True where a first, coarse landscape is wanted: the first of a weight."""
         return self.left > 0 and (
             (self.aimed is not None and not self._coarse)
             or (self.waiting is not None and (self.aimed is None or self.aimed.epsilon != self.waiting.epsilon))
@@ -179,7 +180,7 @@ class Explorer:
 
     @property
     def _coarser(self) -> bool:
-        """Whether what is new is coarser than what is shown of the same weight."""
+        """True where the new landscape is coarser than the one that is shown, of the same weight."""
         if self.drawn is None or self.landscape is None or self.aimed is None:
             return False
         before, shown = self.drawn
@@ -187,21 +188,22 @@ class Explorer:
 
     @property
     def _gained(self) -> float:
-        """By how much what is new is higher than what is shown, in heights of it."""
+        """Gain of the new landscape over the one that is shown, in heights of the latter."""
         assert self.drawn is not None and self.aimed is not None
         before, shown = self.drawn
         return _gain(self.aimed, before, shown)
 
     @property
     def _held(self) -> bool:
-        """Whether what is shown may stay for a moment, because what is new is coarser and hardly higher."""
+        """True where the landscape that is shown may stay for a moment, because the new one is coarser and hardly
+        higher."""
         if not self._coarser:
             return False
         gain = self._gained
         return gain <= SAME or (gain <= LARGE and time.monotonic() - self.since < HELD)
 
     def _better(self, waiting: Aim) -> bool:
-        """Whether a tuple that is waiting is worth more than the landscape in work."""
+        """Return whether a tuple that is waiting is worth more than the landscape in work."""
         if self.aimed is None or self._finished or self.landscape is None:
             return self.aimed is None or self._finished
         if not self._coarse:
@@ -219,18 +221,18 @@ class Explorer:
         if len(slots) == 1 and sr.LandscapeAxes.over(g, 1) is None:  # then the other axis is where one more index is
             slots = np.repeat(slots, 2, axis=0)
             g = self.inspection.relaxed_value(2, aim.epsilon)
-        known, middle = min(slots.shape[1], g.slot.dimension), (g.slot.lower + g.slot.upper) / 2
+        width, middle = min(slots.shape[1], g.slot.dimension), (g.slot.lower + g.slot.upper) / 2
         anchor = np.tile(middle, (len(slots), 1))
-        anchor[:, :known] = slots[:, :known]
+        anchor[:, :width] = slots[:, :width]
         anchor = np.clip(anchor, g.slot.lower, g.slot.upper)
         if sr.LandscapeAxes.over(g, len(anchor)) is None:
             self.wrong = "no landscape: no coordinate of the indices can move"
             return
-        known_pair = len(aim.pair) == 2 and len(set(aim.pair)) == min(2, len(anchor)) and max(aim.pair) < len(anchor)
-        if not known_pair:
+        has_pair = len(aim.pair) == 2 and len(set(aim.pair)) == min(2, len(anchor)) and max(aim.pair) < len(anchor)
+        if not has_pair:
             g.at(anchor)
             yield False
-        pair = (aim.pair[0], aim.pair[1]) if known_pair else sr.deciding_pair(g, anchor)
+        pair = (aim.pair[0], aim.pair[1]) if has_pair else sr.deciding_pair(g, anchor)
         reach = dict[tuple[int, int], tuple[float, float]]()
         if self.options.coordinates is None:
             for _ in sr.LandscapeAxes.measure(g, anchor, pair, reach):
@@ -248,8 +250,8 @@ def _same(one: Aim, other: Aim) -> bool:
 
 
 def _gain(aim: Aim, before: Aim, landscape: sr.Landscape) -> float:
-    """By how much a tuple has a higher value than the one before, of the height of its landscape; NaN where a value is
-    not known."""
+    """Return by how much a tuple has a higher value than the one before, relative to the height of its landscape; NaN
+    where a value is not known."""
     low, high = landscape.limits
     gain = aim.value - before.value
     return gain / (high - low) if high > low else (np.inf if gain > 0.0 else gain)

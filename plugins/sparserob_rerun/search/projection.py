@@ -1,4 +1,5 @@
-"""What a search does, in the coordinates of the map: where the two indices are that decide most in each of its tuples.
+"""Projection of a search onto the coordinates of the map: where the two indices are that decide most in each of its
+tuples.
 
 Of a tuple only the coordinates that a map may have travel to the process that records (`thin`), never those of its
 disturbances: all else is computed there, and takes no time from the search.
@@ -20,14 +21,14 @@ REMEMBERED = 20_000
 """Evaluated tuples whose deciding indices are remembered for cells around them, 200 bytes each. With a tenth of it most
 cells of a search by partition are older; with ten times as many they take 40 MB."""
 DIGITS = 1e7
-"""By this many parts of a box two tuples are told apart: ten times fewer mix neighbours in deep cells, ten times more
-lose those whose middle was rounded."""
+"""Number of parts of a box by which two tuples are told apart: ten times fewer mix neighbours in deep cells, ten times
+more lose those whose middle was rounded."""
 
 
 @final
 @dataclass(frozen=True, eq=False)
 class Outlines:
-    """A sketch of ``count`` things, over the places of the indices that decide at the middle of each: points, boxes or
+    """Sketch of ``count`` things, over the places of the indices that decide at the middle of each: points, boxes or
     ellipses from ``lower (k, 2, c)`` to ``upper``."""
 
     lower: Floats
@@ -54,14 +55,14 @@ class Projection:
 
 
 def thin(event: sr.EvaluationsFinished) -> sr.EvaluationsFinished:
-    """The event with points, domain and sketches over the ``coordinates`` of each index only, the others left out;
-    without any of them where there is no map of it."""
+    """Return the event with points, domain and sketches over the ``coordinates`` of each index only, the others left
+    out; without any of them where there is no map of it."""
     batch, domain, width = event.batch, event.domain, len(event.coordinates)
     count = sum(len(values) for values in batch.values)
     values = [np.concatenate(list(batch.values))] if count else []
     if domain is None or not width or len(event.deciding) != count or not count:
-        none = replace(batch, points=[np.zeros((count, 0))], values=values, origin=None)
-        return replace(event, domain=None, sketches={}, deciding=event.deciding[:0], batch=none)
+        empty = replace(batch, points=[np.zeros((count, 0))], values=values, origin=None)
+        return replace(event, domain=None, sketches={}, deciding=event.deciding[:0], batch=empty)
     starts = np.arange(0, domain.dimension, event.block)[:, np.newaxis]
     columns = (starts + np.array(event.coordinates)).ravel()
     points = np.concatenate(list(batch.points))[:, columns]
@@ -81,28 +82,29 @@ def _thinned(sketch: sr.Sketch, columns: np.ndarray) -> sr.Sketch:
 
 @final
 class Projector:
-    """Projects the events of searches, `thin` ones; it remembers of evaluated tuples which of their indices decide."""
+    """Projector of the events of searches, `thin` ones; it remembers of evaluated tuples which of their indices
+    decide."""
 
     def __init__(self) -> None:
         self.pair, self.known = (0, 0), dict[int, tuple[int, int]]()
 
     def of(self, event: sr.EvaluationsFinished) -> Projection:
-        """What is drawn of an event."""
+        """Return what is drawn of an event."""
         if event.domain is None:
             return Projection()
         count, width = event.count, len(event.coordinates)
         lower, upper = event.domain.lower, event.domain.upper
         if event.total == count:
             self.pair, self.known = (0, min(1, lower.size // width - 1)), {}
-        plain = event.batch.trace.points
-        tuples = plain.reshape(count, -1, width)
+        points = event.batch.trace.points
+        tuples = points.reshape(count, -1, width)
         slots = sr.deciding_slots(event.deciding, tuples, (upper - lower)[:width], self.pair)
         self.pair = (int(slots[-1, 0]), int(slots[-1, 1]))
-        self.known.update(zip(_keys(plain, lower, upper).tolist(), map(tuple, slots.tolist()), strict=True))
+        self.known.update(zip(_keys(points, lower, upper).tolist(), map(tuple, slots.tolist()), strict=True))
         for key in list(islice(self.known, max(0, len(self.known) - REMEMBERED))):
             del self.known[key]
-        rows, moved = event.batch.moves.T
-        moves = np.column_stack([rows, np.array(event.coordinates)[moved % width], plain[rows, moved]])
+        rows, coordinates = event.batch.moves.T
+        moves = np.column_stack([rows, np.array(event.coordinates)[coordinates % width], points[rows, coordinates]])
         sketches = {role: self._outlines(sketch, event.domain, width) for role, sketch in event.sketches.items()}
         places = tuples[np.arange(count)[:, np.newaxis], slots]
         return Projection(event.coordinates, places, slots, moves, sketches)
@@ -111,20 +113,21 @@ class Projector:
         lower, upper = sketch.lower, sketch.upper
         keys = _keys((lower + upper) / 2, box.lower, box.upper)
         pairs = np.array([self.known.get(int(key), self.pair) for key in keys]).reshape(-1, 2)
-        mine = np.arange(len(pairs))[:, np.newaxis], pairs
-        low, high = (side.reshape(len(pairs), -1, width)[mine] for side in (lower, upper))
+        selection = np.arange(len(pairs))[:, np.newaxis], pairs
+        low, high = (side.reshape(len(pairs), -1, width)[selection] for side in (lower, upper))
         return Outlines(low, high, sketch.rounded, sketch.points, len(pairs))
 
 
 def _keys(plain: Floats, lower: Floats, upper: Floats) -> np.ndarray:
-    """Numbers ``(k,)`` by which tuples ``(k, d)`` are found again, whatever rounding did to their last digits."""
+    """Return numbers ``(k,)`` by which tuples ``(k, d)`` are found again, whatever rounding did to their last
+    digits."""
     weights = np.cos(np.arange(1.0, plain.shape[1] + 1.0))  # so that no two coordinates of a grid make up for another
     return np.round(((plain - lower) / (upper - lower)) @ weights * DIGITS).astype(np.int64)
 
 
 def outlines_on(axes: sr.LandscapeAxes, told: tuple[int, ...], sketch: Outlines) -> tuple[Floats, Floats] | None:
-    """The corners ``(k, 2)`` of a sketch on a map, lower and upper; ``None`` where its coordinates are not among those
-    ``told``."""
+    """Return the corners ``(k, 2)`` of a sketch on a map, lower and upper; ``None`` where its coordinates are not among
+    those ``told``."""
     if not set(axes.coordinates) <= set(told):
         return None
     columns = [told.index(c) for c in axes.coordinates]

@@ -1,4 +1,5 @@
-"""A maximiser at work: every value, its walk, the best, its own scalars, and where in the index space it looks."""
+"""Pictures of a maximiser at work: every value, its walk, the best, its own scalars, and where in the index space it
+looks."""
 
 from __future__ import annotations
 
@@ -55,13 +56,14 @@ CLOUDS: dict[str, tuple[str, Colour]] = {"tried": ("tried", ink.SKY), "refused":
 MEANS = ("accepted", "local")  # 0 or 1 at every evaluation, of which a mean says more
 WINDOW = 50
 STRAIGHT = 1e-9
-"""Of the largest value: what bends less is a straight line, for rounding bends more than a tenth of it; of ten times as
-much nothing is seen either."""
+"""Second difference, as a share of the largest value, below which a line is straight. Rounding alone gives more than a
+tenth of it; ten times as much is not seen either."""
 
 
 @final
 class SearchView:
-    """Logs evaluations below ``/search`` in columns: one call for each batch and entity, whatever its size."""
+    """Series of evaluations below ``/search``, logged in columns: one call for each batch and entity, whatever its
+    size."""
 
     def __init__(self, rr: Any, stream: Any, timelines: Timelines) -> None:
         self.rr, self.stream, self.timelines = rr, stream, timelines
@@ -95,7 +97,7 @@ class SearchView:
         self._cloud("search/g/tried", at, np.where(refused, np.nan, batch.values), CLOUDS["tried"])
         self._cloud("search/g/refused", at, np.where(refused, batch.values, np.nan), CLOUDS["refused"])
         walk, best = stage.walk[stage.values.size - count :], batch.best
-        for name, values, which in (
+        for name, values, indices in (
             ("walk", walk, _corners(walk)),
             ("best", best, _corners(best)),
             ("bound", np.full(count, event.lower_bound), np.array([0, count - 1] if count > 1 else [0])),
@@ -103,7 +105,7 @@ class SearchView:
             path = f"search/g/{name}"
             if path in self.known or np.isfinite(values).any():  # that a line is interrupted has to be sent as well
                 self._line(path, *SERIES[name])
-                self.stream.send_columns(path, at(which), self.rr.Scalars.columns(scalars=_shown(values[which])))
+                self.stream.send_columns(path, at(indices), self.rr.Scalars.columns(scalars=_shown(values[indices])))
         self._notes(event, stage, numbers, began)
         self._moves(event, stage, numbers, began, moving, projection.moves)
         self.timelines.move(stage.base + event.total, event.round, began + event.seconds)
@@ -115,13 +117,13 @@ class SearchView:
             self.stream.send_columns(path, at, self.rr.Scalars.columns(scalars=np.array([np.nan])))
 
     def exact(self, value: float, epsilon: float, base: int) -> None:
-        """The proven value, over the evaluations of the last search, before which there were ``base``."""
+        """Draw the proven value over the evaluations of the last search, before which there were ``base``."""
         self._line("search/g/exact", f"exact value (epsilon {epsilon:.3g})" if epsilon else "exact value", ink.PURPLE)
         at = [self.rr.TimeColumn("evaluation", sequence=np.array([base + 1, max(base + 2, self.timelines.evaluation)]))]
         self.stream.send_columns("search/g/exact", at, self.rr.Scalars.columns(scalars=np.full(2, value)))
 
     def separation(self, event: sr.EvaluationsFinished, began: float) -> None:
-        """A search for the worst index of one family: a series of its own, on the timeline of seconds only."""
+        """Log a search for the worst index of one family as a series of its own, on the timeline of seconds only."""
         path, batch = f"separation/{event.family}", event.batch.trace
         self._line(path, f"violation of {event.family}", ink.VERMILLION)
         at = [self.rr.TimeColumn("time", duration=began + batch.seconds)]
@@ -134,27 +136,29 @@ class SearchView:
                 continue
             self.notes.add(name)
             words, colour = NOTES.get(name, (name, ink.GREY))
-            where = np.clip(rows[:, 0].astype(int) + stage.base - numbers[0], 0, numbers.size - 1)
+            positions = np.clip(rows[:, 0].astype(int) + stage.base - numbers[0], 0, numbers.size - 1)
             values = rows[:, 1]
             if name in MEANS:
-                counts = event.batch.changes[where] if name == "accepted" else np.ones(where.size, dtype=bool)
-                where, values = where[counts], self._share(name, values[counts])
+                is_counted = (
+                    event.batch.changes[positions] if name == "accepted" else np.ones(positions.size, dtype=bool)
+                )
+                positions, values = positions[is_counted], self._share(name, values[is_counted])
             if not values.size:
                 continue
             if name in LOGARITHMIC:
                 values = np.log10(np.where(values > 0.0, values, np.nan))
             path = f"search/notes/{name}"
 
-            def at(which: np.ndarray, rows: np.ndarray = where) -> list[Any]:
-                mine = rows[which]
-                return self.timelines.columns(numbers[mine], began + batch.seconds[mine], event.round)
+            def at(which: np.ndarray, rows: np.ndarray = positions) -> list[Any]:
+                indices = rows[which]
+                return self.timelines.columns(numbers[indices], began + batch.seconds[indices], event.round)
 
             if name == "move":
-                self._kinds(event, path, where, values, at)
+                self._kinds(event, path, positions, values, at)
                 continue
             self._line(path, words, colour)
-            few = _corners(values)
-            self.stream.send_columns(path, at(few), self.rr.Scalars.columns(scalars=_shown(values[few])))
+            corners = _corners(values)
+            self.stream.send_columns(path, at(corners), self.rr.Scalars.columns(scalars=_shown(values[corners])))
 
     def _kinds(
         self,
@@ -164,17 +168,18 @@ class SearchView:
         kinds: Floats,
         at: Callable[[np.ndarray], list[Any]],
     ) -> None:
-        """Which share of the moves of each of the ``kinds (k,)``, of those that changed g, the walk accepted."""
+        """Draw the share of the moves of each of the ``kinds (k,)``, of those that changed g, that the walk
+        accepted."""
         changes, accepted = event.batch.changes[where], event.batch.accepted[where].astype(float)
         for kind, (words, colour) in KINDS.items():
-            mine = np.flatnonzero(changes & (kinds == kind))
-            if mine.size:
+            indices = np.flatnonzero(changes & (kinds == kind))
+            if indices.size:
                 self._line(f"{path}/{kind}", words, colour)
-                shares = self._share(f"{path}/{kind}", accepted[mine])
-                self.stream.send_columns(f"{path}/{kind}", at(mine), self.rr.Scalars.columns(scalars=shares))
+                shares = self._share(f"{path}/{kind}", accepted[indices])
+                self.stream.send_columns(f"{path}/{kind}", at(indices), self.rr.Scalars.columns(scalars=shares))
 
     def _share(self, of: str, flags: Floats) -> Floats:
-        """The mean of the last flags ``of`` one kind at each of the new ones."""
+        """Return the mean of the last flags ``of`` one kind at each of the new ones."""
         recent = self.recent.get(of, np.empty(0))
         joined = np.concatenate([recent, flags])
         sums = np.concatenate([[0.0], np.cumsum(joined)])
@@ -192,22 +197,24 @@ class SearchView:
         moving: dict[int, str],
         moves: Floats,
     ) -> None:
-        """Where the coordinates went that moved ``(m, 3)``, one series for each kind: to which time or parameter. Of
-        a walk the moves that it accepted and that changed g."""
+        """Draw where the coordinates went that moved ``(m, 3)``, one series for each kind: to which time or parameter.
+        Of a walk, draw the moves that it accepted and that changed g."""
         rows = moves[:, 0].astype(int)
-        kept = ~stage.refused[stage.values.size - event.batch.trace.values.size :]
-        moves = moves[(kept & event.batch.changes if stage.walks else kept)[rows]]
+        is_accepted = ~stage.refused[stage.values.size - event.batch.trace.values.size :]
+        moves = moves[(is_accepted & event.batch.changes if stage.walks else is_accepted)[rows]]
         for kind, name in moving.items():
-            mine = _few(moves[moves[:, 1] == kind])
-            if not len(mine):
+            kind_moves = _few(moves[moves[:, 1] == kind])
+            if not len(kind_moves):
                 continue
             self.moved.add(name)
 
-            def at(which: np.ndarray, rows: Floats = mine) -> list[Any]:
-                these = rows[which, 0].astype(int)
-                return self.timelines.columns(numbers[these], began + event.batch.trace.seconds[these], event.round)
+            def at(which: np.ndarray, rows: Floats = kind_moves) -> list[Any]:
+                evaluations = rows[which, 0].astype(int)
+                return self.timelines.columns(
+                    numbers[evaluations], began + event.batch.trace.seconds[evaluations], event.round
+                )
 
-            self._cloud(f"search/moves/{name}", at, mine[:, 2], (f"{name} of what moved", ink.PURPLE))
+            self._cloud(f"search/moves/{name}", at, kind_moves[:, 2], (f"{name} of what moved", ink.PURPLE))
 
     def _line(self, path: str, words: str, colour: Colour, width: float = 1.5) -> None:
         if path not in self.known:
@@ -220,20 +227,20 @@ class SearchView:
     def _cloud(
         self, path: str, at: Callable[[np.ndarray], list[Any]], values: Floats, style: tuple[str, Colour]
     ) -> None:
-        """Points at those of the values ``(k,)`` that are finite; ``at`` makes the columns of times of these."""
-        which = np.flatnonzero(np.isfinite(values))
-        if not which.size:
+        """Draw points at those of the values ``(k,)`` that are finite; ``at`` makes the columns of times of these."""
+        indices = np.flatnonzero(np.isfinite(values))
+        if not indices.size:
             return
         if path not in self.known:
             self.known.add(path)
             words, colour = style
             points = self.rr.SeriesPoints(names=[words], colors=[ink.legible(colour)], marker_sizes=[1.5])
             self.stream.log(path, points, static=True)
-        self.stream.send_columns(path, at(which), self.rr.Scalars.columns(scalars=values[which]))
+        self.stream.send_columns(path, at(indices), self.rr.Scalars.columns(scalars=values[indices]))
 
 
 def _few(moves: np.ndarray) -> np.ndarray:
-    """At most `MOVES` rows of each evaluation; rows are sorted by evaluation."""
+    """Return at most `MOVES` rows of each evaluation; rows are sorted by evaluation."""
     if not len(moves):
         return moves
     first = np.searchsorted(moves[:, 0], moves[:, 0], side="left")
@@ -241,17 +248,17 @@ def _few(moves: np.ndarray) -> np.ndarray:
 
 
 def _corners(values: Floats) -> np.ndarray:
-    """Which of the values ``(k,)`` of a batch a line needs: the first, the last, and those that are not between their
-    neighbours on a straight line; of several in a row that are not finite the first."""
+    """Return the indices of the values ``(k,)`` of a batch that a line needs: the first, the last, and those that are
+    not between their neighbours on a straight line; of several in a row that are not finite the first."""
     shown = _shown(values)
-    bends, finite = np.abs(np.diff(shown, 2)), np.isfinite(shown)
-    scale = np.max(np.abs(shown[finite]), initial=0.0)
-    kept = np.ones(values.size, dtype=bool)
-    kept[1:-1] = ~(bends <= STRAIGHT * scale)  # what is beside a gap stays
-    kept[1:] &= finite[1:] | finite[:-1]
-    return np.flatnonzero(kept)
+    curvature, is_finite = np.abs(np.diff(shown, 2)), np.isfinite(shown)
+    scale = np.max(np.abs(shown[is_finite]), initial=0.0)
+    is_needed = np.ones(values.size, dtype=bool)
+    is_needed[1:-1] = ~(curvature <= STRAIGHT * scale)  # what is beside a gap stays
+    is_needed[1:] &= is_finite[1:] | is_finite[:-1]
+    return np.flatnonzero(is_needed)
 
 
 def _shown(values: Floats) -> Floats:
-    """NaN, which a plot leaves out, in the place of infinite values, which would flatten it."""
+    """Replace infinite values, which would flatten a plot, by NaN, which it leaves out."""
     return np.where(np.isfinite(values), values, np.nan)

@@ -1,4 +1,4 @@
-"""The landscape as it is drawn: a heat map with the way of the search on it, and the same as a surface."""
+"""Pictures of the landscape: a heat map with the path of the search on it, and a surface."""
 
 from __future__ import annotations
 
@@ -24,28 +24,28 @@ ABOUT = (
     "**g of a tuple**: the least cost of a control that meets the constraints at its few indices. Its maximum over all"
     " tuples is J\\*, the least cost of a control that meets all."
 )
-"""What a person who has never seen the map has to know first."""
+"""Introduction for a person who has never seen the map."""
 LIFT = 0.015  # points stand this share of the height above the surface
 POLE = 0.32
-"""How far above the surface the value of the best point is written, in heights of it, wherever that point is. Much
-lower, the bright surface is behind the words, which cannot be read in a light theme; twice as high, they are outside
-the panel."""
+"""Height above the surface at which the value of the best point is written, in heights of the surface, wherever that
+point is. Much lower, the bright surface is behind the words, which cannot be read in a light theme; twice as high, they
+are outside the panel."""
 WORDS = 0.08
-"""How far below the place of these words the line from the point to them ends, which the viewer writes below their
-place. With 0 the line crosses them, with 0.2 it is too short to lead to them."""
+"""Distance below the place of these words at which the line from the point to them ends: the viewer writes them below
+their place. With 0 the line crosses them, with 0.2 it is too short to lead to them."""
 SHOWN = 60  # boxes of a sketch that are drawn
 
 
 @final
 class Terrain:
-    """Draws below ``/landscape``.
+    """Pictures of the landscape below ``/landscape``.
 
     ``/landscape/slice`` holds the numbers of what is drawn: ``across (a,)``, ``up (b,)``, ``values (a b)`` row by row,
     the tuple through which it is (``anchor (2,)``), ``value`` there, ``epsilon`` and ``level``, the stride of the grid.
     """
 
     def __init__(self, rr: Any, stream: Any, unit: str = "", cost: str = "") -> None:
-        """``unit``: of the time, ``cost``: of g; empty where none is known."""
+        """Prepare the pictures; ``unit``: of the time, ``cost``: of g; empty where none is known."""
         self.rr, self.stream, self.unit, self.cost = rr, stream, unit, cost
         self.known: sr.Landscape | None = None
         self.words: dict[str, list[str]] = {"about": [], "map": [], "search": [], "exact": []}
@@ -54,33 +54,33 @@ class Terrain:
         self._say("about", [ABOUT])
 
     def surface(self, landscape: sr.Landscape, aim: Aim) -> None:
-        """The values that are known, as numbers with a colour map, with axes and a colour bar, and as a mesh."""
+        """Draw the values that are known, as numbers with a colour map, with axes and a colour bar, and as a mesh."""
         self.known = landscape
         self.scale = self._scale(landscape, aim)
         self._numbers(landscape.picture(CELLS))
-        (one, other), drawing, axes = landscape.names(self.unit), Drawing(), self._axes(landscape)
+        (across_name, up_name), drawing, axes = landscape.names(self.unit), Drawing(), self._axes(landscape)
         drawing.frame(axes, "", room=1.4)
-        drawing.text(axes.width / 2, axes.height + 62.0, f"across: {one}", ink.GREY)
-        drawing.text(axes.width / 2, -44.0, f"up: {other}", ink.GREY)
+        drawing.text(axes.width / 2, axes.height + 62.0, f"across: {across_name}", ink.GREY)
+        drawing.text(axes.width / 2, -44.0, f"up: {up_name}", ink.GREY)
         drawing.text(BAR[0] + BAR[1] / 2, -44.0, f"g{f' in {self.cost}' if self.cost else ''}", ink.GREY)
         for value, words in _numbers_beside(self.scale):
             drawing.text(BAR[0] + BAR[1] + 48.0, float(self._bar.at(0.0, value)[0, 1]), words, ink.GREY)
         drawing.log(self.rr, self.stream, "landscape/map/axes", layers=("frame",))
         self._anchor(landscape, axes)
-        two = landscape.first[0] != landscape.second[0]
+        has_two = landscape.first[0] != landscape.second[0]
         weight = [f"epsilon {landscape.epsilon:.3g}"] if landscape.epsilon > 0.0 else []
-        both = ["over the two indices that decide most"] if two else []
-        about = [", ".join([*both, *weight])]
-        self._say("map", [*_own(landscape, aim), *_said(landscape), *about, aim.words])
+        phrase = ["over the two indices that decide most"] if has_two else []
+        basis = [", ".join([*phrase, *weight])]
+        self._say("map", [*_own(landscape, aim), *_said(landscape), *basis, aim.words])
         across, up, values = landscape.shown
-        place = [landscape.axes[k][landscape.at[k]] for k in (0, 1)]
+        anchor = [landscape.axes[k][landscape.at[k]] for k in (0, 1)]
         self.stream.log(
             "landscape/slice",
             self.rr.AnyValues(
                 across=across,
                 up=up,
                 values=values.ravel(),
-                anchor=np.array(place),
+                anchor=np.array(anchor),
                 value=[landscape.value],
                 sought=[aim.value],
                 epsilon=[landscape.epsilon],
@@ -91,18 +91,18 @@ class Terrain:
         self._mesh(landscape, self.scale)
 
     def _numbers(self, shown: Floats) -> None:
-        """The values ``(k, k)`` under the cursor, and the colour bar, whose values are those of its colours. Where no
-        decision meets the constraints there is no number, but a colour."""
+        """Draw the values ``(k, k)`` under the cursor, and the colour bar, whose values are those of its colours. Where
+        no decision meets the constraints there is no number, but a colour."""
         rr, stream, limits = self.rr, self.stream, self.scale
         size = len(shown)
-        place = rr.Transform3D(scale=(WIDTH / size, HEIGHT / size, 1.0))
+        transform = rr.Transform3D(scale=(WIDTH / size, HEIGHT / size, 1.0))
         image = np.flipud(np.where(np.isfinite(shown), shown, np.nan).T)
-        stream.log("landscape/map/g", place, self._coloured(image, limits))
-        nowhere = np.flipud((shown == np.inf).T)
-        if nowhere.any():
+        stream.log("landscape/map/g", transform, self._coloured(image, limits))
+        is_infeasible = np.flipud((shown == np.inf).T)
+        if is_infeasible.any():
             brown = np.zeros((size, size, 4), dtype=np.uint8)
-            brown[nowhere] = ink.FORBIDDEN
-            stream.log("landscape/map/infeasible", place, rr.Image(brown, draw_order=1.0))
+            brown[is_infeasible] = ink.FORBIDDEN
+            stream.log("landscape/map/infeasible", transform, rr.Image(brown, draw_order=1.0))
         else:
             stream.log("landscape/map/infeasible", rr.Clear(recursive=False))
         left, width = BAR
@@ -111,7 +111,7 @@ class Terrain:
         stream.log("landscape/map/bar", bar, self._coloured(steps[:, np.newaxis], limits))
 
     def _coloured(self, image: Floats, limits: tuple[float, float]) -> Any:
-        """An image of numbers, with colours from the dark to the bright end."""
+        """Return an image of numbers, with colours from the dark to the bright end."""
         return self.rr.DepthImage(
             np.ascontiguousarray(image, dtype=np.float32),
             meter=1.0,
@@ -126,19 +126,19 @@ class Terrain:
         return Axes(BAR[0], 0.0, BAR[1], HEIGHT, (0.0, 1.0), self.scale)
 
     def _say(self, part: str, lines: list[str]) -> None:
-        """Write what the map shows beside it, where a part of it has changed."""
+        """Write what the map shows beside it, where a part of that text has changed."""
         if self.words[part] != lines:
             self.words[part] = lines
-            text = "\n\n".join(line for one in self.words.values() for line in one if line)
+            text = "\n\n".join(line for block in self.words.values() for line in block if line)
             self.stream.log("landscape/words", self.rr.TextDocument(text, media_type="text/markdown"))
 
     def _anchor(self, landscape: sr.Landscape, axes: Axes) -> None:
-        """The tuple through which the slice goes, with the value that the slice has there."""
-        at = axes.at(landscape.axes[0][landscape.at[0]], landscape.axes[1][landscape.at[1]])
+        """Mark the tuple through which the slice goes, with the value that the slice has there."""
+        pixel = axes.at(landscape.axes[0][landscape.at[0]], landscape.axes[1][landscape.at[1]])
         self.stream.log(
             "landscape/map/best",
             self.rr.Points2D(
-                at,
+                pixel,
                 colors=[ink.ORANGE],
                 radii=self.rr.Radius.ui_points(6.0),
                 draw_order=60.0,
@@ -146,7 +146,7 @@ class Terrain:
         )
 
     def visit(self, stage: Stage) -> None:
-        """The way of a search on the landscape that is shown."""
+        """Draw the path of a search on the landscape that is shown."""
         landscape = self.known
         if landscape is None:
             return
@@ -162,21 +162,21 @@ class Terrain:
     def _path(self, path: Shadow, stage: Stage) -> None:
         assert self.known is not None
         axes, rr = self._axes(self.known), self.rr
-        few = np.unique(np.linspace(max(0, len(path.points) - 4 * TRIED), len(path.points) - 1, TRIED).astype(int))
-        own = stage.values[len(stage.values) - len(path.points) :][few]
-        shades = ink.sequential(np.clip((own - self.scale[0]) / (self.scale[1] - self.scale[0]), 0.0, 1.0))
-        shades[own == np.inf] = ink.FORBIDDEN
-        for name, which, rim, size in (
-            ("tried", ~path.refused[few], ink.TRIED, 2.6),
-            ("refused", path.refused[few], ink.REFUSED, 1.8),
+        indices = np.unique(np.linspace(max(0, len(path.points) - 4 * TRIED), len(path.points) - 1, TRIED).astype(int))
+        values = stage.values[len(stage.values) - len(path.points) :][indices]
+        shades = ink.sequential(np.clip((values - self.scale[0]) / (self.scale[1] - self.scale[0]), 0.0, 1.0))
+        shades[values == np.inf] = ink.FORBIDDEN
+        for name, mask, rim, size in (
+            ("tried", ~path.refused[indices], ink.TRIED, 2.6),
+            ("refused", path.refused[indices], ink.REFUSED, 1.8),
         ):
-            places = axes.at(path.points[few][which, 0], path.points[few][which, 1])
+            pixels = axes.at(path.points[indices][mask, 0], path.points[indices][mask, 1])
             # a rim, by which dots of the map's colour are seen
-            rims = np.tile(np.array(rim, dtype=np.uint8), (len(places), 1))
-            radii = rr.Radius.ui_points(np.repeat([size + 0.9, size], len(places)))
+            rims = np.tile(np.array(rim, dtype=np.uint8), (len(pixels), 1))
+            radii = rr.Radius.ui_points(np.repeat([size + 0.9, size], len(pixels)))
             spots = rr.Points2D(
-                np.concatenate([places, places]),
-                colors=np.concatenate([rims, shades[which]]),
+                np.concatenate([pixels, pixels]),
+                colors=np.concatenate([rims, shades[mask]]),
                 radii=radii,
                 draw_order=40.0,
             )
@@ -193,8 +193,8 @@ class Terrain:
             ),
         )
         marks, colours, sizes = [axes.at(path.now[0], path.now[1])], [ink.INK], [4.0]
-        for place in path.restarts[-6:]:
-            marks.append(axes.at(place[0], place[1]))
+        for restart in path.restarts[-6:]:
+            marks.append(axes.at(restart[0], restart[1]))
             colours.append(ink.PURPLE)
             sizes.append(3.5)
         landscape = self.known
@@ -202,8 +202,8 @@ class Terrain:
         if slots.shape == landscape.anchor.shape and not np.array_equal(slots, landscape.anchor) and stage.pair:
             assert landscape.seen is not None
             pair = (stage.pair[0], stage.pair[-1])
-            one, other = landscape.seen.places(pair, slots)
-            marks.append(axes.at(slots[one], slots[other]))
+            first, second = landscape.seen.places(pair, slots)
+            marks.append(axes.at(slots[first], slots[second]))
             colours.append(ink.HALF)
             sizes.append(4.5)
         self.stream.log(
@@ -212,7 +212,7 @@ class Terrain:
         )
 
     def _sketches(self, landscape: sr.Landscape, stage: Stage) -> None:
-        """What a maximiser shows of itself, over where the indices are that decide in the middle of each."""
+        """Draw what a maximiser shows of itself, over where the indices are that decide in the middle of each."""
         axes, legend = self._axes(landscape), list[str]()
         for role, sketch in stage.sketches.items():
             path = f"landscape/map/sketch/{''.join(c if c.isalnum() else '_' for c in role)}"
@@ -221,15 +221,15 @@ class Terrain:
             if corners is None or not sketch.count:
                 continue
             lower, upper = corners
-            few = not sketch.points and sketch.count > SHOWN
-            words = f"white: {role}, {SHOWN} of {sketch.count}" if few else f"white: {role}"
+            is_cut = not sketch.points and sketch.count > SHOWN
+            words = f"white: {role}, {SHOWN} of {sketch.count}" if is_cut else f"white: {role}"
             legend.append(f"blue: {role}" if sketch.points else words)
             if sketch.points:
-                at = axes.at(lower[:, 0], lower[:, 1])
+                pixels = axes.at(lower[:, 0], lower[:, 1])
                 self.stream.log(
                     path,
                     self.rr.Points2D(
-                        at,
+                        pixels,
                         colors=[ink.SKY],
                         radii=self.rr.Radius.ui_points(2.5),
                         draw_order=47.0,
@@ -252,18 +252,19 @@ class Terrain:
         self._say("search", legend)
 
     def mark(self, words: str) -> None:
-        """What is proven of the tuple through which the slice goes."""
+        """Mark the tuple through which the slice goes, with ``words`` of what is proven of it."""
         landscape = self.known
         if landscape is not None:
-            at = self._axes(landscape).at(*(landscape.axes[k][landscape.at[k]] for k in (0, 1)))
+            pixel = self._axes(landscape).at(*(landscape.axes[k][landscape.at[k]] for k in (0, 1)))
             drawing = Drawing()
-            drawing.dot(at, ink.PURPLE, 9.0)
+            drawing.dot(pixel, ink.PURPLE, 9.0)
             drawing.log(self.rr, self.stream, "landscape/map/exact")
             self._say("exact", [f"pink: {words}"])
 
     def _scale(self, landscape: sr.Landscape, aim: Aim) -> tuple[float, float]:
-        """What is dark and what is bright; one colour for a flat slice, which has no range. The value that the search
-        has, which may lie below the map, has a colour of its own where half of them are left for the map."""
+        """Return the values of the dark and of the bright end; one colour for a flat slice, which has no range. The
+        value that the search has, which may lie below the map, has a colour of its own where half of them are left for
+        the map."""
         low, high = landscape.limits
         if not np.isfinite(low):
             return 0.0, 1.0
@@ -290,9 +291,9 @@ class Terrain:
                 np.stack([quads[0], quads[2], quads[3]], -1).reshape(-1, 3),
             ]
         )
-        one, other = ((axis - axis[0]) / (axis[-1] - axis[0]) for axis in (across, up))
-        X, Y = np.meshgrid(one, other, indexing="ij")
-        slope_x, slope_y = np.gradient(heights, one, other)
+        unit_across, unit_up = ((axis - axis[0]) / (axis[-1] - axis[0]) for axis in (across, up))
+        X, Y = np.meshgrid(unit_across, unit_up, indexing="ij")
+        slope_x, slope_y = np.gradient(heights, unit_across, unit_up)
         normals = np.stack([-slope_x, -slope_y, np.ones_like(heights)], -1)
         self.stream.log(
             "landscape/surface/g",
@@ -304,12 +305,12 @@ class Terrain:
             ),
         )
         at = [float((landscape.axes[k][landscape.at[k]] - a[0]) / (a[-1] - a[0])) for k, a in enumerate((across, up))]
-        top = float(np.clip((landscape.value - scale[0]) / (scale[1] - scale[0]), 0.0, 1.0)) + LIFT
-        above = 1.0 + LIFT + POLE
+        point_height = float(np.clip((landscape.value - scale[0]) / (scale[1] - scale[0]), 0.0, 1.0)) + LIFT
+        label_height = 1.0 + LIFT + POLE
         self.stream.log(
             "landscape/surface/best",
             self.rr.Points3D(
-                [[*at, top]],
+                [[*at, point_height]],
                 colors=[ink.ORANGE],
                 radii=self.rr.Radius.ui_points(6.0),
             ),
@@ -317,13 +318,15 @@ class Terrain:
         self.stream.log(
             "landscape/surface/pole",
             self.rr.LineStrips3D(
-                [[[*at, top], [*at, above - WORDS]]], colors=[ink.ORANGE], radii=self.rr.Radius.ui_points(0.6)
+                [[[*at, point_height], [*at, label_height - WORDS]]],
+                colors=[ink.ORANGE],
+                radii=self.rr.Radius.ui_points(0.6),
             ),
         )
         names = landscape.names(self.unit)
         flat = landscape.flat
         corners = {  # words are bright, so that each has the dark ground behind it
-            (at[0], at[1], above): f"best {landscape.value:.6g}",
+            (at[0], at[1], label_height): f"best {landscape.value:.6g}",
             (0.5, -0.12, 0.0): f"{names[0]}: {across[0]:.3g} to {across[-1]:.3g}",
             (1.12, 0.5, 0.0): f"{names[1]}: {up[0]:.3g} to {up[-1]:.3g}",
             (0.0, 0.0, 1.05): ", ".join(_said(landscape)) if flat else f"g = {scale[1]:.4g}",
@@ -342,9 +345,9 @@ class Terrain:
 
 
 def _said(landscape: sr.Landscape) -> list[str]:
-    """What the colours mean, or that there is nothing to see."""
+    """Say what the colours mean, or that there is nothing to see."""
     low, high = landscape.limits
-    nowhere = bool((landscape.shown[2] == np.inf).any())
+    has_infeasible = bool((landscape.shown[2] == np.inf).any())
     if not np.isfinite(low):
         return ["no control meets the constraints anywhere", "here: g is infinite"]
     if landscape.flat or high == low:
@@ -352,23 +355,24 @@ def _said(landscape: sr.Landscape) -> list[str]:
             return [f"g is {low:.6g} on all lines of this coarse grid"]
         return [f"g does not depend on these two here: {low:.6g}"]
     digits = int(np.clip(2 - np.floor(np.log10((high - low) / max(abs(low), abs(high)))), 5, 12))  # that differ
-    said = [f"g from {low:.{digits}g} (dark) to {high:.{digits}g} (bright)"]
-    return [*said, "brown: no control meets the constraints"] if nowhere else said
+    lines = [f"g from {low:.{digits}g} (dark) to {high:.{digits}g} (bright)"]
+    return [*lines, "brown: no control meets the constraints"] if has_infeasible else lines
 
 
 def _own(landscape: sr.Landscape, aim: Aim) -> list[str]:
-    """The value at the anchor, and how far below it that of the search is, whose disturbances need not be the worst."""
-    below, here = landscape.value - aim.value, f"orange dot: the best tuple, g = {landscape.value:.6g}"
-    if not below > VISIBLE * max(1.0, abs(landscape.value)):
-        return [here]
+    """Describe the value at the anchor, and how far below it the value of the search is, whose disturbances need not be
+    the worst."""
+    deficit, sentence = landscape.value - aim.value, f"orange dot: the best tuple, g = {landscape.value:.6g}"
+    if not deficit > VISIBLE * max(1.0, abs(landscape.value)):
+        return [sentence]
     return [
-        f"{here} on the map, where the disturbances of these two indices are the worst for them",
-        f"with its own disturbances g is {aim.value:.6g}, {below:.2g} below the map",
+        f"{sentence} on the map, where the disturbances of these two indices are the worst for them",
+        f"with its own disturbances g is {aim.value:.6g}, {deficit:.2g} below the map",
     ]
 
 
 def _numbers_beside(limits: tuple[float, float]) -> list[tuple[float, str]]:
-    """Round values beside the colour bar, with as many digits as tell them apart."""
+    """Return round values beside the colour bar, with as many digits as tell them apart."""
     values = ticks(*limits, 4)
     digits = next(n for n in range(4, 18) if len({f"{value:.{n}g}" for value in values}) == values.size or n == 17)
     return [(float(value), f"{value:.{digits}g}") for value in values]
@@ -379,7 +383,7 @@ def _weight(epsilon: float) -> float:
 
 
 def _outlines(lower: Floats, upper: Floats, rounded: bool) -> list[Floats]:
-    """The outlines ``(k, 2)`` of boxes, or of the ellipses within them."""
+    """Return the outlines ``(k, 2)`` of boxes, or of the ellipses within them."""
     turn = np.linspace(0.0, 2.0 * np.pi, 33)
     unit = (
         np.column_stack([np.cos(turn), np.sin(turn)])

@@ -1,4 +1,4 @@
-"""The way of a search: its evaluations stage by stage, one stage for each weight epsilon, and where its walk stood."""
+"""Path of a search: its evaluations stage by stage, one stage for each weight epsilon, and where its walk stood."""
 
 from __future__ import annotations
 
@@ -17,7 +17,8 @@ POINTS = 100_000  # tuples whose places are remembered; a tenth of it forgets a 
 
 @final
 class Stage:
-    """One search: ``values (n,)`` of its evaluations, which are numbers ``base + 1, ...`` of the run.
+    """Stage of a search: ``values (n,)`` of its evaluations, which are numbers ``base + 1, ...`` of the run. ``began``:
+    the seconds of the run before it.
 
     ``began``: the seconds of the run before it.
 
@@ -39,23 +40,23 @@ class Stage:
         self.sketches: dict[str, Outlines] = {}
 
     def add(self, event: sr.EvaluationsFinished, projection: Projection) -> None:
-        """Remember a batch, and what of its tuples is drawn on a map."""
-        trace, before = event.batch.trace, self.values.size
+        """Remember a batch, and the part of its tuples that is drawn on a map."""
+        trace, previous_count = event.batch.trace, self.values.size
         if event.phase == "polish" and not self.searched:
-            self.searched = before
+            self.searched = previous_count
         self.values = np.concatenate([self.values, trace.values])
         for name in {*self.notes, *trace.notes}:
             column = np.full(self.values.size, np.nan)
-            column[:before] = self.notes.get(name, np.nan)
+            column[:previous_count] = self.notes.get(name, np.nan)
             rows = trace.notes.get(name, np.zeros((0, 2)))
-            which = rows[:, 0].astype(int) - 1 - event.batch.first
-            inside = (which >= 0) & (which < trace.values.size)
-            column[before + which[inside]] = rows[inside, 1]
+            indices = rows[:, 0].astype(int) - 1 - event.batch.first
+            is_inside = (indices >= 0) & (indices < trace.values.size)
+            column[previous_count + indices[is_inside]] = rows[is_inside, 1]
             self.notes[name] = column
         if event.best_value != self.best_value:
-            top = int(np.argmax(trace.values)) if trace.values.size else -1
-            mine = 0 <= top < len(projection.slots) and trace.values[top] == event.best_value
-            self.pair = tuple(int(k) for k in projection.slots[top]) if mine else ()
+            best = int(np.argmax(trace.values)) if trace.values.size else -1
+            has_best = 0 <= best < len(projection.slots) and trace.values[best] == event.best_value
+            self.pair = tuple(int(k) for k in projection.slots[best]) if has_best else ()
         if event.best_point.size:
             self.best = event.best_point
         self.best_value, self.block = event.best_value, event.block
@@ -70,47 +71,46 @@ class Stage:
             self.coordinates, self.places = (), np.zeros((0, 2, 0))
 
     def note(self, name: str) -> Floats:
-        """What was noted at each evaluation ``(n,)``; NaN where nothing was."""
+        """Return what was noted at each evaluation ``(n,)``; NaN where nothing was."""
         return self.notes.get(name, np.full(self.values.size, np.nan))
 
     @property
     def walks(self) -> bool:
-        """Whether the maximiser has told where its walk stands."""
+        """True where the maximiser has reported where its walk stands."""
         return "stands" in self.notes
 
     @property
     def standing(self) -> np.ndarray:
-        """At which evaluation ``(n,)``, from 0, the walk stands after each; -1 where that is not known."""
+        """Evaluation ``(n,)``, from 0, at which the walk stands after each; -1 where that is not known."""
         stands = self.note("stands")
         return np.where(np.isnan(stands), 0.0, stands).astype(int) - 1
 
     @property
     def walk(self) -> Floats:
-        """The value ``(n,)`` of the walk after each evaluation; NaN where it is not known."""
+        """Value ``(n,)`` of the walk after each evaluation; NaN where it is not known."""
         standing = self.standing
         return np.where(standing >= 0, self.values[np.maximum(standing, 0)], np.nan)
 
     @property
     def refused(self) -> np.ndarray:
-        """Which evaluations ``(n,)`` were proposals that the walk did not accept."""
+        """Mask ``(n,)`` of the evaluations that were proposals which the walk did not accept."""
         return np.asarray(self.note("accepted") == 0.0)
 
     @property
     def restarts(self) -> np.ndarray:
-        """The evaluations, from 0, that are the first after the walk was heated again, or of another ascent or
-        start."""
-        found = np.zeros(0, dtype=int)
+        """Evaluations, from 0, that are the first after the walk was heated again, or of another ascent or start."""
+        restarts = np.zeros(0, dtype=int)
         for name in ("cycle", "ascent", "start"):
             column = self.note(name)
-            known = np.flatnonzero(~np.isnan(column))
-            found = np.union1d(found, known[1:][np.diff(column[known]) != 0.0])
-        return found
+            noted = np.flatnonzero(~np.isnan(column))
+            restarts = np.union1d(restarts, noted[1:][np.diff(column[noted]) != 0.0])
+        return restarts
 
 
 @final
 @dataclass(frozen=True, eq=False)
 class Shadow:
-    """A stage on two coordinates: the points ``(m, 2)`` that are remembered, which were refused ``(m,)``, the walk's
+    """Stage on two coordinates: the points ``(m, 2)`` that are remembered, which were refused ``(m,)``, the walk's
     ``legs`` ``(k_i, 2)`` from one restart to the next, and where it stood when it was heated again ``(r, 2)``."""
 
     points: Floats
@@ -121,30 +121,30 @@ class Shadow:
 
 
 def shadow(stage: Stage, axes: sr.LandscapeAxes) -> Shadow | None:
-    """A stage on the two ``axes`` of a map; ``None`` where its tuples have not come along."""
+    """Return a stage on the two ``axes`` of a map; ``None`` where its tuples have not come along."""
     points = axes.of(stage.coordinates, stage.places)
     if points is None or not len(points):
         return None
     first = stage.values.size - len(points)
-    legs, places, heated = [], [], stage.restarts
+    legs, restart_points, restart_indices = [], [], stage.restarts
     if stage.walks:
         standing = stage.standing - first
-        for start, end in zip([0, *heated], [*heated, stage.values.size], strict=True):
+        for start, end in zip([0, *restart_indices], [*restart_indices, stage.values.size], strict=True):
             path = standing[start:end]
             path = path[path >= 0]
             leg = points[path]
             legs.append(leg[np.append(True, (np.diff(leg, axis=0) != 0.0).any(axis=1))] if len(leg) else leg)
-        places = [leg[0] for leg in legs[1:] if len(leg)]
+        restart_points = [leg[0] for leg in legs[1:] if len(leg)]
     else:  # an ascent is its evaluations
-        ends = [max(0, start - first) for start in [0, *heated, stage.values.size]]
+        ends = [max(0, start - first) for start in [0, *restart_indices, stage.values.size]]
         ascends = bool({"ascent", "start"} & set(stage.notes))
         legs = [points[start:end] for start, end in pairwise(ends)] if ascends else []
-        places = [leg[0] for leg in legs[1:] if len(leg)]
+        restart_points = [leg[0] for leg in legs[1:] if len(leg)]
     standing_now = next((leg[-1] for leg in reversed(legs) if len(leg)), points[-1])
     return Shadow(
         points,
         stage.refused[first:],
         [leg for leg in legs if len(leg)],
-        np.array(places).reshape(-1, 2),
+        np.array(restart_points).reshape(-1, 2),
         np.asarray(standing_now),
     )

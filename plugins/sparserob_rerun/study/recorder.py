@@ -1,4 +1,4 @@
-"""From the events of a study to a recording: what happens in the process that does all the work."""
+"""Recorder of a study, which turns its events into a recording, in the process that does all the work."""
 
 from __future__ import annotations
 
@@ -39,21 +39,21 @@ COLOURS = "Green: a proven lower bound of the least cost J\\*; red: an upper bou
 @final
 @dataclass(frozen=True, eq=False)
 class StudyOpening:
-    """What a recording knows of a study at the beginning; it never makes the study wait."""
+    """Facts about a study that its recording knows at the beginning; it never makes the study wait."""
 
     event: sr.SweepStarted
     waits: bool = False
 
     @property
     def application(self) -> str:
-        """The name of the viewer's application: it keeps one arrangement for each."""
+        """Name of the viewer's application: it keeps one arrangement for each."""
         kind = "comparison" if self.event.arrangement == "runs" else "study"
         return f"sparserob {kind} {crc32(repr((list(self.event.axes), self.event.arrangement)).encode()):08x}"
 
 
 @final
 class StudyRecorder:
-    """Logs the events of one study to a stream that is already open."""
+    """Recorder of the events of one study in a stream that is already open."""
 
     rest, urgent, behind, ended = math.inf, False, False, math.inf
 
@@ -86,7 +86,7 @@ class StudyRecorder:
                 if event.found:
                     self.event = replace(self.event, points=[*self.event.points, *event.found])
                     self.board = Board(self.event)
-                self.running = {place: self.running.get(place, (0, -np.inf, np.inf)) for place in event.now}
+                self.running = {point: self.running.get(point, (0, -np.inf, np.inf)) for point in event.now}
                 self._move(event.seconds)
                 if event.row is not None:
                     self._row(event.places, event.row)
@@ -103,7 +103,7 @@ class StudyRecorder:
 
     @property
     def arrangement(self) -> Any:
-        """How everything is arranged."""
+        """Present arrangement of all panels."""
         return layout(self.opening, self.beside)
 
     def idle(self) -> None:
@@ -112,11 +112,11 @@ class StudyRecorder:
             self._picture()
 
     def say(self, line: str, level: str = "INFO") -> None:
-        """A line of the log."""
+        """Write a line of the log."""
         self.stream.log("log", self.rr.TextLog(line, level=level))
 
     def finish(self) -> None:
-        """Nothing is left to be done after the last event."""
+        """Do nothing: nothing is left to be done after the last event."""
 
     @property
     def _noun(self) -> str:
@@ -130,18 +130,18 @@ class StudyRecorder:
         self.say(line)
 
     def _move(self, seconds: float) -> None:
-        """Go on, never back."""
+        """Move the timelines forward, never back."""
         self.seconds = max(self.seconds, seconds)
         self.stream.set_time("points", sequence=len(self.rows))
         self.stream.set_time("time", duration=self.seconds)
 
     def _row(self, places: Sequence[int], row: Mapping[str, Any]) -> None:
-        for place in places:
-            self.rows[place] = row
-            self.running.pop(place, None)
-            if place in self.newest:
-                self.newest.remove(place)
-            self.newest.appendleft(place)
+        for point in places:
+            self.rows[point] = row
+            self.running.pop(point, None)
+            if point in self.newest:
+                self.newest.remove(point)
+            self.newest.appendleft(point)
         self._move(self.seconds)
         self.say(
             self._line(places[0]),
@@ -149,10 +149,10 @@ class StudyRecorder:
         )
 
     def _finished(self, event: sr.SweepFinished) -> None:
-        """Whatever was lost on the way: what the study ended with is all here."""
-        fresh = [place for place in event.rows if place not in self.rows]
+        """Take over all rows that the study ended with, whatever was lost before, and draw the last picture."""
+        new_points = [point for point in event.rows if point not in self.rows]
         self.rows, self.running = dict(event.rows), {}
-        self.newest = deque([*fresh, *(one for one in self.newest if one in self.rows)], maxlen=board.LINES)
+        self.newest = deque([*new_points, *(point for point in self.newest if point in self.rows)], maxlen=board.LINES)
         self.over = f"stopped: {event.stopped}" if event.stopped else f"the {self._noun} is over"
         self.text = event.answer or f"{len(self.rows)} of {len(self.event.points)} points have an answer or an error"
         self._move(event.seconds)
@@ -163,7 +163,7 @@ class StudyRecorder:
         self.say(f"{self.over}; {self.text}: {self._counts()}", "WARN" if event.stopped else "INFO")
 
     def _picture(self) -> None:
-        """Everything anew, and the moment from which on the next one may come."""
+        """Draw everything anew, and set the moment from which on the next picture may come."""
         spent, self.rest = time.thread_time(), math.inf
         for panel, task in (
             ("the map", self._map),
@@ -211,24 +211,24 @@ class StudyRecorder:
             )
 
     def _bounds(self) -> None:
-        """The ranges of those that run, and of those that have just finished, on one axis of costs."""
+        """Draw the ranges of the points that run, and of those that have just finished, on one axis of costs."""
         drawing = Drawing()
         running = list(self.running)[:SHOWN]
-        shown = [*running, *(place for place in self.newest if place not in self.running)][:SHOWN]
-        known = [one for place in shown for one in self._range(place) if math.isfinite(one)]
-        low, high = (min(known), max(known)) if known else (0.0, 1.0)
+        points = [*running, *(point for point in self.newest if point not in self.running)][:SHOWN]
+        finite_bounds = [bound for point in points for bound in self._range(point) if math.isfinite(bound)]
+        low, high = (min(finite_bounds), max(finite_bounds)) if finite_bounds else (0.0, 1.0)
         axes = Axes(LEFT, 0.0, WIDTH, SHOWN * ROW, board.about(low, high, 0.08), (0.0, 1.0))
         bottom = axes.top + axes.height
         drawing.line("frame", np.array([[LEFT, bottom], [LEFT + WIDTH, bottom]]), ink.GREY, 1.0)
-        if known:
+        if finite_bounds:
             for value in (low, high) if high - low > board.NARROW * max(abs(low), abs(high)) else (low,):
                 x = float(axes.at(value, 0.0)[0, 0])
                 drawing.line("frame", np.array([[x, bottom], [x, bottom + 5]]), ink.GREY, 1.0)
                 drawing.text(x, bottom + 15, f"{value:.6g}", ink.GREY)
         drawing.text(LEFT + WIDTH / 2, bottom + board.NAMED, "bounds on the least cost J*", ink.GREY)
-        for line, place in enumerate(shown):
-            self._one(drawing, axes, (line + 0.5) * ROW, place)
-        drawing.text((LEFT + WIDTH) / 2, -20.0, self._heading(len(shown)))
+        for line, point in enumerate(points):
+            self._one(drawing, axes, (line + 0.5) * ROW, point)
+        drawing.text((LEFT + WIDTH) / 2, -20.0, self._heading(len(points)))
         drawing.log(self.rr, self.stream, "study/bounds", layers=LAYERS)
 
     def _heading(self, shown: int) -> str:
@@ -241,7 +241,7 @@ class StudyRecorder:
         return "the point that runs, and those that were finished before it"
 
     def _one(self, drawing: Drawing, axes: Axes, y: float, place: int) -> None:
-        """The range of one point: its name at the left, its status at the right."""
+        """Draw the range of one point: its name at the left, its status at the right."""
         lower, upper = self._range(place)
         status = "running" if place in self.running else str(self.rows[place]["status"])
         name = self._named(place)
@@ -250,14 +250,14 @@ class StudyRecorder:
         drawing.text(LEFT / 2 - 5, y, name if len(name) <= NAME else f"{name[: NAME - 3]}...")
         mark(drawing, np.array([LEFT + WIDTH + 24.0, y]), status)
         drawing.text(LEFT + WIDTH + 44.0 + 4.0 * len(status), y, status)
-        ends = [float(axes.at(one, 0.0)[0, 0]) if math.isfinite(one) else math.nan for one in (lower, upper)]
+        ends = [float(axes.at(bound, 0.0)[0, 0]) if math.isfinite(bound) else math.nan for bound in (lower, upper)]
         if not any(map(math.isfinite, ends)):
             words = "no bound" if status != "running" else "no bound yet"
             words = "no control meets the constraints" if status == "infeasible" else words
             drawing.text(LEFT + WIDTH / 2, y, words, ink.GREY)
             return
         left, right = (
-            one if math.isfinite(one) else edge for one, edge in zip(ends, (LEFT, LEFT + WIDTH), strict=True)
+            end if math.isfinite(end) else edge for end, edge in zip(ends, (LEFT, LEFT + WIDTH), strict=True)
         )
         line = np.array([[left, y], [right, y]])
         if all(map(math.isfinite, ends)):
@@ -269,13 +269,13 @@ class StudyRecorder:
                 drawing.line("marks", np.array([[end, y], [end, y + reach]]), colour, 3.0)
 
     def _named(self, place: int) -> str:
-        """A point in words; of a search with all digits, by which values come close to one another."""
+        """Name a point in words; of a search with all digits, by which values come close to one another."""
         if self.event.arrangement == "search":
             return f"at {float(self.event.points[place][0]):.9g}"
         return named(self.event.axes, self.event.points[place])
 
     def _range(self, place: int) -> tuple[float, float]:
-        """The bounds of a point, infinite where there are none."""
+        """Return the bounds of a point, infinite where there are none."""
         if place in self.running:
             return self.running[place][1:]
         row = self.rows[place]
@@ -286,35 +286,35 @@ class StudyRecorder:
 
     def _page(self) -> None:
         state = self.over or self.text
-        more = [self.text] if self.over else []
-        more += [self._counts()] if self.rows else []
+        paragraphs = [self.text] if self.over else []
+        paragraphs += [self._counts()] if self.rows else []
         if not self.over:
-            names = [self._line(place) for place in list(self.running)[:LISTED]]
+            names = [self._line(point) for point in list(self.running)[:LISTED]]
             running = f"**Running now: {len(self.running)}**"
-            more += [running if names else "No point is known to run at this moment."]
-            more += ["\n".join(f"- {plainly(one)}" for one in names)] if names else []
+            paragraphs += [running if names else "No point is known to run at this moment."]
+            paragraphs += ["\n".join(f"- {plainly(name)}" for name in names)] if names else []
         title = f"### {plainly(self.event.title)}"
         legend = [COLOURS] if self.board.kind == "table" else [f"{MAP} {COLOURS}"]
-        self._markdown("study/state", "\n\n".join([title, f"**{plainly(state)}**", *more, *legend]))
+        self._markdown("study/state", "\n\n".join([title, f"**{plainly(state)}**", *paragraphs, *legend]))
 
     def _lists(self) -> None:
-        lines = [self._line(place) for place in list(self.newest)[:LISTED]]
+        lines = [self._line(point) for point in list(self.newest)[:LISTED]]
         self.stream.log("study/newest", self.rr.TextDocument("\n".join(lines) or "no point is finished yet"))
 
     def _line(self, place: int) -> str:
-        """A point in words."""
+        """Describe a point in words."""
         name = self._named(place)
         if place in self.running:
-            turn, lower, upper = self.running[place]
+            round_number, lower, upper = self.running[place]
             if self.event.parallel:
                 return name
-            known = math.isfinite(lower) or math.isfinite(upper)
-            bounds = f"{number(lower, '−∞')} ≤ J* ≤ {number(upper, '∞')}" if known else "no bound yet"
-            return f"{name}: round {turn}, {bounds}"
+            is_bounded = math.isfinite(lower) or math.isfinite(upper)
+            bounds = f"{number(lower, '−∞')} ≤ J* ≤ {number(upper, '∞')}" if is_bounded else "no bound yet"
+            return f"{name}: round {round_number}, {bounds}"
         row = self.rows[place]
-        told = f", cost {number(row['cost'])}" if row.get("cost") is not None else ""
-        why = f": {shorten(str(row.get('message')), LETTERS)}" if row["status"] == "failed" else ""
-        return f"{name}: {row['status']}{told}{why}"
+        cost = f", cost {number(row['cost'])}" if row.get("cost") is not None else ""
+        reason = f": {shorten(str(row.get('message')), LETTERS)}" if row["status"] == "failed" else ""
+        return f"{name}: {row['status']}{cost}{reason}"
 
     def _counts(self) -> str:
         counts = Counter(str(row["status"]) for row in self.rows.values())
@@ -325,8 +325,8 @@ class StudyRecorder:
 
 
 def layout(opening: StudyOpening, beside: SideBySide | None = None) -> Any:
-    """The blueprint: of a study its map and its bounds, beside them what is known in words; of runs of one problem what
-    is known of them side by side; the log."""
+    """Build the blueprint. A study has its map and its bounds, with words of what is known; runs of one problem have
+    what is known of them side by side; both have the log."""
     import rerun.blueprint as rrb
 
     compared = opening.event.arrangement == "runs"

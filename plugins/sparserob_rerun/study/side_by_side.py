@@ -1,4 +1,4 @@
-"""Runs of one problem as one picture: a line of its own for the bounds of each, over the same axes."""
+"""Picture of runs of one problem: a line of its own for the bounds of each, over the same axes."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from sparserob_rerun.study.statuses import plainly
 
 COLOURS: tuple[Colour, ...] = (ink.SKY, ink.VERMILLION, ink.GREEN, ink.PURPLE, ink.ORANGE, ink.GREY)
 MARKERS = ("circle", "square", "diamond", "up", "plus", "cross")
-"""Of the corners of each line: lines are told apart by them where their colours are not."""
+"""Markers at the corners of each line: lines are told apart by them where their colours are not."""
 MOST = 12
 """Runs that have a line. With ten times as many neither lines nor names can be told apart; with a tenth there is
 nothing to compare."""
@@ -42,7 +42,7 @@ def folder_of_runs(event: sr.SweepStarted) -> Path | None:
 
 @final
 class SideBySide:
-    """The picture of the finished runs of a study below ``/study/runs``."""
+    """Picture of the finished runs of a study below ``/study/runs``."""
 
     def __init__(self, rr: Any, stream: Any, folder: Path) -> None:
         self.rr, self.stream, self.folder = rr, stream, folder
@@ -53,9 +53,9 @@ class SideBySide:
 
     @property
     def limits(self) -> tuple[float, float] | None:
-        """The axis of bounds; ``None`` where no bound is known."""
-        known = [] if self.comparison is None else [curve.bound for curve in self.comparison.curves]
-        bounds = np.concatenate(known) if known else np.empty(0)
+        """Limits of the axis of bounds; ``None`` where no bound is known."""
+        curve_bounds = [] if self.comparison is None else [curve.bound for curve in self.comparison.curves]
+        bounds = np.concatenate(curve_bounds) if curve_bounds else np.empty(0)
         if self.comparison is None or not bounds.size:
             return None
         top = float(np.nanmax([self.target, bounds.max()]))
@@ -65,41 +65,41 @@ class SideBySide:
 
     @property
     def target(self) -> float:
-        """What gaps are relative to: the exact optimum, or the least upper bound; NaN where there is neither."""
+        """Cost to which gaps are relative: the exact optimum, or the least upper bound; NaN where there is neither."""
         if self.comparison is None or np.isfinite(self.comparison.exact):
             return math.nan if self.comparison is None else self.comparison.exact
-        known = [curve.upper_bound for curve in self.comparison.curves if np.isfinite(curve.upper_bound)]
-        return min(known, default=math.nan)
+        upper_bounds = [curve.upper_bound for curve in self.comparison.curves if np.isfinite(curve.upper_bound)]
+        return min(upper_bounds, default=math.nan)
 
     @property
     def last(self) -> tuple[float, float]:
-        """The evaluations and the seconds at which the picture ends; 1 and 1 before anything is known."""
+        """Evaluations and seconds at which the picture ends; 1 and 1 before anything is known."""
         ends = [] if self.comparison is None else [_end(curve) for curve in self.comparison.curves]
-        evaluations, seconds = (max(part, default=0.0) or 1.0 for part in zip(*ends or [(0.0, 0.0)], strict=True))
+        evaluations, seconds = (max(column, default=0.0) or 1.0 for column in zip(*ends or [(0.0, 0.0)], strict=True))
         return BEYOND * evaluations, BEYOND * seconds
 
     def draw(self, rows: Mapping[int, Mapping[str, Any]]) -> None:
         """Draw the lines of the runs that have come since the last picture, by the ``rows`` of their points."""
-        runs = {str(row["run"]): place for place, row in sorted(rows.items(), reverse=True) if _has_run(row)}
-        self.count, places = len(runs), sorted(runs.values())[:MOST]
-        if places == self.places or not places:
+        runs = {str(row["run"]): point for point, row in sorted(rows.items(), reverse=True) if _has_run(row)}
+        self.count, points = len(runs), sorted(runs.values())[:MOST]
+        if points == self.places or not points:
             return
-        found = sr.compare([self.folder / str(rows[place]["run"]) for place in places])
-        if not isinstance(found, sr.Comparison):
+        comparison = sr.compare([self.folder / str(rows[point]["run"]) for point in points])
+        if not isinstance(comparison, sr.Comparison):
             return
-        self.comparison, self.places = found, places
-        for place, curve, label in zip(places, found.curves, found.labels, strict=True):
-            self._line(f"study/runs/bound/{place}", place, curve, label, curve.bound)
+        self.comparison, self.places = comparison, points
+        for point, curve, label in zip(points, comparison.curves, comparison.labels, strict=True):
+            self._line(f"study/runs/bound/{point}", point, curve, label, curve.bound)
         self.stream.log(
             "study/runs/words", self.rr.TextDocument(self._words(), media_type="text/markdown"), static=True
         )
 
     def finish(self) -> None:
         """Draw what is known once all runs are over: the least cost, and how the gap to it closes."""
-        found, target = self.comparison, self.target
-        if found is None or not np.isfinite(target):
+        comparison, target = self.comparison, self.target
+        if comparison is None or not np.isfinite(target):
             return
-        name = "exact optimum" if np.isfinite(found.exact) else "least upper bound"
+        name = "exact optimum" if np.isfinite(comparison.exact) else "least upper bound"
         last = np.array(self.last)
         self._styled("study/runs/bound/target", f"{name} {target:.9g}", ink.INK, 1.0)
         evaluations, seconds = np.stack([np.zeros(2), last], axis=1)
@@ -108,12 +108,12 @@ class SideBySide:
             return
         self._styled("study/runs/gap/close", f"{NEAR:.1%} of it", ink.GREY, 1.0)
         self._send("study/runs/gap/close", evaluations, seconds, np.full(2, np.log10(NEAR)))
-        for place, curve, label in zip(self.places, found.curves, found.labels, strict=True):
+        for point, curve, label in zip(self.places, comparison.curves, comparison.labels, strict=True):
             gap = np.maximum((target - curve.bound) / abs(target), CLOSED)
-            self._line(f"study/runs/gap/{place}", place, curve, label, np.log10(gap))
+            self._line(f"study/runs/gap/{point}", point, curve, label, np.log10(gap))
 
     def _line(self, path: str, place: int, curve: Any, label: str, values: Floats) -> None:
-        """The line of a run through its ``values``, as steps, to the end of the run; its name may change later."""
+        """Draw the line of a run through its ``values``, as steps, to the end of the run; its name may change later."""
         if not values.size:
             return
         width = max(THINNEST, WIDEST - 0.5 * place)
@@ -144,26 +144,29 @@ class SideBySide:
         self.stream.send_columns(path, at, self.rr.Scalars.columns(scalars=values))
 
     def _words(self) -> str:
-        """What is compared, how it ended, and in what the configs differ, in Markdown."""
-        found = self.comparison
-        if found is None:
+        """Describe what is compared, how it ended, and in what the configs differ, in Markdown."""
+        comparison = self.comparison
+        if comparison is None:
             return "no run is finished yet"
-        unit = f" {plainly(found.cost_unit)}" if found.cost_unit else ""
-        parts = [f"### {plainly(found.title or 'Runs of one problem')}", self._known(unit)]
-        for place, (curve, label) in enumerate(zip(found.curves, found.labels, strict=True)):
-            own = "; ".join(f"{plainly(key)} {plainly(values[place])}" for key, values in found.differences)
-            parts.append(
-                f"**{plainly(label)}**: {_verdict(curve)}{unit}; {_spent(curve)}" + (f"\n\n*{own}*" if own else "")
+        unit = f" {plainly(comparison.cost_unit)}" if comparison.cost_unit else ""
+        paragraphs = [f"### {plainly(comparison.title or 'Runs of one problem')}", self._known(unit)]
+        for index, (curve, label) in enumerate(zip(comparison.curves, comparison.labels, strict=True)):
+            differences = "; ".join(
+                f"{plainly(key)} {plainly(values[index])}" for key, values in comparison.differences
             )
-        more = f"The first {MOST} runs have lines." if self.count > MOST else ""
-        return "\n\n".join([*parts, f"{HELP} {more}".rstrip()])
+            paragraphs.append(
+                f"**{plainly(label)}**: {_verdict(curve)}{unit}; {_spent(curve)}"
+                + (f"\n\n*{differences}*" if differences else "")
+            )
+        note = f"The first {MOST} runs have lines." if self.count > MOST else ""
+        return "\n\n".join([*paragraphs, f"{HELP} {note}".rstrip()])
 
     def _known(self, unit: str) -> str:
-        found = self.comparison
-        if found is None or found.certified is None:
+        comparison = self.comparison
+        if comparison is None or comparison.certified is None:
             return "No run is certified: the exact optimum is not known."
-        best = plainly(found.labels[found.certified])
-        return f"**Exact optimum {found.exact:.9g}{unit}**, certified by {best}."
+        best = plainly(comparison.labels[comparison.certified])
+        return f"**Exact optimum {comparison.exact:.9g}{unit}**, certified by {best}."
 
 
 HELP = (
@@ -182,7 +185,7 @@ def _has_run(row: Mapping[str, Any]) -> bool:
 def _end(curve: Any) -> tuple[float, float]:
     """Return the evaluations and the seconds after which a run was over; 0 where they are not known."""
     columns = ((curve.evaluations, curve.all_evaluations), (curve.seconds, curve.all_seconds))
-    first, second = (float(np.nanmax([*known[-1:], whole, 0.0])) for known, whole in columns)
+    first, second = (float(np.nanmax([*values[-1:], total, 0.0])) for values, total in columns)
     return first, second
 
 
@@ -191,17 +194,17 @@ def _verdict(curve: Any) -> str:
 
 
 def _spent(curve: Any) -> str:
-    """What a run took, in words."""
-    what = "evaluations of g" if curve.searched else "relaxed programs"
-    return f"{number(curve.all_evaluations, '?')} {what}, {curve.all_seconds:.3g} s"
+    """Write in words what a run took."""
+    unit = "evaluations of g" if curve.searched else "relaxed programs"
+    return f"{number(curve.all_evaluations, '?')} {unit}, {curve.all_seconds:.3g} s"
 
 
 def tab(shown: SideBySide | None) -> Any:
-    """The tab of the runs side by side, as far as is known of them."""
+    """Return the tab of the runs side by side, as far as is known of them."""
     import rerun.blueprint as rrb
 
-    limits, found = (None, None) if shown is None else (shown.limits, shown.comparison)
-    unit = f" [{found.cost_unit}]" if found is not None and found.cost_unit else ""
+    limits, comparison = (None, None) if shown is None else (shown.limits, shown.comparison)
+    unit = f" [{comparison.cost_unit}]" if comparison is not None and comparison.cost_unit else ""
     ranges = [] if shown is None else _ranges(rrb, *shown.last)
     across = "over evaluations or seconds (across)"
     plots = [
@@ -214,8 +217,10 @@ def tab(shown: SideBySide | None) -> Any:
         )
     ]
     if shown is not None and any("/gap/" in path for path in shown.drawn):
-        to = "the exact optimum" if found is not None and np.isfinite(found.exact) else "the least upper bound"
-        name = f"log10 of the relative gap to {to} (up) {across}"
+        reference = (
+            "the exact optimum" if comparison is not None and np.isfinite(comparison.exact) else "the least upper bound"
+        )
+        name = f"log10 of the relative gap to {reference} (up) {across}"
         legend = rrb.PlotLegend(visible=False)  # the colours are those above
         plots.append(
             rrb.TimeSeriesView(origin="/study/runs/gap", name=name, plot_legend=legend, time_ranges=ranges or None)
@@ -230,9 +235,9 @@ def tab(shown: SideBySide | None) -> Any:
 
 
 def _ranges(rrb: Any, evaluations: float, seconds: float) -> list[Any]:
-    """What is shown on either timeline: all of the runs, and nothing beyond them, wherever the cursor is."""
-    place = rrb.TimeRangeBoundary.absolute
+    """Return what is shown on either timeline: all of the runs, and nothing beyond them, wherever the cursor is."""
+    boundary = rrb.TimeRangeBoundary.absolute
     return [
-        rrb.VisibleTimeRange("evaluation", start=place(seq=0), end=place(seq=int(np.ceil(evaluations)))),
-        rrb.VisibleTimeRange("time", start=place(seconds=0.0), end=place(seconds=seconds)),
+        rrb.VisibleTimeRange("evaluation", start=boundary(seq=0), end=boundary(seq=int(np.ceil(evaluations)))),
+        rrb.VisibleTimeRange("time", start=boundary(seconds=0.0), end=boundary(seconds=seconds)),
     ]

@@ -1,4 +1,4 @@
-"""How a status looks in a study: a colour and a mark for each, and never the colour alone."""
+"""Appearance of a status in a study: a colour and a mark for each, and never the colour alone."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ COLOURS: Mapping[str, Colour] = {
     "running": ink.SKY,
     "waiting": ink.FAINT,
 }
-"""Every status of a point, with its colour; of one that is not known here, that of a failed one."""
+"""Statuses of a point, with their colours; a status that is not known here has that of a failed one."""
 STEP, LETTERS = 112.0, 24
 SIZE = 5.0
 _TURN = np.linspace(0.0, 2.0 * np.pi, 13)
@@ -39,25 +39,25 @@ _SHAPES: Mapping[str, Sequence[Floats]] = {
 
 
 def mark(drawing: Drawing, at: Floats, status: str, colour: Colour | None = None) -> None:
-    """The mark of a status at a pixel ``(2,)``, in its own colour unless another one is given."""
+    """Draw the mark of a status at a pixel ``(2,)``, in its own colour unless another one is given."""
     width = 5.0 if status == "certified" else 2.0  # a filled dot: a thick, small ring
     for shape in _SHAPES.get(status, _SHAPES["failed"]):
         drawing.line("marks", at + SIZE * shape, colour or COLOURS.get(status, ink.INK), width)
 
 
 def legend(drawing: Drawing, left: float, top: float, counts: Mapping[str, int]) -> None:
-    """What the marks mean, and how many points have each, in rows of four."""
-    for place, status in enumerate(one for one in COLOURS if counts.get(one)):
-        at = np.array([left + 1.4 * STEP * (place % 4), top + 20.0 * (place // 4)])
+    """Draw what the marks mean, and how many points have each, in rows of four."""
+    for position, status in enumerate(name for name in COLOURS if counts.get(name)):
+        at = np.array([left + 1.4 * STEP * (position % 4), top + 20.0 * (position // 4)])
         mark(drawing, at, status)
         drawing.text(at[0] + 16.0 + 4.5 * len(f"{counts[status]} {status}"), at[1], f"{counts[status]} {status}")
 
 
 def said(value: Any) -> str:
-    """A value of an axis in a few letters."""
+    """Write a value of an axis in a few letters."""
     if isinstance(value, Mapping) and "name" in value:
-        rest = ", ".join(f"{key} {said(one)}" for key, one in value.items() if key != "name")
-        text = f"{value['name']} ({rest})" if rest else str(value["name"])
+        options = ", ".join(f"{key} {said(entry)}" for key, entry in value.items() if key != "name")
+        text = f"{value['name']} ({options})" if options else str(value["name"])
     elif isinstance(value, float):
         text = f"{value:.6g}"
     else:
@@ -66,7 +66,7 @@ def said(value: Any) -> str:
 
 
 def named(axes: Sequence[str], values: Sequence[Any]) -> str:
-    """A point in words: the last step of each key and its value; of a study without axes there is only one."""
+    """Name a point in words: the last step of each key and its value; of a study without axes there is only one."""
     if not axes:
         return "the only point"
     steps = [[step for step in key.split(".") if step != "name"] for key in axes]
@@ -76,5 +76,5 @@ def named(axes: Sequence[str], values: Sequence[Any]) -> str:
 
 
 def plainly(text: str) -> str:
-    """A text that Markdown leaves as it is."""
+    """Return a text that Markdown leaves as it is."""
     return "".join(f"\\{letter}" if letter in "\\`*_{}[]<>#|~" else letter for letter in " ".join(text.split()))
