@@ -244,7 +244,7 @@ class Recorder:
         if stage.values.size >= ARRANGED or self.concluded:
             self._arrange(stage)
         weight = f"epsilon = {stage.epsilon:.3g}, " if np.isfinite(stage.epsilon) else ""
-        if not self.exact:
+        if self.exact is None:
             evaluations = self.timelines.evaluation - stage.base
             limit = f" of {stage.budget}" if stage.budget else ""
             line = (
