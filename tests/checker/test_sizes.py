@@ -10,7 +10,7 @@ from flint import ctx
 
 import sparserob_core as sr
 from sparserob_core.checker.claims.case import Case
-from sparserob_core.checker.claims.constraints import _rests
+from sparserob_core.checker.claims.constraints import _is_at_rest
 from sparserob_core.checker.claims.units import nominal_sizes, units_of
 from sparserob_core.checker.outcome import RESOLVED
 from sparserob_core.control.constraints.curved import CurvedConstraint
@@ -47,11 +47,11 @@ def test_a_state_rests_where_it_begins_at_0_and_nothing_moves_it() -> None:
     pushed = IDLE.copy()
     pushed[1, 3] = 1e-12
     with ctx.workprec(96):
-        assert _rests(case_of(IDLE), 2) and not _rests(case_of(IDLE), 0)
-        assert not _rests(case_of(pushed), 2)
-        assert not _rests(case_of(IDLE, initial_state=[0.5, 0.1, 0.0, 1e-12]), 2)
-        assert not _rests(case_of(IDLE, drift=[0.0, 0.0, 0.0, 1e-12]), 2)
-        assert not _rests(case_of(IDLE, initial_control=[0.0, 1e-12]), 2)
+        assert _is_at_rest(case_of(IDLE), 2) and not _is_at_rest(case_of(IDLE), 0)
+        assert not _is_at_rest(case_of(pushed), 2)
+        assert not _is_at_rest(case_of(IDLE, initial_state=[0.5, 0.1, 0.0, 1e-12]), 2)
+        assert not _is_at_rest(case_of(IDLE, drift=[0.0, 0.0, 0.0, 1e-12]), 2)
+        assert not _is_at_rest(case_of(IDLE, initial_control=[0.0, 1e-12]), 2)
 
 
 def test_a_size_is_never_more_than_the_state_has() -> None:

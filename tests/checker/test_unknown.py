@@ -16,7 +16,7 @@ from sparserob_core.checker.claims import case, cells, constraints, followed
 from sparserob_core.checker.claims.answers import feedback_of
 from sparserob_core.checker.claims.case import Case
 from sparserob_core.checker.cost import effort
-from sparserob_core.checker.cost.gains import _chords
+from sparserob_core.checker.cost.gains import _compute_chords
 from sparserob_core.checker.flow.flow import VerifiedFlow
 from sparserob_core.checker.flow.plant import Plant
 from sparserob_core.checker.outcome import Broken, Clock, Unchecked
@@ -102,7 +102,7 @@ UNKNOWN: dict[str, tuple[Callable[[], object], type[Exception], str]] = {
         Unchecked,
         "of a flat set of initial states, the checker knows boxes only",
     ),
-    "no list": (lambda: disturbances._parts(Box([-1.0], [1.0])), Unchecked, "lists of sets only"),
+    "no list": (lambda: disturbances._list_factors(Box([-1.0], [1.0])), Unchecked, "lists of sets only"),
     "measurable in a cylinder, in time": (
         lambda: (
             forced(
@@ -128,12 +128,12 @@ UNKNOWN: dict[str, tuple[Callable[[], object], type[Exception], str]] = {
         "the uncertainty may reach x1",
     ),
     "times that have no middle": (
-        lambda: cells._halves((0, 1.0, JUST_ABOVE_1)),
+        lambda: cells._halve_interval((0, 1.0, JUST_ABOVE_1)),
         Unchecked,
         "cannot be halved any more",
     ),
     "a box that has no middle": (
-        lambda: cells._split(((1.0, 2.0), (JUST_ABOVE_1, 2.0)), np.ones(2)),
+        lambda: cells._halve_box(((1.0, 2.0), (JUST_ABOVE_1, 2.0)), np.ones(2)),
         Unchecked,
         "parameters cannot be halved any more",
     ),
@@ -155,15 +155,15 @@ UNKNOWN: dict[str, tuple[Callable[[], object], type[Exception], str]] = {
         Unchecked,
         "no polynomial from 0.0 to 1.0",
     ),
-    "no corners": (lambda: flat._meets(((1.0, 0.0, 1.0),), ()), Unchecked, "has no corners"),
+    "no corners": (lambda: flat._find_intersections(((1.0, 0.0, 1.0),), ()), Unchecked, "has no corners"),
     "too many corners": (
-        lambda: flat._meets(tuple((*row, 1.0) for row in np.eye(40)[:, :12].tolist()), ()),
+        lambda: flat._find_intersections(tuple((*row, 1.0) for row in np.eye(40)[:, :12].tolist()), ()),
         Unchecked,
         "40 facets in 12 dimensions has too many corners",
     ),
-    "the least of nothing": (lambda: flat._least([]), Unchecked, "the set of controls has no corners"),
+    "the least of nothing": (lambda: flat._find_least([]), Unchecked, "the set of controls has no corners"),
     "a set without chords": (
-        lambda: _chords(Cylinder(NormBall(3.0, 1.0, dimension=2), 3), np.zeros(3)),
+        lambda: _compute_chords(Cylinder(NormBall(3.0, 1.0, dimension=2), 3), np.zeros(3)),
         Unchecked,
         "how long the disturbance's set is along the axes",
     ),

@@ -25,7 +25,7 @@ MOST_BOXES = 20_000
 
 
 @lru_cache(maxsize=32)
-def _conversion(degree: int, symmetric: bool) -> Array:
+def _compute_conversion(degree: int, symmetric: bool) -> Array:
     """Return the matrix ``(degree + 1, degree + 1)`` from powers to Bernstein coefficients on ``[0, 1]``; with
     ``symmetric`` from powers on ``[-1, 1]``."""
     rows = np.array(
@@ -57,7 +57,7 @@ def bernstein(coefficients: Array, symmetric: Sequence[bool], absolute: bool = F
     """
     b = np.abs(coefficients) if absolute else coefficients
     for axis, both in enumerate(symmetric):
-        matrix = _conversion(b.shape[axis + 1] - 1, both)
+        matrix = _compute_conversion(b.shape[axis + 1] - 1, both)
         matrix = np.abs(matrix) if absolute else matrix
         b = np.moveaxis(np.tensordot(b, matrix, axes=(axis + 1, 1)), -1, axis + 1)
     return b
@@ -80,7 +80,7 @@ def highest(coefficients: Array, symmetric: Sequence[bool], errors: Array, limit
     for step in range(HALVINGS if owner.size else 0):
         upper = b.reshape(b.shape[0], -1).max(axis=1)
         is_shown = upper + slack[owner] <= limit
-        attained = _corners(b).max(axis=1)
+        attained = _select_corners(b).max(axis=1)
         is_refuted = attained + slack[owner] > limit  # the polynomial attains this value
         is_stopped = (
             np.zeros(owner.size, dtype=bool)
@@ -93,18 +93,18 @@ def highest(coefficients: Array, symmetric: Sequence[bool], errors: Array, limit
         b, owner = b[~is_closed], owner[~is_closed]
         if not owner.size:
             break
-        b, owner = _halved(b), np.tile(owner, 2)
+        b, owner = _halve_boxes(b), np.tile(owner, 2)
     return bounds
 
 
-def _corners(b: Array) -> Array:
+def _select_corners(b: Array) -> Array:
     corners = b
     for axis in range(1, b.ndim):
         corners = np.take(corners, [0, -1], axis=axis)
     return corners.reshape(b.shape[0], -1)
 
 
-def _halved(b: Array) -> Array:
+def _halve_boxes(b: Array) -> Array:
     """Return both halves of every box, the lower halves first. Each box is halved along the axis on which its
     coefficients vary most (de Casteljau)."""
     variation = np.stack(
@@ -116,12 +116,12 @@ def _halved(b: Array) -> Array:
     for axis in range(1, b.ndim):
         is_chosen = axes == axis
         if is_chosen.any():
-            lower_half, upper_half = _casteljau(np.moveaxis(b[is_chosen], axis, -1))
+            lower_half, upper_half = _apply_de_casteljau(np.moveaxis(b[is_chosen], axis, -1))
             low[is_chosen], high[is_chosen] = np.moveaxis(lower_half, -1, axis), np.moveaxis(upper_half, -1, axis)
     return np.concatenate([low, high])
 
 
-def _casteljau(b: Array) -> tuple[Array, Array]:
+def _apply_de_casteljau(b: Array) -> tuple[Array, Array]:
     lower_half, upper_half, row = np.empty_like(b), np.empty_like(b), b
     for i in range(b.shape[-1]):
         lower_half[..., i], upper_half[..., b.shape[-1] - 1 - i] = row[..., 0], row[..., -1]

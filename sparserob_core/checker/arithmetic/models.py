@@ -37,11 +37,11 @@ class Frame:
 
     def number(self, value: arb) -> Model:
         """Return the model of a constant."""
-        return self._of([value])
+        return self._build_model([value])
 
     def time(self, middle: arb, half: arb) -> Model:
         """Return the model of ``middle + half r``, with the time ``r`` in ``[-1, 1]``."""
-        return self._of([middle, half])
+        return self._build_model([middle, half])
 
     def parameter(self, place: int, middle: arb, half: arb) -> Model:
         """Return the model of ``middle + half s_place``, with the parameter ``s_place`` in ``[-1, 1]``."""
@@ -52,7 +52,7 @@ class Frame:
             model.parts[self.monomials.linear(place)] = arb_poly([half])
         return model
 
-    def _of(self, coefficients: list[arb]) -> Model:
+    def _build_model(self, coefficients: list[arb]) -> Model:
         from flint import arb_poly
 
         return Model(self, [arb_poly(coefficients), *[None] * (self.monomials.size - 1)])
@@ -80,9 +80,9 @@ class Model:
     @property
     def size(self) -> arb:
         """The upper bound of the absolute value."""
-        return sum((_size(coefficient) for coefficient in self.parts if coefficient is not None), ball(0))
+        return sum((_bound_polynomial(coefficient) for coefficient in self.parts if coefficient is not None), ball(0))
 
-    def _other(self, value: object) -> Model:
+    def _convert_to_model(self, value: object) -> Model:
         if isinstance(value, Model):
             return value
         if isinstance(value, int | float | np.integer | np.floating):
@@ -90,7 +90,7 @@ class Model:
         raise Unchecked(f"an entry of the system holds a {type(value).__name__}, expected a number")
 
     def __add__(self, other: object) -> Model:
-        pairs = zip(self.parts, self._other(other).parts, strict=True)
+        pairs = zip(self.parts, self._convert_to_model(other).parts, strict=True)
         return Model(self.frame, [a if b is None else b if a is None else a + b for a, b in pairs])
 
     def __neg__(self) -> Model:
@@ -100,13 +100,13 @@ class Model:
         return self
 
     def __sub__(self, other: object) -> Model:
-        return self + -self._other(other)
+        return self + -self._convert_to_model(other)
 
     def __rsub__(self, other: object) -> Model:
-        return self._other(other) - self
+        return self._convert_to_model(other) - self
 
     def __mul__(self, other: object) -> Model:
-        right, monomials = self._other(other).parts, self.frame.monomials
+        right, monomials = self._convert_to_model(other).parts, self.frame.monomials
         coefficients: list[Part] = [None] * monomials.size
         for a, pairs in zip(self.parts, monomials.products_with, strict=True):
             if a is None:
@@ -115,9 +115,9 @@ class Model:
                 b, total = right[j], coefficients[k]
                 if b is not None:
                     coefficients[k] = a * b if total is None else total + a * b
-        return Model(self.frame, coefficients)._within(_beyond(monomials, self.parts, right))
+        return Model(self.frame, coefficients)._truncate(_bound_truncated_terms(monomials, self.parts, right))
 
-    def _within(self, beyond: arb) -> Model:
+    def _truncate(self, beyond: arb) -> Model:
         """Return the model up to its order in the time, with a remainder of at most ``beyond`` added."""
         from flint import arb, arb_poly
 
@@ -132,27 +132,27 @@ class Model:
         return Model(self.frame, coefficients)
 
     def __truediv__(self, other: object) -> Model:
-        return self * self._other(other)._through(lambda series: 1 / series)
+        return self * self._convert_to_model(other)._apply_function(lambda series: 1 / series)
 
     def __rtruediv__(self, other: object) -> Model:
-        return self._other(other) / self
+        return self._convert_to_model(other) / self
 
     def __pow__(self, other: object) -> Model:
         if isinstance(other, int | float | np.integer | np.floating) and float(other).is_integer():
             count = int(other)
             if abs(count) <= LARGEST_POWER:
-                power, base = self._other(1.0), self
+                power, base = self._convert_to_model(1.0), self
                 for _ in range(abs(count)):
                     power = power * base
                 return power if count >= 0 else 1.0 / power
-        return (self._other(other) * self.log()).exp()
+        return (self._convert_to_model(other) * self.log()).exp()
 
     def __rpow__(self, other: object) -> Model:
-        return self._other(other) ** self
+        return self._convert_to_model(other) ** self
 
     __radd__, __rmul__ = __add__, __mul__
 
-    def _through(self, function: Callable[[arb_series], Any]) -> Model:
+    def _apply_function(self, function: Callable[[arb_series], Any]) -> Model:
         """Return a function of the model: its Taylor polynomial at an exact number in the middle, with Lagrange's
         remainder."""
         from flint import arb, arb_series, ctx
@@ -179,39 +179,39 @@ class Model:
         model = self.frame.number(coefficients[order])
         for coefficient in reversed(coefficients[:order]):
             model = model * deviation + self.frame.number(coefficient)
-        return model._within(remainders[order])
+        return model._truncate(remainders[order])
 
     def exp(self) -> Model:
-        return self._through(lambda s: s.exp())
+        return self._apply_function(lambda s: s.exp())
 
     def sin(self) -> Model:
-        return self._through(lambda s: s.sin())
+        return self._apply_function(lambda s: s.sin())
 
     def cos(self) -> Model:
-        return self._through(lambda s: s.cos())
+        return self._apply_function(lambda s: s.cos())
 
     def tan(self) -> Model:
-        return self._through(lambda s: _steep(s, s[0].tan(), 1 / s[0].cos() ** 2, 1))
+        return self._apply_function(lambda s: _expand_tangent(s, s[0].tan(), 1 / s[0].cos() ** 2, 1))
 
     def log(self) -> Model:
-        return self._through(lambda s: s.log())
+        return self._apply_function(lambda s: s.log())
 
     def sqrt(self) -> Model:
-        return self._through(lambda s: s.sqrt())
+        return self._apply_function(lambda s: s.sqrt())
 
     def tanh(self) -> Model:
-        return self._through(lambda s: _steep(s, s[0].tanh(), s[0].sech() ** 2, -1))
+        return self._apply_function(lambda s: _expand_tangent(s, s[0].tanh(), s[0].sech() ** 2, -1))
 
     def kepler(self, eccentricity: float) -> Model:
         """Return the ``E`` that solves Kepler's equation ``E - e sin E = M``, where the model is ``M``."""
-        return self._through(lambda s: kepler_series(s, eccentricity, s.prec))
+        return self._apply_function(lambda s: kepler_series(s, eccentricity, s.prec))
 
 
-def _size(part: arb_poly) -> arb:
+def _bound_polynomial(part: arb_poly) -> arb:
     return sum(map(abs, part.coeffs()), ball(0))
 
 
-def _beyond(monomials: Monomials, left: Sequence[Part], right: Sequence[Part]) -> arb:
+def _bound_truncated_terms(monomials: Monomials, left: Sequence[Part], right: Sequence[Part]) -> arb:
     """Return an upper bound of the terms of a product whose degree in the parameters is above the kept degree."""
     if not monomials.degree:
         return ball(0)
@@ -219,7 +219,7 @@ def _beyond(monomials: Monomials, left: Sequence[Part], right: Sequence[Part]) -
     for side, coefficients in zip(sizes, (left, right), strict=True):
         for degree, coefficient in zip(monomials.degrees, coefficients, strict=True):
             if coefficient is not None:
-                side[degree] = side[degree] + _size(coefficient)
+                side[degree] = side[degree] + _bound_polynomial(coefficient)
     total = ball(0)
     for i, size in enumerate(sizes[0]):
         if i and not size.is_zero():
@@ -227,7 +227,7 @@ def _beyond(monomials: Monomials, left: Sequence[Part], right: Sequence[Part]) -
     return total
 
 
-def _steep(argument: arb_series, value: arb, slope: arb, sign: int) -> arb_series:
+def _expand_tangent(argument: arb_series, value: arb, slope: arb, sign: int) -> arb_series:
     """Return the tangent of ``c + s``, or with the ``sign`` -1 the hyperbolic one, from its value and its slope at
     ``c``.
 

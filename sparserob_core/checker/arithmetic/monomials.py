@@ -21,28 +21,28 @@ class Monomials:
     @property
     def exponents(self) -> list[tuple[int, ...]]:
         """The exponent vectors, in increasing degree."""
-        return _exponents(self.count, self.degree)
+        return _list_exponents(self.count, self.degree)
 
     @property
     def number(self) -> dict[tuple[int, ...], int]:
         """The number of the monomial with an exponent vector."""
-        return _places(self.count, self.degree)
+        return _number_monomials(self.count, self.degree)
 
     @property
     def products(self) -> list[tuple[int, int, int]]:
         """All ``(i, j, k)`` where monomial ``i`` times monomial ``j`` is monomial ``k``."""
-        return _products(self.count, self.degree)
+        return _list_products(self.count, self.degree)
 
     @property
     def products_with(self) -> list[list[tuple[int, int]]]:
         """For every monomial ``i``, all ``(j, k)`` where monomial ``i`` times monomial ``j`` is monomial ``k``."""
-        return _products_with(self.count, self.degree)
+        return _group_products(self.count, self.degree)
 
     @property
     def quotients(self) -> np.ndarray:
         """The table ``(size, size)`` of quotients: entry ``(i, k)`` is the ``j`` where monomial ``i`` times monomial
         ``j`` is monomial ``k``, and -1 where none is."""
-        return _quotients(self.count, self.degree)
+        return _tabulate_quotients(self.count, self.degree)
 
     @property
     def size(self) -> int:
@@ -52,12 +52,12 @@ class Monomials:
     @property
     def degrees(self) -> list[int]:
         """The degree of every monomial."""
-        return _degrees(self.count, self.degree)
+        return _list_degrees(self.count, self.degree)
 
     @property
     def firsts(self) -> list[int]:
         """The number of the first monomial of every degree."""
-        return _firsts(self.count, self.degree)
+        return _find_firsts(self.count, self.degree)
 
     def linear(self, variable: int) -> int:
         """Return the number of the monomial that is one variable alone."""
@@ -68,37 +68,37 @@ NONE = Monomials(0, 0)
 
 
 @lru_cache(maxsize=64)
-def _exponents(count: int, degree: int) -> list[tuple[int, ...]]:
+def _list_exponents(count: int, degree: int) -> list[tuple[int, ...]]:
     exponents = [e for e in product(range(degree + 1), repeat=count) if sum(e) <= degree]
     return sorted(exponents, key=lambda e: (sum(e), e))
 
 
 @lru_cache(maxsize=64)
-def _degrees(count: int, degree: int) -> list[int]:
-    return [sum(e) for e in _exponents(count, degree)]
+def _list_degrees(count: int, degree: int) -> list[int]:
+    return [sum(e) for e in _list_exponents(count, degree)]
 
 
 @lru_cache(maxsize=64)
-def _firsts(count: int, degree: int) -> list[int]:
-    return [_degrees(count, degree).index(n) for n in range(degree + 1)]
+def _find_firsts(count: int, degree: int) -> list[int]:
+    return [_list_degrees(count, degree).index(n) for n in range(degree + 1)]
 
 
 @lru_cache(maxsize=64)
-def _places(count: int, degree: int) -> dict[tuple[int, ...], int]:
-    return {e: i for i, e in enumerate(_exponents(count, degree))}
+def _number_monomials(count: int, degree: int) -> dict[tuple[int, ...], int]:
+    return {e: i for i, e in enumerate(_list_exponents(count, degree))}
 
 
 @lru_cache(maxsize=64)
-def _products_with(count: int, degree: int) -> list[list[tuple[int, int]]]:
-    pairs: list[list[tuple[int, int]]] = [[] for _ in _exponents(count, degree)]
-    for i, j, k in _products(count, degree):
+def _group_products(count: int, degree: int) -> list[list[tuple[int, int]]]:
+    pairs: list[list[tuple[int, int]]] = [[] for _ in _list_exponents(count, degree)]
+    for i, j, k in _list_products(count, degree):
         pairs[i].append((j, k))
     return pairs
 
 
 @lru_cache(maxsize=64)
-def _products(count: int, degree: int) -> list[tuple[int, int, int]]:
-    places, exponents = _places(count, degree), _exponents(count, degree)
+def _list_products(count: int, degree: int) -> list[tuple[int, int, int]]:
+    places, exponents = _number_monomials(count, degree), _list_exponents(count, degree)
     return [
         (i, j, places[g])
         for i, e in enumerate(exponents)
@@ -109,10 +109,10 @@ def _products(count: int, degree: int) -> list[tuple[int, int, int]]:
 
 
 @lru_cache(maxsize=64)
-def _quotients(count: int, degree: int) -> np.ndarray:
-    size = len(_exponents(count, degree))
+def _tabulate_quotients(count: int, degree: int) -> np.ndarray:
+    size = len(_list_exponents(count, degree))
     quotients = np.full((size, size), -1)
-    for i, j, k in _products(count, degree):
+    for i, j, k in _list_products(count, degree):
         quotients[i, k] = j
     quotients.flags.writeable = False
     return quotients

@@ -42,22 +42,23 @@ def fill(lower: Array, upper: Array, low: Array, high: Array, clock: Clock = NO_
             raise Broken(f"{lower.shape[0]} cells stand for a single point, expected one")
         return
     a, b = lower[:, thick], upper[:, thick]
-    if _overlap(a, b, clock):
+    if _has_overlap(a, b, clock):
         raise Broken("two cells overlap")
-    missing = _volume(low[thick], high[thick])
+    missing = _compute_volume(low[thick], high[thick])
     if a.shape[1] == 1:  # gaps lie between neighbours in order, before the first or after the last
         order = np.lexsort((b[:, 0], a[:, 0]))
         starts, stops = np.append(a[order, 0], high[thick]), np.append(low[thick], b[order, 0])
         missing = sum((Fraction(x) - Fraction(y) for x, y in zip(starts, stops, strict=True) if x != y), Fraction(0))
     else:
-        missing -= sum((_volume(x, y) for x, y in clock.each(zip(a, b, strict=True))), Fraction(0))
+        missing -= sum((_compute_volume(x, y) for x, y in clock.each(zip(a, b, strict=True))), Fraction(0))
     if missing != 0:
         raise Broken(
-            f"the cells leave a share of {float(missing / _volume(low[thick], high[thick])):.3g} of the index set out"
+            f"the cells leave a share of {float(missing / _compute_volume(low[thick], high[thick])):.3g}"
+            " of the index set out"
         )
 
 
-def _overlap(a: Array, b: Array, clock: Clock) -> bool:
+def _has_overlap(a: Array, b: Array, clock: Clock) -> bool:
     """Return True where two of the cells ``[a_i, b_i]`` share more than a face."""
     if a.shape[1] == 1:  # in order, only neighbours can overlap; of two with one start, the shorter is first
         order = np.lexsort((b[:, 0], a[:, 0]))
@@ -67,7 +68,7 @@ def _overlap(a: Array, b: Array, clock: Clock) -> bool:
     )
 
 
-def _volume(low: Array, high: Array) -> Fraction:
+def _compute_volume(low: Array, high: Array) -> Fraction:
     product = Fraction(1)
     for x, y in zip(low.tolist(), high.tolist(), strict=True):
         product *= Fraction(y) - Fraction(x)

@@ -35,7 +35,7 @@ def acted(case: Case) -> float:
     is_active = np.abs(case.control.control(case.theta)) > ROUNDED * case.control.summands(case.theta)
     for block in case.price.blocks:  # the channels of one vector act together
         is_active[block] = is_active[block].any(axis=0)
-    counts = _counts(case)
+    counts = _compute_counts(case)
     return float(counts[is_active].sum() / counts.sum())
 
 
@@ -44,7 +44,9 @@ def shared(case: Case, rows: Rows, pieces: Any) -> tuple[Rows, Any]:
 
     The multipliers are divided by the largest absolute value of a channel times the factor ``l1`` of the cost. This
     divisor is best where all channels have the same largest value; any positive divisor gives a valid bound."""
-    divisor = max((max(float(abs(low).mid()), float(abs(high).mid())) for low, high in _ranges(case)), default=1.0)
+    divisor = max(
+        (max(float(abs(low).mid()), float(abs(high).mid())) for low, high in _enclose_ranges(case)), default=1.0
+    )
     divisor = divisor * case.problem.cost.l1 or 1.0
     piece_multipliers = pieces if pieces is None else (np.asarray(pieces, dtype=float) / divisor).tolist()
     return [(y / divisor, row) for y, row in rows], piece_multipliers
@@ -56,14 +58,14 @@ def least(case: Case, rows: Rows, pieces: Sequence[Sequence[float]] | None) -> f
     ``rows`` are the multipliers with their constraints, ``pieces (m, K)`` those of the control's pieces, if there are
     any. The share is a whole number of pieces where all pieces count the same."""
     total, slopes = case.duality.summed(rows, pieces)
-    ranges = _ranges(case)
-    counts = [[ball(c) * length for c in case.price.counts] for length in _lengths(case)]
+    ranges = _enclose_ranges(case)
+    counts = [[ball(c) * length for c in case.price.counts] for length in _enclose_lengths(case)]
     none = [[ball(0)] * case.problem.system.controls] * len(slopes)
     charged = case.duality.charged(rows, none)
     for count, slope, sizes in zip(counts, slopes, charged, strict=True):
         case.clock.check()
-        total = total + _least(case, ranges, count, slope, sizes=sizes)
-    return _whole(case, total)
+        total = total + _bound_piece(case, ranges, count, slope, sizes=sizes)
+    return _bound_active_share(case, total)
 
 
 def least_of_cost(case: Case, cost: arb) -> float:
@@ -74,16 +76,16 @@ def least_of_cost(case: Case, cost: arb) -> float:
     factors = [
         ball(len(block)) * ball(counts[c]) / (ball(case.problem.cost.l1) * ball(highest[c]) * longest)
         for block in case.price.blocks
-        if (longest := _longest(case, block)) > 0 and highest[c := block[0]] > 0.0
+        if (longest := _bound_length(case, block)) > 0 and highest[c := block[0]] > 0.0
     ]
     if not factors:
         return 0.0
-    return _whole(case, cost * smallest(factors))
+    return _bound_active_share(case, cost * smallest(factors))
 
 
-def _longest(case: Case, block: Sequence[int]) -> arb:
+def _bound_length(case: Case, block: Sequence[int]) -> arb:
     """Return an upper bound of the Euclidean length of the vector of some channels."""
-    bound, ranges = case.problem.control, _ranges(case)
+    bound, ranges = case.problem.control, _enclose_ranges(case)
     largest_values = [abs(ranges[i][0]).max(abs(ranges[i][1])) for i in block]
     size = sum((r * r for r in largest_values), ball(0)).sqrt()
     if isinstance(bound, NormBall) and bound.p == 2.0:
@@ -92,14 +94,14 @@ def _longest(case: Case, block: Sequence[int]) -> arb:
     return size
 
 
-def _whole(case: Case, total: arb) -> float:
+def _bound_active_share(case: Case, total: arb) -> float:
     """Return a lower bound of the time of action as a share of the largest."""
-    return min(1.0, _rounded(case, total) / float(_vectors(case).sum()))
+    return min(1.0, _bound_active_time(case, total) / float(_sum_counts(case).sum()))
 
 
-def _rounded(case: Case, total: arb) -> float:
+def _bound_active_time(case: Case, total: arb) -> float:
     """Return a lower bound of the time of action, rounded up to whole pieces where all of them count the same."""
-    counts = _vectors(case)
+    counts = _sum_counts(case)
     bound = float(np.nextafter(float(total.lower()), -np.inf))
     if np.ptp(counts) <= EQUAL * counts.max():
         count = float(counts.mean())
@@ -107,7 +109,7 @@ def _rounded(case: Case, total: arb) -> float:
     return max(0.0, bound)
 
 
-def _least(
+def _bound_piece(
     case: Case,
     ranges: list[tuple[arb, arb]],
     count: list[arb],
@@ -135,7 +137,7 @@ def _least(
     return certain + known(case.problem.control).least(ups, downs, slope)
 
 
-def _ranges(case: Case) -> list[tuple[arb, arb]]:
+def _enclose_ranges(case: Case) -> list[tuple[arb, arb]]:
     """Return the least and the largest value of every channel."""
     ranges, m, shape = [], case.problem.system.controls, known(case.problem.control)
     for i in range(m):
@@ -144,26 +146,26 @@ def _ranges(case: Case) -> list[tuple[arb, arb]]:
     return ranges
 
 
-def _lengths(case: Case) -> list[arb]:
+def _enclose_lengths(case: Case) -> list[arb]:
     """Return the length of every piece of the control, in time."""
     breakpoints = case.control.breakpoints
     return [ball(b) - ball(a) for a, b in pairwise(breakpoints)]
 
 
-def _counts(case: Case) -> np.ndarray:
+def _compute_counts(case: Case) -> np.ndarray:
     """Return the count of every piece of every channel, ``(m, K)``: its weight times its length."""
     return np.asarray(np.outer(case.price.counts, np.diff(case.control.breakpoints)))
 
 
-def _vectors(case: Case) -> np.ndarray:
+def _sum_counts(case: Case) -> np.ndarray:
     """Return the count of every piece of every vector of channels, ``(b, K)``."""
-    counts = _counts(case)
+    counts = _compute_counts(case)
     return np.array([counts[block].sum(axis=0) for block in case.price.blocks])
 
 
 def largest(case: Case) -> float:
     """Return the longest time that a control can act, weighted over its channels."""
-    return float(_counts(case).sum())
+    return float(_compute_counts(case).sum())
 
 
 Part = tuple[float, float, bool]
@@ -199,9 +201,9 @@ def proven(case: Case, nodes: Sequence[Any], weighted: Callable[[Mapping[str, An
             raise Broken("tree: its nodes are no tree")
         visited.add(number)
         if "multipliers" in node:
-            bound = min(bound, _leaf(case, node.get("feasible") is not False, restrictions, weighted(node)))
+            bound = min(bound, _bound_leaf(case, node.get("feasible") is not False, restrictions, weighted(node)))
             continue
-        halves = _divided(case, node, restrictions)
+        halves = _divide_part(case, node, restrictions)
         for key, half in zip(("first", "second"), halves, strict=True):
             child = node.get(key)
             if type(child) is not int:
@@ -210,7 +212,7 @@ def proven(case: Case, nodes: Sequence[Any], weighted: Callable[[Mapping[str, An
     return bound
 
 
-def _divided(
+def _divide_part(
     case: Case, node: Mapping[str, Any], parts: Mapping[tuple[int, int], Part]
 ) -> tuple[dict[tuple[int, int], Part], dict[tuple[int, int], Part]]:
     """Return two halves that together hold every control of a part.
@@ -244,29 +246,31 @@ def _divided(
     }
 
 
-def _leaf(case: Case, feasible: bool, parts: Mapping[tuple[int, int], Part], rows: Rows) -> float:
+def _bound_leaf(case: Case, feasible: bool, parts: Mapping[tuple[int, int], Part], rows: Rows) -> float:
     """Return a lower bound of the time that the controls of one part act; infinite where none is feasible."""
     total, slopes = case.duality.summed(rows, None)
     sizes = case.duality.charged(rows, [[ball(0)] * case.problem.system.controls] * len(slopes))
-    for k, (length, slope, charged) in enumerate(zip(_lengths(case), slopes, sizes, strict=True)):
+    for k, (length, slope, charged) in enumerate(zip(_enclose_lengths(case), slopes, sizes, strict=True)):
         piece_restrictions = [parts.get((c, k), ANY) for c in range(len(slope))]
         counts = [ball(c) * length if feasible else ball(0) for c in case.price.counts]
-        total = total + _least_of_part(case, piece_restrictions, counts, slope, charged)
+        total = total + _bound_piece_in_part(case, piece_restrictions, counts, slope, charged)
     if not feasible:
         if not total > 0:
             raise Broken(f"tree: multipliers of a part prove {float(total.lower()):.3g}, expected a positive number")
         return float("inf")
-    return _rounded(case, total)
+    return _bound_active_time(case, total)
 
 
-def _least_of_part(case: Case, parts: Sequence[Part], counts: list[arb], slope: list[arb], sizes: Sequence[arb]) -> arb:
-    """Return a lower bound of the sum that one piece contributes, as `_least` does, over the controls of a part."""
+def _bound_piece_in_part(
+    case: Case, parts: Sequence[Part], counts: list[arb], slope: list[arb], sizes: Sequence[arb]
+) -> arb:
+    """Return a lower bound of the sum that one piece contributes, as `_bound_piece` does, over a part's controls."""
     from flint import arb
 
     if case.problem.control.is_box or case.letters is not None:
         box, total = case.problem.control.bounding_box(), arb(0)
         for part, count, s, size, low, high in zip(parts, counts, slope, sizes, box.lower, box.upper, strict=True):
-            values = _values(case, part, float(low), float(high))
+            values = _list_candidate_values(case, part, float(low), float(high))
             if not values:
                 return arb("inf")  # nothing is in this part
             sums = [(count if part[2] or v != 0.0 else arb(0)) + s * arb(v) + size * arb(abs(v)) for v in values]
@@ -274,10 +278,12 @@ def _least_of_part(case: Case, parts: Sequence[Part], counts: list[arb], slope: 
         return total
     certain = sum((count for part, count in zip(parts, counts, strict=True) if part[2]), arb(0))
     priced = [arb(0) if part[2] else count for part, count in zip(parts, counts, strict=True)]
-    return certain + _least(case, _ranges(case), priced, slope, [part[:2] == (0.0, 0.0) for part in parts], sizes)
+    return certain + _bound_piece(
+        case, _enclose_ranges(case), priced, slope, [part[:2] == (0.0, 0.0) for part in parts], sizes
+    )
 
 
-def _values(case: Case, part: Part, low: float, high: float) -> list[float]:
+def _list_candidate_values(case: Case, part: Part, low: float, high: float) -> list[float]:
     """Return the values among which the count of an entry plus any slope has its minimum.
 
     The values are the ends of the range of the entry, and 0 in between; with an alphabet, the letters in the range."""

@@ -46,8 +46,8 @@ class VerifiedFeedback:
         Raises `Broken` where they answer what is not yet measured, or what the policy does not answer."""
         case = self.case
         if not case.answering:
-            return self._none
-        gains = shaped(case.certificate, "gains", self._none.shape)
+            return self._zero_gains
+        gains = shaped(case.certificate, "gains", self._zero_gains.shape)
         times, measurements = case.control.breakpoints, case.problem.measurements
         has_first_deviation = case.problem.initial_set is not None or (
             measurements is not None and measurements.noise is not None
@@ -63,7 +63,7 @@ class VerifiedFeedback:
         return gains
 
     @property
-    def _none(self) -> Array:
+    def _zero_gains(self) -> Array:
         """Gains that answer nothing, ``(K, K, m, p)``."""
         system, measurements, K = self.case.problem.system, self.case.problem.measurements, self.case.control.pieces
         return np.zeros((K, K, system.controls, system.states if measurements is None else measurements.outputs))
@@ -82,9 +82,9 @@ class VerifiedFeedback:
     @cached_property
     def loop(self) -> VerifiedLoop:
         """The system under the nominal control and the gains."""
-        return self._loop(self.case.pieces, self.gains)
+        return self._close_loop(self.case.pieces, self.gains)
 
-    def _loop(self, nominal: Sequence[arb_mat], gains: Array, changes: list[float] | None = None) -> VerifiedLoop:
+    def _close_loop(self, nominal: Sequence[arb_mat], gains: Array, changes: list[float] | None = None) -> VerifiedLoop:
         """Return the closed loop; where ``changes`` are given, under disturbances that jump at these times only.
 
         Raise `Unchecked` for the kinds of systems and disturbances that the checker does not know under feedback."""
@@ -194,7 +194,7 @@ class VerifiedFeedback:
             written = ball(number(case.certificate, "cost"))
             terms = max(case.price.added(case.pieces, ball(0)), case.price.terms(case.pieces))
             rounded = CANCELLED * ball(terms if case.price.is_quadratic else 0.0)
-            self._effort(written - squares + FIGURES * abs(written).max(rounded))
+            self._verify_effort(written - squares + FIGURES * abs(written).max(rounded))
             return written.max(squares)  # an effort is never less than 0
         for k, costs in enumerate(case.price.costs):
             for i, price in enumerate(costs):
@@ -203,7 +203,7 @@ class VerifiedFeedback:
                 total = total + price * height
         return total + squares
 
-    def _effort(self, limit: arb) -> None:
+    def _verify_effort(self, limit: arb) -> None:
         """Raise `Broken` or `Unchecked` unless it is shown that no deviation causes an effort beyond ``limit``."""
         case, loop = self.case, self.loop
         a, A = [], []
@@ -250,17 +250,17 @@ class VerifiedFeedback:
         direction in which any of them does."""
         case = self.case
         if not case.measurable:
-            return self._resting(None)
+            return self._make_loop_at_rest(None)
         fractions = np.arange(case.problem.system.states) / case.problem.system.states
         intervals = zip(case.timing.grid[:-1], case.timing.grid[1:], strict=True)
-        return self._resting([float(t) for a, b in intervals for t in a + fractions * (b - a)])
+        return self._make_loop_at_rest([float(t) for a, b in intervals for t in a + fractions * (b - a)])
 
-    def _resting(self, changes: list[float] | None) -> VerifiedLoop:
+    def _make_loop_at_rest(self, changes: list[float] | None) -> VerifiedLoop:
         """Return the system without any control, under disturbances that jump at ``changes``."""
-        return self._loop(self._still, self._none, changes)
+        return self._close_loop(self._zero_control, self._zero_gains, changes)
 
     @property
-    def _still(self) -> list[arb_mat]:
+    def _zero_control(self) -> list[arb_mat]:
         """The control 0 on every piece."""
         none = stacked([balls([0.0])] * self.case.problem.system.controls)
         return [none] * self.case.control.pieces
@@ -277,8 +277,8 @@ class VerifiedFeedback:
                 raise Broken(f"{name}: the disturbance must change at increasing times from 0 on")
             if changes[-1] >= self.case.timing.grid[-1]:
                 raise Broken(f"{name}: the disturbance changes at {float(changes[-1]):.6g}, after the end")
-            loop = self._resting([float(t) for t in changes])
-        return NamedDeviations(self.case, loop, _deviations(self.case, loop, entry, name))
+            loop = self._make_loop_at_rest([float(t) for t in changes])
+        return NamedDeviations(self.case, loop, _read_deviations(self.case, loop, entry, name))
 
     def following(self, named: NamedDeviations, entry: Mapping[str, Any], name: str) -> NamedDeviations:
         """Return the deviations that the first control of the next period answers, in a plan that repeats.
@@ -368,7 +368,7 @@ class NamedDeviations:
         )
 
 
-def _deviations(case: Case, loop: VerifiedLoop, entry: Mapping[str, Any], name: str) -> list[list[arb]]:
+def _read_deviations(case: Case, loop: VerifiedLoop, entry: Mapping[str, Any], name: str) -> list[list[arb]]:
     """Return the deviations from the middles that an entry names, block by block.
 
     Raise `Broken` unless each point is shown to be in its set. A point that rounding took out of a thin set is replaced

@@ -114,7 +114,8 @@ class Case:
         d, path_count = self.problem.system.states, sum(not isinstance(entry, Accumulated) for entry in path)
         terminal_sets, horizon = self.problem.terminal_sets, self.problem.horizon
         path_windows = [
-            _window(self.problem, entry, f"path[{i}]" if path_count > 1 else "path") for i, entry in enumerate(path)
+            _make_window(self.problem, entry, f"path[{i}]" if path_count > 1 else "path")
+            for i, entry in enumerate(path)
         ]
         names = [f"terminal[{i}]" if len(terminal_sets) > 1 else "terminal" for i in range(len(terminal_sets))]
         terminal_windows = [
@@ -128,7 +129,9 @@ class Case:
 
         There are none where the set of initial states is one point. A curved set has one for every corner of the
         parameters that were made states."""
-        return [_window(self.problem, entry, RETURN) for entry in self.problem.windows if isinstance(entry, Return)]
+        return [
+            _make_window(self.problem, entry, RETURN) for entry in self.problem.windows if isinstance(entry, Return)
+        ]
 
     @property
     def equalities(self) -> list[tuple[int, float]]:
@@ -268,7 +271,9 @@ class Case:
         )
 
 
-def _window(problem: OptimalControlProblem, entry: PathConstraint | MixedConstraint, name: str) -> ConstraintWindow:
+def _make_window(
+    problem: OptimalControlProblem, entry: PathConstraint | MixedConstraint, name: str
+) -> ConstraintWindow:
     """Return the constraint of one entry of a problem, under the entry's own name where it has one."""
     stop = problem.horizon if entry.stop is None else entry.stop
     reference = None if entry.relative_to is None else np.asarray(entry.relative_to)
@@ -277,7 +282,7 @@ def _window(problem: OptimalControlProblem, entry: PathConstraint | MixedConstra
 
 def numbers(data: object, name: str) -> Array:
     """Return finite numbers from the certificate; raise `Broken` where the data are something else."""
-    if not _numeric(data):
+    if not _is_numeric(data):
         raise Broken(f"{name}: expected numbers")
     try:
         array = np.array(data, dtype=float)
@@ -298,7 +303,7 @@ def shaped(data: Mapping[str, Any], key: str, shape: tuple[int, ...], whose: str
     return array
 
 
-def _numeric(data: object) -> bool:
+def _is_numeric(data: object) -> bool:
     """Return whether the data are a number or nested lists of numbers; text and truth values are none."""
     level: list[object] = [data]
     while level:

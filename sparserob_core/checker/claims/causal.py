@@ -63,8 +63,8 @@ def causal_bound(case: Case, data: Mapping[str, Any], priced: bool) -> arb:
     Unchecked
         For problems whose causal policies the checker does not bound.
     """
-    _refuse(case)
-    signals, nominal_report = _signals(case, data), middle_of(case)
+    _require_supported(case)
+    signals, nominal_report = _read_signals(case, data), middle_of(case)
     K, m, total = case.control.pieces, case.problem.system.controls, ball(0)
     changes = case.disturbances.changes or []
     breakpoints, measurements = case.control.breakpoints, case.problem.measurements
@@ -74,19 +74,21 @@ def causal_bound(case: Case, data: Mapping[str, Any], priced: bool) -> arb:
     reports, initial_deviations = signals, None
     if measurements is not None and "outputs" in data:
         known_blocks = measurements.known(breakpoints).sum(axis=1).tolist()
-        initial_deviations = _begun(case, data, len(signals))
+        initial_deviations = _read_initial_deviations(case, data, len(signals))
         reports, nominal_report = (
-            _outputs(case, data, signals, initial_deviations, max(known_blocks)),
+            _read_outputs(case, data, signals, initial_deviations, max(known_blocks)),
             np.zeros((measurements.outputs, K)),
         )
-    groups: list[dict[bytes, list[arb]]] = [{_until(nominal_report, n): [ball(0)] * m} for n in known_blocks]
+    groups: list[dict[bytes, list[arb]]] = [{_encode_prefix(nominal_report, n): [ball(0)] * m} for n in known_blocks]
     entries = listed(data, "multipliers")
     if len(entries) > MOST:
         raise Broken(f"{len(entries)} multipliers are too many to be checked")
     rows_by_key: Rows = {}
     for entry in entries:
         case.clock.check()
-        y, signal_index, (row, disturbance_weights, initial_weights) = _row(case, entry, len(signals), rows_by_key)
+        y, signal_index, (row, disturbance_weights, initial_weights) = _read_entry(
+            case, entry, len(signals), rows_by_key
+        )
         weight, signal = ball(y), signals[signal_index]
         terms = [a * ball(w) for block, column in zip(disturbance_weights, signal.T, strict=True)
                  for a, w in zip(block, column, strict=True)]  # fmt: skip
@@ -98,20 +100,20 @@ def causal_bound(case: Case, data: Mapping[str, Any], priced: bool) -> arb:
         total = total + weight * sum(terms, row.constant)
         for k in range(K):
             if any(not x.is_zero() for x in row.slope[k]):
-                group = groups[k].setdefault(_until(reports[signal_index], known_blocks[k]), [ball(0)] * m)
+                group = groups[k].setdefault(_encode_prefix(reports[signal_index], known_blocks[k]), [ball(0)] * m)
                 group[:] = [a + weight * x for a, x in zip(group, row.slope[k], strict=True)]
-    shares = _shares(data, len(signals)) if priced and case.charge == WORST else None
+    shares = _read_shares(data, len(signals)) if priced and case.charge == WORST else None
     for k in range(K):
-        prices: dict[bytes, arb] = {_until(nominal_report, known_blocks[k]): ball(1)} if shares is None else {}
+        prices: dict[bytes, arb] = {_encode_prefix(nominal_report, known_blocks[k]): ball(1)} if shares is None else {}
         for report, share in zip(reports, shares or (), strict=False):
-            key = _until(report, known_blocks[k])
+            key = _encode_prefix(report, known_blocks[k])
             prices[key] = prices.get(key, ball(0)) + share
             groups[k].setdefault(key, [ball(0)] * m)
-        total = total + _of_piece(case, k, groups[k], prices, priced)
+        total = total + _bound_piece(case, k, groups[k], prices, priced)
     return total
 
 
-def _shares(data: Mapping[str, Any], count: int) -> list[arb]:
+def _read_shares(data: Mapping[str, Any], count: int) -> list[arb]:
     """Return the weights of the efforts under the signals; their weighted sum is at most the largest effort.
 
     Raise `Broken` unless no weight is negative and their sum is at most 1."""
@@ -124,7 +126,7 @@ def _shares(data: Mapping[str, Any], count: int) -> list[arb]:
     return share_balls
 
 
-def _refuse(case: Case) -> None:
+def _require_supported(case: Case) -> None:
     """Raise `Unchecked` for problems whose causal policies the checker does not bound."""
     if case.policy is None or case.problem.system.parameter_count or not case.problem.cost.is_linear:
         raise Unchecked("the checker bounds causal policies of known systems, with the cost of an L1 norm, only")
@@ -132,7 +134,7 @@ def _refuse(case: Case) -> None:
         raise Unchecked("the checker bounds causal policies in indicators")
 
 
-def _row(case: Case, entry: object, signals: int, rows: Rows) -> tuple[float, int, Pushed]:
+def _read_entry(case: Case, entry: object, signals: int, rows: Rows) -> tuple[float, int, Pushed]:
     """Return the multiplier of an entry, the number of its signal, and its constraint.
 
     With the constraint come the weights of the disturbance and of the initial state in it."""
@@ -178,12 +180,12 @@ def middle_of(case: Case) -> Array:
     return np.repeat(middle(shape)[:, None], len(case.disturbances.changes or []), axis=1)
 
 
-def _until(signal: Array, blocks: int) -> bytes:
+def _encode_prefix(signal: Array, blocks: int) -> bytes:
     """Return the first ``blocks`` columns of a signal as bytes, which are equal for equal numbers."""
     return np.ascontiguousarray(signal[:, :blocks] + 0.0).tobytes()
 
 
-def _signals(case: Case, data: Mapping[str, Any]) -> list[Array]:
+def _read_signals(case: Case, data: Mapping[str, Any]) -> list[Array]:
     """Return the signals ``(mw, blocks)``; raise `Broken` unless all are shown to be in the set of disturbances."""
     signals, shape = [], case.problem.disturbance
     for entry in listed(data, "signals"):
@@ -202,7 +204,7 @@ def _signals(case: Case, data: Mapping[str, Any]) -> list[Array]:
     return signals
 
 
-def _begun(case: Case, data: Mapping[str, Any], count: int) -> list[list[arb]]:
+def _read_initial_deviations(case: Case, data: Mapping[str, Any], count: int) -> list[list[arb]]:
     """Return for every signal the deviation ``(d,)`` of its initial state from the middle of the set.
 
     The deviations are empty where there is no set. Raise `Broken` unless every initial state is shown to be in the
@@ -221,7 +223,7 @@ def _begun(case: Case, data: Mapping[str, Any], count: int) -> list[list[arb]]:
     return deviations
 
 
-def _outputs(
+def _read_outputs(
     case: Case, data: Mapping[str, Any], signals: list[Array], begun: list[list[arb]], known_at_all: int
 ) -> list[Array]:
     """Return the outputs ``(p, K)`` under every signal, relative to the nominal ones.
@@ -259,7 +261,7 @@ def _outputs(
     return [np.ascontiguousarray(outputs.T) for outputs in outputs_by_signal]
 
 
-def _of_piece(case: Case, k: int, groups: dict[bytes, list[arb]], counts: dict[bytes, arb], priced: bool) -> arb:
+def _bound_piece(case: Case, k: int, groups: dict[bytes, list[arb]], counts: dict[bytes, arb], priced: bool) -> arb:
     """Return a lower bound of what the controls on one piece contribute to the weighted sum and the cost.
 
     The controls of each group of signals are one vector with the slope ``groups[key]``. ``counts`` says which part of
@@ -269,13 +271,13 @@ def _of_piece(case: Case, k: int, groups: dict[bytes, list[arb]], counts: dict[b
     total, zero = ball(0), [ball(0)] * m
     shares = dict.fromkeys(groups, zero) | {key: [share * price for price in prices] for key, share in counts.items()}
     if priced and case.charge == PEAK:
-        shares = _shared(case, prices, groups)
+        shares = _share_peak_price(case, prices, groups)
     for key, slope in groups.items():
         total = total + known(control).least(shares[key], shares[key], slope)
     return total
 
 
-def _shared(case: Case, prices: list[arb], groups: dict[bytes, list[arb]]) -> dict[bytes, list[arb]]:
+def _share_peak_price(case: Case, prices: list[arb], groups: dict[bytes, list[arb]]) -> dict[bytes, list[arb]]:
     """Return the part of the price of a channel's peak that each group pays, as far as it can lower its slope.
 
     The sum of the parts is at most the price, since ``max_g |u_g|`` is at least every mean of ``|u_g|``."""

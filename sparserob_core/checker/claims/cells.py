@@ -86,7 +86,7 @@ def prove(
     work_by_box = dict[Corners, list[tuple[Sides, list[Interval]]]]()
     for box, sides, intervals in reversed(work):
         work_by_box.setdefault(box, []).append((sides, intervals))
-    excess, cells, boxes = _Found(), 0, 0
+    excess, cells, boxes = _LargestExcess(), 0, 0
     cell_limit = max(MOST_CELLS, TIMES * sum(len(intervals) for _, _, intervals in work))
     while work_by_box:
         # all directions of one box come before any of its halves, because the tube of a box is expensive
@@ -97,7 +97,7 @@ def prove(
         while stack:
             sides, intervals = stack.pop()
             boxes += 1
-            open_cells = _Left(np.zeros(len(box[0])))
+            open_cells = _OpenCells(np.zeros(len(box[0])))
             while intervals:
                 cells += len(intervals)
                 if cells > cell_limit or boxes > MOST_BOXES:
@@ -110,7 +110,7 @@ def prove(
             if open_cells.turned:
                 stack += [(half, open_cells.turned) for half in reversed(sides.halves(open_cells.slopes))]
             if open_cells.wide:
-                halved += [(half, sides, open_cells.wide) for half in _split(box, open_cells.influence)]
+                halved += [(half, sides, open_cells.wide) for half in _halve_box(box, open_cells.influence)]
         for half, sides, intervals in reversed(halved):
             work_by_box.setdefault(half, []).append((sides, intervals))
     return Proven(excess.bound, excess.share, cells, boxes)
@@ -137,7 +137,7 @@ class Place:
 
 @final
 @dataclass(eq=False)
-class _Found:
+class _LargestExcess:
     """The largest excess that could not be excluded so far, as a number and as a share of the unit of its row."""
 
     bound: float = -np.inf
@@ -152,7 +152,7 @@ class _Found:
 
 @final
 @dataclass(eq=False)
-class _Left:
+class _OpenCells:
     """The cells of time that one box of parameters and one cell of directions leave open, sorted by what to halve next.
 
     ``halves`` holds shorter intervals, for the same box and directions. The intervals in ``turned`` wait for smaller
@@ -166,14 +166,14 @@ class _Left:
     wide: list[Interval] = field(default_factory=list)
 
 
-def _examine(place: Place, sides: Sides, todo: Sequence[Interval], left: _Left, shown: _Found) -> None:
+def _examine(place: Place, sides: Sides, todo: Sequence[Interval], left: _OpenCells, shown: _LargestExcess) -> None:
     """Bound the rows on every cell of time, and sort the cells whose bounds are too large into ``left``.
 
     The bounds that suffice are recorded in ``shown``."""
-    for interval, polynomials, tops in _batch(place, sides.rows, todo):
+    for interval, polynomials, tops in _bound_rows(place, sides.rows, todo):
         for i, row in enumerate(sides.rows):
             if not tops[i] <= 0.0:
-                tops[i], polynomials[i] = _closer(place, row, interval, polynomials[i], tops[i])
+                tops[i], polynomials[i] = _tighten_bound(place, row, interval, polynomials[i], tops[i])
         for top, row in zip(tops, sides.rows, strict=True):
             if top <= 0.0:
                 shown.add(top, row)
@@ -183,29 +183,31 @@ def _examine(place: Place, sides: Sides, todo: Sequence[Interval], left: _Left, 
         failed = [(row, poly) for row, poly, _ in over]
         if not failed:
             continue
-        if _turn(place, sides, interval, failed, max(tops)):
+        if _has_too_wide_directions(place, sides, interval, failed, max(tops)):
             left.turned.append(interval)
             left.slopes = left.slopes + sides.slopes(tops)
-        elif place.box[0] and any(_to_blame(poly, top, interval) for _, poly, top in over):
+        elif place.box[0] and any(_is_smaller_box_better(poly, top, interval) for _, poly, top in over):
             left.wide.append(interval)
-            left.influence += sum(_influence(place.tube, poly) for _, poly in failed)
+            left.influence += sum(_measure_influence(place.tube, poly) for _, poly in failed)
         else:
-            left.halves += _halves(interval)
+            left.halves += _halve_interval(interval)
 
 
-def _closer(place: Place, row: Bounded, interval: Interval, poly: Polynomial, top: float) -> tuple[float, Polynomial]:
+def _tighten_bound(
+    place: Place, row: Bounded, interval: Interval, poly: Polynomial, top: float
+) -> tuple[float, Polynomial]:
     """Return a tighter bound with its polynomial, by means that take longer.
 
     The polynomial is sharper where switching disturbances cause the error, and the half-spaces of the set of parameters
     are used."""
     if poly.kinks > BLAME * row.slack:
-        ((_, (sharper,), (sharper_top,)),) = _batch(place, [row], [interval], sharp=True)
+        ((_, (sharper,), (sharper_top,)),) = _bound_rows(place, [row], [interval], sharp=True)
         if sharper_top < top:
             top, poly = sharper_top, sharper
-    return (top if top <= 0.0 else min(top, _cut(place, row, poly))), poly
+    return (top if top <= 0.0 else min(top, _bound_by_halfspaces(place, row, poly))), poly
 
 
-def _turn(
+def _has_too_wide_directions(
     place: Place, sides: Sides, interval: Interval, failed: Sequence[tuple[Bounded, Polynomial]], worst: float
 ) -> bool:
     """Return whether a cell fails, by at most ``worst``, because its directions differ too much.
@@ -218,9 +220,9 @@ def _turn(
     if middle is None:
         _refute(place, interval, failed)
         return False
-    ((_, (poly,), (top,)),) = _batch(place, [middle], [interval])
+    ((_, (poly,), (top,)),) = _bound_rows(place, [middle], [interval])
     if not top <= 0.0:
-        top, poly = _closer(place, middle, interval, poly, top)
+        top, poly = _tighten_bound(place, middle, interval, poly, top)
     _refute(place, interval, [(middle, poly)])
     return sides.is_wide and top <= 0.0 and worst - top > 2.0 * (poly.expansion + poly.kinks)
 
@@ -236,7 +238,7 @@ def _refute(place: Place, interval: Interval, rows: Sequence[tuple[Bounded, Poly
             raise Broken(f"it is exceeded by {least:.3g} at t = {interval[1]:.6g}, {least / row.unit:.1e} of its unit")
 
 
-def _batch(
+def _bound_rows(
     place: Place, rows: Sequence[Bounded], todo: Sequence[Interval], sharp: bool = False
 ) -> Iterator[tuple[Interval, list[Polynomial], list[float]]]:
     """Yield every interval with its polynomials, one per row, and with proven upper bounds of their excess.
@@ -246,7 +248,7 @@ def _batch(
     for interval in todo:
         place.clock.check()
         polynomials_by_interval.append(place.cells(interval, z, sharp))
-    tops = _tops(
+    tops = _bound_polynomials(
         place.tube,
         [
             (poly, row.allowed)
@@ -258,7 +260,7 @@ def _batch(
         yield interval, polynomials, tops[number * len(rows) : (number + 1) * len(rows)].tolist()
 
 
-def _tops(tube: Reached, flat: Sequence[tuple[Polynomial, float]]) -> Array:
+def _bound_polynomials(tube: Reached, flat: Sequence[tuple[Polynomial, float]]) -> Array:
     """Return upper bounds ``(k,)`` of polynomials with their errors, each less the value that it is allowed to reach.
 
     A bound is at most 0 where halving boxes shows that; where it is positive it may be far from sharp."""
@@ -278,7 +280,7 @@ def _tops(tube: Reached, flat: Sequence[tuple[Polynomial, float]]) -> Array:
     return tops
 
 
-def _cut(place: Place, row: Bounded, poly: Polynomial) -> float:
+def _bound_by_halfspaces(place: Place, row: Bounded, poly: Polynomial) -> float:
     """Return the upper bound that the half-spaces of the set of parameters give.
 
     Where ``a'p <= s`` on the set, ``v <= v + weight (s - a'p)`` holds there for every ``weight >= 0``."""
@@ -294,11 +296,11 @@ def _cut(place: Place, row: Bounded, poly: Polynomial) -> float:
         coefficients[0, 0] += float(weights @ (limits - normals @ centre))
         size = float(weights @ (np.abs(limits) + np.abs(normals) @ (np.abs(centre) + radius)))
         changed = replace(poly, coefficients=coefficients, error=poly.error + ROUNDING * size)
-        top = min(top, float(_tops(tube, [(changed, row.allowed)])[0]))
+        top = min(top, float(_bound_polynomials(tube, [(changed, row.allowed)])[0]))
     return top
 
 
-def _to_blame(poly: Polynomial, top: float, interval: Interval) -> bool:
+def _is_smaller_box_better(poly: Polynomial, top: float, interval: Interval) -> bool:
     """Return whether a smaller box of parameters helps more than a shorter time against an excess of ``top``.
 
     A smaller box helps more at a single time, and where the box or a chord in time causes more than a small share of
@@ -311,7 +313,7 @@ def _to_blame(poly: Polynomial, top: float, interval: Interval) -> bool:
     return bool(np.abs(poly.coefficients[0, 1:]).sum() > np.abs(poly.coefficients[1:]).sum())
 
 
-def _influence(tube: Reached, poly: Polynomial) -> Array:
+def _measure_influence(tube: Reached, poly: Polynomial) -> Array:
     """Return how much each parameter contributes to what is left open, ``(nu,)``.
 
     The influence is measured by the coefficients of the system where the expansion causes the error, else by those of
@@ -325,7 +327,7 @@ def _influence(tube: Reached, poly: Polynomial) -> Array:
     return influence
 
 
-def _halves(interval: Interval) -> list[Interval]:
+def _halve_interval(interval: Interval) -> list[Interval]:
     """Return both halves of an interval; raise `Unchecked` where no double lies between its ends."""
     piece, start, stop = interval
     middle = (start + stop) / 2
@@ -334,7 +336,7 @@ def _halves(interval: Interval) -> list[Interval]:
     return [(piece, start, middle), (piece, middle, stop)]
 
 
-def _split(box: Corners, influence: Array) -> list[Corners]:
+def _halve_box(box: Corners, influence: Array) -> list[Corners]:
     """Return both halves of a box, cut across the parameter of most influence whose interval still has a middle."""
     lower, upper = list(box[0]), list(box[1])
     middles = (np.array(lower) + np.array(upper)) / 2

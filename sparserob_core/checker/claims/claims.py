@@ -56,30 +56,32 @@ def check(case: Case, gap_tolerance: float | None) -> list[Finding]:
     with ctx.workprec(precision_of(case)):
         if type(case.certificate.get("format")) is not int or case.certificate["format"] != 1:
             return [Finding("certificate", "fails", f"its format is {case.certificate.get('format')!r}, expected 1")]
-        causal = [judged("causal", lambda: _causal(case))] if "causal" in case.certificate else []
-        policy = [judged("policy", lambda: _policy(case))] if "policy" in case.certificate else []
+        causal = [judged("causal", lambda: _verify_causal_bound(case))] if "causal" in case.certificate else []
+        policy = [judged("policy", lambda: _verify_policy(case))] if "policy" in case.certificate else []
         if status == "infeasible":
-            return [*policy, judged("infeasibility", lambda: _infeasible(case)), *causal]
+            return [*policy, judged("infeasibility", lambda: _verify_infeasibility(case)), *causal]
         if status not in ("certified", "verified", "refuted", "undecided"):
             return [Finding("status", "fails", f"it is {status!r}, which claims nothing")]
         if status == "undecided" and case.certificate.get("decision") is None:  # stopped before there was one
-            return [*policy, judged("lower bound", lambda: _lower(case)), *causal]
-        claims = [*policy, _of_status(str(status), judged("control", lambda: _control(case)))]
-        claims.append(judged("cost", lambda: _cost(case)))
-        claims += [judged("lower bound", lambda: _lower(case))]
+            return [*policy, judged("lower bound", lambda: _verify_lower_bound(case)), *causal]
+        claims = [*policy, _qualify_finding(str(status), judged("control", lambda: _verify_control(case)))]
+        claims.append(judged("cost", lambda: _verify_cost(case)))
+        claims += [judged("lower bound", lambda: _verify_lower_bound(case))]
         if "fewest_active" in case.certificate:
-            claims.append(judged("fewest active", lambda: _fewest(case, str(status))))
+            claims.append(judged("fewest active", lambda: _verify_fewest_active(case, str(status))))
         claims += causal
         if status == "refuted":
-            return [*claims, judged("violation", lambda: _witness(case))]
+            return [*claims, judged("violation", lambda: _verify_witness(case))]
         if case.problem.control_step is not None:
-            claims.append(_of_status(str(status), judged("control_step", lambda: _steps(case))))
+            claims.append(_qualify_finding(str(status), judged("control_step", lambda: _verify_steps(case))))
         if case.equalities:
-            claims.append(_of_status(str(status), judged("equalities", lambda: equalities(case))))
+            claims.append(_qualify_finding(str(status), judged("equalities", lambda: equalities(case))))
         claims += [judged(window.name, lambda window=window: bounded(case, window)) for window in case.windows]  # type: ignore[misc]
         if case.problem.repeat or "repeat" in case.certificate:
-            claims.append(judged("repeat", lambda: _repeats(case, {claim.name: claim.verdict for claim in claims})))
-        return [*claims, judged("status", lambda: _status(case, str(status), gap_tolerance, claims))]
+            claims.append(
+                judged("repeat", lambda: _verify_repeat(case, {claim.name: claim.verdict for claim in claims}))
+            )
+        return [*claims, judged("status", lambda: _verify_status(case, str(status), gap_tolerance, claims))]
 
 
 def derived_bound(case: Case) -> float:
@@ -142,7 +144,7 @@ def judged(name: str, derive: Callable[[], str]) -> Finding:
         return Finding(name, "not checked", "a ball around a divisor holds 0")
 
 
-def _of_status(status: str, found: Finding) -> Finding:
+def _qualify_finding(status: str, found: Finding) -> Finding:
     """Return the verdict on a constraint, given the status of the control.
 
     A control that is not proven, such as one at which a run was stopped, claims no constraint. So it fails none."""
@@ -151,7 +153,7 @@ def _of_status(status: str, found: Finding) -> Finding:
     return Finding(found.name, "not checked", f"the certificate does not claim it: {found.text}")
 
 
-def _policy(case: Case) -> str:
+def _verify_policy(case: Case) -> str:
     """Show that the written policy, which bounds and gains are about, is the policy of the problem."""
     written = written_policy(case.certificate, case.control.pieces)
     if written.charge.cost != case.charge:
@@ -171,16 +173,16 @@ def _policy(case: Case) -> str:
     )
 
 
-def _control(case: Case) -> str:
+def _verify_control(case: Case) -> str:
     """Show that every piece of the control is in its set."""
     commands, places = feedback_of(case).commands, dict[int, int]()
     for k, command in enumerate(commands):
         places.setdefault(id(command), k)
-    shown = _in_set(case, case.problem.control, [*places.values()], lambda k: [commands[k]], "{}")
+    shown = _verify_in_set(case, case.problem.control, [*places.values()], lambda k: [commands[k]], "{}")
     return f"{len(commands)} pieces in their set{shown}"
 
 
-def _in_set(
+def _verify_in_set(
     case: Case, bound: ConvexSet, places: Sequence[int], parts: Callable[[int], list[arb_mat]], name: str
 ) -> str:
     """Show that the control on the given pieces, or its change to them, is in its set for all deviations.
@@ -193,26 +195,30 @@ def _in_set(
         summands = parts(k)
         deviation_support, point = (
             None,
-            [sum(entries[1:], entries[0]) for entries in zip(*map(_nominal, summands), strict=True)],
+            [sum(entries[1:], entries[0]) for entries in zip(*map(_extract_nominal, summands), strict=True)],
         )
         if any(not x.is_zero() for summand in summands for row in summand.tolist() for x in row[1:]):
             if shape.facets is None:
                 answering_pieces.append(k)
                 continue
-            responses = [_without_nominal(summand) for summand in summands]
+            responses = [_zero_nominal(summand) for summand in summands]
             deviation_support = lambda c, responses=responses: feedback.heights(responses, exactly(c[None]))[0]  # noqa: E731
         over, where = shape.excess(point, deviation_support)
         if over > TOLERANCE:
             where = name.format("the control" if where == "it" else where)
-            at = _at(case, float(case.control.breakpoints[k]))
+            at = _format_time(case, float(case.control.breakpoints[k]))
             raise Broken(f"{where} leaves its set by {over:.3g} of its own unit, from {at} on")
         worst = max(worst, over)
     if answering_pieces:
-        worst = max(worst, _turned(case, shape, answering_pieces, lambda k, rows: feedback.heights(parts(k), rows)))
+        worst = max(
+            worst, _bound_curved_excess(case, shape, answering_pieces, lambda k, rows: feedback.heights(parts(k), rows))
+        )
     return f", to {worst:.1e} of its own units" if worst > 0 else ""
 
 
-def _turned(case: Case, shape: Shape, places: Sequence[int], heights: Callable[[int, arb_mat], list[arb]]) -> float:
+def _bound_curved_excess(
+    case: Case, shape: Shape, places: Sequence[int], heights: Callable[[int, arb_mat], list[arb]]
+) -> float:
     """Show that what answers deviations is in a curved set on the given pieces, in every direction.
 
     Return the largest excess that was not excluded, in units of the set."""
@@ -228,17 +234,17 @@ def _turned(case: Case, shape: Shape, places: Sequence[int], heights: Callable[[
     return max(0.0, prove(lambda _: still, Parameters(None), work, case.clock).share)
 
 
-def _nominal(part: arb_mat) -> list[arb]:
+def _extract_nominal(part: arb_mat) -> list[arb]:
     """Return the nominal part ``(m,)``, the first column."""
     return [row[0] for row in part.tolist()]
 
 
-def _without_nominal(part: arb_mat) -> arb_mat:
+def _zero_nominal(part: arb_mat) -> arb_mat:
     """Return a part ``(m, 1 + Q)`` with 0 in place of its nominal column."""
     return stacked([[row[0] * 0, *row[1:]] for row in part.tolist()])
 
 
-def _repeats(case: Case, verdicts: Mapping[str, str]) -> str:
+def _verify_repeat(case: Case, verdicts: Mapping[str, str]) -> str:
     """Show that all constraints hold in every period of a plan that repeats.
 
     Every final state is one of the initial states, and the claims about one period hold. Among these are the return and
@@ -254,7 +260,7 @@ def _repeats(case: Case, verdicts: Mapping[str, str]) -> str:
             name = case.problem.names.state(state)
             raise Broken(f"{name} begins at {float(centre[state])!r}, and does not end there")
     for window in case.returned:
-        _strictly(case, window)
+        _require_strict_return(case, window)
     needed = [name for name, verdict in verdicts.items() if name not in (*ASIDE, "cost", "lower bound")]
     for name in needed:
         if verdicts[name] != "holds":
@@ -267,7 +273,7 @@ def _repeats(case: Case, verdicts: Mapping[str, str]) -> str:
     return f"{back}, so that all constraints hold in every period"
 
 
-def _strictly(case: Case, window: ConstraintWindow) -> None:
+def _require_strict_return(case: Case, window: ConstraintWindow) -> None:
     """Raise `Unchecked` unless the set of initial states also holds what the proof of the return excuses."""
     from flint import arb
 
@@ -292,37 +298,38 @@ def _strictly(case: Case, window: ConstraintWindow) -> None:
             )
 
 
-def _steps(case: Case) -> str:
+def _verify_steps(case: Case) -> str:
     """Show that every step of the control from piece to piece is in its set."""
     bound, breaks = case.problem.control_step, steps(case.problem, case.control)
     assert bound is not None
     return (
-        f"{len(breaks)} steps in their set{_in_set(case, bound, breaks, feedback_of(case).changes, 'the change of {}')}"
+        f"{len(breaks)} steps in their set"
+        f"{_verify_in_set(case, bound, breaks, feedback_of(case).changes, 'the change of {}')}"
     )
 
 
-def _cost(case: Case) -> str:
+def _verify_cost(case: Case) -> str:
     """Show that the written cost is the cost of the control."""
     if case.counts:
-        return _counted(case)
+        return _verify_active_time(case)
     derived = feedback_of(case).cost()
-    _agrees("cost", number(case.certificate, "cost"), derived, CANCELLED * compared(case))
-    return f"J = {float(derived):.12g}{_effort(case)}"
+    _require_agreement("cost", number(case.certificate, "cost"), derived, CANCELLED * compared(case))
+    return f"J = {float(derived):.12g}{_format_cost_unit(case)}"
 
 
-def _effort(case: Case) -> str:
+def _format_cost_unit(case: Case) -> str:
     """Return the unit of the cost after a space; an empty string where it is not known."""
     return f" {unit}" if (unit := case.problem.cost_unit) else ""
 
 
-def _counted(case: Case) -> str:
+def _verify_active_time(case: Case) -> str:
     """Show that the written time of action and the written cost ``J`` are those of the control.
 
     Where there is an alphabet, its letters must be the only values of the control."""
     active_share, total = activity.acted(case), activity.largest(case)
-    _agrees("cost", number(case.certificate, "cost"), ball(active_share * total), 0.0)
+    _require_agreement("cost", number(case.certificate, "cost"), ball(active_share * total), 0.0)
     derived = case.price.of(case.pieces)
-    _agrees(
+    _require_agreement(
         "J",
         number(case.certificate, "J"),
         derived,
@@ -332,18 +339,19 @@ def _counted(case: Case) -> str:
         raise Broken(f"the control takes other values than {list(case.letters)}")
     unit = f" {case.problem.names.time}" if case.problem.names.time else ""
     return (
-        f"it acts for {active_share * total:.9g}{unit} of {total:.9g}{unit}, J = {float(derived):.12g}{_effort(case)}"
+        f"it acts for {active_share * total:.9g}{unit} of {total:.9g}{unit},"
+        f" J = {float(derived):.12g}{_format_cost_unit(case)}"
     )
 
 
-def _agrees(name: str, written: float, derived: arb, scale: float) -> None:
+def _require_agreement(name: str, written: float, derived: arb, scale: float) -> None:
     """Raise `Broken` unless a written figure is the derived one, to `FIGURES` of the larger of it and ``scale``."""
     difference = abs(ball(written) - derived)
     if not difference <= ball(FIGURES) * ball(scale).max(abs(derived)):
         raise Broken(f"{name}: {written!r} is written, {float(derived)!r} is derived")
 
 
-def _fewest(case: Case, status: str) -> str:
+def _verify_fewest_active(case: Case, status: str) -> str:
     """Show the bounds that the certificate claims of the least share of time that an admissible control must act."""
     data = case.certificate["fewest_active"]
     if not isinstance(data, Mapping):
@@ -352,16 +360,16 @@ def _fewest(case: Case, status: str) -> str:
     proven = status in ("certified", "verified")
     if (upper is not None) is not proven:
         raise Broken(f"upper is {upper!r} where the status is {status}")
-    other_case = _other(case, data)
+    other_case = _replace_control(case, data)
     active_share = activity.acted(other_case)
     if proven and abs(number(data, "upper") - active_share) > FIGURES:
         raise Broken(f"upper is {upper!r}, the control acts for a share of {active_share!r}")
     own_multipliers = data.get("multipliers")
     if case.counts and case.letters is None:
-        derived = _tree(case) / activity.largest(case)
+        derived = _bound_by_tree(case) / activity.largest(case)
         if not 0.0 <= written <= min(derived, active_share if proven else np.inf) + FIGURES:
             raise Broken(f"lower is {written!r}, the leaves prove {derived!r}")
-        return _at_least(case, written)
+        return _describe_least_share(case, written)
     if own_multipliers is None and case.problem.cost.blocks and not case.problem.cost.is_quadratic:
         derived = activity.least_of_cost(case, multiplied(case, priced=True))
     else:
@@ -372,23 +380,23 @@ def _fewest(case: Case, status: str) -> str:
         derived = activity.least(case, rows, pieces)
     if not 0.0 <= written <= derived + FIGURES or (proven and written > active_share + FIGURES):
         raise Broken(f"lower is {written!r}, the multipliers prove {derived!r}")
-    least = _at_least(case, written)
+    least = _describe_least_share(case, written)
     return f"{least}, {'this' if other_case is case else 'another'} one {active_share:.1%}" if proven else least
 
 
-def _at_least(case: Case, share: float) -> str:
+def _describe_least_share(case: Case, share: float) -> str:
     """Return the least share of time that an admissible control acts, in the words of a run."""
     mean = ", the mean over its channels" if case.problem.system.controls > 1 else ""
     return f"every admissible control acts at least {share:.1%} of the time{mean}"
 
 
-def _other(case: Case, data: Mapping[str, Any]) -> Case:
+def _replace_control(case: Case, data: Mapping[str, Any]) -> Case:
     """Return the case with another control that the certificate offers, shown to be admissible, or the case itself."""
     if data.get("decision") is None:
         return case
     entries = {name: data.get(name) for name in ("decision", "proof")}
     other_case = replace(case, certificate={**case.certificate, **entries})
-    _control(other_case)
+    _verify_control(other_case)
     if case.equalities:
         equalities(other_case)
     for window in other_case.windows:
@@ -396,30 +404,32 @@ def _other(case: Case, data: Mapping[str, Any]) -> Case:
     return other_case
 
 
-def _lower(case: Case) -> str:
+def _verify_lower_bound(case: Case) -> str:
     """Show that no admissible control costs less than the written lower bound."""
     if case.certificate.get("multipliers") is None and case.certificate.get("tree") is None:
         written = number(case.certificate, "lower_bound")
         if written <= 0.0:
             return f"no control costs less than {written:.12g}, for no term of a cost is negative"
     if case.counts:
-        written, least = number(case.certificate, "lower_bound"), _tree(case)
+        written, least = number(case.certificate, "lower_bound"), _bound_by_tree(case)
         if not written <= least + FIGURES * max(1.0, abs(least)):
             raise Broken(f"{written!r} is written, the leaves prove {least!r}")
         return f"no control of these acts for less than {written:.9g} {case.problem.names.time}".rstrip()
     written, derived = number(case.certificate, "lower_bound"), multiplied(case, priced=True)
     if written <= 0.0:  # absolute values, lengths and semidefinite squares need no multiplier for that
-        return f"no control costs less than {written:.12g}{_effort(case)}, for no term of the cost is negative"
+        return (
+            f"no control costs less than {written:.12g}{_format_cost_unit(case)}, for no term of the cost is negative"
+        )
     if not derived >= written:
         raise Broken(f"{written!r} is written, the multipliers prove {float(derived.lower())!r}")
-    return f"no control costs less than {written:.12g}{_effort(case)}" + (
+    return f"no control costs less than {written:.12g}{_format_cost_unit(case)}" + (
         f" (the multipliers prove {float(derived.lower()):.12g})"
         if not derived - written < FIGURES * max(1.0, abs(written))
         else ""
     )
 
 
-def _causal(case: Case) -> str:
+def _verify_causal_bound(case: Case) -> str:
     """Show the lower bound of every causal policy, or that no causal policy exists."""
     from sparserob_core.checker.claims.causal import causal_bound
 
@@ -435,10 +445,10 @@ def _causal(case: Case) -> str:
     written, derived = number(data, "lower_bound"), causal_bound(case, data, priced=True)
     if not derived >= written:
         raise Broken(f"causal: {written!r} is written, the multipliers prove {float(derived.lower())!r}")
-    return f"no causal policy costs less than {written:.9g}{_effort(case)}, by {count} signals"
+    return f"no causal policy costs less than {written:.9g}{_format_cost_unit(case)}, by {count} signals"
 
 
-def _tree(case: Case) -> float:
+def _bound_by_tree(case: Case) -> float:
     """Return the lower bound of the time of action that the leaves of the certificate's tree prove."""
     data = case.certificate.get("tree")
     if not isinstance(data, Mapping):
@@ -459,10 +469,10 @@ def _tree(case: Case) -> float:
     return activity.proven(case, listed(data, "nodes"), of_leaf)
 
 
-def _infeasible(case: Case) -> str:
+def _verify_infeasibility(case: Case) -> str:
     """Show that no control is feasible."""
     if case.certificate.get("tree") is not None and case.certificate.get("multipliers") is None:
-        if not case.counts or _tree(case) < np.inf:
+        if not case.counts or _bound_by_tree(case) < np.inf:
             raise Broken("the leaves of the tree leave some control")
         return "every part of the controls is excluded by multipliers of its own"
     amount = multiplied(case, priced=False)
@@ -476,7 +486,7 @@ def _infeasible(case: Case) -> str:
     )
 
 
-def _status(case: Case, status: str, tolerance: float | None, claims: list[Finding]) -> str:
+def _verify_status(case: Case, status: str, tolerance: float | None, claims: list[Finding]) -> str:
     """Show that the status follows from the claims before it."""
     if status == "undecided":
         return "nothing is claimed beyond the figures above"
@@ -538,15 +548,15 @@ def largest_cost(case: Case) -> float:
     return activity.largest(case) if case.counts else case.price.largest
 
 
-def _witness(case: Case) -> str:
+def _verify_witness(case: Case) -> str:
     """Show that the state to which the witness leads violates the constraint by as much as is written."""
     data = case.certificate.get("witness")
     if not isinstance(data, Mapping):
         raise Unchecked("the certificate holds no witness")
-    return _exceeded(case, *witnessed(case, data), data)
+    return _verify_violation(case, *witnessed(case, data), data)
 
 
-def _exceeded(case: Case, over: arb, slack: float, data: Mapping[str, Any]) -> str:
+def _verify_violation(case: Case, over: arb, slack: float, data: Mapping[str, Any]) -> str:
     """Show that an excess ``over`` is a violation, and agrees with the figure of the witness up to ``slack``."""
     none = excused(case, data, slack)
     if not over > none:
@@ -557,17 +567,17 @@ def _exceeded(case: Case, over: arb, slack: float, data: Mapping[str, Any]) -> s
         raise Broken(f"a violation of {data.get('violation')!r} is written, {float(over)!r} is derived")
     name, unit = (
         data.get("constraint"),
-        _measured(case, str(data.get("constraint")), numbers(data.get("direction"), "")),
+        _format_row_unit(case, str(data.get("constraint")), numbers(data.get("direction"), "")),
     )
-    return f"{name} is exceeded by {float(over.lower()):.6g}{unit} at {_at(case, number(data, 'time'))}"
+    return f"{name} is exceeded by {float(over.lower()):.6g}{unit} at {_format_time(case, number(data, 'time'))}"
 
 
-def _at(case: Case, time: float) -> str:
+def _format_time(case: Case, time: float) -> str:
     """Return a time in words."""
     return f"t = {time:.6g} {case.problem.names.time}".rstrip()
 
 
-def _measured(case: Case, name: str, direction: Array) -> str:
+def _format_row_unit(case: Case, name: str, direction: Array) -> str:
     """Return the unit of the row of a constraint with this normal, after a space; an empty string for a curved set."""
     control_sets = {case.of_control: case.problem.control, STEP: case.problem.control_step}
     shape = control_sets[name] if name in control_sets else None if name == EQUALS else case.window(name).shape

@@ -64,28 +64,29 @@ def bounded(case: Case, window: ConstraintWindow) -> str:
     normals = normals_of(window, entry.get("normals"))
     covered(case, window, lower, upper)
     if case.followed.are_best and window.seen.facets is not None:
-        proven = _along_rows(case, window)
+        proven = _prove_by_adjoints(case, window)
     else:
-        basis, gains, work = _work(case, window, normals, lower, upper)
+        basis, gains, work = _prepare_work(case, window, normals, lower, upper)
         proven = prove_on_cells(case, window, (basis, gains), work, (lower, upper))
     size = f"{proven.cells} cells" + (f" in {proven.boxes} boxes" if proven.boxes > 1 else "")
     if proven.bound < 0:
-        return f"kept, with a margin of at least {-proven.bound:.1e}{_unit(case, window)} ({size})"
-    return f"kept to {proven.bound:.1e}{_unit(case, window)}{_excused(case, window, normals)} ({size})"
+        return f"kept, with a margin of at least {-proven.bound:.1e}{_format_units(case, window)} ({size})"
+    return f"kept to {proven.bound:.1e}{_format_units(case, window)}{_format_tolerance(case, window, normals)} ({size})"
 
 
-def _excused(case: Case, window: ConstraintWindow, normals: Array) -> str:
+def _format_tolerance(case: Case, window: ConstraintWindow, normals: Array) -> str:
     """Return, in words, the largest violation that counts as none; of a curved set the largest along its normals."""
     if window.seen.facets is None:
         curved = Curved(window.seen, normals, units_of(case, window).least)
         axes = np.eye(len(normals))
         return f" of its gauge, where {max(curved.true(z).slack for z in np.vstack([axes, -axes])):.2g} is excused"
     return (
-        f", where {TOLERANCE * float(units_of(case, window).rows.max(initial=0.0)):.1e}{_unit(case, window)} is excused"
+        f", where {TOLERANCE * float(units_of(case, window).rows.max(initial=0.0)):.1e}"
+        f"{_format_units(case, window)} is excused"
     )
 
 
-def _along_rows(case: Case, window: ConstraintWindow) -> Proven:
+def _prove_by_adjoints(case: Case, window: ConstraintWindow) -> Proven:
     """Show by the adjoints of the rows that no row of a flat set is exceeded by more than what counts as none."""
     facets, units = window.seen.facets, units_of(case, window).rows.tolist()
     assert facets is not None
@@ -98,7 +99,7 @@ def _along_rows(case: Case, window: ConstraintWindow) -> Proven:
     return Proven(bound, share, count, 1)
 
 
-def _unit(case: Case, window: ConstraintWindow) -> str:
+def _format_units(case: Case, window: ConstraintWindow) -> str:
     """Return the units of the rows of a window in words; none for a curved set, judged along its gauge."""
     sides = window.shape.halfspaces()
     rows = () if sides is None else sides[0]
@@ -138,7 +139,7 @@ def covered(case: Case, window: ConstraintWindow, lower: Array, upper: Array) ->
     b = 0 if window.seen.facets is not None else window.seen.spanned
     if lower.ndim != 2 or lower.shape != upper.shape or lower.shape[1] != 1 + nu + b:
         raise Broken(f"its cells are no pairs of corners with {1 + nu + b} coordinates")
-    low, high = _extent(case, window, lower, upper)
+    low, high = _find_extent(case, window, lower, upper)
     if not b:
         fill(lower, upper, low, high, case.clock)
         return
@@ -151,7 +152,7 @@ def covered(case: Case, window: ConstraintWindow, lower: Array, upper: Array) ->
             fill(lower[is_on_face], upper[is_on_face], *ends, case.clock)
 
 
-def _extent(case: Case, window: ConstraintWindow, lower: Array, upper: Array) -> tuple[Array, Array]:
+def _find_extent(case: Case, window: ConstraintWindow, lower: Array, upper: Array) -> tuple[Array, Array]:
     """Return the lower and the upper corner of the times and parameters that the cells must fill, ``(1 + nu,)`` each.
 
     For a set of parameters that is no box, the corners are those of the box around the cells. This box must hold the
@@ -173,7 +174,7 @@ def _extent(case: Case, window: ConstraintWindow, lower: Array, upper: Array) ->
     return np.append(window.start, low), np.append(window.stop, high)
 
 
-def _work(
+def _prepare_work(
     case: Case, window: ConstraintWindow, normals: Array, lower: Array, upper: Array
 ) -> tuple[Array, Array, list[Work]]:
     """Return the vectors that directions are combinations of, and the cells in the form that `prove` takes.
@@ -181,7 +182,7 @@ def _work(
     The vectors are ``(b, d)`` on the state and ``(b, m)`` on the control. Cells with the same parameters and directions
     are put together. Their times are cut at every kink and jump."""
     nu, units = case.problem.system.parameter_count, units_of(case, window)
-    basis, gains, flat = _facets(window, units)
+    basis, gains, flat = _extract_facets(window, units)
     curved = None if flat is not None else Curved(window.seen, normals, units.least)
     pairs = case.clock.each(zip(lower, upper, strict=True))
     keys = [(tuple(a[1:].tolist()), tuple(b[1:].tolist())) for a, b in pairs]
@@ -198,17 +199,17 @@ def _work(
 
 def cut_times(case: Case, window: ConstraintWindow, times: Sequence[tuple[float, float]]) -> list[Interval]:
     """Return the ``times``, each a start and an end, cut at every kink and jump of the state and of the rows."""
-    cuts = np.union1d(_cuts(case), window.cuts(case.control.breakpoints.tolist()))
+    cuts = np.union1d(_find_cuts(case), window.cuts(case.control.breakpoints.tolist()))
     return [interval for start, stop in times for interval in cut(np.array(case.timing.grid), cuts, start, stop)]
 
 
 @lru_cache(maxsize=2)
-def _cuts(case: Case) -> Array:
+def _find_cuts(case: Case) -> Array:
     """Return the times between which one polynomial in time encloses the state, under one control."""
     return np.union1d(case.timing.grid, case.flows.marks(case.timing.grid))
 
 
-def _facets(window: ConstraintWindow, units: WindowUnits) -> tuple[Array, Array, Sides | None]:
+def _extract_facets(window: ConstraintWindow, units: WindowUnits) -> tuple[Array, Array, Sides | None]:
     """Return the normals of a flat set's facets, on the state ``(b, d)`` and on the control ``(b, m)``, and its rows.
 
     Opposite facets share a normal. The rows are ``None`` for a curved set."""
@@ -295,21 +296,21 @@ def missed(case: Case) -> list[tuple[arb, float]]:
     horizon, whole_space = case.problem.horizon, Box(np.full(d, -np.inf), np.full(d, np.inf))
     sums = WindowUnits(case.problem, case.flows, scene, whole_space, horizon, horizon).sums
     feedback, residuals = feedback_of(case), []
-    last = feedback.loop.nodes[-1].tolist() if case.answering else _unreached(case, scene)
+    last = feedback.loop.nodes[-1].tolist() if case.answering else _compute_final_state(case, scene)
     for state, value in case.equalities:
         (final_value, *responses), (goal,) = last[state], balls([value])
         if not case.answering:
-            final_value = final_value * 0 if _rests(case, state) else final_value + pushed_by_middle(case, state)
+            final_value = final_value * 0 if _is_at_rest(case, state) else final_value + pushed_by_middle(case, state)
         residual = final_value - goal
         high, low = residual + feedback.support(responses), feedback.support([-x for x in responses]) - residual
         residuals.append((high.max(low), float(sums[state]) + (feedback.added(state) if case.answering else 0.0)))
     return residuals
 
 
-def _unreached(case: Case, scene: Scene) -> list[list[arb]]:
+def _compute_final_state(case: Case, scene: Scene) -> list[list[arb]]:
     """Return the nominal final state ``(d, 1)``; raise `Unchecked` where an uncertainty may reach a fixed entry."""
     for state, _ in case.equalities:
-        if _reached(case, state):
+        if _is_uncertain(case, state):
             raise Unchecked(f"the uncertainty may reach {case.problem.names.state(state)}, which is to be fixed")
     return list(States(case.price.flow, scene).last.matrix.tolist())
 
@@ -331,12 +332,12 @@ def of_fixed(case: Case) -> str:
     return joined(units[state] if units else "" for state, _ in case.equalities)
 
 
-def _reached(case: Case, state: int) -> bool:
+def _is_uncertain(case: Case, state: int) -> bool:
     """Return whether an uncertain entry, a disturbance or the choice of an initial state may reach a state.
 
     States are linked by the entries of ``A`` that are other than 0 at some time and parameter. Columns of ``E`` count
     as entries where the middle of the disturbance is other than 0."""
-    reaching = _linked(case, state)
+    reaching = _find_linked_states(case, state)
     rows = sorted(reaching)
     is_nonzero, is_parametric = case.flows.links
     d, m = case.problem.system.states, case.flows.plant.driven
@@ -360,11 +361,11 @@ def _is_wide(bound: ConvexSet, axis: Array) -> bool:
     return not width <= math.ulp(0.0)
 
 
-def _rests(case: Case, state: int) -> bool:
+def _is_at_rest(case: Case, state: int) -> bool:
     """Return whether a state starts at 0 and nothing ever moves it.
 
     Neither a linked state, nor a control of the decision, nor a drift, nor the middle of a disturbance may move it."""
-    reaching, (is_nonzero, _) = _linked(case, state), case.flows.links
+    reaching, (is_nonzero, _) = _find_linked_states(case, state), case.flows.links
     m, initial_control = case.problem.system.controls, case.problem.initial_control
     commands = [
         *case.pieces,
@@ -378,7 +379,7 @@ def _rests(case: Case, state: int) -> bool:
     return not is_driven and not any(np.asarray(case.problem.initial_state)[[*reaching]])
 
 
-def _linked(case: Case, state: int) -> set[int]:
+def _find_linked_states(case: Case, state: int) -> set[int]:
     """Return the states that may reach a state by entries of ``A`` that are other than 0 at some time and parameter."""
     d, reaching = case.problem.system.states, {state}
     A = case.flows.links[0][:, :d]

@@ -52,13 +52,13 @@ class FollowedRow:
             count += start.size
             if count > MOST_CELLS:
                 break
-            tops = self.worst.over(start, stop, self._added(start, stop))
+            tops = self.worst.over(start, stop, self._bound_added_terms(start, stop))
             is_open = ~(tops <= limit)
             top = max(top, float(tops[~is_open].max(initial=-np.inf)))
             if not is_open.any():
                 return count, top
             self._refute(start[is_open], stop[is_open], limit)
-            start, stop = _parts(start[is_open], stop[is_open])
+            start, stop = _divide_cells(start[is_open], stop[is_open])
             if not start.size:
                 break
         raise Unchecked(f"neither shown nor refuted: after {count} cells more than {limit!r} is not excluded")
@@ -80,7 +80,7 @@ class FollowedRow:
         return below(total), above(total)
 
     @property
-    def _delivered(self) -> FollowedExecution | None:
+    def _execution(self) -> FollowedExecution | None:
         """The errors of execution of the control; ``None`` where there are none."""
         execution = self.case.sources.execution
         assert execution is None or isinstance(execution, FollowedExecution)  # one system acts all along
@@ -88,15 +88,15 @@ class FollowedRow:
 
     def erring(self, times: Array) -> tuple[Array, Array]:
         """Return bounds, ``(k,)`` below and above, of what the worst errors of execution add at ``times (k,)``."""
-        execution, zeros = self._delivered, np.zeros(times.size)
+        execution, zeros = self._execution, np.zeros(times.size)
         return (zeros, zeros) if execution is None else execution.added_at(self.window.split(self.direction)[0], times)
 
-    def _added(self, start: Array, stop: Array) -> Array:
+    def _bound_added_terms(self, start: Array, stop: Array) -> Array:
         """Return upper bounds ``(2, k)``, at both ends of cells, of the terms that are added to the state.
 
         The worst errors of execution are among these terms, with the largest distance by which they may lie above their
         chord."""
-        bounds, execution = np.zeros((2, start.size)), self._delivered
+        bounds, execution = np.zeros((2, start.size)), self._execution
         if self.window.reference is not None or self.window.is_mixed:
             cells = self.case.clock.each(zip(start.tolist(), stop.tolist(), strict=True))
             bounds = np.array([[self.beside(t, (a + b) / 2)[1] for t in (a, b)] for a, b in cells]).T
@@ -127,7 +127,7 @@ class FollowedRow:
             raise Broken(f"{limit!r} is exceeded, by {least[index] - limit:.3g} at t = {middles[index]:.6g}")
 
 
-def _parts(start: Array, stop: Array) -> tuple[Array, Array]:
+def _divide_cells(start: Array, stop: Array) -> tuple[Array, Array]:
     """Return every cell cut into equal parts; no cells at all where the parts of one are too short for doubles."""
     ends = start[:, None] + (stop - start)[:, None] * (np.arange(PARTS + 1) / PARTS)
     ends[:, 0], ends[:, -1] = start, stop

@@ -72,7 +72,7 @@ def weighted(case: Case, data: object) -> tuple[list[tuple[float, ConstraintRow]
     for multiplier, (state, value) in zip(nu.tolist(), case.equalities, strict=False):
         direction = np.eye(case.problem.system.states)[state]
         if case.followed.are_best:
-            row = _along_adjoint(case, direction, case.problem.horizon, ball(value), disturbed=False)
+            row = _derive_adjoint_row(case, direction, case.problem.horizon, ball(value), disturbed=False)
         else:
             row = case.duality.row(
                 direction, case.problem.horizon, case.nominal_parameter, ball(value), disturbed=False
@@ -122,12 +122,12 @@ def rows_of(case: Case, entry: object) -> list[tuple[float, ConstraintRow]]:
         sized(parameter, case.problem.system.parameter_count, name)
     named = feedback_of(case).named(entry, name) if case.answering else None
     if any(window.name == name for window in case.windows) or (case.answering and name == EQUALS and case.equalities):
-        return [(y, _of_state(case, entry, (name, direction, time, parameter), named))]
+        return [(y, _derive_state_row(case, entry, (name, direction, time, parameter), named))]
     if name == EFFORT and case.charge == WORST:
-        return [(y, _of_effort(case, direction, named))]
+        return [(y, _derive_effort_row(case, direction, named))]
     sized(direction, case.problem.system.controls, name)
     if name in (case.of_control, PEAK) and (name != PEAK or case.charge == PEAK):
-        return [(y, _of_control(case, name, direction, time, named))]
+        return [(y, _derive_control_row(case, name, direction, time, named))]
     if name != STEP:
         raise Broken(f"the problem has no constraint {name!r}")
     row = case.duality.step_row(direction, time)
@@ -144,7 +144,7 @@ def rows_of(case: Case, entry: object) -> list[tuple[float, ConstraintRow]]:
     ]
 
 
-def _of_state(
+def _derive_state_row(
     case: Case, entry: Mapping[str, Any], said: tuple[str, Array, float, Array], named: NamedDeviations | None
 ) -> ConstraintRow:
     """Return the constraint on the state, and on the control of a piece where it is mixed, that an entry names."""
@@ -154,9 +154,9 @@ def _of_state(
     if window is not None:
         admissible(case, window, time, parameter)
     key = name, time, tuple(direction.tolist()), tuple(parameter.tolist()), repr(entry.get("piece"))
-    rows_by_key = _rows_of(case)
+    rows_by_key = _get_row_cache(case)
     if key not in rows_by_key:
-        rows_by_key[key] = _undisturbed(case, window, entry, said)
+        rows_by_key[key] = _derive_base_row(case, window, entry, said)
     row = rows_by_key[key]
     if named is None:
         return row
@@ -165,12 +165,12 @@ def _of_state(
 
 
 @lru_cache(maxsize=2)
-def _rows_of(case: Case) -> dict[tuple[object, ...], ConstraintRow]:
+def _get_row_cache(case: Case) -> dict[tuple[object, ...], ConstraintRow]:
     """Return the constraints of a case that were derived before."""
     return {}
 
 
-def _undisturbed(
+def _derive_base_row(
     case: Case, window: ConstraintWindow | None, entry: Mapping[str, Any], said: tuple[str, Array, float, Array]
 ) -> ConstraintRow:
     """Return the constraint on the state for the worst deviations, or without any where the control answers them."""
@@ -178,7 +178,7 @@ def _undisturbed(
     c, gain = np.split(direction, [case.problem.system.states])
     limit = fixed_limit(case, direction, time) if window is None else window.limit(direction, time)
     if case.followed.are_best:
-        row = _along_adjoint(case, c, time, limit)
+        row = _derive_adjoint_row(case, c, time, limit)
     else:
         row = case.duality.row(c, time, parameter.tolist(), limit, disturbed=not case.answering)
         measurable_input = case.sources.strayed_at(parameter.tolist())
@@ -192,7 +192,7 @@ def _undisturbed(
     return row
 
 
-def _along_adjoint(case: Case, c: Array, time: float, limit: arb, disturbed: bool = True) -> ConstraintRow:
+def _derive_adjoint_row(case: Case, c: Array, time: float, limit: arb, disturbed: bool = True) -> ConstraintRow:
     """Return the constraint ``c'x(t) <= limit`` by the adjoint of its row, for the worst deviations or without them.
 
     No transition matrix is computed, because each would take a minute for hundreds of states."""
@@ -213,7 +213,9 @@ def _along_adjoint(case: Case, c: Array, time: float, limit: arb, disturbed: boo
     return ConstraintRow(constant, [weights[:m] for weights in input_weights])
 
 
-def _of_control(case: Case, name: str, direction: Array, time: float, named: NamedDeviations | None) -> ConstraintRow:
+def _derive_control_row(
+    case: Case, name: str, direction: Array, time: float, named: NamedDeviations | None
+) -> ConstraintRow:
     """Return the constraint on the control of one piece: it is in its set, or a channel is at most its peak."""
     row, piece = case.duality.control_row(direction, time), case.duality.control_piece(time)
     if named is not None:
@@ -232,7 +234,7 @@ def _of_control(case: Case, name: str, direction: Array, time: float, named: Nam
     return replace(row, constant=ball(0), charged=(piece, int(np.abs(direction).argmax())))
 
 
-def _of_effort(case: Case, shares: Array, named: NamedDeviations | None) -> ConstraintRow:
+def _derive_effort_row(case: Case, shares: Array, named: NamedDeviations | None) -> ConstraintRow:
     """Return the constraint that the control, each entry times a share of ``[-1, 1]``, is at most the effort."""
     K, m = case.control.pieces, case.problem.system.controls
     if shares.shape != (m * K,) or not (np.abs(shares) <= 1.0).all():

@@ -57,9 +57,9 @@ def reached(case: Case, time: float, parameter: Array, signal: object, deviation
     deviation
         The deviation ``(d,)`` from the centre of the initial states; not read where these are one point.
     """
-    w = _admissible(case, signal) if case.problem.disturbance is not None else None
+    w = _read_disturbance(case, signal) if case.problem.disturbance is not None else None
     weights = case.flows.at(parameter.tolist()).weights([0.0, *(t for t in case.timing.grid[1:-1] if t < time), time])
-    x = weights.free * _start(case, deviation)
+    x = weights.free * _enclose_initial_state(case, deviation)
     for k, (acts, pushes) in enumerate(zip(weights.control, weights.disturbance, strict=True)):
         x = x + acts * case.scene.control[k]
         if w is not None:
@@ -68,11 +68,11 @@ def reached(case: Case, time: float, parameter: Array, signal: object, deviation
     return state
 
 
-def _start(case: Case, deviation: object) -> arb_mat:
+def _enclose_initial_state(case: Case, deviation: object) -> arb_mat:
     """Return the initial state ``(d, 1)`` that a deviation leads to."""
     state = balls(np.asarray(case.problem.initial_state))
     if case.problem.initial_set is not None:
-        state = [v + z for v, z in zip(state, balls(_begun(case, deviation)), strict=True)]
+        state = [v + z for v, z in zip(state, balls(_read_initial_deviation(case, deviation)), strict=True)]
     return stacked([[v] for v in state])
 
 
@@ -98,13 +98,16 @@ def witnessed(case: Case, data: Mapping[str, Any]) -> tuple[arb, float]:
         if len(summands) > 1 and case.answering:
             raise Unchecked("a witness across the seam is not followed")
         value, limit = (
-            sum(_along(direction, named, summand.tolist()) for summand in summands),
+            sum(_project_onto_direction(direction, named, summand.tolist()) for summand in summands),
             known(control_set).limit(direction),
         )
         slack = TOLERANCE * (1.0 if known(control_set).facets is None else max(known(control_set).units, default=1.0))
     elif name == EQUALS and named is not None:
         sized(direction, case.problem.system.states, name)
-        value, limit = _along(direction, named, feedback.loop.nodes[-1].tolist()), fixed_limit(case, direction, time)
+        value, limit = (
+            _project_onto_direction(direction, named, feedback.loop.nodes[-1].tolist()),
+            fixed_limit(case, direction, time),
+        )
         slack = EQUALITY * max(term_size for _, term_size in missed(case))
     else:
         window, parameter = case.window(name), numbers(data.get("parameter", []), "parameter")
@@ -115,13 +118,15 @@ def witnessed(case: Case, data: Mapping[str, Any]) -> tuple[arb, float]:
         slack = units_of(case, window).slack(direction, limit)
         if named is not None:
             rows = feedback.loop.state(case.timing.piece_at(time), time).tolist()
-            value = _along(direction, named, rows if piece is None else rows + feedback.commands[piece].tolist())
+            value = _project_onto_direction(
+                direction, named, rows if piece is None else rows + feedback.commands[piece].tolist()
+            )
         elif case.sources.strayed is not None:
-            value = _farthest(case, window.split(direction), time, parameter.tolist(), piece)
+            value = _enclose_largest_value(case, window.split(direction), time, parameter.tolist(), piece)
         else:
             state = reached(case, time, parameter, data.get("disturbance"), data.get("deviation"))
             state += [] if piece is None else case.pieces[piece].entries()
-            value = _along(direction, None, [[x] for x in state])
+            value = _project_onto_direction(direction, None, [[x] for x in state])
         execution = case.sources.delivered_at(parameter.tolist())
         if execution is not None:
             low, high = execution.added(window.split(direction)[0], time)
@@ -141,7 +146,7 @@ def excused(case: Case, data: Mapping[str, Any], slack: float) -> float:
     return min(slack, units_of(case, window).excused(direction, window.limit(direction, number(data, "time"))))
 
 
-def _farthest(
+def _enclose_largest_value(
     case: Case, direction: tuple[Array, Array], time: float, parameter: Sequence[float], piece: int | None
 ) -> arb:
     """Return a ball that holds the largest ``c'x(t) + gain'u`` under measurable disturbances, at a parameter.
@@ -160,7 +165,7 @@ def _farthest(
     return total + sum((a * u for a, u in zip(balls(gain), case.pieces[piece].entries(), strict=True)), zero)
 
 
-def _along(direction: Array, named: NamedDeviations | None, rows: Sequence[list[arb]]) -> arb:
+def _project_onto_direction(direction: Array, named: NamedDeviations | None, rows: Sequence[list[arb]]) -> arb:
     """Return ``c'x`` for rows with a nominal value and responses, ``(1 + Q,)`` each, under the named deviations.
 
     Without named deviations it is the nominal value."""
@@ -204,14 +209,14 @@ def exceeded(case: Case, said: Mapping[str, object], begun: Array | None = None)
     facets, facet_basis = window.seen.facets, window.seen.basis
     if facets is None or facet_basis is None:
         raise Unchecked("the worst direction of a curved set is not told")
-    pieces = _pieces(case, time, jumps=window.is_mixed)
+    pieces = _find_pieces(case, time, jumps=window.is_mixed)
     if case.followed.are_best:
-        over, slack = _along_rows(case, window, time, begun, pieces)
+        over, slack = _compute_excess_by_adjoints(case, window, time, begun, pieces)
         return over, slack + ROUNDED * case.problem.system.states * float(
             units_of(case, window).resolved.max(initial=0.0)
         )
     (basis, gains), z = np.split(facet_basis[0], [window.states], axis=1), facet_basis[1]
-    tube = _tube(case, parameter, begun, basis, gains)
+    tube = _build_tube(case, parameter, begun, basis, gains)
     added_terms = case.beside(window, basis, gains, parameter.tolist())
     polynomials = list[Polynomial]()
     for piece, k in pieces:
@@ -225,7 +230,7 @@ def exceeded(case: Case, said: Mapping[str, object], begun: Array | None = None)
     return over, slack
 
 
-def _along_rows(
+def _compute_excess_by_adjoints(
     case: Case, window: ConstraintWindow, time: float, begun: Array | None, pieces: Sequence[tuple[int, int]]
 ) -> tuple[list[float], float]:
     """Return the excess of the worst disturbance over each row of a flat set, by adjoints, with its accuracy."""
@@ -245,7 +250,7 @@ def _along_rows(
     return over, slack
 
 
-def _pieces(case: Case, time: float, jumps: bool) -> list[tuple[int, int]]:
+def _find_pieces(case: Case, time: float, jumps: bool) -> list[tuple[int, int]]:
     """Return the pairs of a piece of the grid and a piece of the control that a time is in.
 
     Where the control ``jumps``, the pieces on both sides of the time count."""
@@ -255,7 +260,7 @@ def _pieces(case: Case, time: float, jumps: bool) -> list[tuple[int, int]]:
     return sorted({(piece, k) for piece, k in places})
 
 
-def _tube(case: Case, parameter: Array, begun: Array | None, basis: Array, gains: Array) -> Reached:
+def _build_tube(case: Case, parameter: Array, begun: Array | None, basis: Array, gains: Array) -> Reached:
     """Return the reachable states at a parameter, from the initial state ``begun (d,)`` alone where it is given."""
     if case.answering:
         return LoopTube(feedback_of(case).loop, basis, gains)
@@ -264,7 +269,7 @@ def _tube(case: Case, parameter: Array, begun: Array | None, basis: Array, gains
     return VerifiedTube(ProjectedStates(States(flow, scene), basis), flow.box)
 
 
-def _begun(case: Case, data: object) -> Array:
+def _read_initial_deviation(case: Case, data: object) -> Array:
     """Return the deviation ``(d,)`` of the initial state; raise `Broken` unless it is shown to be in its set."""
     bound = case.problem.initial_set
     assert bound is not None
@@ -274,7 +279,7 @@ def _begun(case: Case, data: object) -> Array:
     return deviation
 
 
-def _admissible(case: Case, signal: object) -> Array:
+def _read_disturbance(case: Case, signal: object) -> Array:
     """Return the disturbance ``(mw, pieces)``, shown to be admissible.
 
     Raise `Broken` where it leaves its set or jumps within one of its pieces, `Unchecked` where its grid is another."""

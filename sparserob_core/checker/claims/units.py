@@ -78,7 +78,7 @@ class WindowUnits:
         sizes = np.array([abs(float(b)) for _, b in facets])
         sizes = np.maximum(sizes, np.where(np.isfinite(slab_widths), slab_widths, 0.0))
         if (resolved > sizes).any() and self.nominal is not None:
-            sizes = np.maximum(sizes, self.nominal(*self._rows_of(states=False)))
+            sizes = np.maximum(sizes, self.nominal(*self._select_rows(states=False)))
         return np.asarray(np.minimum(resolved, np.where(sizes > 0.0, sizes, NOTHING * np.minimum(resolved, 1.0))))
 
     def least(self, direction: Array, width: float) -> float:
@@ -87,16 +87,16 @@ class WindowUnits:
         The least unit is what double precision resolves, but never more than the values of the states along the nominal
         trajectory. Where the set is `THIN`, these values alone count."""
         size = np.abs(direction)
-        floors = self._seen if width < THIN * float(size @ self.sums) else self._floors
+        floors = self._nominal_state_sizes if width < THIN * float(size @ self.sums) else self._least_units
         return float(size @ floors)
 
     @cached_property
-    def _floors(self) -> Array:
+    def _least_units(self) -> Array:
         """The least units ``(d,)`` of the states."""
-        return np.minimum(RESOLVED * self.sums, self._seen)
+        return np.minimum(RESOLVED * self.sums, self._nominal_state_sizes)
 
     @cached_property
-    def _seen(self) -> Array:
+    def _nominal_state_sizes(self) -> Array:
         """The largest absolute value of every state along the nominal trajectory, ``(d,)``."""
         d = self.problem.system.states
         return np.zeros(d) if self.nominal is None else self.nominal(np.eye(d), np.zeros((d, 0)))
@@ -109,13 +109,13 @@ class WindowUnits:
         facets = known(self.shape).facets
         assert facets is not None
         heights = np.array([abs(float(b)) for _, b in facets])
-        reach, sums = self._measured(self._middle, states=False)
+        reach, sums = self._measure_reach(self._interior_parameter, states=False)
         slab_widths, thin = np.array(widths(facets)), THIN * sums[: heights.size]
         candidates = np.where(slab_widths > thin, np.stack([heights, slab_widths]), 0.0)
         sizes = np.array([smallest(pair) for pair in np.where(candidates > thin, candidates, 0.0).T.tolist()])
         # another parameter may take a row further
         if (reach[: sizes.size] < np.where(sizes > 0.0, sizes, np.inf)).any():
-            other_reaches = [self._measured(point, states=False)[0] for point in self._elsewhere]
+            other_reaches = [self._measure_reach(point, states=False)[0] for point in self._edge_parameters]
             reach = np.max([reach, *other_reaches], axis=0)
         unit = [smallest(pair) for pair in zip(sizes.tolist(), reach.tolist(), strict=False)]
         least = RESOLVED * sums[: sizes.size]
@@ -125,14 +125,14 @@ class WindowUnits:
     @cached_property
     def sums(self) -> Array:
         """The largest numbers ``(d,)`` that are added up to each state within the window."""
-        return self._measured(self._middle, states=True)[1]
+        return self._measure_reach(self._interior_parameter, states=True)[1]
 
     def slack(self, direction: Array, limit: arb) -> float:
         """Return how closely doubles determine ``c'x`` in a direction ``c (d,)`` with ``c'x <= limit`` on the set.
 
         The direction of a flat set is a combination of normals with weights that are not negative. The numbers of these
         facets are added up with the same weights."""
-        return self._share(
+        return self._scale_tolerance(
             direction,
             limit,
             lambda: self.resolved,
@@ -141,9 +141,9 @@ class WindowUnits:
 
     def excused(self, direction: Array, limit: arb) -> float:
         """Return the violation that a claim excuses in a direction ``c (d,)`` with ``c'x <= limit`` (decision 0088)."""
-        return self._share(direction, limit, lambda: self.rows, lambda width: self.least(direction, width))
+        return self._scale_tolerance(direction, limit, lambda: self.rows, lambda width: self.least(direction, width))
 
-    def _share(
+    def _scale_tolerance(
         self, direction: Array, limit: arb, facets: Callable[[], Array], least: Callable[[float], float]
     ) -> float:
         """Return `TOLERANCE` of the unit of a direction.
@@ -157,13 +157,13 @@ class WindowUnits:
         return TOLERANCE * float(shape.shares(direction) @ facets())
 
     @property
-    def _middle(self) -> tuple[float, ...]:
+    def _interior_parameter(self) -> tuple[float, ...]:
         """A parameter in the interior of the set, ``(nu,)``."""
         bound = self.problem.system.parameters
         return () if bound is None else tuple(map(float, bound.interior_point()))
 
     @property
-    def _elsewhere(self) -> list[tuple[float, ...]]:
+    def _edge_parameters(self) -> list[tuple[float, ...]]:
         """Some parameters at the edge of their set."""
         bound = self.problem.system.parameters
         if bound is None:
@@ -172,18 +172,18 @@ class WindowUnits:
         return [tuple(map(float, point)) for point in bound.support_point(np.vstack([axes, -axes]))]
 
     @remembered()
-    def _measured(self, parameter: tuple[float, ...], states: bool) -> tuple[Array, Array]:
+    def _measure_reach(self, parameter: tuple[float, ...], states: bool) -> tuple[Array, Array]:
         """Return how far rows reach over the window at one parameter, and the largest sums of absolute terms.
 
         The rows are the normals of the facets, or all ``states``; both results are ``(k,)``. The intervals of time are
         traversed once backwards from every time of the window that is examined, for as many times together as memory
         allows."""
         with np.errstate(over="ignore", invalid="ignore"):
-            nodes, places = self._nodes()
-            weights_per_time = len(nodes) * len(self._rows_of(states)[0])
+            nodes, places = self._find_nodes()
+            weights_per_time = len(nodes) * len(self._select_rows(states)[0])
             weights_per_time *= self.problem.system.controls + 1 + self.problem.system.disturbances
             batches = np.array_split(places, min(places.size, -(-places.size * weights_per_time // MOST_HELD)))
-            results = [self._walked(parameter, states, nodes[: batch[-1] + 1], batch) for batch in batches]
+            results = [self._measure_batch(parameter, states, nodes[: batch[-1] + 1], batch) for batch in batches]
             reach_and_sums = (
                 np.max([reach for reach, _ in results], axis=0),
                 np.max([sums for _, sums in results], axis=0),
@@ -192,7 +192,7 @@ class WindowUnits:
             raise Unchecked("the response grows beyond what numbers can hold")
         return reach_and_sums
 
-    def _rows_of(self, states: bool) -> tuple[Array, Array]:
+    def _select_rows(self, states: bool) -> tuple[Array, Array]:
         """Return the facets' normals on state ``(k, d)`` and control ``(k, m)``, or the axes of the ``states``."""
         d = self.problem.system.states
         if states:
@@ -202,13 +202,13 @@ class WindowUnits:
         )
         return normals, gains
 
-    def _walked(
+    def _measure_batch(
         self, parameter: tuple[float, ...], states: bool, nodes: list[float], places: npt.NDArray[np.intp]
     ) -> tuple[Array, Array]:
-        """Return reach and sums as in `_measured`, ``(k,)`` each, over the times ``places`` among the ``nodes``."""
+        """Return reach and sums as `_measure_reach` does, ``(k,)`` each, at the times ``places`` of the ``nodes``."""
         system, bound = self.problem.system, self.problem.disturbance
         d, m, input_count = system.states, system.controls, system.controls + system.drifts
-        rows, gains = self._rows_of(states)
+        rows, gains = self._select_rows(states)
         flow = self.flows.at(parameter)
         v = np.tile(rows, (len(places), 1, 1))
         count = len(nodes) - 1
@@ -239,7 +239,7 @@ class WindowUnits:
         sums = sums + np.abs(applied).sum(axis=(0, 3))
         for convex, weights in (
             (self.problem.control, control_weights[first_acting:, ..., :m]),
-            (bound, self._joined(nodes, disturbance_weights)),
+            (bound, self._sum_over_pieces(nodes, disturbance_weights)),
         ):
             if convex is not None and len(weights):
                 high, low = high + convex.support(weights).sum(axis=0), low + convex.support(-weights).sum(axis=0)
@@ -259,7 +259,7 @@ class WindowUnits:
             high, low, sums = high + up, low + down, sums + np.maximum(np.abs(up), np.abs(down))
         return np.maximum(np.abs(high), np.abs(low)).max(axis=0), sums.max(axis=0)
 
-    def _joined(self, nodes: list[float], pushed: Array) -> Array:
+    def _sum_over_pieces(self, nodes: list[float], pushed: Array) -> Array:
         """Return the weights of the disturbance on its pieces, from those on the intervals between ``nodes``."""
         if self.problem.disturbance is None or len(nodes) < 2:
             return pushed
@@ -270,7 +270,7 @@ class WindowUnits:
             return weights
         return self.scene.lasting.gathered(weights[..., None], np.zeros((*weights.shape, 1)))[0][..., 0]
 
-    def _nodes(self) -> tuple[list[float], npt.NDArray[np.intp]]:
+    def _find_nodes(self) -> tuple[list[float], npt.NDArray[np.intp]]:
         """Return the grid up to the window's end, with both its ends, and the places of the times to examine."""
         inside = [t for t in self.scene.grid if t < self.stop]
         nodes = sorted({*inside, self.start, self.stop})
@@ -281,14 +281,14 @@ class WindowUnits:
 
 
 @lru_cache(maxsize=2)
-def _units_of(case: Case) -> dict[ConstraintWindow, WindowUnits]:
+def _get_units_cache(case: Case) -> dict[ConstraintWindow, WindowUnits]:
     """Return the units of the constraints of a case that were made before."""
     return {}
 
 
 def units_of(case: Case, window: ConstraintWindow) -> WindowUnits:
     """Return the units by which violations of a constraint are judged."""
-    units_by_window = _units_of(case)
+    units_by_window = _get_units_cache(case)
     if window not in units_by_window:
         units_by_window[window] = WindowUnits(
             case.problem,
@@ -305,7 +305,7 @@ def units_of(case: Case, window: ConstraintWindow) -> WindowUnits:
 
 
 @lru_cache(maxsize=2)
-def _nominal_values(case: Case) -> tuple[Array, Array]:
+def _enclose_nominal_values(case: Case) -> tuple[Array, Array]:
     """Return the nominal ``(x, u)`` where pieces begin to act and at the end, ``(K', d + m)``, and the radii."""
     states = case.price.nominal_states(case.pieces)
     entries = np.array([[(float(x), float(x.rad())) for x in state.entries()] for state in states])
@@ -328,7 +328,7 @@ def nominal_sizes(case: Case, rows: Array, gains: Array) -> Array:
     """
     if case.answering and not gains.any():
         return feedback_of(case).sizes(rows)
-    mid, rad = _nominal_values(case)
+    mid, rad = _enclose_nominal_values(case)
     both = np.zeros((len(rows), mid.shape[1]))
     d = case.problem.system.states
     both[:, :d], both[:, d : d + gains.shape[1]] = rows, gains

@@ -156,7 +156,7 @@ class Beside:
         enclosed = Enclosed.all(terms, (len(terms), self.basis.shape[0]))
         mid = enclosed.mid @ z.T
         error_bounds = (enclosed.rad + rounding(z.shape[1]) * np.abs(enclosed.mid)) @ np.abs(z).T
-        found = [_plus(poly, mid[:, i, None], float(error_bounds[:, i].sum())) for i, poly in enumerate(found)]
+        found = [_add_terms(poly, mid[:, i, None], float(error_bounds[:, i].sum())) for i, poly in enumerate(found)]
         if not self.delivered:
             return list(found)
         directions, direction_errors = self.directions(z)
@@ -164,7 +164,7 @@ class Beside:
         for bounded_input in self.delivered:
             rows = zip(found, directions, direction_errors, strict=True)
             found = [
-                self._erring(poly, bounded_input, c, direction_error, times, within)
+                self._add_bounded_input(poly, bounded_input, c, direction_error, times, within)
                 for poly, c, direction_error in rows
             ]
         return list(found)
@@ -182,7 +182,7 @@ class Beside:
         return np.reshape(floats, shape), np.reshape(error_bounds, shape)
 
     @staticmethod
-    def _erring(
+    def _add_bounded_input(
         poly: Polynomial,
         one: BoundedInput,
         c: Array,
@@ -204,13 +204,13 @@ class Beside:
             axis = np.eye(off.size)[state]
             axis_bounds = [one.over(side, times, within) for side in (axis, -axis)]
             error += off[state] * max(float(np.abs(b.ends).sum(axis=1).max()) + b.off for b in axis_bounds) * OUTWARD
-        total = _plus(poly, terms, error)
+        total = _add_terms(poly, terms, error)
         width_errors = bounds.wide if total.bent is None else total.bent + bounds.wide
         turning = total.turning + float(bounds.wide.sum())
         return replace(total, kinks=total.kinks + bounds.over, turning=turning, bent=width_errors)
 
 
-def _plus(poly: Polynomial, terms: Array, lost: float) -> Polynomial:
+def _add_terms(poly: Polynomial, terms: Array, lost: float) -> Polynomial:
     """Return the sum of a polynomial and another one with coefficients ``terms (J, M)`` of the first monomials.
 
     All errors of these coefficients together are at most ``lost``."""

@@ -201,13 +201,13 @@ class Duality:
         for k, (cost, size, slope) in enumerate(zip(costs, sizes, slopes, strict=True)):
             if groups and touched is not None:
                 offered = None if norms is None else [ball(v) for v in norms[:, k]]
-                constant = constant + self._least_of_groups(cost, size, slope, groups, touched[k].entries(), offered)
+                constant = constant + self._bound_least_cost(cost, size, slope, groups, touched[k].entries(), offered)
             else:
                 weights = [a + b for a, b in zip(cost, size, strict=True)]
                 constant = constant + known(self.problem.control).least(weights, weights, slope)
         return constant
 
-    def _least_of_groups(
+    def _bound_least_cost(
         self,
         weights: list[arb],
         sizes: list[arb],
@@ -225,10 +225,10 @@ class Duality:
         In a corner of oblique facets the best vector is between the first two. The multipliers of the facets compensate
         a part of the slope, and a tangent at a slightly wrong control tilts the corner.
         """
-        balancing = _shrunk([ball(-float(s)) for s in slope], sizes)
-        optional = [] if offered is None else [(_within, _shrunk(offered, sizes))]
+        balancing = _shrink([ball(-float(s)) for s in slope], sizes)
+        optional = [] if offered is None else [(_shorten, _shrink(offered, sizes))]
         candidates = []
-        for adjust, target in ((_within, balancing), (_lengthened, at), *optional):
+        for adjust, target in ((_shorten, balancing), (_scale_to_length, at), *optional):
             tilted_slope, remaining = list(slope), [a + b for a, b in zip(weights, sizes, strict=True)]
             for block in groups:
                 d = adjust([target[c] for c in block], weights[block[0]])
@@ -271,7 +271,7 @@ class Duality:
                 for slope, tangent_slope in zip(slopes, tangent.slope, strict=True)
             ]
         if pieces is not None and self.control.functions < K:
-            slopes, error_bound = self._moved(slopes, pieces)
+            slopes, error_bound = self._substitute_slopes(slopes, pieces)
             constant = constant - error_bound
         return constant, slopes
 
@@ -287,7 +287,9 @@ class Duality:
                 ]
         return totals
 
-    def _moved(self, slopes: list[list[arb]], pieces: Sequence[Sequence[float]]) -> tuple[list[list[arb]], arb]:
+    def _substitute_slopes(
+        self, slopes: list[list[arb]], pieces: Sequence[Sequence[float]]
+    ) -> tuple[list[list[arb]], arb]:
         """Return the slopes of the certificate in place of the derived ones, and a bound of the difference.
 
         With fewer functions than pieces, different slopes have the same effect on every control of the dictionary. The
@@ -297,7 +299,7 @@ class Duality:
         certified = [[-ball(pieces[c][k]) for c in range(m)] for k in range(K)]
         error_bound = ball(0.0)
         for c in range(m):
-            coefficient_bounds = self._largest_coefficients(c)
+            coefficient_bounds = self._bound_coefficients(c)
             for n in range(N):
                 difference = sum(
                     ((certified[k][c] - slopes[k][c]) * ball(v) for k, v in enumerate(self.control.values[n]) if v),
@@ -306,7 +308,7 @@ class Duality:
                 error_bound = error_bound + abs(difference) * coefficient_bounds[n]
         return certified, error_bound
 
-    def _largest_coefficients(self, channel: int) -> list[arb]:
+    def _bound_coefficients(self, channel: int) -> list[arb]:
         axis = [ball(float(i == channel)) for i in range(self.problem.system.controls)]
         shape = known(self.problem.control)
         reach = shape.support(axis).max(shape.support([-a for a in axis]))
@@ -326,23 +328,23 @@ def steps(problem: OptimalControlProblem, control: Dictionary) -> range:
     return range(0 if problem.initial_control is not None else 1, control.pieces + bool(problem.repeat))
 
 
-def _shrunk(vector: Sequence[arb], sizes: Sequence[arb]) -> list[arb]:
+def _shrink(vector: Sequence[arb], sizes: Sequence[arb]) -> list[arb]:
     """Return exact numbers, each moved towards 0 by a size, but not across 0."""
     pairs = [(float(v), float(size)) for v, size in zip(vector, sizes, strict=True)]
     return [ball(np.sign(v) * max(abs(v) - size, 0.0)) for v, size in pairs]
 
 
-def _within(vector: Sequence[arb], length: arb) -> Sequence[arb]:
+def _shorten(vector: Sequence[arb], length: arb) -> Sequence[arb]:
     """Return a vector of exact numbers, shortened to a length where it is longer."""
-    return vector if _squares(vector) <= length * length else _lengthened(vector, length)
+    return vector if _sum_squares(vector) <= length * length else _scale_to_length(vector, length)
 
 
-def _lengthened(vector: Sequence[arb], length: arb) -> list[arb]:
+def _scale_to_length(vector: Sequence[arb], length: arb) -> list[arb]:
     """Return the vector of a length in the direction of the middle of another one; 0 where that is 0."""
     vector = [ball(float(v)) for v in vector]
-    size = _squares(vector)
+    size = _sum_squares(vector)
     return [length * v / size.sqrt() for v in vector] if size > 0 else [ball(0.0) for _ in vector]
 
 
-def _squares(vector: Sequence[arb]) -> arb:
+def _sum_squares(vector: Sequence[arb]) -> arb:
     return sum((v * v for v in vector), ball(0.0))

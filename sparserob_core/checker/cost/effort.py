@@ -58,7 +58,7 @@ def at_most(
     """
     high = [x + support(row) for x, row in zip(a, A, strict=True)]
     low = [x - support([-y for y in row]) for x, row in zip(a, A, strict=True)]
-    slopes = np.array([_slope(float(u), float(v)) for u, v in zip(high, low, strict=True)])
+    slopes = np.array([_compute_chord_slope(float(u), float(v)) for u, v in zip(high, low, strict=True)])
     ends = zip(high, low, balls(slopes), strict=True)
     heights = [(u * (1 - s)).max(-v * (1 + s)).max(ball(0)) for u, v, s in ends]
     middles, table = np.array([float(x) for x in a]), stacked([[x, *row] for x, row in zip(a, A, strict=True)])
@@ -93,7 +93,7 @@ def at_most(
     return count
 
 
-def _slope(high: float, low: float) -> float:
+def _compute_chord_slope(high: float, low: float) -> float:
     """Return the slope of the chord of the absolute value, within ``[-1, 1]``."""
     if low >= 0.0 or high <= 0.0:
         return 1.0 if low >= 0.0 else -1.0

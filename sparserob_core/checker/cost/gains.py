@@ -51,9 +51,9 @@ class GainsBound:
         slopes = stacked([[ball(y) * row.slope[k][i] for y, row in rows] for k in range(K) for i in range(m)])
         innovations = stacked([[x for innovation in row.innovations for x in innovation] for _, row in rows])
         product = (slopes * innovations).tolist()
-        width = [_width(self.control, i) for i in range(m)]
+        width = [_compute_width(self.control, i) for i in range(m)]
         for k in range(K):
-            clusters = self._clusters(k)
+            clusters = self._cluster_breakpoints(k)
             for i in range(m):
                 sizes = [ball(0)]
                 for members, inverse, blocks in clusters:
@@ -68,14 +68,14 @@ class GainsBound:
                 total = total + width[i] * largest(sizes)
         return total
 
-    def _clusters(self, k: int) -> list[tuple[list[int], arb_mat, list[int]]]:
+    def _cluster_breakpoints(self, k: int) -> list[tuple[list[int], arb_mat, list[int]]]:
         """Return the breakpoints that the control on a piece answers, in clusters: those that measure a common block
         are together.
 
         Returns
         -------
         list[tuple[list[int], arb_mat, list[int]]]
-            For every cluster its breakpoints, the matrix of `_inverse`, and its blocks.
+            For every cluster its breakpoints, the matrix of `_compute_inverse`, and its blocks.
         """
         groups: list[tuple[list[int], set[int]]] = []
         for j in np.flatnonzero(self.answers[k, : k + 1]).tolist():
@@ -89,10 +89,10 @@ class GainsBound:
                 else:
                     separate.append((members, blocks))
             groups = [*separate, cluster]
-        return [(sorted(members), *self._inverse(tuple(sorted(members)))) for members, _ in groups]
+        return [(sorted(members), *self._compute_inverse(tuple(sorted(members)))) for members, _ in groups]
 
     @remembered()
-    def _inverse(self, members: tuple[int, ...]) -> tuple[arb_mat, list[int]]:
+    def _compute_inverse(self, members: tuple[int, ...]) -> tuple[arb_mat, list[int]]:
         """Return a generalised inverse ``(q, J d)`` of the matrix from the blocks to the states measured at these
         breakpoints.
 
@@ -105,7 +105,7 @@ class GainsBound:
         for j in members:
             responses = self.loop.seen[j]
             response_rows = {
-                block: _onto(response, self._segments[block])
+                block: _multiply_by_segments(response, self._segments[block])
                 for block, response in responses.items()
                 if block in blocks
             }
@@ -113,11 +113,11 @@ class GainsBound:
                 [
                     x
                     for block in blocks
-                    for x in (response_rows[block][s] if block in response_rows else self._none_of(block))
+                    for x in (response_rows[block][s] if block in response_rows else self._list_zeros(block))
                 ]
                 for s in range(d)
             ]
-        groups = [self._pushed(block) for block in blocks]
+        groups = [self._find_measuring_states(block) for block in blocks]
         pattern = np.vstack(
             [np.hstack([g.pattern & (b in self.loop.seen[j]) for g, b in zip(groups, blocks, strict=True)])
              for j in members]
@@ -129,21 +129,21 @@ class GainsBound:
         reach = np.array([float(length) for block in blocks for _, length in self._segments[block]])
         return SeenDeviations(stacked(table), pattern, rows, columns, reach).inverse(), blocks
 
-    def _none_of(self, block: int) -> list[arb]:
+    def _list_zeros(self, block: int) -> list[arb]:
         """Return zeros, one for each of the segments of a block."""
         return [ball(0.0)] * len(self._segments[block])
 
-    def _pushed(self, block: int) -> Pushed:
+    def _find_measuring_states(self, block: int) -> Pushed:
         """Return which states can measure the deviations of a block; each state measures its own initial deviation."""
         loop, vectors = self.loop, [vector for vector, _ in self._segments[block]]
         if loop.measured is not None:  # through the observer every output may measure every deviation
             return Pushed(np.ones((loop.outputs, len(vectors)), dtype=bool), loop.outputs, len(vectors))
         if loop.initial is not None and block == loop.deviations.begun:
             return Pushed(np.array([[bool(v) for v in row] for row in vectors]).T, len(vectors), len(vectors))
-        return self._pushed_along(vectors)
+        return self._find_states_along(vectors)
 
     @remembered(key=lambda self, vectors: tuple(map(tuple, vectors)))
-    def _pushed_along(self, vectors: list[list[Fraction]]) -> Pushed:
+    def _find_states_along(self, vectors: list[list[Fraction]]) -> Pushed:
         """Return which states can measure deviations along some directions."""
         return self.loop.pushed(vectors)
 
@@ -156,17 +156,21 @@ class GainsBound:
         return [segments[id(shape)] for shape, _ in loop.deviations.sets]
 
 
-def _axis(shape: ConvexSet, channel: int, sign: float) -> arb:
+def _evaluate_along_axis(shape: ConvexSet, channel: int, sign: float) -> arb:
     return known(shape).support(balls(sign * np.eye(shape.dimension)[channel]))
 
 
-def _width(shape: ConvexSet, channel: int) -> arb:
-    return _axis(shape, channel, 1.0) + _axis(shape, channel, -1.0)
+def _compute_width(shape: ConvexSet, channel: int) -> arb:
+    return _evaluate_along_axis(shape, channel, 1.0) + _evaluate_along_axis(shape, channel, -1.0)
 
 
 def reach(shape: ConvexSet, channel: int) -> arb:
     """Return the largest absolute value of a channel over a set."""
-    return _axis(shape, channel, 1.0).max(_axis(shape, channel, -1.0)).max(_axis(shape, channel, 1.0) * 0)
+    return (
+        _evaluate_along_axis(shape, channel, 1.0)
+        .max(_evaluate_along_axis(shape, channel, -1.0))
+        .max(_evaluate_along_axis(shape, channel, 1.0) * 0)
+    )
 
 
 def _segments(shape: ConvexSet, middle: Array) -> list[tuple[list[Fraction], arb]]:
@@ -179,11 +183,11 @@ def _segments(shape: ConvexSet, middle: Array) -> list[tuple[list[Fraction], arb
     if isinstance(shape, Product):
         return [
             ([*[Fraction(0)] * indices.start, *vector, *[Fraction(0)] * (shape.dimension - indices.stop)], length)
-            for factor, point, indices in _parts(shape, middle)
+            for factor, point, indices in _split_product(shape, middle)
             for vector, length in _segments(factor, point)
         ]
-    chords, axes = _chords(shape, middle), np.eye(shape.dimension)
-    widths = [_width(shape, channel) for channel in range(shape.dimension)]
+    chords, axes = _compute_chords(shape, middle), np.eye(shape.dimension)
+    widths = [_compute_width(shape, channel) for channel in range(shape.dimension)]
     if all(widths[b].is_zero() or chord > NEAR * widths[b] for b, chord in enumerate(chords)):
         channels = [b for b, width in enumerate(widths) if not width.is_zero()]
         return [([Fraction(float(v)) for v in axes[b]], chords[b]) for b in channels]
@@ -193,18 +197,18 @@ def _segments(shape: ConvexSet, middle: Array) -> list[tuple[list[Fraction], arb
     return [(vector, rational(length)) for vector, length in segments]
 
 
-def _parts(shape: Product, middle: Array) -> list[tuple[ConvexSet, Array, slice]]:
+def _split_product(shape: Product, middle: Array) -> list[tuple[ConvexSet, Array, slice]]:
     """Return every part of a product, each with its part of a point and its place."""
     ends = np.cumsum([0, *(factor.dimension for factor in shape.parts)]).tolist()
     slices = [slice(begin, end) for begin, end in pairwise(ends)]
     return [(factor, middle[indices], indices) for factor, indices in zip(shape.parts, slices, strict=True)]
 
 
-def _chords(shape: ConvexSet, middle: Array) -> list[arb]:
+def _compute_chords(shape: ConvexSet, middle: Array) -> list[arb]:
     """Return numbers ``c_b`` such that the width of a set along any ``a`` is at least ``c_b |a_b|``: the lengths of its
     chords along the axes through its middle."""
     if isinstance(shape, Product):
-        return [chord for factor, point in shape.split(middle) for chord in _chords(factor, point)]
+        return [chord for factor, point in shape.split(middle) for chord in _compute_chords(factor, point)]
     if isinstance(shape, NormBall):
         return [2 * ball(shape.radius)] * shape.dimension
     if isinstance(shape, Ellipsoid):
@@ -223,7 +227,7 @@ def _chords(shape: ConvexSet, middle: Array) -> list[arb]:
     return chords
 
 
-def _onto(push: arb_mat, segments: Sequence[tuple[list[Fraction], arb]]) -> list[list[arb]]:
+def _multiply_by_segments(push: arb_mat, segments: Sequence[tuple[list[Fraction], arb]]) -> list[list[arb]]:
     """Return the matrix of a block times its segments: the coefficients of the segments in every entry."""
     rows, columns = push.tolist(), [[(b, v) for b, v in enumerate(vector) if v] for vector, _ in segments]
     return [

@@ -54,17 +54,17 @@ def walked(nominal: NominalMotion, control: Dictionary, pieces: Sequence[arb_mat
 
     problem, x, steps = nominal.problem, nominal.begin, []
     d, m = problem.system.states, problem.system.controls
-    for start, stop, k in _acting(problem, control):
+    for start, stop, k in _list_acting_intervals(problem, control):
         flow, weight = nominal.step(start, stop), nominal.weight(start, stop)
         z = arb_mat(x.tolist() + (nominal.before if k < 0 else pieces[k]).tolist())
         steps.append((k, flow, weight, z))
         x = arb_mat((flow * z).tolist()[: d + 1])
     costate = nominal.final * x
-    value, terms = (x.transpose() * costate)[0, 0], _terms(x, nominal.final)
+    value, terms = (x.transpose() * costate)[0, 0], _sum_absolute_products(x, nominal.final)
     slope: list[list[arb]] = [[arb(0)] * m for _ in pieces]
     for k, flow, weight, z in reversed(steps):
         weighted = weight * z
-        value, terms = value + (z.transpose() * weighted)[0, 0], terms + _terms(z, weight)
+        value, terms = value + (z.transpose() * weighted)[0, 0], terms + _sum_absolute_products(z, weight)
         adjoint = (weighted + flow.transpose() * arb_mat([*costate.tolist(), *([arb(0)] for _ in range(m))])).tolist()
         costate = arb_mat(adjoint[: d + 1])
         if k >= 0:
@@ -75,7 +75,7 @@ def walked(nominal: NominalMotion, control: Dictionary, pieces: Sequence[arb_mat
         for k, (begin, end) in enumerate(pairwise(ends)):
             weighted_control = matrix * pieces[k] * rational(end - begin)
             value = value + (pieces[k].transpose() * weighted_control)[0, 0]
-            terms += _terms(pieces[k], matrix) * float(end - begin)
+            terms += _sum_absolute_products(pieces[k], matrix) * float(end - begin)
             slope[k] = [g + 2 * entry for g, entry in zip(slope[k], weighted_control.entries(), strict=True)]
     sizes = [abs(float(value)), *(abs(float(g)) for entry in slope for g in entry)]
     radii = [float(value.rad()), *(float(g.rad()) for entry in slope for g in entry)]
@@ -92,21 +92,21 @@ def nominal_states(nominal: NominalMotion, control: Dictionary, pieces: Sequence
     from flint import arb_mat
 
     x, zero_control, states = nominal.begin.tolist(), (nominal.before * 0).tolist(), []
-    for start, stop, k in _acting(nominal.problem, control):
+    for start, stop, k in _list_acting_intervals(nominal.problem, control):
         u = nominal.before if k < 0 else pieces[k]
         states.append(arb_mat(x + (zero_control if k < 0 else u.tolist())))
         x = (nominal.step(start, stop) * arb_mat(x + u.tolist())).tolist()[: len(x)]
     return [*states, arb_mat(x + zero_control)]
 
 
-def _terms(z: arb_mat, M: arb_mat) -> float:
+def _sum_absolute_products(z: arb_mat, M: arb_mat) -> float:
     """Return ``|z|' |M| |z|``, the sum of the absolute values of all products in ``z'M z``."""
     size = np.array([abs(float(entry)) for entry in z.entries()])
     weight = np.abs([float(entry) for entry in M.entries()]).reshape(size.size, size.size)
     return float(size @ weight @ size)
 
 
-def _acting(problem: OptimalControlProblem, control: Dictionary) -> list[tuple[float, float, int]]:
+def _list_acting_intervals(problem: OptimalControlProblem, control: Dictionary) -> list[tuple[float, float, int]]:
     """Return the intervals of time on which one piece of the control acts in one phase of the system.
 
     Each interval has the number of its piece; -1 before the first piece acts.
@@ -149,15 +149,15 @@ class NominalMotion:
     @cached_property
     def running(self) -> arb_mat:
         """The cost per time as a quadratic form of ``z``."""
-        corner, d, m = self._deviation(0).tolist(), self.problem.system.states, self.problem.system.controls
+        corner, d, m = self._build_quadratic_form(0).tolist(), self.problem.system.states, self.problem.system.controls
         return stacked([[*row, *balls(np.zeros(m))] for row in corner] + [balls(np.zeros(d + 1 + m))] * m)
 
     @cached_property
     def final(self) -> arb_mat:
         """The cost of the final state as a quadratic form of ``(x, 1)``."""
-        return self._deviation(2)
+        return self._build_quadratic_form(2)
 
-    def _deviation(self, which: int) -> arb_mat:
+    def _build_quadratic_form(self, which: int) -> arb_mat:
         """Return a term ``(x - r)'Q (x - r)`` of the cost as a matrix on ``(x, 1)``."""
         term, d = self.problem.cost.terms[which], self.problem.system.states
         if term is None:

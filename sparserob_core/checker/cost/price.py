@@ -50,24 +50,24 @@ class Price:
     control: Dictionary
     flow: VerifiedFlow
     clock: Clock = NO_LIMIT
-    _latest: deque[tuple[Sequence[arb_mat], int, Walk]] = field(default_factory=lambda: deque(maxlen=KEPT))
-    _nominals: dict[int, NominalMotion] = field(default_factory=dict)
+    _latest_walks: deque[tuple[Sequence[arb_mat], int, Walk]] = field(default_factory=lambda: deque(maxlen=KEPT))
+    _motions_by_precision: dict[int, NominalMotion] = field(default_factory=dict)
 
     @cached_property
-    def _lengths(self) -> list[Fraction]:
+    def _piece_lengths(self) -> list[Fraction]:
         ends = [Fraction(t) for t in self.clock.each(self.control.breakpoints.tolist())]
         return [b - a for a, b in self.clock.each(pairwise(ends))]
 
     @property
     def is_quadratic(self) -> bool:
-        return any(term is not None for term in self._terms)
+        return any(term is not None for term in self._quadratic_terms)
 
     @cached_property
     def costs(self) -> list[list[arb]]:
         """The cost of the absolute value of every channel on every piece, ``(K, m)``: the integrals of its weights."""
         l1, ends = ball(self.problem.cost.l1), [Fraction(t) for t in self.control.breakpoints.tolist()]
-        times = [Fraction(t) for t in self._changes[0]]
-        rows = [balls(row) for row in self._changes[1]]
+        times = [Fraction(t) for t in self._weight_changes[0]]
+        rows = [balls(row) for row in self._weight_changes[1]]
         costs, first = [], 0
         for begin, end in self.clock.each(pairwise(ends)):
             while first + 1 < len(times) and times[first + 1] <= begin:
@@ -85,15 +85,19 @@ class Price:
     @cached_property
     def counts(self) -> np.ndarray:
         """The weight of every channel in the time of action, ``(m,)``: 1 where weights change with time."""
-        return self._changes[1][0] if np.asarray(self.problem.weights).ndim == 1 else np.ones(self._changes[1].shape[1])
+        return (
+            self._weight_changes[1][0]
+            if np.asarray(self.problem.weights).ndim == 1
+            else np.ones(self._weight_changes[1].shape[1])
+        )
 
     @property
     def highest(self) -> np.ndarray:
         """The largest of all weights of every channel, ``(m,)``."""
-        return np.asarray(self._changes[1].max(axis=0))
+        return np.asarray(self._weight_changes[1].max(axis=0))
 
     @cached_property
-    def _changes(self) -> tuple[list[float], np.ndarray]:
+    def _weight_changes(self) -> tuple[list[float], np.ndarray]:
         """The times from which weights apply, and the weights ``(r, m)``."""
         rows = np.asarray(self.problem.weights, dtype=float)
         return ([0.0], rows[None]) if rows.ndim == 1 else (rows[:, 0].tolist(), rows[:, 1:])
@@ -111,14 +115,14 @@ class Price:
         """Return the cost ``J`` of a control ``(m, 1)`` on every piece."""
         total = ball(0)
         for costs, piece in self.clock.each(zip(self.costs, pieces, strict=True)):
-            total = total + self._norms(costs, piece.entries())
+            total = total + self._sum_norms(costs, piece.entries())
         return total + self.squares(pieces)
 
     def squares(self, pieces: Sequence[arb_mat]) -> arb:
         """Return the quadratic terms of a control ``(m, 1)`` on every piece."""
-        return self._quadratic(pieces).value if self.is_quadratic else ball(0)
+        return self._evaluate_quadratic(pieces).value if self.is_quadratic else ball(0)
 
-    def _norms(self, costs: Sequence[arb], u: Sequence[arb]) -> arb:
+    def _sum_norms(self, costs: Sequence[arb], u: Sequence[arb]) -> arb:
         total = ball(0)
         for block in self.blocks:
             size = abs(u[block[0]]) if len(block) == 1 else norm(stacked([[u[c]] for c in block]))
@@ -127,7 +131,7 @@ class Price:
 
     def tangent(self, pieces: Sequence[arb_mat]) -> Tangent:
         """Return the tangent of the quadratic terms at a control ``(m, 1)`` on every piece."""
-        quadratic = self._quadratic(pieces)
+        quadratic = self._evaluate_quadratic(pieces)
         constant = quadratic.value
         for piece, slope in self.clock.each(zip(pieces, quadratic.slope, strict=True)):
             constant = constant - sum((g * u for g, u in zip(slope, piece.entries(), strict=True)), constant * 0)
@@ -142,11 +146,11 @@ class Price:
         pairs = zip(self.costs, pieces, strict=True)
         norms = lengths
         if norms is None:
-            norms = sum((self._norms(costs, piece.entries()) for costs, piece in pairs), rational(Fraction(0)))
+            norms = sum((self._sum_norms(costs, piece.entries()) for costs, piece in pairs), rational(Fraction(0)))
         if not self.is_quadratic:
             return float(norms)
-        quadratic = self._quadratic(pieces)
-        constant, linear = self._quadratic(self._still).value, -quadratic.value
+        quadratic = self._evaluate_quadratic(pieces)
+        constant, linear = self._evaluate_quadratic(self._zero_control).value, -quadratic.value
         for piece, slope in zip(pieces, quadratic.slope, strict=True):
             linear = linear + sum((g * u for g, u in zip(slope, piece.entries(), strict=True)), linear * 0)
         curvature = linear + constant  # slope'u - value + constant = u'P u / 2
@@ -158,7 +162,7 @@ class Price:
 
         Rounding errors are relative to this sum, also where products cancel within one matrix.
         """
-        return self._quadratic(pieces).terms if self.is_quadratic else 0.0
+        return self._evaluate_quadratic(pieces).terms if self.is_quadratic else 0.0
 
     @cached_property
     def largest(self) -> float:
@@ -173,62 +177,62 @@ class Price:
             [float(known(self.problem.control).support(balls(s * axis)).mid()) for s in (1.0, -1.0)] for axis in axes
         ]
         reach = [max(abs(high), abs(low)) for high, low in ends]
-        durations = np.diff([*self._changes[0], self.problem.horizon])
-        total = float(self.problem.cost.l1) * float(durations @ self._changes[1] @ np.asarray(reach))
+        durations = np.diff([*self._weight_changes[0], self.problem.horizon])
+        total = float(self.problem.cost.l1) * float(durations @ self._weight_changes[1] @ np.asarray(reach))
         if not self.is_quadratic:
             return total
         vectors = [np.zeros(m)] + [s * r * axis for axis, r in zip(axes, reach, strict=True) for s in (1.0, -1.0)]
-        controls = [[stacked([[u] for u in balls(control)])] * len(self._lengths) for control in vectors]
-        return total + max(float(self._quadratic(pieces).value.mid()) for pieces in controls)
+        controls = [[stacked([[u] for u in balls(control)])] * len(self._piece_lengths) for control in vectors]
+        return total + max(float(self._evaluate_quadratic(pieces).value.mid()) for pieces in controls)
 
     @property
-    def _terms(self) -> tuple[Quadratic | None, ...]:
+    def _quadratic_terms(self) -> tuple[Quadratic | None, ...]:
         return self.problem.cost.terms
 
     @property
-    def _nominal(self) -> NominalMotion:
+    def _nominal_motion(self) -> NominalMotion:
         """The nominal motion, at the present working precision or a higher one."""
         from flint import ctx
 
-        if not any(bits >= ctx.prec for bits in self._nominals):
-            flow = self.flow.sharper(2.0**-ctx.prec) if self._nominals else self.flow
-            self._nominals[int(ctx.prec)] = NominalMotion(self.problem, flow)
-        return next(nominal for bits, nominal in self._nominals.items() if bits >= ctx.prec)
+        if not any(bits >= ctx.prec for bits in self._motions_by_precision):
+            flow = self.flow.sharper(2.0**-ctx.prec) if self._motions_by_precision else self.flow
+            self._motions_by_precision[int(ctx.prec)] = NominalMotion(self.problem, flow)
+        return next(nominal for bits, nominal in self._motions_by_precision.items() if bits >= ctx.prec)
 
     def nominal_states(self, pieces: Sequence[arb_mat]) -> list[arb_mat]:
         """Return the nominal ``(x, 1, u)`` of a control where every piece begins to act, and at the end."""
-        return nominal_states(self._nominal, self.control, pieces)
+        return nominal_states(self._nominal_motion, self.control, pieces)
 
     def convex(self) -> None:
         """Raise `Broken` unless every matrix of the cost is positive semidefinite."""
-        for name, term in zip(("state", "control", "final"), self._terms, strict=True):
-            if term is not None and not _semidefinite(term):
+        for name, term in zip(("state", "control", "final"), self._quadratic_terms, strict=True):
+            if term is not None and not _is_semidefinite(term):
                 raise Broken(f"the matrix of the cost's {name} term is not positive semidefinite")
 
     @cached_property
-    def _still(self) -> list[arb_mat]:
+    def _zero_control(self) -> list[arb_mat]:
         """The control that stays 0."""
-        return [stacked([[ball(0)]] * self.problem.system.controls)] * len(self._lengths)
+        return [stacked([[ball(0)]] * self.problem.system.controls)] * len(self._piece_lengths)
 
-    def _quadratic(self, pieces: Sequence[arb_mat]) -> Walk:
+    def _evaluate_quadratic(self, pieces: Sequence[arb_mat]) -> Walk:
         """Return the quadratic terms and their slopes, at the working precision that they need.
 
         The latest are remembered, since the cost, its terms and its rounding error are needed for the same control.
         """
         from flint import ctx
 
-        for control, bits, quadratic in self._latest:
+        for control, bits, quadratic in self._latest_walks:
             if control is pieces and bits >= ctx.prec:
                 return quadratic
-        self._latest.append((pieces, int(ctx.prec), self._resolved(pieces, int(ctx.prec))))
-        return self._latest[-1][2]
+        self._latest_walks.append((pieces, int(ctx.prec), self._resolve_quadratic(pieces, int(ctx.prec))))
+        return self._latest_walks[-1][2]
 
-    def _resolved(self, pieces: Sequence[arb_mat], bits: int) -> Walk:
+    def _resolve_quadratic(self, pieces: Sequence[arb_mat], bits: int) -> Walk:
         from flint import ctx
 
         while True:
             with ctx.workprec(bits):
-                quadratic = walked(self._nominal, self.control, pieces)
+                quadratic = walked(self._nominal_motion, self.control, pieces)
             if quadratic.blurred <= ENOUGH:
                 return quadratic
             bits *= 2
@@ -236,7 +240,7 @@ class Price:
                 raise Unchecked("the quadratic cost cannot be resolved: the state grows too far over the horizon")
 
 
-def _semidefinite(term: Quadratic) -> bool:
+def _is_semidefinite(term: Quadratic) -> bool:
     """Return True where a matrix is positive semidefinite, by symmetric elimination in rational numbers: no pivot is
     negative, and the row of a zero pivot is zero."""
     from flint import fmpq

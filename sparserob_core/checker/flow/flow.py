@@ -80,8 +80,8 @@ class VerifiedFlow:
     timing: Law | None = None
     sharp: float = SHARP
     _segments: dict[tuple[float, float], VerifiedSegment] = field(default_factory=dict, repr=False)
-    _longest: dict[float, float] = field(default_factory=dict, repr=False)
-    _about: dict[tuple[int, float], tuple[Array, Array]] = field(default_factory=dict, repr=False)
+    _segment_stops: dict[float, float] = field(default_factory=dict, repr=False)
+    _float_flows: dict[tuple[int, float], tuple[Array, Array]] = field(default_factory=dict, repr=False)
 
     @remembered(lambda: POINTS_KEPT, lambda self, parameter: tuple(map(float, parameter)))
     def at(self, parameter: Sequence[float]) -> VerifiedFlow:
@@ -116,14 +116,14 @@ class VerifiedFlow:
         return self.plant.driven
 
     @cached_property
-    def _begins(self) -> list[float]:
+    def _stretch_starts(self) -> list[float]:
         return [stretch.start for stretch in self.law.stretches]
 
-    def _place(self, start: float, stop: float) -> int:
+    def _find_stretch(self, start: float, stop: float) -> int:
         """Return the number of the stretch that holds an interval; raise `Unchecked` where none does."""
         if not 0.0 <= start <= stop <= self.until:
             raise Unchecked(f"the system is not known from {start:g} to {stop:g}")
-        index = max(0, bisect_right(self._begins, start) - 1)
+        index = max(0, bisect_right(self._stretch_starts, start) - 1)
         if stop > self.law.stretches[index].stop:
             raise Unchecked(f"the system is no polynomial from {start!r} to {stop!r}")
         return index
@@ -133,9 +133,9 @@ class VerifiedFlow:
         next."""
         marks = [times[0]]
         for start, stop in pairwise(times):
-            cuts = [begin for begin in self._begins if start < begin < stop]
+            cuts = [begin for begin in self._stretch_starts if start < begin < stop]
             for a, b in pairwise([start, *cuts, stop]):
-                stretch = self.law.stretches[self._place(a, b)]
+                stretch = self.law.stretches[self._find_stretch(a, b)]
                 count = (b - a) / stretch.stride * (1.0 - 1e-14) if stretch.is_still else 1.0
                 if not len(marks) + count <= MOST_MARKS:
                     raise Unchecked("the system is too fast for its horizon to be followed")
@@ -145,26 +145,26 @@ class VerifiedFlow:
     def segment(self, start: float, stop: float) -> tuple[VerifiedSegment, arb]:
         """Return the verified segment of the flow from ``start`` on, and the share of its time that has passed at
         ``stop``."""
-        stretch = self.law.stretches[self._place(start, stop)]
+        stretch = self.law.stretches[self._find_stretch(start, stop)]
         if stretch.is_still:
             share = (ball(stop) - ball(start)) / stretch.stride
             if not share <= LONGER:
                 raise Unchecked(f"the system is no polynomial from {start!r} to {stop!r}")
-            return self._still(stretch), share
-        longest = self._longest.get(start, -1.0)
+            return self._solve_constant_stretch(stretch), share
+        longest = self._segment_stops.get(start, -1.0)
         if stop > longest:
             if len(self._segments) >= KEPT:
                 self._segments.clear()
-                self._longest.clear()
+                self._segment_stops.clear()
             self._segments[start, stop] = solve(*stretch.between(start, stop), stretch.units, self.sharp)
-            longest = self._longest[start] = stop
+            longest = self._segment_stops[start] = stop
         if longest == start:
             return self._segments[start, longest], ball(1)
         return self._segments[start, longest], (ball(stop) - ball(start)) / (ball(longest) - ball(start))
 
     def kind(self, start: float, stop: float) -> tuple[int, tuple[float, float]]:
         """Return the kind of an interval: intervals of one kind have one flow."""
-        index = self._place(start, stop)
+        index = self._find_stretch(start, stop)
         is_still = self.law.stretches[index].is_still
         return (index, difference(stop, start)) if is_still else (-1 - index, (start, stop))
 
@@ -201,27 +201,27 @@ class VerifiedFlow:
             length = min(stop, phase.until) - max(start, phase.begin)
             if length > 0.0:
                 key = number, length
-                if key not in self._about:
+                if key not in self._float_flows:
                     table = called(phase, np.array([phase.begin, *self.box.middle])).astype(float)
-                    self._about[key] = held_about(table[:, :d], table[:, d:], length)
-                Phi, Gamma = self._about[key]
+                    self._float_flows[key] = held_about(table[:, :d], table[:, d:], length)
+                Phi, Gamma = self._float_flows[key]
                 flow = Phi @ flow
                 flow[:, d:] += Gamma
         return flow[:, :d], flow[:, d : d + self.driven], flow[:, d + self.driven :]
 
     def parts(self, start: float, stop: float) -> Iterator[FlowPart]:
         """Yield the parts of an interval, one after another."""
-        for a, b in pairwise([start, *(begin for begin in self._begins if start < begin < stop), stop]):
-            stretch, doublings, length = self.law.stretches[self._place(a, b)], 0, ball(b) - ball(a)
+        for a, b in pairwise([start, *(begin for begin in self._stretch_starts if start < begin < stop), stop]):
+            stretch, doublings, length = self.law.stretches[self._find_stretch(a, b)], 0, ball(b) - ball(a)
             if not stretch.is_still:
                 yield FlowPart(*self.segment(a, b), length)
                 continue
             share = length / stretch.stride
             while not share <= 1:
                 share, length, doublings = share / 2, length / 2, doublings + 1
-            yield FlowPart(self._still(stretch), share, length, doublings)
+            yield FlowPart(self._solve_constant_stretch(stretch), share, length, doublings)
 
-    def _still(self, stretch: Stretch) -> VerifiedSegment:
+    def _solve_constant_stretch(self, stretch: Stretch) -> VerifiedSegment:
         """Return the verified segment of a stretch on which nothing changes with time."""
         key = (-1.0, stretch.start)
         if key not in self._segments:
@@ -258,9 +258,9 @@ class VerifiedFlow:
             Coefficients ``(d, w)`` in powers of the share of the interval that is left at ``s``, and an upper bound
             ``(d, w)`` of their error.
         """
-        stretch = self.law.stretches[self._place(start, stop)]
+        stretch = self.law.stretches[self._find_stretch(start, stop)]
         A, F = stretch.between(start, stop, backwards=True)
-        Phi, Phi_error = self._back(stretch, A, start, stop)
+        Phi, Phi_error = self._solve_backwards(stretch, A, start, stop)
         w = F[0].shape[1]
         negligible = max(float((series.size / stretch.units[:, None]).max(initial=0.0)) for series in F) * ENOUGH
         input_sizes, terms, remainder = [series.size for series in F], list[Series](), np.zeros((self.states, w))
@@ -280,7 +280,9 @@ class VerifiedFlow:
             terms.append(term)
         return terms, remainder * OUTWARD
 
-    def _back(self, stretch: Stretch, A: Sequence[Series], start: float, stop: float) -> tuple[list[Series], Array]:
+    def _solve_backwards(
+        self, stretch: Stretch, A: Sequence[Series], start: float, stop: float
+    ) -> tuple[list[Series], Array]:
         """Return ``Phi(stop, s)`` as coefficients in powers of the share of an interval that is left at ``s``, with an
         error bound ``(d, d)``. Where nothing changes with time, it is the flow over the time that is left."""
         if stretch.is_still:
@@ -293,7 +295,7 @@ class VerifiedFlow:
 
     def alike(self, start: float, stop: float) -> tuple[object, ...]:
         """Return a key that is equal for intervals with the same flow."""
-        inside = not any(start < begin < stop for begin in self._begins)
+        inside = not any(start < begin < stop for begin in self._stretch_starts)
         return self.kind(start, stop) if inside else (start, stop)
 
     def sizes(self, start: float, stop: float) -> tuple[Array, Array, Array]:
@@ -305,7 +307,7 @@ class VerifiedFlow:
             The largest absolute values of ``[A B E]`` and of its derivative in time, ``(d, d + w)`` each. The third
             value is the units ``(d,)`` of the states, in which the law is small there.
         """
-        stretch = self.law.stretches[self._place(start, stop)]
+        stretch = self.law.stretches[self._find_stretch(start, stop)]
         return *stretch.sizes, stretch.units
 
     @remembered(lambda: WEIGHTS_KEPT, lambda self, grid: tuple(grid))

@@ -43,10 +43,10 @@ class VerifiedFlows:
 
     def at(self, parameter: Sequence[float]) -> VerifiedFlow:
         """Return the flow at one parameter, of which there may be none."""
-        return self._points.at(parameter)
+        return self._point_flow.at(parameter)
 
     @cached_property
-    def _points(self) -> VerifiedFlow:
+    def _point_flow(self) -> VerifiedFlow:
         return VerifiedFlow(self.plant, self.until)
 
     @property
@@ -81,9 +81,9 @@ class VerifiedFlows:
             return self.over(box, self.degree)
         candidate, degree = self.box, WIDE.get(len(box.middle), 2)
         for _ in range(HALVINGS):
-            if not candidate.holds(box) or candidate == box or self._is_close(candidate, degree):
+            if not candidate.holds(box) or candidate == box or self._has_small_remainder(candidate, degree):
                 break
-            candidate = next((half for half in candidate.halved(self._axis(candidate)) if half.holds(box)), box)
+            candidate = next((half for half in candidate.halved(self._choose_axis(candidate)) if half.holds(box)), box)
         return self.over(candidate if candidate.holds(box) else box, degree)
 
     @cached_property
@@ -92,7 +92,7 @@ class VerifiedFlows:
         return not self.box.middle or all(stretch.is_still for stretch in self.timing.stretches)
 
     @remembered()
-    def _is_close(self, box: ParameterBox, degree: int) -> bool:
+    def _has_small_remainder(self, box: ParameterBox, degree: int) -> bool:
         """Return True where the expansion over a box, to a degree, has a small remainder."""
         try:
             flow = self.over(box, degree)
@@ -103,7 +103,7 @@ class VerifiedFlows:
         size, error = ((values * units / units[:, None]).max() for values in (Phi.size, radii))
         return bool(error <= CLOSE * max(1.0, size))
 
-    def _axis(self, box: ParameterBox) -> int:
+    def _choose_axis(self, box: ParameterBox) -> int:
         """Return the number of the parameter that changes the system most across a box."""
         try:
             law = Law(self.plant, self.until, box, 1, self.timing)

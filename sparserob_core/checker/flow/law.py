@@ -117,7 +117,9 @@ class Stretch:
         for k in range(order):
             tables = [[[e[k] if k < len(e) else zero for e in row] for row in table] for table in coefficients]
             terms.append(Series(self.frame.monomials, list(map(stacked, tables))))
-        return _kept([term.columns(0, d) for term in terms], self.units), [term.columns(d, None) for term in terms]
+        return _truncate_powers([term.columns(0, d) for term in terms], self.units), [
+            term.columns(d, None) for term in terms
+        ]
 
     @cached_property
     def sizes(self) -> tuple[Array, Array]:
@@ -138,12 +140,12 @@ def most(table: Sequence[Sequence[arb_poly]]) -> Array:
     return np.array([[sum(float(c.abs_upper()) for c in entry.coeffs()) for entry in row] for row in table])
 
 
-def _power(length: float) -> float:
+def _round_up_to_power(length: float) -> float:
     """Return the least power of two that is not below the length."""
     return 2.0 ** ceil(log2(length))
 
 
-def _kept(A: list[Series], units: Array) -> list[Series]:
+def _truncate_powers(A: list[Series], units: Array) -> list[Series]:
     """Return the leading powers of ``A``. The first one encloses the later powers, whose sum is at most `SHARP`."""
     sizes = [term.size for term in A]
     paces = [pace(size, units) for size in sizes]
@@ -173,11 +175,11 @@ class Law:
     @cached_property
     def units(self) -> Array:
         """The units ``(d,)`` of the states, powers of two, in which the system is small."""
-        A = self._looks[0]
+        A = self._sampled_sizes[0]
         return balanced(A, self.until, np.ones(A.shape[0]) / self.until)
 
     @cached_property
-    def _looks(self) -> tuple[Array, Array]:
+    def _sampled_sizes(self) -> tuple[Array, Array]:
         """The largest absolute values of the entries of ``A``, and of every column of ``[B c E]``, at sample times in
         the middle of the box. Units are made of them; any values would be right."""
         samples = np.array([np.abs(table) for table in self.plant.looked_at(self.box.middle)])
@@ -198,9 +200,14 @@ class Law:
             Where the law is not finite.
         """
         if self.timing is not None:
-            return [self._on_same(stretch) for stretch in self.timing.stretches]
+            return [self._rebuild_stretch(stretch) for stretch in self.timing.stretches]
         spans = [(phase.begin, min(phase.until, self.until), phase) for phase in self.plant.phases]
-        return [stretch for begin, until, phase in spans if begin < until for stretch in self._on(begin, until, phase)]
+        return [
+            stretch
+            for begin, until, phase in spans
+            if begin < until
+            for stretch in self._divide_phase(begin, until, phase)
+        ]
 
     @property
     def is_still(self) -> bool:
@@ -220,21 +227,23 @@ class Law:
             weights += [most(table).sum() for table in stretch.table]
         return weights
 
-    def _on_same(self, other: Stretch) -> Stretch:
+    def _rebuild_stretch(self, other: Stretch) -> Stretch:
         """Return the law on a stretch of the timing."""
         phase = next(phase for phase in reversed(self.plant.phases) if phase.begin <= other.start)
-        frame, table = self._table(other.start, other.stop, phase, self.monomials)
-        return replace(other, frame=frame, table=table, stride=min(other.stride, _power(other.stop - other.start)))
+        frame, table = self._tabulate_law(other.start, other.stop, phase, self.monomials)
+        return replace(
+            other, frame=frame, table=table, stride=min(other.stride, _round_up_to_power(other.stop - other.start))
+        )
 
-    def _on(self, begin: float, until: float, phase: Phase) -> list[Stretch]:
-        constant_stretch = self._still(begin, until, phase)
+    def _divide_phase(self, begin: float, until: float, phase: Phase) -> list[Stretch]:
+        constant_stretch = self._enclose_constant_law(begin, until, phase)
         if constant_stretch is not None:
             return [constant_stretch]
         count = ceil(FIRST * (until - begin) / self.until)
         todo, stretches = list(pairwise(np.linspace(begin, until, count + 1).tolist()))[::-1], []
         while todo:
             start, stop = todo.pop()
-            stretch = self._stretch(start, stop, phase)
+            stretch = self._enclose_stretch(start, stop, phase)
             if stretch is not None:
                 stretches.append(stretch)
                 continue
@@ -244,24 +253,24 @@ class Law:
             todo += [(middle, stop), (start, middle)]
         return stretches
 
-    def _still(self, begin: float, until: float, phase: Phase) -> Stretch | None:
+    def _enclose_constant_law(self, begin: float, until: float, phase: Phase) -> Stretch | None:
         """Return a law that does not change with time as one stretch; ``None`` where it changes."""
         try:
-            stretch = Stretch(begin, until, *self._table(begin, until, phase, self.monomials), self.units)
+            stretch = Stretch(begin, until, *self._tabulate_law(begin, until, phase, self.monomials), self.units)
         except Unchecked:
             return None
-        if not stretch.is_still or (phase.timed and self._hides(stretch, phase)):
+        if not stretch.is_still or (phase.timed and self._has_hidden_dependence(stretch, phase)):
             return None
-        longest, rate = _power(until - begin), pace(stretch.sizes[0][:, : self.plant.states], self.units)
+        longest, rate = _round_up_to_power(until - begin), pace(stretch.sizes[0][:, : self.plant.states], self.units)
         if not rate < 2.0**1000:
             raise Unchecked("the system is too fast for its horizon to be followed")
         return replace(stretch, stride=min(longest, 2.0 ** floor(log2(LONG / rate))) if rate > 0.0 else longest)
 
-    def _hides(self, found: Stretch, phase: Phase) -> bool:
+    def _has_hidden_dependence(self, found: Stretch, phase: Phase) -> bool:
         """Return True where wide balls hide a dependence on time: at a single time the balls are less than half as
         wide."""
         time = (found.start + found.stop) / 2
-        _, table = self._table(time, time, phase, self.monomials)
+        _, table = self._tabulate_law(time, time, phase, self.monomials)
         return any(
             a.length() and float(a[0].rad()) > 2.0 * float(b[0].rad())
             for wide, sharp in zip(found.table, table, strict=True)
@@ -269,27 +278,27 @@ class Law:
             for a, b in zip(wide_row, sharp_row, strict=True)
         )
 
-    def _stretch(self, start: float, stop: float, phase: Phase) -> Stretch | None:
+    def _enclose_stretch(self, start: float, stop: float, phase: Phase) -> Stretch | None:
         """Return the law from ``start`` to ``stop``; ``None`` where that is too long, judged in the middle of the
         box."""
         try:
-            _, middle = self._table(start, stop, phase, NONE)
+            _, middle = self._tabulate_law(start, stop, phase, NONE)
             d, u = len(middle[0]), self.units
             size = most(middle[0])
             radii = np.array([[sum(float(c.rad()) for c in e.coeffs()) for e in row] for row in middle[0]])
             rate, long = pace(size[:, :d], u), float((stop - start) * OUTWARD)
-            ratios = np.ones(d) if rate * long <= LONG else _slow(size[:, :d] * u / u[:, None] * long)
-            least = SHARP * max(rate, pace(self._looks[0], u))
+            ratios = np.ones(d) if rate * long <= LONG else _find_unit_factors(size[:, :d] * u / u[:, None] * long)
+            least = SHARP * max(rate, pace(self._sampled_sizes[0], u))
             if ratios is None or not pace(radii[:, :d], u) * ratios.max() <= least:
                 return None
-            if not (radii[:, d:] <= SHARP * self._looks[1]).all():
+            if not (radii[:, d:] <= SHARP * self._sampled_sizes[1]).all():
                 return None
-            table = middle if self.monomials.size == 1 else self._table(start, stop, phase, self.monomials)[1]
+            table = middle if self.monomials.size == 1 else self._tabulate_law(start, stop, phase, self.monomials)[1]
         except Unchecked:
             return None
         return Stretch(start, stop, Frame(self.monomials, ORDER), table, u * ratios)
 
-    def _table(
+    def _tabulate_law(
         self, start: float, stop: float, phase: Phase, monomials: Monomials
     ) -> tuple[Frame, list[list[list[arb_poly]]]]:
         """Return every entry of the law from ``start`` to ``stop``, one table for each monomial."""
@@ -313,7 +322,7 @@ class Law:
         return frame, tables
 
 
-def _slow(most: Array) -> Array | None:
+def _find_unit_factors(most: Array) -> Array | None:
     """Return factors ``(d,)`` of the units of the states in which the system is small enough; ``None`` where none
     exist.
 

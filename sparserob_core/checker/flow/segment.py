@@ -59,14 +59,14 @@ class Powers:
         a, b = ([x**n for n in range(count)] for x in (start, width))
         weights = [[a[n - j] * b[j] * comb(n, j) if n >= j else arb(0) for n in range(count)] for j in range(kept)]
         size, coefficients = d * columns, []
-        for row in (arb_mat(weights) * self._table).tolist():
+        for row in (arb_mat(weights) * self._coefficient_table).tolist():
             matrices = [arb_mat(d, columns, row[k : k + size]) for k in range(0, len(row), size)]
             coefficients.append(Series(self.stack.monomials, matrices))
         dropped_weights = shifted(float(start.abs_upper()), float(width.abs_upper()), count)[kept:].sum(axis=0)
         return coefficients, np.einsum("n,nij->ij", dropped_weights, self.sizes) * OUTWARD + self.off
 
     @cached_property
-    def _table(self) -> arb_mat:
+    def _coefficient_table(self) -> arb_mat:
         """All entries of all coefficients, one row for each power."""
         from flint import arb_mat
 
@@ -149,12 +149,14 @@ def shifted(start: float, width: float, count: int) -> Array:
         The matrix ``(power of y, power)``. Each entry is rounded outward for ``4 count`` terms.
     """
     n = np.arange(count)
-    table = _binomials(count) * np.power(start, np.maximum(n[None] - n[:, None], 0)) * np.power(width, n)[:, None]
+    table = (
+        _compute_binomials(count) * np.power(start, np.maximum(n[None] - n[:, None], 0)) * np.power(width, n)[:, None]
+    )
     return np.asarray(table * (1.0 + 8.0 * count * 2.0**-53))
 
 
 @lru_cache(maxsize=16)
-def _binomials(count: int) -> Array:
+def _compute_binomials(count: int) -> Array:
     return np.array([[float(comb(n, j)) for n in range(count)] for j in range(count)])
 
 
@@ -184,7 +186,7 @@ def guess(equation: Equation, units: Array, sharp: float = SHARP) -> list[Series
     while len(terms) <= TERMS:
         first = len(terms)
         for n in range(first - 1, first - 1 + AT_ONCE):
-            terms.append(equation.slope(terms, n).scaled(_inverse(n + 1)).middle)
+            terms.append(equation.slope(terms, n).scaled(_invert(n + 1)).middle)
         sizes = (sizes_of(terms[first:]) / scale).max(axis=1)
         largest = np.maximum(largest, sizes.max(axis=0))
         small = (sizes[-2:] <= sharp * np.where(largest > 0.0, largest, 1.0)).all()
@@ -226,7 +228,7 @@ class Equation:
 
     A: Sequence[Series]
     F: Sequence[Series]
-    _known: dict[int, tuple[list[Series], Series]] = field(default_factory=dict, repr=False)
+    _slope_cache: dict[int, tuple[list[Series], Series]] = field(default_factory=dict, repr=False)
 
     @cached_property
     def begin(self) -> Series:
@@ -244,12 +246,12 @@ class Equation:
         """Return the term of order ``n`` of ``A P + [0 F]``; for the same terms of ``P`` it is remembered."""
         count = min(n + 1, len(self.A))
         factors = [terms[n - k] for k in range(count)]
-        cached = self._known.get(n)
+        cached = self._slope_cache.get(n)
         if cached is None or not all(a is b for a, b in zip(cached[0], factors, strict=True)):
             product = dot(self.A[:count], factors)
-            cached = self._known[n] = factors, product + self._inputs[n] if n < len(self.F) else product
+            cached = self._slope_cache[n] = factors, product + self._inputs[n] if n < len(self.F) else product
         return cached[1]
 
 
-def _inverse(value: int) -> arb:
+def _invert(value: int) -> arb:
     return 1 / ball(value)

@@ -91,7 +91,7 @@ class Disturbances:
         bound, classes = self.problem.disturbance, self.problem.disturbance_class
         if self.timing.answering or self.problem.measurable is None or bound is None:
             return bound
-        factors, kinds = ((bound,), (classes,)) if isinstance(classes, str) else (_parts(bound), classes)
+        factors, kinds = ((bound,), (classes,)) if isinstance(classes, str) else (_list_factors(bound), classes)
         sets = [
             factor if kind != "measurable" else Box(*2 * (middle(factor),))
             for factor, kind in zip(factors, kinds, strict=True)
@@ -100,7 +100,7 @@ class Disturbances:
         return None if isinstance(classes, str) and not middle(held_set).any() else held_set
 
 
-def _parts(bound: ConvexSet) -> Sequence[ConvexSet]:
+def _list_factors(bound: ConvexSet) -> Sequence[ConvexSet]:
     if not isinstance(bound, Product):
         raise Unchecked("of disturbances of several classes, the checker knows lists of sets only")
     return bound.parts

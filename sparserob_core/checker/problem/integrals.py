@@ -96,31 +96,31 @@ def integrating(problem: OptimalControlProblem) -> OptimalControlProblem:
     """Return the problem with one more coordinate for every integral; the problem itself where there is none."""
     if not problem.integral:
         return problem
-    d, (coordinates, windows) = problem.system.states, _coordinates(problem)
+    d, (coordinates, windows) = problem.system.states, _derive_coordinates(problem)
     size = d + len(coordinates)
     return replace(
         problem,
         **with_zeros(problem, len(coordinates)),
-        system=_larger(problem.system, coordinates, problem.horizon),
+        system=_extend_system(problem.system, coordinates, problem.horizon),
         path=[
-            *(_freed(entry, size) for entry in problem.windows),
-            *(Accumulated(_summed(sums, size), time, time, name) for name, time, sums in windows),
+            *(_extend_constraint(entry, size) for entry in problem.windows),
+            *(Accumulated(_make_sum_set(sums, size), time, time, name) for name, time, sums in windows),
         ],
         terminal=[
             Equality(np.pad(end.values, (0, size - d), constant_values=np.nan))
             if isinstance(end, Equality)
-            else _free(end, size)
+            else _extend_set(end, size)
             for end in problem.terminal
         ],
         integral=(),
-        names=_named(problem, coordinates),
+        names=_extend_names(problem, coordinates),
         commanded=tuple(
             d + i for i, coordinate in enumerate(coordinates) if coordinate.g.any() and problem.execution is not None
         ),
     )
 
 
-def _coordinates(
+def _derive_coordinates(
     problem: OptimalControlProblem,
 ) -> tuple[list[Coordinate], list[tuple[str, float, list[tuple[list[int], float, float]]]]]:
     """Return the coordinates of all integrals, and how they are judged.
@@ -141,7 +141,7 @@ def _coordinates(
         label = entry.name or ("integral" if len(problem.integral) == 1 else f"integral[{number}]")
         bounds = zip(np.asarray(entry.lower).tolist(), np.asarray(entry.upper).tolist(), strict=True)
         for row, (h, g, (lower, upper)) in enumerate(zip(H, G, bounds, strict=True)):
-            name, unit = label + (f" {row + 1}" if len(H) > 1 else ""), _unit(problem.names, h, g)
+            name, unit = label + (f" {row + 1}" if len(H) > 1 else ""), _derive_unit(problem.names, h, g)
             coords = [Coordinate(h, g, entry.start, entry.stop, name, unit)]
             if g.any() and (delay or problem.execution is not None):  # commands count, their errors do not
                 names = [f"{name} of states", f"{name} of controls"] if h.any() else [name]
@@ -176,8 +176,8 @@ class RunningIntegrals:
         system = problem.system
         if not problem.integral or not system.is_constant or system.parameters is not None:
             return None
-        coordinates, _ = _coordinates(problem)
-        phase = _with(system.phases[0], [(coordinate.h, coordinate.g) for coordinate in coordinates])
+        coordinates, _ = _derive_coordinates(problem)
+        phase = _extend_phase(system.phases[0], [(coordinate.h, coordinate.g) for coordinate in coordinates])
         windows = np.array([[coordinate.begin, coordinate.end] for coordinate in coordinates])
         return RunningIntegrals(System((phase,), None, system.delay), *windows.T)
 
@@ -206,7 +206,7 @@ class RunningIntegrals:
         return [(row, until) for row, until in rows if row.any()] or rows[:1]
 
 
-def _larger(system: System, coordinates: list[Coordinate], horizon: float) -> System:
+def _extend_system(system: System, coordinates: list[Coordinate], horizon: float) -> System:
     """Return the system with its coordinates, divided where one of them begins or ends."""
     switches = [phase.begin for phase in system.phases[1:]]
     boundaries = [*switches, horizon]
@@ -216,11 +216,13 @@ def _larger(system: System, coordinates: list[Coordinate], horizon: float) -> Sy
     phases = []
     for begin, until in pairwise([0.0, *sorted(boundaries)]):
         number = sum(switch <= begin for switch in switches)
-        phases.append(_with(system.phases[number], list(_acting(coordinates, begin, until))).between(begin, until))
+        phases.append(
+            _extend_phase(system.phases[number], list(_list_rates(coordinates, begin, until))).between(begin, until)
+        )
     return system.in_phases(phases)
 
 
-def _acting(coordinates: list[Coordinate], begin: float, until: float) -> Iterator[tuple[Array, Array]]:
+def _list_rates(coordinates: list[Coordinate], begin: float, until: float) -> Iterator[tuple[Array, Array]]:
     """Yield the rates of the coordinates on an interval of time, which lies inside the window of each or outside of
     it."""
     middle = (begin + until) / 2
@@ -229,7 +231,7 @@ def _acting(coordinates: list[Coordinate], begin: float, until: float) -> Iterat
         yield share * coordinate.h, share * coordinate.g
 
 
-def _with(phase: Phase, rates: list[tuple[Array, Array]]) -> Phase:
+def _extend_phase(phase: Phase, rates: list[tuple[Array, Array]]) -> Phase:
     k, m = len(rates), phase.controls
     below = {
         "A": np.array([[*h, *np.zeros(k)] for h, _ in rates]),
@@ -244,16 +246,16 @@ def _with(phase: Phase, rates: list[tuple[Array, Array]]) -> Phase:
     return replace(phase, A=matrices["A"], B=matrices["B"], E=matrices["E"], c=matrices.get("c"))
 
 
-def _freed(entry: PathConstraint | MixedConstraint, size: int) -> PathConstraint | MixedConstraint:
+def _extend_constraint(entry: PathConstraint | MixedConstraint, size: int) -> PathConstraint | MixedConstraint:
     if isinstance(entry, MixedConstraint):
         H = np.asarray(entry.H)
         return replace(entry, H=np.pad(H, ((0, 0), (0, size - H.shape[1]))))
     rows = None if entry.relative_to is None else np.asarray(entry.relative_to)
     padded = None if rows is None else np.pad(rows, ((0, 0), (0, size + 1 - rows.shape[1])))
-    return replace(entry, set=_free(entry.set, size), relative_to=padded)
+    return replace(entry, set=_extend_set(entry.set, size), relative_to=padded)
 
 
-def _free(bound: ConvexSet, size: int) -> ConvexSet:
+def _extend_set(bound: ConvexSet, size: int) -> ConvexSet:
     """Return a set of more coordinates: the first ones are in the given set, the others are free."""
     extra = size - bound.dimension
     if isinstance(bound, Box):
@@ -288,7 +290,7 @@ def with_zeros(problem: OptimalControlProblem, more: int) -> dict[str, Any]:
     }
 
 
-def _summed(sums: list[tuple[list[int], float, float]], size: int) -> ConvexSet:
+def _make_sum_set(sums: list[tuple[list[int], float, float]], size: int) -> ConvexSet:
     """Return the set in which sums of coordinates are between their bounds."""
     if all(len(indices) == 1 for indices, _, _ in sums):
         lower, upper = np.full(size, -np.inf), np.full(size, np.inf)
@@ -301,14 +303,14 @@ def _summed(sums: list[tuple[list[int], float, float]], size: int) -> ConvexSet:
     return Polytope(H[np.isfinite(h)], h[np.isfinite(h)])
 
 
-def _named(problem: OptimalControlProblem, coordinates: list[Coordinate]) -> Names:
+def _extend_names(problem: OptimalControlProblem, coordinates: list[Coordinate]) -> Names:
     names, d = problem.names, problem.system.states
     units = [*(names.state_units or ("",) * d), *(coordinate.unit for coordinate in coordinates)]
     labels = [*(names.states or [f"x{i + 1}" for i in range(d)]), *(coordinate.name for coordinate in coordinates)]
     return replace(names, states=labels, state_units=units if any(units) else ())
 
 
-def _unit(names: Names, h: Array, g: Array) -> str:
+def _derive_unit(names: Names, h: Array, g: Array) -> str:
     """Return the unit of an integral, that of the integrand times that of time; empty where terms have different
     units."""
     pairs = [(h, names.state_units), (g, names.control_units)]

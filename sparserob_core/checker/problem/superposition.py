@@ -49,35 +49,35 @@ class Affine:
     def __init__(self, parameters: frozenset[int] = frozenset(), bent: bool = False) -> None:
         self.parameters, self.bent = parameters, bent
 
-    def _sum(self, other: object, product: bool = False) -> Affine:
+    def _add(self, other: object, product: bool = False) -> Affine:
         if not isinstance(other, Affine):
             return self
         is_bilinear = product and bool(self.parameters) and bool(other.parameters)
         return Affine(self.parameters | other.parameters, self.bent or other.bent or is_bilinear)
 
-    def _product(self, other: object) -> Affine:
-        return self._sum(other, product=True)
+    def _multiply(self, other: object) -> Affine:
+        return self._add(other, product=True)
 
-    def _curved(self, *_: object) -> Affine:
+    def _apply_nonlinear(self, *_: object) -> Affine:
         return Affine(self.parameters, self.bent or bool(self.parameters))
 
-    def _same(self) -> Affine:
+    def _return_self(self) -> Affine:
         return self
 
     def __truediv__(self, other: object) -> Affine:
-        return self * other._curved() if isinstance(other, Affine) else self
+        return self * other._apply_nonlinear() if isinstance(other, Affine) else self
 
     def __pow__(self, other: object) -> Affine:
         if isinstance(other, Affine):
-            return self._curved() * other._curved()
+            return self._apply_nonlinear() * other._apply_nonlinear()
         if other == 0:
             return Affine()
-        return self if other == 1 else self._curved()
+        return self if other == 1 else self._apply_nonlinear()
 
-    __add__ = __radd__ = __sub__ = __rsub__ = _sum
-    __mul__ = __rmul__ = _product
-    __neg__ = __pos__ = _same
-    __rtruediv__ = __rpow__ = sin = cos = tan = exp = sqrt = log = tanh = kepler = _curved
+    __add__ = __radd__ = __sub__ = __rsub__ = _add
+    __mul__ = __rmul__ = _multiply
+    __neg__ = __pos__ = _return_self
+    __rtruediv__ = __rpow__ = sin = cos = tan = exp = sqrt = log = tanh = kepler = _apply_nonlinear
 
 
 @final
@@ -96,7 +96,7 @@ class ParameterExpansion:
             raise Unchecked("the checker knows boxes of parameters beside the time")
         ranges = zip(box.lower.tolist(), box.upper.tolist(), self.middle, strict=True)
         return [
-            _above(max(Fraction(high) - Fraction(middle), Fraction(middle) - Fraction(low)))
+            _round_up(max(Fraction(high) - Fraction(middle), Fraction(middle) - Fraction(low)))
             for low, high, middle in ranges
         ]
 
@@ -114,7 +114,7 @@ class ParameterExpansion:
             Where an entry is no affine function of the parameters.
         """
         movable = [frozenset([j]) if scale else frozenset[int]() for j, scale in enumerate(self.scales)]
-        matrix = _called(entry, [Affine(), *map(Affine, movable)])
+        matrix = _evaluate_matrix(entry, [Affine(), *map(Affine, movable)])
         nonzero, dependent = np.zeros(matrix.shape, dtype=bool), np.zeros((len(movable), *matrix.shape), dtype=bool)
         for index, value in np.ndenumerate(matrix):
             nonzero[index] = isinstance(value, Affine) or float(value) != 0.0
@@ -131,11 +131,11 @@ class ParameterExpansion:
         """
         zero: Any = 0.0 * time  # type: ignore[operator]  # a number of the kind of the time
         middle, dependent = [zero + value for value in self.middle], self.depends(entry)[1]
-        tables = [_called(entry, [time, *middle])]
+        tables = [_evaluate_matrix(entry, [time, *middle])]
         for j, (scale, mask) in enumerate(zip(self.scales, dependent, strict=True)):
             change = np.zeros(mask.shape, dtype=object)
             if mask.any():
-                shifted = _called(entry, [time, *middle[:j], middle[j] + scale, *middle[j + 1 :]])
+                shifted = _evaluate_matrix(entry, [time, *middle[:j], middle[j] + scale, *middle[j + 1 :]])
                 for index in zip(*np.nonzero(mask), strict=True):
                     change[index] = shifted[index] - tables[0][index]
             tables.append(change)
@@ -253,36 +253,40 @@ def parted(problem: OptimalControlProblem) -> OptimalControlProblem:
     return replace(
         problem,
         **with_zeros(problem, extra),
-        system=System(tuple(_larger(expansion, phase) for phase in system.phases), None, system.delay),
-        path=[row for entry, name in zip(problem.path, labels, strict=True) for row in _seen(entry, name, corners)],
+        system=System(tuple(_extend_phase(expansion, phase) for phase in system.phases), None, system.delay),
+        path=[
+            row
+            for entry, name in zip(problem.path, labels, strict=True)
+            for row in _extend_constraint(entry, name, corners)
+        ],
         terminal=[
             bound
             for end in problem.terminal
             for bound in (
                 [Equality(np.pad(end.values, (0, extra), constant_values=np.nan))]
                 if isinstance(end, Equality)
-                else _bounds(end, corners)
+                else _extend_set(end, corners)
             )
         ],
-        integral=[_sums(entry, corners) for entry in problem.integral],
+        integral=[_extend_integral(entry, corners) for entry in problem.integral],
         names=replace(problem.names, states=state_names, state_units=units),
     )
 
 
-def _called(entry: object, arguments: list[Any]) -> np.ndarray:
+def _evaluate_matrix(entry: object, arguments: list[Any]) -> np.ndarray:
     """Return a matrix at the time and the parameters, numbers of any kind."""
     p = np.empty(len(arguments), dtype=object)
     p[:] = arguments
     return matrix_at(entry, p)
 
 
-def _above(exact: Fraction) -> float:
+def _round_up(exact: Fraction) -> float:
     """Return the number itself, or the next double above it."""
     rounded = float(exact)
     return nextafter(rounded, inf) if Fraction(rounded) < exact else rounded
 
 
-def _larger(parts: ParameterExpansion, phase: Phase) -> Phase:
+def _extend_phase(parts: ParameterExpansion, phase: Phase) -> Phase:
     matrices = {name: Larger(parts, name, phase.entry(name)) for name in PARTS if phase.entry(name) is not None}
     times = Box([phase.begin], [phase.until])
     return Phase(
@@ -298,12 +302,12 @@ def _larger(parts: ParameterExpansion, phase: Phase) -> Phase:
     )
 
 
-def _rows(blocks: list[Array]) -> Array:
+def _deduplicate_rows(blocks: list[Array]) -> Array:
     """Return every distinct row once, in the order of first occurrence."""
     return np.array(list(dict.fromkeys(tuple(row) for block in blocks for row in block.tolist())))
 
 
-def _bounds(bound: ConvexSet, corners: list[Array]) -> list[ConvexSet]:
+def _extend_set(bound: ConvexSet, corners: list[Array]) -> list[ConvexSet]:
     """Return the sets of the larger state that hold a set at all corners.
 
     A set with flat sides becomes one polytope with the rows of all corners, another set becomes one set for each
@@ -311,7 +315,7 @@ def _bounds(bound: ConvexSet, corners: list[Array]) -> list[ConvexSet]:
     """
     facets = bound.halfspaces()
     if facets is not None:
-        rows = _rows([np.column_stack([facets[0] @ projection, facets[1]]) for projection in corners])
+        rows = _deduplicate_rows([np.column_stack([facets[0] @ projection, facets[1]]) for projection in corners])
         return [Polytope(rows[:, :-1], rows[:, -1])]
     base = bound.base if isinstance(bound, Cylinder) else bound
     b = base.dimension
@@ -319,14 +323,14 @@ def _bounds(bound: ConvexSet, corners: list[Array]) -> list[ConvexSet]:
     return [Cylinder(base, corners[0].shape[1], np.array(slopes)) for slopes in distinct_slopes]
 
 
-def _seen(
+def _extend_constraint(
     entry: PathConstraint | MixedConstraint | ConvexSet, name: str, corners: list[Array]
 ) -> list[PathConstraint | MixedConstraint]:
     assert not isinstance(entry, ConvexSet)
     d, size = corners[0].shape
     if isinstance(entry, MixedConstraint):
         H, G = np.asarray(entry.H), np.asarray(entry.G)
-        table = _rows(
+        table = _deduplicate_rows(
             [
                 np.column_stack([H @ projection, G, np.broadcast_to(np.asarray(entry.h), len(H))])
                 for projection in corners
@@ -335,16 +339,16 @@ def _seen(
         return [replace(entry, name=name, H=table[:, :size], G=table[:, size:-1], h=table[:, -1])]
     rows = None if entry.relative_to is None else np.asarray(entry.relative_to)
     padded = None if rows is None else np.pad(rows, ((0, 0), (0, size - d)))
-    bounds = _bounds(entry.set, corners)
+    bounds = _extend_set(entry.set, corners)
     return [
         replace(entry, name=name if len(bounds) == 1 else f"{name} at corner {k + 1}", set=bound, relative_to=padded)
         for k, bound in enumerate(bounds)
     ]
 
 
-def _sums(entry: IntegralConstraint, corners: list[Array]) -> IntegralConstraint:
+def _extend_integral(entry: IntegralConstraint, corners: list[Array]) -> IntegralConstraint:
     size, sides = corners[0].shape[1], [np.asarray(side, dtype=float) for side in (entry.lower, entry.upper)]
-    table = _rows(
+    table = _deduplicate_rows(
         [np.column_stack([np.asarray(entry.H) @ projection, np.asarray(entry.G), *sides]) for projection in corners]
     )
     return replace(entry, H=table[:, :size], G=table[:, size:-2], lower=table[:, -2], upper=table[:, -1])

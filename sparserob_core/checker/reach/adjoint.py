@@ -96,16 +96,16 @@ class AdjointFlow:
         return APART if self.count * self.states**2 > DEAR else 1
 
     @cached_property
-    def _powers(self) -> list[arb_mat]:
+    def _transition_powers(self) -> list[arb_mat]:
         """The transitions over 1, 2, 4, ... steps that are made so far."""
         return [self.segment.end.matrix]
 
     def over(self, place: int) -> arb_mat:
         """Return the transition over ``2^place`` steps."""
-        while len(self._powers) <= place:
+        while len(self._transition_powers) <= place:
             self.clock.check()
-            self._powers.append(self._powers[-1] * self._powers[-1])
-        return self._powers[place]
+            self._transition_powers.append(self._transition_powers[-1] * self._transition_powers[-1])
+        return self._transition_powers[place]
 
     @cached_property
     def between(self) -> list[Enclosed]:
@@ -119,7 +119,7 @@ class AdjointFlow:
             transitions.append(power if j == 2**exponent else transitions[j - 2**exponent - 1] * power)
         return [Enclosed.all([transition], shape) for transition in transitions]
 
-    def _expanded(self, order: int, columns: arb_mat | None = None) -> Enclosed:
+    def _expand_adjoint(self, order: int, columns: arb_mat | None = None) -> Enclosed:
         """Return matrices ``(order + 1, d, n)`` that turn an adjoint at the beginning of a step into the terms of ``l``
         on this step, or of ``l`` times ``columns (d, n)``. The remainder is in the radius of the first."""
         self.clock.check()
@@ -135,19 +135,19 @@ class AdjointFlow:
     @cached_property
     def rows(self) -> Enclosed:
         """The matrices that turn an adjoint into the terms of ``l`` on a step, ``(p + 1, d, d)``."""
-        return self._expanded(ORDER)
+        return self._expand_adjoint(ORDER)
 
     @cached_property
     def inputs(self) -> Enclosed:
         """The matrices that turn an adjoint into the terms of ``l'F`` on a step, ``(p + 1, d, q)``."""
-        return self._expanded(ORDER, self.F)
+        return self._expand_adjoint(ORDER, self.F)
 
     @cached_property
     def bending(self) -> Enclosed:
         """The matrices that turn an adjoint into the first terms of ``l'[A^2, A F, A^2 F]`` on a step,
         ``(J, d, d + 2 q)``."""
         once, twice = (Series.known(self.A * matrix) for matrix in (self.F, self.A))
-        return self._expanded(BENDING, twice.beside(once).beside(Series.known(self.A * once.matrix)).matrix)
+        return self._expand_adjoint(BENDING, twice.beside(once).beside(Series.known(self.A * once.matrix)).matrix)
 
 
 def choose_step(A: Array, horizon: float) -> float:
@@ -201,7 +201,7 @@ class AdjointRow:
         nodes[0][:, 0], nodes[1][:, 0] = mid, rad
         for j in range(1, motion.apart):
             motion.clock.check()
-            for node, product in zip(nodes, _product(Enclosed(mid, rad), motion.between[j - 1]), strict=True):
+            for node, product in zip(nodes, _multiply_rows(Enclosed(mid, rad), motion.between[j - 1]), strict=True):
                 node[:, j] = product[:, 0]
         return AdjointRow(motion, Enclosed(*(node.reshape(-1, len(c))[: motion.count + 1] for node in nodes)))
 
@@ -222,10 +222,10 @@ class AdjointRow:
     @cached_property
     def driven(self) -> Enclosed:
         """The terms of ``l'F`` on every step, ``(N, p + 1, q)``; the remainder is in the radius of the first."""
-        return Enclosed(*_product(Enclosed(self.nodes.mid[:-1], self.nodes.rad[:-1]), self.motion.inputs))
+        return Enclosed(*_multiply_rows(Enclosed(self.nodes.mid[:-1], self.nodes.rad[:-1]), self.motion.inputs))
 
     @cached_property
-    def _weights(self) -> Array:
+    def _integration_weights(self) -> Array:
         return 1.0 / np.arange(1.0, ORDER + 2.0)
 
     @cached_property
@@ -234,11 +234,13 @@ class AdjointRow:
         by the error bound of this step, so that the error of a difference of two is bounded by the difference of their
         radii."""
         increments, size = (
-            self.step * np.einsum("kjq,j->kq", terms, self._weights)
+            self.step * np.einsum("kjq,j->kq", terms, self._integration_weights)
             for terms in (self.driven.mid, np.abs(self.driven.mid))
         )
-        rad = self.step * np.einsum("kjq,j->kq", self.driven.rad, self._weights) + rounding(ORDER + 2) * size
-        return Enclosed(accumulate_exactly(increments), _accumulated(rad) * OUTWARD)
+        rad = (
+            self.step * np.einsum("kjq,j->kq", self.driven.rad, self._integration_weights) + rounding(ORDER + 2) * size
+        )
+        return Enclosed(accumulate_exactly(increments), _accumulate_bounds(rad) * OUTWARD)
 
     def placed(self, times: Array) -> tuple[np.ndarray, Array]:
         """Return the step that holds each time, and the share of the step that has passed, both exact."""
@@ -257,7 +259,9 @@ class AdjointRow:
         for start in range(0, indices.size, batch_size):
             batch = indices[start : start + batch_size]
             distinct, positions = np.unique(steps[batch], return_inverse=True)
-            terms, errors = _product(Enclosed(self.nodes.mid[distinct], self.nodes.rad[distinct]), self.motion.rows)
+            terms, errors = _multiply_rows(
+                Enclosed(self.nodes.mid[distinct], self.nodes.rad[distinct]), self.motion.rows
+            )
             powers = shares[batch][:, None] ** np.arange(ORDER + 1)
             chosen = terms[positions]
             mid[batch] = np.einsum("kjd,kj->kd", chosen, powers)
@@ -275,7 +279,7 @@ class AdjointRow:
             ``(..., q)``.
         """
         steps, shares = self.placed(np.maximum(times, 0.0))
-        powers = self.step * shares[..., None] ** np.arange(1, ORDER + 2) * self._weights
+        powers = self.step * shares[..., None] ** np.arange(1, ORDER + 2) * self._integration_weights
         mid = np.einsum("...jq,...j->...q", self.driven.mid[steps], powers)
         rad = np.einsum("...jq,...j->...q", self.driven.rad[steps], powers)
         size = np.einsum("...jq,...j->...q", np.abs(self.driven.mid[steps]), powers)
@@ -310,7 +314,7 @@ class AdjointRow:
         for start in range(0, self.count, batch_size):
             steps = slice(start, min(start + batch_size, self.count))
             for term in zip(terms.mid[:, None], terms.rad[:, None], strict=True):
-                mid, rad = _product(Enclosed(self.nodes.mid[steps], self.nodes.rad[steps]), Enclosed(*term))
+                mid, rad = _multiply_rows(Enclosed(self.nodes.mid[steps], self.nodes.rad[steps]), Enclosed(*term))
                 bounds[steps] += np.abs(mid[:, 0]) + rad[:, 0]
         bounds *= OUTWARD
         return bounds[:, :d], bounds[:, d : d + q], bounds[:, d + q :]
@@ -337,14 +341,14 @@ class SupportIntegrals:
         return np.einsum("ij,kjw->kiw", CENTRED, mid), errors * OUTWARD, size
 
     @cached_property
-    def _heights(self) -> Array:
+    def _support_bounds(self) -> Array:
         """The upper bounds of the support functions on every step and its neighbours, ``(N, S)``."""
         _, errors, size = self._polynomials
         heights = (size + errors) @ np.array([side.far for side in self.sides]).T * OUTWARD
         padded = np.pad(heights, ((1, 1), (0, 0)), mode="edge")
         return np.asarray(np.maximum(heights, np.maximum(padded[:-2], padded[2:])))
 
-    def _parts(self, steps: np.ndarray, shares: Array) -> tuple[Array, Array, Array]:
+    def _integrate_steps(self, steps: np.ndarray, shares: Array) -> tuple[Array, Array, Array]:
         """Return the integrals over the first ``shares (k,)`` of ``steps (k,)``, and how much more and how much less
         they may be, ``(k, S)`` each."""
         P, errors, size = (values[steps] for values in self._polynomials)
@@ -359,20 +363,25 @@ class SupportIntegrals:
         return value, excess, deficit
 
     @cached_property
-    def _ends(self) -> tuple[Array, Array, Array]:
+    def _end_integrals(self) -> tuple[Array, Array, Array]:
         """The integrals from 0 to the end of every step, and how much more and how much less they may be,
         ``(N + 1, S)`` each."""
-        value, excess, deficit = self._parts(np.arange(self.row.count), np.ones(self.row.count))
+        value, excess, deficit = self._integrate_steps(np.arange(self.row.count), np.ones(self.row.count))
         outward = OUTWARD * (1.0 + rounding(self.row.count))
-        return accumulate_exactly(value), _accumulated(excess) * outward, _accumulated(deficit) * outward
+        return accumulate_exactly(value), _accumulate_bounds(excess) * outward, _accumulate_bounds(deficit) * outward
 
     def at(self, times: Array, rounded: Array | float = 0.0) -> tuple[Array, Array]:
         """Return lower and upper bounds ``(k, S)`` of the integrals from 0 to ``times (k,)``, whose rounding errors are
         at most ``rounded``."""
         steps, shares = self.row.placed(times)
-        (value, excess, deficit), partial = (values[steps] for values in self._ends), self._parts(steps, shares)
+        (value, excess, deficit), partial = (
+            (values[steps] for values in self._end_integrals),
+            self._integrate_steps(steps, shares),
+        )
         total = value + partial[0]
-        error = np.asarray(rounded)[..., None] * self._heights[steps] + 4.0 * HALF_ULP * (np.abs(value) + np.abs(total))
+        error = np.asarray(rounded)[..., None] * self._support_bounds[steps] + 4.0 * HALF_ULP * (
+            np.abs(value) + np.abs(total)
+        )
         return total - (deficit + partial[2] + error) * OUTWARD, total + (excess + partial[1] + error) * OUTWARD
 
 
@@ -415,14 +424,14 @@ class Stopped:
 
     def at(self, times: Array) -> Enclosed:
         """Return the sum of the adjoints at exact ``times (k,)``, ``(k, d)``."""
-        return _sum([row.at(np.minimum(times, until)) for row, until in self.parts])
+        return _sum_enclosures([row.at(np.minimum(times, until)) for row, until in self.parts])
 
     def between(self, times: Array, start: Array | float, stop: Array | float) -> Enclosed:
         """Return what an input of 1 from ``start`` to ``stop`` adds to the sum at exact times, ``(..., q)``."""
-        return _sum([row.between(np.minimum(times, until), start, stop) for row, until in self.parts])
+        return _sum_enclosures([row.between(np.minimum(times, until), start, stop) for row, until in self.parts])
 
 
-def _sum(parts: Sequence[Enclosed]) -> Enclosed:
+def _sum_enclosures(parts: Sequence[Enclosed]) -> Enclosed:
     mid, rad = parts[0].mid, parts[0].rad
     for summand in parts[1:]:
         mid = mid + summand.mid
@@ -436,7 +445,7 @@ def accumulate_exactly(values: Array) -> Array:
     return np.array([[float(x) for x in column] for column in sums]).reshape(-1, len(values) + 1).T
 
 
-def _accumulated(values: Array) -> Array:
+def _accumulate_bounds(values: Array) -> Array:
     return np.vstack([np.zeros((1, values.shape[1])), np.cumsum(values, axis=0)])
 
 
@@ -448,7 +457,7 @@ def subtract_times(times: Array, others: Array | float) -> tuple[Array, Array]:
     return nearest, np.abs((times - (nearest - opposite)) - (others + opposite))
 
 
-def _product(left: Enclosed, right: Enclosed) -> tuple[Array, Array]:
+def _multiply_rows(left: Enclosed, right: Enclosed) -> tuple[Array, Array]:
     """Return the products ``(k, j, n)`` of rows ``(k, d)`` with matrices ``(j, d, n)``, and their error bounds. The
     rounding error grows with the number of terms of one partial sum plus the number of these sums (Higham 2002, section
     4.2)."""
@@ -492,14 +501,14 @@ class Worst:
     changes: Array | None
 
     @property
-    def _row(self) -> AdjointRow:
+    def _single_adjoint(self) -> AdjointRow:
         """The one adjoint of the row, where it is known at all times."""
         if isinstance(self.adjoint, Stopped):
             raise Unchecked("a sum of rows that stop is known at single times alone")
         return self.adjoint
 
     @property
-    def _mine(self) -> slice:
+    def _disturbance_columns(self) -> slice:
         """The inputs of the adjoint by which the disturbance enters."""
         return slice(self.drives.mid.shape[0], None)
 
@@ -518,7 +527,7 @@ class Worst:
         """
         times = np.array([time])
         row = self.adjoint.at(times)
-        value, rad = self._driven(times)
+        value, rad = self._evaluate_inputs(times)
         for state in (self.centre, deviation):
             value = value + row.mid @ state
             rad = rad + row.rad @ np.abs(state) + rounding(state.size) * (np.abs(row.mid) @ np.abs(state))
@@ -526,13 +535,16 @@ class Worst:
         if signal is not None:
             late, early = np.append(changes[:-1], time)[:-1], np.minimum(changes[1:], time)
             effects = self.adjoint.between(np.full(late.size, time), late, early)
-            gains, gain_errors = effects.mid[:, self._mine] * signal.T, effects.rad[:, self._mine] * np.abs(signal.T)
+            gains, gain_errors = (
+                effects.mid[:, self._disturbance_columns] * signal.T,
+                effects.rad[:, self._disturbance_columns] * np.abs(signal.T),
+            )
             value = value + gains.sum()
             rad = rad + gain_errors.sum() + rounding(gains.size) * np.abs(gains).sum()
         error = float(rad[0] + 4.0 * HALF_ULP * abs(value[0])) * OUTWARD
         return float(value[0]) - error, float(value[0]) + error
 
-    def _driven(self, times: Array) -> tuple[Array, Array]:
+    def _evaluate_inputs(self, times: Array) -> tuple[Array, Array]:
         """Return what the known inputs add to the row at ``times (k,)``, and the error bounds, ``(k,)`` each."""
         mid, rad, size = np.zeros(times.size), np.zeros(times.size), np.zeros(times.size)
         used = self.drives.mid.shape[0]
@@ -549,13 +561,15 @@ class Worst:
         """Return upper bounds ``(k,)`` of the largest value at exact ``times (k,)``, and how far these bounds may be
         above it, ``(k,)``. The second result is proven for flat sets only."""
         rows = self.adjoint.at(times)
-        top, rad = self._driven(times)
+        top, rad = self._evaluate_inputs(times)
         size = np.abs(rows.mid) @ np.abs(self.centre)
         top = top + rows.mid @ self.centre
         rad = rad + rows.rad @ np.abs(self.centre) + rounding(self.centre.size) * size
-        supports = [] if self.begun is None else [_supported(self.begun, rows)]
+        supports = [] if self.begun is None else [_evaluate_support(self.begun, rows)]
         if self.pushed is not None:
-            supports.append(self._constant(times) if self.changes is not None else self._measurable(times))
+            supports.append(
+                self._evaluate_held(times) if self.changes is not None else self._evaluate_measurable(times)
+            )
         for high, error in supports:
             top, rad, size = top + high, rad + error, size + np.abs(high)
         rad = (rad + 8.0 * HALF_ULP * (np.abs(top) + size)) * OUTWARD
@@ -590,66 +604,71 @@ class Worst:
 
         assert self.pushed is not None
         if self.changes is None:
-            (value,), (rad,) = self._measurable(np.array([time]))
+            (value,), (rad,) = self._evaluate_measurable(np.array([time]))
             return arb(float(value), float(2.0 * rad))
         weights = self.weights(time, self.changes[:-1], self.changes[1:])
-        return sum((known(self.pushed).support(weight[self._mine]) for weight in weights), arb(0))
+        return sum((known(self.pushed).support(weight[self._disturbance_columns]) for weight in weights), arb(0))
 
-    def _constant(self, times: Array) -> tuple[Array, Array]:
+    def _evaluate_held(self, times: Array) -> tuple[Array, Array]:
         """Return what the worst disturbance that is constant between ``changes`` adds to the row at ``times (k,)``, and
         error bounds, ``(k,)`` each."""
         assert self.pushed is not None and self.changes is not None
         top, rad = np.zeros(times.size), np.zeros(times.size)
         for start, stop in zip(self.changes[:-1], self.changes[1:], strict=True):
             effects = self.adjoint.between(times, float(start), float(stop))
-            high, error = _supported(self.pushed, Enclosed(effects.mid[:, self._mine], effects.rad[:, self._mine]))
+            high, error = _evaluate_support(
+                self.pushed,
+                Enclosed(effects.mid[:, self._disturbance_columns], effects.rad[:, self._disturbance_columns]),
+            )
             top, rad = top + high, rad + error + HALF_ULP * np.abs(top)
         return top, rad
 
     @cached_property
-    def _about(self) -> Array:
+    def _disturbance_middle(self) -> Array:
         """The middle of the set of a measurable disturbance, ``(mw,)``."""
         assert self.pushed is not None
         return middle(self.pushed)
 
     @cached_property
-    def _swept(self) -> SupportIntegrals:
+    def _disturbance_integrals(self) -> SupportIntegrals:
         """The integrals of the support functions of a measurable disturbance about the middle of its set."""
         assert self.pushed is not None
-        return SupportIntegrals(self._row, self._mine, Side.of(self.pushed))
+        return SupportIntegrals(self._single_adjoint, self._disturbance_columns, Side.of(self.pushed))
 
-    def _measurable(self, times: Array) -> tuple[Array, Array]:
+    def _evaluate_measurable(self, times: Array) -> tuple[Array, Array]:
         """Return what the worst measurable disturbance adds to the row at ``times (k,)``, and error bounds, ``(k,)``
         each."""
         if isinstance(self.adjoint, Stopped):
-            return self._over_ways(self.adjoint, times)
-        low, high = (bound.sum(axis=1) for bound in self._swept.at(times))
-        linear, rounded = self._row.integrals(times)
-        mid, mid_errors = linear.mid[:, self._mine], (linear.rad + rounded)[:, self._mine]
-        top = (low + high) / 2.0 + mid @ self._about
-        size = np.abs(mid) @ np.abs(self._about) + np.abs(low) + np.abs(high)
-        rounding_error = rounding(len(self._swept.sides) + self._about.size + 2) * size
-        return top, (high - low) / 2.0 + mid_errors @ np.abs(self._about) + rounding_error
+            return self._evaluate_stopped(self.adjoint, times)
+        low, high = (bound.sum(axis=1) for bound in self._disturbance_integrals.at(times))
+        linear, rounded = self._single_adjoint.integrals(times)
+        mid, mid_errors = linear.mid[:, self._disturbance_columns], (linear.rad + rounded)[:, self._disturbance_columns]
+        top = (low + high) / 2.0 + mid @ self._disturbance_middle
+        size = np.abs(mid) @ np.abs(self._disturbance_middle) + np.abs(low) + np.abs(high)
+        rounding_error = rounding(len(self._disturbance_integrals.sides) + self._disturbance_middle.size + 2) * size
+        return top, (high - low) / 2.0 + mid_errors @ np.abs(self._disturbance_middle) + rounding_error
 
-    def _over_ways(self, stopped: Stopped, times: Array) -> tuple[Array, Array]:
+    def _evaluate_stopped(self, stopped: Stopped, times: Array) -> tuple[Array, Array]:
         """Return what the worst measurable disturbance adds to an integral that has ended at all ``times (k,)``, and
         error bounds, ``(k,)`` each."""
         assert self.pushed is not None
         if not stopped.ways or (times < stopped.parts[0][1]).any():
             raise Unchecked("of measurable disturbances one integral at a time is followed")
         top, rad = np.zeros(times.size), np.zeros(times.size)
-        radius: Array = np.abs(self._about) + np.array(known(self.pushed).radius)
+        radius: Array = np.abs(self._disturbance_middle) + np.array(known(self.pushed).radius)
         for row, length, rounded in stopped.ways:
-            value, error = replace(self, adjoint=row)._measurable(np.full(times.size, length))
+            value, error = replace(self, adjoint=row)._evaluate_measurable(np.full(times.size, length))
             top = top + value
-            rad = rad + error + HALF_ULP * np.abs(top) + rounded * float(row.fastest[self._mine] @ radius)
+            rad = (
+                rad + error + HALF_ULP * np.abs(top) + rounded * float(row.fastest[self._disturbance_columns] @ radius)
+            )
         return top, rad * OUTWARD
 
     @cached_property
-    def _bent(self) -> Array:
+    def _curvature_bounds(self) -> Array:
         """The bounds ``(N,)`` of the curvature of the largest value on every step. Times an eighth of the square of the
         width of a cell, they bound how far the largest value lies above its chord."""
-        states, once, twice = self._row.bends
+        states, once, twice = self._single_adjoint.bends
         state_bound = np.abs(self.centre) + (0.0 if self.begun is None else np.array(known(self.begun).radius))
         curvature = states @ state_bound
         inputs = np.zeros(once.shape[1])
@@ -658,12 +677,12 @@ class Worst:
         if self.pushed is not None:
             radius = np.array(known(self.pushed).radius)
             if self.changes is None:  # an integral of a support function, whose argument changes at the rate l'AE
-                curvature = curvature + once[:, self._mine] @ radius
+                curvature = curvature + once[:, self._disturbance_columns] @ radius
             else:
-                inputs[self._mine] = radius
+                inputs[self._disturbance_columns] = radius
         # an input on a piece has a difference of l'AF as second derivative: all together the total variation of l'AF,
         # and one value for the piece that acts
-        total = self._row.step * float((twice @ inputs).sum()) + float((once @ inputs).max(initial=0.0))
+        total = self._single_adjoint.step * float((twice @ inputs).sum()) + float((once @ inputs).max(initial=0.0))
         return np.asarray((curvature + total) * OUTWARD)
 
     def over(self, start: Array, stop: Array, beside: Array | float = 0.0) -> Array:
@@ -678,8 +697,10 @@ class Worst:
         tops = np.concatenate(bounds)[positions]
         width, curvature = (stop - start) * OUTWARD, np.zeros(start.size)
         if width.any():
-            step, last = self._row.step, self._row.count - 1
-            curvature = np.maximum(*(self._bent[np.clip((t / step).astype(int), 0, last)] for t in (start, stop)))
+            step, last = self._single_adjoint.step, self._single_adjoint.count - 1
+            curvature = np.maximum(
+                *(self._curvature_bounds[np.clip((t / step).astype(int), 0, last)] for t in (start, stop))
+            )
         end_values = tops.reshape(2, -1) + beside
         rounding_error = 4.0 * HALF_ULP * (np.abs(end_values) + np.abs(beside)).max(axis=0)
         return np.asarray(end_values.max(axis=0) + (width**2 / 8.0 * curvature + rounding_error) * OUTWARD)
@@ -694,7 +715,7 @@ class Worst:
         return np.unique(np.concatenate(times))
 
 
-def _supported(bound: ConvexSet, rows: Enclosed) -> tuple[Array, Array]:
+def _evaluate_support(bound: ConvexSet, rows: Enclosed) -> tuple[Array, Array]:
     """Return the support values of a set at rows ``(k, d)``, and how much more they may be, ``(k,)`` each."""
     w, excess = known(bound).bound(rows.mid, rows.rad)
     size = (np.abs(w) * np.abs(rows.mid)).sum(axis=1)

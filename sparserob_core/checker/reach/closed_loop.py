@@ -101,19 +101,19 @@ class VerifiedLoop:
         """The number of entries of an innovation."""
         return int(self.system.states) if self.measured is None else self.measured.outputs
 
-    def _places(self, piece: int) -> tuple[int, int]:
+    def _find_acting_indices(self, piece: int) -> tuple[int, int]:
         """Return the indices of the piece of the control and of the block of the disturbance that act on a piece of the
         grid. The piece of the control is -1 before the delay is over."""
         inside = (self.grid[piece] + self.grid[piece + 1]) / 2
         return bisect_right(self.acting, inside) - 1, bisect_right(self.changes, inside) - 1
 
-    def _moved(self, piece: int, start: float, stop: float) -> tuple[arb_mat, arb_mat]:
+    def _compute_part_flow(self, piece: int, start: float, stop: float) -> tuple[arb_mat, arb_mat]:
         """Return the transition ``(d, d)`` of a part of a piece of the grid, and what the inputs add to the nominal
         state and to the responses, ``(d, 1 + Q)``."""
         Phi, Gamma, Delta = self.flow.over(start, stop)
         return Phi.matrix, Gamma.beside(Delta).matrix * self.drives[piece]
 
-    def _passed(self, piece: int) -> tuple[arb_mat, arb_mat]:
+    def _compute_piece_flow(self, piece: int) -> tuple[arb_mat, arb_mat]:
         """Return the transition ``(d, d)`` of a piece of the grid, and the effect ``(d, mw)`` of a disturbance that is
         constant on it."""
         Phi, _, Delta = self.flow.over(self.grid[piece], self.grid[piece + 1])
@@ -131,9 +131,9 @@ class VerifiedLoop:
     @cached_property
     def seen(self) -> list[dict[int, arb_mat]]:
         """The matrices ``D_jl (p, mw)`` of every innovation ``j``, by block ``l``; blocks without effect are absent."""
-        return self._entering if self.measured is None else self._observed(self.measured)
+        return self._entering_effects if self.measured is None else self._compute_observer_innovations(self.measured)
 
-    def _observed(self, measured: Measurements) -> list[dict[int, arb_mat]]:
+    def _compute_observer_innovations(self, measured: Measurements) -> list[dict[int, arb_mat]]:
         """Return ``D_jl`` of the innovations of the observer. Its error is propagated from breakpoint to breakpoint,
         less its correction."""
         assert self.observer is not None
@@ -141,7 +141,7 @@ class VerifiedLoop:
         unit = identity(self.outputs)
         innovations: list[dict[int, arb_mat]] = []
         error: dict[int, arb_mat] = {}
-        for j, entering in enumerate(self._entering):
+        for j, entering in enumerate(self._entering_effects):
             for block, effect in entering.items():
                 error[block] = error[block] + effect if block in error else effect
             innovation = {block: C * effect for block, effect in error.items()}
@@ -150,21 +150,21 @@ class VerifiedLoop:
             innovations.append(innovation)
             if j + 1 == len(self.breakpoints) - 1:
                 break
-            L, flow = exactly(self.observer[j]), self._between[j]
+            L, flow = exactly(self.observer[j]), self._breakpoint_transitions[j]
             error = {block: flow * error[block] - L * effect if block in error else -L * effect
                      for block, effect in innovation.items()}  # fmt: skip
         return innovations
 
     @cached_property
-    def _between(self) -> list[arb_mat]:
+    def _breakpoint_transitions(self) -> list[arb_mat]:
         """The transitions from each breakpoint of the control to the next, ``(d, d)`` each."""
         transitions = [identity(self.system.states) for _ in self.breakpoints[:-1]]
         for piece in range(len(self.grid) - 1):
-            transitions[self.on(piece)] = self._passed(piece)[0] * transitions[self.on(piece)]
+            transitions[self.on(piece)] = self._compute_piece_flow(piece)[0] * transitions[self.on(piece)]
         return transitions
 
     @cached_property
-    def _entering(self) -> list[dict[int, arb_mat]]:
+    def _entering_effects(self) -> list[dict[int, arb_mat]]:
         """The effect ``(d, mw)`` of every block on the state at a breakpoint of the control, as far as it entered since
         the breakpoint before; at the first breakpoint, the initial deviation."""
         K = len(self.breakpoints) - 1
@@ -172,10 +172,10 @@ class VerifiedLoop:
         if self.initial is not None:
             effects[0][self.deviations.begun] = identity(self.system.states)
         for piece in range(len(self.grid) - 1 if self.deviations.blocks else 0):
-            k, (_, block) = self.on(piece), self._places(piece)
+            k, (_, block) = self.on(piece), self._find_acting_indices(piece)
             if k + 1 >= K:
                 break
-            Phi, effect = self._passed(piece)
+            Phi, effect = self._compute_piece_flow(piece)
             by_block = {earlier: Phi * before for earlier, before in effects[k + 1].items()}
             if any(not x.is_zero() for x in effect.entries()):
                 by_block[block] = by_block[block] + effect if block in by_block else effect
@@ -206,21 +206,21 @@ class VerifiedLoop:
         drift ``(m + 1 + mw, 1 + Q)``, without one ``(m + mw, 1 + Q)``."""
         drives, zeros = [], [0.0] * self.deviations.starts[-1]
         for piece in range(len(self.grid) - 1):
-            k, block = self._places(piece)
+            k, block = self._find_acting_indices(piece)
             drift = [balls([1.0, *zeros])] if self.flow.driven > self.system.controls else []
             entering = [balls([middle, *zeros]) for middle in self.deviations.middle.tolist()]
             if self.deviations.blocks:
-                self._entered(entering, block)
+                self._add_block_response(entering, block)
             drives.append(stacked([*self.inputs(k).tolist(), *drift, *entering]))
         return drives
 
-    def _entered(self, rows: list[list[arb]], block: int) -> None:
+    def _add_block_response(self, rows: list[list[arb]], block: int) -> None:
         """Add the response to a block of the disturbance to the rows of the disturbance, in place."""
         for i, row in enumerate(rows):
             column = 1 + block * self.system.disturbances + i
             row[column] = row[column] + 1
 
-    def _ended(self, piece: int, state: arb_mat) -> arb_mat:
+    def _add_piece_effect(self, piece: int, state: arb_mat) -> arb_mat:
         """Return the nominal state and the responses after a piece of the grid, from those at its end: the same, unless
         the disturbance on the piece counts there."""
         return state
@@ -236,8 +236,8 @@ class VerifiedLoop:
         zero = [ball(0)] * self.deviations.starts[self.deviations.begun]
         nodes = [stacked([[v, *zero, *row] for v, row in zip(begin, answers, strict=True)])]
         for piece, ends in enumerate(pairwise(self.grid)):
-            Phi, effect = self._moved(piece, *ends)
-            nodes.append(self._ended(piece, Phi * nodes[-1] + effect))
+            Phi, effect = self._compute_part_flow(piece, *ends)
+            nodes.append(self._add_piece_effect(piece, Phi * nodes[-1] + effect))
         return nodes
 
     def state(self, piece: int, time: float) -> arb_mat:
@@ -246,7 +246,7 @@ class VerifiedLoop:
             return self.nodes[piece]
         if time == self.grid[piece + 1]:
             return self.nodes[piece + 1]
-        Phi, effect = self._moved(piece, self.grid[piece], time)
+        Phi, effect = self._compute_part_flow(piece, self.grid[piece], time)
         return Phi * self.nodes[piece] + effect
 
     def inputs(self, k: int) -> arb_mat:

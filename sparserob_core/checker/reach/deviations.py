@@ -113,9 +113,9 @@ class HeldDeviations(Deviations):
         return rounded_radii([], self.sets)
 
     def supports(self, every: Sequence[list[arb]]) -> list[arb]:
-        return [self._support(a) for a in every]
+        return [self._evaluate_support(a) for a in every]
 
-    def _support(self, a: list[arb]) -> arb:
+    def _evaluate_support(self, a: list[arb]) -> arb:
         blocks = (a[first : first + shape.dimension] for first, (shape, _) in zip(self.starts, self.sets, strict=False))
         return sum((of_block(*pair, block) for pair, block in zip(self.sets, blocks, strict=True)), ball(0))
 

@@ -110,12 +110,12 @@ class FollowedExecution(BoundedInputHere):
         steepest, step = self.absolute(c).row.bends[1], self.motion.step
         ages = np.stack([start, stop])[:, :, None] - self.breakpoints[indices]
         places = np.clip(np.floor(ages / step).astype(int) + np.array([-1, 1])[:, None, None], 0, len(steepest) - 1)
-        tops = _tallest(steepest, places[0], places[1] + 1)
+        tops = _find_largest(steepest, places[0], places[1] + 1)
         total = ((np.abs(change) + errors) * tops * (ages[1] > 0.0)[..., None]).sum(axis=(1, 2))
         return np.asarray((stop - start) ** 2 / 8.0 * total * (1.0 + rounding(change.size + 16)))
 
 
-def _tallest(values: Array, first: np.ndarray, last: np.ndarray) -> Array:
+def _find_largest(values: Array, first: np.ndarray, last: np.ndarray) -> Array:
     """Return the largest of ``values (N, m)`` from index ``first (...)`` up to before ``last (...)``, ``(..., m)``."""
     padded = np.vstack([values, values[-1:]])
     ends = np.stack([first.ravel(), last.ravel()], axis=1).ravel()

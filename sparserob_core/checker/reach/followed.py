@@ -38,7 +38,7 @@ class FollowedRows:
     stated: OptimalControlProblem
     timing: Timing
     disturbances: Disturbances
-    _made: dict[bytes, AdjointRow] = field(default_factory=dict, repr=False)
+    _adjoints: dict[bytes, AdjointRow] = field(default_factory=dict, repr=False)
 
     @cached_property
     def running(self) -> RunningIntegrals | None:
@@ -98,7 +98,7 @@ class FollowedRows:
             table = Enclosed.of(stacked([list(row) for row in zip(*on_grid, strict=True)]))
         jumps = None if problem.measurable is not None else self.disturbances.changes
         return Worst(
-            self._adjoint(c),
+            self._choose_adjoint(c),
             np.asarray(problem.initial_state, dtype=float),
             problem.initial_set,
             np.array(self.timing.grid),
@@ -107,22 +107,22 @@ class FollowedRows:
             None if jumps is None else np.append(jumps, problem.horizon),
         )
 
-    def _adjoint(self, c: Array) -> AdjointRow | Stopped:
+    def _choose_adjoint(self, c: Array) -> AdjointRow | Stopped:
         """Return the adjoint of a row ``c (d,)``. An integral over a window is a sum of two rows, one that stops at the
         end of the window and an opposite one that stops at its beginning."""
         if self.running is not None:
             terms = self.running.parts(c)
-            rows = [(self._kept(row), until) for row, until in terms]
+            rows = [(self._remember_adjoint(row), until) for row, until in terms]
             if self.problem.measurable is not None and len(terms) == 2 and not (terms[0][0] + terms[1][0]).any():
                 (row, end), (_, begin) = terms
                 return Stopped.integral(rows, row, begin, end)
             if len(terms) > 1 or terms[0][1] < np.inf:
                 return Stopped(rows, [(*rows[0], 0.0)] if len(terms) == 1 else ())
-        return self._kept(c)
+        return self._remember_adjoint(c)
 
-    def _kept(self, c: Array) -> AdjointRow:
+    def _remember_adjoint(self, c: Array) -> AdjointRow:
         """Return the adjoint of a row ``c (d,)``, which is made once for the row and its opposite."""
-        adjoints, c = self._made, c + 0.0  # turns -0 into 0, so that equal rows have equal bytes
+        adjoints, c = self._adjoints, c + 0.0  # turns -0 into 0, so that equal rows have equal bytes
         if c.tobytes() not in adjoints:
             opposite = adjoints.get((0.0 - c).tobytes())
             adjoints[c.tobytes()] = AdjointRow.of(self.flow, c) if opposite is None else opposite.reversed()

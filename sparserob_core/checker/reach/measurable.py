@@ -208,7 +208,7 @@ def swept(P: Array, e: Array, ends: Array) -> tuple[Array, Array, Array]:
     weights = 1.0 / (orders + 1.0)
     for iteration in range(ROUNDS + 1):
         Q = P[owners]
-        start_values, stop_values = _valued(Q, start), _valued(Q, stop)
+        start_values, stop_values = _evaluate_polynomials(Q, start), _evaluate_polynomials(Q, stop)
         best, rows, width = (start_values + stop_values).argmax(axis=1), np.arange(owners.size), stop - start
         G = Q[rows, :, best][:, :, None] - Q
         g = [values[rows, best][:, None] - values for values in (start_values, stop_values)]
@@ -226,7 +226,10 @@ def swept(P: Array, e: Array, ends: Array) -> tuple[Array, Array, Array]:
         )
         settled, targets = rows[is_settled], owners[is_settled]
         chosen = Q[settled, :, best[settled]] * weights
-        area = _valued(chosen, stop[settled]) * stop[settled] - _valued(chosen, start[settled]) * start[settled]
+        area = (
+            _evaluate_polynomials(chosen, stop[settled]) * stop[settled]
+            - _evaluate_polynomials(chosen, start[settled]) * start[settled]
+        )
         own_errors, largest_errors = e[targets, best[settled]], e[targets].max(axis=1)
         np.add.at(value, targets, area)
         # ``e`` allows for the rounding errors of two parts; with more parts, those at both ends of each are added
@@ -239,30 +242,30 @@ def swept(P: Array, e: Array, ends: Array) -> tuple[Array, Array, Array]:
         a, b = start_values[open_cells].argmax(axis=1), stop_values[open_cells].argmax(axis=1)
         cut = (start[open_cells] + stop[open_cells]) / 2.0
         if iteration < CROSSING or iteration % 2:
-            cut = _equal(Q[open_cells, :, a] - Q[open_cells, :, b], start[open_cells], stop[open_cells])
+            cut = _find_crossings(Q[open_cells, :, a] - Q[open_cells, :, b], start[open_cells], stop[open_cells])
         owners = np.tile(owners[open_cells], 2)
         start, stop = np.concatenate([start[open_cells], cut]), np.concatenate([cut, stop[open_cells]])
     return value, excess * OUTWARD, deficit * OUTWARD
 
 
-def _valued(P: Array, u: Array) -> Array:
+def _evaluate_polynomials(P: Array, u: Array) -> Array:
     """Return the values of polynomials ``(M, p + 1, ...)`` at ``u (M,)``."""
     powers = u[:, None] ** np.arange(P.shape[1])
     return np.asarray(np.einsum("mp,mp...->m...", powers, P))
 
 
-def _equal(P: Array, start: Array, stop: Array) -> Array:
+def _find_crossings(P: Array, start: Array, stop: Array) -> Array:
     """Return points near a root of polynomials ``(M, p + 1)`` that differ in sign at the ends, by the Illinois method:
     secants in which the value at the older end is halved. Elsewhere return the middle. All bounds hold wherever the
     points are."""
-    a, b, fa, fb = start, stop, _valued(P, start), _valued(P, stop)
+    a, b, fa, fb = start, stop, _evaluate_polynomials(P, start), _evaluate_polynomials(P, stop)
     middle_of = (a + b) / 2.0
     crossing, cut = fa * fb < 0.0, middle_of
     for _ in range(SECANTS):
         with np.errstate(divide="ignore", invalid="ignore"):
             cut = np.where(crossing, b - fb * (b - a) / (fb - fa), middle_of)
         cut = np.where(np.isfinite(cut), cut, middle_of)
-        f = _valued(P, cut)
+        f = _evaluate_polynomials(P, cut)
         has_changed = f * fb < 0.0
         a, fa = np.where(has_changed, b, a), np.where(has_changed, fb, fa / 2.0)
         b, fb = cut, f
@@ -390,13 +393,13 @@ class MeasurableLoop(VerifiedLoop):
             transition = later[1] if later[0] == k else identity(self.system.states)
             if k + 1 < K:
                 transitions[k + 1][piece] = transition
-            later = k, transition * self._passed(piece)[0]
+            later = k, transition * self._compute_piece_flow(piece)[0]
         return transitions
 
-    def _entered(self, rows: list[list[arb]], block: int) -> None:
+    def _add_block_response(self, rows: list[list[arb]], block: int) -> None:
         """Leave the rows as they are: a disturbance within a piece counts at the end of the piece."""
 
-    def _ended(self, piece: int, state: arb_mat) -> arb_mat:
+    def _add_piece_effect(self, piece: int, state: arb_mat) -> arb_mat:
         """Return the state and the responses after a piece of the grid, with the effect of the disturbance on it."""
         rows, unit = state.tolist(), identity(self.system.states)
         for i, row in enumerate(rows):
@@ -409,7 +412,7 @@ class MeasurableLoop(VerifiedLoop):
         disturbance on this piece, ``(d, 1 + Q)``."""
         if time == self.grid[piece]:
             return self.nodes[piece]
-        Phi, effect = self._moved(piece, self.grid[piece], time)
+        Phi, effect = self._compute_part_flow(piece, self.grid[piece], time)
         return Phi * self.nodes[piece] + effect
 
     def highest(self, piece: int, time: float, rows: Array | arb_mat, beside: arb_mat | None = None) -> list[arb]:

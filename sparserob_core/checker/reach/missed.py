@@ -127,29 +127,29 @@ class BoundedInputAt(BoundedInputHere):
         """Return lower bounds ``(K, m)`` of what the worst input adds to ``c'x(t)`` for a command of size 1 on every
         piece."""
         bounds = np.zeros((self.input.breakpoints.size - 1, self.input.shares.size))
-        low, _, indices = self._integrals(c[None], time, np.arange(len(self.marks) - 1))
+        low, _, indices = self._bound_integrals(c[None], time, np.arange(len(self.marks) - 1))
         np.add.at(bounds, self.owner[indices], np.maximum(low[:, 0], 0.0))
         return bounds * self.input.shares * (1.0 - rounding(indices.size))
 
     def added(self, c: Array, time: float) -> tuple[float, float]:
         """Return a lower and an upper bound of what the worst input adds to ``c'x(t)``."""
-        low, high = self._summed(c[None], time)
+        low, high = self._bound_effects(c[None], time)
         return float(low[0]), float(high[0])
 
     def bent(self, c: Array, start: float, stop: float) -> float:
         """Return an upper bound of how far `added` lies above its chord on ``[start, stop]``."""
         d = c.size
-        start_bounds = self._summed(np.eye(d), start)[1]
+        start_bounds = self._bound_effects(np.eye(d), start)[1]
         if self.input.side is not None:
-            start_bounds = np.maximum(start_bounds, self._summed(-np.eye(d), start)[1])
+            start_bounds = np.maximum(start_bounds, self._bound_effects(-np.eye(d), start)[1])
         size = self.input.largest(self.input.piece_at(start))
         return float(above_chord(self.law, c[None], start, stop, start_bounds, size, self.input.first)[0])
 
     @remembered(lambda: TIMES_KEPT, lambda self, rows, time: (time, rows.tobytes()))
-    def _summed(self, rows: Array, time: float) -> tuple[Array, Array]:
+    def _bound_effects(self, rows: Array, time: float) -> tuple[Array, Array]:
         """Return lower and upper bounds ``(n,)`` of what the worst input adds to ``rows (n, d)`` at a time."""
         used = np.flatnonzero((self.input.sizes.mid + self.input.sizes.rad).any(axis=1))
-        low, high, indices = self._integrals(rows, time, np.flatnonzero(np.isin(self.owner, used)))
+        low, high, indices = self._bound_integrals(rows, time, np.flatnonzero(np.isin(self.owner, used)))
         owner = self.owner[indices]
         mid, rad = self.input.sizes.mid[owner, None], self.input.sizes.rad[owner, None]
         # absolute values are not negative; a support function may be, where the middle of a thin set is not in it
@@ -160,7 +160,7 @@ class BoundedInputAt(BoundedInputHere):
         rounding_error = rounding(2 * indices.size * self.input.shares.size + 8) * at_most
         return at_least - rounding_error * OUTWARD, at_most + rounding_error * OUTWARD
 
-    def _integrals(self, rows: Array, time: float, pieces: np.ndarray) -> tuple[Array, Array, np.ndarray]:
+    def _bound_integrals(self, rows: Array, time: float, pieces: np.ndarray) -> tuple[Array, Array, np.ndarray]:
         """Return bounds of ``int |c'Phi(t, s) B_j(s)| ds`` for ``rows (n, d)``, over the intervals between marks among
         ``pieces`` that begin before ``time``.
 
@@ -180,12 +180,12 @@ class BoundedInputAt(BoundedInputHere):
         if (indices < last).any():
             transition = self.law.over(self.marks[last], time)[0].matrix
             last_rows = Enclosed.of(exactly(rows) * transition)
-            past, transitions = indices[indices < last], self._onward_to(last)
-            propagated = _carried(last_rows, Enclosed(transitions.mid[past], transitions.rad[past]))
-            kernels += [self._kernel(self.marks[k], self.marks[k + 1]) for k in past]
+            past, transitions = indices[indices < last], self._compute_transitions(last)
+            propagated = _propagate_rows(last_rows, Enclosed(transitions.mid[past], transitions.rad[past]))
+            kernels += [self._compute_kernel(self.marks[k], self.marks[k + 1]) for k in past]
             lines.append(propagated)
         if indices[-1] == last:
-            kernels.append(self._kernel(self.marks[last], time))
+            kernels.append(self._compute_kernel(self.marks[last], time))
             lines.append(Enclosed(rows[None], np.zeros((1, *rows.shape))))
         order = max(kernel.mid.shape[0] for kernel in kernels)
         K = Enclosed(*(
@@ -199,14 +199,14 @@ class BoundedInputAt(BoundedInputHere):
         errors = (errors + np.einsum("qnd,qdm->qnm", rad, sizes + K.rad.sum(axis=1))) * OUTWARD
         errors = errors + rounding(4 * order + 32) * np.abs(plain).sum(axis=2)  # rounding of the sums that follow
         if self.input.side is not None:
-            return *self._together(self.input.side, plain, errors), indices
+            return *self._bound_support_integrals(self.input.side, plain, errors), indices
         flat = signed(plain.reshape(-1, *plain.shape[2:]), errors.reshape(-1, errors.shape[2]))
         value, excess, deficit = (values.reshape(errors.shape) / 2.0 for values in swept(*flat, np.ones(errors.size)))
         rounding_error = rounding(4) * (np.abs(value) + excess)
         return value - deficit - rounding_error, value + excess + rounding_error, indices
 
     @staticmethod
-    def _together(side: Side | CurvedSide | Together, plain: Array, off: Array) -> tuple[Array, Array]:
+    def _bound_support_integrals(side: Side | CurvedSide | Together, plain: Array, off: Array) -> tuple[Array, Array]:
         """Return lower and upper bounds ``(q, n, 1)`` of the integrals of the support function of a set along
         polynomials ``(q, n, p + 1, m)`` with error bounds ``off (q, n, m)``."""
         q, n, order, m = plain.shape
@@ -218,19 +218,19 @@ class BoundedInputAt(BoundedInputHere):
         return value - deficit - rounding_error, np.maximum(value + excess, 0.0) + rounding_error
 
     @remembered(lambda: TIMES_KEPT)
-    def _kernel(self, start: float, stop: float) -> Enclosed:
+    def _compute_kernel(self, start: float, stop: float) -> Enclosed:
         """Return the kernel of an interval in powers of ``u`` from -1 to 1, ``(p + 1, d, m)``."""
         kernel = pushes(self.law, start, stop, self.input.columns)
         return Enclosed(kernel.mid[:, 0], kernel.rad[:, 0])
 
     @remembered(lambda: KEPT)
-    def _onward_to(self, node: int) -> Enclosed:
+    def _compute_transitions(self, node: int) -> Enclosed:
         """Return the transitions to a mark from the end of every interval before it, ``(node, d, d)``."""
-        transitions = enclosed(products(self._steps[:node])[1:])
+        transitions = enclosed(products(self._interval_transitions[:node])[1:])
         return Enclosed(transitions.mid[:, 0], transitions.rad[:, 0])
 
     @cached_property
-    def _steps(self) -> list[Series]:
+    def _interval_transitions(self) -> list[Series]:
         return [self.law.over(*ends)[0] for ends in pairwise(self.marks)]
 
 
@@ -276,13 +276,13 @@ class BoundedInputOver(BoundedInput):
         inside = np.minimum(high - centre, centre - low) * (1.0 - rounding(2))
         skew = float(((radius - inside) / np.where(radius > 0.0, radius, 1.0)).sum())
         fit_error += 2.0 * skew * float(np.ptp(middle, axis=0).max()) + rounding(4 * len(signs) + 8) * float(sums.max())
-        wide, remainder, chord_error = self._curved(c, times, ParameterBox(flow.centre, flow.radius))
+        wide, remainder, chord_error = self._bound_curvature(c, times, ParameterBox(flow.centre, flow.radius))
         least = np.array([self.at(centre.tolist()).added(c, time)[0] for time in times])
         over = max(0.0, float((middle.mean(axis=0) - least).max()))
         total = float(wide.sum()) * OUTWARD
         return Added(ends, (gap + fit_error + total + 2.0 * remainder + chord_error) * OUTWARD, over * OUTWARD, wide)
 
-    def _curved(self, c: Array, times: Sequence[float], box: ParameterBox) -> tuple[Array, float, float]:
+    def _bound_curvature(self, c: Array, times: Sequence[float], box: ParameterBox) -> tuple[Array, float, float]:
         """Return bounds of what the curvature adds on a box of parameters.
 
         Returns
@@ -301,21 +301,21 @@ class BoundedInputOver(BoundedInput):
         mask = self.input.reaching(np.ones((1, c.size)))[0]
         wide, remainder, chord_error = np.zeros(len(shares)), 0.0, 0.0
         for time in times:
-            size, remainders = self._summed(flow, (c * mask)[None], time)
+            size, remainders = self._bound_effects(flow, (c * mask)[None], time)
             wide = np.maximum(wide, (size[0] @ (exponents * (exponents - 1.0))) * shares**2 / 2.0)
             remainder = max(remainder, float(remainders[0]))
         if times[-1] > times[0]:
-            size, remainders = self._summed(flow, np.diag(mask), times[0])
+            size, remainders = self._bound_effects(flow, np.diag(mask), times[0])
             entering = self.input.largest(self.input.piece_at(times[0])) * OUTWARD
             start_bounds = (size.sum(axis=1) + remainders) * OUTWARD
             ends, first = (times[0], times[-1]), self.input.first
             chord_error = float(above_chord(flow, (c * mask)[None], *ends, start_bounds, entering, first)[0])
         return wide * OUTWARD, remainder * OUTWARD, chord_error * OUTWARD
 
-    def _summed(self, flow: VerifiedFlow, rows: Array, time: float) -> tuple[Array, Array]:
+    def _bound_effects(self, flow: VerifiedFlow, rows: Array, time: float) -> tuple[Array, Array]:
         """Return upper bounds of what the input adds to ``rows (n, d)`` by a time, in absolute values: for every
         coefficient in the parameters, ``(n, M)``, and for the remainder, ``(n,)``."""
-        transitions, kernels, owner = self._reaching(flow, time)
+        transitions, kernels, owner = self._collect_transitions(flow, time)
         size, remainders = np.zeros((len(rows), flow.monomials.size)), np.zeros(len(rows))
         transition_errors = transitions.rad + rounding(rows.shape[1]) * np.abs(transitions.mid)
         for q, piece in enumerate(owner):
@@ -330,12 +330,12 @@ class BoundedInputOver(BoundedInput):
         return size * OUTWARD, remainders * OUTWARD
 
     @remembered(lambda: TIMES_KEPT)
-    def _kernel(self, flow: VerifiedFlow, start: float, stop: float) -> Enclosed:
+    def _compute_kernel(self, flow: VerifiedFlow, start: float, stop: float) -> Enclosed:
         """Return the kernel of an interval between marks, ``(p + 1, M, d, m)``."""
         return pushes(flow, start, stop, self.input.columns)
 
     @remembered(lambda: KEPT)
-    def _reaching(self, flow: VerifiedFlow, time: float) -> tuple[Enclosed, Enclosed, np.ndarray]:
+    def _collect_transitions(self, flow: VerifiedFlow, time: float) -> tuple[Enclosed, Enclosed, np.ndarray]:
         """Return the transitions to a time from the end of every interval between marks before it, ``(q, M, d, d)``;
         the kernels of these intervals, ``(q, p + 1, M, d, m)``; and the indices ``(q,)`` of the pieces of the command
         that hold them."""
@@ -346,7 +346,7 @@ class BoundedInputOver(BoundedInput):
         if not steps:
             none = np.zeros((2, 0, flow.monomials.size, d, d)), np.zeros((2, 0, 1, flow.monomials.size, d, m))
             return Enclosed(*none[0]), Enclosed(*none[1]), np.zeros(0, dtype=int)
-        kernels = [self._kernel(flow, *pair) for pair in pairwise(marks)]
+        kernels = [self._compute_kernel(flow, *pair) for pair in pairwise(marks)]
         order = max(len(kernel.mid) for kernel in kernels)
         pad = [
             [np.pad(array, ((0, order - len(array)), *[(0, 0)] * 3)) for array in (kernel.mid, kernel.rad)]
@@ -356,7 +356,7 @@ class BoundedInputOver(BoundedInput):
         return enclosed(products(steps)[1:]), Enclosed(*(np.array(arrays) for arrays in zip(*pad, strict=True))), owner
 
 
-def _carried(rows: Enclosed, steps: Enclosed) -> Enclosed:
+def _propagate_rows(rows: Enclosed, steps: Enclosed) -> Enclosed:
     """Return ``rows (n, d)`` times every one of ``steps (q, d, d)``, ``(q, n, d)``."""
     row_size, step_size = np.abs(rows.mid), np.abs(steps.mid)
     rad = np.einsum("nd,qde->qne", row_size, steps.rad + rounding(row_size.shape[1]) * step_size)

@@ -82,9 +82,9 @@ class Pushed:
 
         if not all(x.is_exact() for mode in modes for matrix in mode for x in matrix.entries()):
             raise Unchecked("the numbers of the system are not exact")
-        systems = [_rational(A.transpose().tolist()) for A, _ in modes]
+        systems = [_convert_to_rational(A.transpose().tolist()) for A, _ in modes]
         along = fmpq_mat([[fmpq(v.numerator, v.denominator) for v in vector] for vector in vectors]).transpose()
-        columns = [_rational(E.tolist()) * along for _, E in modes]
+        columns = [_convert_to_rational(E.tolist()) * along for _, E in modes]
         pattern: Pattern = np.any([[[x != 0 for x in row] for row in E.tolist()] for E in columns], axis=0)
         linked = np.any([middles(A) != 0.0 for A, _ in modes], axis=0).astype(int)
         spanned = spanning([row for matrix in columns for row in matrix.transpose().tolist()])
@@ -104,7 +104,7 @@ class Pushed:
         return Pushed(pattern, int(pattern.any(axis=1).sum()), int(pattern.any(axis=0).sum()))
 
 
-def _rational(rows: Sequence[Sequence[arb]]) -> fmpq_mat:
+def _convert_to_rational(rows: Sequence[Sequence[arb]]) -> fmpq_mat:
     from flint import fmpq, fmpq_mat
 
     return fmpq_mat([[fmpq(*float(x).as_integer_ratio()) for x in row] for row in rows])
@@ -148,8 +148,8 @@ class SeenDeviations:
         links = [(row + i, column + j, 1) for i, j in np.argwhere(self.pattern).tolist()]
         links += [(source, seeing + g, capacity) for g, (_, capacity) in enumerate(self.rows)]
         links += [(shown + g, sink, capacity) for g, (_, capacity) in enumerate(self.columns)]
-        links += [(seeing + g, row + i, 1) for i, g in enumerate(_groups(self.rows, r))]
-        links += [(column + j, shown + g, 1) for j, g in enumerate(_groups(self.columns, c))]
+        links += [(seeing + g, row + i, 1) for i, g in enumerate(_find_groups(self.rows, r))]
+        links += [(column + j, shown + g, 1) for j, g in enumerate(_find_groups(self.columns, c))]
         starts, ends, room = (np.array(values, dtype=np.int32) for values in zip(*links, strict=True))
         network = csr_array((room, (starts, ends)), shape=(sink + 1, sink + 1))
         residual = csr_array(network - maximum_flow(network, source, sink).flow)
@@ -175,11 +175,11 @@ class SeenDeviations:
 
         r, c, rank = self.matrix.nrows(), self.matrix.ncols(), self.most
         D, rows, columns = (
-            _evened(self.matrix) if rank == c or self.reach is None else _reaching(self.matrix, self.reach)
+            _equilibrate(self.matrix) if rank == c or self.reach is None else _scale_by_reach(self.matrix, self.reach)
         )
         entries = D.tolist()
         for bits in (ctx.prec - OBSERVED, FEWEST):
-            usable = [i for i, row in enumerate(entries) if _is_told(row, bits)]
+            usable = [i for i, row in enumerate(entries) if _has_known_bits(row, bits)]
             if len(usable) < rank:
                 continue
             chosen = usable
@@ -195,16 +195,16 @@ class SeenDeviations:
                 )
             except ZeroDivisionError:
                 continue
-            return scaled(_spread(inverse, chosen, r), columns, rows)
+            return scaled(_insert_zero_columns(inverse, chosen, r), columns, rows)
         raise Unchecked("the checker cannot tell in which directions the disturbance pushes the state")
 
 
-def _groups(groups: Sequence[tuple[int, int]], count: int) -> list[int]:
+def _find_groups(groups: Sequence[tuple[int, int]], count: int) -> list[int]:
     """Return the index of the group of each of ``count`` members."""
     return [int(g) for g in np.searchsorted([end for end, _ in groups], np.arange(count), side="right")]
 
 
-def _spread(matrix: arb_mat, places: list[int], count: int) -> arb_mat:
+def _insert_zero_columns(matrix: arb_mat, places: list[int], count: int) -> arb_mat:
     """Return a matrix with its columns at these ``places`` of ``count``, and columns of 0 at the others."""
     zero, rows = ball(0), []
     for row in matrix.tolist():
@@ -213,13 +213,13 @@ def _spread(matrix: arb_mat, places: list[int], count: int) -> arb_mat:
     return stacked(rows)
 
 
-def _is_told(row: Sequence[arb], bits: int) -> bool:
+def _has_known_bits(row: Sequence[arb], bits: int) -> bool:
     """Return whether so many bits of a row are known. With rows of one size, a row of which few bits are known makes a
     matrix that balls cannot invert, or an inverse of which few bits are known."""
     return max(float(abs(x.mid())) for x in row) > 2.0**bits * max(float(x.rad()) for x in row)
 
 
-def _reaching(D: arb_mat, reach: Array) -> tuple[arb_mat, Array, Array]:
+def _scale_by_reach(D: arb_mat, reach: Array) -> tuple[arb_mat, Array, Array]:
     """Return a scaled matrix, and the powers of two that multiply its rows and its columns. Columns are multiplied by
     about their reach, so that short solutions are those that use little of it. Rows are multiplied so that their
     largest entry is about 1."""
@@ -229,7 +229,7 @@ def _reaching(D: arb_mat, reach: Array) -> tuple[arb_mat, Array, Array]:
     return scaled(D, rows, columns), rows, columns
 
 
-def _evened(D: arb_mat) -> tuple[arb_mat, Array, Array]:
+def _equilibrate(D: arb_mat) -> tuple[arb_mat, Array, Array]:
     """Return a scaled matrix, and the powers of two that multiply its rows and its columns, so that the largest entry
     of each is about 1 (Ruiz 2001). The scaled matrix does not depend on units."""
     sizes = np.abs(middles(D))

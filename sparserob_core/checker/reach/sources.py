@@ -51,16 +51,16 @@ class Sources:
         first = system.controls + system.drifts
         if not bound.is_box:
             side = Together(Side.of(bound))
-            return self._missing(np.ones(1), ends, [stacked([balls([1.0])])], first, side=side)
+            return self._build_bounded_input(np.ones(1), ends, [stacked([balls([1.0])])], first, side=side)
         box, about = bound.bounding_box(), middle(bound)
         sides, is_single = np.stack([box.upper - about, about - box.lower]), box.upper == box.lower
         largest = np.where(is_single, 0.0, np.nextafter(sides.max(axis=0), np.inf))
         smallest = np.where(is_single, 0.0, np.maximum(np.nextafter(sides.min(axis=0), -np.inf), 0.0))
         half = smallest + (largest - smallest) / 2.0
         errors = np.nextafter(np.maximum(largest - half, half - smallest), np.inf)
-        return self._missing(half, ends, [stacked([[v] for v in balls([1.0] * half.size)])], first, errors)
+        return self._build_bounded_input(half, ends, [stacked([[v] for v in balls([1.0] * half.size)])], first, errors)
 
-    def _missing(self, *errors: Any, **more: Any) -> BoundedInput:
+    def _build_bounded_input(self, *errors: Any, **more: Any) -> BoundedInput:
         """Return a bounded input of this size at every parameter of the system."""
         entering = SizedInput(*errors, **more)
         if self.flows.box.middle:
@@ -89,7 +89,7 @@ class Sources:
             pieces = [stacked([[v] for v in balls(before(self.problem))]), *pieces][
                 : breakpoints.size - 1 if pieces else 0
             ]
-        return self._missing(shares, breakpoints, pieces, numb=self.problem.commanded)
+        return self._build_bounded_input(shares, breakpoints, pieces, numb=self.problem.commanded)
 
     def delivered_at(self, parameter: Sequence[float]) -> BoundedInputHere | None:
         """Return `execution` at one parameter."""

@@ -68,14 +68,14 @@ class States:
 
     flow: VerifiedFlow
     scene: Scene
-    _tables: dict[int, tuple[Series, Series]] = field(default_factory=dict, repr=False)
-    _floats: dict[int, Enclosed] = field(default_factory=dict, repr=False)
-    _numbers: dict[tuple[object, ...], int] = field(default_factory=dict, repr=False)
-    _places: dict[tuple[int, int], int] = field(default_factory=dict, repr=False)
-    _nodes: dict[int, Series] = field(default_factory=dict, repr=False)
-    _driven: dict[tuple[int, int], Series] = field(default_factory=dict, repr=False)
-    _made: dict[tuple[int, ...], Series] = field(default_factory=dict, repr=False)
-    _inputs: dict[int, Series] = field(default_factory=dict, repr=False)
+    _block_matrices: dict[int, tuple[Series, Series]] = field(default_factory=dict, repr=False)
+    _block_effects: dict[int, Enclosed] = field(default_factory=dict, repr=False)
+    _block_numbers: dict[tuple[object, ...], int] = field(default_factory=dict, repr=False)
+    _interval_blocks: dict[tuple[int, int], int] = field(default_factory=dict, repr=False)
+    _node_states: dict[int, Series] = field(default_factory=dict, repr=False)
+    _control_effects: dict[tuple[int, int], Series] = field(default_factory=dict, repr=False)
+    _shared_effects: dict[tuple[int, ...], Series] = field(default_factory=dict, repr=False)
+    _input_matrices: dict[int, Series] = field(default_factory=dict, repr=False)
 
     @cached_property
     def marks(self) -> list[float]:
@@ -93,7 +93,7 @@ class States:
         return min(bisect_right(self.marks, time) - 1, last)
 
     @cached_property
-    def _steps(self) -> list[Series]:
+    def _step_flows(self) -> list[Series]:
         return [self.flow.step(*ends) for ends in pairwise(self.marks)]
 
     @property
@@ -103,72 +103,76 @@ class States:
 
     def node(self, mark: int) -> Series:
         """Return the undisturbed state at a mark, ``(d, 1)``, from blocks of intervals as in `effect`."""
-        if mark not in self._nodes:
+        if mark not in self._node_states:
             x = Series.constant(self.flow.monomials, stacked([[v] for v in balls(self.scene.initial_state)]))
-            for level, number in _blocks(mark):
-                x = self._tables[self._block(level, number)][0] * x + self._controlled(level, number)
-            self._nodes[mark] = x
-        return self._nodes[mark]
+            for level, number in _list_blocks(mark):
+                x = self._block_matrices[self._find_block(level, number)][0] * x + self._compute_control_effect(
+                    level, number
+                )
+            self._node_states[mark] = x
+        return self._node_states[mark]
 
-    def _controlled(self, level: int, number: int) -> Series:
+    def _compute_control_effect(self, level: int, number: int) -> Series:
         """Return what the control adds to the state over ``2^level`` consecutive intervals, ``(d, 1)``."""
-        if (level, number) not in self._driven:
-            block, last = self._block(level, number), 2 * number + 1
+        if (level, number) not in self._control_effects:
+            block, last = self._find_block(level, number), 2 * number + 1
             if level:
-                effects = [self._controlled(level - 1, number) for number in (last - 1, last)]
+                effects = [self._compute_control_effect(level - 1, number) for number in (last - 1, last)]
                 key: tuple[int, ...] = (block, *map(id, effects))
             else:
                 u = self.scene.control[self.pieces[number]]
                 key = block, id(u)
-            if key not in self._made:  # most pieces of a sparse control are the same
-                self._made[key] = (
-                    self._tables[self._block(level - 1, last)][0] * effects[0] + effects[1]
+            if key not in self._shared_effects:  # most pieces of a sparse control are the same
+                self._shared_effects[key] = (
+                    self._block_matrices[self._find_block(level - 1, last)][0] * effects[0] + effects[1]
                     if level
-                    else self._inputs[block].scaled(u)
+                    else self._input_matrices[block].scaled(u)
                 )
-            self._driven[level, number] = self._made[key]
-        return self._driven[level, number]
+            self._control_effects[level, number] = self._shared_effects[key]
+        return self._control_effects[level, number]
 
     @remembered(lambda: EFFECTS_KEPT)
     def effect(self, mark: int) -> tuple[Enclosed, Enclosed]:
         """Return how the state at a mark depends on the initial state, ``(M, d, d)``, and on the disturbance on every
         interval before the mark, ``(M, d, mark mw)``. Both are made of blocks of 1, 2, 4, ... intervals, each
         propagated by the blocks after it."""
-        d, blocks = self.flow.states, [self._block(*pair) for pair in _blocks(mark)]
+        d, blocks = self.flow.states, [self._find_block(*pair) for pair in _list_blocks(mark)]
         monomials = self.flow.monomials
         after, effects = Series.constant(monomials, identity(d)), [Enclosed(*np.zeros((2, monomials.size, d, 0)))]
         for block in reversed(blocks):
-            effects.insert(1, ring(monomials, single(after), self._floats[block]))
-            after = after * self._tables[block][0]
+            effects.insert(1, ring(monomials, single(after), self._block_effects[block]))
+            after = after * self._block_matrices[block][0]
         mid, rad = (np.concatenate([getattr(effect, name) for effect in effects], axis=2) for name in ("mid", "rad"))
         return single(after), Enclosed(mid, rad)
 
-    def _block(self, level: int, number: int) -> int:
+    def _find_block(self, level: int, number: int) -> int:
         """Return the number of the block of ``2^level`` consecutive intervals. Blocks with the same flow share one
         number. The transition of the block and the effects of the disturbances on its intervals are kept under this
         number."""
-        if (level, number) in self._places:
-            return self._places[level, number]
+        if (level, number) in self._interval_blocks:
+            return self._interval_blocks[level, number]
         if not level:
             name: tuple[object, ...] = self.flow.kind(self.marks[number], self.marks[number + 1])
         else:
-            name = (level, *(self._block(level - 1, 2 * number + i) for i in range(2)))
-        if name not in self._numbers:
-            block = self._numbers[name] = len(self._numbers)
+            name = (level, *(self._find_block(level - 1, 2 * number + i) for i in range(2)))
+        if name not in self._block_numbers:
+            block = self._block_numbers[name] = len(self._block_numbers)
             if not level:
-                d, step = self.flow.states, self._steps[number]
-                Delta = step.columns(d + self.flow.driven, None) if self._is_pushed else step.columns(0, 0)
-                self._tables[block] = step.columns(0, d), Delta
-                self._inputs[block] = step.columns(d, d + self.flow.driven)
+                d, step = self.flow.states, self._step_flows[number]
+                Delta = step.columns(d + self.flow.driven, None) if self._has_disturbance else step.columns(0, 0)
+                self._block_matrices[block] = step.columns(0, d), Delta
+                self._input_matrices[block] = step.columns(d, d + self.flow.driven)
             else:
-                (Phi, early), (onward, late) = (self._tables[self._block(level - 1, 2 * number + i)] for i in range(2))
-                self._tables[block] = onward * Phi, (onward * early).beside(late)
-            self._floats[block] = single(self._tables[block][1])
-        self._places[level, number] = self._numbers[name]
-        return self._places[level, number]
+                (Phi, early), (onward, late) = (
+                    self._block_matrices[self._find_block(level - 1, 2 * number + i)] for i in range(2)
+                )
+                self._block_matrices[block] = onward * Phi, (onward * early).beside(late)
+            self._block_effects[block] = single(self._block_matrices[block][1])
+        self._interval_blocks[level, number] = self._block_numbers[name]
+        return self._interval_blocks[level, number]
 
     @property
-    def _is_pushed(self) -> bool:
+    def _has_disturbance(self) -> bool:
         return self.scene.disturbance is not None
 
     def seen(
@@ -200,11 +204,11 @@ class States:
         segment, share = flow.segment(begin, end)
         first, width = ((ball(b) - ball(a)) / (ball(end) - ball(begin)) * share
                         for a, b in ((begin, start), (start, stop)))  # fmt: skip
-        terms, remainder = self._path(place).within(first, width, order)
+        terms, remainder = self._compute_path(place).within(first, width, order)
         rows = exactly(basis)
         state = enclosed([term.along(rows) for term in terms])
         state.rad[0, 0] += np.abs(basis) @ remainder * OUTWARD
-        lines = self._lines(segment, basis).shifted(float(first), float(width), order)
+        lines = self._project_flow(segment, basis).shifted(float(first), float(width), order)
         propagated_rows, effects = Enclosed(lines.mid[..., :d], lines.rad[..., :d]), list[tuple[ConvexSet, Enclosed]]()
         if scene.disturbance is not None and stop > 0.0:
             past = ring(flow.monomials, propagated_rows, self.effect(place)[1])
@@ -230,7 +234,7 @@ class States:
         return Enclosed(state.mid[..., 0], state.rad[..., 0]), effects
 
     @remembered(lambda: PATHS_KEPT)
-    def _path(self, place: int) -> Powers:
+    def _compute_path(self, place: int) -> Powers:
         """Return the undisturbed state from one mark to the next, ``(d, 1)``, as a polynomial in the share of the
         interval."""
         segment, _ = self.flow.segment(self.marks[place], self.marks[place + 1])
@@ -238,7 +242,7 @@ class States:
         return segment.applied(self.node(place).above(control))
 
     @remembered(lambda: PATHS_KEPT, lambda self, segment, basis: (segment, basis.tobytes()))
-    def _lines(self, segment: VerifiedSegment, basis: Array) -> Lines:
+    def _project_flow(self, segment: VerifiedSegment, basis: Array) -> Lines:
         """Return the rows ``basis (b, d)`` of the flow on a segment."""
         return Lines.of(segment, basis)
 
@@ -266,10 +270,10 @@ class StatesOverBoxes:
 
     def over(self, box: ParameterBox) -> States:
         """Return the states over a box, or over a larger one that holds it."""
-        return self._of(self.flows.holding(box))
+        return self._build_states(self.flows.holding(box))
 
     @remembered(lambda: BOXES_KEPT)
-    def _of(self, flow: VerifiedFlow) -> States:
+    def _build_states(self, flow: VerifiedFlow) -> States:
         return States(flow, self.scene)
 
 
@@ -302,7 +306,7 @@ class Lines:
         return Enclosed(mid, rad * OUTWARD)
 
 
-def _blocks(mark: int) -> list[tuple[int, int]]:
+def _list_blocks(mark: int) -> list[tuple[int, int]]:
     """Return the level and the number of the blocks of ``2^level`` intervals that fill those before a mark, longest
     first."""
     blocks, begin = [], 0
@@ -331,9 +335,11 @@ def ring(monomials: Monomials, left: Enclosed, right: Enclosed) -> Enclosed:
     truncated at the degree. The radii of the constants hold the truncation error."""
     left_size, right_size = np.abs(left.mid), np.abs(right.mid)
     right_error = right.rad + rounding(left.mid.shape[-1] * monomials.size) * right_size
-    mid = _multiplied(monomials, left.mid, right.mid)
+    mid = _multiply_coefficients(monomials, left.mid, right.mid)
     with np.errstate(invalid="ignore"):
-        rad = _multiplied(monomials, left_size, right_error) + _multiplied(monomials, left.rad, right_size + right.rad)
+        rad = _multiply_coefficients(monomials, left_size, right_error) + _multiply_coefficients(
+            monomials, left.rad, right_size + right.rad
+        )
     rad = np.where(np.isnan(rad), np.inf, rad)  # 0 times infinity: no bound
     if monomials.degree:
         degrees = np.array(monomials.degrees)
@@ -346,7 +352,7 @@ def ring(monomials: Monomials, left: Enclosed, right: Enclosed) -> Enclosed:
     return Enclosed(mid, rad * OUTWARD)
 
 
-def _multiplied(monomials: Monomials, left: Array, right: Array) -> Array:
+def _multiply_coefficients(monomials: Monomials, left: Array, right: Array) -> Array:
     """Return the coefficients of the products up to the degree by one matrix product: ``right (M, d, n)`` becomes a
     matrix ``(M d, M n)``, whose blocks belong to a monomial of the left factor and a monomial of the product."""
     (M, d, n), indices = right.shape, monomials.quotients

@@ -82,18 +82,18 @@ class ProjectedStates:
 
     states: States
     basis: Array
-    _seen: dict[tuple[int, float, float], tuple[Enclosed, list[tuple[ConvexSet, Enclosed]]]] = field(
+    _projections: dict[tuple[int, float, float], tuple[Enclosed, list[tuple[ConvexSet, Enclosed]]]] = field(
         default_factory=dict, repr=False
     )
 
     def on(self, place: int, start: float, stop: float) -> tuple[Enclosed, list[tuple[ConvexSet, Enclosed]]]:
         """Return `States.seen` for the basis on ``[start, stop]``, a part of an interval between marks."""
         key = place, start, stop
-        if key not in self._seen:
-            if len(self._seen) >= CELLS_KEPT or not self.states.flow.monomials.degree:
-                self._seen.clear()
-            self._seen[key] = self.states.seen(self.basis, place, start, stop, ORDER)
-        return self._seen[key]
+        if key not in self._projections:
+            if len(self._projections) >= CELLS_KEPT or not self.states.flow.monomials.degree:
+                self._projections.clear()
+            self._projections[key] = self.states.seen(self.basis, place, start, stop, ORDER)
+        return self._projections[key]
 
 
 @final
@@ -112,7 +112,7 @@ class VerifiedTube:
         return Around(flow.monomials, self.box.middle, self.box.halves, flow.law.weights)
 
     @cached_property
-    def _recentred(self) -> Enclosed | None:
+    def _recentring_matrix(self) -> Enclosed | None:
         """The matrix ``(M, M)`` from coefficients on the larger box to those on this one; ``None`` where both boxes are
         the same."""
         outer_box = self.rows.states.flow.box
@@ -156,12 +156,12 @@ class VerifiedTube:
         states = self.rows.states
         interval = states.place(piece, start)
         state, effects = self.rows.on(interval, start, stop)
-        state = self._moved(state, 1)
+        state = self._recentre(state, 1)
         mid = np.einsum("jmb,ib->ijm", state.mid, z)
         errors = state.rad + rounding(z.shape[1]) * np.abs(state.mid)
         rad, kinks, turning = np.abs(z) @ errors.sum(axis=(0, 1)), np.zeros(len(z)), np.zeros(len(z))
         for convex, effect in effects:
-            arguments = self._moved(effect, 2)
+            arguments = self._recentre(effect, 2)
             supports, support_errors, switching, of_box = bound_supports(
                 known(convex), self.flow.monomials, arguments.mid, arguments.rad, z, sharp
             )
@@ -173,9 +173,9 @@ class VerifiedTube:
             for i in range(len(z))
         ]
 
-    def _moved(self, rows: Enclosed, axis: int) -> Enclosed:
+    def _recentre(self, rows: Enclosed, axis: int) -> Enclosed:
         """Return coefficients on this box from those on the larger one; they stand along an ``axis``."""
-        moves = self._recentred
+        moves = self._recentring_matrix
         if moves is None:
             return rows
         mid, rad, size = (np.moveaxis(values, axis, -1) for values in (rows.mid, rows.rad, np.abs(rows.mid)))
@@ -207,7 +207,7 @@ def bound_supports(
         of parameters.
     """
     pieces = every.shape[0]
-    mid, w, argument_errors, error, kinks, share = _linear(shape, every, errors, z, pieces)
+    mid, w, argument_errors, error, kinks, share = _bound_linearly(shape, every, errors, z, pieces)
     k, mw = mid.shape[0], mid.shape[-1]
     if not sharp or shape.round is None:
         coefficients = np.einsum("ilw,iljkw->ijk", w, mid)
@@ -228,7 +228,7 @@ def bound_supports(
     return coefficients, error.sum(axis=1) * OUTWARD, kinks.sum(axis=1) * OUTWARD, (share * kinks).sum(axis=1)
 
 
-def _linear(
+def _bound_linearly(
     shape: Shape, every: Array, errors: Array, z: Array, count: int
 ) -> tuple[Array, Array, Array, Array, Array, Array]:
     """Return linear bounds of the support function of each piece, by a point of the set that is best or nearly so.
@@ -244,7 +244,7 @@ def _linear(
     mid = np.einsum("ljkwb,ib->iljkw", every, z)
     rad = np.einsum("ljkwb,ib->iljkw", errors + rounding(z.shape[1]) * np.abs(every), np.abs(z)) * OUTWARD
     k, pieces, mw = mid.shape[0], mid.shape[1], mid.shape[-1]
-    value, spread, of_box = _ranges(mid, rad)
+    value, spread, of_box = _compute_ranges(mid, rad)
     w, excess = shape.bound(value.reshape(-1, mw), spread.reshape(-1, mw))
     w, kinks = w.reshape(k, pieces, mw), excess.reshape(k, pieces) * OUTWARD
     argument_errors = rad.sum(axis=(2, 3)) + rounding(count * mw) * np.abs(mid).sum(axis=(2, 3))
@@ -254,7 +254,7 @@ def _linear(
     return mid, w, argument_errors, np.einsum("ilw,ilw->il", np.abs(w), argument_errors) * OUTWARD + kinks, kinks, share
 
 
-def _ranges(mid: Array, rad: Array) -> tuple[Array, Array, Array]:
+def _compute_ranges(mid: Array, rad: Array) -> tuple[Array, Array, Array]:
     """Return the ranges of arguments ``(k, pieces, J + 1, M, mw)`` on the cell: their middles, their half-widths, and
     the part of the half-widths due to the parameters, ``(k, pieces, mw)`` each."""
     k, pieces, orders, _, mw = mid.shape
@@ -280,10 +280,10 @@ class LoopTube:
         """Return chords with error bounds for every direction ``c = z_i'basis``, with the parameters of
         `VerifiedTube.cells`. The part ``expansion`` of the error is due to the length of the cell. The true value may
         be far below a chord between its ends."""
-        begin, end = self._height(piece, start, z), self._height(piece, stop, z)
+        begin, end = self._enclose_heights(piece, start, z), self._enclose_heights(piece, stop, z)
         chord_errors = np.zeros(z.shape[0])
         if start < stop:
-            chord_errors = self.loop.bent(piece, start, stop, _combined(z, self.basis))
+            chord_errors = self.loop.bent(piece, start, stop, _combine_rows(z, self.basis))
         errors = np.maximum(begin.rad, end.rad) + rounding(2) * (np.abs(begin.mid) + np.abs(end.mid)) + chord_errors
         chords = np.stack([begin.mid, end.mid - begin.mid] if start < stop else [begin.mid])
         return [
@@ -292,12 +292,12 @@ class LoopTube:
         ]
 
     @remembered(key=lambda self, piece, time, z: (piece, time, z.tobytes()))
-    def _height(self, piece: int, time: float, z: Array) -> Enclosed:
+    def _enclose_heights(self, piece: int, time: float, z: Array) -> Enclosed:
         """Return the largest ``c'x`` at a time in a piece of the grid, ``(k,)``."""
         answers = None
         if self.gains.shape[1]:
-            answers = exactly(_combined(z, self.gains)) * self.loop.answers(self.loop.on(piece))
-        return _of_column(self.loop.highest(piece, time, _combined(z, self.basis), answers))
+            answers = exactly(_combine_rows(z, self.gains)) * self.loop.answers(self.loop.on(piece))
+        return _convert_balls(self.loop.highest(piece, time, _combine_rows(z, self.basis), answers))
 
 
 @final
@@ -313,20 +313,20 @@ class Still:
     def cells(self, piece: int, start: float, stop: float, z: Array, sharp: bool = False) -> list[Polynomial]:
         """Return constants with error bounds at the place number ``piece``, with the parameters of
         `VerifiedTube.cells`."""
-        heights = _of_column(self.heights(piece, exactly(_combined(z, self.basis))))
+        heights = _convert_balls(self.heights(piece, exactly(_combine_rows(z, self.basis))))
         return [
             Polynomial(np.array([[height]]), float(error), 0.0, 0.0)
             for height, error in zip(heights.mid, heights.rad, strict=True)
         ]
 
 
-def _combined(z: Array, basis: Array) -> Array | arb_mat:
+def _combine_rows(z: Array, basis: Array) -> Array | arb_mat:
     """Return ``z'basis (k, d)``: as floats where this needs no rounding, as balls elsewhere."""
     is_exact = (np.count_nonzero(z, axis=1) <= 1).all() and np.isin(z, (-1.0, 0.0, 1.0)).all()
     return np.asarray(z @ basis) if is_exact else exactly(z) * exactly(basis)
 
 
-def _of_column(heights: Sequence[arb]) -> Enclosed:
+def _convert_balls(heights: Sequence[arb]) -> Enclosed:
     """Return balls as floats with radii, ``(k,)`` each."""
     enclosure = Enclosed.of(stacked([[height] for height in heights]))
     return Enclosed(enclosure.mid[:, 0], enclosure.rad[:, 0])

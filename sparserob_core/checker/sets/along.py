@@ -52,7 +52,7 @@ class CurvedSide:
     def far(self) -> Array:
         """The upper bounds ``(mw,)`` of the distance from the point to the set's ends along every coordinate."""
         axes = np.vstack([np.eye(self.dimension), -np.eye(self.dimension)])
-        heights, errors = _heights(self.shape, self.about, axes)
+        heights, errors = _evaluate_support(self.shape, self.about, axes)
         return np.asarray((heights + errors).reshape(2, -1).max(axis=0) * OUTWARD)
 
     def swept(self, plain: Array, off: Array, sizes: Array, ends: Array) -> tuple[Array, Array, Array, Array]:
@@ -78,26 +78,26 @@ class CurvedSide:
         outputs = [np.zeros(0)] * 3
         for first in range(0, len(plain), AT_ONCE):
             batch = slice(first, first + AT_ONCE)
-            batch_outputs = self._along(plain[batch], ends[batch])
+            batch_outputs = self._integrate(plain[batch], ends[batch])
             outputs = [np.concatenate(pair) for pair in zip(outputs, batch_outputs, strict=True)]
         value, errors, tops = outputs
         errors = (errors + (ends + 1.0) * (off @ self.far)) * OUTWARD
         return value, errors, errors, tops
 
-    def _along(self, plain: Array, ends: Array) -> tuple[Array, Array, Array]:
+    def _integrate(self, plain: Array, ends: Array) -> tuple[Array, Array, Array]:
         count = plain.shape[1]
         owner, radii = np.arange(len(plain)), self.far
         value, errors, length = np.zeros(len(plain)), np.zeros(len(plain)), (ends + 1.0) / 2.0
         tops = np.abs(plain).sum(axis=1) @ radii
         # on the cell from -1 to the end, with s from -1 to 1: u = -1 + length (1 + s) = (length - 1) + length s
-        a, step_error = _stretched(plain, length), rounding(2 * count) * tops
+        a, step_error = _rescale_polynomials(plain, length), rounding(2 * count) * tops
         coefficient_error = step_error.copy()
         nodes, weights = rule()
         orders, powers = np.arange(count), nodes[:, None] ** np.arange(count)
         for level in range(ROUNDS + 1):
             spread = np.einsum("n,mnw->mw", DISC ** orders[1:], np.abs(a[:, 1:])) * OUTWARD
-            bounds = _most(self.shape, self.about, a[:, 0], spread)
-            heights, height_errors = _heights(self.shape, self.about, (powers @ a).reshape(-1, a.shape[2]))
+            bounds = _bound_support(self.shape, self.about, a[:, 0], spread)
+            heights, height_errors = _evaluate_support(self.shape, self.about, (powers @ a).reshape(-1, a.shape[2]))
             total = heights.reshape(len(a), -1) @ weights
             rounding_errors = (
                 height_errors.reshape(len(a), -1) @ weights
@@ -105,7 +105,7 @@ class CurvedSide:
             )
             rule_error = np.where(np.isfinite(bounds), LEFT * bounds, np.inf)
             change = 2.0 * np.abs(a[:, 1:]).sum(axis=1) @ radii
-            middle_heights, middle_errors = _heights(self.shape, self.about, a[:, 0])
+            middle_heights, middle_errors = _evaluate_support(self.shape, self.about, a[:, 0])
             if not np.isfinite(rounding_errors).all():
                 raise Unchecked("a support function grows beyond what numbers can hold")
             use_middle = change < rule_error
@@ -124,7 +124,7 @@ class CurvedSide:
                 break
             a, owner = a[~is_done], np.tile(owner[~is_done], 2)
             coefficient_error = coefficient_error + step_error
-            a = np.concatenate([np.einsum("kn,mnw->mkw", half, a) for half in _halves(count)])
+            a = np.concatenate([np.einsum("kn,mnw->mkw", half, a) for half in _compute_halving_matrices(count)])
         return value, errors + rounding(2 * ROUNDS) * np.abs(value), tops
 
 
@@ -141,7 +141,7 @@ def rule() -> tuple[Array, Array]:
 
 
 @cache
-def _halves(count: int) -> tuple[Array, Array]:
+def _compute_halving_matrices(count: int) -> tuple[Array, Array]:
     """Return the matrices from coefficients of powers of ``x`` to those of ``s``, for ``x = -1/2 + s/2`` and ``x = 1/2
     + s/2``."""
     matrices = [
@@ -153,7 +153,7 @@ def _halves(count: int) -> tuple[Array, Array]:
     return matrices[0], matrices[1]
 
 
-def _stretched(plain: Array, length: Array) -> Array:
+def _rescale_polynomials(plain: Array, length: Array) -> Array:
     """Return polynomials ``(M, p + 1, mw)`` at ``(length - 1) + length s``, by Horner's rule."""
     polynomials = np.zeros_like(plain)
     shift, stretch = (length - 1.0)[:, None, None], length[:, None, None]
@@ -165,7 +165,7 @@ def _stretched(plain: Array, length: Array) -> Array:
     return polynomials
 
 
-def _parts(shape: Shape, about: Array, *arrays: Array) -> list[tuple[Shape, list[Array]]]:
+def _split_product(shape: Shape, about: Array, *arrays: Array) -> list[tuple[Shape, list[Array]]]:
     """Return the factors of a product of sets, each with its columns of the arrays; another set is its own only
     factor."""
     if not isinstance(shape, Joint):
@@ -174,24 +174,24 @@ def _parts(shape: Shape, about: Array, *arrays: Array) -> list[tuple[Shape, list
     return [(factor, [about[columns], *(array[:, columns] for array in arrays)]) for factor, columns in pairs]
 
 
-def _heights(shape: Shape, about: Array, values: Array) -> tuple[Array, Array]:
+def _evaluate_support(shape: Shape, about: Array, values: Array) -> tuple[Array, Array]:
     """Return the support function of the set minus the point at exact directions ``(k, mw)``, and error bounds,
     ``(k,)`` each."""
     total, total_error = np.zeros(len(values)), np.zeros(len(values))
-    for factor, (point, c) in _parts(shape, about, values):
-        height, error = _height(factor, point, c)
+    for factor, (point, c) in _split_product(shape, about, values):
+        height, error = _evaluate_factor(factor, point, c)
         total, total_error = total + height, total_error + error + HALF_ULP * np.abs(total + height)
     return total, total_error * OUTWARD
 
 
-def _height(part: Shape, about: Array, c: Array) -> tuple[Array, Array]:
+def _evaluate_factor(part: Shape, about: Array, c: Array) -> tuple[Array, Array]:
     size = np.abs(c)
     if isinstance(part, Boxed):
-        middle, half, error = _sides(part, about)
+        middle, half, error = _shift_box(part, about)
         high = c @ middle + size @ half
         return high, (size @ (error + rounding(c.shape[1] + 2) * (np.abs(middle) + half))) * OUTWARD
     if isinstance(part, Cornered):
-        corners, error = _corners(part, about)
+        corners, error = _shift_corners(part, about)
         high = (c @ corners.T).max(axis=1)
         return high, (size @ (error + rounding(c.shape[1] + 2) * np.abs(corners)).T).max(axis=1) * OUTWARD
     if isinstance(part, Segments):
@@ -199,16 +199,18 @@ def _height(part: Shape, about: Array, c: Array) -> tuple[Array, Array]:
         high = np.abs(c @ part.source.generators.T).sum(axis=1) + c @ offset
         error = rounding(sum(ends.shape) + 2) * (size @ ends).sum(axis=1)
         return high, (error + rounding(len(ends) + 4) * (size @ np.abs(offset))) * OUTWARD
-    L, share, q = _root(part)
+    L, share, q = _find_norm_matrix(part)
     y = c @ L
-    norm = _norm(y, q)
-    norm_error = _norm(size @ np.abs(L), q) * rounding(2 * len(L) + 8) + norm * (2.0 * share + rounding(64 * len(L)))
+    norm = _compute_norms(y, q)
+    norm_error = _compute_norms(size @ np.abs(L), q) * rounding(2 * len(L) + 8) + norm * (
+        2.0 * share + rounding(64 * len(L))
+    )
     offset = part.centre - about
     norm_error = norm_error + (size @ np.abs(offset)) * rounding(len(L) + 2)
     return norm + c @ offset, norm_error * OUTWARD
 
 
-def _most(shape: Shape, about: Array, c: Array, spread: Array) -> Array:
+def _bound_support(shape: Shape, about: Array, c: Array, spread: Array) -> Array:
     """Return bounds ``(k,)`` of the absolute value of the support function of the set minus the point at complex
     directions.
 
@@ -216,14 +218,14 @@ def _most(shape: Shape, about: Array, c: Array, spread: Array) -> Array:
     shown to be analytic at all of them.
     """
     total = np.zeros(len(c))
-    for factor, (point, value, deviation) in _parts(shape, about, c, spread):
+    for factor, (point, value, deviation) in _split_product(shape, about, c, spread):
         reach = np.abs(value) + deviation
         if isinstance(factor, Boxed):
-            middle, half, error = _sides(factor, point)
+            middle, half, error = _shift_box(factor, point)
             is_fixed = (np.abs(value) > deviation) | (half + error == 0.0) | (reach == 0.0)
             bound = np.where(is_fixed.all(axis=1), reach @ (np.abs(middle) + half + error), np.inf)
         elif isinstance(factor, Cornered):
-            corners, error = _corners(factor, point)
+            corners, error = _shift_corners(factor, point)
             heights = value @ corners.T
             best = corners[heights.argmax(axis=1)]
             rounding_error = 2.0 * (reach @ (error + rounding(value.shape[1] + 2) * np.abs(corners)).T)
@@ -238,7 +240,7 @@ def _most(shape: Shape, about: Array, c: Array, spread: Array) -> Array:
             heights = (reach @ ends).sum(axis=1) + reach @ (np.abs(factor.source.centre - point) * OUTWARD)
             bound = np.where(is_fixed.all(axis=1), heights, np.inf)
         else:
-            L, share, q = _root(factor)
+            L, share, q = _find_norm_matrix(factor)
             y, b = np.abs(value @ L), deviation @ np.abs(L)
             unit = np.maximum((y + b).max(axis=1, keepdims=True), TINY)
             y, b = y / unit, b / unit
@@ -252,14 +254,14 @@ def _most(shape: Shape, about: Array, c: Array, spread: Array) -> Array:
             norm_bound = np.where(is_analytic, (power_sum + change) ** (1.0 / q), np.inf)
             if q != 2.0:
                 is_smooth = ((y * ROOM > b) | (y + b == 0.0)).all(axis=1)
-                norm_bound = np.where(is_smooth, np.minimum(norm_bound, _led(y, b, q)), np.inf)
+                norm_bound = np.where(is_smooth, np.minimum(norm_bound, _bound_dominated_norm(y, b, q)), np.inf)
             offset = np.abs(factor.centre - point) * OUTWARD
             bound = unit[:, 0] * norm_bound * (1.0 + 2.0 * share) + reach @ offset
         total = total + bound
     return total * OUTWARD
 
 
-def _led(y: Array, b: Array, q: float) -> Array:
+def _bound_dominated_norm(y: Array, b: Array, q: float) -> Array:
     """Return bounds of the ``q``-norm within ``b (k, d)`` of ``y (k, d)``, both nonnegative, where one entry dominates.
 
     The entries are divided by the dominating one. Where the powers of all others add up to less than 1, the sum of all
@@ -275,14 +277,14 @@ def _led(y: Array, b: Array, q: float) -> Array:
     return np.where((low[:, 0] > 0.0) & (power_sum < ROOM), high[:, 0] * (1.0 + power_sum) ** (1.0 / q), np.inf)
 
 
-def _norm(y: Array, q: float) -> Array:
+def _compute_norms(y: Array, q: float) -> Array:
     """Return the q-norms of rows; no entry overflows or underflows."""
     size = np.abs(y).max(axis=1, keepdims=True)
     safe = np.where(size > 0.0, size, 1.0)
     return np.asarray(size[:, 0] * np.linalg.norm(y / safe, ord=q, axis=1))
 
 
-def _root(part: Shape) -> tuple[Array, float, float]:
+def _find_norm_matrix(part: Shape) -> tuple[Array, float, float]:
     """Return ``L (d, d)``, the relative error of ``L``, and ``q`` with ``h(c) = c'm + |L'c|_q``."""
     if isinstance(part, Ball):
         p = part.source.p
@@ -295,7 +297,7 @@ def _root(part: Shape) -> tuple[Array, float, float]:
     )
 
 
-def _sides(part: Boxed, about: Array) -> tuple[Array, Array, Array]:
+def _shift_box(part: Boxed, about: Array) -> tuple[Array, Array, Array]:
     """Return the middle of a box minus a point, half its widths, and the error bound of both together, ``(d,)``
     each."""
     ends = part.exact
@@ -304,7 +306,7 @@ def _sides(part: Boxed, about: Array) -> tuple[Array, Array, Array]:
     return np.array(middle), np.array(half), HALF_ULP * 2.0 * (np.abs(middle) + np.array(half))
 
 
-def _corners(part: Cornered, about: Array) -> tuple[Array, Array]:
+def _shift_corners(part: Cornered, about: Array) -> tuple[Array, Array]:
     """Return the corners of a set minus a point, and their error bounds, ``(v, d)`` each."""
     exact: Sequence[Sequence[Fraction]] = part.corners
     corners = [[float(x - Fraction(float(m))) for x, m in zip(corner, about, strict=True)] for corner in exact]

@@ -40,7 +40,7 @@ class Ellipsoidal(Shape):
         return along(self.centre, direction) + quadratic.nonnegative_part().sqrt()
 
     def holds(self, point: Sequence[arb]) -> bool:
-        return bool(self._square([x - m for x, m in zip(point, balls(self.centre), strict=True)]) <= 1)
+        return bool(self._compute_squared_gauge([x - m for x, m in zip(point, balls(self.centre), strict=True)]) <= 1)
 
     def far(self, direction: Sequence[arb]) -> list[arb]:
         images = [along(row, direction) for row in self.source.shape]
@@ -48,9 +48,9 @@ class Ellipsoidal(Shape):
         return [v / size for v in images]
 
     def gauge(self, offsets: Sequence[arb]) -> arb:
-        return self._square(offsets).nonnegative_part().sqrt()
+        return self._compute_squared_gauge(offsets).nonnegative_part().sqrt()
 
-    def _square(self, offsets: Sequence[arb]) -> arb:
+    def _compute_squared_gauge(self, offsets: Sequence[arb]) -> arb:
         from flint import arb_mat
 
         z = arb_mat([balls(row) for row in self.source.shape]).solve(arb_mat([[v] for v in offsets]))
@@ -60,7 +60,7 @@ class Ellipsoidal(Shape):
         return np.asarray(np.linalg.solve(self.source.shape, offset), dtype=float)
 
     def bound(self, value: Array, spread: Array) -> tuple[Array, Array]:
-        return _round_bound(self.centre, self.source.shape, value, spread)
+        return _bound_ellipsoid(self.centre, self.source.shape, value, spread)
 
     @cached_property
     def round(self) -> tuple[Array, Array]:
@@ -95,21 +95,21 @@ class Ball(Shape):
         return np.asarray(self.source.centre, dtype=float)
 
     def support(self, direction: Sequence[arb]) -> arb:
-        return along(self.centre, direction) + ball(self.source.radius) * self._dual(direction)
+        return along(self.centre, direction) + ball(self.source.radius) * self._compute_dual_norm(direction)
 
-    def _dual(self, direction: Sequence[arb]) -> arb:
+    def _compute_dual_norm(self, direction: Sequence[arb]) -> arb:
         p, sizes = self.source.p, [abs(c) for c in direction]
         if p == 1.0:
             return largest(sizes)
         if p == 2.0:
             return total(c * c for c in direction).nonnegative_part().sqrt()
         q = ball(p) / (ball(p) - 1)
-        power_sum = total(_power(size, q) for size in sizes if not size.is_zero())
-        return power_sum if power_sum.is_zero() else _power(power_sum, 1 / q)
+        power_sum = total(_compute_power(size, q) for size in sizes if not size.is_zero())
+        return power_sum if power_sum.is_zero() else _compute_power(power_sum, 1 / q)
 
     def far(self, direction: Sequence[arb]) -> list[arb]:
         q = ball(self.source.p) / (ball(self.source.p) - 1)
-        powers = [_power(c, q - 1) if not c.is_zero() else c for c in direction]
+        powers = [_compute_power(c, q - 1) if not c.is_zero() else c for c in direction]
         size = self.gauge(powers)
         return [v / size if c > 0 else -v / size for c, v in zip(direction, powers, strict=True)]
 
@@ -122,8 +122,8 @@ class Ball(Shape):
 
     def gauge(self, offsets: Sequence[arb]) -> arb:
         p = ball(self.source.p)
-        power_sum = total(_power(v, p) for v in offsets if not v.is_zero())
-        return (power_sum if power_sum.is_zero() else _power(power_sum, 1 / p)) / ball(self.source.radius)
+        power_sum = total(_compute_power(v, p) for v in offsets if not v.is_zero())
+        return (power_sum if power_sum.is_zero() else _compute_power(power_sum, 1 / p)) / ball(self.source.radius)
 
     def bound(self, value: Array, spread: Array) -> tuple[Array, Array]:
         """Return linear upper bounds of the support function: ``h(f) - w'f`` is convex, hence largest at a corner of a
@@ -131,19 +131,21 @@ class Ball(Shape):
         d, p = self.dimension, self.source.p
         if p == 2.0:
             size, power = math.frexp(self.source.radius)
-            return _round_bound(self.centre, size**2 * np.eye(d), value, spread, power)
+            return _bound_ellipsoid(self.centre, size**2 * np.eye(d), value, spread, power)
         w = self.source.support_point(value)
         if d <= MOST_ENDS:
             ends = value[:, None] + spread[:, None] * np.array(list(product((-1.0, 1.0), repeat=d)))
-            excess = (self._norm(ends) - np.einsum("kw,kew->ke", w - self.centre, ends)).max(axis=1)
+            excess = (self._evaluate_support(ends) - np.einsum("kw,kew->ke", w - self.centre, ends)).max(axis=1)
         else:
-            excess = self._norm(value) - ((w - self.centre) * value).sum(axis=1)
-            excess += self._norm(spread) + (np.abs(w - self.centre) * spread).sum(axis=1)
+            excess = self._evaluate_support(value) - ((w - self.centre) * value).sum(axis=1)
+            excess += self._evaluate_support(spread) + (np.abs(w - self.centre) * spread).sum(axis=1)
         reach = np.abs(value) + spread
-        rounding_error = ROUNDING * (self._norm(reach) + (reach * (np.abs(w) + 2.0 * np.abs(self.centre))).sum(axis=1))
+        rounding_error = ROUNDING * (
+            self._evaluate_support(reach) + (reach * (np.abs(w) + 2.0 * np.abs(self.centre))).sum(axis=1)
+        )
         return w, (np.maximum(excess, 0.0) + rounding_error) * OUTWARD
 
-    def _norm(self, vectors: Array) -> Array:
+    def _evaluate_support(self, vectors: Array) -> Array:
         """Return the support values about the centre, up to rounding; no component overflows or underflows."""
         size = np.abs(vectors).max(axis=-1, keepdims=True)
         scaled = vectors / np.where(size > 0.0, size, 1.0)
@@ -198,7 +200,7 @@ class Cylindrical(Shape):
                 raise Broken("a direction points where its set is unbounded")
         return self.base.support(base_direction)
 
-    def _seen(self, point: Sequence[arb]) -> list[arb]:
+    def _project_onto_base(self, point: Sequence[arb]) -> list[arb]:
         """Return a point projected onto the coordinates of the base."""
         projection = list(point[: self.spanned])
         for i, column in np.argwhere(self.slopes).tolist():
@@ -206,10 +208,10 @@ class Cylindrical(Shape):
         return projection
 
     def holds(self, point: Sequence[arb]) -> bool:
-        return self.base.holds(self._seen(point))
+        return self.base.holds(self._project_onto_base(point))
 
     def gauge(self, offsets: Sequence[arb]) -> arb:
-        return self.base.gauge(self._seen(offsets))
+        return self.base.gauge(self._project_onto_base(offsets))
 
     def far(self, direction: Sequence[arb]) -> list[arb]:
         return [*self.base.far(direction[: self.spanned]), *balls(np.zeros(self.dimension - self.spanned))]
@@ -252,7 +254,7 @@ class Joint(Shape):
         return np.hstack([w for w, _ in bounds]), np.sum([excess for _, excess in bounds], axis=0) * OUTWARD
 
 
-def _power(value: arb, exponent: arb) -> arb:
+def _compute_power(value: arb, exponent: arb) -> arb:
     """Return ``|value|^exponent`` with ``exponent > 0``, also for a ball that contains 0, where Arb gives none."""
     from flint import arb
 
@@ -260,7 +262,7 @@ def _power(value: arb, exponent: arb) -> arb:
     return size**exponent if size > 0 else arb(0).union(arb(size.upper()) ** exponent)
 
 
-def _round_bound(centre: Array, S: Array, value: Array, spread: Array, power: int = 0) -> tuple[Array, Array]:
+def _bound_ellipsoid(centre: Array, S: Array, value: Array, spread: Array, power: int = 0) -> tuple[Array, Array]:
     """Return linear upper bounds of the support function of an ellipsoid: a point, and an excess, as `Shape.bound`
     does.
 

@@ -49,10 +49,10 @@ class Flat(Shape):
         linear. Its minimum is attained at a corner of a part.
         """
         rows = tuple((*map(float, c), float(b) if b == float(b) else above(b)) for c, b in self.holding)
-        return _least(
+        return _find_least(
             [
-                total(map(_height, ups, downs, slope, map(rational, point)))
-                for point in _meets(rows, tuple(range(self.dimension)))
+                total(map(_evaluate_cost, ups, downs, slope, map(rational, point)))
+                for point in _find_intersections(rows, tuple(range(self.dimension)))
             ]
         )
 
@@ -71,10 +71,10 @@ class Boxed(Flat):
         super().__init__(source)
         self.is_box = isinstance(source, Box)
         if isinstance(source, Box):
-            self._low, self._high = ([ball(v) for v in ends] for ends in (source.lower, source.upper))
+            self._lower_corner, self._upper_corner = ([ball(v) for v in ends] for ends in (source.lower, source.upper))
         else:
             middles, radius = [ball(v) for v in source.centre], ball(source.radius)
-            self._low, self._high = [m - radius for m in middles], [m + radius for m in middles]
+            self._lower_corner, self._upper_corner = [m - radius for m in middles], [m + radius for m in middles]
 
     @cached_property
     def exact(self) -> list[tuple[Fraction, Fraction]]:
@@ -89,13 +89,13 @@ class Boxed(Flat):
     @cached_property
     def facets(self) -> list[Facet]:
         axes = np.eye(self.dimension)
-        return [(axis, b) for axis, b in zip(axes, self._high, strict=True) if b.is_finite()] + [
-            (-axis, -b) for axis, b in zip(axes, self._low, strict=True) if b.is_finite()
+        return [(axis, b) for axis, b in zip(axes, self._upper_corner, strict=True) if b.is_finite()] + [
+            (-axis, -b) for axis, b in zip(axes, self._lower_corner, strict=True) if b.is_finite()
         ]
 
     def support(self, direction: Sequence[arb]) -> arb:
         height = ball(0)
-        for c, low, high in zip(direction, self._low, self._high, strict=True):
+        for c, low, high in zip(direction, self._lower_corner, self._upper_corner, strict=True):
             if c.is_zero():
                 continue
             if low.is_finite() and high.is_finite():
@@ -109,7 +109,7 @@ class Boxed(Flat):
         return height
 
     def bound(self, value: Array, spread: Array) -> tuple[Array, Array]:
-        low, high = np.array([below(b) for b in self._low]), np.array([above(b) for b in self._high])
+        low, high = np.array([below(b) for b in self._lower_corner]), np.array([above(b) for b in self._upper_corner])
         w = np.where(value >= 0, high, low)
         return w, (np.maximum(spread - np.abs(value), 0.0) * (high - low)).sum(axis=1) * OUTWARD
 
@@ -118,10 +118,10 @@ class Boxed(Flat):
 
     def shares_of_least(self, ups: Sequence[arb], downs: Sequence[arb], slope: Sequence[arb]) -> list[arb]:
         """Return the contribution of every component to `least`."""
-        ends = zip(self._low, self._high, strict=True)
+        ends = zip(self._lower_corner, self._upper_corner, strict=True)
         points = [[low, high] + ([0 * low] if low <= 0 and high >= 0 else []) for low, high in ends]
         return [
-            _least([_height(up, down, s, v) for v in values])
+            _find_least([_evaluate_cost(up, down, s, v) for v in values])
             for up, down, s, values in zip(ups, downs, slope, points, strict=True)
         ]
 
@@ -145,8 +145,10 @@ class Cornered(Flat):
     def segments(self) -> list[tuple[list[Fraction], Fraction]] | None:
         """The vectors from the first corner to others, each with the number 1; ``None`` for a set that is not thin. The
         lines between corners lie in the set."""
-        chosen = _apart(self._offsets)
-        if len(chosen) == self.dimension or (len(chosen) > 1 and len(_independent(self._offsets)) > len(chosen)):
+        chosen = _select_distant_rows(self._offsets)
+        if len(chosen) == self.dimension or (
+            len(chosen) > 1 and len(_select_independent_rows(self._offsets)) > len(chosen)
+        ):
             return None
         return [(vector, Fraction(1)) for vector in chosen]
 
@@ -154,7 +156,7 @@ class Cornered(Flat):
     def _offsets(self) -> list[list[Fraction]]:
         """The vectors from the first corner to the others, the longest first."""
         first, *remaining = self.corners
-        return _longest_first([[a - b for a, b in zip(x, first, strict=True)] for x in remaining])
+        return _sort_by_length([[a - b for a, b in zip(x, first, strict=True)] for x in remaining])
 
     def nearest(self, point: Array) -> list[arb]:
         """Return a weighted mean of corners close to a point."""
@@ -204,7 +206,7 @@ class Polyhedral(Cornered):
     @cached_property
     def corners(self) -> list[tuple[Fraction, ...]]:
         H, h = self.source.H, self.source.h
-        return list(_meets(tuple((*map(float, row), float(b)) for row, b in zip(H, h, strict=True)), ()))
+        return list(_find_intersections(tuple((*map(float, row), float(b)) for row, b in zip(H, h, strict=True)), ()))
 
     def limit(self, direction: Array) -> arb:
         """Return the right-hand side of the facet whose normal the direction is, times the factor between the two."""
@@ -216,7 +218,7 @@ class Polyhedral(Cornered):
         multipliers: Array = float(factor) * np.eye(len(self.sides))[number]
         return multipliers
 
-    def _sizes(self, limit: arb) -> list[float]:
+    def _list_sizes(self, limit: arb) -> list[float]:
         return [abs(float(limit))]
 
 
@@ -283,7 +285,7 @@ class Segments(Flat):
 
         d, normals = self.dimension, dict[tuple[str, ...], list[fmpq]]()
         rows = [[fmpq(*v.as_integer_ratio()) for v in g] for g in self.source.generators.tolist() if any(g)]
-        complement = _null_space(rows, d)
+        complement = _compute_null_space(rows, d)
         rank = d - len(complement)
         spanning_sets = [[*vectors, *complement] for vectors in combinations(rows, rank - 1)] if rank else []
         spanning_sets += [[*complement[:i], *complement[i + 1 :], *spanning(rows)] for i in range(len(complement))]
@@ -305,29 +307,29 @@ class Segments(Flat):
     @cached_property
     def segments(self) -> list[tuple[list[Fraction], Fraction]] | None:
         """The longest of the segments whose sum the set is, as many as have distinct directions."""
-        chosen = _apart(self._sums)
-        if len(chosen) == self.dimension or len(_independent(self._sums)) > len(chosen):
+        chosen = _select_distant_rows(self._merged_segments)
+        if len(chosen) == self.dimension or len(_select_independent_rows(self._merged_segments)) > len(chosen):
             return None
         return [(vector, Fraction(2)) for vector in chosen]
 
     @cached_property
-    def _sums(self) -> list[list[Fraction]]:
+    def _merged_segments(self) -> list[list[Fraction]]:
         """The long segments, the longest first. Parallel segments are added into one, so that the zonotope of the
         results lies in the set."""
         sums = list[list[Fraction]]()
-        rows = _longest_first([[Fraction(v) for v in g] for g in self.source.generators.tolist() if any(g)])
-        widths = _widths(rows)
+        rows = _sort_by_length([[Fraction(v) for v in g] for g in self.source.generators.tolist() if any(g)])
+        widths = _compute_widths(rows)
         for row in rows:
-            if _share(row, widths) <= NEAR:
+            if _compute_relative_length(row, widths) <= NEAR:
                 continue
             for index, segment in enumerate(sums):
                 sign = 1 if sum(a * b for a, b in zip(row, segment, strict=True)) > 0 else -1
-                if len(_apart([segment, row], widths)) == 1:
+                if len(_select_distant_rows([segment, row], widths)) == 1:
                     sums[index] = [b + sign * a for a, b in zip(row, segment, strict=True)]
                     break
             else:
                 sums.append(row)
-        return _longest_first(sums)
+        return _sort_by_length(sums)
 
     @property
     def generators(self) -> list[list[Fraction]]:
@@ -339,7 +341,7 @@ class Segments(Flat):
         from scipy.optimize import lsq_linear
 
         offset, middle = point - self.source.centre, self.source.centre
-        sums = self.generators if self.segments is None else self._sums
+        sums = self.generators if self.segments is None else self._merged_segments
         if not sums:
             return balls(middle)
         table = np.array([[float(v) for v in row] for row in sums])
@@ -378,11 +380,11 @@ class Segments(Flat):
         return super().least(ups, downs, slope) if has_facets else Shape.least(self, ups, downs, slope)
 
 
-def _size(row: Sequence[Fraction]) -> float:
+def _compute_length(row: Sequence[Fraction]) -> float:
     return float(np.linalg.norm([float(v) for v in row]))
 
 
-def _widths(rows: Sequence[list[Fraction]]) -> list[Fraction]:
+def _compute_widths(rows: Sequence[list[Fraction]]) -> list[Fraction]:
     """Return the largest absolute value of every column, 1 where all are 0.
 
     The columns are coordinates in different units. A vector that is short relative to another coordinate is not thin.
@@ -390,24 +392,26 @@ def _widths(rows: Sequence[list[Fraction]]) -> list[Fraction]:
     return [max(map(abs, column)) or Fraction(1) for column in zip(*rows, strict=True)]
 
 
-def _share(row: Sequence[Fraction], widths: Sequence[Fraction]) -> float:
+def _compute_relative_length(row: Sequence[Fraction], widths: Sequence[Fraction]) -> float:
     """Return the length of a row in units of the ``widths``."""
-    return _size([v / width for v, width in zip(row, widths, strict=True)])
+    return _compute_length([v / width for v, width in zip(row, widths, strict=True)])
 
 
-def _longest_first(rows: Sequence[list[Fraction]]) -> list[list[Fraction]]:
-    """Return the rows sorted by their length in units of their `_widths`, the longest first."""
-    widths = _widths(rows)
-    return sorted(rows, key=lambda row: _share(row, widths), reverse=True)
+def _sort_by_length(rows: Sequence[list[Fraction]]) -> list[list[Fraction]]:
+    """Return the rows sorted by their length in units of `_compute_widths`, the longest first."""
+    widths = _compute_widths(rows)
+    return sorted(rows, key=lambda row: _compute_relative_length(row, widths), reverse=True)
 
 
-def _apart(rows: Sequence[list[Fraction]], widths: Sequence[Fraction] | None = None) -> list[list[Fraction]]:
+def _select_distant_rows(
+    rows: Sequence[list[Fraction]], widths: Sequence[Fraction] | None = None
+) -> list[list[Fraction]]:
     """Return the rows whose distance from the span of the rows chosen before is more than `NEAR`, in units of the
     ``widths``."""
     chosen, basis = list[list[Fraction]](), list[Array]()
-    units = _widths(rows) if widths is None else widths
+    units = _compute_widths(rows) if widths is None else widths
     for row in rows:
-        size = _share(row, units)
+        size = _compute_relative_length(row, units)
         residual = np.array([float(v / unit) for v, unit in zip(row, units, strict=True)]) / (size or 1.0)
         for _ in range(2):
             for direction in basis:
@@ -419,7 +423,7 @@ def _apart(rows: Sequence[list[Fraction]], widths: Sequence[Fraction] | None = N
     return chosen
 
 
-def _independent(rows: Sequence[list[Fraction]]) -> list[list[Fraction]]:
+def _select_independent_rows(rows: Sequence[list[Fraction]]) -> list[list[Fraction]]:
     """Return the rows that are not a linear combination of the rows before them."""
     chosen, reduced = list[list[Fraction]](), list[tuple[int, list[Fraction]]]()
     for row in rows:
@@ -434,7 +438,7 @@ def _independent(rows: Sequence[list[Fraction]]) -> list[list[Fraction]]:
     return chosen
 
 
-def _null_space(rows: Sequence[Sequence[fmpq]], d: int) -> list[list[fmpq]]:
+def _compute_null_space(rows: Sequence[Sequence[fmpq]], d: int) -> list[list[fmpq]]:
     """Return vectors ``(d,)`` that span the orthogonal complement of the rows."""
     from flint import fmpq
 
@@ -449,18 +453,20 @@ def _null_space(rows: Sequence[Sequence[fmpq]], d: int) -> list[list[fmpq]]:
     return vectors
 
 
-def _height(up: arb, down: arb, slope: arb, value: arb) -> arb:
+def _evaluate_cost(up: arb, down: arb, slope: arb, value: arb) -> arb:
     return up * value.nonnegative_part() + down * (-value).nonnegative_part() + slope * value
 
 
-def _least(values: Sequence[arb]) -> arb:
+def _find_least(values: Sequence[arb]) -> arb:
     if not values:
         raise Unchecked("the set of controls has no corners")
     return smallest(values)
 
 
 @lru_cache(maxsize=64)
-def _meets(rows: tuple[tuple[float, ...], ...], planes: tuple[int, ...]) -> tuple[tuple[Fraction, ...], ...]:
+def _find_intersections(
+    rows: tuple[tuple[float, ...], ...], planes: tuple[int, ...]
+) -> tuple[tuple[Fraction, ...], ...]:
     """Return the points of ``{x : H x <= h}`` where ``d`` of its facets and of the coordinate ``planes`` meet.
 
     The rows are ``(*H_i, h_i)``, and the arithmetic is rational.

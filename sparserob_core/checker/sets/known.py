@@ -19,7 +19,7 @@ from sparserob_core.sip.convex_set import Array
 MOST_SIGNS = 10  # the largest dimension in which the facets of a 1-norm ball are listed
 
 
-def _ball(source: NormBall) -> Shape:
+def _build_ball(source: NormBall) -> Shape:
     if source.dimension == 1 or source.p == np.inf:
         return Boxed(source)
     return Octahedral(source) if source.p == 1.0 and source.dimension <= MOST_SIGNS else Ball(source)
@@ -30,7 +30,7 @@ KINDS: Mapping[type[ConvexSet], Callable[[Any], Shape]] = MappingProxyType(
         Box: Boxed,
         Polytope: Polyhedral,
         Ellipsoid: Ellipsoidal,
-        NormBall: _ball,
+        NormBall: _build_ball,
         Zonotope: Segments,
         Cylinder: lambda source: Cylindrical(source, known(source.base)),
         Product: lambda source: Joint(source, [known(part) for part in source.parts]),
@@ -52,11 +52,11 @@ def known(source: ConvexSet) -> Shape:
 
     if type(source) not in KINDS:
         raise Unchecked(f"the checker does not know sets of the kind {source.kind}")
-    return _seen(source, ctx.prec)
+    return _build_shape(source, ctx.prec)
 
 
 @lru_cache(maxsize=64)
-def _seen(source: ConvexSet, precision: int) -> Shape:
+def _build_shape(source: ConvexSet, precision: int) -> Shape:
     return KINDS[type(source)](source)
 
 

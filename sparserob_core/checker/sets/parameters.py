@@ -41,7 +41,10 @@ class Parameters:
         if self.shape is None or self.is_box:
             return True
         low, high = np.array(box[0]), np.array(box[1])
-        return all(not _least(normal, low, high) > limit for normal, limit in halfspaces(self.shape, (low + high) / 2))
+        return all(
+            not _minimise_on_box(normal, low, high) > limit
+            for normal, limit in halfspaces(self.shape, (low + high) / 2)
+        )
 
     def bounds(self, box: Corners, slope: Array) -> list[tuple[Array, Array, float]]:
         """Return combinations of half-spaces of the set that compensate a slope as far as they can.
@@ -63,7 +66,9 @@ class Parameters:
             return []
         combinations = [(slope[None], np.array([above(self.shape.support(balls(slope)))]), np.ones(1))]
         low, high = np.array(box[0]), np.array(box[1])
-        cutting = [(a, s) for a, s in halfspaces(self.shape, (low + high) / 2) if not -_least(-a, low, high) <= s]
+        cutting = [
+            (a, s) for a, s in halfspaces(self.shape, (low + high) / 2) if not -_minimise_on_box(-a, low, high) <= s
+        ]
         if cutting:
             from scipy.optimize import nnls
 
@@ -80,7 +85,7 @@ def halfspaces(shape: Shape, point: Array) -> list[Facet]:
     return [(normal, shape.support(balls(normal)))] if normal.any() else []
 
 
-def _least(normal: Array, low: Array, high: Array) -> arb:
+def _minimise_on_box(normal: Array, low: Array, high: Array) -> arb:
     """Return the least ``a'p`` on a box."""
     ends = zip(normal, balls(normal), balls(low), balls(high), strict=True)
     return sum((c * (a if weight > 0 else b) for weight, c, a, b in ends), ball(0.0))

@@ -80,7 +80,7 @@ class Truncated:
 
     def __mul__(self, other: Truncated) -> Truncated:
         left, right = self.coefficients, other.coefficients
-        J, first, second, gather, degrees = left.shape[1], *_pairs(self.monomials)
+        J, first, second, gather, degrees = left.shape[1], *_tabulate_products(self.monomials)
         coefficients = np.empty_like(left)
         for t in range(J):
             pairs = sum(left[:, s, first] * right[:, t - s, second] for s in range(t + 1))
@@ -120,7 +120,7 @@ class Truncated:
 
 
 @lru_cache(maxsize=16)
-def _pairs(monomials: Monomials) -> tuple[Array, Array, Array, Array]:
+def _tabulate_products(monomials: Monomials) -> tuple[Array, Array, Array, Array]:
     """Return the pairs of monomials whose product is kept.
 
     Returns
@@ -150,10 +150,10 @@ def lengths(monomials: Monomials, parts: Array) -> tuple[Array, Array, Array]:
     """
     none = np.zeros(len(parts))
     with np.errstate(over="ignore", invalid="ignore"):
-        return _lengths(monomials, parts, none)
+        return _bound_lengths(monomials, parts, none)
 
 
-def _lengths(monomials: Monomials, parts: Array, none: Array) -> tuple[Array, Array, Array]:
+def _bound_lengths(monomials: Monomials, parts: Array, none: Array) -> tuple[Array, Array, Array]:
     square = Truncated(monomials, np.zeros(parts.shape[:3]), none)
     for r in range(parts.shape[3]):
         component = Truncated(monomials, parts[..., r], none)

@@ -175,11 +175,11 @@ class Shape(ABC):
         """
         assert self.facets is not None
         return [
-            smallest([width, max(_reach(self, c), _reach(self, -c)), *self._sizes(b)])
+            smallest([width, max(_estimate_support(self, c), _estimate_support(self, -c)), *self._list_sizes(b)])
             for (c, b), width in zip(self.facets, widths(self.facets), strict=True)
         ]
 
-    def _sizes(self, limit: arb) -> list[float]:
+    def _list_sizes(self, limit: arb) -> list[float]:
         return []
 
     # Curved sets
@@ -267,18 +267,18 @@ class Shape(ABC):
             unit = max(unit, RESOLVED * float((abs(b) + abs(extra) + total(abs(t) for t in terms)).mid())) or 1.0
             over = float((total(terms) + extra - b).upper()) / unit
             if over > worst:
-                worst, where = over, _named(c, number)
+                worst, where = over, _name_facet(c, number)
         return worst, where
 
 
-def _reach(shape: Shape, direction: Array) -> float:
+def _estimate_support(shape: Shape, direction: Array) -> float:
     try:
         return abs(float(shape.support(balls(direction)).mid()))
     except (Broken, Unchecked):  # unbounded in this direction, or without corners
         return math.inf
 
 
-def _named(normal: Array, number: int) -> str:
+def _name_facet(normal: Array, number: int) -> str:
     return f"u{int(np.abs(normal).argmax()) + 1}" if np.count_nonzero(normal) == 1 else f"row {number + 1}"
 
 

@@ -61,15 +61,15 @@ class Curved:
         c = self.balls(z)
         height, middle = total(a * x for a, x in zip(c, inside, strict=True)), along(self.shape.centre, c)
         unit = max(0.0, below(height - middle))
-        return self._row(z, below(height), unit)
+        return self._build_row(z, below(height), unit)
 
     def true(self, z: Array) -> Bounded:
         """Return the constraint in one direction, with its true limit."""
         c = self.balls(z)
         height = self.shape.support(c)
-        return self._row(z, below(height), max(0.0, below(height - along(self.shape.centre, c))))
+        return self._build_row(z, below(height), max(0.0, below(height - along(self.shape.centre, c))))
 
-    def _row(self, z: Array, limit: float, unit: float) -> Bounded:
+    def _build_row(self, z: Array, limit: float, unit: float) -> Bounded:
         return Bounded(z, limit, max(unit, self.least(self.floats(z), unit)) or 1.0)
 
     def floats(self, z: Array) -> Array:

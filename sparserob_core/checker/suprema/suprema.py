@@ -55,22 +55,22 @@ def check_suprema(case: Case) -> list[Finding]:
         findings, entries = list[Finding](), list[Any]()
 
         def every() -> str:
-            entries.extend(_matched(case))
+            entries.extend(_match_rows(case))
             return f"{len(entries)} rows, each of the problem's once"
 
         findings.append(judged("rows", every))
         for row, entry in entries:
-            name = f"{row.window.name}: {_sense(row)} {entry.get('quantity')}"
+            name = f"{row.window.name}: {_get_sense(row)} {entry.get('quantity')}"
             name += f" at {entry['corner']}" if entry.get("corner") else ""
-            findings.append(judged(name, lambda row=row, entry=entry: _enclosed(case, row, entry)))  # type: ignore[misc]
+            findings.append(judged(name, lambda row=row, entry=entry: _verify_row(case, row, entry)))  # type: ignore[misc]
         return findings
 
 
-def _sense(asked: SupremumRow) -> str:
+def _get_sense(asked: SupremumRow) -> str:
     return "inf" if asked.direction[np.flatnonzero(asked.direction)[0]] < 0.0 else "sup"
 
 
-def _asked(case: Case) -> list[SupremumRow]:
+def _list_rows(case: Case) -> list[SupremumRow]:
     """Return the rows of the problem: those of its constraints, or else of its outputs or states."""
     rows = [
         SupremumRow(window, direction, b)
@@ -87,10 +87,10 @@ def _asked(case: Case) -> list[SupremumRow]:
     return [SupremumRow(window, sign * direction, None) for direction in directions for sign in (1.0, -1.0)]
 
 
-def _matched(case: Case) -> list[tuple[SupremumRow, Mapping[str, Any]]]:
+def _match_rows(case: Case) -> list[tuple[SupremumRow, Mapping[str, Any]]]:
     """Return the rows of the certificate, each with the row of the problem that it is about; raise `Broken` unless both
     agree."""
-    remaining_rows, pairs = _asked(case), []
+    remaining_rows, pairs = _list_rows(case), []
     for entry in listed(case.certificate, "rows"):
         if not isinstance(entry, Mapping):
             raise Broken("rows: expected a constraint, a direction and two bounds each")
@@ -111,9 +111,9 @@ def _matched(case: Case) -> list[tuple[SupremumRow, Mapping[str, Any]]]:
     return pairs
 
 
-def _enclosed(case: Case, asked: SupremumRow, entry: Mapping[str, Any]) -> str:
+def _verify_row(case: Case, asked: SupremumRow, entry: Mapping[str, Any]) -> str:
     """Return a sentence with both sides of one row; raise `Broken` or `Unchecked` where they are not shown."""
-    sense = _sense(asked)
+    sense = _get_sense(asked)
     if entry.get("sense") != sense:
         raise Broken(f"it is called {entry.get('sense')!r}, its direction is that of {sense}")
     lower, upper = (None if entry.get(side) is None else number(entry, side) for side in ("lower", "upper"))
@@ -124,10 +124,10 @@ def _enclosed(case: Case, asked: SupremumRow, entry: Mapping[str, Any]) -> str:
         raise Unchecked("no value is written that is reached")
     sign = 1.0 if sense == "sup" else -1.0
     low, high = sign * reached_side, None if proven_side is None else sign * proven_side
-    _margin(asked, entry, sign, high)
+    _verify_margin(asked, entry, sign, high)
     case.clock.check()
     row = FollowedRow(case, asked.window, asked.direction)
-    value = _witnessed(case, asked, entry, row)
+    value = _enclose_witness_value(case, asked, entry, row)
     if not value[1] >= low:
         raise Broken(f"{reached_side!r} is written, its witness reaches {sign * value[1]!r}")
     if not value[0] >= low:
@@ -136,12 +136,12 @@ def _enclosed(case: Case, asked: SupremumRow, entry: Mapping[str, Any]) -> str:
         raise Unchecked(f"{reached_side:.9g} is reached, and no bound is written on the other side")
     if value[0] > high:
         raise Broken(f"{proven_side!r} is written, its witness reaches {sign * value[0]!r}")
-    count = row.prove(high)[0] if case.followed.are_possible else _proven_in_cells(case, asked, high)
+    count = row.prove(high)[0] if case.followed.are_possible else _prove_row_on_cells(case, asked, high)
     side = "above" if sense == "sup" else "below"
     return f"{reached_side:.9g} is reached, nothing is {side} {proven_side:.9g} ({count} cells)"
 
 
-def _margin(asked: SupremumRow, entry: Mapping[str, Any], sign: float, high: float | None) -> None:
+def _verify_margin(asked: SupremumRow, entry: Mapping[str, Any], sign: float, high: float | None) -> None:
     """Raise `Broken` unless the wall is the problem's, and the margin is the difference between the wall and the
     bound."""
     wall, margin = entry.get("wall"), entry.get("margin")
@@ -160,7 +160,9 @@ def _margin(asked: SupremumRow, entry: Mapping[str, Any], sign: float, high: flo
         raise Broken(f"a margin of {margin!r} is written, {written - high!r} follows")
 
 
-def _witnessed(case: Case, asked: SupremumRow, entry: Mapping[str, Any], row: FollowedRow) -> tuple[float, float]:
+def _enclose_witness_value(
+    case: Case, asked: SupremumRow, entry: Mapping[str, Any], row: FollowedRow
+) -> tuple[float, float]:
     """Return a lower and an upper bound of the value of the row along its witness, which must be admissible."""
     problem, window, time = case.problem, asked.window, number(entry, "time")
     parameter = numbers(entry.get("parameter"), "parameter")
@@ -170,7 +172,7 @@ def _witnessed(case: Case, asked: SupremumRow, entry: Mapping[str, Any], row: Fo
         raise Broken("a deviation is written, there is one initial state")
     if problem.initial_set is not None and not known(problem.initial_set).contains(deviation):
         raise Broken("the deviation of the initial state is not shown to be in its set")
-    changes, signal = _signal(case, entry)
+    changes, signal = _read_signal(case, entry)
     low, high = row.beside(time, time)
     execution = case.sources.delivered_at(parameter.tolist())
     if execution is not None:  # an enclosure of the worst errors
@@ -180,14 +182,14 @@ def _witnessed(case: Case, asked: SupremumRow, entry: Mapping[str, Any], row: Fo
     if case.followed.are_possible:
         value = row.worst.along(time, deviation, changes, signal)
         return value[0] + low - 4.0 * HALF_ULP * (abs(value[0]) + abs(low)), value[1] + high
-    fine, on_grid = _following(case, changes, signal)
+    fine, on_grid = _refine_grid(case, changes, signal)
     state = reached(fine, time, parameter, on_grid, entry.get("deviation"))
     direction = window.split(asked.direction)[0]
     total = sum((a * x for a, x in zip(balls(direction), state, strict=True)), ball(0.0))
     return below(total + low), above(total + high)
 
 
-def _signal(case: Case, entry: Mapping[str, Any]) -> tuple[Array, Array | None]:
+def _read_signal(case: Case, entry: Mapping[str, Any]) -> tuple[Array, Array | None]:
     """Return the times at which the disturbance of a witness changes, and the disturbance, which must be admissible."""
     problem = case.problem
     changes = numbers(entry.get("changes"), "changes")
@@ -213,7 +215,7 @@ def _signal(case: Case, entry: Mapping[str, Any]) -> tuple[Array, Array | None]:
     return changes, signal
 
 
-def _following(case: Case, changes: Array, signal: Array | None) -> tuple[Case, object]:
+def _refine_grid(case: Case, changes: Array, signal: Array | None) -> tuple[Case, object]:
     """Return the case whose grid has the ``changes`` of a signal, and the signal on the pieces of that grid.
 
     A measurable signal that is constant between the changes is one of a dictionary with these pieces.
@@ -227,7 +229,7 @@ def _following(case: Case, changes: Array, signal: Array | None) -> tuple[Case, 
     return case, signal[:, np.searchsorted(changes, starts, side="right") - 1].tolist()
 
 
-def _proven_in_cells(case: Case, asked: SupremumRow, limit: float) -> int:
+def _prove_row_on_cells(case: Case, asked: SupremumRow, limit: float) -> int:
     """Show that a row is at most the ``limit`` over the parameters and phases of the system; return the number of
     cells."""
     window = asked.window

@@ -20,7 +20,7 @@ from sparserob_core.checker.claims import claims, constraints, replay
 from sparserob_core.checker.claims import multipliers as bounds
 from sparserob_core.checker.claims.answers import VerifiedFeedback, feedback_of
 from sparserob_core.checker.claims.case import Case
-from sparserob_core.checker.cost.gains import _chords, _segments, _width, reach
+from sparserob_core.checker.cost.gains import _compute_chords, _compute_width, _segments, reach
 from sparserob_core.checker.outcome import Broken, Unchecked
 from sparserob_core.checker.sets.known import known
 from sparserob_core.control.policies.affine import AffinePolicy
@@ -88,24 +88,24 @@ def test_a_peak_is_charged_to_its_own_channel_and_piece():
     )
     for channel, piece in ((0, 0), (1, 0), (0, 1), (1, 1)):
         for sign in (1.0, -1.0):
-            row = bounds._of_control(two, "peak", sign * np.eye(2)[channel], float(piece), None)
+            row = bounds._derive_control_row(two, "peak", sign * np.eye(2)[channel], float(piece), None)
             assert row.charged == (piece, channel)
     for other in ([1.0, 1.0], [0.5, 0.0]):
         with pytest.raises(Broken, match="not that of a peak"):
-            bounds._of_control(two, "peak", np.array(other), 0.0, None)
+            bounds._derive_control_row(two, "peak", np.array(other), 0.0, None)
 
 
 def test_a_control_is_as_large_as_its_answers_make_it():
-    assert "2 pieces" in claims._control(case_of(0.325 / (1 + NOTHING)))
+    assert "2 pieces" in claims._verify_control(case_of(0.325 / (1 + NOTHING)))
     for size in (0.325 / (1 + TOO_MUCH), 0.31):
         with pytest.raises(Broken, match="from t = 1"):
-            claims._control(case_of(size))
+            claims._verify_control(case_of(size))
     with pytest.raises(Broken, match="from t = 0"):
-        claims._control(case_of(0.35, gains=gains_of(m11=0.0), certificate={"decision": [[0.4, 0.0]]}))
+        claims._verify_control(case_of(0.35, gains=gains_of(m11=0.0), certificate={"decision": [[0.4, 0.0]]}))
     # one side only, and a set that is curved where it is larger than a segment
-    assert claims._control(case_of(Box([-0.325], [9.0])))
+    assert claims._verify_control(case_of(Box([-0.325], [9.0])))
     with pytest.raises(Broken):
-        claims._control(case_of(Box([-9.0], [0.299])))
+        claims._verify_control(case_of(Box([-9.0], [0.299])))
 
 
 def test_a_control_in_a_curved_set_is_as_large_as_its_answers_make_it():
@@ -113,27 +113,27 @@ def test_a_control_in_a_curved_set_is_as_large_as_its_answers_make_it():
     for radius, kept in ((0.425 / (1 + NOTHING), True), (0.425 / (1 + TOO_MUCH), False), (0.3, False)):
         judged = case_of(NormBall(p=2.0, radius=radius, centre=[0.1]))
         if kept:
-            assert "2 pieces in their set" in claims._control(judged)
+            assert "2 pieces in their set" in claims._verify_control(judged)
         else:
             with pytest.raises(Broken):
-                claims._control(judged)
+                claims._verify_control(judged)
     for radius, kept in ((0.3 * (1 + 1e-8), True), (0.3 * (1 - 1e-8), False)):  # u_0 is 0.3, whatever happens
         judged = case_of(Ellipsoid([0.0], [[radius**2]]), gains=gains_of(m11=0.0))
         if kept:
-            assert claims._control(judged)
+            assert claims._verify_control(judged)
         else:
             with pytest.raises(Broken):
-                claims._control(judged)
+                claims._verify_control(judged)
 
 
 def test_a_control_in_an_ellipse_is_as_far_along_every_direction_as_its_answers_take_it():
     for radius, kept in ((0.425 / (1 + NOTHING), True), (0.425 / (1 + TOO_MUCH), False), (0.3, False)):
         judged = case_of(Ellipsoid([0.1], [[radius**2]]))
         if kept:
-            assert "2 pieces in their set" in claims._control(judged)
+            assert "2 pieces in their set" in claims._verify_control(judged)
         else:
             with pytest.raises(Broken):
-                claims._control(judged)
+                claims._verify_control(judged)
 
 
 def test_across_the_seam_the_controls_of_two_periods_answer_apart():
@@ -150,10 +150,10 @@ def test_a_step_is_as_large_as_the_answers_of_both_pieces_make_it():
     for size, kept in ((0.625 / (1 + NOTHING), True), (0.625 / (1 + TOO_MUCH), False), (0.55, False)):
         judged = case_of(control_step=box(size))
         if kept:
-            assert "steps in their set" in claims._steps(judged)
+            assert "steps in their set" in claims._verify_steps(judged)
         else:
             with pytest.raises(Broken, match="t = 1"):
-                claims._steps(judged)
+                claims._verify_steps(judged)
     assert float(feedback_of(case_of(control_step=box(1.0))).changes(1)[0][0, 1].mid()) == pytest.approx(-0.5)
     assert feedback_of(case_of(control_step=box(1.0))).changes(1)[0][0, 0].mid() == pytest.approx(-0.5)
 
@@ -433,7 +433,7 @@ def test_chords_are_how_long_a_set_is_through_its_middle(shape, chords):
     if chords is None:  # the triangle (0, 0), (1, 0), (0, 2)
         x, y = middle
         chords = [1.0 - y / 2, 2.0 - 2 * x]
-    assert [float(c.mid()) for c in _chords(shape, middle)] == pytest.approx(chords)
+    assert [float(c.mid()) for c in _compute_chords(shape, middle)] == pytest.approx(chords)
 
 
 def test_a_policy_is_refused_where_the_checker_does_not_know_the_system():
@@ -453,7 +453,7 @@ def test_how_far_and_how_wide_a_set_is_along_a_channel():
         (Box([-3.0, -5.0], [1.0, -2.0]), (4.0, 3.0), (3.0, 5.0)),
         (NormBall(p=2.0, radius=2.0, centre=[0.5, -1.0]), (4.0, 4.0), (2.5, 3.0)),
     ):
-        assert [float(_width(shape, c).mid()) for c in (0, 1)] == pytest.approx(wide)
+        assert [float(_compute_width(shape, c).mid()) for c in (0, 1)] == pytest.approx(wide)
         assert [float(reach(shape, c).mid()) for c in (0, 1)] == pytest.approx(far)
 
 
@@ -469,7 +469,7 @@ def test_the_effort_is_looked_for_where_deviations_go(monkeypatch):
     """How far every entry goes, from the middle of its set, is handed on."""
     told = []
     monkeypatch.setattr("sparserob_core.checker.claims.answers.at_most", lambda *given: told.append(given) or 1)
-    feedback_of(case_of(cost="worst", disturbance=Box([-0.1], [0.3])))._effort(arb(9.0))
+    feedback_of(case_of(cost="worst", disturbance=Box([-0.1], [0.3])))._verify_effort(arb(9.0))
     a, A, _, reach, limit, _ = told[0]
     assert reach == pytest.approx([0.2, 0.2]) and float(limit) == 9.0
     assert [float(x.mid()) for x in a] == pytest.approx([0.3, -0.2])
@@ -488,9 +488,9 @@ def test_an_effort_is_bounded_where_its_parts_are_not_largest_together(kind):
     said = {"decision": np.zeros((2, 3)).tolist(), "gains": gains.tolist()}
     judged = case_of(pieces=3, gains=gains, cost="worst", certificate=said, disturbance_class=kind, **two)
     most = (2.0 / 3.0) * 2.0 * (2.0 / 3.0) * REACH
-    feedback_of(judged)._effort(arb(most * (1.0 + 1e-9)))
+    feedback_of(judged)._verify_effort(arb(most * (1.0 + 1e-9)))
     with pytest.raises((Broken, Unchecked)):
-        feedback_of(judged)._effort(arb(most * (1.0 - 1e-6)))
+        feedback_of(judged)._verify_effort(arb(most * (1.0 - 1e-6)))
 
 
 def test_innovations_of_a_flat_set_are_those_of_differences_of_its_points():

@@ -51,24 +51,24 @@ def test_the_control_and_its_steps_are_as_large_as_they_are():
     for size, kept in ((0.75 / (1 + NOTHING), True), (0.75 / (1 + TOO_MUCH), False), (0.7, False)):
         case = case_of(size)
         if kept:
-            assert "2 pieces" in claims._control(case)
+            assert "2 pieces" in claims._verify_control(case)
         else:
             with pytest.raises(Broken, match="from t = 0"):
-                claims._control(case)
+                claims._verify_control(case)
     for before in (None, [0.0]):
         for size, kept in ((1.0 / (1 + NOTHING), True), (1.0 / (1 + TOO_MUCH), False)):
             case = case_of(control_step=box(size), initial_control=before)
             if kept:
-                assert f"{1 if before is None else 2} steps" in claims._steps(case)
+                assert f"{1 if before is None else 2} steps" in claims._verify_steps(case)
             else:
                 with pytest.raises(Broken, match="t = 1"):
-                    claims._steps(case)
+                    claims._verify_steps(case)
     # the first step is one where it is known what was before
-    assert "1 steps" in claims._steps(case_of(control_step=Box([-0.5], [1.0])))
+    assert "1 steps" in claims._verify_steps(case_of(control_step=Box([-0.5], [1.0])))
     with pytest.raises(Broken, match="t = 0"):
-        claims._steps(case_of(control_step=Box([-0.5], [1.0]), initial_control=[0.0]))
+        claims._verify_steps(case_of(control_step=Box([-0.5], [1.0]), initial_control=[0.0]))
     with pytest.raises(Broken, match="the change of the control leaves"):
-        claims._steps(case_of(control_step=NormBall(2.0, 0.9, dimension=2), decision=((-0.75, 0.25), (0.0, 0.0)),
+        claims._verify_steps(case_of(control_step=NormBall(2.0, 0.9, dimension=2), decision=((-0.75, 0.25), (0.0, 0.0)),
                                 control=Box([-1.0] * 2, [1.0] * 2)))  # fmt: skip
 
 
@@ -82,13 +82,13 @@ def test_a_cost_agrees_to_eleven_digits():
     ):
         case = case_of(certificate={"cost": written})
         if agrees:
-            assert claims._cost(case) == "J = 1"
+            assert claims._verify_cost(case) == "J = 1"
         else:
             with pytest.raises(Broken, match="cost"):
-                claims._cost(case)
+                claims._verify_cost(case)
     with pytest.raises(Broken):
-        claims._agrees("a", 1e-13, arb(0), 1e-3)
-    claims._agrees("a", 1e-15, arb(0), 1e-3)
+        claims._require_agreement("a", 1e-13, arb(0), 1e-3)
+    claims._require_agreement("a", 1e-15, arb(0), 1e-3)
 
 
 def test_a_cost_whose_terms_cancel_agrees_to_the_rounding_of_its_terms():
@@ -98,10 +98,10 @@ def test_a_cost_whose_terms_cancel_agrees_to_the_rounding_of_its_terms():
         plant = {"system": LinearSystem(np.zeros((1, 1)), np.ones((1, 1))), "disturbance": None, "cost": cost}
         case = case_of(decision=((-1.0, 0.0),), certificate={"cost": off}, **plant)
         if agrees:
-            assert claims._cost(case) == "J = 0"
+            assert claims._verify_cost(case) == "J = 0"
         else:
             with pytest.raises(Broken, match="cost"):
-                claims._cost(case)
+                claims._verify_cost(case)
 
 
 def test_a_cost_that_cancels_within_one_matrix_agrees_to_the_rounding_of_its_products():
@@ -117,15 +117,15 @@ def test_a_cost_that_cancels_within_one_matrix_agrees_to_the_rounding_of_its_pro
         said = {"cost": cost + off, "lower_bound": cost + off, "gap_tolerance": 1e-6, "status": "certified"}
         case = case_of(certificate=said, **plant)
         if agrees:
-            assert claims._cost(case).startswith("J = 2.91038304")
+            assert claims._verify_cost(case).startswith("J = 2.91038304")
         else:
             with pytest.raises(Broken, match="cost"):
-                claims._cost(case)
+                claims._verify_cost(case)
         if off < 0.0:
             with pytest.raises(Broken, match="certified, but the gap is"):
-                claims._status(case, "certified", 1e-6, [])
+                claims._verify_status(case, "certified", 1e-6, [])
         else:
-            assert "within 0.00e+00" in claims._status(case, "certified", 1e-6, [])
+            assert "within 0.00e+00" in claims._verify_status(case, "certified", 1e-6, [])
 
 
 def entry(y=1.0, **more):
@@ -138,7 +138,7 @@ def multipliers(*entries, equalities=(), pieces=None):
 
 
 def lower(written, *entries, **more):
-    return claims._lower(case_of(certificate={"lower_bound": written, **multipliers(*entries)}, **more))
+    return claims._verify_lower_bound(case_of(certificate={"lower_bound": written, **multipliers(*entries)}, **more))
 
 
 def test_a_lower_bound_is_what_its_multipliers_prove_and_no_more():
@@ -169,18 +169,20 @@ def test_a_lower_bound_is_what_its_multipliers_prove_and_no_more():
         with pytest.raises(Broken):
             lower(0.1, wrong, **end)
     with pytest.raises(Unchecked):
-        claims._lower(case_of(certificate={"lower_bound": 0.1}, **end))
+        claims._verify_lower_bound(case_of(certificate={"lower_bound": 0.1}, **end))
     with pytest.raises(Broken):
-        claims._lower(case_of(certificate={"lower_bound": 0.1, "multipliers": 3}, **end))
+        claims._verify_lower_bound(case_of(certificate={"lower_bound": 0.1, "multipliers": 3}, **end))
 
 
 def test_multipliers_of_fixed_states_of_steps_and_of_the_control_are_rows_too():
     fixed = {"terminal": [Equality([0.5])]}
     said = {"lower_bound": 0.5, **multipliers(equalities=[1.0])}
-    assert "0.5" in claims._lower(case_of(certificate=said, **fixed))
+    assert "0.5" in claims._verify_lower_bound(case_of(certificate=said, **fixed))
     for wrong in ([], [1.0, 0.0], [-1.0]):
         with pytest.raises(Broken):
-            claims._lower(case_of(certificate={"lower_bound": 0.1, **multipliers(equalities=wrong)}, **fixed))
+            claims._verify_lower_bound(
+                case_of(certificate={"lower_bound": 0.1, **multipliers(equalities=wrong)}, **fixed)
+            )
     # |u| <= 0.2 a piece does not reach it: the sum of rows is above 0 whatever the control
     weak = case_of(0.2, certificate=multipliers(equalities=[1.0]), **fixed)
     assert float(bounds.multiplied(weak, priced=False).mid()) == pytest.approx(0.5 - 0.4)
@@ -242,20 +244,20 @@ ROWS = (entry(),)
 
 
 def test_the_leaves_of_a_tree_prove_how_long_a_control_acts():
-    assert claims._tree(case_of(certificate=tree(*TREE, constraints=ROWS), **END)) == 2.0
+    assert claims._bound_by_tree(case_of(certificate=tree(*TREE, constraints=ROWS), **END)) == 2.0
     # without the division: 1.2 by the slope, rounded up to whole pieces
     once = tree(leaf((0, 1.0)), constraints=ROWS)
-    assert claims._tree(case_of(certificate=once, **END)) == 2.0
+    assert claims._bound_by_tree(case_of(certificate=once, **END)) == 2.0
     loose = {"terminal": [Box([-9.0], [0.2])], "counts": True}
-    assert claims._tree(case_of(certificate=once, **loose)) == 1.0
+    assert claims._bound_by_tree(case_of(certificate=once, **loose)) == 1.0
     assert activity.largest(case_of()) == 2.0
     weighted = case_of(certificate=once, weights=[3.0], **loose)
-    assert claims._tree(weighted) == 3.0
+    assert claims._bound_by_tree(weighted) == 3.0
     assert activity.largest(weighted) == 6.0
     written = {"lower_bound": 2.0, **tree(*TREE, constraints=ROWS)}
-    assert "acts for less than 2" in claims._lower(case_of(certificate=written, **END))
+    assert "acts for less than 2" in claims._verify_lower_bound(case_of(certificate=written, **END))
     with pytest.raises(Broken):
-        claims._lower(case_of(certificate={**written, "lower_bound": 2.0 + 1e-9}, **END))
+        claims._verify_lower_bound(case_of(certificate={**written, "lower_bound": 2.0 + 1e-9}, **END))
 
 
 @pytest.mark.parametrize(
@@ -283,17 +285,19 @@ def test_the_leaves_of_a_tree_prove_how_long_a_control_acts():
 )
 def test_a_tree_that_leaves_something_out_proves_nothing(nodes):
     with pytest.raises(Broken):
-        claims._tree(case_of(certificate=tree(*nodes, constraints=ROWS), terminal=[Box([-9.0], [0.2])], counts=True))
+        claims._bound_by_tree(
+            case_of(certificate=tree(*nodes, constraints=ROWS), terminal=[Box([-9.0], [0.2])], counts=True)
+        )
 
 
 def test_letters_are_divided_between_neighbours_only():
     end = {"terminal": [Box([-9.0], [0.2])], "counts": True, "letters": (-1.0, 0.0, 0.5), "decision": ((-1.0, 0.0),)}
     nodes = (split(0, 1, 2, at=[-1.0, 0.0]), leaf((0, 1.0)), leaf((0, 1.0)))
-    assert claims._tree(case_of(certificate=tree(*nodes, constraints=ROWS), **end)) == 1.0
+    assert claims._bound_by_tree(case_of(certificate=tree(*nodes, constraints=ROWS), **end)) == 1.0
     for at in ([-1.0, 0.5], [0.0, -1.0], [0.0, 0.25], [0.0], None, [0.0, 0.0]):
         with pytest.raises(Broken):
             bad = (split(0, 1, 2, at=at), leaf(), leaf())
-            claims._tree(case_of(certificate=tree(*bad, constraints=ROWS), **end))
+            claims._bound_by_tree(case_of(certificate=tree(*bad, constraints=ROWS), **end))
     # the half from 0 up cannot come down: infeasible for the one piece if the other is from 0 up as well
     up = (
         split(0, 1, 2, at=[-1.0, 0.0]),
@@ -302,15 +306,15 @@ def test_letters_are_divided_between_neighbours_only():
         leaf((0, 1.0)),
         leaf((0, 1.0), feasible=False),
     )
-    assert claims._tree(case_of(certificate=tree(*up, constraints=ROWS), **end)) == 1.0
+    assert claims._bound_by_tree(case_of(certificate=tree(*up, constraints=ROWS), **end)) == 1.0
     with pytest.raises(Broken):
         case = case_of(certificate={"cost": 1.0, "J": 1.0}, **{**end, "decision": ((-0.75, 0.0),)})
-        claims._counted(case)
+        claims._verify_active_time(case)
     counted = case_of(certificate={"cost": 1.0, "J": 1.0}, **end)
-    assert claims._counted(counted).startswith("it acts for 1 of 2, J = 1")
+    assert claims._verify_active_time(counted).startswith("it acts for 1 of 2, J = 1")
     for wrong in ({"cost": 2.0, "J": 1.0}, {"cost": 1.0, "J": 1.1}):
         with pytest.raises(Broken):
-            claims._counted(case_of(certificate=wrong, **end))
+            claims._verify_active_time(case_of(certificate=wrong, **end))
 
 
 def test_the_share_of_time_that_a_control_acts_is_that_of_what_is_not_dust():
@@ -346,7 +350,7 @@ def test_how_little_a_control_may_act_is_between_what_multipliers_prove_and_what
     def fewest(status="verified", own_decision=((-0.75, 0.0),), **said):
         data = {"lower": 0.5, "upper": 0.5, "multipliers": own, **said}
         more = {"fewest_active": data, "status": status, "multipliers": own}
-        return claims._fewest(case_of(decision=own_decision, certificate=more, **end), status)
+        return claims._verify_fewest_active(case_of(decision=own_decision, certificate=more, **end), status)
 
     assert "at least 50.0% of the time, this one 50.0%" in fewest()
     assert "at least 25.0%" in fewest(lower=0.25)
@@ -376,7 +380,7 @@ def test_how_little_a_control_may_act_is_between_what_multipliers_prove_and_what
         with pytest.raises(Broken):
             fewest(own_decision=((-0.5, -0.25),), **{**idle, "decision": wrong})
     with pytest.raises(Broken, match="expected lower"):
-        claims._fewest(case_of(certificate={"fewest_active": 3}, **end), "verified")
+        claims._verify_fewest_active(case_of(certificate={"fewest_active": 3}, **end), "verified")
 
 
 def test_every_claim_of_a_certificate_has_a_verdict():
@@ -408,14 +412,14 @@ def test_every_claim_of_a_certificate_has_a_verdict():
 
 def test_a_figure_agrees_to_a_share_of_its_own_size_whatever_its_sign():
     for sign in (1.0, -1.0):
-        claims._agrees("cost", sign * 1000.0 * (1.0 + 0.9 * FIGURES), arb(sign * 1000.0), 1.0)
-        claims._agrees("cost", sign * 1000.0 * (1.0 - 0.9 * FIGURES), arb(sign * 1000.0), 1.0)
-        claims._agrees("cost", 1.9 * FIGURES * sign, arb(0.0), 2.0)
+        claims._require_agreement("cost", sign * 1000.0 * (1.0 + 0.9 * FIGURES), arb(sign * 1000.0), 1.0)
+        claims._require_agreement("cost", sign * 1000.0 * (1.0 - 0.9 * FIGURES), arb(sign * 1000.0), 1.0)
+        claims._require_agreement("cost", 1.9 * FIGURES * sign, arb(0.0), 2.0)
         for wrong, size in (
             (1000.0 * (1.0 + 1.1 * FIGURES), 1000.0),
             (1000.0 * (1.0 - 1.1 * FIGURES), 1000.0),
         ):
             with pytest.raises(Broken, match="is written"):
-                claims._agrees("cost", sign * wrong, arb(sign * size), 1.0)
+                claims._require_agreement("cost", sign * wrong, arb(sign * size), 1.0)
         with pytest.raises(Broken, match="cost"):
-            claims._agrees("cost", 2.1 * FIGURES * sign, arb(0.0), 2.0)
+            claims._require_agreement("cost", 2.1 * FIGURES * sign, arb(0.0), 2.0)

@@ -54,8 +54,8 @@ def test_a_state_that_a_known_push_moves_does_not_rest() -> None:
     case = case_of("one that pushes", 1.0, status="certified", decision=[[0.0] * 4])
     with ctx.workprec(96):
         ((off, _),) = constraints.missed(case)
-        assert off.contains(0) and not constraints._rests(case, 0)
-        assert constraints._rests(case_of("beside one that varies", decision=[[0.0] * 4]), 1)
+        assert off.contains(0) and not constraints._is_at_rest(case, 0)
+        assert constraints._is_at_rest(case_of("beside one that varies", decision=[[0.0] * 4]), 1)
 
 
 @pytest.mark.parametrize("push", [0.0, 1.0])

@@ -161,8 +161,8 @@ def test_controls_and_steps_are_as_large_as_the_worst_deviation_makes_them(name:
     before = np.zeros_like(U[:1])
     before[0, 0, 0] = 0.2
     for steps, judged, tell in (
-        (U, claims._control, "control"),
-        (np.diff(np.concatenate([before, U]), axis=0), claims._steps, STEP),
+        (U, claims._verify_control, "control"),
+        (np.diff(np.concatenate([before, U]), axis=0), claims._verify_steps, STEP),
     ):
         ends = [float(loop.height(s * steps[:, 0]).max()) for s in (-1.0, 1.0)]
         unit = min(abs(ends[0]), abs(ends[1]), sum(ends))
@@ -290,7 +290,7 @@ def test_what_is_written_of_a_policy_is_what_the_problem_asks_for() -> None:
     rows = [[[0, 0]], [[0, 1]], [[0, 0], [2, 2]]]
 
     def judged(answers: Any, cost: Any = "peak", own: str = "peak") -> str:
-        return claims._policy(case_of("outputs", own, {"policy": {"answers": answers, "cost": cost}}))
+        return claims._verify_policy(case_of("outputs", own, {"policy": {"answers": answers, "cost": cost}}))
 
     every = [[[0, k]] for k in range(3)]
     assert judged(every)

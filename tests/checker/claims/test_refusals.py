@@ -96,7 +96,7 @@ REFUSED: dict[str, tuple[Callable[[], object], type[Exception], str]] = {
         r"pieces: shape \(1, 1\), expected \(1, 2\)",
     ),
     "no tree of all pieces": (
-        lambda: claims._tree(moved(case_of(certificate={"tree": {"nodes": []}}), control=FEWER)),
+        lambda: claims._bound_by_tree(moved(case_of(certificate={"tree": {"nodes": []}}), control=FEWER)),
         Unchecked,
         "fewer functions than pieces",
     ),
@@ -107,20 +107,24 @@ REFUSED: dict[str, tuple[Callable[[], object], type[Exception], str]] = {
         "in indicators",
     ),
     "a causal claim that is none": (
-        lambda: claims._causal(moved(causal()[0], certificate={"causal": [1.0]})),
+        lambda: claims._verify_causal_bound(moved(causal()[0], certificate={"causal": [1.0]})),
         Broken,
         "expected lower_bound, signals and multipliers",
     ),
     "a disturbance that jumps within a piece": (
-        lambda: replay._admissible(
+        lambda: replay._read_disturbance(
             moved(case_of(), control=FINE, disturbance=sr.Dictionary.indicators([0.0, 1.0, 2.0])), [[0.1, 0.2, 0.2]]
         ),
         Broken,
         "jumps at t = 0.5, within a piece",
     ),
-    "a disturbance on another grid": (lambda: replay._admissible(case_of(), [[0.1]]), Unchecked, "on another grid"),
+    "a disturbance on another grid": (
+        lambda: replay._read_disturbance(case_of(), [[0.1]]),
+        Unchecked,
+        "on another grid",
+    ),
     "a deviation of another size": (
-        lambda: replay._begun(case_of(initial_set=Box([-0.1], [0.1])), [0.0, 0.0]),
+        lambda: replay._read_initial_deviation(case_of(initial_set=Box([-0.1], [0.1])), [0.0, 0.0]),
         Broken,
         r"deviation: shape \(2,\), expected \(1,\)",
     ),

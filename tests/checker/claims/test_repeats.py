@@ -51,28 +51,28 @@ def begun(width: float) -> dict[str, Any]:
 
 
 def test_what_holds_in_one_period_holds_for_ever() -> None:
-    assert "every period" in claims._repeats(case_of(), HOLDS)
-    assert "every period" in claims._repeats(case_of(**begun(0.25)), HOLDS)
+    assert "every period" in claims._verify_repeat(case_of(), HOLDS)
+    assert "every period" in claims._verify_repeat(case_of(**begun(0.25)), HOLDS)
     for name in (*ASIDE, "cost", "lower bound"):
-        assert claims._repeats(case_of(), {**HOLDS, name: "fails"})
+        assert claims._verify_repeat(case_of(), {**HOLDS, name: "fails"})
     for name in ("path", "control", "return"):
         for verdict, kind in (("fails", Broken), ("not checked", Unchecked)):
             with pytest.raises(kind, match=name):
-                claims._repeats(case_of(), {**HOLDS, name: verdict})
+                claims._verify_repeat(case_of(), {**HOLDS, name: verdict})
 
 
 def test_a_plan_that_does_not_repeat_is_none_for_ever() -> None:
     for said in (None, 1, "true", False):
         with pytest.raises(Broken):
-            claims._repeats(case_of({"repeat": said}), HOLDS)
+            claims._verify_repeat(case_of({"repeat": said}), HOLDS)
     with pytest.raises(Broken):
-        claims._repeats(case_of(repeat=False), HOLDS)
+        claims._verify_repeat(case_of(repeat=False), HOLDS)
     with pytest.raises(Broken, match="delay"):
-        claims._repeats(case_of(delay=0.25), HOLDS)
+        claims._verify_repeat(case_of(delay=0.25), HOLDS)
     elsewhere = case_of()
     object.__setattr__(elsewhere.problem, "initial_state", np.array([1.0 + 1e-12]))
     with pytest.raises(Broken, match="does not end there"):
-        claims._repeats(elsewhere, HOLDS)
+        claims._verify_repeat(elsewhere, HOLDS)
 
 
 def test_what_counts_as_no_violation_of_the_return_is_still_an_initial_state() -> None:
@@ -80,16 +80,16 @@ def test_what_counts_as_no_violation_of_the_return_is_still_an_initial_state() -
     (window,) = case.returned
     assert (window.start, window.stop) == (2.0, 2.0)
     assert 0.25 * (1.0 - 1e-6) < float(window.shape.upper[0]) < 0.25
-    claims._strictly(case, window)
+    claims._require_strict_return(case, window)
     for width in (0.25, 0.25 * (1.0 + 1e-9), 0.5):
         with pytest.raises(Unchecked, match="too thin"):
-            claims._strictly(case, replace(window, shape=Box([-width], [width])))
+            claims._require_strict_return(case, replace(window, shape=Box([-width], [width])))
     with pytest.raises(Unchecked, match="not told apart"):
-        claims._strictly(case, replace(window, shape=Box([-np.inf], [0.2])))
+        claims._require_strict_return(case, replace(window, shape=Box([-np.inf], [0.2])))
     # beside numbers that are much larger what counts as none is more than the set
     with pytest.raises(Unchecked, match="too thin"):
         thin = case_of(**{**begun(1e-7), "initial_state": [1e9], "control": Box([-1e9], [1e9])})
-        claims._strictly(thin, *thin.returned)
+        claims._require_strict_return(thin, *thin.returned)
 
 
 def test_the_next_periods_deviation_is_one_of_the_initial_states() -> None:

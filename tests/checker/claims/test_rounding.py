@@ -13,7 +13,7 @@ from flint import arb, ctx
 
 from sparserob_core.checker.arithmetic.monomials import Monomials
 from sparserob_core.checker.claims import activity, cells, window
-from sparserob_core.checker.claims.window import _plus
+from sparserob_core.checker.claims.window import _add_terms
 from sparserob_core.checker.reach.kernels import BoundedInputHere
 from sparserob_core.checker.reach.tube import Polynomial
 from tests.support.worst_cases import kind, walls
@@ -59,7 +59,7 @@ def test_a_sum_of_polynomials_is_off_by_no_more_than_it_says() -> None:
         own = rng.normal(size=rng.integers(1, 4))
         more = rng.normal(size=rng.integers(1, 4)) * 2.0 ** rng.integers(-60, 4)
         error, lost = rng.choice([0.0, 1.0, 1e-3]), rng.choice([0.0, 2.0**-54, 2.0**-70])
-        found = _plus(polynomial(own, error), more[:, None], lost)
+        found = _add_terms(polynomial(own, error), more[:, None], lost)
         assert found.coefficients.shape == (max(own.size, more.size), 1)
         missed = Fraction(0)
         for i, value in enumerate(exact(found.coefficients)):
@@ -137,19 +137,19 @@ def test_what_is_taken_off_a_bound_rounds_upwards(monkeypatch: pytest.MonkeyPatc
     rng = np.random.default_rng(6)
     for level, allowed in ((2.0**-54, 1.0), (-(2.0**-54), 1.0), *rng.uniform(0.0, 1.0, size=(20, 2))):
         for error in (0.0, 1.0):
-            cells._tops(tube, [(polynomial([level], error), max(level, allowed))])
+            cells._bound_polynomials(tube, [(polynomial([level], error), max(level, allowed))])
             value, off = given[-1]
             assert value + off >= Fraction(float(level)) - Fraction(float(max(level, allowed))) + Fraction(error)
             assert off <= error * (1.0 + 1e-11) + 1e-15
 
 
 def test_a_bound_of_a_time_rounds_down(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(activity, "_vectors", lambda case: np.array([0.25, 0.75]))
-    monkeypatch.setattr(activity, "_lengths", lambda case: [])
+    monkeypatch.setattr(activity, "_sum_counts", lambda case: np.array([0.25, 0.75]))
+    monkeypatch.setattr(activity, "_enclose_lengths", lambda case: [])
     low = arb(1) + arb(2) ** -52 - arb(2) ** -80
     duality = SimpleNamespace(summed=lambda rows, pieces: (low, []), charged=lambda rows, costs: costs)
     case: Any = SimpleNamespace(duality=duality, problem=SimpleNamespace(system=SimpleNamespace(controls=1)))
-    for found in (activity._whole(case, low), activity._leaf(case, True, {}, [])):
+    for found in (activity._bound_active_share(case, low), activity._bound_leaf(case, True, {}, [])):
         assert arb(found) <= low
         assert found > 1.0 - 1e-12
 
@@ -164,7 +164,7 @@ def test_a_chord_of_what_errors_of_execution_add_is_as_near_to_both_ends_as_it_s
         high = low + rng.choice([0.0, 1e-16, 1.0], size=2) * rng.uniform(size=2)
         start, stop = sorted((rng.choice(np.arange(513, 767), size=2, replace=False) / 1024.0).tolist())
         told = Told(low, high, start)
-        found = beside._erring(
+        found = beside._add_bounded_input(
             polynomial(np.zeros(1), 0.0), told, np.array([1.0, 0.0]), np.zeros(2), [start, stop], None
         )
         (level, slope), off = found.coefficients[:, 0], found.error

@@ -66,7 +66,7 @@ def test_a_part_counts_what_no_control_in_it_goes_below(name: str) -> None:
         for number in range(8):
             counts, slope = rng.uniform(0.2, 2.0, 2), rng.normal(size=2) * rng.choice([0.3, 3.0])
             sizes = rng.uniform(0.1, 1.0, 2) * (number % 2)
-            bound = activity._least_of_part(case, parts, numbers(counts), numbers(slope), numbers(sizes))
+            bound = activity._bound_piece_in_part(case, parts, numbers(counts), numbers(slope), numbers(sizes))
             if not allowed.any():
                 assert bound == arb("inf")
                 continue
@@ -87,16 +87,16 @@ def test_a_part_counts_what_no_control_in_it_goes_below(name: str) -> None:
 def test_letters_are_all_that_a_part_of_an_alphabet_offers() -> None:
     case = replace(case_of(Box([-2.0], [2.0])), letters=(-2.0, -0.5, 0.0, 1.0, 2.0))
     for part, letters in (((-2.0, -0.5, False), [-2.0, -0.5]), ((0.0, 1.0, False), [0.0, 1.0]), (ANY, case.letters)):
-        assert activity._values(case, part, -2.0, 2.0) == list(letters or ())
+        assert activity._list_candidate_values(case, part, -2.0, 2.0) == list(letters or ())
         for slope in (-0.7, 0.1, 3.0):
-            found = activity._least_of_part(case, [part], numbers([1.0]), numbers([slope]), numbers([0.25]))
+            found = activity._bound_piece_in_part(case, [part], numbers([1.0]), numbers([slope]), numbers([0.25]))
             assert float(found.mid()) == min((v != 0.0) + slope * v + 0.25 * abs(v) for v in letters or ())
     node = {"channel": 0, "piece": 1, "at": [-0.5, 0.0]}
-    low, high = activity._divided(case, node, {(0, 1): (-2.0, 1.0, False)})
+    low, high = activity._divide_part(case, node, {(0, 1): (-2.0, 1.0, False)})
     assert low == {(0, 1): (-2.0, -0.5, False)} and high == {(0, 1): (0.0, 1.0, False)}
     for at in ([-0.5, 1.0], [0.0, 0.0], [1.0, 0.0], [0.0, 0.5], [0.0], None):
         with pytest.raises(Broken, match="tree"):
-            activity._divided(case, {**node, "at": at}, {})
+            activity._divide_part(case, {**node, "at": at}, {})
 
 
 def written(nodes: list[Any], **more: Any) -> dict[str, Any]:
@@ -113,22 +113,22 @@ def test_a_tree_proves_that_both_pieces_act_where_one_alone_does_not_bring_the_s
     """From 1 to -0.5 by controls of 1: piece 0 alone is too little, and so is piece 1."""
     down = {"terminal": [Box([-9.0], [-0.5])]}
     tree = written([SPLIT, NOT_ONE, BOTH], lower_bound=2.0)
-    assert claims._tree(case_of(Box([-1.0], [1.0]), tree, **down)) == 2.0
-    assert "acts for less than 2" in claims._lower(case_of(Box([-1.0], [1.0]), tree, **down))
+    assert claims._bound_by_tree(case_of(Box([-1.0], [1.0]), tree, **down)) == 2.0
+    assert "acts for less than 2" in claims._verify_lower_bound(case_of(Box([-1.0], [1.0]), tree, **down))
     with pytest.raises(Broken, match="the leaves prove"):
-        claims._lower(case_of(Box([-1.0], [1.0]), {**tree, "lower_bound": 2.0 + 1e-6}, **down))
+        claims._verify_lower_bound(case_of(Box([-1.0], [1.0]), {**tree, "lower_bound": 2.0 + 1e-6}, **down))
     # where 0.8 is enough, the leaf that says that nothing is feasible without piece 0 is wrong
     with pytest.raises(Broken, match="multipliers of a part prove"):
-        claims._tree(case_of(Box([-1.0], [1.0]), tree))
+        claims._bound_by_tree(case_of(Box([-1.0], [1.0]), tree))
     plain = {**NOT_ONE, "feasible": True}
-    assert claims._tree(case_of(Box([-1.0], [1.0]), written([SPLIT, plain, BOTH]))) == 1.0
+    assert claims._bound_by_tree(case_of(Box([-1.0], [1.0]), written([SPLIT, plain, BOTH]))) == 1.0
     # more than two pieces can bring: every part is empty
     none = written([SPLIT, NOT_ONE, NOT_ONE])
-    assert "excluded" in claims._infeasible(case_of(Box([-1.0], [1.0]), none, terminal=[Box([-9.0], [-1.1])]))
+    assert "excluded" in claims._verify_infeasibility(case_of(Box([-1.0], [1.0]), none, terminal=[Box([-9.0], [-1.1])]))
     with pytest.raises(Broken):
-        claims._infeasible(case_of(Box([-1.0], [1.0]), none, **down))
+        claims._verify_infeasibility(case_of(Box([-1.0], [1.0]), none, **down))
     with pytest.raises(Broken, match="leave some control"):
-        claims._infeasible(case_of(Box([-1.0], [1.0]), tree, **down))
+        claims._verify_infeasibility(case_of(Box([-1.0], [1.0]), tree, **down))
 
 
 @pytest.mark.parametrize(
@@ -158,21 +158,21 @@ def test_a_tree_proves_that_both_pieces_act_where_one_alone_does_not_bring_the_s
 )
 def test_what_is_no_tree_of_parts_proves_nothing(nodes: list[Any]) -> None:
     with pytest.raises(Broken):
-        claims._tree(case_of(Box([-1.0], [1.0]), written(nodes), terminal=[Box([-9.0], [-0.5])]))
+        claims._bound_by_tree(case_of(Box([-1.0], [1.0]), written(nodes), terminal=[Box([-9.0], [-0.5])]))
 
 
 def test_a_tree_is_asked_for_where_time_counts_and_letters_are_kept_to() -> None:
     with pytest.raises(Unchecked, match="no tree"):
-        claims._lower(case_of(Box([-1.0], [1.0]), {"lower_bound": 1.0}))
+        claims._verify_lower_bound(case_of(Box([-1.0], [1.0]), {"lower_bound": 1.0}))
     said = {"decision": [[-1.0, 0.0]], "cost": 1.0, "J": 1.0}
     case = case_of(Box([-1.0], [1.0]), said)
-    assert claims._cost(case).startswith("it acts for 1 of 2, J = 1")
-    assert claims._cost(replace(case, letters=(-1.0, 0.0)))
+    assert claims._verify_cost(case).startswith("it acts for 1 of 2, J = 1")
+    assert claims._verify_cost(replace(case, letters=(-1.0, 0.0)))
     with pytest.raises(Broken, match="other values"):
-        claims._cost(replace(case, letters=(-0.5, 0.0)))
+        claims._verify_cost(replace(case, letters=(-0.5, 0.0)))
     for wrong in ({"cost": 2.0}, {"cost": 1.0 + 1e-6}, {"J": 0.9}):
         with pytest.raises(Broken):
-            claims._cost(replace(case, certificate={**said, **wrong}))
+            claims._verify_cost(replace(case, certificate={**said, **wrong}))
 
 
 def test_what_counts_alike_is_rounded_up_to_whole_pieces_and_what_does_not_is_a_share() -> None:
@@ -180,11 +180,11 @@ def test_what_counts_alike_is_rounded_up_to_whole_pieces_and_what_does_not_is_a_
     case = case_of(SETS["box"])
     one = activity.largest(case) / 4.0
     for count, pieces in ((-1.0, 0), (0.3, 1), (1.0 + 1e-3, 2), (2.0, 2), (2.0 - 1e-9, 2), (3.9, 4), (4.7, 4)):
-        assert activity._whole(case, arb(count * one)) == pieces / 4.0
+        assert activity._bound_active_share(case, arb(count * one)) == pieces / 4.0
     apart = case_of(SETS["box"], weights=[1.0, 3.0])
     most = activity.largest(apart)
     for share in (-0.5, 0.0, 0.3, 0.9):
-        found = activity._whole(apart, arb(share * most))
+        found = activity._bound_active_share(apart, arb(share * most))
         assert max(0.0, share) - 1e-12 <= found <= max(0.0, share)
 
 
@@ -194,7 +194,9 @@ def test_the_share_of_time_that_a_control_acts_is_what_the_leaves_prove_and_no_m
     def fewest(status: str = "verified", last: float = -0.75, **said: Any) -> str:
         told = {"lower": 1.0, "upper": 1.0, **said}
         more = {"fewest_active": told, "decision": [[-0.75, last]], "status": status, "multipliers": None}
-        return claims._fewest(case_of(Box([-1.0], [1.0]), written([SPLIT, NOT_ONE, BOTH], **more), **down), status)
+        return claims._verify_fewest_active(
+            case_of(Box([-1.0], [1.0]), written([SPLIT, NOT_ONE, BOTH], **more), **down), status
+        )
 
     assert fewest() == "every admissible control acts at least 100.0% of the time"
     assert "at least 50.0%" in fewest(lower=0.5)

@@ -73,7 +73,7 @@ def test_a_row_along_its_adjoint_is_the_one_that_exponentials_give(name: str, mo
     for time in (0.0, 0.25, 0.7, 1.25, 1.3, 2.0):
         for one in cases:
             row, limit = DIRECTIONS[2], arb(0.375)
-            found = multipliers._along_adjoint(one, row, time, limit)
+            found = multipliers._derive_adjoint_row(one, row, time, limit)
             exact = one.duality.row(row, time, [], limit)
             strayed = one.sources.strayed
             constant = exact.constant if strayed is None else exact.constant + arb(strayed.added(row, time)[1])
@@ -192,7 +192,7 @@ def test_an_integral_that_begins_later_is_the_one_of_pieces_where_rows_are_follo
         monkeypatch.setattr(followed_rows, "FOLLOWED", followed)
         assert case.followed.are_best == (followed == 1)
         numbers = [x for state in (None, begun) for x in replay.exceeded(case, said, state)[0]]
-        derive = multipliers._along_adjoint if followed == 1 else _by_duality
+        derive = multipliers._derive_adjoint_row if followed == 1 else _by_duality
         row = derive(case, c, window.start, arb(0.25))
         found.append(numbers + [float(x.mid()) for part in ([row.constant], *row.slope) for x in part])
     assert found[1] == pytest.approx(found[0], abs=1e-12)
@@ -382,7 +382,7 @@ def test_what_errors_of_execution_add_beside_a_row_is_near_its_chord() -> None:
     assert beside is not None and case.sources.execution is not None
     for a, b in ((0.125, 0.1875), (0.25, 0.5), (0.75, 1.0), (1.5, 2.0), (1.25, 1.25)):
         none, times = Polynomial(np.zeros((1, 1)), 0.0, 0.0, 0.0), [a] if a == b else [a, b]
-        found = beside._erring(none, case.sources.execution, c, np.zeros(2), times, None)
+        found = beside._add_bounded_input(none, case.sources.execution, c, np.zeros(2), times, None)
         terms, off = found.coefficients[:, 0], found.error
         truth = []
         for share in (0.0, 0.25, 0.5, 0.75, 1.0):

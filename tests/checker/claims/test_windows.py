@@ -22,10 +22,10 @@ from sparserob_core.checker.arithmetic.monomials import Monomials
 from sparserob_core.checker.arithmetic.series import stacked
 from sparserob_core.checker.claims import claims, constraints, multipliers, replay
 from sparserob_core.checker.claims.case import Case, numbers
-from sparserob_core.checker.claims.causal import _shared, causal_bound
-from sparserob_core.checker.claims.cells import Place, _cut
+from sparserob_core.checker.claims.causal import _share_peak_price, causal_bound
+from sparserob_core.checker.claims.cells import Place, _bound_by_halfspaces
 from sparserob_core.checker.claims.units import units_of
-from sparserob_core.checker.cost.price import _semidefinite
+from sparserob_core.checker.cost.price import _is_semidefinite
 from sparserob_core.checker.outcome import RESOLVED, Broken, Clock, Finding, Unchecked
 from sparserob_core.checker.reach import followed as followed_rows
 from sparserob_core.checker.reach.tube import Polynomial
@@ -300,7 +300,7 @@ def test_a_bound_with_the_set_of_parameters_is_above_every_parameter_in_it(seed)
     place = Place(SimpleNamespace(flow=flow), parameters, box, Clock(9.0))
     for limit in (0.0, 0.7):
         row = Bounded(np.ones(1), limit, 1.0)
-        found = _cut(place, row, poly)
+        found = _bound_by_halfspaces(place, row, poly)
         assert truth - row.allowed - 1e-9 <= found <= truth - row.allowed + 0.02
 
 
@@ -330,7 +330,7 @@ def test_a_witness_leads_to_what_it_says():
         "constraint": "path", "time": 1.0, "direction": [1.0], "parameter": [], "disturbance": [[0.25, 0.0]],
         "violation": 0.25,
     }  # fmt: skip
-    assert "exceeded by 0.25 at t = 1" in claims._witness(case_of(wall, certificate={"witness": data}))
+    assert "exceeded by 0.25 at t = 1" in claims._verify_witness(case_of(wall, certificate={"witness": data}))
     assert float(replay.reached(case_of(wall), 2.0, np.zeros(0), [[0.25, -0.1]])[0].mid()) == pytest.approx(1.15)
     assert float(replay.reached(case_of(wall), 0.5, np.zeros(0), [[0.2, -0.1]])[0].mid()) == pytest.approx(1.35)
     for wrong in (
@@ -348,19 +348,19 @@ def test_a_witness_leads_to_what_it_says():
         {"constraint": "nobody"},
     ):
         with pytest.raises((Broken, Unchecked)):
-            claims._witness(case_of(wall, certificate={"witness": {**data, **wrong}}))
+            claims._verify_witness(case_of(wall, certificate={"witness": {**data, **wrong}}))
     little = {**data, "disturbance": [[1e-8, 0.0]], "violation": 1e-8}
-    assert claims._witness(case_of(wall, certificate={"witness": little}))
+    assert claims._verify_witness(case_of(wall, certificate={"witness": little}))
     with pytest.raises(Unchecked):
-        claims._witness(case_of(wall))
+        claims._verify_witness(case_of(wall))
     begun = case_of(
         wall, certificate={"witness": {**data, "deviation": [0.1], "violation": 0.35}}, initial_set=Box([-0.1], [0.1])
     )
-    assert claims._witness(begun)
+    assert claims._verify_witness(begun)
     for wrong in ([0.1 + 1e-15], [0.0, 0.0], None):
         with pytest.raises(Broken):
             said = {"witness": {**data, "deviation": wrong, "violation": 0.35}}
-            claims._witness(case_of(wall, certificate=said, initial_set=Box([-0.1], [0.1])))
+            claims._verify_witness(case_of(wall, certificate=said, initial_set=Box([-0.1], [0.1])))
 
 
 def test_how_much_a_row_is_exceeded_is_told_at_its_time():
@@ -389,7 +389,7 @@ def test_a_status_follows_from_the_claims_under_it():
 
     def status(said, tolerance=1e-6, lower=1.0 - 1e-7, gap_tolerance: Any = 1e-6, found=every):
         written = {"cost": 1.0, "lower_bound": lower, "gap_tolerance": gap_tolerance}
-        return claims._status(case_of(certificate=written), said, tolerance, found)
+        return claims._verify_status(case_of(certificate=written), said, tolerance, found)
 
     assert "bounds meet" in status("certified")
     assert "gap" in status("verified", lower=0.0)
@@ -429,7 +429,7 @@ def test_infeasibility_needs_a_sum_that_is_positive(followed, monkeypatch):
     def judged(goal, **more):
         said = {"multipliers": {"constraints": [entry], "equalities": [], "pieces": None}, "status": "infeasible"}
         said["decision"] = None
-        return claims._infeasible(case_of(certificate={**said, **more}, terminal=[Box([-9.0], [goal])]))
+        return claims._verify_infeasibility(case_of(certificate={**said, **more}, terminal=[Box([-9.0], [goal])]))
 
     assert "at least 0.1" in judged(-0.6)
     for goal in (-0.5, -0.4):
@@ -498,13 +498,13 @@ def test_a_bound_against_every_causal_policy_is_by_hand():
     with pytest.raises(Unchecked):
         causal_bound(replace(case, policy=None), case.certificate["causal"], priced=True)
     case, _ = causal("peak", lower=0.79)
-    assert "0.79" in claims._causal(case)
+    assert "0.79" in claims._verify_causal_bound(case)
     for lower, cost in ((0.8 + 1e-9, "peak"), (None, "peak"), (1.0, "nominal")):
         with pytest.raises(Broken):
-            claims._causal(causal(cost, lower=lower)[0])
+            claims._verify_causal_bound(causal(cost, lower=lower)[0])
     hopeless = causal("peak", rows=((0, 1.0),), priced=False)[0]
     weak = replace(hopeless, problem=replace(hopeless.problem, control=Box([-0.3], [0.3])))
-    assert "no causal policy exists" in claims._causal(weak)
+    assert "no causal policy exists" in claims._verify_causal_bound(weak)
 
 
 def test_a_bound_behind_a_noise_is_by_hand():
@@ -605,7 +605,7 @@ def test_a_matrix_is_positive_semidefinite_in_rational_numbers():
         ([[4.0, 2.0, 0.0], [2.0, 1.0, 0.0], [0.0, 0.0, 0.0]], True),
         ([[4.0, 2.0, 1.0], [2.0, 1.0, 0.0], [1.0, 0.0, 9.0]], False),
     ):
-        assert _semidefinite(Quadratic(np.array(Q), np.zeros(len(Q)))) is well
+        assert _is_semidefinite(Quadratic(np.array(Q), np.zeros(len(Q)))) is well
 
 
 def test_the_unit_of_a_row_is_the_smallest_of_its_width_its_limit_and_how_far_it_can_reach():
@@ -683,7 +683,7 @@ def test_a_vector_that_is_offered_for_a_norm_closes_the_bound_in_a_corner_and_ne
         told, beside = ([arb(float(v)) for v in part] for part in (slope, sizes))
         given = ([arb(weight)] * 2, beside, told, [[0, 1]], [arb(0.3), arb(0.1)])
         bounds = [
-            float(case.duality._least_of_groups(*given, None if one is None else [arb(float(v)) for v in one]).mid())
+            float(case.duality._bound_least_cost(*given, None if one is None else [arb(float(v)) for v in one]).mid())
             for one in (
                 None,
                 weight * best / np.linalg.norm(best) + sizes * np.sign(best),
@@ -723,7 +723,7 @@ def test_the_price_of_a_peak_is_parted_and_no_more_of_it_is():
         case = case_of(control=Box([-1.0], [0.5]))
         groups = {bytes([g]): [arb(float(v))] for g, v in enumerate(rng.normal(size=rng.integers(1, 5)))}
         price = float(rng.uniform(0.1, 2.0))
-        parts = [row[0] for row in _shared(case, [arb(price)], groups).values()]
+        parts = [row[0] for row in _share_peak_price(case, [arb(price)], groups).values()]
         assert all(part >= 0 for part in parts)
         assert sum(parts, arb(0)) <= arb(price)
         assert float(sum(parts, arb(0)).mid()) >= price * (1.0 - 1e-9)

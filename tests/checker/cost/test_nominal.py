@@ -223,7 +223,7 @@ def test_a_plant_that_grows_is_resolved_by_more_bits_and_by_a_sharper_guess() ->
             pieces = [stacked([balls([-a])])] * 2
             if resolved:
                 assert abs(price.squares(pieces) - 2) < 1e-4
-                assert price._quadratic(pieces).blurred <= 1e-20
+                assert price._evaluate_quadratic(pieces).blurred <= 1e-20
             else:
                 with pytest.raises(Unchecked, match="resolved"):
                     price.squares(pieces)

@@ -118,8 +118,8 @@ def test_the_parameter_that_matters_most_is_halved() -> None:
         [["-p*(1 + sin(t)) - 0.001*q"]], [[1]], 2.0, [[1]], parameters=sr.Box([0.0, 0.0], [1.0, 9.0]), names=["p", "q"]
     )
     every = VerifiedFlows(Plant.of(system, 2.0), 2.0, ParameterBox.between([0.0, 0.0], [1.0, 9.0]))
-    assert every._axis(every.box) == 0
-    assert every._axis(ParameterBox((0.5, 4.5), (1e-6, 4.5))) == 1
+    assert every._choose_axis(every.box) == 0
+    assert every._choose_axis(ParameterBox((0.5, 4.5), (1e-6, 4.5))) == 1
 
 
 def test_no_more_flows_are_remembered_than_are_kept(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -246,7 +246,7 @@ def test_a_box_holds_another_exactly() -> None:
 def test_units_of_slow_parts_make_them_small_enough_or_there_are_none() -> None:
     for _ in range(100):
         M = RNG.uniform(0.0, 1.0, (3, 3)) * 10.0 ** RNG.uniform(-6, 0.5, (3, 3))
-        ratios = laws._slow(M)
+        ratios = laws._find_unit_factors(M)
         if ratios is None:
             assert np.abs(np.linalg.eigvals(M)).max() > 0.4 * LONG
         else:
@@ -255,10 +255,10 @@ def test_units_of_slow_parts_make_them_small_enough_or_there_are_none() -> None:
 
 def test_powers_of_the_time_that_are_left_out_are_in_the_balls_of_the_first() -> None:
     A = [Series.known(arb_mat([[x]])) for x in (arb(1), arb(0.5), arb(2.0**-60), arb(2.0**-105), arb(-(2.0**-106)))]
-    kept = laws._kept(A, np.ones(1))
+    kept = laws._truncate_powers(A, np.ones(1))
     assert len(kept) == 3 and kept[1:] == A[1:3]
     assert 2.0**-105 * 1.5 <= float(kept[0].matrix[0, 0].rad()) <= 2.0**-105 * 1.6
-    assert laws._kept(A[:3], np.ones(1)) == A[:3]
+    assert laws._truncate_powers(A[:3], np.ones(1)) == A[:3]
 
 
 def test_units_are_not_those_of_times_at_which_a_wave_is_0() -> None:

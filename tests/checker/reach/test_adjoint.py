@@ -118,7 +118,7 @@ def test_products_of_many_terms_hold_the_truth_and_round_as_sums_of_sums() -> No
     rng = np.random.default_rng(5)
     for d in (1, 31, 32, 33, 300):
         left, right = rng.normal(size=(3, d)), rng.normal(size=(2, d, 4))
-        found = module._product(Enclosed(left, 0.0 * left), Enclosed(right, 0.0 * right))
+        found = module._multiply_rows(Enclosed(left, 0.0 * left), Enclosed(right, 0.0 * right))
         for j, part in enumerate(right):
             exact = (arb_mat(left.tolist()) * arb_mat(part.tolist())).tolist()
             pairs = zip(found[0][:, j].tolist(), exact, strict=True)
@@ -255,17 +255,20 @@ def radii(kind: str) -> dict[str, np.ndarray]:
         "integrals": sums.rad,
         "rounded": rounded,
         "between": known.between(times, 0.1, 0.2).rad,
-        "drives": row._driven(times)[1],
+        "drives": row._evaluate_inputs(times)[1],
         "most": row.most(times)[1],
         "along": np.array([high - low]),
-        "supported": module._supported(Box([-0.2], [0.5]), Enclosed(np.array([[0.7]]), np.array([[1e-9]])))[1],
+        "supported": module._evaluate_support(Box([-0.2], [0.5]), Enclosed(np.array([[0.7]]), np.array([[1e-9]])))[1],
     }
     if kind == "measurable":
         steps, shares = np.array([3, 9]), np.array([0.25, 0.75])
-        for name, (_, over, less) in (("ends", row._swept._ends), ("parts", row._swept._parts(steps, shares))):
+        for name, (_, over, less) in (
+            ("ends", row._disturbance_integrals._end_integrals),
+            ("parts", row._disturbance_integrals._integrate_steps(steps, shares)),
+        ):
             found |= {f"{name} above": over[1:], f"{name} below": less[1:]}
-        found["swept"] = np.subtract(*row._swept.at(times)[::-1])
-        found["measurable"] = row._measurable(times)[1]
+        found["swept"] = np.subtract(*row._disturbance_integrals.at(times)[::-1])
+        found["measurable"] = row._evaluate_measurable(times)[1]
     return found
 
 
@@ -437,9 +440,9 @@ def test_integrals_are_off_by_what_all_steps_are_and_by_what_their_sum_is_rounde
     known = replace(known, sides=[cast(Side, SimpleNamespace(swept=found, far=np.ones(1)))])
     with monkeypatch.context() as patched, ctx.workprec(128):
         told(patched, COARSE, half, outward)
-        value, more, less = (part[:, 0] for part in known._ends)
+        value, more, less = (part[:, 0] for part in known._end_integrals)
         low, high = (part[:, 0] for part in known.at(np.array([1.75])))
-        _, over, less_here = (part[:, 0] for part in known._parts(np.array([3]), np.array([0.5])))
+        _, over, less_here = (part[:, 0] for part in known._integrate_steps(np.array([3]), np.array([0.5])))
     assert value[-1] == 0.5 and value[-2] == 0.25
     rounded, steps = 4 * module.ORDER * COARSE * 6.0, np.arange(5)
     np.testing.assert_allclose([over[0], less_here[0]], (np.array([0.1, 0.2]) + rounded) * outward * 0.25)
@@ -455,10 +458,10 @@ def test_a_measurable_worst_is_off_by_what_its_integrals_are(monkeypatch: pytest
     stub = SimpleNamespace(integrals=lambda times: (linear, np.array([[9.0, 0.05]])))
     row = replace(worst("measurable"), adjoint=cast(AdjointRow, stub))
     integrals = (np.array([[1.0, 2.0]]), np.array([[1.5, 2.25]]))
-    row.__dict__["_swept"] = SimpleNamespace(at=lambda times: integrals, sides=[None, None])
+    row.__dict__["_disturbance_integrals"] = SimpleNamespace(at=lambda times: integrals, sides=[None, None])
     about = 0.15  # the middle of the set
     with monkeypatch.context() as patched:
         told(patched, COARSE, 0.0, 1.0)
-        (top,), (rad,) = row._measurable(np.array([1.0]))
+        (top,), (rad,) = row._evaluate_measurable(np.array([1.0]))
     assert top == pytest.approx(3.375 + 2.0 * about)
     assert rad == pytest.approx(0.375 + 0.35 * about + 5 * COARSE * (2.0 * about + 3.0 + 3.75), rel=1e-12)

@@ -341,7 +341,7 @@ def test_the_error_of_a_chord_holds_all_that_is_lost_in_rational_numbers(monkeyp
     rng = np.random.default_rng(11)
     ends = {time: Enclosed(rng.normal(size=200), 1e-3 * rng.uniform(size=200)) for time in (0.25, 0.5)}
     missed = 1e-2 * rng.uniform(size=200)
-    monkeypatch.setattr(LoopTube, "_height", lambda self, piece, time, z: ends[time])
+    monkeypatch.setattr(LoopTube, "_enclose_heights", lambda self, piece, time, z: ends[time])
     tube = LoopTube(SimpleNamespace(bent=lambda *given: missed), np.eye(2), np.zeros((2, 0)))
     found = tube.cells(0, 0.25, 0.5, np.zeros((200, 2)))
     for i, poly in enumerate(found):

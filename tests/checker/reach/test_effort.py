@@ -9,7 +9,7 @@ import pytest
 from flint import arb, ctx
 
 from sparserob_core.checker.cost import effort
-from sparserob_core.checker.cost.effort import _slope, at_most
+from sparserob_core.checker.cost.effort import _compute_chord_slope, at_most
 from sparserob_core.checker.outcome import Broken, Clock, Unchecked
 from sparserob_core.checker.sets.known import known
 from sparserob_core.control.sets.sets import Box, NormBall
@@ -54,10 +54,10 @@ def test_the_largest_effort_is_shown_just_above_what_it_is_and_never_below(conve
 
 
 def test_the_slope_of_a_chord_of_an_absolute_value():
-    assert _slope(2.0, 0.5) == _slope(2.0, 0.0) == 1.0
-    assert _slope(-0.5, -2.0) == _slope(0.0, -2.0) == -1.0
-    assert _slope(3.0, -1.0) == pytest.approx((3.0 - 1.0) / 4.0)
-    assert _slope(1.0, -3.0) == pytest.approx(-0.5)
+    assert _compute_chord_slope(2.0, 0.5) == _compute_chord_slope(2.0, 0.0) == 1.0
+    assert _compute_chord_slope(-0.5, -2.0) == _compute_chord_slope(0.0, -2.0) == -1.0
+    assert _compute_chord_slope(3.0, -1.0) == pytest.approx((3.0 - 1.0) / 4.0)
+    assert _compute_chord_slope(1.0, -3.0) == pytest.approx(-0.5)
 
 
 def test_too_many_parts_and_no_time_are_no_verdict(monkeypatch):

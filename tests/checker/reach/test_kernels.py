@@ -9,7 +9,14 @@ import numpy as np
 import pytest
 from flint import arb_mat, ctx
 
-from sparserob_core.checker.reach.measurable import MeasurableLoop, Side, Together, _equal, _valued, swept
+from sparserob_core.checker.reach.measurable import (
+    MeasurableLoop,
+    Side,
+    Together,
+    _evaluate_polynomials,
+    _find_crossings,
+    swept,
+)
 from sparserob_core.checker.sets.polynomials import Enclosed, product
 from sparserob_core.control.problem.system import LinearSystem
 from sparserob_core.control.sets.sets import Box, NormBall, Zonotope
@@ -80,8 +87,8 @@ def test_errors_of_polynomials_are_errors_of_the_integral():
 def test_roots_are_found_between_signs_that_differ_and_the_middle_is_taken_elsewhere():
     P = np.array([[0.0, 1.0, 0.0], [-0.25, 0.0, 1.0], [1.0, 0.0, 1.0], [1e-300, 0.0, 0.0]])
     start, stop = np.array([-0.7, 0.0, -1.0, -1.0]), np.array([1.0, 1.0, 0.5, 0.0])
-    assert _equal(P, start, stop) == pytest.approx([0.0, 0.5, -0.25, -0.5], abs=1e-7)
-    assert _valued(P, np.array([0.5, 0.5, 2.0, 0.0])).tolist() == [0.5, 0.0, 5.0, 1e-300]
+    assert _find_crossings(P, start, stop) == pytest.approx([0.0, 0.5, -0.25, -0.5], abs=1e-7)
+    assert _evaluate_polynomials(P, np.array([0.5, 0.5, 2.0, 0.0])).tolist() == [0.5, 0.0, 5.0, 1e-300]
 
 
 def kernel_of(A, E, length):

@@ -15,7 +15,7 @@ from flint import arb, ctx
 import sparserob_core as sr
 from sparserob_core.checker.arithmetic.bernstein import highest
 from sparserob_core.checker.arithmetic.series import stacked
-from sparserob_core.checker.claims.cells import _to_blame
+from sparserob_core.checker.claims.cells import _is_smaller_box_better
 from sparserob_core.checker.cost.duality import Duality
 from sparserob_core.checker.flow.flow import VerifiedFlow
 from sparserob_core.checker.flow.flows import VerifiedFlows
@@ -277,8 +277,8 @@ def test_what_initial_states_lose_while_they_switch_is_laid_to_what_it_depends_o
             (poly,) = tube.cells(0, 0.0, 0.5, np.array([[1.0, 0.3]]))
         assert poly.kinks > 1e-3
         assert (poly.turning > 0.2 * poly.kinks) if because else poly.turning == 0.0
-        assert _to_blame(poly, 0.0, (0, 0.0, 0.5)) == because
-        assert _to_blame(poly, 0.0, (0, 0.5, 0.5))
+        assert _is_smaller_box_better(poly, 0.0, (0, 0.0, 0.5)) == because
+        assert _is_smaller_box_better(poly, 0.0, (0, 0.5, 0.5))
 
 
 def test_a_clock_looks_at_the_time_while_items_are_taken() -> None:
@@ -295,9 +295,9 @@ def test_a_clock_looks_at_the_time_while_items_are_taken() -> None:
 def test_a_row_that_is_certainly_exceeded_is_looked_for_where_it_changes():
     flat = Polynomial(np.array([[0.0, 0.5], [0.1, 0.0]]), 1e-3, 0.0, 1e-3)
     for top, blamed in ((1e-3, False), (1.0, True)):
-        assert _to_blame(flat, top, (0, 0.0, 1.0)) == blamed
+        assert _is_smaller_box_better(flat, top, (0, 0.0, 1.0)) == blamed
     turned = replace(flat, coefficients=np.array([[0.0, 0.1], [0.5, 0.0]]))
-    assert not _to_blame(turned, 1.0, (0, 0.0, 1.0))
+    assert not _is_smaller_box_better(turned, 1.0, (0, 0.0, 1.0))
 
 
 @pytest.mark.parametrize("factor", [1.0, 2.0**-30, 2.0**40, 3e5])

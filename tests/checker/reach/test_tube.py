@@ -22,7 +22,7 @@ from sparserob_core.checker.flow.law import ParameterBox
 from sparserob_core.checker.flow.plant import Plant
 from sparserob_core.checker.flow.segment import VerifiedSegment
 from sparserob_core.checker.problem.lasting import Lasting
-from sparserob_core.checker.reach.states import Lines, Scene, States, _blocks, enclosed, ring
+from sparserob_core.checker.reach.states import Lines, Scene, States, _list_blocks, enclosed, ring
 from sparserob_core.checker.reach.tube import Polynomial, ProjectedStates, VerifiedTube
 from sparserob_core.checker.sets.polynomials import Enclosed
 from sparserob_core.control.problem.system import VaryingSystem
@@ -250,7 +250,7 @@ def test_beyond_the_degree_all_is_in_the_error_of_a_state_that_cancels() -> None
 
 def test_blocks_of_intervals_are_all_those_before_a_mark() -> None:
     for mark in range(40):
-        found = [k for level, number in _blocks(mark) for k in range(number << level, (number + 1) << level)]
+        found = [k for level, number in _list_blocks(mark) for k in range(number << level, (number + 1) << level)]
         assert found == list(range(mark))
 
 

@@ -10,7 +10,7 @@ from flint import arb, ctx
 
 from sparserob_core.checker.arithmetic.balls import balls
 from sparserob_core.checker.outcome import Unchecked
-from sparserob_core.checker.sets.along import LEFT, NODES, CurvedSide, _heights, _most, rule
+from sparserob_core.checker.sets.along import LEFT, NODES, CurvedSide, _bound_support, _evaluate_support, rule
 from sparserob_core.checker.sets.known import known, middle
 from sparserob_core.checker.sets.shape import Shape
 from sparserob_core.control.sets.sets import Box, ConvexSet, Cylinder, Ellipsoid, NormBall, Polytope, Zonotope, product
@@ -41,7 +41,7 @@ def test_heights_are_those_of_the_set_in_balls(name: str, size: float) -> None:
     some = curve(bound)
     more = np.array([[1.0, -0.5, 2.0, 0.25][: bound.dimension]])
     values = size * np.vstack([rng.normal(size=(20, bound.dimension)), np.eye(bound.dimension), more])
-    heights, off = _heights(some.shape, some.about, values)
+    heights, off = _evaluate_support(some.shape, some.about, values)
     with ctx.workprec(300):
         for c, height, wrong in zip(values, heights, off, strict=True):
             moved = sum((a * b for a, b in zip(balls(c), balls(some.about), strict=True)), arb(0))
@@ -70,7 +70,7 @@ def test_integrals_hold_what_balls_of_many_digits_say_and_are_close(name: str, e
             at = u[:, None] ** np.arange(count) @ plain[k]
             total += float((bound.support(at) - at @ some.about) @ shares) * (b - a) / 2
         assert -less[k] - 2e-15 * tops[k] <= total - value[k] <= more[k] + 2e-15 * tops[k]
-    (ahead, back), _ = _heights(some.shape, some.about, np.array([vector, -vector]))
+    (ahead, back), _ = _evaluate_support(some.shape, some.about, np.array([vector, -vector]))
     exact = back * 0.25**2 / 2 + ahead * (end + 0.75) ** 2 / 2
     assert -less[4] <= exact - value[4] <= more[4]
     assert ((more + less) <= (1e-11 if "long" in name else 3e-13) * tops).all()
@@ -85,7 +85,7 @@ def test_heights_count_from_any_point_and_allow_for_what_the_factor_of_a_long_el
     segments = Zonotope(np.array([0.2, 0.1]), SEGMENTS)
     away = ((SETS["ball"], np.array([0.3, -0.2])), (SETS["ellipsoid"], np.ones(2)), (segments, np.array([1.0, -2.0])))
     for bound, about in ((long, np.zeros(2)), *away):
-        heights, off = _heights(known(bound), about, values)
+        heights, off = _evaluate_support(known(bound), about, values)
         with ctx.workprec(300):
             for c, height, wrong in zip(values, heights, off, strict=True):
                 moved = sum((a * b for a, b in zip(balls(c), balls(about), strict=True)), arb(0))
@@ -108,7 +108,9 @@ def test_where_a_root_or_an_absolute_value_may_be_0_nothing_is_analytic() -> Non
     corners = Polytope([[-1, 0], [0, -1], [1, 1]], [0.0, 0.0, 1.0])
 
     def analytic(bound: ConvexSet, centre: list[float], spread: list[float]) -> bool:
-        return bool(np.isfinite(_most(known(bound), np.zeros(len(centre)), np.array([centre]), np.array([spread]))[0]))
+        return bool(
+            np.isfinite(_bound_support(known(bound), np.zeros(len(centre)), np.array([centre]), np.array([spread]))[0])
+        )
 
     ball, third = NormBall(2.0, 1.0, dimension=2), NormBall(3.0, 1.0, dimension=2)
     assert not analytic(ball, [1.0, 0.0], [0.0, 1.0])  # 1 + i^2 = 0
@@ -119,7 +121,7 @@ def test_where_a_root_or_an_absolute_value_may_be_0_nothing_is_analytic() -> Non
     segments = Zonotope(np.zeros(2), np.array([[1.0, 0.0], [1.0, 1.0]]))
     assert analytic(segments, [1.0, 0.5], [0.2, 0.2]) and not analytic(segments, [1.0, -0.5], [0.3, 0.3])
     with pytest.raises(Unchecked, match="boxes, polytopes, ellipsoids"):
-        _most(known(Cylinder(ball, 3)), np.zeros(3), np.ones((1, 3)), np.zeros((1, 3)))
+        _bound_support(known(Cylinder(ball, 3)), np.zeros(3), np.ones((1, 3)), np.zeros((1, 3)))
 
 
 @pytest.mark.first(1)
@@ -128,10 +130,10 @@ def test_what_is_said_of_complex_directions_holds_of_those_that_are_real(name: s
     bound, rng = SETS[name], np.random.default_rng(2)
     some, centre = curve(bound), rng.normal(size=(200, bound.dimension))
     spread = np.abs(centre) * rng.uniform(0.0, 0.4, size=centre.shape)
-    most = _most(some.shape, some.about, centre, spread)
+    most = _bound_support(some.shape, some.about, centre, spread)
     assert np.isfinite(most).sum() > 10
     for sign in rng.uniform(-1.0, 1.0, size=(20, bound.dimension)):
-        inside, _ = _heights(some.shape, some.about, centre + sign * spread)
+        inside, _ = _evaluate_support(some.shape, some.about, centre + sign * spread)
         assert (np.abs(inside) <= most).all()
 
 
@@ -142,7 +144,7 @@ def test_a_norm_is_no_larger_at_complex_directions_than_is_said(p: float) -> Non
     q = p / (p - 1.0)
     centre = np.sort(np.abs(rng.normal(size=(600, 2))), axis=1)
     spread = centre * rng.uniform(0.0, 1.0, size=(600, 1)) ** 3
-    most = _most(some.shape, some.about, centre, spread)
+    most = _bound_support(some.shape, some.about, centre, spread)
     finite = np.isfinite(most)
     assert finite.sum() > 200
     z, apart = centre[finite], spread[finite]
@@ -163,9 +165,9 @@ def test_balls_that_are_nearly_those_of_the_1_norm_take_few_cells(p: float, monk
 
     def most(shape: Shape, about: np.ndarray, c: np.ndarray, spread: np.ndarray) -> np.ndarray:
         cells.append(len(c))
-        return _most(shape, about, c, spread)
+        return _bound_support(shape, about, c, spread)
 
-    monkeypatch.setattr("sparserob_core.checker.sets.along._most", most)
+    monkeypatch.setattr("sparserob_core.checker.sets.along._bound_support", most)
     zero, plain = np.zeros((1, 2)), np.array([[[0.45, 0.25], [-0.35, 0.55]]])
     value, more, less, _ = curve(NormBall(p, 0.7, dimension=2)).swept(plain, zero, zero, np.ones(1))
     q, edge = p / (p - 1.0), 0.2 / 0.9
