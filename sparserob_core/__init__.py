@@ -22,14 +22,14 @@ from importlib import import_module
 from pathlib import Path
 
 
-def _public() -> dict[str, str]:
+def _map_public_names() -> dict[str, str]:
     """The module of every public name, from the table in ``__init__.pyi``, which type checkers read too."""
     table = ast.parse(Path(__file__).with_suffix(".pyi").read_text("utf-8"))
     imports = [node for node in table.body if isinstance(node, ast.ImportFrom)]
     return {alias.name: str(node.module) for node in imports for alias in node.names}
 
 
-_HOME = _public()
+_HOME = _map_public_names()
 __all__ = sorted(_HOME)  # noqa: PLE0605
 _FORMER = {
     f"{piece}Plugin": "sparserob_core.experiment.plugins.hookspecs"

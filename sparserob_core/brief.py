@@ -23,29 +23,29 @@ would be told by its shape only."""
 def brief(record: Any) -> str:
     """A dataclass in at most `LINES` lines, for its ``__repr__``: a line for every field that is shown, and the names
     of those for which no line is left."""
-    return _lines(type(record).__name__, _shown(record))
+    return _format_lines(type(record).__name__, _list_fields(record))
 
 
 def shortened(lines: Sequence[str]) -> str:
     """Lines for a prompt: long ones cut, and of many the first and how many more there are."""
     kept = lines if len(lines) <= LINES else [*lines[: LINES - 1], f"  and {len(lines) - LINES + 1} more"]
-    return "\n".join(f"{line[: len(line) - len(line.lstrip())]}{_cut(line)}" for line in kept)
+    return "\n".join(f"{line[: len(line) - len(line.lstrip())]}{_shorten(line)}" for line in kept)
 
 
-def _lines(heading: str, shown: Sequence[tuple[str, object]]) -> str:
+def _format_lines(heading: str, shown: Sequence[tuple[str, object]]) -> str:
     room = len(shown) if len(shown) < LINES else LINES - 2
-    lines = [heading, *(f"  {name}: {_value(value)}" for name, value in shown[:room])]
+    lines = [heading, *(f"  {name}: {_format_value(value)}" for name, value in shown[:room])]
     if shown[room:]:
-        lines.append("  " + _cut(f"and {', '.join(name for name, _ in shown[room:])}"))
+        lines.append("  " + _shorten(f"and {', '.join(name for name, _ in shown[room:])}"))
     return "\n".join(lines)
 
 
-def _shown(record: Any) -> list[tuple[str, object]]:
+def _list_fields(record: Any) -> list[tuple[str, object]]:
     names = [item.name for item in fields(record) if item.repr and not item.name.startswith("_")]
     return [(name, getattr(record, name)) for name in names]
 
 
-def _given(shown: Sequence[tuple[str, object]]) -> list[tuple[str, object]]:
+def _drop_empty(shown: Sequence[tuple[str, object]]) -> list[tuple[str, object]]:
     return [(name, value) for name, value in shown if not (value is None or _is_empty(value))]
 
 
@@ -57,13 +57,13 @@ def noun(record: Any) -> str:
     """A dataclass of what a problem is made of, for its ``__repr__``: one line where it fits into `WIDTH`, else as
     `brief` says it. What was left out, ``None`` or nothing, is not said. A record may have a name and fields of its own
     to be shown by, ``noun_of``."""
-    heading, shown = getattr(record, "noun_of", None) or (type(record).__name__, _shown(record))
-    entries = _given(shown)
-    line = f"{heading}({', '.join(f'{name}={_value(value)}' for name, value in entries)})"
-    return line if len(line) <= WIDTH else _lines(heading, entries)
+    heading, shown = getattr(record, "noun_of", None) or (type(record).__name__, _list_fields(record))
+    entries = _drop_empty(shown)
+    line = f"{heading}({', '.join(f'{name}={_format_value(value)}' for name, value in entries)})"
+    return line if len(line) <= WIDTH else _format_lines(heading, entries)
 
 
-def _value(value: object) -> str:
+def _format_value(value: object) -> str:
     if isinstance(value, np.ndarray):
         numbers = np.array2string(value, precision=6, separator=", ", max_line_width=WIDTH)
         return " ".join(numbers.split()) if value.size <= ENTRIES else f"array {value.shape}"
@@ -75,12 +75,12 @@ def _value(value: object) -> str:
         line = repr(value) if type(value).__repr__ is noun else ""
         return line if line and "\n" not in line else getattr(value, "noun_of", (type(value).__name__,))[0]
     if isinstance(value, Mapping):
-        return _cut("{" + ", ".join(f"{key}: {_value(item)}" for key, item in value.items()) + "}")
+        return _shorten("{" + ", ".join(f"{key}: {_format_value(item)}" for key, item in value.items()) + "}")
     if isinstance(value, list | tuple):
-        return _cut("[" + ", ".join(_value(item) for item in value) + "]")
-    return _cut(value if isinstance(value, str) else repr(value))
+        return _shorten("[" + ", ".join(_format_value(item) for item in value) + "]")
+    return _shorten(value if isinstance(value, str) else repr(value))
 
 
-def _cut(text: str) -> str:
+def _shorten(text: str) -> str:
     line = " ".join(text.split())
     return line if len(line) <= WIDTH else f"{line[: WIDTH - 3]}..."

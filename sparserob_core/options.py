@@ -41,7 +41,7 @@ class Checked(ModelMetaclass):
             if hidden is None:
                 raise
             raise InputError(f"{name}: the option {hidden[1]!r} bears a name that pydantic uses; rename it") from None
-        for key, owner in _names_in_use(model):
+        for key, owner in _find_hidden_names(model):
             raise InputError(f"{name}: the option {key!r} bears a name that {owner} uses; rename it")
         return model
 
@@ -51,10 +51,10 @@ class Checked(ModelMetaclass):
         try:
             return super().__call__(**keywords)
         except ValidationError as error:
-            raise InputError("\n".join(_sentences(cls.__name__, error))) from None
+            raise InputError("\n".join(_describe_errors(cls.__name__, error))) from None
 
 
-def _names_in_use(model: type) -> Iterator[tuple[str, str]]:
+def _find_hidden_names(model: type) -> Iterator[tuple[str, str]]:
     """The options of a class that hide an attribute of one of its bases, or that a method of its own hides, with the
     class that has the attribute."""
     fields: Mapping[str, Any] = getattr(model, "model_fields", {})
@@ -70,18 +70,18 @@ class Exact(BaseModel):
 
     @field_validator("*", mode="before")
     @classmethod
-    def _no_disguise(cls, value: object, info: ValidationInfo) -> object:
-        allowed = set(_types(cls.model_fields[str(info.field_name)].annotation))
+    def _reject_disguised_numbers(cls, value: object, info: ValidationInfo) -> object:
+        allowed = set(_list_types(cls.model_fields[str(info.field_name)].annotation))
         is_sequence = isinstance(value, list | tuple)
         if {int, float} & allowed and not {Any, object} & allowed and (is_sequence or not {list, tuple} & allowed):
-            for scalar in _scalars(value):
+            for scalar in _list_scalars(value):
                 true_or_false = isinstance(scalar, bool) and bool not in allowed
-                if true_or_false or (isinstance(scalar, str) and str not in allowed and _reads_as_number(scalar)):
+                if true_or_false or (isinstance(scalar, str) and str not in allowed and _is_number_text(scalar)):
                     raise InputError("must be a number" if not is_sequence else "every entry must be a number")
         return value
 
 
-def _reads_as_number(text: str) -> bool:
+def _is_number_text(text: str) -> bool:
     try:
         float(text)
     except ValueError:
@@ -89,7 +89,7 @@ def _reads_as_number(text: str) -> bool:
     return True
 
 
-def _types(annotation: object) -> Iterator[object]:
+def _list_types(annotation: object) -> Iterator[object]:
     """Every type inside an annotation such as ``list[float | None]``; a literal counts as the types of its values."""
     arguments = get_args(annotation)
     if arguments:
@@ -97,14 +97,14 @@ def _types(annotation: object) -> Iterator[object]:
     else:
         yield type(annotation) if isinstance(annotation, str | bool | int | float) else annotation
     for argument in arguments:
-        yield from _types(argument)
+        yield from _list_types(argument)
 
 
-def _scalars(value: object) -> Iterator[object]:
+def _list_scalars(value: object) -> Iterator[object]:
     """Yield every value inside nested lists and tuples. Mappings are skipped: their fields have checks of their own."""
     if isinstance(value, list | tuple):
         for item in value:
-            yield from _scalars(item)
+            yield from _list_scalars(item)
     elif not isinstance(value, Mapping):
         yield value
 
@@ -137,12 +137,12 @@ def meanings(model: type[BaseModel]) -> Mapping[str, str]:
     descriptions = {}
     for name, field in model.model_fields.items():
         owner = next((base for base in model.__mro__ if name in inspect.get_annotations(base)), model)
-        descriptions[name] = field.description or _docstrings(owner).get(name, "")
+        descriptions[name] = field.description or _read_docstrings(owner).get(name, "")
     return descriptions
 
 
 @cache
-def _docstrings(owner: type) -> Mapping[str, str]:
+def _read_docstrings(owner: type) -> Mapping[str, str]:
     """The docstrings below the attributes of a class; none where its source is not to be had."""
     try:
         body = ast.parse(textwrap.dedent(inspect.getsource(owner))).body[0]
@@ -168,7 +168,7 @@ def part(kind: str, of: type | None = None) -> Any:
     return Field(default=None, json_schema_extra={"component": kind, **restriction})
 
 
-def _sentences(name: str, error: ValidationError) -> list[str]:
+def _describe_errors(name: str, error: ValidationError) -> list[str]:
     sentences = []
     for item in error.errors(include_url=False):
         cause = item.get("ctx", {}).get("error")  # what a validator has raised

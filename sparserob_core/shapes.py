@@ -32,7 +32,7 @@ elif CHECKED:
     import jaxtyping
     from beartype import beartype
 
-    class _Checked:
+    class _CheckedArray:
         """An array of one kind of numbers; a number of numpy is one without axes, since numpy makes it one."""
 
         def __init__(self, kind: Any) -> None:
@@ -42,9 +42,9 @@ elif CHECKED:
             return self.kind[np.ndarray | np.generic, item[1]]
 
     # whole numbers may stand where numbers are asked for: numpy computes with them, and shapes are what matters here
-    Bool, Float, Int = _Checked(jaxtyping.Bool), _Checked(jaxtyping.Real), _Checked(jaxtyping.Integer)
+    Bool, Float, Int = _CheckedArray(jaxtyping.Bool), _CheckedArray(jaxtyping.Real), _CheckedArray(jaxtyping.Integer)
 
-    def _undrawn(function: Any) -> Any:
+    def _restore_random_state(function: Any) -> Any:
         """Give back what a check has drawn: beartype looks at one item of a list, and takes the random numbers of the
         whole process to choose it, which components are tested not to touch."""
 
@@ -63,7 +63,7 @@ elif CHECKED:
     def shaped(function: Any) -> Any:
         """Check the shapes in the annotations of a function at its first calls, and ever more rarely afterwards; at
         every call of what it has as ``checked``."""
-        checked = _undrawn(jaxtyping.jaxtyped(function, typechecker=beartype))
+        checked = _restore_random_state(jaxtyping.jaxtyped(function, typechecker=beartype))
         calls, skipped = 0, 0
 
         @wraps(function)
@@ -82,13 +82,13 @@ elif CHECKED:
 
 else:
 
-    class _Plain:
+    class _AnyShape:
         """Stands for an array of any shape."""
 
         def __class_getitem__(cls, item: object) -> type:
             return np.ndarray
 
-    Bool = Float = Int = _Plain
+    Bool = Float = Int = _AnyShape
 
     def shaped(function: Any) -> Any:
         """Mark a function whose annotations state shapes; nothing is checked."""

@@ -317,7 +317,7 @@ class ConvexSet(ABC):
         rays = points.reshape(-1, self.dimension) - middle
         flat = self.halfspaces()
         if flat is None:
-            sizes = self._boundary(np.broadcast_to(middle, rays.shape), rays)[0]
+            sizes = self._compute_gauge(np.broadcast_to(middle, rays.shape), rays)[0]
         else:
             # rounding may put an interior point outside
             sizes = ratios(rays @ flat[0].T, np.maximum(flat[1] - flat[0] @ middle, 0.0)).max(axis=1, initial=0.0)
@@ -335,7 +335,7 @@ class ConvexSet(ABC):
             return steepest
         middle = self.interior_point()
         rays = points.reshape(-1, self.dimension) - middle
-        return self._boundary(np.broadcast_to(middle, rays.shape), rays)[1].reshape(points.shape)
+        return self._compute_gauge(np.broadcast_to(middle, rays.shape), rays)[1].reshape(points.shape)
 
     @shaped
     def violation(self, points: Float[Array, "*k d"]) -> Float[Array, " *k"]:
@@ -415,7 +415,7 @@ class ConvexSet(ABC):
         flat = self.halfspaces()
         if flat is None:
             with np.errstate(divide="ignore"):
-                high, low = (1.0 / self._boundary(points, sign * directions)[0] for sign in (1.0, -1.0))
+                high, low = (1.0 / self._compute_gauge(points, sign * directions)[0] for sign in (1.0, -1.0))
             return -low, high
         slopes, distances = directions @ flat[0].T, np.maximum(flat[1] - points @ flat[0].T, 0.0)
         slopes = np.where(np.abs(slopes) > CLOSED * (np.abs(directions) @ np.abs(flat[0]).T), slopes, 0.0)
@@ -427,7 +427,7 @@ class ConvexSet(ABC):
         )
 
     @shaped
-    def _boundary(
+    def _compute_gauge(
         self, origins: Float[Array, "k d"], rays: Float[Array, "k d"]
     ) -> tuple[Float[Array, " k"], Float[Array, "k d"]]:
         """Return the gauge of rays about points of the set, and normals where the rays leave the set.
@@ -491,7 +491,9 @@ class ConvexSet(ABC):
         """
         axes = self.normals
         rays = np.vstack([axes, -axes])
-        sizes = self._boundary(np.broadcast_to(self.interior_point(), rays.shape), rays)[0].reshape(2, -1).max(axis=0)
+        sizes = (
+            self._compute_gauge(np.broadcast_to(self.interior_point(), rays.shape), rays)[0].reshape(2, -1).max(axis=0)
+        )
         return float(1.0 / np.linalg.norm(sizes))
 
     # Random points
@@ -515,8 +517,8 @@ class ConvexSet(ABC):
         ndarray, shape (count, d)
             Points of the set.
         """
-        points = self._by_rejection(count, rng) if self.dimension <= PLAIN else None
-        return self._hit_and_run(count, rng) if points is None else points
+        points = self._sample_by_rejection(count, rng) if self.dimension <= PLAIN else None
+        return self._sample_by_hit_and_run(count, rng) if points is None else points
 
     @shaped
     def sample_extreme(self, count: int, rng: np.random.Generator) -> Float[Array, "{count} d"]:
@@ -538,7 +540,7 @@ class ConvexSet(ABC):
         """
         return self.support_point(rng.normal(size=(count, self.dimension)))
 
-    def _by_rejection(self, count: int, rng: np.random.Generator) -> Array | None:
+    def _sample_by_rejection(self, count: int, rng: np.random.Generator) -> Array | None:
         """Return random points of the bounding box that lie in the set; ``None`` where too few of them do."""
         box = self.bounding_box()
         accepted_points, drawn_count = np.empty((0, self.dimension)), 0
@@ -550,7 +552,7 @@ class ConvexSet(ABC):
                 return None
         return accepted_points[:count]
 
-    def _hit_and_run(self, count: int, rng: np.random.Generator) -> Array:
+    def _sample_by_hit_and_run(self, count: int, rng: np.random.Generator) -> Array:
         """Return the ends of ``count`` chains of hit and run, all from the interior point.
 
         A chain that cannot move along a line stays where it is.
@@ -1077,7 +1079,7 @@ class Scaled(ConvexSet):
 
     @shaped
     def support_point(self, directions: Float[Array, "*k d"]) -> Float[Array, "*k d"]:
-        return self._moved(self.base.support_point(directions))
+        return self._scale_points(self.base.support_point(directions))
 
     @shaped
     def halfspaces(self) -> tuple[Float[Array, "r d"], Float[Array, " r"]] | None:
@@ -1089,11 +1091,11 @@ class Scaled(ConvexSet):
 
     @shaped
     def interior_point(self) -> Float[Array, " d"]:
-        return self._moved(self.base.interior_point())
+        return self._scale_points(self.base.interior_point())
 
     @shaped
     def middle(self) -> Float[Array, " d"]:
-        return self._moved(self.base.middle())
+        return self._scale_points(self.base.middle())
 
     @shaped
     def in_units(self, units: Float[Array, " d"]) -> ConvexSet:
@@ -1108,7 +1110,7 @@ class Scaled(ConvexSet):
         self, centre: Float[Array, "*k d"], spread: Float[Array, "*k J d"]
     ) -> tuple[Float[Array, "*k d"], Float[Array, " *k"]]:
         point, excess = self.base.support_majorant(centre, spread)
-        return self._moved(point), self.factor * excess
+        return self._scale_points(point), self.factor * excess
 
     @shaped
     def support_minorant(
@@ -1118,7 +1120,7 @@ class Scaled(ConvexSet):
         f, shift = self.factor, (1.0 - self.factor) * self.about
         return f * value + float(centre @ shift), f * gradient + spread @ shift, f * hessian
 
-    def _moved(self, points: Array) -> Array:
+    def _scale_points(self, points: Array) -> Array:
         return self.about + self.factor * (points - self.about)
 
 

@@ -32,7 +32,7 @@ FULL = 0.1  # share of non-zero entries from which larger matrices are dense too
 SHOWN = 1000  # rows up to which a refusal computes all eigenvalues; ten times as many take minutes
 STEPS = 60  # steps of the Lanczos method by which a refusal estimates the least eigenvalue of larger matrices
 
-_convex: WeakValueDictionary[int, csc_array] = WeakValueDictionary()
+_convex_matrices: WeakValueDictionary[int, csc_array] = WeakValueDictionary()
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,15 +123,15 @@ def require_convex(path: str, matrix: object, size: int) -> csc_array:
     """
     from scipy.sparse import csc_array
 
-    if isinstance(matrix, csc_array) and _convex.get(id(matrix)) is matrix:
+    if isinstance(matrix, csc_array) and _convex_matrices.get(id(matrix)) is matrix:
         return matrix
     P = sparse_matrix(path, matrix)
     if P.shape != (size, size):
         raise InputError(path=path, expected=f"shape ({size}, {size})", got=f"{P.shape}")
     P = P if P.dtype == float else csc_array(P.astype(float))
-    P = _symmetric(path, P)
-    if (direction := _descent(P)) is not None:
-        raise InputError(path=path, expected="a positive semidefinite matrix", got=_negative(P, direction))
+    P = _symmetrise(path, P)
+    if (direction := _find_negative_direction(P)) is not None:
+        raise InputError(path=path, expected="a positive semidefinite matrix", got=_describe_eigenvalue(P, direction))
     return convex_by_construction(P)
 
 
@@ -141,7 +141,7 @@ def convex_by_construction(P: csc_array) -> csc_array:
     The caller guarantees that the matrix is a sum of squares, and exactly symmetric, whatever its rounding errors.
     """
     kept: csc_array = read_only(P)
-    _convex[id(kept)] = kept
+    _convex_matrices[id(kept)] = kept
     return kept
 
 
@@ -160,7 +160,9 @@ def sparse_matrix(path: str, matrix: object) -> csc_array:
     if indices.size:
         row, column = int(array.indices[indices[0]]), int(np.searchsorted(array.indptr, indices[0], "right")) - 1
         raise InputError(
-            path=path, expected="a matrix of finite numbers", got=f"{array.data[indices[0]]} {_place(row, column)}"
+            path=path,
+            expected="a matrix of finite numbers",
+            got=f"{array.data[indices[0]]} {_locate_entry(row, column)}",
         )
     kept: csc_array = read_only(array)
     return kept
@@ -173,7 +175,7 @@ def is_semidefinite(P: csc_array) -> bool:
     scaled to 1 is at least ``-(ROUNDED + (k + 1) 2^-53) k``, with ``k`` the number of entries of the longest row of its
     factor.
     """
-    return _descent(P) is None
+    return _find_negative_direction(P) is None
 
 
 def is_definite(P: csc_array, factor: float = 1.0) -> bool:
@@ -181,15 +183,15 @@ def is_definite(P: csc_array, factor: float = 1.0) -> bool:
 
     The test is whether elimination without pivoting meets only positive pivots.
     """
-    return _failing(P, factor) is None
+    return _find_nonpositive_direction(P, factor) is None
 
 
-def _descent(P: csc_array) -> Array | None:
+def _find_negative_direction(P: csc_array) -> Array | None:
     """Return a direction ``(n,)`` along which the form is negative; ``None`` where it is semidefinite except for
     rounding."""
     diagonal = np.asarray(P.diagonal(), dtype=float)
     bare = np.flatnonzero(~(diagonal > 0.0))
-    if bare.size and (direction := _bare(P, diagonal, bare)) is not None:
+    if bare.size and (direction := _check_diagonal(P, diagonal, bare)) is not None:
         return direction
     kept = np.flatnonzero(diagonal > 0.0)
     P = P if kept.size == diagonal.size else P[kept][:, kept]
@@ -197,7 +199,7 @@ def _descent(P: csc_array) -> Array | None:
     shift = 1.0 + ROUNDED * int(np.diff(P.indptr).max(initial=1))
     if (size * (abs(P) @ size) <= 1.0 + shift).all():  # every row is dominated by its diagonal (Gershgorin)
         return None
-    kept_direction = _failing(P, shift)
+    kept_direction = _find_nonpositive_direction(P, shift)
     if kept_direction is None:
         return None
     direction = np.zeros(diagonal.size)
@@ -205,7 +207,7 @@ def _descent(P: csc_array) -> Array | None:
     return direction
 
 
-def _bare(P: csc_array, diagonal: Array, bare: np.ndarray) -> Array | None:
+def _check_diagonal(P: csc_array, diagonal: Array, bare: np.ndarray) -> Array | None:
     """Return a direction along which the form is negative, for a matrix whose diagonal is not positive.
 
     The direction is the unit vector of a negative diagonal entry, or combines a diagonal entry of 0 with a variable
@@ -224,14 +226,14 @@ def _bare(P: csc_array, diagonal: Array, bare: np.ndarray) -> Array | None:
     return direction
 
 
-def _failing(P: csc_array, factor: float) -> Array | None:
+def _find_nonpositive_direction(P: csc_array, factor: float) -> Array | None:
     """Return a direction ``(n,)`` along which the form with its diagonal times ``factor`` is not positive.
 
     ``None`` where elimination without pivoting meets only positive pivots.
     """
     n = P.shape[0]
     if n <= DENSE or P.nnz >= FULL * n * n:
-        return _failing_dense(P, factor)
+        return _find_nonpositive_direction_dense(P, factor)
     from scipy.sparse import csc_array, diags_array
     from scipy.sparse.linalg import splu, spsolve_triangular
 
@@ -252,8 +254,8 @@ def _failing(P: csc_array, factor: float) -> Array | None:
     return direction
 
 
-def _failing_dense(P: csc_array, factor: float) -> Array | None:
-    """Return the direction of `_failing`, by a dense Cholesky factorisation."""
+def _find_nonpositive_direction_dense(P: csc_array, factor: float) -> Array | None:
+    """Return the direction of `_find_nonpositive_direction`, by a dense Cholesky factorisation."""
     n = P.shape[0]
     entries = P.toarray()
     entries[np.diag_indices(n)] *= factor
@@ -274,7 +276,7 @@ def _failing_dense(P: csc_array, factor: float) -> Array | None:
     return direction
 
 
-def _symmetric(path: str, P: csc_array) -> csc_array:
+def _symmetrise(path: str, P: csc_array) -> csc_array:
     """Return the matrix, made exactly symmetric; raise `InputError` where its asymmetry exceeds rounding."""
     from scipy.sparse import csc_array
 
@@ -297,17 +299,17 @@ def _symmetric(path: str, P: csc_array) -> csc_array:
         raise InputError(
             path=path,
             expected="a symmetric matrix",
-            got=f"{float(P[i, j]):.12g} {_place(i, j)} and {float(P[j, i]):.12g} {_place(j, i)}",
+            got=f"{float(P[i, j]):.12g} {_locate_entry(i, j)} and {float(P[j, i]):.12g} {_locate_entry(j, i)}",
         )
     return csc_array((P + transpose) / 2)
 
 
-def _place(row: int, column: int) -> str:
+def _locate_entry(row: int, column: int) -> str:
     """Return the position of an entry in words."""
     return f"in row {row + 1}, column {column + 1}"
 
 
-def _negative(P: csc_array, direction: Array) -> str:
+def _describe_eigenvalue(P: csc_array, direction: Array) -> str:
     """Return in words the least eigenvalue of a matrix whose form is negative along ``direction``.
 
     Where rounding hides the eigenvalue, that of the matrix with its diagonal scaled to 1 is given.
@@ -317,15 +319,17 @@ def _negative(P: csc_array, direction: Array) -> str:
     diagonal = np.asarray(P.diagonal(), dtype=float)
     if P.nnz == np.count_nonzero(diagonal):
         return f"the eigenvalue {diagonal.min():.6g}"
-    if not (diagonal > 0.0).all() or _least(P, direction)[0] < -1e-12 * diagonal.max():
-        least, exact = _least(P, direction)
+    if not (diagonal > 0.0).all() or _find_least_eigenvalue(P, direction)[0] < -1e-12 * diagonal.max():
+        least, exact = _find_least_eigenvalue(P, direction)
         return f"{'the eigenvalue' if exact else 'an eigenvalue of at most'} {min(least, diagonal.min()):.6g}"
     root = np.sqrt(diagonal)
-    least, exact = _least(csc_array(diags_array(1.0 / root) @ P @ diags_array(1.0 / root)), direction * root)
+    least, exact = _find_least_eigenvalue(
+        csc_array(diags_array(1.0 / root) @ P @ diags_array(1.0 / root)), direction * root
+    )
     return f"{'the eigenvalue' if exact else 'an eigenvalue of at most'} {least:.6g} where its diagonal is scaled to 1"
 
 
-def _least(P: csc_array, direction: Array) -> tuple[float, bool]:
+def _find_least_eigenvalue(P: csc_array, direction: Array) -> tuple[float, bool]:
     """Return the least eigenvalue, and whether it is exact.
 
     For a large matrix, it is the least value of the form on unit vectors of a Krylov space (Lanczos) that starts from

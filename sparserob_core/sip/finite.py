@@ -199,7 +199,7 @@ class FiniteProgram:
         )
         # quantities that do not depend on the rows
         program.__dict__.update(
-            curvature=self.curvature, steepest=self.steepest, bounded=self.bounded, _sound=self._sound
+            curvature=self.curvature, steepest=self.steepest, bounded=self.bounded, _is_valid=self._is_valid
         )
         return program
 
@@ -220,7 +220,7 @@ class FiniteProgram:
         """
         program = replace(self, P=P, q=q)
         if q is self.q:
-            program.__dict__.update(steepest=self.steepest, bounded=self.bounded, _sound=self._sound)
+            program.__dict__.update(steepest=self.steepest, bounded=self.bounded, _is_valid=self._is_valid)
         return program
 
     @cached_property
@@ -239,15 +239,15 @@ class FiniteProgram:
 
         Rounding may make a square negative where its terms cancel; it is then counted as 0.
         """
-        quadratic = 0.0 if self.P is None else max(0.0, self._square(x)[0])
-        return float(self.weights @ self._lengths(x) + self.q @ x) + quadratic + self.constant
+        quadratic = 0.0 if self.P is None else max(0.0, self._evaluate_quadratic(x)[0])
+        return float(self.weights @ self._measure_lengths(x) + self.q @ x) + quadratic + self.constant
 
-    def _square(self, x: Array) -> tuple[float, float]:
+    def _evaluate_quadratic(self, x: Array) -> tuple[float, float]:
         """Return ``1/2 x'P x``, and the size to which its rounding error is relative.
 
         The sum is computed with more digits where most of it cancels.
         """
-        square = 0.5 * float(x @ self._bent(x))
+        square = 0.5 * float(x @ self._differentiate_quadratic(x))
         if self.P is None or self.curvature is not None:
             return square, abs(square)
         size = np.abs(x)
@@ -259,12 +259,12 @@ class FiniteProgram:
         return square, abs(square) + magnitude * float(np.finfo(np.longdouble).eps / np.finfo(float).eps)
 
     @shaped
-    def _lengths(self, x: Float[Array, " n"]) -> Float[Array, " k"]:
+    def _measure_lengths(self, x: Float[Array, " n"]) -> Float[Array, " k"]:
         """Return the length ``(k,)`` with which each entry of the image enters the cost."""
         image = self.image(x)
         return np.abs(image) if self.blocks is None else self.blocks.lengths(image)
 
-    def _bent(self, x: Array) -> Array:
+    def _differentiate_quadratic(self, x: Array) -> Array:
         """Return ``P x``."""
         if self.curvature is not None:
             return self.curvature * x
@@ -276,7 +276,7 @@ class FiniteProgram:
         """Return the program with ``1/2 x'P x`` replaced by its tangent at ``at``, which lies below it."""
         if self.P is None:
             return self
-        gradient = self._bent(at)
+        gradient = self._differentiate_quadratic(at)
         return replace(self, P=None, q=self.q + gradient, constant=self.constant - 0.5 * float(at @ gradient))
 
     @shaped
@@ -284,14 +284,19 @@ class FiniteProgram:
         """Return the sum of the absolute values of all terms of the cost at ``x``, to which its rounding error is
         relative."""
         size = np.abs(x)
-        quadratic = 0.0 if self.P is None else self._square(x)[1]
-        return float(self.weights @ self._lengths(x) + np.abs(self.q) @ size) + quadratic + abs(self.constant)
+        quadratic = 0.0 if self.P is None else self._evaluate_quadratic(x)[1]
+        return float(self.weights @ self._measure_lengths(x) + np.abs(self.q) @ size) + quadratic + abs(self.constant)
 
     @shaped
     def added(self, x: Float[Array, " n"]) -> float:
         """Return the sum of the absolute values of the four parts of the cost at ``x``."""
-        quadratic = 0.0 if self.P is None else self._square(x)[0]
-        return float(self.weights @ self._lengths(x)) + abs(float(self.q @ x)) + abs(quadratic) + abs(self.constant)
+        quadratic = 0.0 if self.P is None else self._evaluate_quadratic(x)[0]
+        return (
+            float(self.weights @ self._measure_lengths(x))
+            + abs(float(self.q @ x))
+            + abs(quadratic)
+            + abs(self.constant)
+        )
 
     @shaped
     def residual(self, x: Float[Array, " n"]) -> float:
@@ -322,17 +327,17 @@ class FiniteProgram:
 
     def validate(self) -> None:
         """Raise `InputError` where shapes disagree, or a number is NaN or has a wrong sign."""
-        self._demand({"G": (self.h.size, self.n)}, ("G",))
+        self._check_arrays({"G": (self.h.size, self.n)}, ("G",))
         if not self.h.min(initial=np.inf) > -np.inf:
             raise InputError(NAN if np.isnan(self.h).any() else SIGNS)
-        assert self._sound
+        assert self._is_valid
 
     @cached_property
-    def _sound(self) -> bool:
+    def _is_valid(self) -> bool:
         """True where everything except the rows is valid; otherwise `InputError` is raised."""
         k = self.n if self.S is None else int(self.S.shape[0])
         shapes = {"weights": (k,), "lower": (k,), "upper": (k,), "A": (self.b.size, self.n)}
-        self._demand(shapes, ("q", "weights", "A", "b"))
+        self._check_arrays(shapes, ("q", "weights", "A", "b"))
         if np.isnan(self.lower).any() or np.isnan(self.upper).any():
             raise InputError(NAN)
         if (self.weights < 0).any():
@@ -341,7 +346,7 @@ class FiniteProgram:
             raise InputError(f"finite program: constant is {self.constant}, expected a finite number")
         return True
 
-    def _demand(self, shapes: Mapping[str, tuple[int, ...]], finite: Sequence[str]) -> None:
+    def _check_arrays(self, shapes: Mapping[str, tuple[int, ...]], finite: Sequence[str]) -> None:
         for name, shape in shapes.items():
             if getattr(self, name).shape != shape:
                 raise InputError(f"finite program: {name} has shape {getattr(self, name).shape}, expected {shape}")
@@ -577,7 +582,7 @@ class Spread:
     def within(self, a: Array) -> Array:
         """Return ``a (..., Q)`` projected onto the span of the set; 0 for entries that do not deviate, or are
         `still`."""
-        return self._projected(a) * (self.chords > 0.0) * (1.0 if self.still is None else ~self.still)
+        return self._project_onto_span(a) * (self.chords > 0.0) * (1.0 if self.still is None else ~self.still)
 
     def named(self, w: Array) -> Array:
         """Return the deviations that a proof may name instead of deviations ``w (..., Q)``.
@@ -585,9 +590,9 @@ class Spread:
         The deviations ``w`` are projected onto the span of the set, and set to 0 for entries that are `still`. Sets
         with an interior leave ``w`` unchanged.
         """
-        return self._projected(w) * (1.0 if self.still is None else ~self.still)
+        return self._project_onto_span(w) * (1.0 if self.still is None else ~self.still)
 
-    def _projected(self, a: Array) -> Array:
+    def _project_onto_span(self, a: Array) -> Array:
         """Return ``a (..., Q)`` projected onto the span of the set."""
         projection = np.array(a)
         for (entries, count, convex, _), matrix in zip(self.parts, self._projectors, strict=True):

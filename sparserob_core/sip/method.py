@@ -79,7 +79,7 @@ class Continuation(Options):
         raise InputError(f"regu: expected a positive weight below {epsilon!r}, got {weight!r}")
 
     @model_validator(mode="after")
-    def _decreases(self) -> Continuation:
+    def _check_decrease(self) -> Continuation:
         if self.stop > self.start:
             raise InputError(path="stop", expected=f"at most start, which is {self.start!r}", got=f"{self.stop!r}")
         return self

@@ -359,21 +359,21 @@ class ConstraintFamily:
             np.asarray(separation.violations, dtype=float),
         )
         if indices.ndim != 2 or not len(indices) == np.size(separation.rows) == violations.size:
-            raise self._wrong("worst", "indices (k, d), rows (k,) and violations (k,)", f"shape {indices.shape}")
+            raise self._make_error("worst", "indices (k, d), rows (k,) and violations (k,)", f"shape {indices.shape}")
         if np.asarray(separation.rows).dtype.kind not in "iu" or (np.asarray(separation.rows) < 0).any():
-            raise self._wrong("worst", "numbers of rows, from 0", f"{np.asarray(separation.rows).tolist()}")
+            raise self._make_error("worst", "numbers of rows, from 0", f"{np.asarray(separation.rows).tolist()}")
         if np.isnan(violations).any():
-            raise self._wrong("worst", "violations that are numbers", f"{violations.tolist()}")
+            raise self._make_error("worst", "violations that are numbers", f"{violations.tolist()}")
         if violations.size and separation.bound < violations.max() - TOLERANCE:
-            raise self._wrong(
+            raise self._make_error(
                 "worst", f"a bound of at least {violations.max():.6g}, its own", f"{separation.bound:.6g}"
             )
         if indices.shape[1] != box.dimension:
-            raise self._wrong("worst", f"indices (k, {box.dimension})", f"shape {indices.shape}")
+            raise self._make_error("worst", f"indices (k, {box.dimension})", f"shape {indices.shape}")
         slack = OUTSIDE * (box.upper - box.lower + np.abs(box.lower) + np.abs(box.upper))
         outside = ~((indices >= box.lower - slack) & (indices <= box.upper + slack)).all(axis=1)
         if outside.any():
-            raise self._wrong("worst", "indices of the index set", f"{indices[outside][0].tolist()}")
+            raise self._make_error("worst", "indices of the index set", f"{indices[outside][0].tolist()}")
         return separation
 
     @shaped
@@ -401,7 +401,7 @@ class ConstraintFamily:
         enclosure = self.enclosure(x, lower, upper)
         if np.shape(enclosure.bounds) != (len(lower),) or np.shape(enclosure.split) != (len(lower),):
             got = f"shapes {np.shape(enclosure.bounds)} and {np.shape(enclosure.split)}"
-            raise self._wrong("enclosure", f"bounds and coordinates ({len(lower)},)", got)
+            raise self._make_error("enclosure", f"bounds and coordinates ({len(lower)},)", got)
         return replace(enclosure, bounds=np.where(np.isnan(enclosure.bounds), np.inf, enclosure.bounds))
 
     @cached_property
@@ -414,10 +414,10 @@ class ConstraintFamily:
         lower, upper = self.cells
         missing = uncovered(lower, upper, box)
         if missing is not None:
-            raise self._wrong("cells", "cells that cover the index set", f"none around {missing.tolist()}")
+            raise self._make_error("cells", "cells that cover the index set", f"none around {missing.tolist()}")
         return lower, upper
 
-    def _wrong(self, what: str, expected: str, got: str) -> InputError:
+    def _make_error(self, what: str, expected: str, got: str) -> InputError:
         return InputError(f"family {self.name!r}: {what}: expected {expected}, got {got}")
 
     @shaped
@@ -537,7 +537,7 @@ def uncovered(lower: Array, upper: Array, box: Box) -> Array | None:
         return box.lower
     if ((begins == ends) & ((begins == 0.0) | (begins == 1.0))).any(axis=1).all() and free_axes.size:
         return None
-    edges = [_apart(np.concatenate([begins[:, i], ends[:, i], [0.0, 1.0]])) for i in range(free_axes.size)]
+    edges = [_merge_edges(np.concatenate([begins[:, i], ends[:, i], [0.0, 1.0]])) for i in range(free_axes.size)]
     middle = (box.lower + box.upper) / 2
     if np.prod([float(axis_edges.size) for axis_edges in edges]) > PARTS:
         return middle if volumes.sum() < 1.0 - OUTSIDE else None
@@ -557,7 +557,7 @@ def uncovered(lower: Array, upper: Array, box: Box) -> Array | None:
     return middle
 
 
-def _apart(corners: Array) -> Array:
+def _merge_edges(corners: Array) -> Array:
     """Return the sorted shares of a side, clipped to [0, 1], without those within `NARROW` of the one before."""
     edges = np.unique(np.clip(corners, 0.0, 1.0))
     kept: Array = edges[np.append(True, np.diff(edges) > NARROW)]
@@ -697,24 +697,24 @@ class SemiInfiniteProgram:
         if S is not None and S.shape[1] != self.n:
             raise InputError(f"S: expected {self.n} columns, got shape {S.shape}")
         images = self.n if S is None else int(S.shape[0])
-        G, h = self._rows("G", self.G, "h", self.h)
-        A, b = self._rows("A", self.A, "b", self.b)
-        weights = _vector("weights", 0.0 if self.weights is None else self.weights, images)
+        G, h = self._check_rows("G", self.G, "h", self.h)
+        A, b = self._check_rows("A", self.A, "b", self.b)
+        weights = _check_vector("weights", 0.0 if self.weights is None else self.weights, images)
         if (weights < 0).any():
             raise InputError(f"weights: expected numbers that are not negative, got {weights.min()}")
         lower, upper = as_bound("lower", self.lower, images), as_bound("upper", self.upper, images)
         if (lower > upper).any():
             raise InputError("lower: is above upper, so nothing is feasible")
-        q = _vector("q", 0.0 if self.q is None else self.q, self.n)
+        q = _check_vector("q", 0.0 if self.q is None else self.q, self.n)
         names = [family.name for family in self.families]
         if len(set(names)) < len(names):
             raise InputError(f"families: names must differ, got {names}")
         object.__setattr__(self, "families", tuple(self.families))
-        constant = _vector("constant", self.constant, 1)
+        constant = _check_vector("constant", self.constant, 1)
         finite = FiniteProgram(
             q=q, weights=weights, lower=lower, upper=upper, G=G, h=h, A=A, b=b, P=P, S=S, constant=float(constant[0])
         )
-        finite = replace(finite, blocks=self._blocks(weights))
+        finite = replace(finite, blocks=self._build_blocks(weights))
         sealed(finite)
         for name, kept in (("S", finite.S), ("P", finite.P), ("finite", finite)):
             object.__setattr__(self, name, kept)
@@ -724,7 +724,7 @@ class SemiInfiniteProgram:
                 object.__setattr__(self, entry.name, np.array(value))
         sealed(self)
 
-    def _blocks(self, weights: Array) -> Blocks | None:
+    def _build_blocks(self, weights: Array) -> Blocks | None:
         if self.blocks is None:
             return None
         numbers = np.asarray(self.blocks)
@@ -736,7 +736,7 @@ class SemiInfiniteProgram:
             raise InputError("weights: expected one weight for all images of a block")
         return blocks if blocks.entries.size else None
 
-    def _rows(self, left: str, matrix: object, right: str, bounds: object) -> tuple[Array, Array]:
+    def _check_rows(self, left: str, matrix: object, right: str, bounds: object) -> tuple[Array, Array]:
         if (matrix is None) != (bounds is None):
             raise InputError(f"{left}, {right}: give both or neither")
         if matrix is None:
@@ -744,19 +744,23 @@ class SemiInfiniteProgram:
         rows = np.atleast_2d(np.asarray(matrix, dtype=float))
         if rows.ndim != 2 or rows.shape[1] != self.n or not np.isfinite(rows).all():
             raise InputError(f"{left}: expected finite numbers of shape (rows, {self.n}), got shape {rows.shape}")
-        return rows, (_vector if left == "A" else _upper)(right, bounds, rows.shape[0])
+        return rows, (_check_vector if left == "A" else _check_upper)(right, bounds, rows.shape[0])
 
     @property
     def own_units(self) -> OwnUnits | None:
         """Twin of this program in its own units; ``None`` where it has no twin, or was changed after the twin was
         attached."""
         own = None if self.twin is None else self.twin()
-        if own is None or len(own.of) != len(self._parts):
+        if own is None or len(own.of) != len(self._components):
             return None
-        return own if all(value is twin_value for value, twin_value in zip(self._parts, own.of, strict=True)) else None
+        return (
+            own
+            if all(value is twin_value for value, twin_value in zip(self._components, own.of, strict=True))
+            else None
+        )
 
     @property
-    def _parts(self) -> tuple[object, ...]:
+    def _components(self) -> tuple[object, ...]:
         """All fields of the program except its twin.
 
         Arrays cannot be written to, and families and sets are frozen records. So the same objects mean the same
@@ -782,7 +786,7 @@ class SemiInfiniteProgram:
 
         def once() -> OwnUnits:
             if not cache:
-                cache.append(replace(twin(self), of=self._parts))
+                cache.append(replace(twin(self), of=self._components))
             return cache[0]
 
         return replace(self, twin=once)
@@ -890,7 +894,7 @@ class OwnUnits:
     of: tuple[object, ...] = field(default=(), repr=False)
 
 
-def _vector(name: str, value: object, size: int) -> Array:
+def _check_vector(name: str, value: object, size: int) -> Array:
     """Return a vector of ``size`` finite numbers; raise `InputError` otherwise."""
     vector = as_bound(name, value, size)
     if not np.isfinite(vector).all():
@@ -898,7 +902,7 @@ def _vector(name: str, value: object, size: int) -> Array:
     return vector
 
 
-def _upper(name: str, value: object, size: int) -> Array:
+def _check_upper(name: str, value: object, size: int) -> Array:
     """Return the right-hand sides of inequalities; an entry of infinity is a row without effect, NaN and -inf are
     refused."""
     vector = as_bound(name, value, size)

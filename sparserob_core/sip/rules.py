@@ -84,12 +84,12 @@ class Rule:
     @classmethod
     def of(cls, function: Callable[..., object]) -> type[Self]:
         """Return a class of rules of this kind, without options, whose answers are those of a plain function."""
-        own = {"__call__": staticmethod(function), "__reduce__": lambda rule: (_rule, (cls, function))}
+        own = {"__call__": staticmethod(function), "__reduce__": lambda rule: (_make_rule, (cls, function))}
         named = {"__doc__": function.__doc__, "__module__": function.__module__}
         return type(function.__name__, (cls,), {**own, **named})
 
 
-def _rule(kind: type[Rule], function: Callable[..., object]) -> Rule:
+def _make_rule(kind: type[Rule], function: Callable[..., object]) -> Rule:
     """Return a rule made from a function, for unpickling."""
     return kind.of(function)()
 

@@ -111,7 +111,7 @@ def bound_before(scenarios: int, variables: int, beta: float = SURE) -> float:
     """
     from scipy.special import betaincinv
 
-    _check(scenarios, "variables", variables, 1, beta)
+    _check_arguments(scenarios, "variables", variables, 1, beta)
     if scenarios < variables:
         return 1.0
     return 1.0 - float(betaincinv(scenarios - variables + 1, variables, beta))
@@ -131,21 +131,21 @@ def bound_after(scenarios: int, support: int, beta: float = SURE) -> float:
     """
     from scipy.optimize import brentq
 
-    _check(scenarios, "support", support, 0, beta)
+    _check_arguments(scenarios, "support", support, 0, beta)
     if support >= scenarios:
         return 1.0
-    surplus = partial(_log_ratio, scenarios, support, np.log(beta))
+    surplus = partial(_compute_log_ratio, scenarios, support, np.log(beta))
     below, above = 1e-300, 1.0 - 1e-16
     return 1.0 if surplus(above) > 0 else float(brentq(surplus, below, above, xtol=1e-300, rtol=1e-13))
 
 
-def _log_ratio(scenarios: int, support: int, level: float, epsilon: float) -> float:
+def _compute_log_ratio(scenarios: int, support: int, level: float, epsilon: float) -> float:
     """Return ``log((k + 1) P(X = k + 1) / P(X > k)) - log(beta)``, which decreases in ``epsilon``."""
     m = np.arange(support + 1, scenarios + 2)
-    return float(-np.logaddexp.reduce(_log_terms(scenarios, support, epsilon, m)) + np.log(support + 1) - level)
+    return float(-np.logaddexp.reduce(_compute_log_terms(scenarios, support, epsilon, m)) + np.log(support + 1) - level)
 
 
-def _log_terms(scenarios: int, support: int, epsilon: float, m: np.ndarray) -> np.ndarray:
+def _compute_log_terms(scenarios: int, support: int, epsilon: float, m: np.ndarray) -> np.ndarray:
     """Return ``log(P(X = m) / P(X = k + 1))``."""
     from scipy.special import gammaln
 
@@ -157,7 +157,7 @@ def _log_terms(scenarios: int, support: int, epsilon: float, m: np.ndarray) -> n
     )
 
 
-def _check(scenarios: int, name: str, count: int, least: int, beta: float) -> None:
+def _check_arguments(scenarios: int, name: str, count: int, least: int, beta: float) -> None:
     whole("scenarios", scenarios, 1)
     whole(name, count, least)
     if not 0.0 < beta < 1.0:

@@ -331,16 +331,16 @@ class Auto(Solver, Options):
     cones: Any = Field(default={"name": "clarabel"}, json_schema_extra={"component": "solver"})
     """The solver for costs with norms of groups; a solver that is not conic leaves these programs to ``general``."""
 
-    _called: str = PrivateAttr(default=SOLVER)
-    _called_of_cones: str = PrivateAttr(default=SOLVER)
+    _general_name: str = PrivateAttr(default=SOLVER)
+    _cones_name: str = PrivateAttr(default=SOLVER)
 
     @model_validator(mode="after")
-    def _named(self) -> Auto:
+    def _record_names(self) -> Auto:
         if isinstance(self.general, Mapping):
-            self._called = str(self.general.get("name"))
+            self._general_name = str(self.general.get("name"))
         if isinstance(self.cones, Mapping):
-            self._called_of_cones = str(self.cones.get("name"))
-        for path, name in (("general", self._called), ("cones", self._called_of_cones)):
+            self._cones_name = str(self.cones.get("name"))
+        for path, name in (("general", self._general_name), ("cones", self._cones_name)):
             if name == AUTO or isinstance(getattr(self, path), Auto):
                 raise InputError(path=path, expected="a solver that answers by itself", got=AUTO)
         return self
@@ -348,14 +348,14 @@ class Auto(Solver, Options):
     @property
     def called(self) -> str:
         """Name of the ``general`` solver."""
-        return whole_name(self.general, self._called)
+        return whole_name(self.general, self._general_name)
 
     @property
     def of_cones(self) -> tuple[Solver, str] | None:
         """Solver for ``cones`` and its name; ``None`` where it is not conic."""
         if not isinstance(self.cones, Solver) or not self.cones.conic:
             return None
-        return self.cones, whole_name(self.cones, self._called_of_cones)
+        return self.cones, whole_name(self.cones, self._cones_name)
 
     def solve(self, program: QuadraticProgram, accuracy: float) -> Claim:
         """Return the claim of the ``general`` solver.
@@ -386,8 +386,8 @@ class Failures:
 
     def __init__(self, name: str = "") -> None:
         self.calls, self.name = 0, name
-        self._known: dict[tuple[str, str, str], Unanswered] = {}
-        self._logged = set[tuple[str, str]]()
+        self._entries: dict[tuple[str, str, str], Unanswered] = {}
+        self._logged_kinds = set[tuple[str, str]]()
 
     def add(self, kind: str, reason: str, by: str, count: int = 1) -> None:
         """Add programs that the named solver did not answer.
@@ -404,10 +404,10 @@ class Failures:
             Number of programs.
         """
         key = (kind, NUMBERS.sub("#", reason), by)
-        entry = self._known.get(key, Unanswered(kind, 0, reason, by))
-        self._known[key] = replace(entry, count=entry.count + count)
-        if self.name and (kind, by) not in self._logged:
-            self._logged.add((kind, by))
+        entry = self._entries.get(key, Unanswered(kind, 0, reason, by))
+        self._entries[key] = replace(entry, count=entry.count + count)
+        if self.name and (kind, by) not in self._logged_kinds:
+            self._logged_kinds.add((kind, by))
             logger.warning("solver %s did not answer a %s program, %s did: %s", self.name, kind, by, reason)
 
     def without_log(self) -> Failures:
@@ -428,11 +428,11 @@ class Failures:
         """
         self.calls += calls
         for entry in missed:
-            self._logged.add((entry.kind, entry.by))
+            self._logged_kinds.add((entry.kind, entry.by))
             self.add(entry.kind, entry.reason, entry.by, entry.count)
 
     def __iter__(self) -> Iterator[Unanswered]:
-        return iter(tuple(self._known.values()))
+        return iter(tuple(self._entries.values()))
 
     def since(self, before: tuple[Unanswered, ...]) -> tuple[Unanswered, ...]:
         """Return the programs that were added after ``before``, an earlier ``tuple`` of this account."""

@@ -132,13 +132,13 @@ class ExecutorContract(Contract[ExecutorFactory], kind="executor"):
     def test_what_cannot_be_sent_is_named_and_harms_nothing_else(self) -> None:
         mend = "pickle the call in `submit`, and the answer in the worker, and pass on what that raises"
         with self.opened() as executor:
-            for future in (executor.submit(echo, _unsendable()), executor.submit(_unsendable)):
+            for future in (executor.submit(echo, _make_unsendable()), executor.submit(_make_unsendable)):
                 error = self.outcome(future)
                 if error is None:  # it can be sent after all
                     demand(future.result()(3) == 3, "a function has come back as another one", mend)
                 else:
                     demand(not isinstance(error, BrokenExecutor), "what cannot be sent has ended the workers", mend)
-                    demand("_unsendable" in str(error), f"it is not named: {named(error)}", mend)
+                    demand("_make_unsendable" in str(error), f"it is not named: {named(error)}", mend)
             if self.isolated:
                 text = named(self.error(executor.submit(echo, threading.Lock())))
                 demand("lock" in text, f"a lock cannot be sent, and that is told as: {text}", mend)
@@ -349,7 +349,7 @@ def fails_oddly() -> None:
     raise Odd("it", mood="odd")
 
 
-def _unsendable() -> Callable[[int], int]:
+def _make_unsendable() -> Callable[[int], int]:
     return lambda value: value
 
 

@@ -70,7 +70,7 @@ def unbounded(points: Array) -> Array:
     return np.where(points[:, 0] > 0.2, np.inf, bowl(points))
 
 
-class _Counted:
+class _CountedFunction:
     """A function that counts the points it is asked for, keeps its best value, and fails in the call after
     ``fails_after`` points."""
 
@@ -179,7 +179,7 @@ class MaximiserContract(Contract[Maximiser], kind="maximiser"):
     def test_the_budget_is_never_exceeded(self) -> None:
         for budget in (1, 2, 7, 100):
             for function in (ripples, nowhere, half_undefined):
-                counted = _Counted(function)
+                counted = _CountedFunction(function)
                 report = self.search(counted, budget=budget)
                 demand(
                     report.evaluations == counted.calls <= budget,
@@ -204,7 +204,7 @@ class MaximiserContract(Contract[Maximiser], kind="maximiser"):
         )
 
     def test_a_function_that_raises_ends_the_search_and_keeps_what_was_found(self) -> None:
-        counted = _Counted(bowl, fails_after=20, failure=ArithmeticError("no value here"))
+        counted = _CountedFunction(bowl, fails_after=20, failure=ArithmeticError("no value here"))
         try:
             self.search(counted)
         except EvaluationError as error:
@@ -222,7 +222,7 @@ class MaximiserContract(Contract[Maximiser], kind="maximiser"):
             broken("the failure of the function was swallowed", "catch no exception of `objective.evaluate`")
 
     def test_an_interrupt_ends_the_search_and_keeps_what_was_found(self) -> None:
-        counted = _Counted(bowl, fails_after=20, failure=KeyboardInterrupt())
+        counted = _CountedFunction(bowl, fails_after=20, failure=KeyboardInterrupt())
         report = self.search(counted)
         demand(
             report.interrupted and counted.failures == 1,
@@ -278,7 +278,7 @@ class MaximiserContract(Contract[Maximiser], kind="maximiser"):
         )
 
     def test_a_gradient_may_be_used_and_costs_what_it_says(self) -> None:
-        counted = _Counted(bowl)
+        counted = _CountedFunction(bowl)
         target = Target(counted, PLANE, gradient=lambda point: -2.0 * (point - 0.3))
         report = maximise(target, self.create(), 60, np.random.default_rng(0))
         demand(

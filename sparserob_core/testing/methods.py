@@ -40,7 +40,7 @@ class Known:
     provable: bool = True
 
 
-def _dip(provable: bool) -> ConstraintFamily:
+def _make_dip(provable: bool) -> ConstraintFamily:
     """``x1 + x2 t <= 1 + (t - DIP)^2 - 0.3 exp(-((t - DIP) / WIDTH)^2)`` for all t in [0, 1]."""
 
     def rows(t: Array) -> tuple[Array, Array]:
@@ -62,10 +62,10 @@ def _dip(provable: bool) -> ConstraintFamily:
 
 def dipping(provable: bool = True) -> SemiInfiniteProgram:
     """minimise ``-x1 - DIP x2`` below a curve with a narrow dip that no coarse grid meets: -0.7, at (0.7, 0)."""
-    return SemiInfiniteProgram(n=2, q=np.array([-1.0, -DIP]), lower=-10.0, upper=10.0, families=[_dip(provable)])
+    return SemiInfiniteProgram(n=2, q=np.array([-1.0, -DIP]), lower=-10.0, upper=10.0, families=[_make_dip(provable)])
 
 
-def _bilinear() -> SemiInfiniteProgram:
+def _make_bilinear() -> SemiInfiniteProgram:
     """minimise ``|x|_1`` such that ``x1 + x2 s + x3 t >= 1 + s t`` on the unit square: 2, at (1, 1/2, 1/2)."""
 
     def rows(index: Array) -> tuple[Array, Array]:
@@ -81,7 +81,7 @@ def _bilinear() -> SemiInfiniteProgram:
     return SemiInfiniteProgram(n=3, weights=1.0, lower=-5.0, upper=5.0, families=[above])
 
 
-def _contradiction() -> SemiInfiniteProgram:
+def _make_contradiction() -> SemiInfiniteProgram:
     """`dipping`, and ``x1 + x2 t >= 0.9`` for all t: nothing is feasible."""
 
     def rows(t: Array) -> tuple[Array, Array]:
@@ -92,10 +92,10 @@ def _contradiction() -> SemiInfiniteProgram:
         return Enclosure(bounds, np.zeros(len(lower), dtype=int))
 
     above = ConstraintFamily(name="above", index_set=Box(np.zeros(1), np.ones(1)), rows=rows, enclosure=enclosure)
-    return replace(dipping(), families=[_dip(True), above])
+    return replace(dipping(), families=[_make_dip(True), above])
 
 
-def _curved() -> SemiInfiniteProgram:
+def _make_quadratic() -> SemiInfiniteProgram:
     """minimise ``(x - 1)^2 - 1`` such that ``x <= 1/2 + (t - 1/2)^2``: -3/4, at 1/2."""
 
     def rows(t: Array) -> tuple[Array, Array]:
@@ -122,14 +122,14 @@ def double_integrator(spread: float) -> SemiInfiniteProgram:
         system=LinearSystem(np.array([[0.0, 1.0], [0.0, 0.0]]), np.array([[0.0], [1.0]])),
         horizon=5.0,
         initial_state=[4.0, 0.0],
-        control=_symmetric(1.0),
-        disturbance=_symmetric(0.02 * spread, 0.02 * spread),
-        terminal=[_symmetric(0.5, 0.3)],
+        control=_make_symmetric(1.0),
+        disturbance=_make_symmetric(0.02 * spread, 0.02 * spread),
+        terminal=[_make_symmetric(0.5, 0.3)],
     )
     return transcribe(problem, control=pieces, disturbance=pieces)
 
 
-def _symmetric(*sides: float) -> Box:
+def _make_symmetric(*sides: float) -> Box:
     return Box(-np.array(sides), np.array(sides))
 
 
@@ -137,15 +137,15 @@ def known() -> Iterator[Known]:
     """Programs with and without a solution; in the first one the worst index is hard to meet, and of the last one
     nothing can be proven."""
     yield Known("a narrow dip", dipping(), -0.7)
-    yield Known("a bilinear family", _bilinear(), 2.0)
-    yield Known("a quadratic cost", _curved(), -0.75)
+    yield Known("a bilinear family", _make_bilinear(), 2.0)
+    yield Known("a quadratic cost", _make_quadratic(), -0.75)
     yield Known("a double integrator", double_integrator(1.0), 1.6)
     yield Known("a double integrator, infeasible", double_integrator(2.0), np.inf)
-    yield Known("a contradiction", _contradiction(), np.inf)
+    yield Known("a contradiction", _make_contradiction(), np.inf)
     yield Known("a family without an enclosure", dipping(provable=False), -0.7, provable=False)
 
 
-class _Watched(Deadline):
+class _WatchedDeadline(Deadline):
     """A deadline that counts how often it is asked."""
 
     def __init__(self, seconds: float | None = None) -> None:
@@ -163,7 +163,7 @@ class _Watched(Deadline):
         return super().reason
 
 
-class _Lying(Solver):
+class _LyingSolver(Solver):
     """Answers with a fixed status, zeros and multipliers of 1."""
 
     def __init__(self, status: Literal["solved", "infeasible", "failed"]) -> None:
@@ -258,7 +258,7 @@ class MethodContract(Contract[Method], kind="method"):
                     )
 
     def test_a_solver_that_lies_misleads_nobody(self) -> None:
-        for liar in (_Lying("solved"), _Lying("infeasible"), _Lying("failed")):
+        for liar in (_LyingSolver("solved"), _LyingSolver("infeasible"), _LyingSolver("failed")):
             for case in known():
                 if case.name in ("a narrow dip", "a contradiction"):
                     result = self.solved(case, solver=liar)
@@ -270,8 +270,9 @@ class MethodContract(Contract[Method], kind="method"):
         for case in known():
             first, second = self.solved(case), self.solved(case)
             demand(
-                _numbers(first) == _numbers(second),
-                f"{case.name}: the same seed gives another result: {_numbers(first)[:3]}, {_numbers(second)[:3]}",
+                _list_numbers(first) == _list_numbers(second),
+                f"{case.name}: the same seed gives another result: {_list_numbers(first)[:3]},"
+                f" {_list_numbers(second)[:3]}",
                 "draw from `tools.rng` only, and let no clock decide",
             )
         demand(
@@ -285,7 +286,7 @@ class MethodContract(Contract[Method], kind="method"):
         for case in known():
             reused, fresh = self.solved(case, method), self.solved(case)
             demand(
-                _numbers(reused) == _numbers(fresh),
+                _list_numbers(reused) == _list_numbers(fresh),
                 f"{case.name}: a method that has solved other programs before comes to another result than a new one",
                 "keep nothing of a program in `self`",
             )
@@ -305,7 +306,7 @@ class MethodContract(Contract[Method], kind="method"):
 
     def test_it_ends_when_its_time_is_over(self) -> None:
         for case in known():
-            late = _Watched(1e-9)
+            late = _WatchedDeadline(1e-9)
             result = self.solved(case, deadline=late)
             if result is None:
                 continue
@@ -419,7 +420,7 @@ def _judge_bounds(one: Known, result: Result, scale: float) -> None:
     )
     if result.status != "infeasible" and not result.lower_bound > -np.inf:
         return
-    derived = _derived(one.program, result)
+    derived = _derive_bound(one.program, result)
     if derived is None:
         return
     if result.status == "infeasible":
@@ -436,7 +437,7 @@ def _judge_bounds(one: Known, result: Result, scale: float) -> None:
         )
 
 
-def _derived(program: SemiInfiniteProgram, result: Result) -> float | None:
+def _derive_bound(program: SemiInfiniteProgram, result: Result) -> float | None:
     """Derive the bound that the multipliers of a result prove: a lower bound of the value, or the margin of
     infeasibility.
 
@@ -475,7 +476,7 @@ def _judge_decision(one: Known, result: Result, x: Array, scale: float) -> None:
         "look at `program.finite.residual(decision)` before you claim anything",
     )
     for family in program.families:
-        worst = _worst_sampled(family, x)
+        worst = _sample_worst_violation(family, x)
         demand(
             worst <= 1e-8,
             f"{one.name}: it is {result.status}, and the decision violates {family.name} by {worst:.3g}",
@@ -501,7 +502,7 @@ def _judge_decision(one: Known, result: Result, x: Array, scale: float) -> None:
     )
 
 
-def _worst_sampled(family: ConstraintFamily, x: Array) -> float:
+def _sample_worst_violation(family: ConstraintFamily, x: Array) -> float:
     """The largest violation at many indices, near the dip of `dipping` above all; it proves nothing."""
     box, rng = family.index_set, np.random.default_rng(1)
     spread = rng.random((SAMPLES, box.dimension))
@@ -525,7 +526,7 @@ def _judge_witness(one: Known, result: Result, x: Array) -> None:
     )
 
 
-def _numbers(result: Result | None) -> list[object]:
+def _list_numbers(result: Result | None) -> list[object]:
     if result is None:
         return []
     decision = None if result.decision is None else result.decision.tolist()

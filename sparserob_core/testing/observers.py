@@ -79,16 +79,16 @@ class Recording(Observer):
     def receive(self, event: Event) -> None:
         """Pass it on, then fail where that was asked for."""
         self.events.append(event)
-        self._noting(lambda: self.observer.receive(event))
+        self._note_error(lambda: self.observer.receive(event))
         if self.failure is not None and len(self.events) - 1 == self.fails_at:
             raise self.failure
 
     def close(self) -> None:
         """Pass it on."""
         self.closed += 1
-        self._noting(self.observer.close)
+        self._note_error(self.observer.close)
 
-    def _noting(self, call: Any) -> None:
+    def _note_error(self, call: Any) -> None:
         try:
             call()
         except Exception as error:
@@ -123,7 +123,7 @@ class ObserverContract(Contract[Observer], kind="observer"):
         kinds: set[type[Event]] = set()
         for method in METHODS:
             _, recording = self.watched(method)
-            _unharmed(recording, f"a run of {method}")
+            _check_unharmed(recording, f"a run of {method}")
             first, last = recording.events[0], recording.events[-1]
             demand(isinstance(first, RunStarted) and isinstance(last, RunFinished), f"{method}: {first}", FRAMEWORK)
             demand(recording.closed == 1, f"{method}: it was closed {recording.closed} times", FRAMEWORK)
@@ -137,9 +137,9 @@ class ObserverContract(Contract[Observer], kind="observer"):
     def test_the_run_is_the_same_with_and_without_it(self) -> None:
         for method in METHODS:
             watched, recording = self.watched(method)
-            _unharmed(recording, f"a run of {method}")
+            _check_unharmed(recording, f"a run of {method}")
             demand(
-                numbers(watched.result) == _unwatched(method),
+                numbers(watched.result) == _run_unwatched(method),
                 f"{method}: the observer has changed the result",
                 "only look at what an event holds: copy arrays before you change them, and ask `inspection` for the "
                 "rest, which has a copy of its own",
@@ -151,7 +151,7 @@ class ObserverContract(Contract[Observer], kind="observer"):
                 recording = Recording(self.create(), count, KeyboardInterrupt())
                 with suppress(KeyboardInterrupt):
                     self.watched("sparserob", recording)
-                _unharmed(recording, f"a run that is interrupted after {count} events")
+                _check_unharmed(recording, f"a run that is interrupted after {count} events")
                 demand(isinstance(recording.events[-1], RunFinished), "the last event is missing", FRAMEWORK)
                 demand(recording.closed == 1, f"it was closed {recording.closed} times", FRAMEWORK)
 
@@ -161,7 +161,7 @@ class ObserverContract(Contract[Observer], kind="observer"):
                 outcome, recording = self.watched(
                     "sparserob", Recording(self.create(), count, RuntimeError("detached by the contract"))
                 )
-                _unharmed(recording, f"a run from which it is detached after {count} events")
+                _check_unharmed(recording, f"a run from which it is detached after {count} events")
                 demand(len(recording.events) == count + 1, "it heard more after it was detached", FRAMEWORK)
                 demand(recording.closed == 1, f"it was closed {recording.closed} times", FRAMEWORK)
                 demand(outcome.result.decision is not None, "the run did not go on without it", FRAMEWORK)
@@ -187,23 +187,26 @@ class ObserverContract(Contract[Observer], kind="observer"):
             )
 
     def test_events_of_an_unknown_kind_and_in_an_unknown_order_are_ignored(self) -> None:
-        self._hears((_New(), *bare_events(), _New(), *bare_events()[-1:]), "events of later versions, and out of order")
+        self._send_events(
+            (_LaterEvent(), *bare_events(), _LaterEvent(), *bare_events()[-1:]),
+            "events of later versions, and out of order",
+        )
 
     def test_a_program_that_is_no_control_problem_is_watched_too(self) -> None:
-        self._hears((started(), *bare_events()), "a program that is no control problem")
+        self._send_events((started(), *bare_events()), "a program that is no control problem")
 
     def test_a_study_is_watched_or_ignored(self) -> None:
         with TemporaryDirectory() as directory:
-            self._hears(study_events(Path(directory)), "a study")
+            self._send_events(study_events(Path(directory)), "a study")
 
-    def _hears(self, events: Sequence[Event], what: str) -> None:
+    def _send_events(self, events: Sequence[Event], what: str) -> None:
         recording = Recording(self.create())
         with suppress(Exception):
             for event in events:
                 recording.receive(event)
         with suppress(Exception):
             recording.close()
-        _unharmed(recording, what)
+        _check_unharmed(recording, what)
 
     def test_it_does_not_hold_up_the_solver(self) -> None:
         observer, seconds = self.create(), []
@@ -226,14 +229,14 @@ class ObserverContract(Contract[Observer], kind="observer"):
 
 
 @cache
-def _unwatched(method: str) -> object:
+def _run_unwatched(method: str) -> object:
     """The numbers of a run of `METHODS` that nobody watches; the same for every observer."""
     with TemporaryDirectory() as directory:
         alone = run({**CONFIG, **METHODS[method]}, out=Path(directory) / "run", figures=False, quiet=True)
     return numbers(alone.result)
 
 
-def _unharmed(recording: Recording, what: str) -> None:
+def _check_unharmed(recording: Recording, what: str) -> None:
     """Raise `ContractBroken` where the observer raised."""
     if recording.errors:
         error, count = recording.errors[0], len(recording.events)
@@ -255,7 +258,7 @@ class _Terminal(io.StringIO):
 
 
 @final
-class _New(Event):
+class _LaterEvent(Event):
     """An event of a later version."""
 
 

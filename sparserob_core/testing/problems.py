@@ -97,7 +97,7 @@ class ProblemContract(Contract[ProblemFactory], kind="problem"):
             "let nothing but the options decide: no clock, and no random numbers without a seed among the options",
         )
         for family, twin in zip(first.families, second.families, strict=True):
-            points = _points(family.index_set, np.random.default_rng(1), POINTS)
+            points = _sample_points(family.index_set, np.random.default_rng(1), POINTS)
             x = np.random.default_rng(2).random(first.n)
             is_same = same(family.violations(x, points), twin.violations(x, points))
             if family.uncertain is None:
@@ -127,10 +127,10 @@ class ProblemContract(Contract[ProblemFactory], kind="problem"):
                 f"{family.name}: the index set is not bounded",
                 "the index set of a family is a bounded box: transform what runs to infinity",
             )
-            points = _points(box, np.random.default_rng(3), POINTS)
+            points = _sample_points(box, np.random.default_rng(3), POINTS)
             if family.uncertain is not None:
                 continue
-            G, h = _rows(family, points)
+            G, h = _ask_rows(family, points)
             demand(
                 G.shape == (len(points), h.shape[-1], n) and h.shape == (len(points), G.shape[1]),
                 f"{family.name}: rows returned {G.shape} and {h.shape} for {len(points)} indices of {box.dimension} "
@@ -143,7 +143,7 @@ class ProblemContract(Contract[ProblemFactory], kind="problem"):
                 "look for a division by zero, or a root of a negative number, at the ends of the index set",
             )
             order = np.random.default_rng(4).permutation(len(points))
-            single_rows = [_rows(family, points[[k]]) for k in order]
+            single_rows = [_ask_rows(family, points[[k]]) for k in order]
             for k, (G_alone, h_alone) in zip(order, single_rows, strict=True):
                 demand(
                     np.allclose(G_alone[0], G[k], rtol=1e-9, atol=1e-12) and np.allclose(h_alone[0], h[k], rtol=1e-9),
@@ -163,12 +163,12 @@ class ProblemContract(Contract[ProblemFactory], kind="problem"):
             )
             assert spread is not None
             for x in decisions:
-                points = _points(family.index_set, np.random.default_rng(13), 8)
-                violations = _asked(family, "excess", lambda f=family, x=x, p=points: f.violations(x, p))
+                points = _sample_points(family.index_set, np.random.default_rng(13), 8)
+                violations = _ask_family(family, "excess", lambda f=family, x=x, p=points: f.violations(x, p))
                 for point, batch_violation in zip(points, violations, strict=True):
                     violation = family.violations(x, point[None])[0]
-                    rows = _asked(family, "uncertain", lambda f=family, p=point: f.uncertain(p))
-                    excess, size = rows.excess(x, spread), _size(family, x, point[None])
+                    rows = _ask_family(family, "uncertain", lambda f=family, p=point: f.uncertain(p))
+                    excess, size = rows.excess(x, spread), _measure_size(family, x, point[None])
                     demand(
                         excess.shape == violation.shape and np.abs(excess - violation).max(initial=0.0) <= CLOSE * size,
                         f"{family.name}: the rows are violated by {excess[:3]} at {point}, and excess says "
@@ -186,11 +186,11 @@ class ProblemContract(Contract[ProblemFactory], kind="problem"):
             if family.gradient is None:
                 continue
             box, rng = family.index_set, np.random.default_rng(5)
-            points = _points(box, rng, POINTS, margin=0.01)
+            points = _sample_points(box, rng, POINTS, margin=0.01)
             for x in decisions:
-                rows = rng.integers(0, _rows(family, points)[1].shape[1], len(points))
-                gradients = _asked(family, "gradient", lambda f=family, x=x, p=points, r=rows: f.gradient(x, p, r))
-                wrong = _wrong_slopes(family, x, points, rows, np.asarray(gradients))
+                rows = rng.integers(0, _ask_rows(family, points)[1].shape[1], len(points))
+                gradients = _ask_family(family, "gradient", lambda f=family, x=x, p=points, r=rows: f.gradient(x, p, r))
+                wrong = _find_wrong_slopes(family, x, points, rows, np.asarray(gradients))
                 demand(
                     wrong.mean() <= 0.1,
                     f"{family.name}: at {wrong.mean():.0%} of the indices the gradient is not the derivative of "
@@ -202,11 +202,11 @@ class ProblemContract(Contract[ProblemFactory], kind="problem"):
         for family, decisions in self.families():
             if family.worst is None:
                 continue
-            points = _points(family.index_set, np.random.default_rng(6), 50 * POINTS)
+            points = _sample_points(family.index_set, np.random.default_rng(6), 50 * POINTS)
             for x in decisions:
-                separation = _asked(family, "worst", lambda f=family, x=x: f.worst(x))
-                size = _size(family, x, points)
-                self._look_at(family, x, separation, size)
+                separation = _ask_family(family, "worst", lambda f=family, x=x: f.worst(x))
+                size = _measure_size(family, x, points)
+                self._check_separation(family, x, separation, size)
                 sampled = float(family.violations(x, points).max())
                 demand(
                     sampled <= separation.bound + CLOSE * size,
@@ -221,7 +221,7 @@ class ProblemContract(Contract[ProblemFactory], kind="problem"):
                     "name the most violated index of the whole set; leave `worst` out where it is not known exactly",
                 )
 
-    def _look_at(self, family: ConstraintFamily, x: Array, found: Separation, size: float) -> None:
+    def _check_separation(self, family: ConstraintFamily, x: Array, found: Separation, size: float) -> None:
         box, count = family.index_set, len(found.violations)
         demand(
             found.indices.shape == (count, box.dimension) and found.rows.shape == (count,),
@@ -253,8 +253,8 @@ class ProblemContract(Contract[ProblemFactory], kind="problem"):
             box, rng = family.index_set, np.random.default_rng(7)
             for x in decisions[:2]:
                 for share in (1.0, 0.2, 0.01, SMALL):
-                    lower, upper = _cells(family, rng, share)
-                    enclosure = _asked(
+                    lower, upper = _sample_cells(family, rng, share)
+                    enclosure = _ask_family(
                         family, "enclosure", lambda f=family, x=x, a=lower, b=upper: f.enclosure(x, a, b)
                     )
                     samples = (
@@ -262,7 +262,7 @@ class ProblemContract(Contract[ProblemFactory], kind="problem"):
                     )
                     violations = family.violations(x, samples.reshape(-1, box.dimension))
                     largest = violations.reshape(len(lower), INSIDE, -1).max(axis=(1, 2))
-                    size = _size(family, x, samples.reshape(-1, box.dimension))
+                    size = _measure_size(family, x, samples.reshape(-1, box.dimension))
                     demand(
                         np.shape(enclosure.bounds) == np.shape(enclosure.split) == (len(lower),),
                         f"{family.name}: enclosure has bounds {np.shape(enclosure.bounds)} and split "
@@ -315,7 +315,7 @@ class ProblemContract(Contract[ProblemFactory], kind="problem"):
                 f"{family.name}: the cells fill {volume:.6g} of the index set",
                 "cells cover the index set without a gap, and do not overlap but at their sides",
             )
-            points = _points(box, np.random.default_rng(8), POINTS)
+            points = _sample_points(box, np.random.default_rng(8), POINTS)
             inside = np.all((points[:, None] >= lower) & (points[:, None] <= upper), axis=2)
             demand(
                 np.any(inside, axis=1).all(),
@@ -334,11 +334,11 @@ class ProblemContract(Contract[ProblemFactory], kind="problem"):
             for name, form in forms.items():
                 if form is None:
                     continue
-                points = _points(form.index_set, np.random.default_rng(10), POINTS)
+                points = _sample_points(form.index_set, np.random.default_rng(10), POINTS)
                 for x in decisions:
                     bound, drawn = family.worst(x).bound, float(form.violations(x, points).max())
                     demand(
-                        drawn <= bound + CLOSE * _size(form, x, points),
+                        drawn <= bound + CLOSE * _measure_size(form, x, points),
                         f"{family.name}: its {name} form has a violation of {drawn:.9g}, the family itself at most "
                         f"{bound:.9g}",
                         "the nominal, the sampled and the literal form have some of the constraints, and no others",
@@ -346,9 +346,9 @@ class ProblemContract(Contract[ProblemFactory], kind="problem"):
 
     def test_a_constraint_is_explained_in_words(self) -> None:
         for family, _ in self.families():
-            points = _points(family.index_set, np.random.default_rng(11), 5)
+            points = _sample_points(family.index_set, np.random.default_rng(11), 5)
             for point in points:
-                explanation = _asked(family, "explain", lambda f=family, p=point: f.explanation(p, 0))
+                explanation = _ask_family(family, "explain", lambda f=family, p=point: f.explanation(p, 0))
                 demand(
                     isinstance(explanation, Explanation) and bool(explanation.text.strip()),
                     f"{family.name}: a constraint is explained by {explanation!r}",
@@ -394,7 +394,7 @@ class ProblemContract(Contract[ProblemFactory], kind="problem"):
         )
 
 
-def _points(box: Box, rng: np.random.Generator, count: int, margin: float = 0.0) -> Array:
+def _sample_points(box: Box, rng: np.random.Generator, count: int, margin: float = 0.0) -> Array:
     """Indices ``(count, d)`` in a box, its corners among them where no margin is asked for."""
     sides = box.upper - box.lower
     points = box.lower + (margin + (1.0 - 2.0 * margin) * rng.random((count, box.dimension))) * sides
@@ -403,7 +403,7 @@ def _points(box: Box, rng: np.random.Generator, count: int, margin: float = 0.0)
     return np.asarray(points)
 
 
-def _asked(family: ConstraintFamily, what: str, call: Any) -> Any:
+def _ask_family(family: ConstraintFamily, what: str, call: Any) -> Any:
     try:
         return call()
     except Exception as error:  # noqa: BLE001  a component may raise anything, and must not
@@ -413,8 +413,8 @@ def _asked(family: ConstraintFamily, what: str, call: Any) -> Any:
         )
 
 
-def _rows(family: ConstraintFamily, points: Array) -> tuple[Array, Array]:
-    G, h = _asked(family, "rows", lambda: family.rows(points))
+def _ask_rows(family: ConstraintFamily, points: Array) -> tuple[Array, Array]:
+    G, h = _ask_family(family, "rows", lambda: family.rows(points))
     G, h = np.asarray(G, dtype=float), np.asarray(h, dtype=float)
     demand(
         G.ndim == 3 and h.ndim == 2,
@@ -424,7 +424,7 @@ def _rows(family: ConstraintFamily, points: Array) -> tuple[Array, Array]:
     return G, h
 
 
-def _size(family: ConstraintFamily, x: Array, points: Array) -> float:
+def _measure_size(family: ConstraintFamily, x: Array, points: Array) -> float:
     """The largest sum of the terms of a row; of one that holds for every deviation, of its nominal ones and what these
     make of it."""
     if family.uncertain is not None:
@@ -437,7 +437,7 @@ def _size(family: ConstraintFamily, x: Array, points: Array) -> float:
     return float(terms.max(initial=0.0)) or 1.0
 
 
-def _cells(family: ConstraintFamily, rng: np.random.Generator, share: float) -> tuple[Array, Array]:
+def _sample_cells(family: ConstraintFamily, rng: np.random.Generator, share: float) -> tuple[Array, Array]:
     """Cells whose sides are a share of those of the family's own cells, or of its index set."""
     box = family.index_set
     lower, upper = (box.lower[None], box.upper[None]) if family.cells is None else family.cells
@@ -447,14 +447,14 @@ def _cells(family: ConstraintFamily, rng: np.random.Generator, share: float) -> 
     return first, np.minimum(first + share * sides, low + sides)
 
 
-def _wrong_slopes(family: ConstraintFamily, x: Array, points: Array, rows: np.ndarray, told: Array) -> np.ndarray:
+def _find_wrong_slopes(family: ConstraintFamily, x: Array, points: Array, rows: np.ndarray, told: Array) -> np.ndarray:
     """Return a mask ``(k,)`` of the indices at which ``told (k, d)`` is no derivative of the row.
 
     A derivative must equal one of the two one-sided differences, as a row may have kinks.
     """
     box, k = family.index_set, np.arange(len(points))
     sides = box.upper - box.lower
-    size, is_wrong = _size(family, x, points), np.zeros(len(points), dtype=bool)
+    size, is_wrong = _measure_size(family, x, points), np.zeros(len(points), dtype=bool)
     demand(
         told.shape == points.shape,
         f"{family.name}: gradient returned the shape {told.shape} for {len(points)} indices",

@@ -529,7 +529,7 @@ class SolverContract(Contract[Solver], kind="solver"):
             changed = [
                 name
                 for name in ("P", "q", "G", "h", "A", "b", "lower", "upper")
-                if not np.array_equal(_dense(getattr(before, name)), _dense(getattr(question.program, name)))
+                if not np.array_equal(_make_dense(getattr(before, name)), _make_dense(getattr(question.program, name)))
             ]
             demand(
                 not changed,
@@ -640,5 +640,5 @@ def compare(instance: Instance, solution: FiniteSolution) -> None:
         )
 
 
-def _dense(value: object) -> Array:
+def _make_dense(value: object) -> Array:
     return np.asarray(value.toarray() if hasattr(value, "toarray") else value)

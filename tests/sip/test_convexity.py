@@ -12,7 +12,7 @@ import pytest
 from scipy.sparse import block_diag, csc_array, csr_array, diags_array, eye_array, kron
 
 import sparserob_core as sr
-from sparserob_core.experiment.cli.main import _status
+from sparserob_core.experiment.cli.main import _run_command_line
 from sparserob_core.sip import convexity
 from sparserob_core.sip.convexity import ROUNDED, convex_by_construction, is_definite, is_semidefinite, require_convex
 
@@ -176,7 +176,7 @@ def test_a_direction_that_refuses_a_form_shows_it(n, seed, monkeypatch):
     for full in (0.0, 2.0):
         monkeypatch.setattr(convexity, "FULL", full)
         monkeypatch.setattr(convexity, "DENSE", 0)
-        direction = convexity._descent(P)
+        direction = convexity._find_negative_direction(P)
         size = np.sqrt(P.diagonal())
         if direction is None:
             direction = np.zeros(P.shape[0])
@@ -192,7 +192,7 @@ def test_definite_is_more_than_semidefinite():
 
 def test_the_same_form_is_looked_at_once(monkeypatch):
     program = sr.SemiInfiniteProgram(n=2, P=np.array([[2.0, 1.0], [1.0, 2.0]]), lower=-1.0, upper=1.0)
-    monkeypatch.setattr(convexity, "_descent", lambda P: pytest.fail("looked at again"))
+    monkeypatch.setattr(convexity, "_find_negative_direction", lambda P: pytest.fail("looked at again"))
     assert replace(program, lower=-2.0).P is program.P
     made = convex_by_construction(csc_array(np.diag([1.0, 2.0])))
     assert sr.SemiInfiniteProgram(n=2, P=made).P is made
@@ -262,7 +262,7 @@ def test_the_command_ends_with_status_2(config, words, tmp_path: Path, capsys) -
     (tmp_path / "odd.yaml").write_text(f"plugins: [odd.py]\nobservers: []\nproblem: {problem}\n".replace("'", '"'))
     key, _, value = config.partition(": ")
     arguments = ["run", str(tmp_path / "odd.yaml"), f"{key}={value}", "--out", str(tmp_path / "run"), "--no-figures"]
-    assert _status(arguments) == 2
+    assert _run_command_line(arguments) == 2
     said = " ".join(capsys.readouterr().err.split())
     assert words in said and "Traceback" not in said, said
 
@@ -270,7 +270,7 @@ def test_the_command_ends_with_status_2(config, words, tmp_path: Path, capsys) -
 @pytest.mark.parametrize("kind", ["band", "blocks", "dense"])
 def test_a_look_costs_little_beside_the_solution(kind, monkeypatch):
     """The look takes less than a third of the processor time of a solution without families, which is the shortest."""
-    rng, spent, look = np.random.default_rng(0), [0.0], convexity._descent
+    rng, spent, look = np.random.default_rng(0), [0.0], convexity._find_negative_direction
     if kind == "band":
         B = diags_array([rng.normal(size=100_000) for _ in range(4)], offsets=list(range(4)), shape=(100_000, 100_003))
         P = csc_array(B @ B.T)
@@ -288,7 +288,7 @@ def test_a_look_costs_little_beside_the_solution(kind, monkeypatch):
         return found
 
     require_convex("P", biharmonic(25), 625)  # imports
-    monkeypatch.setattr(convexity, "_descent", timed)
+    monkeypatch.setattr(convexity, "_find_negative_direction", timed)
     clock = time.process_time()
     n = P.shape[0]
     result = sr.solve(sr.SemiInfiniteProgram(n=n, P=P, q=rng.normal(size=n), lower=-1.0, upper=1.0))

@@ -38,19 +38,23 @@ class NewVariables:
 
 def in_new_variables(program: FiniteProgram) -> NewVariables | None:
     """The program in coordinates that make it easier; ``None`` where it has such coordinates already."""
-    return _of_the_image(program) if program.S is not None else _of_size_one(program)
+    return _change_to_image(program) if program.S is not None else _rescale_variables(program)
 
 
-def _of_the_image(program: FiniteProgram) -> NewVariables | None:
+def _change_to_image(program: FiniteProgram) -> NewVariables | None:
     """The coordinates ``s = S x``, in which the program is separable; ``None`` unless ``S`` is square and well
     conditioned and ``P`` becomes diagonal."""
     S = program.S
     if S is None or S.shape[0] != S.shape[1]:
         return None
-    inverse = _inverses.recall((S,), None, partial(_inverse, S))
+    inverse = _inverses.recall((S,), None, partial(_invert, S))
     if inverse is None:
         return None
-    P = None if program.P is None else _curvatures.recall((S, program.P), None, partial(_curvature, program.P, inverse))
+    P = (
+        None
+        if program.P is None
+        else _curvatures.recall((S, program.P), None, partial(_transform_curvature, program.P, inverse))
+    )
     if program.P is not None and P is None:
         return None
     easier = replace(program, S=None, P=P, q=program.q @ inverse, G=program.G @ inverse, A=program.A @ inverse)
@@ -86,13 +90,13 @@ def in_round_coordinates(program: FiniteProgram) -> NewVariables | None:
     return NewVariables(easier, lambda x: factor.T @ x, lambda v: np.asarray(inverse @ v), lambda z: z)
 
 
-def _of_size_one(program: FiniteProgram) -> NewVariables | None:
+def _rescale_variables(program: FiniteProgram) -> NewVariables | None:
     """The variables ``x_k / unit_k``, with powers of two for units, which change no number but its exponent; ``None``
     where the bounds of all variables are of ordinary size."""
     if program.blocks is not None:  # a norm has one unit for all its entries
         return None
     sources = (program.lower, program.upper, program.weights)
-    scaling = _units.recall(sources, None, lambda: _scaled(*sources))
+    scaling = _units.recall(sources, None, lambda: _scale_bounds(*sources))
     if scaling is None:
         return None
     unit, lower, upper, weights = scaling
@@ -108,7 +112,7 @@ def _of_size_one(program: FiniteProgram) -> NewVariables | None:
     return NewVariables(easier, lambda x: x / unit, lambda v: v * unit, lambda z: z / unit)
 
 
-def _scaled(lower: Array, upper: Array, weights: Array) -> tuple[Array, Array, Array, Array] | None:
+def _scale_bounds(lower: Array, upper: Array, weights: Array) -> tuple[Array, Array, Array, Array] | None:
     reach = np.maximum(np.abs(lower), np.abs(upper))
     has_size = np.isfinite(reach) & (reach > 0.0)
     if not ((reach[has_size] > ORDINARY) | (reach[has_size] < 1.0 / ORDINARY)).any():
@@ -117,7 +121,7 @@ def _scaled(lower: Array, upper: Array, weights: Array) -> tuple[Array, Array, A
     return unit, lower / unit, upper / unit, weights * unit
 
 
-def _inverse(S: csc_array) -> Array | None:
+def _invert(S: csc_array) -> Array | None:
     dense = S.toarray()
     try:
         inverse = np.linalg.inv(dense)
@@ -126,7 +130,7 @@ def _inverse(S: csc_array) -> Array | None:
     return inverse if np.linalg.norm(dense, 1) * np.linalg.norm(inverse, 1) <= WORST else None
 
 
-def _curvature(P: csc_array, inverse: Array) -> csc_array | None:
+def _transform_curvature(P: csc_array, inverse: Array) -> csc_array | None:
     from scipy.sparse import csc_array, diags_array
 
     transformed = inverse.T @ (P @ inverse)

@@ -53,13 +53,13 @@ def least_curvature(P: Array) -> Array | None:
         return None
     error = 2.0 * (n + 2) * ROUNDING * float(scaled.trace())
     if not share > error:
-        error = _missed(scaled, share, factor)
+        error = _bound_factor_error(scaled, share, factor)
     if not share > error:
         return None
     return np.asarray((share - error) / unit**2 * (1.0 - 4.0 * ROUNDING), dtype=float)
 
 
-def _missed(scaled: Array, share: float, factor: np.ndarray) -> float:
+def _bound_factor_error(scaled: Array, share: float, factor: np.ndarray) -> float:
     """A bound of the norm of ``scaled - share I - factor factor'``, by the sums of its rows; every entry is a sum of
     ``n + 2`` terms, and off by at most so many roundings of their absolute values (Higham 2002, section 3.1)."""
     wide, size = factor.astype(WIDE), np.abs(factor)
@@ -103,13 +103,13 @@ def curved_bound(program: FiniteProgram, bend: Array, y: Array, mu: Array, at: A
     rows, equalities = y.astype(WIDE), mu.astype(WIDE)
     h = np.where(y > 0.0, program.h, 0.0)
     pull = program.q + rows @ program.G + equalities @ program.A
-    offers: list[np.ndarray] = [point, _stationary(program, wide, pull, point)]
-    bounds = [_bound_at(program, wide, bend, (rows, equalities, h, pull), offer) for offer in offers]
+    offers: list[np.ndarray] = [point, _find_stationary_point(program, wide, pull, point)]
+    bounds = [_evaluate_bound(program, wide, bend, (rows, equalities, h, pull), offer) for offer in offers]
     best = int(np.argmax(bounds))
     return bounds[best], offers[best].astype(float)
 
 
-def _stationary(program: FiniteProgram, wide: np.ndarray, pull: np.ndarray, at: np.ndarray) -> np.ndarray:
+def _find_stationary_point(program: FiniteProgram, wide: np.ndarray, pull: np.ndarray, at: np.ndarray) -> np.ndarray:
     """The point near ``at`` where the slope of every entry is 0 that no bound and no kink holds."""
     low, high, weights = program.lower, program.upper, program.weights
     width = np.where(np.isfinite(high - low), high - low, 1.0)
@@ -133,7 +133,7 @@ def _stationary(program: FiniteProgram, wide: np.ndarray, pull: np.ndarray, at: 
     return np.asarray(np.minimum(np.maximum(point, low), high))
 
 
-def _bound_at(
+def _evaluate_bound(
     program: FiniteProgram, wide: np.ndarray, bend: Array, given: tuple[np.ndarray, ...], at: np.ndarray
 ) -> float:
     """The bound with the tangent at one point."""

@@ -75,7 +75,7 @@ class DualNewton(Solver, Options):
         slope = program.q + gradient + solution.y @ finite.G + solution.mu @ finite.A
         low, high = solution.x <= program.lower, solution.x >= program.upper
         box = np.where(low, np.minimum(-slope, 0.0), 0.0) + np.where(high, np.maximum(-slope, 0.0), 0.0)
-        converged = solution.residual <= accuracy and solution.gap <= max(accuracy, _noise(solution))
+        converged = solution.residual <= accuracy and solution.gap <= max(accuracy, _estimate_rounding(solution))
         message = f"{steps} proximal points; residual {solution.residual:.1e}, gap {solution.gap:.1e}"
         return Claim("solved" if converged else "failed", solution.x, solution.y, solution.mu, box, message)
 
@@ -115,15 +115,15 @@ def from_nothing(program: FiniteProgram, accuracy: float, points: int) -> tuple[
             continue
         solution = measure(program, near.x, near.y, near.mu, message="dual Newton")
         x, y, mu = solution.x, solution.y, solution.mu
-        is_better = _size(solution) < 0.5 * _size(best)
+        is_better = _measure_error(solution) < 0.5 * _measure_error(best)
         best, idle = (solution, 0) if is_better else (best, idle + 1)
-        if best.residual <= accuracy and best.gap <= max(0.1 * accuracy, _noise(best)):
+        if best.residual <= accuracy and best.gap <= max(0.1 * accuracy, _estimate_rounding(best)):
             break
         weight = max(LIGHTER * weight, LIGHTEST * cost)
     return best, number
 
 
-def _size(solution: FiniteSolution) -> float:
+def _measure_error(solution: FiniteSolution) -> float:
     return solution.residual + max(solution.gap, 0.0)
 
 
@@ -158,7 +158,7 @@ def proximal_polish(
 
     is_flat = not curvature.min(initial=np.inf) > 0
     best: FiniteSolution | None = None
-    for weight in _weights(program.steepest or 1.0, float(curvature.min(initial=np.inf))):
+    for weight in _list_weights(program.steepest or 1.0, float(curvature.min(initial=np.inf))):
         P = dia_array(((curvature + weight)[None], [0]), shape=(program.n, program.n)).tocsc()
         near = newton_solve(replace(program, P=P, q=program.q - weight * x), y, mu)
         if near is None:
@@ -166,9 +166,9 @@ def proximal_polish(
         solution = measure(program, near.x, near.y, near.mu, message="proximal Newton")
         distance = float(np.abs(solution.x - x).max(initial=0.0))
         x, y, mu = solution.x, solution.y, solution.mu
-        is_better = best is None or _better(solution, best)
+        is_better = best is None or _is_better(solution, best)
         best = solution if is_better or best is None else best
-        if is_flat and not (is_better and solution.gap > _noise(solution)):
+        if is_flat and not (is_better and solution.gap > _estimate_rounding(solution)):
             break
         if (
             not is_flat
@@ -179,7 +179,7 @@ def proximal_polish(
     return best
 
 
-def _weights(cost: float, curvature: float) -> Iterator[float]:
+def _list_weights(cost: float, curvature: float) -> Iterator[float]:
     """Constant for a polyhedral program; otherwise down to the curvature, where each round halves the distance to the
     optimiser."""
     weight = 0.1 * cost
@@ -189,11 +189,11 @@ def _weights(cost: float, curvature: float) -> Iterator[float]:
             weight = max(0.1 * weight, curvature, 1e-6 * cost)
 
 
-def _better(one: FiniteSolution, other: FiniteSolution) -> bool:
-    return one.gap <= max(0.9 * other.gap, _noise(other)) and one.residual <= max(other.residual, 1e-10)
+def _is_better(one: FiniteSolution, other: FiniteSolution) -> bool:
+    return one.gap <= max(0.9 * other.gap, _estimate_rounding(other)) and one.residual <= max(other.residual, 1e-10)
 
 
-def _noise(solution: FiniteSolution) -> float:
+def _estimate_rounding(solution: FiniteSolution) -> float:
     return 1e-13 * (1.0 + abs(solution.value))
 
 
@@ -281,7 +281,7 @@ def newton_solve(
         with np.errstate(over="ignore"):
             first = dual.at(start)
             if x0 is not None and (dual.free(x0) != dual.free(first.x)).any():
-                predicted = dual.at(_predicted(dual, start, x0))
+                predicted = dual.at(_predict_multipliers(dual, start, x0))
                 first = predicted if dual.error(predicted) < dual.error(first) else first
             point = _ascend(dual, first, steps, patience)
     except np.linalg.LinAlgError:
@@ -295,7 +295,7 @@ def newton_solve(
 
 
 @shaped
-def _predicted(dual: _Dual, start: Float[Array, " v"], x: Float[Array, " n"]) -> Float[Array, " v"]:
+def _predict_multipliers(dual: _Dual, start: Float[Array, " v"], x: Float[Array, " n"]) -> Float[Array, " v"]:
     """The multipliers under which the free entries of ``x (n,)`` move to where the rows hold, while the others stay:
     where the program has changed a little, or only its curvature, mostly the optimal ones."""
     x = np.minimum(np.maximum(x, dual.program.lower), dual.program.upper)
@@ -306,7 +306,7 @@ def _predicted(dual: _Dual, start: Float[Array, " v"], x: Float[Array, " n"]) ->
         - rows @ x[free]
         - (rows / curvature) @ (dual.program.q[free] + dual.program.weights[free] * np.sign(x[free]))
     )
-    return _non_negative(dual.hessian(_Point(start, x, residual)), linear, dual.signed, start > 0)
+    return _solve_non_negative(dual.hessian(_Point(start, x, residual)), linear, dual.signed, start > 0)
 
 
 @shaped
@@ -320,11 +320,11 @@ def _ascend(dual: _Dual, point: _Point, steps: int, patience: int) -> _Point | N
         if not np.isfinite(error) or stalled > patience:
             return None
         hessian = dual.hessian(point, damping)
-        target = _non_negative(hessian, point.gradient + hessian @ point.dual, dual.signed, point.dual > 0)
+        target = _solve_non_negative(hessian, point.gradient + hessian @ point.dual, dual.signed, point.dual > 0)
         trial = dual.at(target)
         if not dual.error(trial) < 0.5 * least:
             step = target - point.dual
-            length = _line_maximum(dual, point, step)
+            length = _search_line(dual, point, step)
             # where too few entries are free, a step is as good as any direction: nearer to the gradient then
             damping = DAMPING if length > 0.0 else min(DAMPED * damping, 1.0)
             trial = dual.at(point.dual + length * step)
@@ -335,7 +335,7 @@ def _ascend(dual: _Dual, point: _Point, steps: int, patience: int) -> _Point | N
 
 
 @shaped
-def _non_negative(
+def _solve_non_negative(
     hessian: Float[Array, "v v"],
     linear: Float[Array, " v"],
     signed: Bool[np.ndarray, " v"],
@@ -370,7 +370,7 @@ def _non_negative(
 
 
 @shaped
-def _line_maximum(dual: _Dual, point: _Point, step: Float[Array, " v"]) -> float:
+def _search_line(dual: _Dual, point: _Point, step: Float[Array, " v"]) -> float:
     """A feasible length at which the dual's derivative along ``step`` has fallen to a tenth, by bisection and false
     position."""
     slope, change, constant = dual.program.q + point.dual @ dual.M, step @ dual.M, float(dual.c @ step)

@@ -85,32 +85,32 @@ def proving(
 ) -> tuple[float, Float[Array, " r"], Float[Array, " e"], Float[Array, " k"] | None]:
     """`dual_bound` with the ``y``, ``mu`` and ``z`` that prove it: those given, or where these prove nothing the ones
     that they were moved to. Whoever writes the bound down must write these."""
-    y = _usable(program, y)
-    return _proven(program, _terms(program, y, mu, z, at), y, mu, z, at)
+    y = _clip_multipliers(program, y)
+    return _prove_bound(program, _compute_terms(program, y, mu, z, at), y, mu, z, at)
 
 
-def _proven(
+def _prove_bound(
     program: FiniteProgram, terms: Terms, y: Array, mu: Array, z: Array | None, at: Array | None
 ) -> tuple[float, Array, Array, Array | None]:
-    bound = _bound(terms, program)
+    bound = _evaluate_bound(terms, program)
     if bound > -np.inf:
         large = ROUND_OFF * terms.magnitude > NOTABLE * abs(bound)
         bound = max(bound, extended_bound(program, y, mu)) if large else bound
-        is_beyond = _overshot(terms, program, bound)
+        is_beyond = _find_overshoot(terms, program, bound)
         if is_beyond is not None:
-            shrunk = _shrunk_bound(program, y, mu, z, at, is_beyond)
+            shrunk = _shrink_multipliers(program, y, mu, z, at, is_beyond)
             if shrunk[0] > bound:
                 return shrunk
         return bound, y, mu, z
     better = repaired(program, y, mu, z, at)
     if better is not None:
-        bound = _bound(_terms(program, *better), program)
+        bound = _evaluate_bound(_compute_terms(program, *better), program)
     if bound == -np.inf and not program.q.any() and program.blocks is None:
-        slope = _terms(program, y, mu, z, at).slope
+        slope = _compute_terms(program, y, mu, z, at).slope
         is_beyond = np.isinf(program.lower) & (slope > program.weights) | np.isinf(program.upper) & (
             slope < -program.weights
         )
-        return _shrunk_bound(program, y, mu, z, at, is_beyond)
+        return _shrink_multipliers(program, y, mu, z, at, is_beyond)
     return (bound, y, mu, z) if better is None else (bound, *better[:3])
 
 
@@ -132,17 +132,17 @@ def farkas_margin(
     program: FiniteProgram, y: Float[Array, " r"], mu: Float[Array, " e"], z: Float[Array, " k"] | None = None
 ) -> tuple[float, float]:
     """`farkas_bound`, and the magnitude of the terms that cancelled in it."""
-    y = _usable(program, y)
+    y = _clip_multipliers(program, y)
     total = float(y @ np.linalg.norm(program.G, axis=1) + np.abs(mu) @ np.linalg.norm(program.A, axis=1))
     if not (np.isfinite(total) and total > 0):
         return -np.inf, 0.0
     y, mu, z = y / total, mu / total, None if z is None else z / total
     flat = homogeneous(program)
-    terms = _terms(flat, y, mu, z, None)
-    bound = _bound(terms, flat)
+    terms = _compute_terms(flat, y, mu, z, None)
+    bound = _evaluate_bound(terms, flat)
     if bound == -np.inf and (better := repaired(flat, y, mu, z, None)) is not None:
-        terms = _terms(flat, *better)
-        bound = _bound(terms, flat)
+        terms = _compute_terms(flat, *better)
+        bound = _evaluate_bound(terms, flat)
     return bound, terms.magnitude
 
 
@@ -192,14 +192,14 @@ def measure(
     """
     x = within_bounds(program, x)
     x = onto_equalities(program, x) if program.b.size else x
-    y = _usable(program, y)
+    y = _clip_multipliers(program, y)
     value, residual = program.objective(x), program.residual(x)
-    terms = _terms(program, y, mu, z, x)
-    lower = _proven(program, terms, y, mu, z, x)[0]
+    terms = _compute_terms(program, y, mu, z, x)
+    lower = _prove_bound(program, terms, y, mu, z, x)[0]
     if z is None and program.S is None:
         z = -terms.slope if terms.curvature is None else -(terms.slope + terms.curvature * x)
     elif z is None:
-        z = onto_stationary(program, np.zeros(program.weights.size), _stationary(program, y, mu, x))
+        z = onto_stationary(program, np.zeros(program.weights.size), _compute_slope(program, y, mu, x))
     return FiniteSolution("failed", x, value, lower, y, mu, z, residual, value - lower, message)
 
 
@@ -225,20 +225,20 @@ def bent_minimisers(weights: Array, curvature: Array | float, slope: Array, lowe
 
 
 @shaped
-def _usable(program: FiniteProgram, y: Float[Array, " r"]) -> Float[Array, " r"]:
+def _clip_multipliers(program: FiniteProgram, y: Float[Array, " r"]) -> Float[Array, " r"]:
     return np.where(np.isfinite(program.h) & np.isfinite(y), np.maximum(y, 0.0), 0.0)
 
 
 @shaped
-def _stationary(
+def _compute_slope(
     program: FiniteProgram, y: Float[Array, " r"], mu: Float[Array, " e"], at: Float[Array, " n"] | None
 ) -> Float[Array, " n"]:
-    slope = program.q + _weighed(y, program.G, mu, program.A)
+    slope = program.q + _weigh_rows(y, program.G, mu, program.A)
     return slope if program.P is None or at is None else slope + program.P @ at
 
 
 @shaped
-def _terms(
+def _compute_terms(
     program: FiniteProgram,
     y: Float[Array, " r"],
     mu: Float[Array, " e"],
@@ -246,12 +246,12 @@ def _terms(
     at: Float[Array, " n"] | None,
 ) -> Terms:
     finite = np.where(y > 0, program.h, 0.0)
-    constant = program.constant - float(_weighed(y, finite, mu, program.b))
-    magnitude = float(_weighed(y, np.abs(finite), np.abs(mu), np.abs(program.b))) + abs(program.constant)
+    constant = program.constant - float(_weigh_rows(y, finite, mu, program.b))
+    magnitude = float(_weigh_rows(y, np.abs(finite), np.abs(mu), np.abs(program.b))) + abs(program.constant)
     image = None if at is None or program.blocks is None else program.image(at)
-    noise = np.abs(program.q) + _weighed(y, np.abs(program.G), np.abs(mu), np.abs(program.A))
+    noise = np.abs(program.q) + _weigh_rows(y, np.abs(program.G), np.abs(mu), np.abs(program.A))
     curvature = program.curvature if program.S is None else None
-    slope = program.q + _weighed(y, program.G, mu, program.A)
+    slope = program.q + _weigh_rows(y, program.G, mu, program.A)
     if curvature is None and program.P is not None:
         at = np.zeros(program.n) if at is None else at
         gradient = np.asarray(program.P @ at)
@@ -268,7 +268,7 @@ def _terms(
     return Terms(constant, -z, np.abs(z) + np.abs(noise).max(initial=0.0), program.weights, None, magnitude, image)
 
 
-def _weighed(y: Array, rows: Array, mu: Array, equalities: Array) -> Array:
+def _weigh_rows(y: Array, rows: Array, mu: Array, equalities: Array) -> Array:
     """``y'rows + mu'equalities``."""
     return np.asarray(y @ rows + mu @ equalities if mu.size else y @ rows)
 
@@ -281,9 +281,9 @@ def without_norms(terms: Terms, program: FiniteProgram) -> Terms:
         return terms
     entries, of = blocks.entries, blocks.of
     weights = terms.weights[blocks.first] * (1.0 - ROUND_OFF)
-    offers = [-terms.slope * _shrinking(weights, blocks.norms(terms.slope))[_numbered(blocks.number)]]
+    offers = [-terms.slope * _compute_shrink_factors(weights, blocks.norms(terms.slope))[_clip_numbers(blocks.number)]]
     if terms.at is not None:
-        offers.append(blocks.directions(terms.at) * weights[_numbered(blocks.number)])
+        offers.append(blocks.directions(terms.at) * weights[_clip_numbers(blocks.number)])
     bounds, slopes = [], []
     low, high = program.lower[entries], program.upper[entries]
     for offer in offers:
@@ -300,16 +300,16 @@ def without_norms(terms: Terms, program: FiniteProgram) -> Terms:
     return replace(terms, slope=slope, weights=weights, noise=noise)
 
 
-def _numbered(number: Int[np.ndarray, " k"]) -> Int[np.ndarray, " k"]:
+def _clip_numbers(number: Int[np.ndarray, " k"]) -> Int[np.ndarray, " k"]:
     answer: np.ndarray = np.maximum(number, 0)
     return answer
 
 
-def _shrinking(weights: Array, norms: Array) -> Array:
+def _compute_shrink_factors(weights: Array, norms: Array) -> Array:
     return np.minimum(1.0, weights / np.where(norms > 0.0, norms, 1.0))
 
 
-def _bound(terms: Terms, program: FiniteProgram) -> float:
+def _evaluate_bound(terms: Terms, program: FiniteProgram) -> float:
     terms = without_norms(terms, program)
     slope = terms.slope
     if not (isfinite(terms.constant) and np.isfinite(slope).all()):
@@ -327,10 +327,10 @@ def _bound(terms: Terms, program: FiniteProgram) -> float:
     return terms.constant + float(values.sum()) - ROUND_OFF * size
 
 
-def _overshot(terms: Terms, program: FiniteProgram, bound: float) -> Bool[np.ndarray, " k"] | None:
+def _find_overshoot(terms: Terms, program: FiniteProgram, bound: float) -> Bool[np.ndarray, " k"] | None:
     """The entries whose slope is beyond their weight by a little, `NEAR` of it, where that costs a notable share of the
     bound because their bounds are far away; ``None`` where there is none, or shrinking the multipliers is no way out
-    (`_shrunk_bound`)."""
+    (`_shrink_multipliers`)."""
     if program.q.any() or program.P is not None or program.blocks is not None or not isfinite(bound):
         return None
     excess = np.abs(terms.slope) - terms.weights
@@ -343,7 +343,7 @@ def _overshot(terms: Terms, program: FiniteProgram, bound: float) -> Bool[np.nda
 
 
 @shaped
-def _shrunk_bound(
+def _shrink_multipliers(
     program: FiniteProgram,
     y: Float[Array, " r"],
     mu: Float[Array, " e"],
@@ -353,13 +353,13 @@ def _shrunk_bound(
 ) -> tuple[float, Float[Array, " r"], Float[Array, " e"], Float[Array, " k"] | None]:
     """`proving`: without a linear cost, multipliers may be scaled towards 0 until the slope of every entry ``beyond``
     its weight is within it: of those without a bound, or with one so far away that rounding of the slope costs more."""
-    slope = _terms(program, y, mu, z, at).slope
+    slope = _compute_terms(program, y, mu, z, at).slope
     with np.errstate(invalid="ignore"):
         factor = float((program.weights[beyond] / np.abs(slope[beyond])).min(initial=1.0)) * (1 - ROUND_OFF)
     factor = factor if np.isfinite(factor) and np.isfinite(slope).all() else 0.0
     y, mu = factor * y, factor * mu
     z, at = (None if v is None else factor * v for v in (z, at))
-    return _bound(_terms(program, y, mu, z, at), program), y, mu, z
+    return _evaluate_bound(_compute_terms(program, y, mu, z, at), program), y, mu, z
 
 
 @shaped
@@ -379,7 +379,7 @@ def repaired(
     for _ in range(REPAIRS):
         if better is None or not all(np.isfinite(v).all() for v in better if v is not None):
             return None
-        better = _corrected(program, *better)
+        better = _correct_multipliers(program, *better)
         if better is not None and (better[0] >= 0).all():
             return better
         better = None if better is None else (np.maximum(better[0], 0.0), *better[1:])
@@ -387,7 +387,7 @@ def repaired(
 
 
 @shaped
-def _corrected(
+def _correct_multipliers(
     program: FiniteProgram,
     y: Float[Array, " r"],
     mu: Float[Array, " e"],
@@ -402,14 +402,16 @@ def _corrected(
     used = y > 0
     blocks = [program.G[used].T, program.A.T, np.zeros((program.n, 0)) if tangent is None else tangent]
     if program.S is None:
-        tight = _at_limit(program, -slope) & (tangent is not None or program.curvature == 0)
+        tight = _is_at_limit(program, -slope) & (tangent is not None or program.curvature == 0)
         target = np.sign(slope[tight]) * program.weights[tight] - slope[tight]
-        corrections = _least_norm([block[tight] for block in blocks], target)
+        corrections = _solve_least_norm([block[tight] for block in blocks], target)
     else:
         z = np.zeros(program.weights.size) if z is None else z.copy()
-        tight = _at_limit(program, z)
+        tight = _is_at_limit(program, z)
         z[tight] = np.sign(z[tight]) * program.weights[tight]
-        corrections = _least_norm([*blocks, program.S[np.flatnonzero(~tight)].toarray().T], -(program.S.T @ z + slope))
+        corrections = _solve_least_norm(
+            [*blocks, program.S[np.flatnonzero(~tight)].toarray().T], -(program.S.T @ z + slope)
+        )
         z[~tight] += 0.0 if corrections is None else corrections[3]
     if corrections is None:
         return None
@@ -419,13 +421,13 @@ def _corrected(
 
 
 @shaped
-def _at_limit(program: FiniteProgram, z: Float[Array, " k"]) -> Bool[np.ndarray, " k"]:
+def _is_at_limit(program: FiniteProgram, z: Float[Array, " k"]) -> Bool[np.ndarray, " k"]:
     """Unbounded images whose multiplier is at its limit, the weight, or beyond."""
     near = np.abs(z) > program.weights - NEAR * (1.0 + program.weights)
     return near & (np.isposinf(program.upper) & (z >= 0) | np.isneginf(program.lower) & (z <= 0))
 
 
-def _least_norm(blocks: list[Array], target: Array) -> list[Array] | None:
+def _solve_least_norm(blocks: list[Array], target: Array) -> list[Array] | None:
     columns = np.hstack(blocks)
     if not columns.size:
         return None
@@ -462,7 +464,7 @@ def vertex_multipliers(
     free = away > FREE * width
     rows, equalities = program.G[active][:, free].T, program.A[:, free].T
     slope = -program.q[free] - program.weights[free] * sign[free]
-    multipliers = _least_norm([rows, equalities], slope)
+    multipliers = _solve_least_norm([rows, equalities], slope)
     if multipliers is None or multipliers[0].min(initial=0.0) < -ACTIVE * multipliers[0].max(initial=0.0):
         from scipy.optimize import nnls  # only here: its import takes as long as a small run
 

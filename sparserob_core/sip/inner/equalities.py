@@ -26,7 +26,7 @@ def onto_equalities(program: FiniteProgram, x: Float[Array, " n"]) -> Float[Arra
     share = program.missed(x)
     if not ROUNDED < share <= NEARLY:
         return x
-    is_still = _still(program, x)
+    is_still = _find_active_images(program, x)
     rows, free = (program.A[:, ~is_still], ~is_still) if program.S is None else (program.A, np.full(program.n, True))
     if program.S is not None:
         rows = np.vstack([rows, program.S[np.flatnonzero(is_still)].toarray()])
@@ -48,7 +48,7 @@ def onto_equalities(program: FiniteProgram, x: Float[Array, " n"]) -> Float[Arra
 
 
 @shaped
-def _still(program: FiniteProgram, x: Float[Array, " n"]) -> Bool[np.ndarray, " k"]:
+def _find_active_images(program: FiniteProgram, x: Float[Array, " n"]) -> Bool[np.ndarray, " k"]:
     """Images at a bound, and those of 0 that cost something: they are to stay where they are."""
     image, still = program.image(x), np.zeros(program.weights.size, dtype=bool)
     terms = np.abs(x) if program.S is None else np.asarray(abs(program.S) @ np.abs(x))

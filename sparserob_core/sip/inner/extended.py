@@ -40,8 +40,8 @@ def extended_bound(program: FiniteProgram, y: Float[Array, " r"], mu: Float[Arra
     rows = np.vstack([program.G[used], program.A]).astype(WIDE)
     rhs = np.concatenate([program.h[used], program.b]).astype(WIDE)
     slope, terms = program.q + v @ rows, np.abs(program.q) + np.abs(v) @ np.abs(rows)
-    error = _gamma(v.size + 2) * terms
-    least = np.minimum(*(_least(program, curvature, slope + side * error) for side in (-1.0, 1.0)))
+    error = _bound_rounding(v.size + 2) * terms
+    least = np.minimum(*(_minimise_entries(program, curvature, slope + side * error) for side in (-1.0, 1.0)))
     reach = np.maximum(np.abs(program.lower), np.abs(program.upper)).astype(WIDE)
     size = np.abs(v) @ np.abs(rhs) + np.abs(least).sum() + abs(program.constant)
     # the terms of each minimum are rounded too, and no larger than at the bound further away; where the slope is well
@@ -49,15 +49,15 @@ def extended_bound(program: FiniteProgram, y: Float[Array, " r"], mu: Float[Arra
     near = (least != 0.0) | ((1.0 + NEAR) * np.abs(slope) + error >= program.weights)
     moving = np.where(near, (program.weights + terms + curvature * reach) * reach, 0.0)
     size = size + 8.0 * moving.sum() / (program.n + v.size + 8)
-    total = least.sum() - v @ rhs + program.constant - _gamma(program.n + v.size + 8) * size
+    total = least.sum() - v @ rhs + program.constant - _bound_rounding(program.n + v.size + 8) * size
     return float(np.nextafter(float(total), -np.inf))
 
 
-def _gamma(count: int) -> float:
+def _bound_rounding(count: int) -> float:
     return count * UNIT / (1.0 - count * UNIT)
 
 
-def _least(program: FiniteProgram, curvature: Array, slope: Array) -> Array:
+def _minimise_entries(program: FiniteProgram, curvature: Array, slope: Array) -> Array:
     """The minima ``(n,)`` over the bounds at a slope ``(n,)``; rounding of the terms apart."""
     lower, upper, weights = (array.astype(WIDE) for array in (program.lower, program.upper, program.weights))
     is_curved = curvature > 0.0

@@ -25,19 +25,19 @@ class Memory:
 
     def __init__(self, size: int) -> None:
         self.size = size
-        self._made: OrderedDict[Hashable, tuple[tuple[object, ...], object]] = OrderedDict()
+        self._results: OrderedDict[Hashable, tuple[tuple[object, ...], object]] = OrderedDict()
 
     def recall(self, sources: tuple[object, ...], key: Hashable, make: Callable[[], Made]) -> Made:
         """Return the object that ``make`` made for these very sources and this key; call ``make`` if none is
         remembered."""
         identity = (key, *map(id, sources))
-        if identity in self._made:
-            self._made.move_to_end(identity)
-            return cast(Made, self._made[identity][1])
+        if identity in self._results:
+            self._results.move_to_end(identity)
+            return cast(Made, self._results[identity][1])
         result = make()
-        self._made[identity] = (sources, result)
-        if len(self._made) > self.size:
-            self._made.popitem(last=False)
+        self._results[identity] = (sources, result)
+        if len(self._results) > self.size:
+            self._results.popitem(last=False)
         return result
 
 
@@ -63,9 +63,9 @@ def onto_stationary(program: FiniteProgram, z: Float[Array, " k"], slope: Float[
     is_held = (program.weights == 0) & unbounded_below & unbounded_above
     projected = z
     for number in range(HOLDS):
-        if number or not _stationary(S, projected, slope, ROUNDED):
+        if number or not _is_stationary(S, projected, slope, ROUNDED):
             z = np.where(is_held, np.clip(z, -program.weights, program.weights), z)
-            project = _factors.recall((S,), is_held.tobytes(), partial(_projection, S, ~is_held))
+            project = _factors.recall((S,), is_held.tobytes(), partial(_factor_projection, S, ~is_held))
             projected = z - project(S.T @ z + slope)
             projected = projected - project(S.T @ projected + slope)
         limit = program.weights + CANCELLED * float(np.abs(projected).max(initial=0.0))
@@ -73,7 +73,7 @@ def onto_stationary(program: FiniteProgram, z: Float[Array, " k"], slope: Float[
         if not is_beyond.any():
             break
         z, is_held = projected, is_held | is_beyond
-    return projected if _stationary(S, projected, slope) else np.full_like(projected, np.nan)
+    return projected if _is_stationary(S, projected, slope) else np.full_like(projected, np.nan)
 
 
 @shaped
@@ -82,7 +82,7 @@ def within_bounds(program: FiniteProgram, x: Float[Array, " n"]) -> Float[Array,
     of that image: an entry that may only be 0 is 0, and no dust that a solver left."""
     if program.S is None:
         return np.minimum(np.maximum(x, program.lower), program.upper)
-    rows, entries, factors = _factors.recall((program.S,), "alone", partial(_alone, program.S))
+    rows, entries, factors = _factors.recall((program.S,), "alone", partial(_find_single_entries, program.S))
     ends = program.lower[rows] / factors, program.upper[rows] / factors
     clipped = x.copy()  # several images may be of one entry
     np.maximum.at(clipped, entries, np.minimum(*ends))
@@ -90,7 +90,7 @@ def within_bounds(program: FiniteProgram, x: Float[Array, " n"]) -> Float[Array,
     return clipped
 
 
-def _alone(S: csc_array) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64], Array]:
+def _find_single_entries(S: csc_array) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64], Array]:
     """The images that are one entry times a factor: their numbers, those of the entries, and the factors, ``(a,)``."""
     by_row = S.tocsr()
     by_row.eliminate_zeros()
@@ -99,12 +99,12 @@ def _alone(S: csc_array) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64], 
     return rows, by_row.indices[places].astype(np.int64), np.asarray(by_row.data[places])
 
 
-def _stationary(S: csc_array, z: Array, slope: Array, share: float = CANCELLED) -> bool:
+def _is_stationary(S: csc_array, z: Array, slope: Array, share: float = CANCELLED) -> bool:
     residual, size = np.abs(S.T @ z + slope), np.abs(S).T @ np.abs(z) + np.abs(slope)
     return bool((residual <= share * size.max(initial=0.0)).all())
 
 
-def _projection(S: csc_array, used: npt.NDArray[np.bool_]) -> Callable[[Array], Array]:
+def _factor_projection(S: csc_array, used: npt.NDArray[np.bool_]) -> Callable[[Array], Array]:
     """``r -> S (S'S)^{-1} r`` on the used images."""
     from scipy.sparse.linalg import splu
 

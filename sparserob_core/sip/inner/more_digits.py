@@ -26,15 +26,15 @@ RANK = 1e-13  # of the largest entry: what is left of a row that depends on othe
 def refined(program: QuadraticProgram, solver: Solver, start: Claim | None, accuracy: float) -> Iterator[Claim]:
     """Better and better claims from ``start``, or from zero; ends where the solver gives no numbers.
 
-    Inequalities become ``G x + s = h`` with ``s >= 0``, so that only equalities ``M w = c`` and bounds on
-    ``w = (x, s)`` are left; these may be combined (`_independent`). With multipliers ``y`` and factors ``p, d`` (powers
-    of two, the inverses of what is missed) the next program is: minimise ``d/(2p) v'P v + d (q + P w + M'y)'v`` subject
-    to ``M v = p (c - M w)`` and ``p (lower - w) <= v <= p (upper - w)``; then ``w + v/p`` and ``y + y'/d`` miss less.
+    Inequalities become ``G x + s = h`` with ``s >= 0``, so that only equalities ``M w = c`` and bounds on ``w = (x,
+    s)`` are left; these may be combined (`_orthogonalise_rows`). With multipliers ``y`` and factors ``p, d`` (powers of
+    two, the inverses of what is missed) the next program is: minimise ``d/(2p) v'P v + d (q + P w + M'y)'v`` subject to
+    ``M v = p (c - M w)`` and ``p (lower - w) <= v <= p (upper - w)``; then ``w + v/p`` and ``y + y'/d`` miss less.
     """
     from scipy.sparse import block_array, block_diag, csc_array, diags_array
 
     n, r = program.q.size, program.h.size
-    combine = _independent(program.G.toarray()) if r else np.zeros((0, 0))
+    combine = _orthogonalise_rows(program.G.toarray()) if r else np.zeros((0, 0))
     units = np.exp2(-np.round(np.log2(np.abs(combine).max(axis=0, initial=0.0)))) if r else np.ones(0)  # of slacks
     rows = [csc_array(combine @ program.G), csc_array(combine * units)]
     M = csc_array(block_array([rows, [program.A, None]]) if program.b.size else block_array([rows])) if r else program.A
@@ -50,8 +50,8 @@ def refined(program: QuadraticProgram, solver: Solver, start: Claim | None, accu
         w = np.clip(w, lower, upper)
         residual, slope = c - M @ w, q + P @ w + M.T @ y
         if number or start is not None:
-            p = _factor(p, float(np.abs(residual).max(initial=0.0)))
-            d = _factor(d, _pull(slope, p * (w - lower), p * (upper - w)))
+            p = _choose_factor(p, float(np.abs(residual).max(initial=0.0)))
+            d = _choose_factor(d, _measure_dual_residual(slope, p * (w - lower), p * (upper - w)))
         below, above, cost = p * (lower - w), p * (upper - w), d * slope
         is_held = (cost > DEAR) & (below > -1.0) | (cost < -DEAR) & (above < 1.0)
         fixed, free = np.where(is_held, np.where(cost > 0.0, below, above), 0.0), np.flatnonzero(~is_held)
@@ -77,7 +77,7 @@ def refined(program: QuadraticProgram, solver: Solver, start: Claim | None, accu
         yield Claim(answer.status, x, z, y[r:], np.zeros(n), answer.message)
 
 
-def _independent(G: Array) -> Array:
+def _orthogonalise_rows(G: Array) -> Array:
     """A nonsingular ``T (r, r)`` for which ``T G`` has orthonormal rows, and rows of 0 where ``G (r, n)`` has rows that
     depend on others."""
     from scipy.linalg import qr, solve_triangular
@@ -93,13 +93,13 @@ def _independent(G: Array) -> Array:
     return np.asarray(solve_triangular(L, np.eye(count)[order], lower=True))
 
 
-def _factor(before: float, missed: float) -> float:
+def _choose_factor(before: float, missed: float) -> float:
     """The power of two that makes what is missed of size 1, at most `GROWTH` times the one before."""
     wanted = LARGEST if missed < 1.0 / LARGEST else float(np.exp2(np.floor(-np.log2(missed))))
     return float(min(max(wanted, before), GROWTH * before, LARGEST))
 
 
-def _pull(slope: Array, below: Array, above: Array) -> float:
+def _measure_dual_residual(slope: Array, below: Array, above: Array) -> float:
     """Return the dual residual: the largest absolute slope of an entry that has room to move against its slope.
 
     ``below`` and ``above`` are the distances to the bounds, blown up; room is a distance of more than 1.

@@ -25,13 +25,13 @@ def around(blocks: Blocks) -> Directions:
     sizes = (blocks.table >= 0).sum(axis=1)
     groups = [Directions(np.zeros(0, dtype=int), np.zeros((0, width)))]
     for size in np.unique(sizes).tolist():
-        vectors = np.hstack([_around(size), np.zeros((len(_around(size)), width - size))])
+        vectors = np.hstack([_list_unit_vectors(size), np.zeros((len(_list_unit_vectors(size)), width - size))])
         numbers = np.flatnonzero(sizes == size)
         groups.append(Directions(np.repeat(numbers, len(vectors)), np.tile(vectors, (numbers.size, 1))))
     return Directions(np.concatenate([group.block for group in groups]), np.vstack([group.vectors for group in groups]))
 
 
-def _around(size: int) -> Array:
+def _list_unit_vectors(size: int) -> Array:
     if size == 2:
         angles = 2.0 * np.pi * np.arange(FAN) / FAN
         return np.column_stack([np.cos(angles), np.sin(angles)])
@@ -57,7 +57,7 @@ def towards(
     wanted = -slope
     if program.S is not None:
         wanted = onto_stationary(program, np.zeros(program.weights.size) if z is None else z, slope)
-    groups = [_unit(blocks, vector) for vector in (program.image(x), wanted) if np.isfinite(vector).all()]
+    groups = [_find_directions(blocks, vector) for vector in (program.image(x), wanted) if np.isfinite(vector).all()]
     return Directions(np.concatenate([group.block for group in groups]), np.vstack([group.vectors for group in groups]))
 
 
@@ -97,11 +97,11 @@ def bent(
     data = (curved[:, None, None] * across)[inside]
     H = csc_array((data, (row[inside], column[inside])), shape=(program.n, program.n))
     P = csc_array(H if program.P is None else program.P + H)
-    still = None if moving.all() else Blocks(_renumbered(number))
+    still = None if moving.all() else Blocks(_renumber(number))
     return replace(program, P=P, q=q, weights=weights, blocks=still)
 
 
-def _renumbered(number: np.ndarray) -> np.ndarray:
+def _renumber(number: np.ndarray) -> np.ndarray:
     """Return the numbers of the blocks without gaps, counted from 0; entries of no block keep -1."""
     _, numbers = np.unique(number, return_inverse=True)
     answer: np.ndarray = numbers.reshape(-1) - int((number < 0).any())
@@ -116,7 +116,7 @@ def of_the_rest(directions: Directions, moving: Bool[np.ndarray, " b"], width: i
     return Directions(numbers[directions.block[kept]], directions.vectors[kept, :width])
 
 
-def _unit(blocks: Blocks, image: Array) -> Directions:
+def _find_directions(blocks: Blocks, image: Array) -> Directions:
     norms = blocks.norms(image)
     kept = np.flatnonzero(norms > NOTHING * norms.max(initial=0.0))
     table = blocks.table[kept]

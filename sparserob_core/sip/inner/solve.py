@@ -2,17 +2,18 @@
 
 The walk of `solve_finite`, each step only where the ones before gave no answer that is believed:
 
-1. `_contradiction`: bounds that cross, rows without entries that ask for the impossible.
-2. `_cheap`: the optimum without rows, and Newton's method from a guess (`polish`), or from nothing where it is
-   large, unless a solver was named.
-3. `_through`: the program in other variables, where that makes it easier (`change_of_variables`), solved by this walk.
-4. `_tried`: the program in the form that a solver takes (`standard_form`), form after form and accuracy after accuracy;
-   every claim is polished, measured (`duality.measure`) and judged. Where the first is not believed, or not sharp
-   enough, the solver is asked for more digits of it (`more_digits`). Where the solver says infeasible, or nothing is
-   believed, the elastic program is asked how far the rows must be relaxed: its multipliers may prove infeasibility.
-   `_through` again where it is the curvature that is hard (`in_round_coordinates`).
-5. `_failed`: the best of what was not believed, and what was wrong with it. Where a solver was named, the walk begins
-   anew without it (`solver.Asked.instead`).
+1. `_find_contradiction`: bounds that cross, rows without entries that ask for the impossible.
+2. `_list_cheap_answers`: the optimum without rows, and Newton's method from a guess (`polish`), or from nothing where
+   it is large, unless a solver was named.
+3. `_solve_in_new_variables`: the program in other variables, where that makes it easier (`change_of_variables`), solved
+   by this walk.
+4. `_try_forms`: the program in the form that a solver takes (`standard_form`), form after form and accuracy after
+   accuracy; every claim is polished, measured (`duality.measure`) and judged. Where the first is not believed, or not
+   sharp enough, the solver is asked for more digits of it (`more_digits`). Where the solver says infeasible, or nothing
+   is believed, the elastic program is asked how far the rows must be relaxed: its multipliers may prove infeasibility.
+   `_solve_in_new_variables` again where it is the curvature that is hard (`in_round_coordinates`).
+5. `_report_failure`: the best of what was not believed, and what was wrong with it. Where a solver was named, the walk
+   begins anew without it (`solver.Asked.instead`).
 """
 
 from __future__ import annotations
@@ -105,7 +106,7 @@ class _Case:
             self.program, solution.value
         )
 
-    def _size(self, solution: FiniteSolution) -> float:
+    def _compute_gap_scale(self, solution: FiniteSolution) -> float:
         """Return the size that the gap of a sharp answer is relative to: the value, but at least ``small`` times the
         sum of the absolute parts of the cost."""
         return max(abs(solution.value), self.small * self.program.added(solution.x))
@@ -118,12 +119,12 @@ class _Case:
         if self.believes(solution):
             message, attempts = f"{name}: {solution.message}", tuple(self.attempts)
             believed = replace(solution, status="optimal", attempts=attempts, message=message, by=by or solution.by)
-            if np.isinf(self.small) or solution.gap <= 10 * self.tolerance * self._size(solution):
+            if np.isinf(self.small) or solution.gap <= 10 * self.tolerance * self._compute_gap_scale(solution):
                 return believed
             if self.blunt is None or solution.gap < self.blunt.gap:
                 self.blunt = believed
             return None
-        if self.best is None or _badness(solution) < _badness(self.best):
+        if self.best is None or _measure_error(solution) < _measure_error(self.best):
             self.best = solution
         self.attempts.append(
             f"{name}: {solution.message}; not believed: residual {solution.residual:.1e}, gap {solution.gap:.1e}"
@@ -152,7 +153,7 @@ def solve_finite(
     program.validate()
     counted = Asked.of(solver)
     case = _Case(program, counted, tolerance, small)
-    solution = _answer(case, guess)
+    solution = _solve_case(case, guess)
     if counted.instead is not None and solution.status == "failed":
         fallback = solve_finite(program, counted.instead, tolerance=tolerance, guess=guess, small=small)
         reason = next(iter(solution.attempts), solution.message)
@@ -164,33 +165,33 @@ def solve_finite(
     return solution if solution.by else replace(solution, by=NOBODY if solution.status == "failed" else counted.name)
 
 
-def _answer(case: _Case, guess: FiniteSolution | None) -> FiniteSolution:
+def _solve_case(case: _Case, guess: FiniteSolution | None) -> FiniteSolution:
     program = case.program
-    impossible = _contradiction(program, case.tolerance)
+    impossible = _find_contradiction(program, case.tolerance)
     if impossible is not None:
         return replace(impossible, by=CLOSED_FORM)
-    for by, solution in _cheap(case, guess):
+    for by, solution in _list_cheap_answers(case, guess):
         believed = case.judge(solution, "without a solver", by)
         if believed is not None:
             return believed
     case.attempts.clear()
     if program.blocks is not None and program.S is None:
-        return _by_directions(case, program.blocks, guess)
+        return _solve_by_directions(case, program.blocks, guess)
     easier = in_new_variables(program)
-    answer = None if easier is None else _through(case, easier, guess)
+    answer = None if easier is None else _solve_in_new_variables(case, easier, guess)
     if answer is None and program.blocks is not None:
-        return _by_directions(case, program.blocks, guess)
+        return _solve_by_directions(case, program.blocks, guess)
     if answer is not None:
         return answer
-    answer = _tried(case)
+    answer = _try_forms(case)
     rounder = in_round_coordinates(program) if answer.status == "failed" else None
-    return answer if rounder is None else _through(case, rounder, guess) or _failed(case)
+    return answer if rounder is None else _solve_in_new_variables(case, rounder, guess) or _report_failure(case)
 
 
-def _by_directions(case: _Case, blocks: Blocks, guess: FiniteSolution | None) -> FiniteSolution:
-    """Norms of blocks as second-order cones, where there is a solver that takes them (`_conic`); else as the largest of
-    ``d's`` over finitely many directions (Kelley 1960), those of the answers and those that their multipliers ask for,
-    until the cost with the norms themselves meets the bound."""
+def _solve_by_directions(case: _Case, blocks: Blocks, guess: FiniteSolution | None) -> FiniteSolution:
+    """Norms of blocks as second-order cones, where there is a solver that takes them (`_solve_conic`); else as the
+    largest of ``d's`` over finitely many directions (Kelley 1960), those of the answers and those that their
+    multipliers ask for, until the cost with the norms themselves meets the bound."""
     program, directions = case.program, around(blocks)
     if guess is not None and np.isfinite(guess.x).all():
         wanted = towards(program, blocks, guess.x, guess.y, guess.mu, guess.z)
@@ -199,24 +200,24 @@ def _by_directions(case: _Case, blocks: Blocks, guess: FiniteSolution | None) ->
             directions = directions.joined(addition)
         if program.S is None:
             start = (guess.x, guess.y, guess.mu, guess.z)
-            believed, _, _ = _newton(case, blocks, ACCURACIES[0] * case.tolerance, directions, start, np.inf)
+            believed, _, _ = _refine_by_newton(case, blocks, ACCURACIES[0] * case.tolerance, directions, start, np.inf)
             if believed is not None:
                 return replace(believed, directions=directions)
-    believed = _conic(case, blocks, directions)
+    believed = _solve_conic(case, blocks, directions)
     if believed is not None:
         return believed
     for accuracy in ACCURACIES:
-        believed, proof, directions = _kelley(case, blocks, accuracy * case.tolerance, directions)
+        believed, proof, directions = _solve_by_kelley(case, blocks, accuracy * case.tolerance, directions)
         if believed is None:
-            believed = case.blunt or _elastic_proof(case, proof)
+            believed = case.blunt or _find_elastic_proof(case, proof)
         if believed is not None:
             return replace(believed, directions=directions)
         if case.given_up:
             break
-    return replace(_failed(case), directions=directions)
+    return replace(_report_failure(case), directions=directions)
 
 
-def _conic(case: _Case, blocks: Blocks, directions: Directions) -> FiniteSolution | None:
+def _solve_conic(case: _Case, blocks: Blocks, directions: Directions) -> FiniteSolution | None:
     """A believed answer of a solver that takes second-order cones, or its proof that there is none; ``None`` without
     such a solver. Along a norm whose bounds are reached the cost is flat, and the bound asks for more digits of the
     decision than such a solver has: Newton's method goes on from there, with ``directions`` for the blocks that are
@@ -225,39 +226,39 @@ def _conic(case: _Case, blocks: Blocks, directions: Directions) -> FiniteSolutio
     if cones is None or not has_cones(program, blocks):
         return None
     for accuracy in ACCURACIES:
-        claim, answer = _ask(case, program, "cones", accuracy * case.tolerance)
+        claim, answer = _ask_solver(case, program, "cones", accuracy * case.tolerance)
         if claim is not None and claim.status == "infeasible":
-            proof = _proof(case, answer, "the solver's ray")
+            proof = _check_proof(case, answer, "the solver's ray")
             return None if proof is None else replace(proof, by=cones[1])
         if answer is not None and np.isfinite(answer[0]).all():
-            believed, gap = _looked_at(case, answer, "with cones", cones[1])
+            believed, gap = _judge_answer(case, answer, "with cones", cones[1])
             if believed is None and program.S is None and gap < np.inf:
-                believed, _, _ = _newton(case, blocks, accuracy * case.tolerance, directions, answer, gap)
+                believed, _, _ = _refine_by_newton(case, blocks, accuracy * case.tolerance, directions, answer, gap)
             if believed is not None:
                 return believed
     return case.blunt
 
 
-def _kelley(
+def _solve_by_kelley(
     case: _Case, blocks: Blocks, accuracy: float, directions: Directions
 ) -> tuple[FiniteSolution | None, FiniteSolution | None, Directions]:
     """A believed answer, or a proof that there is none, or neither; and the directions used. Where an answer is near,
     Newton's method is tried from it: it knows the curvature of the norms, but not which blocks are 0."""
     program, closest, tried, idle = case.program, np.inf, np.inf, 0
     for _ in range(DIRECTIONS):
-        claim, answer = _ask(case, program, "epigraph", accuracy, directions)
+        claim, answer = _ask_solver(case, program, "epigraph", accuracy, directions)
         if claim is not None and claim.status == "infeasible":
-            return None, _proof(case, answer, "the solver's ray"), directions
+            return None, _check_proof(case, answer, "the solver's ray"), directions
         if answer is None or not np.isfinite(answer[0]).all():
             break
-        believed, gap = _looked_at(case, answer)
+        believed, gap = _judge_answer(case, answer)
         if (
             believed is None
             and program.S is None
             and gap <= NEARLY * min(tried, cost_scale(program, program.objective(answer[0])))
         ):
             tried = gap
-            believed, answer, gap = _newton(case, blocks, accuracy, directions, answer, gap)
+            believed, answer, gap = _refine_by_newton(case, blocks, accuracy, directions, answer, gap)
         if believed is not None:
             return believed, None, directions
         idle = 0 if gap < 0.9 * closest else idle + 1
@@ -270,7 +271,7 @@ def _kelley(
     return None, None, directions
 
 
-def _looked_at(
+def _judge_answer(
     case: _Case, answer: Recovered, name: str = "by directions", by: str = ""
 ) -> tuple[FiniteSolution | None, float]:
     """A believed solution, if the answer is one, and its gap: with its own multipliers or those of the tangent there,
@@ -286,7 +287,7 @@ def _looked_at(
     return None, gap
 
 
-def _newton(
+def _refine_by_newton(
     case: _Case, blocks: Blocks, accuracy: float, directions: Directions, answer: Recovered, gap: float
 ) -> tuple[FiniteSolution | None, Recovered, float]:
     """A believed solution, the best answer and its gap, by second-order expansions of the norms that are not 0; the
@@ -300,10 +301,10 @@ def _newton(
             break
         step = bent(program, blocks, centre, moving)
         fixed_directions = None if step.blocks is None else of_the_rest(directions, moving, step.blocks.table.shape[1])
-        _, candidate = _ask(case, step, "epigraph", accuracy, fixed_directions)
+        _, candidate = _ask_solver(case, step, "epigraph", accuracy, fixed_directions)
         if candidate is None or not np.isfinite(candidate[0]).all():
             break
-        believed, candidate_gap = _looked_at(case, candidate)
+        believed, candidate_gap = _judge_answer(case, candidate)
         if believed is not None or not candidate_gap < 0.5 * gap:
             return believed, answer, gap
         answer, gap = candidate, candidate_gap
@@ -312,19 +313,23 @@ def _newton(
     return None, answer, gap
 
 
-def _tried(case: _Case) -> FiniteSolution:
+def _try_forms(case: _Case) -> FiniteSolution:
     """Form after form, accuracy after accuracy."""
-    attempts = _attempts(case.program)
+    attempts = _order_attempts(case.program)
     for form, factor in attempts:
-        claim, answer = _ask(case, case.program, form, factor * case.tolerance)
-        proof = _proof(case, answer, "the solver's ray") if claim is not None and claim.status == "infeasible" else None
+        claim, answer = _ask_solver(case, case.program, form, factor * case.tolerance)
+        proof = (
+            _check_proof(case, answer, "the solver's ray")
+            if claim is not None and claim.status == "infeasible"
+            else None
+        )
         message = "" if claim is None else claim.message
-        for by, solution in _candidates(case, answer, message) if proof is None else ():
+        for by, solution in _list_candidates(case, answer, message) if proof is None else ():
             believed = case.judge(solution, f"{form} form", by)
             if believed is not None:
                 return believed
         if (form, factor) == attempts[0] and proof is None:
-            believed = _sharper(case, claim, answer)
+            believed = _sharpen(case, claim, answer)
             if believed is not None:
                 return believed
         if case.blunt is not None:
@@ -332,30 +337,30 @@ def _tried(case: _Case) -> FiniteSolution:
         if case.given_up and proof is None:
             break
         if proof is not None or form == attempts[0][0] or (claim is not None and claim.status == "infeasible"):
-            proof = _elastic_proof(case, proof)
+            proof = _find_elastic_proof(case, proof)
         if proof is not None:
             return proof
-    return _failed(case)
+    return _report_failure(case)
 
 
-def _attempts(program: FiniteProgram) -> tuple[tuple[Form, float], ...]:
+def _order_attempts(program: FiniteProgram) -> tuple[tuple[Form, float], ...]:
     """The forms and accuracies in the order in which they are tried: parts would double a dense matrix."""
     dense = program.P is not None and program.S is None and program.curvature is None
     return (ATTEMPTS[1], ATTEMPTS[0], *ATTEMPTS[2:]) if dense else ATTEMPTS
 
 
-def _sharper(case: _Case, claim: Claim | None, answer: Recovered | None) -> FiniteSolution | None:
+def _sharpen(case: _Case, claim: Claim | None, answer: Recovered | None) -> FiniteSolution | None:
     """The first answer that is believed and sharp: more digits of the ``claim``, and a vertex, which comes first where
     the solver has an answer that lacks digits, and last where it goes somewhere and does not arrive. One that raises,
     or has nothing to say, is told of."""
     solved = claim is not None and claim.status == "solved" and answer is not None
-    believed = _at_a_vertex(case) if solved else None
-    believed = believed or _more_digits(case, claim)
+    believed = _solve_by_simplex(case) if solved else None
+    believed = believed or _refine_digits(case, claim)
     is_stalled = claim is not None and claim.status == "failed" and np.isfinite(claim.x).all() and claim.x.any()
-    return _at_a_vertex(case) if believed is None and is_stalled else believed
+    return _solve_by_simplex(case) if believed is None and is_stalled else believed
 
 
-def _at_a_vertex(case: _Case) -> FiniteSolution | None:
+def _solve_by_simplex(case: _Case) -> FiniteSolution | None:
     """The answer of the simplex method to a linear program, if it is believed and sharp: where an interior-point method
     lacks digits, as with rows that are nearly parallel, or goes in circles, a vertex is a system of equations. Nothing
     where a solver was named."""
@@ -377,43 +382,43 @@ def _at_a_vertex(case: _Case) -> FiniteSolution | None:
     return None
 
 
-def _more_digits(case: _Case, claim: Claim | None) -> FiniteSolution | None:
+def _refine_digits(case: _Case, claim: Claim | None) -> FiniteSolution | None:
     """The first refined answer that is believed and sharp, from nothing and then from the ``claim``."""
     form, factor = ATTEMPTS[0]
     qp, recover = standard_form(case.program, form)
-    usable = claim is not None and _well_formed(claim, qp) and np.isfinite(claim.x).all()
+    usable = claim is not None and _is_well_formed(claim, qp) and np.isfinite(claim.x).all()
     for start in (None, claim) if usable else (None,):
         badness = np.inf
         try:
             for refined_claim in refined(qp, case.solver, start, factor * case.tolerance):
                 case.heard(refined_claim)
-                candidates = list(_candidates(case, recover(refined_claim), refined_claim.message))
+                candidates = list(_list_candidates(case, recover(refined_claim), refined_claim.message))
                 judged = [case.judge(solution, "with more digits", by) for by, solution in candidates]
                 believed = [solution for solution in judged if solution is not None]
                 if believed:  # digits are what was asked for: of those that are believed, the one that misses least
                     return min(believed, key=lambda solution: solution.residual)
                 before = badness
-                badness = min([badness, *(_badness(solution) for _, solution in candidates)])
+                badness = min([badness, *(_measure_error(solution) for _, solution in candidates)])
                 if badness > 0.5 * before or case.given_up:
                     break
-        except Exception as error:  # noqa: BLE001  as in `_ask`
+        except Exception as error:  # noqa: BLE001  as in `_ask_solver`
             case.attempts.append(f"with more digits: the solver raised {type(error).__name__}: {error}")
     return None
 
 
-def _through(case: _Case, easier: NewVariables, guess: FiniteSolution | None) -> FiniteSolution | None:
+def _solve_in_new_variables(case: _Case, easier: NewVariables, guess: FiniteSolution | None) -> FiniteSolution | None:
     """The answer found in easier variables, checked in those of the program."""
     program = case.program
     start = guess if guess is None or guess.x.size != program.n else replace(guess, x=easier.to(guess.x))
     inner = _Case(easier.program, case.solver, case.tolerance, case.small)
     easier.program.validate()
-    solution = _answer(inner, start)
+    solution = _solve_case(inner, start)
     case.crude = inner.crude
     case.attempts += inner.attempts
     case.lost = inner.lost
     x = easier.back(solution.x)
     if solution.status == "infeasible":
-        proof = _proof(case, (x, solution.y, solution.mu, None), "the program in other variables")
+        proof = _check_proof(case, (x, solution.y, solution.mu, None), "the program in other variables")
         return proof if proof is None else replace(proof, by=solution.by)
     measured = measure(program, x, solution.y, solution.mu, easier.dual(solution.z), solution.message)
     return case.judge(replace(measured, by=solution.by), "new variables") or case.blunt
@@ -428,7 +433,7 @@ def cost_scale(program: FiniteProgram, value: float) -> float:
     return max(abs(value), min(1.0, largest or 1.0))
 
 
-def _cheap(case: _Case, guess: FiniteSolution | None) -> Iterator[tuple[str, FiniteSolution]]:
+def _list_cheap_answers(case: _Case, guess: FiniteSolution | None) -> Iterator[tuple[str, FiniteSolution]]:
     """Yield answers that need no solver, each with the name of the method that it is by.
 
     These are the optimum without rows; the simplex method, where few of many entries matter to it; and Newton's method
@@ -453,7 +458,7 @@ def _cheap(case: _Case, guess: FiniteSolution | None) -> Iterator[tuple[str, Fin
         yield DUAL_NEWTON, from_nothing(program, 0.1 * case.tolerance, POINTS)[0]
 
 
-def _ask(
+def _ask_solver(
     case: _Case, program: FiniteProgram, form: Form, accuracy: float, directions: Directions | None = None
 ) -> tuple[Claim | None, Recovered | None]:
     """The solver's claim, and its numbers in terms of the program if they have the right shapes and are finite."""
@@ -466,19 +471,19 @@ def _ask(
         case.heard(None)
         return None, None
     case.heard(claim)
-    if not _well_formed(claim, qp):
+    if not _is_well_formed(claim, qp):
         shapeless = "; its arrays are not finite, or not of the right size" if claim.status == "solved" else ""
         case.attempts.append(f"{form} form: {claim.status}, {claim.message}{shapeless}")
         return claim, None
     return claim, recover(claim)
 
 
-def _well_formed(claim: Claim, qp: QuadraticProgram) -> bool:
+def _is_well_formed(claim: Claim, qp: QuadraticProgram) -> bool:
     pairs = ((claim.x, qp.q), (claim.z, qp.h), (claim.y, qp.b))
     return all(np.shape(got) == want.shape and bool(np.isfinite(got).all()) for got, want in pairs)
 
 
-def _candidates(case: _Case, answer: Recovered | None, said: str) -> Iterator[tuple[str, FiniteSolution]]:
+def _list_candidates(case: _Case, answer: Recovered | None, said: str) -> Iterator[tuple[str, FiniteSolution]]:
     """A claim of a solver that ``said`` so, polished, where the structure allows, and as it is, and who each is by. The
     polished one of a solver that was named is its own answer only where the claim would do."""
     if answer is None:
@@ -487,14 +492,14 @@ def _candidates(case: _Case, answer: Recovered | None, said: str) -> Iterator[tu
     raw, polished = measure(program, x, y, mu, z, message=f"claimed ({said})"), polish(program, x, y, mu)
     if polished is not None:
         by = "" if case.solver.quick or case.believes(raw) else DUAL_NEWTON
-        case.crude = f"its answer {_short(raw)}; Newton's method went on from it" if by else ""
+        case.crude = f"its answer {_describe_errors(raw)}; Newton's method went on from it" if by else ""
         yield by, polished
         vertex = vertex_multipliers(program, polished.x, polished.y, polished.mu)
         yield by, measure(program, polished.x, *vertex, message="its vertex")
     yield "", raw
 
 
-def _elastic_proof(case: _Case, known: FiniteSolution | None) -> FiniteSolution | None:
+def _find_elastic_proof(case: _Case, known: FiniteSolution | None) -> FiniteSolution | None:
     """The sharpest proof of infeasibility, from the elastic program or already known; sought once."""
     if case.elastic:
         return known
@@ -502,8 +507,8 @@ def _elastic_proof(case: _Case, known: FiniteSolution | None) -> FiniteSolution 
     relaxed = elastic_program(case.program)
     forms: tuple[Form, ...] = ("split", "epigraph")
     for form in forms if known is None else forms[:1]:
-        claim, answer = _ask(case, relaxed, form, 0.1 * case.tolerance)
-        proof = None if answer is None else _proof(case, unrelaxed(case.program, answer), "the elastic program")
+        claim, answer = _ask_solver(case, relaxed, form, 0.1 * case.tolerance)
+        proof = None if answer is None else _check_proof(case, unrelaxed(case.program, answer), "the elastic program")
         if proof is not None and (known is None or proof.infeasibility > known.infeasibility):
             return proof
         if claim is not None and claim.status == "solved":
@@ -511,7 +516,7 @@ def _elastic_proof(case: _Case, known: FiniteSolution | None) -> FiniteSolution 
     return known
 
 
-def _proof(case: _Case, answer: Recovered | None, source: str) -> FiniteSolution | None:
+def _check_proof(case: _Case, answer: Recovered | None, source: str) -> FiniteSolution | None:
     """The answer as ``infeasible``, if its multipliers prove that."""
     if answer is None:
         return None
@@ -565,7 +570,7 @@ def unrelaxed(program: FiniteProgram, answer: Recovered) -> Recovered:
     return x[:-1], y[:r], y[r : r + e] - y[r + e :], None if z is None else z[:-1]
 
 
-def _contradiction(program: FiniteProgram, tolerance: float) -> FiniteSolution | None:
+def _find_contradiction(program: FiniteProgram, tolerance: float) -> FiniteSolution | None:
     """Bounds that cross, and rows without entries that ask for the impossible."""
     y, mu, x = np.zeros(program.h.size), np.zeros(program.b.size), np.zeros(program.n)
     crossed = program.lower - program.upper
@@ -589,22 +594,22 @@ def _contradiction(program: FiniteProgram, tolerance: float) -> FiniteSolution |
     return FiniteSolution("infeasible", x, np.inf, np.inf, y, mu, z, np.inf, 0.0, f"infeasible: {reason}", (), amount)
 
 
-def _failed(case: _Case) -> FiniteSolution:
+def _report_failure(case: _Case) -> FiniteSolution:
     program, best = case.program, case.best
     if best is None:
         best = measure(program, np.zeros(program.n), np.zeros(program.h.size), np.zeros(program.b.size))
         reason = "; ".join(dict.fromkeys(case.attempts)) or "the solver gave no answer"
     else:
-        reason = f"of {len(case.attempts)} answers none holds: the best {_short(best)}"
+        reason = f"of {len(case.attempts)} answers none holds: the best {_describe_errors(best)}"
     return replace(best, status="failed", message=f"{reason}; {ADVICE}", attempts=tuple(case.attempts))
 
 
-def _short(solution: FiniteSolution) -> str:
+def _describe_errors(solution: FiniteSolution) -> str:
     """Describe the residual of an answer and its distance to its own lower bound, in words."""
     side = "above" if solution.gap >= 0.0 else "below"  # where it misses its rows
     bound = "has no lower bound" if solution.gap == np.inf else f"is {abs(solution.gap):.1e} {side} its lower bound"
     return f"misses its rows by {solution.residual:.1e} and {bound}"
 
 
-def _badness(solution: FiniteSolution) -> float:
+def _measure_error(solution: FiniteSolution) -> float:
     return solution.residual + max(solution.gap, 0.0)

@@ -59,20 +59,22 @@ def standard_form(
     and ``t >= |s|`` itself in the form ``cones``.
     """
     if program.blocks is not None and form == "cones":
-        model = _with_cones(_epigraph_model(program, program.blocks.number < 0), program, program.blocks)
-        return _substituted(program, model) if program.S is None else _lifted(program, model)
+        model = _add_cones(_build_epigraph_model(program, program.blocks.number < 0), program, program.blocks)
+        return _substitute(program, model) if program.S is None else _lift(program, model)
     if program.blocks is not None and directions is not None:
-        model = _with_norms(_epigraph_model(program, program.blocks.number < 0), program, program.blocks, directions)
-        return _substituted(program, model) if program.S is None else _lifted(program, model)
+        model = _add_norms(
+            _build_epigraph_model(program, program.blocks.number < 0), program, program.blocks, directions
+        )
+        return _substitute(program, model) if program.S is None else _lift(program, model)
     sources = (program.weights, program.lower, program.upper)
-    model = _models.recall(sources, (form, program.S is None), lambda: _model(program, form))
-    return _substituted(program, model) if program.S is None else _lifted(program, model)
+    model = _models.recall(sources, (form, program.S is None), lambda: _build_model(program, form))
+    return _substitute(program, model) if program.S is None else _lift(program, model)
 
 
-def _model(program: FiniteProgram, form: Form) -> ImageModel:
+def _build_model(program: FiniteProgram, form: Form) -> ImageModel:
     lower, upper, weights = program.lower, program.upper, program.weights
     if form == "epigraph":
-        return _epigraph_model(program, np.full(weights.size, True))
+        return _build_epigraph_model(program, np.full(weights.size, True))
     fixed = lower == upper
     offset = np.where(fixed, lower, 0.0)
     is_weighted = ~fixed & (weights > 0)
@@ -85,7 +87,7 @@ def _model(program: FiniteProgram, form: Form) -> ImageModel:
     return ImageModel(entry, sign, offset, weights[entry], floor, ceiling, None, np.zeros(0))
 
 
-def _epigraph_model(program: FiniteProgram, alone: npt.NDArray[np.bool_]) -> ImageModel:
+def _build_epigraph_model(program: FiniteProgram, alone: npt.NDArray[np.bool_]) -> ImageModel:
     """``alone (k,)``: the entries that count with their absolute values."""
     from scipy.sparse import csc_array
 
@@ -112,12 +114,12 @@ def _epigraph_model(program: FiniteProgram, alone: npt.NDArray[np.bool_]) -> Ima
     return ImageModel(entry, sign, offset, cost, floor, ceiling, R, np.zeros(2 * kinks.size))
 
 
-def _with_norms(model: ImageModel, program: FiniteProgram, blocks: Blocks, directions: Directions) -> ImageModel:
+def _add_norms(model: ImageModel, program: FiniteProgram, blocks: Blocks, directions: Directions) -> ImageModel:
     """The model with one variable ``t`` for every block, which costs the block's weight, and rows ``d's <= t``."""
     from scipy.sparse import csc_array, vstack
 
-    model = _with_tops(model, program, blocks)
-    size, tops, of = directions.block.size, model.entry.size - blocks.first.size, _places(model, program)
+    model = _add_block_bounds(model, program, blocks)
+    size, tops, of = directions.block.size, model.entry.size - blocks.first.size, _number_variables(model, program)
     entries = blocks.table[directions.block]
     inside = (entries >= 0) & (directions.vectors != 0.0)
     moving = inside & (of[entries] >= 0)
@@ -134,18 +136,18 @@ def _with_norms(model: ImageModel, program: FiniteProgram, blocks: Blocks, direc
     return replace(model, R=rows, right=np.concatenate([model.right, -fixed / np.sqrt(2.0)]))
 
 
-def _with_cones(model: ImageModel, program: FiniteProgram, blocks: Blocks) -> ImageModel:
+def _add_cones(model: ImageModel, program: FiniteProgram, blocks: Blocks) -> ImageModel:
     """The model with one variable for every block, which costs the block's weight and is at least its norm. An entry
     that is fixed is fixed at 0 (`has_cones`), and is in no cone."""
-    model, tops = _with_tops(model, program, blocks), model.entry.size
-    places = _places(model, program)[blocks.table]
+    model, tops = _add_block_bounds(model, program, blocks), model.entry.size
+    places = _number_variables(model, program)[blocks.table]
     return replace(
         model,
         cones=tuple(np.concatenate([[tops + b], variables[variables >= 0]]) for b, variables in enumerate(places)),
     )
 
 
-def _with_tops(model: ImageModel, program: FiniteProgram, blocks: Blocks) -> ImageModel:
+def _add_block_bounds(model: ImageModel, program: FiniteProgram, blocks: Blocks) -> ImageModel:
     """The model with one variable more for every block, at least 0, which costs the block's weight."""
     from scipy.sparse import csc_array, hstack
 
@@ -161,7 +163,7 @@ def _with_tops(model: ImageModel, program: FiniteProgram, blocks: Blocks) -> Ima
     )
 
 
-def _places(model: ImageModel, program: FiniteProgram) -> np.ndarray:
+def _number_variables(model: ImageModel, program: FiniteProgram) -> np.ndarray:
     """Return the number of the variable of every entry of the image, ``(k + 1,)``; -1 for an entry that is fixed.
 
     The array has one more value at its end, which is -1: the index -1, which stands for no entry, finds it.
@@ -178,7 +180,7 @@ def has_cones(program: FiniteProgram, blocks: Blocks) -> bool:
     return not ((lower == upper) & (lower != 0.0)).any()
 
 
-def _substituted(program: FiniteProgram, model: ImageModel) -> tuple[QuadraticProgram, Callable[[Claim], Recovered]]:
+def _substitute(program: FiniteProgram, model: ImageModel) -> tuple[QuadraticProgram, Callable[[Claim], Recovered]]:
     """Variables ``v``; ``x = T v + offset``."""
     from scipy.sparse import csc_array
 
@@ -187,17 +189,17 @@ def _substituted(program: FiniteProgram, model: ImageModel) -> tuple[QuadraticPr
     if program.P is not None and curvature is None:
         q = q + program.P @ model.offset
     cost = model.cost + model.sign * q[model.entry]
-    kappa = _largest(cost) or _largest(curvature) or 1.0
+    kappa = _find_largest(cost) or _find_largest(curvature) or 1.0
     if curvature is not None:
-        P = _diagonal_matrix(np.abs(model.sign) * curvature[model.entry] / kappa)
+        P = _build_diagonal(np.abs(model.sign) * curvature[model.entry] / kappa)
     else:
         T = csc_array((model.sign, (model.entry, np.arange(model.entry.size))), shape=(program.n, model.entry.size))
         P = csc_array(T.T @ program.P @ T) / kappa
-    rows, h, keep, norms = _unit_rows(program.G, program.h, model)
-    equal, b, keep_equal, norms_equal = _unit_rows(program.A, program.b, model)
-    G = _stack(rows, model.R)
+    rows, h, keep, norms = _normalise_rows(program.G, program.h, model)
+    equal, b, keep_equal, norms_equal = _normalise_rows(program.A, program.b, model)
+    G = _stack_rows(rows, model.R)
     right = np.concatenate([h, model.right])
-    qp = QuadraticProgram(P, cost / kappa, G, right, _stack(equal, None), b, model.lower, model.upper, model.cones)
+    qp = QuadraticProgram(P, cost / kappa, G, right, _stack_rows(equal, None), b, model.lower, model.upper, model.cones)
 
     def recover(claim: Claim) -> Recovered:
         x = model.offset + np.bincount(model.entry, model.sign * claim.x, program.n)
@@ -209,7 +211,7 @@ def _substituted(program: FiniteProgram, model: ImageModel) -> tuple[QuadraticPr
     return qp, recover
 
 
-def _lifted(program: FiniteProgram, model: ImageModel) -> tuple[QuadraticProgram, Callable[[Claim], Recovered]]:
+def _lift(program: FiniteProgram, model: ImageModel) -> tuple[QuadraticProgram, Callable[[Claim], Recovered]]:
     """Variables ``(x, v)``; equality rows ``S x - T v = offset`` for every image that has a weight or a bound."""
     from scipy.sparse import block_diag, csc_array, hstack, vstack
 
@@ -219,10 +221,10 @@ def _lifted(program: FiniteProgram, model: ImageModel) -> tuple[QuadraticProgram
     link = hstack([program.S, -T], format="csr")[images]
     free = np.full(n, np.inf)
     identity = ImageModel(np.arange(n), np.ones(n), np.zeros(n), program.q, -free, free, None, np.zeros(0))
-    rows, h, keep, norms = _unit_rows(program.G, program.h, identity)
-    equal, b, keep_equal, norms_equal = _unit_rows(program.A, program.b, identity)
+    rows, h, keep, norms = _normalise_rows(program.G, program.h, identity)
+    equal, b, keep_equal, norms_equal = _normalise_rows(program.A, program.b, identity)
     cost = np.concatenate([program.q, model.cost])
-    kappa = _largest(cost) or _largest(None if program.P is None else program.P.data) or 1.0
+    kappa = _find_largest(cost) or _find_largest(None if program.P is None else program.P.data) or 1.0
     P = csc_array((n, n)) if program.P is None else program.P / kappa
     P = block_diag([P, csc_array((size, size))], format="csc")
     pad = csc_array((rows.shape[0], size))
@@ -254,7 +256,7 @@ def _lifted(program: FiniteProgram, model: ImageModel) -> tuple[QuadraticProgram
 
 
 @shaped
-def _unit_rows(
+def _normalise_rows(
     rows: Float[Array, "r n"], rhs: Float[Array, " r"], model: ImageModel
 ) -> tuple[Float[Array, "p v"], Float[Array, " p"], Int[np.ndarray, " p"], Float[Array, " p"]]:
     """Rows over ``v`` and right-hand sides, divided by the norm of the row; which rows were kept, and their norms."""
@@ -266,7 +268,7 @@ def _unit_rows(
     return block[keep] / norms[:, None], limits[keep] / norms, keep, norms
 
 
-def _stack(rows: Array, below: csc_array | None) -> csc_array:
+def _stack_rows(rows: Array, below: csc_array | None) -> csc_array:
     from scipy.sparse import csc_array, vstack
 
     across = rows.T
@@ -276,7 +278,7 @@ def _stack(rows: Array, below: csc_array | None) -> csc_array:
     return top if below is None else vstack([top, below], format="csc")
 
 
-def _diagonal_matrix(values: Array) -> csc_array:
+def _build_diagonal(values: Array) -> csc_array:
     from scipy.sparse import csc_array
 
     places = np.flatnonzero(values)
@@ -284,5 +286,5 @@ def _diagonal_matrix(values: Array) -> csc_array:
     return csc_array((values[places], places, pointers), shape=(values.size, values.size))
 
 
-def _largest(values: Array | None) -> float:
+def _find_largest(values: Array | None) -> float:
     return 0.0 if values is None else float(np.abs(values).max(initial=0.0))

@@ -64,7 +64,7 @@ def sifted(program: FiniteProgram, y: Array | None = None, mu: Array | None = No
     mu = np.zeros(program.b.size) if mu is None or mu.shape != program.b.shape else mu
     near, count = np.zeros(program.n, dtype=bool), max(NEAREST, int(SHARE * program.n))
     near[:: max(1, program.n // count)] = True  # neighbours are alike: some of everything, then zoom in
-    x, distance = _placed(program, y, mu)
+    x, distance = _evaluate_entries(program, y, mu)
     while True:
         count = min(count, program.n)
         near[np.argpartition(distance, count - 1)[:count]] = True
@@ -72,11 +72,11 @@ def sifted(program: FiniteProgram, y: Array | None = None, mu: Array | None = No
         if near.sum() > program.n // 2:
             return simplex(program)
         fixed_values = np.where(near, 0.0, x)
-        corner = simplex(_on(program, near, fixed_values))
+        corner = simplex(_restrict(program, near, fixed_values))
         if corner.status != "optimal":  # what is left out may be what is needed
             count *= 4
             continue
-        values, distance = _placed(program, corner.y, corner.mu)
+        values, distance = _evaluate_entries(program, corner.y, corner.mu)
         # the others stay where they are: the next ones fit, as these do
         misplaced = np.flatnonzero(~near & (values != fixed_values))
         if not misplaced.size:
@@ -85,7 +85,7 @@ def sifted(program: FiniteProgram, y: Array | None = None, mu: Array | None = No
         near[misplaced[:: max(1, misplaced.size // NEAREST)]] = True
 
 
-def _placed(program: FiniteProgram, y: Array, mu: Array) -> tuple[Array, Array]:
+def _evaluate_entries(program: FiniteProgram, y: Array, mu: Array) -> tuple[Array, Array]:
     """Return the values ``(n,)`` of all entries at given multipliers, and the distance ``(n,)`` of each slope from a
     change.
 
@@ -98,7 +98,7 @@ def _placed(program: FiniteProgram, y: Array, mu: Array) -> tuple[Array, Array]:
     return np.where(finite, x, 0.0), np.where(finite, np.abs(np.abs(slope) - program.weights), -1.0)
 
 
-def _on(program: FiniteProgram, near: np.ndarray, far: Array) -> FiniteProgram:
+def _restrict(program: FiniteProgram, near: np.ndarray, far: Array) -> FiniteProgram:
     """The program in some of the entries, the others at ``far (n,)``."""
     return replace(
         program,
@@ -128,7 +128,7 @@ def simplex(program: FiniteProgram, turns: int | None = None) -> Corner:
         y[is_finite] = answer.y
         return replace(answer, y=y)
     n, k, r = program.n, program.weights.size, program.h.size
-    columns = _separable(program) if program.S is None else _images(program)
+    columns = _build_separable_columns(program) if program.S is None else _build_image_columns(program)
     answer = linprog(
         columns["c"],
         A_ub=columns["rows"] if r else None,
@@ -151,16 +151,16 @@ def simplex(program: FiniteProgram, turns: int | None = None) -> Corner:
     return Corner("optimal", np.asarray(answer.x[:n]), np.maximum(y, 0.0), mu, -np.asarray(answer.eqlin.marginals)[:k])
 
 
-def _sides(program: FiniteProgram) -> tuple[list[Array], list[Array]]:
+def _split_bounds(program: FiniteProgram) -> tuple[list[Array], list[Array]]:
     """Bounds of the positive and of the negative part of an image, so that a vertex has exact zeros."""
     lower, upper = program.lower, program.upper
     plus = [np.maximum(lower, 0.0), np.maximum(upper, 0.0)]
     return plus, [np.maximum(-upper, 0.0), np.maximum(-lower, 0.0)]
 
 
-def _separable(program: FiniteProgram) -> dict[str, Any]:
+def _build_separable_columns(program: FiniteProgram) -> dict[str, Any]:
     """``x = plus - minus``."""
-    plus, minus = _sides(program)
+    plus, minus = _split_bounds(program)
     return {
         "c": np.concatenate([program.weights + program.q, program.weights - program.q]),
         "rows": np.hstack([program.G, -program.G]),
@@ -170,23 +170,23 @@ def _separable(program: FiniteProgram) -> dict[str, Any]:
     }
 
 
-def _images(program: FiniteProgram) -> dict[str, Any]:
+def _build_image_columns(program: FiniteProgram) -> dict[str, Any]:
     """``x`` is free, ``S x = plus - minus``."""
     from scipy.sparse import csr_array, eye_array, hstack, vstack
 
     n, k = program.n, program.weights.size
     images = hstack([csr_array(program.S), -eye_array(k), eye_array(k)], format="csr")
-    plus, minus = _sides(program)
+    plus, minus = _split_bounds(program)
     return {
         "c": np.concatenate([program.q, program.weights, program.weights]),
-        "rows": _wide(program.G, k),
-        "equal": images if not program.b.size else vstack([images, _wide(program.A, k)], format="csr"),
+        "rows": _widen_rows(program.G, k),
+        "equal": images if not program.b.size else vstack([images, _widen_rows(program.A, k)], format="csr"),
         "right": np.concatenate([np.zeros(k), program.b]),
         "bounds": np.vstack([np.tile([-np.inf, np.inf], (n, 1)), np.column_stack(plus), np.column_stack(minus)]),
     }
 
 
-def _wide(rows: Array, k: int) -> object:
+def _widen_rows(rows: Array, k: int) -> object:
     from scipy.sparse import csr_array, hstack
 
     return hstack([csr_array(rows), csr_array((rows.shape[0], 2 * k))], format="csr")

@@ -50,10 +50,10 @@ def call_apart(call: Callable[[], Value], deadline: Deadline) -> Value:
         process = os.fork()
     if not process:
         os.close(read)
-        _answer(call, write)
+        _write_answer(call, write)
     os.close(write)
     try:
-        answer = _received(read, deadline)
+        answer = _read_answer(read, deadline)
     finally:
         os.close(read)
         with suppress(ProcessLookupError):
@@ -68,7 +68,7 @@ def call_apart(call: Callable[[], Value], deadline: Deadline) -> Value:
     return value  # type: ignore[no-any-return]
 
 
-def _answer(call: Callable[[], object], write: int) -> NoReturn:
+def _write_answer(call: Callable[[], object], write: int) -> NoReturn:
     """Make the call in the copy, write the answer, and end."""
     try:
         signal.signal(signal.SIGINT, signal.SIG_IGN)  # whoever pressed a key is heard by the process itself
@@ -90,7 +90,7 @@ def _answer(call: Callable[[], object], write: int) -> NoReturn:
         os._exit(0)
 
 
-def _received(read: int, deadline: Deadline) -> bytes:
+def _read_answer(read: int, deadline: Deadline) -> bytes:
     """All that comes out of a pipe; raises `OutOfTime` at the deadline."""
     answer = b""
     while True:

@@ -42,8 +42,8 @@ class Deadline:
 
     def __init__(self, seconds: float | None = None) -> None:
         self.seconds = seconds
-        self._ends = np.inf if seconds is None else time.monotonic() + seconds
-        self._interrupted = ""
+        self._end_time = np.inf if seconds is None else time.monotonic() + seconds
+        self._interruption = ""
         self.pressed = False
         """Whether somebody has interrupted the computation, by a key or a signal, before the end of the time."""
 
@@ -55,14 +55,14 @@ class Deadline:
     @property
     def reason(self) -> str:
         """Reason why the time is over, in words; empty while it is not over."""
-        if self._interrupted:
-            return self._interrupted
-        return f"the limit of {self.seconds:g} s is reached" if time.monotonic() >= self._ends else ""
+        if self._interruption:
+            return self._interruption
+        return f"the limit of {self.seconds:g} s is reached" if time.monotonic() >= self._end_time else ""
 
     @property
     def left(self) -> float | None:
         """The seconds that are left, a millisecond at least; none without a limit."""
-        return None if self.seconds is None else max(1e-3, self._ends - time.monotonic())
+        return None if self.seconds is None else max(1e-3, self._end_time - time.monotonic())
 
     def at_most(self, seconds: float) -> float:
         """Return ``seconds``, or the seconds that are left where these are fewer."""
@@ -71,19 +71,19 @@ class Deadline:
     @property
     def used(self) -> float:
         """The share of the time that is over, 1 at most; 0 where there is no limit."""
-        remaining = self._ends - time.monotonic()
+        remaining = self._end_time - time.monotonic()
         return 0.0 if self.seconds is None else 1.0 - max(0.0, remaining) / self.seconds if self.seconds > 0.0 else 1.0
 
     @property
     def passed(self) -> bool:
         """True where the time is over, by the limit or by an interrupt."""
-        return bool(self._interrupted) or time.monotonic() >= self._ends
+        return bool(self._interruption) or time.monotonic() >= self._end_time
 
     def sooner(self, seconds: float) -> Deadline:
         """Return a copy of the deadline that ends ``seconds`` earlier, for a step that leaves time for others before
         the limit."""
         earlier = copy(self)
-        earlier._ends -= seconds
+        earlier._end_time -= seconds
         return earlier
 
     def check(self) -> None:
@@ -102,10 +102,10 @@ class Deadline:
         if not self.bounded:
             yield
             return
-        due = max(self._ends + GRACE, time.monotonic() + LAST)
+        due = max(self._end_time + GRACE, time.monotonic() + LAST)
         bell = _bells.get(threading.get_ident())
         if bell is None:
-            with _hung(due, self) as bell:
+            with _hang_bell(due, self) as bell:
                 yield
             return
         before = bell.due, bell.deadline
@@ -126,8 +126,8 @@ class Deadline:
     def interrupt(self, error: KeyboardInterrupt) -> str:
         """Take note of an interrupt, and return why the time is over: in the words of the error where it has some."""
         self.pressed |= not isinstance(error, OutOfTime)
-        self._interrupted = self.reason or str(error) or "interrupted from the keyboard"
-        return self._interrupted
+        self._interruption = self.reason or str(error) or "interrupted from the keyboard"
+        return self._interruption
 
 
 class _Bell(ABC):
@@ -140,14 +140,14 @@ class _Bell(ABC):
     def ring_at(self, due: float, deadline: Deadline) -> None:
         """Ring at this moment of the machine's clock, for this deadline."""
         self.due, self.deadline = due, deadline
-        self._set()
+        self._set_timer()
 
     def error(self) -> OutOfTime:
         """Return the exception to raise, with the reason of the deadline."""
         return OutOfTime(self.deadline.reason or "the time is over")
 
     @abstractmethod
-    def _set(self) -> None: ...
+    def _set_timer(self) -> None: ...
 
     @abstractmethod
     def take_down(self) -> None:
@@ -155,7 +155,7 @@ class _Bell(ABC):
 
 
 @final
-class _Alarm(_Bell):
+class _AlarmBell(_Bell):
     """Bell that uses the alarm signal of the operating system, which also interrupts calls that wait."""
 
     def __init__(self) -> None:
@@ -165,7 +165,7 @@ class _Alarm(_Bell):
         self.rung = True
         raise self.error()
 
-    def _set(self) -> None:
+    def _set_timer(self) -> None:
         signal.setitimer(signal.ITIMER_REAL, max(1e-3, self.due - time.monotonic()), LAST)
 
     def take_down(self) -> None:
@@ -174,38 +174,38 @@ class _Alarm(_Bell):
 
 
 @final
-class _Call(_Bell):
+class _ThreadBell(_Bell):
     """Bell that another thread rings through the interpreter, for threads and systems without an alarm."""
 
     def __init__(self) -> None:
-        self._thread, self._changed, self._ended = threading.get_ident(), threading.Condition(), False
+        self._thread, self._condition, self._has_ended = threading.get_ident(), threading.Condition(), False
         self.due = np.inf
         threading.Thread(target=self._watch, name="deadline", daemon=True).start()
 
     def _watch(self) -> None:
-        with self._changed:
-            while not self._ended:
+        with self._condition:
+            while not self._has_ended:
                 remaining = self.due - time.monotonic()
                 if remaining <= 0.0:
                     self.rung, self.due = True, time.monotonic() + LAST
                     self._raise(OutOfTime)
-                self._changed.wait(min(max(remaining, 0.0), threading.TIMEOUT_MAX))
+                self._condition.wait(min(max(remaining, 0.0), threading.TIMEOUT_MAX))
 
     def _raise(self, error: type[OutOfTime]) -> None:
         ctypes.pythonapi.PyThreadState_SetAsyncExc(ctypes.c_ulong(self._thread), ctypes.py_object(error))
 
-    def _set(self) -> None:
-        with self._changed:
-            self._changed.notify()
+    def _set_timer(self) -> None:
+        with self._condition:
+            self._condition.notify()
 
     def take_down(self) -> None:
-        with self._changed:
-            self._ended = True
-            self._changed.notify()
+        with self._condition:
+            self._has_ended = True
+            self._condition.notify()
         if self.rung:
-            self._wait_for_the_last()
+            self._wait_for_last_ring()
 
-    def _wait_for_the_last(self) -> None:
+    def _wait_for_last_ring(self) -> None:
         """Let what was set and is not raised yet be raised here, or another in its place. It could be withdrawn, but
         the interpreter (3.11) would look for it ever after, at every call, and be slow."""
         with suppress(OutOfTime):
@@ -219,11 +219,11 @@ _bells: dict[int, _Bell] = {}
 
 
 @contextmanager
-def _hung(due: float, deadline: Deadline) -> Iterator[_Bell]:
+def _hang_bell(due: float, deadline: Deadline) -> Iterator[_Bell]:
     """A bell for this thread: the alarm where it has one that nobody else uses."""
     alarm = getattr(signal, "SIGALRM", None)
     main = threading.current_thread() is threading.main_thread()
-    bell = _Alarm() if alarm is not None and main and signal.getsignal(alarm) is signal.SIG_DFL else _Call()
+    bell = _AlarmBell() if alarm is not None and main and signal.getsignal(alarm) is signal.SIG_DFL else _ThreadBell()
     _bells[threading.get_ident()] = bell
     try:
         bell.ring_at(due, deadline)

@@ -34,8 +34,12 @@ class Nominal(Method, Options):
     """Rounds at most."""
 
     def solve(self, program: SemiInfiniteProgram, tools: Tools) -> Result:
-        return _judged(
-            program, _simplified(program, "nominal", lambda family: family.nominal), tools, self.tolerance, self.rounds
+        return _judge_simplified(
+            program,
+            _simplify_families(program, "nominal", lambda family: family.nominal),
+            tools,
+            self.tolerance,
+            self.rounds,
         )
 
 
@@ -57,7 +61,7 @@ class Scenario(Method, Options):
     """How many uncertainties are sampled."""
 
     def solve(self, program: SemiInfiniteProgram, tools: Tools) -> Result:
-        result = _judged(program, self.simplified(program, tools.rng), tools, self.tolerance, self.rounds)
+        result = _judge_simplified(program, self.simplified(program, tools.rng), tools, self.tolerance, self.rounds)
         if result.decision is None:
             return result
         bound = scenario_bound(self.scenarios, program.n, len(result.indices))
@@ -71,10 +75,10 @@ class Scenario(Method, Options):
         def sampled(family: ConstraintFamily) -> ConstraintFamily | None:
             return None if family.sample is None else family.sample(self.scenarios, np.random.default_rng(seed))
 
-        return _simplified(program, "scenario", sampled)
+        return _simplify_families(program, "scenario", sampled)
 
 
-def _simplified(
+def _simplify_families(
     program: SemiInfiniteProgram, method: str, simpler: Callable[[ConstraintFamily], ConstraintFamily | None]
 ) -> SemiInfiniteProgram:
     families = [simpler(family) for family in program.families]
@@ -87,7 +91,7 @@ def _simplified(
     return replace(program, families=[family for family in families if family is not None])
 
 
-def _judged(
+def _judge_simplified(
     program: SemiInfiniteProgram, simple: SemiInfiniteProgram, tools: Tools, tolerance: float, rounds: int
 ) -> Result:
     """Solve the simpler program, whose lower bound holds for the full one too, and say what its decision is worth in

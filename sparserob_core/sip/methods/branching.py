@@ -65,23 +65,23 @@ class Branching:
 
     def __post_init__(self) -> None:
         base = self.program.finite
-        self.prices, self._vectors = prices_of(self.program), vectors(self.program)
+        self.prices, self._vector_numbers = prices_of(self.program), vectors(self.program)
         root = Part(-1, 0, float(base.lower[0]), float(base.upper[0]), False)
         self.parts, self.nodes = [root], [Leaf(NO_BOUND)]
-        self._heap = [(self._renewed(0), 0)]
+        self._heap = [(self._update_bound(0), 0)]
 
     @property
     def lower(self) -> float:
         """Lower bound of the count of every decision, in the user's units; infinite where nothing is feasible."""
-        return min((self._safe(bound) for bound, _ in self._heap), default=np.inf)
+        return min((self._round_bound(bound) for bound, _ in self._heap), default=np.inf)
 
-    def _safe(self, bound: float) -> float:
+    def _round_bound(self, bound: float) -> float:
         return bound if np.isinf(bound) else whole(self.program, bound - INWARDS * abs(bound))
 
     def open(self, incumbent: float) -> bool:
         """Return whether a part may contain a decision that counts less than the ``incumbent``."""
         least = self._heap[0][0] if self._heap else np.inf
-        return least < np.inf and self._safe(least) < incumbent * (1.0 - MISSED)
+        return least < np.inf and self._round_bound(least) < incumbent * (1.0 - MISSED)
 
     def grow(self, incumbent: Callable[[], float], look: Callable[[Array], bool]) -> bool:
         """Divide the part with the least bound, of a tree that is open; ``False`` where it cannot be divided. ``look``
@@ -91,18 +91,18 @@ class Branching:
         x = self.parts[number].x
         if x is None:
             return False
-        image = self._undecided(number, x)
+        image = self._find_undecided(number, x)
         if image is None and look(x):
-            if self._safe(bound) < incumbent() * (1.0 - MISSED):
-                heapq.heapreplace(self._heap, (self._renewed(number), number))
+            if self._round_bound(bound) < incumbent() * (1.0 - MISSED):
+                heapq.heapreplace(self._heap, (self._update_bound(number), number))
             return True
-        if image is None and (image := self._free(number)) is None:
+        if image is None and (image := self._find_free(number)) is None:
             return False
         self._divide(number, image, float(self.program.finite.image(x)[image]))
         return True
 
     def _divide(self, number: int, image: int, value: float) -> None:
-        low, high, _ = self._bounds(self.parts[number])
+        low, high, _ = self._find_bounds(self.parts[number])
         below, above = float(low[image]), float(high[image])
         if self.letters is None:
             letters_at_cut = None
@@ -118,7 +118,7 @@ class Branching:
                 Part(number, image, float(allowed[upper_index]), above, False),
             ]
         # measured before anything is changed: whoever is interrupted leaves a tree that covers every decision
-        bounded_children, first = [self._measured(child, Leaf(NO_BOUND)) for child in children], len(self.nodes)
+        bounded_children, first = [self._bound_part(child, Leaf(NO_BOUND)) for child in children], len(self.nodes)
         heap = [entry for entry in self._heap if entry[1] != number]
         heap += [(child.bound, first + k) for k, (child, _) in enumerate(bounded_children)]
         heapq.heapify(heap)
@@ -127,17 +127,17 @@ class Branching:
         self.nodes[number], self._heap = Branch(image, first, first + 1, letters_at_cut), heap
         self.parts[number] = replace(self.parts[number], x=None)
 
-    def _renewed(self, number: int) -> float:
+    def _update_bound(self, number: int) -> float:
         """Bound one part anew; the bound that is known of it now."""
         leaf = self.nodes[number]
         assert isinstance(leaf, Leaf)
-        self.parts[number], self.nodes[number] = self._measured(self.parts[number], leaf)
+        self.parts[number], self.nodes[number] = self._bound_part(self.parts[number], leaf)
         return self.parts[number].bound
 
-    def _measured(self, part: Part, leaf: Leaf) -> tuple[Part, Leaf]:
+    def _bound_part(self, part: Part, leaf: Leaf) -> tuple[Part, Leaf]:
         """A part and its leaf, bounded with all rows; with what was known of it where that is better."""
-        finite, certain = self._finite(part)
-        corner = self._corner(finite)
+        finite, certain = self._build_finite(part)
+        corner = self._solve_part(finite)
         y, mu, z = corner.y, corner.mu, corner.z
         fallback = replace(part, bound=max(part.bound, 0.0))
         if corner.status == "infeasible":
@@ -146,7 +146,7 @@ class Branching:
                 return fallback, leaf
             size = float(y @ np.linalg.norm(finite.G, axis=1) + np.abs(mu) @ np.linalg.norm(finite.A, axis=1))
             z = None if z is None else z / size
-            dual = self._told(finite, y / size, mu / size, z, amount, False)
+            dual = self._make_dual(finite, y / size, mu / size, z, amount, False)
             return replace(part, bound=np.inf, x=None), Leaf(dual, feasible=False)
         if corner.status == "failed":
             return fallback, leaf
@@ -155,10 +155,10 @@ class Branching:
         bound, y, mu, z = max(bounds, key=lambda item: item[0])
         bound += certain - self.relaxed.rounding(finite, y, mu, corner.x)
         if bound > part.bound:
-            leaf = Leaf(self._told(finite, y, mu, z, bound))
+            leaf = Leaf(self._make_dual(finite, y, mu, z, bound))
         return replace(part, bound=max(bound, part.bound), x=corner.x), leaf
 
-    def _corner(self, finite: FiniteProgram) -> Corner:
+    def _solve_part(self, finite: FiniteProgram) -> Corner:
         """The answer to the linear program of a part, with multipliers that may prove it infeasible where it is said to
         be: of the solver that was named, or of the simplex method, whose vertices have zeros."""
         if self.relaxed.counted.instead is not None:
@@ -166,9 +166,9 @@ class Branching:
             return Corner(answer.status, answer.x, answer.y, answer.mu, None if finite.S is None else answer.z)
         corner = simplex(finite)
         self.relaxed.count(NOBODY if corner.status == "failed" else HIGHS)
-        return _unrelaxed(finite) if corner.status == "infeasible" else corner
+        return _find_infeasibility(finite) if corner.status == "infeasible" else corner
 
-    def _told(
+    def _make_dual(
         self, finite: FiniteProgram, y: Array, mu: Array, z: Array | None, bound: float, priced: bool = True
     ) -> Dual:
         """Multipliers of the ``finite`` program of a part in the unit of the cost, as every program tells them. The
@@ -177,7 +177,7 @@ class Branching:
         of = replace(finite, q=finite.q / unit, weights=finite.weights / unit)
         return self.relaxed.dual(self.rows, y / unit, mu / unit, z / unit, bound / unit, priced=priced, of=of)
 
-    def _bounds(self, part: Part) -> tuple[Array, Array, np.ndarray]:
+    def _find_bounds(self, part: Part) -> tuple[Array, Array, np.ndarray]:
         """The bounds of all images in one part, and which count there whatever their value."""
         base = self.program.finite
         lower, upper, is_on = base.lower.copy(), base.upper.copy(), np.zeros(base.lower.size, dtype=bool)
@@ -186,7 +186,7 @@ class Branching:
             if part.image not in assigned_images:
                 lower[part.image], upper[part.image], is_on[part.image] = part.lower, part.upper, part.on
                 assigned_images.add(part.image)
-                for image in np.flatnonzero(self._vectors == self._vectors[part.image]).tolist():
+                for image in np.flatnonzero(self._vector_numbers == self._vector_numbers[part.image]).tolist():
                     if (
                         image not in assigned_images
                     ):  # nothing else was said of it, so that its bounds are those of the program
@@ -196,15 +196,15 @@ class Branching:
             part = self.parts[part.above]
         return lower, upper, is_on
 
-    def _finite(self, part: Part) -> tuple[FiniteProgram, float]:
-        lower, upper, is_on = self._bounds(part)
+    def _build_finite(self, part: Part) -> tuple[FiniteProgram, float]:
+        lower, upper, is_on = self._find_bounds(part)
         base = replace(self.relaxed.finite(self.rows.G, self.rows.h, 0.0), lower=lower, upper=upper)
         finite, _, certain = convex_below(base, self.prices, is_on)
         return finite, certain
 
-    def _undecided(self, number: int, x: Array) -> int | None:
+    def _find_undecided(self, number: int, x: Array) -> int | None:
         """The image that is furthest from being decided at ``x``; ``None`` where each is 0, on, or a letter."""
-        lower, upper, is_on = self._bounds(self.parts[number])
+        lower, upper, is_on = self._find_bounds(self.parts[number])
         image = self.program.finite.image(x)
         is_counted = self.prices > 0.0
         if self.letters is not None:
@@ -219,16 +219,16 @@ class Branching:
         choice = int(np.argmax(share))
         return choice if share[choice] > INTEGRAL else None
 
-    def _free(self, number: int) -> int | None:
+    def _find_free(self, number: int) -> int | None:
         """An image that may still be 0 or not, or one of several letters."""
-        lower, upper, is_on = self._bounds(self.parts[number])
+        lower, upper, is_on = self._find_bounds(self.parts[number])
         is_free = (self.prices > 0.0) & ~is_on & (lower < upper)
         if self.letters is None:
             is_free &= (lower <= 0.0) & (upper >= 0.0)
         return int(np.argmax(is_free)) if is_free.any() else None
 
 
-def _unrelaxed(program: FiniteProgram) -> Corner:
+def _find_infeasibility(program: FiniteProgram) -> Corner:
     """Multipliers that may prove that a finite program is infeasible: those of its elastic program."""
     corner = simplex(elastic_program(program))
     if corner.status != "optimal":
@@ -269,7 +269,7 @@ def proposed(
     n, unit = program.n, prices[prices > 0.0].min()
     S = csr_array(eye_array(n)) if finite.S is None else csr_array(finite.S)
     groups = vectors(program)
-    blocks = _off_or_on(S, finite, prices, groups) if letters is None else _spelt(S, letters, prices)
+    blocks = _couple_binaries(S, finite, prices, groups) if letters is None else _couple_letters(S, letters, prices)
     cost, couplings = blocks[0] / unit, list(blocks[1])
     count, seconds_left = cost.size, relaxed.deadline.left
     linear_rows = [(S, finite.lower, finite.upper), (finite.G, -np.inf, finite.h), (finite.A, finite.b, finite.b)]
@@ -284,7 +284,7 @@ def proposed(
     return None if solution is None else solution[:n]
 
 
-def _off_or_on(S: Any, finite: FiniteProgram, prices: Array, together: np.ndarray) -> tuple[Array, list[Any]]:
+def _couple_binaries(S: Any, finite: FiniteProgram, prices: Array, together: np.ndarray) -> tuple[Array, list[Any]]:
     """``lower b <= s <= upper b`` with ``b`` 0 or 1, the same for all that count ``together (k,)``, and what every
     ``b`` costs."""
     from scipy.optimize import LinearConstraint
@@ -309,7 +309,7 @@ def _off_or_on(S: Any, finite: FiniteProgram, prices: Array, together: np.ndarra
     return prices[optional], couplings
 
 
-def _spelt(S: Any, letters: Array, prices: Array) -> tuple[Array, list[Any]]:
+def _couple_letters(S: Any, letters: Array, prices: Array) -> tuple[Array, list[Any]]:
     """``s = sum_j letters_j b_j`` with one ``b_j`` of each entry 1, and what every ``b`` costs."""
     from scipy.optimize import LinearConstraint
     from scipy.sparse import csr_array, eye_array, hstack, kron

@@ -66,10 +66,10 @@ class Exchange(Method, Options):
         constraints to impose from the beginning."""
         if not self.exact and tools.regulariser is None:
             raise InputError(path="exact", expected="true, for there is no regulariser", got="false")
-        rounds = self._init(program, tools, prover, start)
+        rounds = self._start_rounds(program, tools, prover, start)
         return drive(tools.deadline, rounds.step, lambda error: rounds.ledger.stopped(error, prover))
 
-    def _init(self, program: SemiInfiniteProgram, tools: Tools, prover: Prover, start: Violated) -> Rounds:
+    def _start_rounds(self, program: SemiInfiniteProgram, tools: Tools, prover: Prover, start: Violated) -> Rounds:
         close = self.model_copy(update={"exact": True}).close
         regulariser = tools.regulariser if program.spread is None else None
         relaxed = RelaxedProgram(program, tools.solver, regulariser, deadline=tools.deadline)
@@ -148,9 +148,11 @@ class Rounds:
             return None
 
         # Terminate: with what was proven of this decision, or of an earlier one that is.
-        return self._earlier(ledger.judged(answer, worst_of(separations), proofs, self._ending(answer, last)), answer)
+        return self._choose_result(
+            ledger.judged(answer, worst_of(separations), proofs, self._explain_ending(answer, last)), answer
+        )
 
-    def _ending(self, answer: Answer, last: bool) -> str:
+    def _explain_ending(self, answer: Answer, last: bool) -> str:
         """Return the reason why there is no further round, where the rules of the exchange are not the reason."""
         if self.ledger.tools.deadline.passed:
             return self.ledger.tools.deadline.reason
@@ -160,7 +162,7 @@ class Rounds:
             return ""
         return f"the decision is optimal for the regularised problem, epsilon = {answer.epsilon:g}"
 
-    def _earlier(self, result: Result, answer: Answer) -> Result:
+    def _choose_result(self, result: Result, answer: Answer) -> Result:
         """The result, or that of a decision that is proven, or of the last one that seemed feasible, with an open gap,
         where only that is proven."""
         result = or_proven(self.ledger, result)

@@ -103,22 +103,24 @@ class UsersUnits:
             upper_bound=own.upper_bound * self.cost,
             cost_scale=own.cost_scale * self.cost,
             ray=None if own.ray is None else own.ray * self.decision,
-            worst=None if own.worst is None else self._witness(own.worst),
+            worst=None if own.worst is None else self._convert_witness(own.worst),
             indices=self.cuts(own.indices),
-            history=tuple(self._round(event) for event in own.history),
-            trace=None if own.trace is None else self._trace(own.trace),
-            dual=self._dual(own.dual, infeasible=own.status == "infeasible"),
-            proofs=tuple(self._proof(proof) for proof in own.proofs),
-            sparsest=None if own.sparsest is None else self._sparsest(own.sparsest),
-            errors=None if own.errors is None else self._errors(own.errors),
+            history=tuple(self._convert_round(event) for event in own.history),
+            trace=None if own.trace is None else self._convert_trace(own.trace),
+            dual=self._convert_dual(own.dual, infeasible=own.status == "infeasible"),
+            proofs=tuple(self._convert_proof(proof) for proof in own.proofs),
+            sparsest=None if own.sparsest is None else self._convert_sparsest(own.sparsest),
+            errors=None if own.errors is None else self._convert_errors(own.errors),
         )
 
-    def _errors(self, own: EqualityErrors) -> EqualityErrors:
+    def _convert_errors(self, own: EqualityErrors) -> EqualityErrors:
         return replace(own, missed=own.missed * self.equalities, allowed=own.allowed * self.equalities)
 
-    def _sparsest(self, own: Sparsest) -> Sparsest:
+    def _convert_sparsest(self, own: Sparsest) -> Sparsest:
         tree = [
-            replace(node, dual=self._dual(node.dual, infeasible=not node.feasible)) if isinstance(node, Leaf) else node
+            replace(node, dual=self._convert_dual(node.dual, infeasible=not node.feasible))
+            if isinstance(node, Leaf)
+            else node
             for node in own.tree
         ]
         plain = None if own.plain is None else own.plain * self.cost
@@ -127,26 +129,26 @@ class UsersUnits:
     def event(self, own: Event) -> Event:
         """An event of a method that works on the program in its own units, in the user's."""
         if isinstance(own, RoundFinished):
-            return self._round(own)
+            return self._convert_round(own)
         if isinstance(own, EvaluationsFinished):
-            return self._evaluations(own)
+            return self._convert_evaluations(own)
         if isinstance(own, ProofProgress):
-            before = self._bounded(own.family, own.bound_before)
-            return replace(own, bound=self._bounded(own.family, own.bound), bound_before=before)
+            before = self._convert_bound(own.family, own.bound_before)
+            return replace(own, bound=self._convert_bound(own.family, own.bound), bound_before=before)
         return own
 
-    def _bounded(self, name: str, bound: float) -> float:
+    def _convert_bound(self, name: str, bound: float) -> float:
         """The least bound in the user's units that holds for every row of a family that is bounded in their own."""
-        family = self._family(name)
+        family = self._find_family(name)
         if family is None or family.row_units is None:
             return bound
         return bound * float(family.row_units.max() if bound > 0.0 else family.row_units.min())
 
-    def _round(self, own: RoundFinished) -> RoundFinished:
+    def _convert_round(self, own: RoundFinished) -> RoundFinished:
         decision = None if own.decision is None else frozen(own.decision * self.decision)
         worst = own.separations.get(own.worst_family)
         row = int(worst.rows[0]) if worst is not None and worst.rows.size else 0
-        multipliers = [m * self._price(cut) for m, cut in zip(own.multipliers, own.imposed, strict=False)]
+        multipliers = [m * self._compute_price(cut) for m, cut in zip(own.multipliers, own.imposed, strict=False)]
         return replace(
             own,
             decision=decision,
@@ -154,18 +156,20 @@ class UsersUnits:
             lower_bound=own.lower_bound * self.cost,
             upper_bound=own.upper_bound * self.cost,
             proven=own.proven * self.cost,
-            violation=own.violation * self._row_unit(own.worst_family, row),
-            separations={name: self._separation(name, separation) for name, separation in own.separations.items()},
+            violation=own.violation * self._find_row_unit(own.worst_family, row),
+            separations={
+                name: self._convert_separation(name, separation) for name, separation in own.separations.items()
+            },
             imposed=self.cuts(own.imposed),
             multipliers=frozen(np.array(multipliers, dtype=float)),
             added=self.cuts(own.added),
             dropped=self.cuts(own.dropped),
         )
 
-    def _evaluations(self, own: EvaluationsFinished) -> EvaluationsFinished:
+    def _convert_evaluations(self, own: EvaluationsFinished) -> EvaluationsFinished:
         size = own.best_point.size if own.domain is None else own.domain.dimension
         if own.family:
-            units, value = self._index_units(own.family, "reduced", size), 1.0
+            units, value = self._find_index_units(own.family, "reduced", size), 1.0
         else:
             units, value = self.tuple_units(size, own.block), self.cost
         batch = own.batch
@@ -177,7 +181,7 @@ class UsersUnits:
             if own.domain is None
             else Box(frozen(own.domain.lower * units), frozen(own.domain.upper * units)),
             lower_bound=own.lower_bound * self.cost,
-            sketches={role: _in_units(sketch, units) for role, sketch in own.sketches.items()},
+            sketches={role: _convert_sketch(sketch, units) for role, sketch in own.sketches.items()},
             batch=replace(
                 batch,
                 points=tuple(points * units for points in batch.points),
@@ -188,9 +192,9 @@ class UsersUnits:
             ),
         )
 
-    def _trace(self, own: SearchTrace) -> SearchTrace:
+    def _convert_trace(self, own: SearchTrace) -> SearchTrace:
         width = own.points.shape[1]
-        block = max((family.index_set.dimension for family in self._searched(width)), default=1)
+        block = max((family.index_set.dimension for family in self._list_searched_families(width)), default=1)
         return replace(
             own,
             value=own.value * self.cost,
@@ -198,7 +202,7 @@ class UsersUnits:
             points=own.points * self.tuple_units(width, block) if width else own.points,
         )
 
-    def _searched(self, width: int) -> Sequence[ConstraintFamily]:
+    def _list_searched_families(self, width: int) -> Sequence[ConstraintFamily]:
         """The families whose indices a tuple of ``width`` coordinates may be made of: literal ones where they fit."""
         reduced = self.program.families
         literal = [family.literal or family for family in reduced]
@@ -214,18 +218,18 @@ class UsersUnits:
         unit = np.ones(block) if longest is None or longest.index_units is None else longest.index_units
         return np.tile(unit, size // max(block, 1)) if size % max(block, 1) == 0 else np.ones(size)
 
-    def _separation(self, name: str, own: Separation) -> Separation:
-        family = self._family(name)
+    def _convert_separation(self, name: str, own: Separation) -> Separation:
+        family = self._find_family(name)
         rows = None if family is None else family.row_units
         units = np.ones(own.rows.size) if rows is None else rows[own.rows]
         return replace(
             own,
-            indices=own.indices * self._index_units(name, own.formulation, own.indices.shape[1]),
+            indices=own.indices * self._find_index_units(name, own.formulation, own.indices.shape[1]),
             violations=own.violations * units,
             bound=own.bound * (1.0 if rows is None else float(rows.max())),
         )
 
-    def _dual(self, own: Dual, infeasible: bool) -> Dual:
+    def _convert_dual(self, own: Dual, infeasible: bool) -> Dual:
         return replace(
             own,
             bound=own.bound if infeasible else own.bound * self.cost,
@@ -241,45 +245,45 @@ class UsersUnits:
         return tuple(
             Cut(
                 cut.family,
-                cut.index * self._index_units(cut.family, cut.formulation, cut.index.size),
+                cut.index * self._find_index_units(cut.family, cut.formulation, cut.index.size),
                 cut.row,
-                cut.multiplier * self._price(cut),
+                cut.multiplier * self._compute_price(cut),
                 cut.formulation,
             )
             for cut in own
         )
 
-    def _price(self, cut: Cut) -> float:
+    def _compute_price(self, cut: Cut) -> float:
         """Return the multiplier, in the user's units of cost and row, of a row whose multiplier is 1 in the program's
         own units."""
-        return self.cost / self._row_unit(cut.family, cut.row)
+        return self.cost / self._find_row_unit(cut.family, cut.row)
 
-    def _witness(self, own: WorstConstraint) -> WorstConstraint:
-        units = self._index_units(own.constraint, own.formulation, own.index.size)
-        violation = own.violation * self._row_unit(own.constraint, own.row)
+    def _convert_witness(self, own: WorstConstraint) -> WorstConstraint:
+        units = self._find_index_units(own.constraint, own.formulation, own.index.size)
+        violation = own.violation * self._find_row_unit(own.constraint, own.row)
         return replace(own, index=own.index * units, violation=violation)
 
-    def _proof(self, own: Proof) -> Proof:
+    def _convert_proof(self, own: Proof) -> Proof:
         def placed(index: Array) -> Array:
-            return index * self._index_units(own.family, own.formulation, index.shape[-1])
+            return index * self._find_index_units(own.family, own.formulation, index.shape[-1])
 
         return replace(
             own,
-            bound=self._bounded(own.family, own.bound),
+            bound=self._convert_bound(own.family, own.bound),
             share=own.bound,
             violation=own.violation * own.unit,
             unit=1.0,
-            units=None if (family := self._family(own.family)) is None else family.row_units,
+            units=None if (family := self._find_family(own.family)) is None else family.row_units,
             index=None if own.index is None else placed(own.index),
             leaves=None if own.leaves is None else (placed(own.leaves[0]), placed(own.leaves[1])),
         )
 
-    def _row_unit(self, name: str, row: int) -> float:
-        family = self._family(name)
+    def _find_row_unit(self, name: str, row: int) -> float:
+        family = self._find_family(name)
         return 1.0 if family is None else family.row_unit(row)
 
-    def _index_units(self, name: str, formulation: Formulation, size: int) -> Array:
-        family = self._family(name)
+    def _find_index_units(self, name: str, formulation: Formulation, size: int) -> Array:
+        family = self._find_family(name)
         if family is None:
             return np.ones(size)
         if formulation == "sampled" and family.index_units is not None:
@@ -288,11 +292,11 @@ class UsersUnits:
         units = None if own is None else own.index_units
         return np.ones(size) if units is None or units.size != size else units
 
-    def _family(self, name: str) -> ConstraintFamily | None:
+    def _find_family(self, name: str) -> ConstraintFamily | None:
         """The family of that name; ``None`` for one that only the method knows, which then has no units."""
         return self._families.get(name)
 
 
-def _in_units(sketch: Sketch, units: Array) -> Sketch:
+def _convert_sketch(sketch: Sketch, units: Array) -> Sketch:
     lower = frozen(sketch.lower * units)
     return Sketch(lower, lower if sketch.points else frozen(sketch.upper * units), sketch.rounded)

@@ -68,7 +68,9 @@ class Reweighted(Method, Options):
             labelled_tools = replace(
                 plain_tools, notify=beside(tools.notify, f"weighted program {number} of at most {self.passes}")
             )
-            heavier_program = replace(program, weights=program.finite.weights * self._weights(program, x), twin=None)
+            heavier_program = replace(
+                program, weights=program.finite.weights * self._compute_weights(program, x), twin=None
+            )
             weighted_result = exchange.close(heavier_program, labelled_tools, unproven, imposed_cuts(cuts))
             spent.append(weighted_result)
             if weighted_result.decision is None or weighted_result.status not in PROVEN:
@@ -105,7 +107,7 @@ class Reweighted(Method, Options):
             seconds=first.seconds + result.seconds,
         ).charged(spent)
 
-    def _weights(self, program: SemiInfiniteProgram, x: Array) -> Array:
+    def _compute_weights(self, program: SemiInfiniteProgram, x: Array) -> Array:
         """The slope of the penalty at ``x (n,)``, ``(k,)``, 1 at 0; 1 where nothing counts."""
         base, is_counted = program.finite, prices_of(program) > 0.0
         radii = np.maximum(np.abs(base.lower), np.abs(base.upper))

@@ -87,7 +87,7 @@ class SparseRob(Method, Options):
 
     @field_validator("regu", "sc1", "sc2", "slcr")
     @classmethod
-    def _rule(cls, rule: object) -> object:
+    def _check_rule(cls, rule: object) -> object:
         """A rule, a function, or what the registry makes a rule of."""
         if rule is None or callable(rule) or (isinstance(rule, Mapping) and "name" in rule):
             return rule
@@ -108,7 +108,7 @@ class SparseRob(Method, Options):
         ledger = Ledger(program, relaxed, tools, self.tolerance)
         g = TupleValue(imposed, relaxed, self.indices or program.n)
         epsilon = 0.0 if tools.regulariser is None else tools.continuation.start
-        outer = _Outer(self, g, ledger, epsilon, tools.rng.uniform(g.domain.lower, g.domain.upper))
+        outer = _OuterIteration(self, g, ledger, epsilon, tools.rng.uniform(g.domain.lower, g.domain.upper))
         result = drive(tools.deadline, outer.step, lambda error: ledger.stopped(error, prover_of(program, tools)))
         trace = SearchTrace.joined(outer.parts) if outer.parts else None
         evaluations = 0 if trace is None else int(trace.value.size)
@@ -117,7 +117,7 @@ class SparseRob(Method, Options):
 
 
 @dataclass(eq=False)
-class _Outer:
+class _OuterIteration:
     """The outer iteration: the weight ``epsilon`` and the best ``point`` so far, (t_0, Beta_0) to begin with; its
     ``steps``, and the ``parts`` of the search."""
 
@@ -135,13 +135,13 @@ class _Outer:
         program, tools = ledger.program, ledger.tools
 
         # Maximise: g(epsilon; .) over tuples, from the best so far, until SC2; walks accept by SlCr.
-        self.point = _searched(method, g, ledger, self.parts, self.point, epsilon, j)
+        self.point = _search_tuples(method, g, ledger, self.parts, self.point, epsilon, j)
         value, x = g.at(self.point), g.solution.x
         answer = Answer(g.solution, g.rows(), epsilon, value)
         self.steps.append(OuterStep(j, epsilon, value, program.cost(x), ledger.lower, x))
         if np.isfinite(value):
             separations = separate(program, x, tools, number=number)
-            _secured(ledger, answer, separations, tools)
+            _prove_answer(ledger, answer, separations, tools)
             ledger.tell(number, answer, separations, np.inf, kept=int((answer.multipliers > 0).sum()))
 
         # No optimiser: g is infinite where nothing meets the constraints at the tuple.
@@ -163,10 +163,10 @@ class _Outer:
         worst_proofs = as_bad_as_found(proofs, separations)
         short = MORE_EVALUATIONS if any(proof.verdict == "refuted" for proof in worst_proofs) else ""
         result = ledger.judged(answer, worst_of(separations), worst_proofs, tools.deadline.reason or short)
-        return _or_backed_off(ledger, result, answer)
+        return _choose_result(ledger, result, answer)
 
 
-def _or_backed_off(ledger: Ledger, result: Result, answer: Answer) -> Result:
+def _choose_result(ledger: Ledger, result: Result, answer: Answer) -> Result:
     """The result of the last ``answer``, or that of the decision that is proven in its place, with what that one is."""
     if result.status not in ("refuted", "undecided") or ledger.proven is None:
         return result
@@ -178,7 +178,7 @@ def _or_backed_off(ledger: Ledger, result: Result, answer: Answer) -> Result:
     return ledger.judged(proven_answer, worst_of(separations), proofs, ledger.tools.deadline.reason or ending)
 
 
-def _secured(ledger: Ledger, answer: Answer, found: Found, tools: Tools) -> None:
+def _prove_answer(ledger: Ledger, answer: Answer, found: Found, tools: Tools) -> None:
     """Keep an answer, and prove it or one that is backed off by the little that it misses the constraints by."""
     ledger.keep(answer, found)
     idle = np.zeros(answer.rows.h.size, dtype=int)
@@ -186,7 +186,7 @@ def _secured(ledger: Ledger, answer: Answer, found: Found, tools: Tools) -> None
     back_off(working, ledger, prover_of(ledger.program, tools), answer, found)
 
 
-def _searched(
+def _search_tuples(
     method: SparseRob, g: TupleValue, ledger: Ledger, parts: list[SearchTrace], point: Array, epsilon: float, j: int
 ) -> Array:
     """The best tuple that one search for the maximum of ``g`` finds from ``point``; of every value that is the best so
@@ -223,14 +223,14 @@ def _searched(
     ledger.relaxed.deadline = tools.deadline
     parts.append(SearchTrace.of(j, epsilon, report.trace, np.array(lower_bounds[: report.evaluations]), start))
     if report.interrupted:
-        _at_interrupt(g, ledger, report.best_point, report.best_value, epsilon)
+        _save_interrupted(g, ledger, report.best_point, report.best_value, epsilon)
         raise (OutOfTime if early_deadline.passed else KeyboardInterrupt)(
             report.stopped
         )  # of which only one was pressed
     return report.best_point
 
 
-def _at_interrupt(g: TupleValue, ledger: Ledger, point: Array, value: float, epsilon: float) -> None:
+def _save_interrupted(g: TupleValue, ledger: Ledger, point: Array, value: float, epsilon: float) -> None:
     """Leave the optimiser of the best tuple with the ledger, proven or backed off if that takes no more than a moment,
     in which nothing is told and another interrupt ends it."""
     ledger.relaxed.deadline = Deadline()  # one last program
@@ -240,5 +240,5 @@ def _at_interrupt(g: TupleValue, ledger: Ledger, point: Array, value: float, eps
         ledger.keep(answer)
         tools, ledger.relaxed.deadline = replace(ledger.tools, deadline=grace, notify=ignore), grace
         with suppress(KeyboardInterrupt), grace.enforced():
-            _secured(ledger, answer, separate(ledger.program, answer.solution.x, tools), tools)
+            _prove_answer(ledger, answer, separate(ledger.program, answer.solution.x, tools), tools)
     ledger.relaxed.deadline = ledger.tools.deadline

@@ -67,7 +67,7 @@ class SparsestMethod(Method, Options):
 
     @field_validator("alphabet")
     @classmethod
-    def _distinct(cls, value: list[float] | None) -> list[float] | None:
+    def _check_alphabet(cls, value: list[float] | None) -> list[float] | None:
         if value is None:
             return None
         if not np.isfinite(value).all() or len(set(value)) < len(value):
@@ -82,22 +82,22 @@ class SparsestMethod(Method, Options):
                 "method: sparsest counts pieces, for which a control needs a function per piece; expected a dictionary"
                 " such as piecewise_constant"
             )
-        bounded, letters = self._bounded(program)
-        plain = self._plain(program, tools)
+        bounded, letters = self._narrow_bounds(program)
+        plain = self._solve_plain(program, tools)
         if plain is not None and plain.status == "infeasible":
-            return _none(program, plain, ())
+            return _report_infeasible(program, plain, ())
         if plain is not None and plain.decision is None:
             return plain
         state = _Search(self, program, bounded, tools, letters, plain)
         root = state.root()
         return drive(tools.deadline, state.step, state.stopped) if root is None else root
 
-    def _bounded(self, program: SemiInfiniteProgram) -> tuple[SemiInfiniteProgram, Array | None]:
+    def _narrow_bounds(self, program: SemiInfiniteProgram) -> tuple[SemiInfiniteProgram, Array | None]:
         """The program with bounds as narrow as the alphabet is, and its letters in the program's units."""
         if self.alphabet is None:
             return program, None
         base, size = program.finite, counting(program)
-        if base.S is not None and (abs(base.S[:size] - _identity(size, program.n))).max() > 0.0:
+        if base.S is not None and (abs(base.S[:size] - _build_identity(size, program.n))).max() > 0.0:
             raise InputError(
                 "method: sparsest.alphabet needs a dictionary whose coefficients are the control's values; expected"
                 " piecewise_constant"
@@ -113,7 +113,7 @@ class SparsestMethod(Method, Options):
         lower[:size], upper[:size] = letters[:, 0], letters[:, -1]
         return replace(program, lower=lower, upper=upper, twin=None), letters
 
-    def _plain(self, program: SemiInfiniteProgram, tools: Tools) -> Result | None:
+    def _solve_plain(self, program: SemiInfiniteProgram, tools: Tools) -> Result | None:
         """An optimum of the program's own cost, to compare with; none with an alphabet."""
         if self.alphabet is not None:
             return None
@@ -157,7 +157,7 @@ class _Search:
         self.spent += [] if self.plain is None else [self.plain]
         if self.plain is not None and self.plain.status in PROVEN and self.plain.decision is not None:
             self.best, self.least = self.plain, count(self.program, self.plain.decision)
-            self._keep(self.plain.indices)
+            self._impose_cuts(self.plain.indices)
 
     @property
     def lower(self) -> float:
@@ -183,15 +183,15 @@ class _Search:
         if result.status == "infeasible":
             letters = tuple(self.method.alphabet or ())
             message = f"no control with values in {list(letters)}: {result.message}" if letters else result.message
-            return _none(self.program, replace(result, message=message), letters)
-        self._keep([*result.indices, *result.dual.cuts])
+            return _report_infeasible(self.program, replace(result, message=message), letters)
+        self._impose_cuts([*result.indices, *result.dual.cuts])
         self.rounds = list(result.history)
         self.tree = Branching(self.bounded, self.relaxed, self.rows, self.letters, tuple(self.method.alphabet or ()))
         if result.decision is not None and self.letters is None:
             self.look(result.decision)
         return None
 
-    def _keep(self, cuts: Sequence[Cut]) -> bool:
+    def _impose_cuts(self, cuts: Sequence[Cut]) -> bool:
         """Impose constraints; ``False`` where all are known."""
         imposed_keys = {(cut.family, cut.row, cut.index.tobytes()) for cut in self.rows.cuts}
         fresh = [cut for cut in cuts if (cut.family, cut.row, cut.index.tobytes()) not in imposed_keys]
@@ -209,7 +209,7 @@ class _Search:
         radii = np.maximum(np.abs(base.lower), np.abs(base.upper))
         is_acting = np.abs(image) > DUST * np.where(np.isfinite(radii), radii, 1.0)
         if self.letters is not None:
-            return self._exactly(self._spelt(image))
+            return self._prove_letters(self._round_to_letters(image))
         key = np.packbits(is_acting[prices > 0.0]).tobytes()
         if count_of(self.program, is_acting) >= self.least * (1.0 - SAME) or key in self.tried:
             return False
@@ -217,7 +217,7 @@ class _Search:
         method = Exchange(tolerance=self.method.tolerance, rounds=self.method.rounds)
         result = on_support(self.program, x, self.tools, method, self.rows.cuts)
         self.spent.append(result)
-        is_new = self._keep([*result.indices, *result.dual.cuts])
+        is_new = self._impose_cuts([*result.indices, *result.dual.cuts])
         if result.status in PROVEN and result.decision is not None:
             new_count = count(self.program, result.decision)
             if new_count < self.least * (1.0 - SAME):
@@ -226,12 +226,12 @@ class _Search:
                 return True
         return is_new
 
-    def _spelt(self, image: Array) -> Array:
+    def _round_to_letters(self, image: Array) -> Array:
         assert self.letters is not None
         nearest = np.abs(image[: len(self.letters), None] - self.letters).argmin(axis=1)
         return completed(self.program, self.letters[np.arange(nearest.size), nearest])
 
-    def _exactly(self, x: Array) -> bool:
+    def _prove_letters(self, x: Array) -> bool:
         """Prove a decision of letters, or impose what it violates."""
         if x.tobytes() in self.tried:
             return False
@@ -247,7 +247,7 @@ class _Search:
             fresh += [Cut(family.name, index, int(row), formulation=family.formulation) for index, row in pairs]
         if fresh:
             row_count = self.rows.h.size
-            is_new = self._keep(fresh)
+            is_new = self._impose_cuts(fresh)
             G, h = self.rows.G[row_count:], self.rows.h[row_count:]
             norms = np.maximum(np.linalg.norm(G, axis=1), np.finfo(float).tiny)
             self.missed = float(((G @ x - h) / norms).max(initial=0.0))
@@ -261,7 +261,7 @@ class _Search:
                 for proof in proofs
                 if proof.verdict == "refuted" and proof.index is not None
             ]
-            return self._keep(cuts)
+            return self._impose_cuts(cuts)
         self.least = count(program, x)
         worst = witness(program, worst_of(separations), proofs)
         self.best = Result(
@@ -342,7 +342,7 @@ class _Search:
         self.margin = PAID * self.missed if self.roomy else 0.0
         return True
 
-    def _hindrance(self) -> str:
+    def _explain_failure(self) -> str:
         """Return the reason why there is no control although none is excluded, and the remedy, in words."""
         if self.plain is not None:
             return f"no control was proven: {self.plain.message}"
@@ -367,7 +367,9 @@ class _Search:
             exclusion = f"no control with values in {list(letters or ())} meets the constraints, by branch and bound"
             return Result(
                 status="infeasible" if is_infeasible else "undecided",
-                message=exclusion if is_infeasible else "; ".join(text for text in (self._hindrance(), ending) if text),
+                message=exclusion
+                if is_infeasible
+                else "; ".join(text for text in (self._explain_failure(), ending) if text),
                 stopped="" if is_infeasible else self.tools.deadline.reason,
                 lower_bound=np.inf if is_infeasible else self.lower / unit,
                 counts=counts,
@@ -407,13 +409,13 @@ class _Search:
         ).charged(self.spent)
 
 
-def _none(program: SemiInfiniteProgram, result: Result, letters: Sequence[float]) -> Result:
+def _report_infeasible(program: SemiInfiniteProgram, result: Result, letters: Sequence[float]) -> Result:
     """The result where nothing is feasible, by one set of multipliers: a tree of one leaf."""
     tree = Sparsest(np.nan, None, None, (Leaf(result.dual, feasible=False),), letters or None)
     return replace(result, sparsest=tree, cost_scale=0.0)
 
 
-def _identity(size: int, columns: int) -> object:
+def _build_identity(size: int, columns: int) -> object:
     from scipy.sparse import csc_array, eye_array
 
     return csc_array(eye_array(size, columns))

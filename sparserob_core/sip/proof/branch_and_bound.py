@@ -83,7 +83,7 @@ def prove(
     try:
         proofs.extend((family, _prove(family, x, notify, budgets[family.name], time_left)) for family in families)
     except OutOfTime as error:  # there is no time to bound the remaining families even once
-        proofs += [(family, _begun_only(family, error, time_left)) for family in families[len(proofs) :]]
+        proofs += [(family, _report_interrupted(family, error, time_left)) for family in families[len(proofs) :]]
     return tuple(
         replace(
             proof,
@@ -175,28 +175,28 @@ def prove_family(
     try:
         return _prove(family, x, notify, cells, time_left)
     except OutOfTime as error:
-        return _begun_only(family, error, time_left)
+        return _report_interrupted(family, error, time_left)
 
 
 def _prove(family: ConstraintFamily, x: Array, notify: Notify, cells: int, deadline: Deadline) -> Proof:
     """Return the proof of one family; raise `OutOfTime` where the deadline comes before every cell was bounded once."""
     try:
         if family.enclosure is None:
-            return _by_separation(family, x)
+            return _prove_by_separation(family, x)
         try:
             course = Course(family, notify, cells, deadline)
             return _branch_and_bound(family, x, course, NoViolation(family.allowed(x)))[0]
         except NotEnclosable as error:
             if deadline.passed:
                 return Proof(family.name, "undecided", np.inf, reason=f"{family.name}: {error}")
-            return replace(_by_separation(family, x), reason=f"{family.name}: {error}")
+            return replace(_prove_by_separation(family, x), reason=f"{family.name}: {error}")
     except OutOfTime:
         raise
     except KeyboardInterrupt as error:
-        return _begun_only(family, error, deadline)
+        return _report_interrupted(family, error, deadline)
 
 
-def _begun_only(family: ConstraintFamily, error: KeyboardInterrupt, deadline: Deadline) -> Proof:
+def _report_interrupted(family: ConstraintFamily, error: KeyboardInterrupt, deadline: Deadline) -> Proof:
     """Return the undecided proof of a family that was interrupted, and record the interrupt in the deadline."""
     deadline.interrupt(error)
     reason = f"{family.name}: its proof had begun only; {more(deadline)}"
@@ -297,7 +297,7 @@ class Course:
         units = self.family.index_units
         lower, upper = (lower, upper) if units is None or units.size != lower.size else (lower * units, upper * units)
         allowed = bound * (1.0 if self.family.row_units is None else float(self.family.row_units.max()))
-        cell = f"the cell from {_shown(lower)} to {_shown(upper)} still allows {allowed:.1e}"
+        cell = f"the cell from {_format_point(lower)} to {_format_point(upper)} still allows {allowed:.1e}"
         cell += f" {self.family.measure()}" if self.family.measure() else ""
         cell = f"{self.along}; {cell}" if self.along else cell
         return f"{self.family.name}: {cell}; {advice or ADVICE}"
@@ -384,7 +384,7 @@ def _branch_and_bound(
 
     while True:
         # Bound every cell, and close those where no violation is left.
-        bounds, split, bend = _bounded(course, x, lower, upper)
+        bounds, split, bend = _bound_cells(course, x, lower, upper)
         bounds = np.minimum(bounds, parent_bounds)  # a part violates no more than the whole
         course.examined += bounds.size
         open_ = bounds > goal.closes(best[0])
@@ -403,9 +403,9 @@ def _branch_and_bound(
         open_ = bounds > goal.closes(best[0])
         leaves.append((lower[~open_], upper[~open_], bounds[~open_]))
         if goal.ends(best[0]):
-            return _answers(course, "refuted", best, leaves)
+            return _form_answers(course, "refuted", best, leaves)
         if not open_.any():
-            return _answers(course, "proven", best, leaves)
+            return _form_answers(course, "proven", best, leaves)
 
         # Divide the open cells, as long as their number, their width and the time allow: once towards the peaks, then
         # into halves. Rows at their worst deviations have kinks, not smooth peaks.
@@ -416,10 +416,10 @@ def _branch_and_bound(
         children = (
             None
             if bend is None or family.uncertain is not None
-            else _towards(peaks, low, high, bounds[open_], bend[open_])
+            else _divide_towards_peaks(peaks, low, high, bounds[open_], bend[open_])
         )
         if children is None or course.examined + children[0].shape[0] > course.budget:
-            children, parent_bounds = _halved(low, high, split[open_]), np.tile(bounds[open_], 2)
+            children, parent_bounds = _halve_cells(low, high, split[open_]), np.tile(bounds[open_], 2)
         else:
             parent_bounds = np.full(children[0].shape[0], np.inf)
         slacks.append(worst - best[0])
@@ -427,15 +427,15 @@ def _branch_and_bound(
         is_rounding = (
             box.dimension == 1 and bend is not None and _is_rounding(worst, float(bend[at]), goal.closes(best[0]))
         )
-        if children is None or is_spent or is_rounding or _at_rest(slacks):
+        if children is None or is_spent or is_rounding or _is_stalled(slacks):
             hindrance = course.hindrance(worst, lower[at], upper[at])
             leaves.append((low, high, bounds[open_]))
             reason = f"{int(open_.sum())} of {course.examined} cells were left; {hindrance}"
-            return _answers(course, "undecided", best, leaves, reason)
+            return _form_answers(course, "undecided", best, leaves, reason)
         lower, upper = children
 
 
-def _answers(
+def _form_answers(
     course: Course,
     verdict: Literal["proven", "refuted", "undecided"],
     best: tuple[float, Array, int],
@@ -444,7 +444,7 @@ def _answers(
 ) -> tuple[Proof, Supremum]:
     """Return the proof and the supremum, where ``best`` was found and ``leaves`` were closed, or left open if
     undecided."""
-    lower, upper, bounds = _in_order(leaves)
+    lower, upper, bounds = _sort_leaves(leaves)
     top, name, (violation, index, row) = float(bounds.max(initial=-np.inf)), course.family.name, best
     proof = Proof(
         name,
@@ -461,7 +461,7 @@ def _answers(
     return proof, Supremum(violation, max(top, violation), index, row, course.examined, cells, reason)
 
 
-def _at_rest(slacks: Sequence[float]) -> bool:
+def _is_stalled(slacks: Sequence[float]) -> bool:
     """Return whether a tiny worst bound no longer approaches the largest violation found as cells shrink.
 
     The difference is then rounding.
@@ -478,7 +478,7 @@ def _is_rounding(bound: float, bend: float, limit: float) -> bool:
     return bound <= TINY and bend <= FALLING * (bound - limit)
 
 
-def _bounded(course: Course, x: Array, lower: Array, upper: Array) -> tuple[Array, Array, Array | None]:
+def _bound_cells(course: Course, x: Array, lower: Array, upper: Array) -> tuple[Array, Array, Array | None]:
     """Return bounds ``(k,)`` of cells, the coordinates ``(k,)`` to halve, and the parts ``(k,)`` quadratic in the
     widths.
 
@@ -492,7 +492,7 @@ def _bounded(course: Course, x: Array, lower: Array, upper: Array) -> tuple[Arra
     bounds, split, bend = np.full(count, np.inf), (upper - lower).argmax(axis=1), np.full(count, np.inf)
     has_bend, hurried = True, course.deadline.bounded or course.deadline.passed
     start, size = 0, FIRST_BATCH if hurried else BATCH
-    order, ends = _together(lower, upper) if count > size else (np.arange(count), np.array([count]))
+    order, ends = _group_cells(lower, upper) if count > size else (np.arange(count), np.array([count]))
     while start < count and not (start and course.deadline.passed):
         started, stop = time.perf_counter(), min(start + size, count)
         if hurried:  # to the end of the group that shares work, unless that is far
@@ -512,7 +512,7 @@ def _bounded(course: Course, x: Array, lower: Array, upper: Array) -> tuple[Arra
     return bounds, split, bend if has_bend else None
 
 
-def _together(lower: Array, upper: Array) -> tuple[np.ndarray, np.ndarray]:
+def _group_cells(lower: Array, upper: Array) -> tuple[np.ndarray, np.ndarray]:
     """Return an order ``(k,)`` of cells that groups those that differ in their first coordinate only, and the ends of
     groups.
 
@@ -526,7 +526,9 @@ def _together(lower: Array, upper: Array) -> tuple[np.ndarray, np.ndarray]:
     return order, np.append(np.flatnonzero(np.diff(groups.reshape(-1)[order])) + 1, count)
 
 
-def _towards(peaks: Separation, lower: Array, upper: Array, bounds: Array, bend: Array) -> tuple[Array, Array] | None:
+def _divide_towards_peaks(
+    peaks: Separation, lower: Array, upper: Array, bounds: Array, bend: Array
+) -> tuple[Array, Array] | None:
     """Return cells ``(k, 1)`` after a division towards the peaks of the violation; ``None`` where it does not apply.
 
     A cell near or around a peak is divided at once into parts that are short at the peak and longer with the distance
@@ -593,14 +595,14 @@ def _climb(family: ConstraintFamily, x: Array, lower: Array, upper: Array) -> tu
     return best
 
 
-def _in_order(leaves: list[tuple[Array, Array, Array]]) -> tuple[Array, Array, Array]:
+def _sort_leaves(leaves: list[tuple[Array, Array, Array]]) -> tuple[Array, Array, Array]:
     """Return the corners of all leaves, sorted by lower and then by upper corners, and their bounds."""
     lower, upper, bounds = (np.concatenate(arrays) for arrays in zip(*leaves, strict=True))
     order = np.lexsort(np.hstack([lower, upper]).T[::-1])
     return lower[order], upper[order], bounds[order]
 
 
-def _halved(lower: Array, upper: Array, split: Array) -> tuple[Array, Array] | None:
+def _halve_cells(lower: Array, upper: Array, split: Array) -> tuple[Array, Array] | None:
     """Return both halves of every cell along its coordinate ``split``; ``None`` where a cell is too narrow for floating
     point."""
     rows = np.arange(split.size)
@@ -613,7 +615,7 @@ def _halved(lower: Array, upper: Array, split: Array) -> tuple[Array, Array] | N
     return np.vstack([lower, right_lower]), np.vstack([left_upper, upper])
 
 
-def _by_separation(family: ConstraintFamily, x: Array) -> Proof:
+def _prove_by_separation(family: ConstraintFamily, x: Array) -> Proof:
     """Return the proof of a family without an enclosure, from its separation.
 
     A proven bound of the separation is believed, except where the rows at the ends of the index set contradict it.
@@ -648,6 +650,6 @@ def _by_separation(family: ConstraintFamily, x: Array) -> Proof:
     )
 
 
-def _shown(point: Array) -> str:
+def _format_point(point: Array) -> str:
     """Return a point as a short text."""
     return np.array2string(point, precision=4, separator=", ", threshold=8)

@@ -43,10 +43,10 @@ def irreducible(relaxed: RelaxedProgram, rows: Rows, solution: FiniteSolution) -
         Solution with the multipliers that prove it.
     """
     fixed = relaxed.program.finite.h.size
-    plain = _self_evident(relaxed, solution)
+    plain = _find_evident_reason(relaxed, solution)
     if plain is not None:
         return plain
-    solution = _at_a_vertex(relaxed, rows, solution)
+    solution = _move_to_vertex(relaxed, rows, solution)
     y = solution.y[fixed:]
     support = np.flatnonzero(y > 0.0)
     rows, y = rows.take(support), y[support]
@@ -64,7 +64,7 @@ def irreducible(relaxed: RelaxedProgram, rows: Rows, solution: FiniteSolution) -
     return rows, replace(solution, y=np.concatenate([solution.y[:fixed], y]))
 
 
-def _at_a_vertex(relaxed: RelaxedProgram, rows: Rows, solution: FiniteSolution) -> FiniteSolution:
+def _move_to_vertex(relaxed: RelaxedProgram, rows: Rows, solution: FiniteSolution) -> FiniteSolution:
     """Return a solution whose proof has few rows, where the given proof has many.
 
     The new multipliers are at a vertex of the multipliers of the least relaxation that makes the program feasible. At a
@@ -85,7 +85,7 @@ def _at_a_vertex(relaxed: RelaxedProgram, rows: Rows, solution: FiniteSolution) 
     return replace(solution, y=y, mu=mu, z=measured.z, infeasibility=amount)
 
 
-def _self_evident(relaxed: RelaxedProgram, solution: FiniteSolution) -> tuple[Rows, FiniteSolution] | None:
+def _find_evident_reason(relaxed: RelaxedProgram, solution: FiniteSolution) -> tuple[Rows, FiniteSolution] | None:
     """Return the rows of the first reason that needs no solver, with its multipliers, if they are rows of this
     program."""
     base = relaxed.program.finite

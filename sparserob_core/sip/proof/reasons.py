@@ -65,7 +65,7 @@ def reasons(program: SemiInfiniteProgram) -> list[Reason]:
         reason
         for family in program.families
         if family.uncertain is None
-        for reason in _of_family(program.finite, family.reduced or family)
+        for reason in _list_reasons(program.finite, family.reduced or family)
     ]
     worst: dict[tuple[str, ...], Reason] = {}
     for reason in candidates:  # none is reported twice
@@ -74,9 +74,9 @@ def reasons(program: SemiInfiniteProgram) -> list[Reason]:
     return list(worst.values())
 
 
-def _of_family(base: FiniteProgram, family: ConstraintFamily) -> Iterator[Reason]:
+def _list_reasons(base: FiniteProgram, family: ConstraintFamily) -> Iterator[Reason]:
     """Yield the reasons among the rows of one family."""
-    indices = _looked_at(family)
+    indices = _choose_indices(family)
     if not indices.shape[0]:
         return
     G, h = family.rows(indices)
@@ -87,7 +87,7 @@ def _of_family(base: FiniteProgram, family: ConstraintFamily) -> Iterator[Reason
     empty_violation = np.where(size <= NONE * size.max(initial=0.0), -h, -np.inf)
     for row in np.flatnonzero((empty_violation > scale).any(axis=0)):
         explained.add(int(row))
-        yield _reason(
+        yield _make_reason(
             "beyond every decision",
             family,
             G,
@@ -97,14 +97,16 @@ def _of_family(base: FiniteProgram, family: ConstraintFamily) -> Iterator[Reason
             [int(row)],
             np.ones(1),
         )
-    for first, second, share, missing in _opposite(G, h, size):
+    for first, second, share, missing in _list_opposite_rows(G, h, size):
         if {first, second} & explained or not (worst := int(missing.argmax()), missing.max() > scale.max())[1]:
             continue
         explained |= {first, second}
-        yield _reason("nothing between", family, G, h, indices, worst, [first, second], np.array([1.0, share[worst]]))
+        yield _make_reason(
+            "nothing between", family, G, h, indices, worst, [first, second], np.array([1.0, share[worst]])
+        )
     for row in np.flatnonzero((least > scale).any(axis=0)):
         if row not in explained:
-            yield _reason(
+            yield _make_reason(
                 "out of reach",
                 family,
                 G,
@@ -169,7 +171,7 @@ def least_within(base: FiniteProgram, row: Array) -> float:
     return dual_bound(single, corner.y, corner.mu, corner.z) if corner.status == "optimal" else -np.inf
 
 
-def _looked_at(family: ConstraintFamily) -> Array:
+def _choose_indices(family: ConstraintFamily) -> Array:
     """Return the indices ``(k, d)`` at which the rows of a family are examined."""
     if family.cells is None:
         return np.zeros((0, family.index_set.dimension))
@@ -179,7 +181,7 @@ def _looked_at(family: ConstraintFamily) -> Array:
     return np.asarray(points[chosen])
 
 
-def _opposite(G: Array, h: Array, size: Array) -> Iterator[tuple[int, int, Array, Array]]:
+def _list_opposite_rows(G: Array, h: Array, size: Array) -> Iterator[tuple[int, int, Array, Array]]:
     """Yield pairs of rows with opposite normals.
 
     Each item holds the numbers of the two rows, the weight ``(k,)`` of the second, and the violation ``(k,)`` of their
@@ -197,7 +199,7 @@ def _opposite(G: Array, h: Array, size: Array) -> Iterator[tuple[int, int, Array
             yield first, second, share, np.where(np.isnan(missing), -np.inf, missing)
 
 
-def _reason(
+def _make_reason(
     kind: Kind,
     family: ConstraintFamily,
     G: Array,
@@ -215,11 +217,11 @@ def _reason(
     )
     rows = Rows(G[at, which], h[at, which], cuts)
     amount = float(-multipliers @ rows.h) if amount is None else amount
-    text, keys = sentence(kind, family, rows, multipliers, amount), [_told(family, cut).alike for cut in cuts]
+    text, keys = sentence(kind, family, rows, multipliers, amount), [_explain_cut(family, cut).alike for cut in cuts]
     return Reason(kind, rows, multipliers, amount, text, (kind, *keys) if all(keys) else (text,))
 
 
-def _told(family: ConstraintFamily, cut: Cut) -> Explanation:
+def _explain_cut(family: ConstraintFamily, cut: Cut) -> Explanation:
     """Return the description of a cut's constraint."""
     return family.explanation(cut.index, cut.row)
 
@@ -247,7 +249,7 @@ def sentence(kind: Kind, family: ConstraintFamily, rows: Rows, multipliers: Arra
     """
     units = [family.row_unit(cut.row) for cut in rows.cuts]
     amount = amount * units[0]
-    explanations = [_told(family, cut) for cut in rows.cuts]
+    explanations = [_explain_cut(family, cut) for cut in rows.cuts]
     if kind == "beyond every decision":
         return explanations[0].beyond(amount)
     if kind == "nothing between":

@@ -78,7 +78,7 @@ def remarked(program: SemiInfiniteProgram, result: Result) -> Result:
     Result
         The result, with a longer message, or with the status ``failed`` and without bounds.
     """
-    if denied := _denied(program, result):
+    if denied := _describe_contradiction(program, result):
         return replace(
             result,
             status="failed",
@@ -97,7 +97,7 @@ def remarked(program: SemiInfiniteProgram, result: Result) -> Result:
     return replace(result, message=f"{result.message}; {warning}")
 
 
-def _denied(program: SemiInfiniteProgram, result: Result) -> str:
+def _describe_contradiction(program: SemiInfiniteProgram, result: Result) -> str:
     """Return in words how the rows of a family contradict its answers; empty where they do not.
 
     A witness may satisfy its row. Or chosen rows, on which multipliers rest, may differ from the rows at the same
@@ -144,10 +144,10 @@ def as_bad_as_found(proofs: Sequence[Proof], separations: Sequence[tuple[Constra
         The proofs.
     """
     by_name = {family.name: (family, separation) for family, separation in separations}
-    return [_worse(proof, *by_name[proof.family]) if proof.family in by_name else proof for proof in proofs]
+    return [_choose_worse(proof, *by_name[proof.family]) if proof.family in by_name else proof for proof in proofs]
 
 
-def _worse(proof: Proof, family: ConstraintFamily, found: Separation) -> Proof:
+def _choose_worse(proof: Proof, family: ConstraintFamily, found: Separation) -> Proof:
     """Return the proof, or the refutation by the separation's violation where that is worse."""
     if proof.verdict == "proven" or not found.violations.size or found.violations[0] <= max(proof.violation, TOLERANCE):
         return proof
@@ -262,25 +262,25 @@ def infeasible_subsystem(
         if violation > max((reason.amount for reason in evident), default=0.0):
             family = program.family(rows.cuts[i].family)
             text = sentence("out of reach", family, rows.take(np.array([i])), np.ones(1), violation)
-            return InfeasibleSubsystem(reasons=(text,)), _worst_at(program, rows.cuts[i], violation)
+            return InfeasibleSubsystem(reasons=(text,)), _make_worst_constraint(program, rows.cuts[i], violation)
     if evident:
         texts = tuple(reason.text for reason in evident[:NAMED])
         subsystem = InfeasibleSubsystem(reasons=texts, others=max(0, len(evident) - NAMED))
-        return subsystem, _worst_at(program, evident[0].rows.cuts[0], evident[0].amount)
+        return subsystem, _make_worst_constraint(program, evident[0].rows.cuts[0], evident[0].amount)
     if not active.size:
         return InfeasibleSubsystem(amount=amount, equalities=equalities), None
     order = active[np.argsort(-multipliers[active], kind="stable")]
-    worst = _worst_at(program, rows.cuts[order[0]], amount)
-    return _together(program, rows, multipliers, order, amount), worst
+    worst = _make_worst_constraint(program, rows.cuts[order[0]], amount)
+    return _describe_subsystem(program, rows, multipliers, order, amount), worst
 
 
-def _together(
+def _describe_subsystem(
     program: SemiInfiniteProgram, rows: Rows, multipliers: Array, order: np.ndarray, amount: float
 ) -> InfeasibleSubsystem:
     """Return several rows that cannot hold together, by their descriptions, with the weighted sum that proves it."""
     from sparserob_core.sip.proof.reasons import least_of, least_within
 
-    explanations = [_explanation(program, rows.cuts[i]) for i in order[:NAMED]]
+    explanations = [_explain_cut(program, rows.cuts[i]) for i in order[:NAMED]]
     units = np.array([program.family(cut.family).row_unit(cut.row) for cut in rows.cuts])
     y = multipliers / units
     share = 1.0 / y.max()
@@ -306,12 +306,12 @@ def _together(
     )
 
 
-def _worst_at(program: SemiInfiniteProgram, cut: Cut, violation: float) -> WorstConstraint:
+def _make_worst_constraint(program: SemiInfiniteProgram, cut: Cut, violation: float) -> WorstConstraint:
     """Return the worst constraint at a cut, with the facts that its family adds."""
     return explained(program, WorstConstraint(violation, cut.family, cut.index, cut.row, cut.formulation))
 
 
-def _explanation(program: SemiInfiniteProgram, cut: Cut) -> Explanation:
+def _explain_cut(program: SemiInfiniteProgram, cut: Cut) -> Explanation:
     """Return the description of a cut's constraint."""
     family = program.formulated(cut.family, cut.formulation) or program.family(cut.family)
     return family.explanation(cut.index, cut.row)

@@ -96,21 +96,21 @@ class Oracle:
         return TupleValue(imposed, relaxed, self.count)
 
 
-class _Kept(threading.local):
+class _WorkerState(threading.local):
     """The ``g`` that a worker made last, one for each thread, as every evaluation changes it."""
 
     oracle: Oracle | None = None
     g: TupleValue | None = None
 
 
-_kept = _Kept()
+_worker_state = _WorkerState()
 
 
 def on_worker(oracle: Oracle, points: Array, epsilon: float, best: float, seconds: float | None) -> Valued:
     """`value_chunk` in a worker, who has ``seconds`` for it."""
-    if _kept.oracle != oracle or _kept.g is None:
-        _kept.oracle, _kept.g = oracle, oracle.build()
-    g = _kept.g
+    if _worker_state.oracle != oracle or _worker_state.g is None:
+        _worker_state.oracle, _worker_state.g = oracle, oracle.build()
+    g = _worker_state.g
     g.epsilon, g.relaxed.deadline = epsilon, Deadline(seconds)
     try:
         return value_chunk(g, points, best)
@@ -132,26 +132,26 @@ class Batches:
     ) -> None:
         self.g, self.oracle, self.executor, self.budget, self.watched = g, oracle, executor, budget, watched
         self.sent, self.imposed = 0, list[Imposed]()
-        self._best, self._started = -np.inf, False
+        self._best, self._has_started = -np.inf, False
 
     def values(self, points: Array, tell: Callable[[float, Dual | None], None]) -> Array:
         """``g`` at points ``(k, D width)``; ``tell`` is told each value in order, with the lower bound that its
         multipliers prove where it is the best one so far."""
         if len(points) < LONG:
-            return np.concatenate([self._told(self._next(point), tell) for point in points])
+            return np.concatenate([self._report_values(self._evaluate_next(point), tell) for point in points])
         best = self._best
         chunks = [points[first : first + CHUNK] for first in range(0, len(points), CHUNK)]
         start = time.perf_counter()
-        values = [self._told(value_chunk(self.g, chunks[0], best), tell)]
+        values = [self._report_values(value_chunk(self.g, chunks[0], best), tell)]
         seconds = time.perf_counter() - start
-        if self._worth(seconds, len(chunks) - 1, len(points)):
-            values += [self._told(valued, tell) for valued in self._elsewhere(chunks[1:], best)]
+        if self._is_worth_sending(seconds, len(chunks) - 1, len(points)):
+            values += [self._report_values(valued, tell) for valued in self._evaluate_on_workers(chunks[1:], best)]
         else:
-            values += [self._told(value_chunk(self.g, chunk, best), tell) for chunk in chunks[1:]]
+            values += [self._report_values(value_chunk(self.g, chunk, best), tell) for chunk in chunks[1:]]
         self.g.forget(points[-1])
         return np.concatenate(values)
 
-    def _next(self, point: Array) -> Valued:
+    def _evaluate_next(self, point: Array) -> Valued:
         """Evaluate ``g`` at one point, from the solution of the point before."""
         value = self.g.at(point)
         better = np.isfinite(value) and value > self._best
@@ -164,7 +164,7 @@ class Batches:
         first, self.imposed = self.imposed[:count], self.imposed[count:]
         return first
 
-    def _told(self, chunk: Valued, tell: Callable[[float, Dual | None], None]) -> Array:
+    def _report_values(self, chunk: Valued, tell: Callable[[float, Dual | None], None]) -> Array:
         if self.watched:
             self.imposed += chunk.imposed
         for k, value in enumerate(chunk.values):
@@ -174,16 +174,16 @@ class Batches:
             tell(float(value), chunk.duals[k] if better else None)
         return chunk.values
 
-    def _worth(self, seconds: float, chunks: int, points: int) -> bool:
+    def _is_worth_sending(self, seconds: float, chunks: int, points: int) -> bool:
         """Return whether the chunks are to be sent to workers, when one chunk took ``seconds``; charge the ``points``
         to the budget."""
         self.budget -= points
         if self.executor is None or self.oracle is None or seconds * chunks < WORTH:
             return False
-        self._started = self._started or seconds * (chunks + max(self.budget, 0) / CHUNK) >= START
-        return self._started
+        self._has_started = self._has_started or seconds * (chunks + max(self.budget, 0) / CHUNK) >= START
+        return self._has_started
 
-    def _elsewhere(self, chunks: Sequence[Array], best: float) -> Sequence[Valued]:
+    def _evaluate_on_workers(self, chunks: Sequence[Array], best: float) -> Sequence[Valued]:
         g, seconds = self.g, self.g.relaxed.deadline.left
         assert self.executor is not None
         assert self.oracle is not None

@@ -44,12 +44,12 @@ def differences(function: Callable[[Array, np.ndarray], Array], points: Array, l
         step = STEP * (upper[axis] - lower[axis])
         middles = points.copy()
         middles[:, axis] = np.clip(points[:, axis], lower[axis] + step, upper[axis] - step)
-        slopes[int(axis)] = _parabola_slopes(function, points, middles, int(axis), step)
+        slopes[int(axis)] = _compute_parabola_slopes(function, points, middles, int(axis), step)
     still = np.zeros_like(next(iter(slopes.values())) if slopes else function(points, np.arange(points.shape[0])))
     return np.stack([slopes.get(axis, still) for axis in range(points.shape[1])], axis=1)
 
 
-def _parabola_slopes(
+def _compute_parabola_slopes(
     function: Callable[[Array, np.ndarray], Array], points: Array, middles: Array, axis: int, step: float
 ) -> Array:
     """The slopes at ``points`` of parabolas through three values about ``middles``, a step apart along one axis."""

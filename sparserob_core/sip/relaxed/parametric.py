@@ -23,15 +23,15 @@ class ParametricProgram:
     factors ``>= 0``."""
 
     at: Programs
-    _known: dict[float, SemiInfiniteProgram] = field(default_factory=dict, init=False, repr=False)
+    _programs: dict[float, SemiInfiniteProgram] = field(default_factory=dict, init=False, repr=False)
 
     def program(self, factor: float) -> SemiInfiniteProgram:
         """The program at a factor, remembered."""
-        if factor not in self._known:
-            if len(self._known) >= KEPT:
-                self._known.pop(next(iter(self._known)))
-            self._known[factor] = self.at(factor)
-        return self._known[factor]
+        if factor not in self._programs:
+            if len(self._programs) >= KEPT:
+                self._programs.pop(next(iter(self._programs)))
+            self._programs[factor] = self.at(factor)
+        return self._programs[factor]
 
 
 def extreme_program(
@@ -46,20 +46,20 @@ def extreme_program(
     """
     unit_program, double_program = factored.at(1.0), factored.at(2.0)
     first, second = unit_program.finite, double_program.finite
-    slope_low, slope_high = _difference(second.lower, first.lower), _difference(second.upper, first.upper)
+    slope_low, slope_high = _subtract_finite(second.lower, first.lower), _subtract_finite(second.upper, first.upper)
     moves = bool(slope_low.any() or slope_high.any())
-    G, h = _appended(first.G, first.h, second.h)
+    G, h = _append_factor(first.G, first.h, second.h)
     if moves:
-        rows, bounds = _moving_bounds(unit_program, slope_low, slope_high)
+        rows, bounds = _build_moving_bounds(unit_program, slope_low, slope_high)
         G, h = np.vstack([G, rows]), np.concatenate([h, bounds])
-    A, b = _appended(first.A, first.b, second.b)
+    A, b = _append_factor(first.A, first.b, second.b)
     q = np.zeros(unit_program.n + 1)
     q[-1] = -1.0 if sense == "largest" else 1.0
     free = np.full(first.lower.size, np.inf)
     return SemiInfiniteProgram(
         n=unit_program.n + 1,
         q=q,
-        S=_image(unit_program),
+        S=_extend_image(unit_program),
         G=G if h.size else None,
         h=h if h.size else None,
         A=A if b.size else None,
@@ -67,7 +67,7 @@ def extreme_program(
         lower=np.append(-free if moves else first.lower, 0.0),
         upper=np.append(free if moves else first.upper, cap),
         families=[
-            _family(factored, unit_family, double_family)
+            _parametrise_family(factored, unit_family, double_family)
             for unit_family, double_family in zip(unit_program.families, double_program.families, strict=True)
         ],
     )
@@ -88,28 +88,28 @@ def slack_program(program: SemiInfiniteProgram, lowest: float, highest: float) -
     return SemiInfiniteProgram(
         n=program.n + 1,
         q=q,
-        S=_image(program),
+        S=_extend_image(program),
         G=G if base.h.size else None,
         h=base.h if base.h.size else None,
         A=A if base.b.size else None,
         b=base.b if base.b.size else None,
         lower=np.append(base.lower, lowest),
         upper=np.append(base.upper, highest),
-        families=[_relaxed(family) for family in program.families],
+        families=[_relax_family(family) for family in program.families],
     )
 
 
-def _difference(second: Array, first: Array) -> Array:
+def _subtract_finite(second: Array, first: Array) -> Array:
     return np.where(
         np.isfinite(first), np.where(np.isfinite(first), second, 0.0) - np.where(np.isfinite(first), first, 0.0), 0.0
     )
 
 
-def _appended(rows: Array, one: Array, two: Array) -> tuple[Array, Array]:
+def _append_factor(rows: Array, one: Array, two: Array) -> tuple[Array, Array]:
     return np.hstack([rows, -(two - one)[:, None]]), 2.0 * one - two
 
 
-def _moving_bounds(program: SemiInfiniteProgram, slope_low: Array, slope_high: Array) -> tuple[Array, Array]:
+def _build_moving_bounds(program: SemiInfiniteProgram, slope_low: Array, slope_high: Array) -> tuple[Array, Array]:
     """Return the finite upper and lower bounds of the image, which change with the factor, as rows with right-hand
     sides."""
     base = program.finite
@@ -119,7 +119,7 @@ def _moving_bounds(program: SemiInfiniteProgram, slope_low: Array, slope_high: A
     return rows, np.concatenate([(base.upper - slope_high)[above], (slope_low - base.lower)[below]])
 
 
-def _image(program: SemiInfiniteProgram) -> object:
+def _extend_image(program: SemiInfiniteProgram) -> object:
     if program.finite.S is None:
         return None
     from scipy.sparse import block_diag
@@ -127,7 +127,7 @@ def _image(program: SemiInfiniteProgram) -> object:
     return block_diag([program.finite.S, [[1.0]]], format="csc")
 
 
-def _family(factored: ParametricProgram, one: ConstraintFamily, two: ConstraintFamily) -> ConstraintFamily:
+def _parametrise_family(factored: ParametricProgram, one: ConstraintFamily, two: ConstraintFamily) -> ConstraintFamily:
     name = one.name
 
     def rows(indices: Array) -> tuple[Array, Array]:
@@ -160,7 +160,7 @@ def _family(factored: ParametricProgram, one: ConstraintFamily, two: ConstraintF
     )
 
 
-def _relaxed(family: ConstraintFamily) -> ConstraintFamily:
+def _relax_family(family: ConstraintFamily) -> ConstraintFamily:
     def rows(indices: Array) -> tuple[Array, Array]:
         G, h = family.rows(indices)
         return np.concatenate([G, -np.ones((*h.shape, 1))], axis=2), h

@@ -36,31 +36,31 @@ class PolicyValue:
         self.program, self.spread = program, program.spread
         self.size = max(family.index_set.dimension for family in program.families)
         # rows that stay where the index moves, and those that only say what the cost is, decide nothing
-        self._moves = [
+        self._is_moving = [
             bool(family.index_set.upper[0] > family.index_set.lower[0]) and not family.defines
             for family in program.families
         ]
-        self._known: dict[bytes, Linear] = {}
+        self._linear_rows: dict[bytes, Linear] = {}
         self._weights: Array = np.zeros(0)
         self._base: tuple[bytes, Any] = b"", None  # the rows at a deviation of the last tuple, and where they began
 
     def at(self, slots: Array) -> float:
         """The value; ``inf`` where nothing meets the rows, NaN where the solver failed or takes too long."""
         counterpart = Counterpart(self.program.finite, self.spread)
-        plain = [self._at_deviation(slot) for slot in slots if not np.isnan(slot).any()]
+        plain = [self._fix_deviation(slot) for slot in slots if not np.isnan(slot).any()]
         order = [*np.flatnonzero(~np.isnan(slots).any(axis=1)), *np.flatnonzero(np.isnan(slots).any(axis=1))]
         until = time.monotonic() + LASTING
         moving: list[np.ndarray] = []
         if plain:
             G, h, _ = (np.concatenate(arrays) for arrays in zip(*plain, strict=True))
-            counterpart.add(_plain(G, h, self.spread.size))
+            counterpart.add(_make_certain_rows(G, h, self.spread.size))
             moving = [moves for _, _, moves in plain]
-            self._begun(counterpart, slots[order[: len(plain)]].tobytes())
+            self._begin_at_base(counterpart, slots[order[: len(plain)]].tobytes())
         for slot in order[len(plain) :]:
-            blocks = self._rows(slots[slot])
+            blocks = self._build_rows(slots[slot])
             for rows in blocks:
                 counterpart.add(rows)
-            moving.append(self._flags(blocks))
+            moving.append(self._flag_moving_rows(blocks))
         answer = counterpart.solve(seconds=until - time.monotonic())
         while answer.solved and counterpart.sharpen(answer.x):
             answer = counterpart.solve(seconds=until - time.monotonic())
@@ -72,7 +72,7 @@ class PolicyValue:
         self._weights = np.asarray(weights, dtype=float)
         return self.program.cost(np.clip(answer.x, self.program.finite.lower, self.program.finite.upper))
 
-    def _begun(self, counterpart: Counterpart, which: bytes) -> None:
+    def _begin_at_base(self, counterpart: Counterpart, which: bytes) -> None:
         """Begin where rows at a deviation alone are at their optimum: on a map all others are added to the same ones,
         and are few."""
         if which != self._base[0]:
@@ -85,11 +85,13 @@ class PolicyValue:
         """The multipliers ``(D,)`` of the rows at every index that move with it, in the last evaluation."""
         return self._weights
 
-    def _flags(self, blocks: Sequence[UncertainRows]) -> np.ndarray:
+    def _flag_moving_rows(self, blocks: Sequence[UncertainRows]) -> np.ndarray:
         """Return a mask ``(r,)`` of the rows of all families that move with their index."""
-        return np.concatenate([np.full(rows.h.size, moves) for rows, moves in zip(blocks, self._moves, strict=True)])
+        return np.concatenate(
+            [np.full(rows.h.size, moves) for rows, moves in zip(blocks, self._is_moving, strict=True)]
+        )
 
-    def _rows(self, slot: Array) -> list[UncertainRows]:
+    def _build_rows(self, slot: Array) -> list[UncertainRows]:
         blocks = []
         for family in self.program.families:
             box = family.index_set
@@ -97,20 +99,20 @@ class PolicyValue:
             blocks.append(family.uncertain(np.clip(slot[: box.dimension], box.lower, box.upper)))
         return blocks
 
-    def _at_deviation(self, slot: Array) -> Linear:
+    def _fix_deviation(self, slot: Array) -> Linear:
         key = slot.tobytes()
-        if key not in self._known:
-            w, pairs, blocks = slot[self.size :], [], self._rows(slot)
+        if key not in self._linear_rows:
+            w, pairs, blocks = slot[self.size :], [], self._build_rows(slot)
             for rows in blocks:
                 products = np.stack([w @ C for C in rows.C]) if rows.C else np.zeros((1, self.program.n))
                 G = rows.g.toarray() + rows.factor[:, np.newaxis] * products[rows.part]
                 pairs.append((G, rows.h - rows.factor * (rows.d @ w)[rows.part]))
             G, h = (np.concatenate(arrays) for arrays in zip(*pairs, strict=True))
-            self._known[key] = G, h, self._flags(blocks)
-        return self._known[key]
+            self._linear_rows[key] = G, h, self._flag_moving_rows(blocks)
+        return self._linear_rows[key]
 
 
-def _plain(G: Array, h: Array, deviations: int) -> UncertainRows:
+def _make_certain_rows(G: Array, h: Array, deviations: int) -> UncertainRows:
     """Rows that no deviation changes."""
     from scipy.sparse import csr_array
 

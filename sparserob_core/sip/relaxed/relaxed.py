@@ -108,7 +108,7 @@ class RelaxedSolution:
     def multipliers(self) -> dict[tuple[str, bytes, int], float]:
         """The multipliers of the imposed rows, by family, index and row."""
         y = self.finite.y[self.finite.y.size - self.rows.h.size :]
-        return {_key(cut): float(m) for cut, m in zip(self.rows.cuts, y, strict=False)}
+        return {_make_key(cut): float(m) for cut, m in zip(self.rows.cuts, y, strict=False)}
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,12 +130,12 @@ def value_of(solution: FiniteSolution) -> float:
     return {"optimal": solution.value, "infeasible": np.inf}.get(solution.status, solution.lower_bound)
 
 
-def _key(cut: Cut) -> tuple[str, bytes, int]:
+def _make_key(cut: Cut) -> tuple[str, bytes, int]:
     return cut.family, cut.index.tobytes(), cut.row
 
 
 @shaped
-def _most_violated(excess: Float[Array, " r"], kinds: Int[np.ndarray, " r"]) -> Int[np.ndarray, " v"]:
+def _select_most_violated(excess: Float[Array, " r"], kinds: Int[np.ndarray, " r"]) -> Int[np.ndarray, " v"]:
     """The position of the largest excess of every kind, where it is above `LAZY`."""
     violated = np.flatnonzero(excess > LAZY)
     order = violated[np.lexsort((-excess[violated], kinds[violated]))]
@@ -156,7 +156,7 @@ def require_separable(program: SemiInfiniteProgram, solver: Solver, regulariser:
         raise InputError(path="solver.name", expected=f"another solver, such as piqp: {reason}", got="dual_newton")
 
 
-def _touched(plain: FiniteProgram, y: Array, mu: Array, x: Array) -> Array:
+def _choose_tangent_point(plain: FiniteProgram, y: Array, mu: Array, x: Array) -> Array:
     """Return the point ``(n,)`` at which the cost is replaced by its tangent, for a bound from these multipliers.
 
     The point is the minimiser for these multipliers where that is explicit, which gives the bound of the cost itself;
@@ -188,9 +188,9 @@ class RelaxedProgram:
     deadline: Deadline = field(default_factory=Deadline)
     _terms: tuple[csc_array, Array] | None = None
     _last: RelaxedSolution | None = None
-    _least: tuple[float, Array, Array, Array | None] | None = None
+    _zero_bound: tuple[float, Array, Array, Array | None] | None = None
     _programs: dict[float, FiniteProgram] = field(default_factory=dict)
-    _plain: tuple[Rows, FiniteProgram] | None = None
+    _plain_program: tuple[Rows, FiniteProgram] | None = None
 
     def __post_init__(self) -> None:
         self.counted = Asked.of(self.solver)
@@ -211,7 +211,7 @@ class RelaxedProgram:
         """Solve with all of these rows at once, each tightened by ``margin`` times its norm; ``guess`` is a solution
         with the same rows."""
         h = rows.h - margin * rows.norms if margin else rows.h
-        return self._solved(rows.G, h, epsilon, guess)
+        return self._solve_rows(rows.G, h, epsilon, guess)
 
     def lower_bound(self, rows: Rows, solution: FiniteSolution) -> Dual:
         """A lower bound of the *unregularised* semi-infinite program, from the multipliers of any solution with these
@@ -220,39 +220,44 @@ class RelaxedProgram:
         Less an allowance for the rounding of the rows themselves; no multipliers at all are an offer too, and need
         none.
         """
-        if self._plain is None or self._plain[0] is not rows:  # the same again and again while the weight falls
-            self._plain = rows, self.finite(rows.G, rows.h, 0.0)
-        plain = self._plain[1]
+        if (
+            self._plain_program is None or self._plain_program[0] is not rows
+        ):  # the same again and again while the weight falls
+            self._plain_program = rows, self.finite(rows.G, rows.h, 0.0)
+        plain = self._plain_program[1]
         offers = [(solution.y, solution.mu, solution.z)]
         if np.isfinite(solution.x).all():
             linear = plain.tangent(solution.x)
             offers.append((*vertex_multipliers(linear, solution.x, solution.y, solution.mu), solution.z))
-        proven = [self._without(plain, solution), *(self._proven(plain, solution, *offer) for offer in offers)]
+        proven = [
+            self._bound_without_multipliers(plain, solution),
+            *(self._prove_bound(plain, solution, *offer) for offer in offers),
+        ]
         bound, y, mu, z, at = proven[int(np.argmax([proof[0] for proof in proven]))]
         curved = plain.P is not None or plain.blocks is not None
         return self.dual(rows, y, mu, solution.z if z is None else z, bound, at if curved else None)
 
-    def _without(self, plain: FiniteProgram, solution: FiniteSolution) -> _Proven:
+    def _bound_without_multipliers(self, plain: FiniteProgram, solution: FiniteSolution) -> _Proven:
         """The bound of no multipliers at all, which is the same again and again where the cost is linear."""
         zero, x = np.zeros_like(solution.y), solution.x
         if plain.P is not None or plain.blocks is not None:
-            return self._proven(plain, solution, zero, np.zeros_like(solution.mu), np.zeros_like(solution.z))
-        if self._least is None:
-            self._least = proving(plain, zero, np.zeros_like(solution.mu), np.zeros_like(solution.z))
-        bound, _, mu, z = self._least
+            return self._prove_bound(plain, solution, zero, np.zeros_like(solution.mu), np.zeros_like(solution.z))
+        if self._zero_bound is None:
+            self._zero_bound = proving(plain, zero, np.zeros_like(solution.mu), np.zeros_like(solution.z))
+        bound, _, mu, z = self._zero_bound
         return bound - self.rounding(plain, zero, mu, x), zero, mu, z, x
 
-    def _proven(self, plain: FiniteProgram, solution: FiniteSolution, y: Array, mu: Array, z: Array) -> _Proven:
+    def _prove_bound(self, plain: FiniteProgram, solution: FiniteSolution, y: Array, mu: Array, z: Array) -> _Proven:
         """A lower bound, less its rounding, with the multipliers that prove it and where the cost is touched."""
-        at = _touched(plain, y, mu, solution.x)
+        at = _choose_tangent_point(plain, y, mu, solution.x)
         bound, y, mu, z_proving = proving(plain.tangent(at), y, mu, z, at=at)
-        if solution.value - bound > UNCLOSED * abs(solution.value) and self._bend is not None:
-            better, point = curved_bound(plain, self._bend, y, mu, at)
+        if solution.value - bound > UNCLOSED * abs(solution.value) and self._curvature is not None:
+            better, point = curved_bound(plain, self._curvature, y, mu, at)
             bound, at = (better, point) if better > bound else (bound, at)
         return bound - self.rounding(plain, y, mu, solution.x), y, mu, z_proving, at
 
     @cached_property
-    def _bend(self) -> Array | None:
+    def _curvature(self) -> Array | None:
         """Curvature ``c (n,)`` of the quadratic cost by entries (`curvature_of`); ``None`` where a tangent does as
         well.
 
@@ -309,7 +314,7 @@ class RelaxedProgram:
         for family, points in indices.items():
             pool = pool.joined(rows_at(self.program, family, points))
         multipliers = {} if self._last is None else self._last.multipliers()
-        start = [(i, y) for i, cut in enumerate(pool.cuts) if (y := multipliers.get(_key(cut), 0.0)) > 0.0]
+        start = [(i, y) for i, cut in enumerate(pool.cuts) if (y := multipliers.get(_make_key(cut), 0.0)) > 0.0]
         kinds = {kind: number for number, kind in enumerate(dict.fromkeys((cut.family, cut.row) for cut in pool.cuts))}
         imposed = Imposed(
             np.array([i for i, _ in start], dtype=int),
@@ -336,9 +341,9 @@ class RelaxedProgram:
         kind ``(r,)``, until no other is violated. Returns the rows imposed last, in terms of which the solution's
         multipliers are."""
         norms = np.maximum(np.linalg.norm(G, axis=1), np.finfo(float).tiny) if norms is None else norms
-        positions, guess = start.positions, self._guess(start)
+        positions, guess = start.positions, self._build_guess(start)
         for number in range(ROUNDS):
-            solution = self._solved(G[positions], h[positions], epsilon, guess)
+            solution = self._solve_rows(G[positions], h[positions], epsilon, guess)
             multipliers = (
                 solution.y[solution.y.size - positions.size :]
                 if solution.y.size >= positions.size
@@ -350,17 +355,17 @@ class RelaxedProgram:
             with np.errstate(over="ignore"):  # a row that is zero, with a right-hand side that nothing keeps
                 excess = (G @ solution.x - h) / norms
             excess[positions] = -np.inf
-            fresh = _most_violated(excess, kinds)
+            fresh = _select_most_violated(excess, kinds)
             if not fresh.size:
                 break
             needed = (multipliers > 0.0) | (number > DROPPING)
             positions = np.concatenate([positions[needed], fresh])
-            guess = self._guess(
+            guess = self._build_guess(
                 Imposed(positions, np.concatenate([multipliers[needed], np.zeros(fresh.size)]), solution)
             )
         return imposed, solution
 
-    def _guess(self, start: Imposed) -> FiniteSolution | None:
+    def _build_guess(self, start: Imposed) -> FiniteSolution | None:
         """The solution that the imposed rows came with, with their multipliers."""
         last = start.solution
         if last is None or not np.isfinite(last.x).all():
@@ -369,7 +374,7 @@ class RelaxedProgram:
         return replace(last, y=np.concatenate([fixed, start.multipliers]))
 
     @shaped
-    def _solved(
+    def _solve_rows(
         self, G: Float[Array, "r n"], h: Float[Array, " r"], epsilon: float, guess: FiniteSolution | None
     ) -> FiniteSolution:
         self.deadline.check()
@@ -395,10 +400,10 @@ class RelaxedProgram:
     @shaped
     def finite(self, G: Float[Array, "r n"], h: Float[Array, " r"], epsilon: float) -> FiniteProgram:
         """The finite program with these rows."""
-        base = self._regularised(epsilon)
+        base = self._regularise(epsilon)
         return base.under(G, h)
 
-    def _regularised(self, epsilon: float) -> FiniteProgram:
+    def _regularise(self, epsilon: float) -> FiniteProgram:
         base = self.program.finite
         if epsilon == 0.0 or self._terms is None:
             return base

@@ -63,11 +63,11 @@ def imposed_program(program: SemiInfiniteProgram, formulation: Literal["reduced"
     return (
         program
         if formulation == "reduced"
-        else replace(program, families=[_literal(family) for family in program.families])
+        else replace(program, families=[_require_literal(family) for family in program.families])
     )
 
 
-def _literal(family: ConstraintFamily) -> ConstraintFamily:
+def _require_literal(family: ConstraintFamily) -> ConstraintFamily:
     if family.literal is None:
         raise InputError(
             f"formulation: literal needs families with a disturbance in their index, which {family.name} is not;"
@@ -94,9 +94,9 @@ class TupleValue:
         )
         self.domain, self.block = self.layout.domain, self.layout.slot.dimension
         self.slots = np.full((count, self.block), np.nan)
-        self.imposed, self.solution = Imposed(np.zeros(0, dtype=int), np.zeros(0)), _nothing(program.n)
-        self._solved_for = np.nan
-        self._owed: Array | None = None
+        self.imposed, self.solution = Imposed(np.zeros(0, dtype=int), np.zeros(0)), _make_empty_solution(program.n)
+        self._solved_epsilon = np.nan
+        self._owed_point: Array | None = None
         lowest = self.layout.slot.lower[np.newaxis]
         first = [family.rows_at(self.layout.indices(family, lowest), program.n) for family in program.families]
         ends = np.cumsum([h.shape[1] for _, h in first], dtype=int)
@@ -107,7 +107,9 @@ class TupleValue:
             np.zeros((count, self._kinds.size // count)),
         )
         self._norms = np.ones(self._h.shape)
-        self._before = _Before(np.zeros(0, dtype=int), self.slots[:0], self._G[:0], self._h[:0], self._norms[:0])
+        self._previous = _PreviousRows(
+            np.zeros(0, dtype=int), self.slots[:0], self._G[:0], self._h[:0], self._norms[:0]
+        )
 
     def __call__(self, points: Array) -> Array:
         return np.array([self.at(point) for point in points])
@@ -116,21 +118,23 @@ class TupleValue:
         """Let the next evaluation start from nothing. Whoever asks about the last tuple is answered about ``point``,
         which is then evaluated for it."""
         self.slots = np.full_like(self.slots, np.nan)
-        self.imposed, self.solution = Imposed(np.zeros(0, dtype=int), np.zeros(0)), _nothing(self.program.n)
-        self._before = _Before(np.zeros(0, dtype=int), self.slots[:0], self._G[:0], self._h[:0], self._norms[:0])
-        self._owed = None if point is None else point.copy()
+        self.imposed, self.solution = Imposed(np.zeros(0, dtype=int), np.zeros(0)), _make_empty_solution(self.program.n)
+        self._previous = _PreviousRows(
+            np.zeros(0, dtype=int), self.slots[:0], self._G[:0], self._h[:0], self._norms[:0]
+        )
+        self._owed_point = None if point is None else point.copy()
 
-    def _settle(self) -> None:
-        if self._owed is not None:
-            self.at(self._owed)
+    def _evaluate_owed(self) -> None:
+        if self._owed_point is not None:
+            self.at(self._owed_point)
 
     def at(self, point: Array) -> float:
         """``g`` at one point ``(D width,)``."""
-        self._owed = None
-        changed = self._move(point.reshape(self.slots.shape))
-        if self._unmoved(changed):
+        self._owed_point = None
+        changed = self._update_rows(point.reshape(self.slots.shape))
+        if self._is_still_optimal(changed):
             return value_of(self.solution)
-        rows, self._solved_for = self._kinds.size, np.nan
+        rows, self._solved_epsilon = self._kinds.size, np.nan
         self.imposed, self.solution = self.relaxed.lazily(
             self._G.reshape(rows, -1),
             self._h.reshape(rows),
@@ -139,7 +143,7 @@ class TupleValue:
             self.imposed,
             self._norms.reshape(rows),
         )
-        self._solved_for = self.epsilon
+        self._solved_epsilon = self.epsilon
         return value_of(self.solution)
 
     def gradient(self, point: Array) -> Array:
@@ -178,7 +182,7 @@ class TupleValue:
             size = family.index_set.dimension
             coordinates[:size] &= family.linear
             coordinates[size:] = False
-        return LinearBlocks(np.tile(coordinates, self.layout.count), self.acting, self._steepest)
+        return LinearBlocks(np.tile(coordinates, self.layout.count), self.acting, self._find_steepest)
 
     @cached_property
     def coordinates(self) -> tuple[int, ...]:
@@ -202,7 +206,7 @@ class TupleValue:
         positions = np.concatenate([np.zeros(0, dtype=int), *(entry.positions for entry in imposed)])
         multipliers = np.concatenate([np.zeros(0), *(entry.multipliers for entry in imposed)])
         slots, kinds = np.divmod(positions, rows)
-        weights = np.bincount(tuples * count + slots, multipliers * self._moving[kinds], len(imposed) * count)
+        weights = np.bincount(tuples * count + slots, multipliers * self._moving_rows[kinds], len(imposed) * count)
         weights = weights.reshape(len(imposed), count)
         order = np.argsort(-weights, axis=1, kind="stable")[:, :most]
         indices = np.full((len(imposed), most), -1)
@@ -210,7 +214,7 @@ class TupleValue:
         return indices
 
     @cached_property
-    def _moving(self) -> np.ndarray:
+    def _moving_rows(self) -> np.ndarray:
         """Mask ``(r,)`` of the rows of an index that move with any of its `coordinates`, such as its time."""
         moving = np.zeros(self._h.shape[1], dtype=bool)
         for family, first, last in self._columns:
@@ -221,15 +225,15 @@ class TupleValue:
 
     def acting(self) -> np.ndarray:
         """Return a mask ``(D,)`` of the indices of the last tuple that have a multiplier."""
-        self._settle()
+        self._evaluate_owed()
         acts = np.zeros(self.layout.count, dtype=bool)
         acts[self.imposed.positions[self.imposed.multipliers > 0.0] // self._h.shape[1]] = True
         return acts
 
-    def _steepest(self, point: Array) -> Array:
+    def _find_steepest(self, point: Array) -> Array:
         """The tuple with the linear coordinates of every index where the row is violated most by the last optimum: the
         row that the index acts by, or else the one of any family that is then violated most."""
-        self._settle()
+        self._evaluate_owed()
         slots, x = point.reshape(self.slots.shape).copy(), self.solution.x
         kinds = np.full(len(slots), -1)
         for position in self.imposed.positions[np.argsort(self.imposed.multipliers, kind="stable")]:
@@ -249,7 +253,7 @@ class TupleValue:
 
     def rows(self) -> Rows:
         """The rows that were imposed in the last evaluation, in the order of its multipliers."""
-        self._settle()
+        self._evaluate_owed()
         slots, kinds = np.divmod(self.imposed.positions, self._h.shape[1])
         cuts = []
         for slot, kind, multiplier in zip(slots, kinds, self.imposed.multipliers, strict=True):
@@ -258,22 +262,22 @@ class TupleValue:
             cuts.append(Cut(family.name, index, int(kind - first), float(multiplier), family.formulation))
         return Rows(self._G[slots, kinds], self._h[slots, kinds], tuple(cuts))
 
-    def _unmoved(self, changed: np.ndarray) -> bool:
+    def _is_still_optimal(self, changed: np.ndarray) -> bool:
         """Return whether the last optimum is still an optimum: none of its imposed rows has changed, and it satisfies
         the rows of the indices that have."""
-        if self.solution.status != "optimal" or self._solved_for != self.epsilon:
+        if self.solution.status != "optimal" or self._solved_epsilon != self.epsilon:
             return False
         if ((self.imposed.positions // self._h.shape[1])[:, None] == changed).any():
             return False
         return bool((self._G[changed] @ self.solution.x - self._h[changed] <= LAZY * self._norms[changed]).all())
 
-    def _move(self, slots: Array) -> np.ndarray:
+    def _update_rows(self, slots: Array) -> np.ndarray:
         """Bring the rows up to date with the indices ``(count, width)``; returns which of them changed."""
-        changed = np.flatnonzero(_moved(self.slots, slots))
+        changed = np.flatnonzero(_find_moved(self.slots, slots))
         if not changed.size:
             return changed
-        before, fresh, old_slots = self._before, changed, self.slots[changed]
-        self._before = _Before(changed, old_slots, self._G[changed], self._h[changed], self._norms[changed])
+        before, fresh, old_slots = self._previous, changed, self.slots[changed]
+        self._previous = _PreviousRows(changed, old_slots, self._G[changed], self._h[changed], self._norms[changed])
         self.slots[changed] = np.nan  # whatever is interrupted here, nobody takes their rows for those of an index
         if before.changed.size:
             back, positions = before.find(changed, slots[changed])
@@ -284,17 +288,17 @@ class TupleValue:
                 before.norms[positions],
             )
         if fresh.size:
-            self._build(fresh, old_slots, slots[fresh])
+            self._build_rows(fresh, old_slots, slots[fresh])
         self.slots[changed] = slots[changed]
         return changed
 
-    def _build(self, fresh: np.ndarray, old: Array, wanted: Array) -> None:
+    def _build_rows(self, fresh: np.ndarray, old: Array, wanted: Array) -> None:
         """The rows of some indices ``fresh (k,)`` that go from ``old`` to ``wanted (k, width)``."""
         is_new = np.isnan(old).all(axis=1)
         for family, first, last in self._columns:
             # an index may move where the point at which it imposes a family does not, as at the end of the horizon
             indices = self.layout.indices(family, wanted)
-            is_changed = is_new | _moved(self.layout.indices(family, old), indices)
+            is_changed = is_new | _find_moved(self.layout.indices(family, old), indices)
             if is_changed.any():
                 rebuilt = fresh[is_changed]
                 G, self._h[rebuilt, first:last] = family.rows_at(indices[is_changed], self.program.n)
@@ -303,7 +307,7 @@ class TupleValue:
 
 
 @dataclass(frozen=True, eq=False)
-class _Before:
+class _PreviousRows:
     """State before the last change: the indices ``changed (k,)`` of the tuple, sorted, with their old coordinates, rows
     and norms of rows."""
 
@@ -317,18 +321,18 @@ class _Before:
         """Return a mask ``(k,)`` of the indices ``changed`` that return to their old coordinates, and the places where
         their old rows are kept."""
         positions = np.minimum(self.changed.searchsorted(changed), self.changed.size - 1)
-        back = (self.changed[positions] == changed) & ~_moved(self.slots[positions], slots)
+        back = (self.changed[positions] == changed) & ~_find_moved(self.slots[positions], slots)
         return back, positions[back]
 
 
-def _moved(old: Array, new: Array) -> np.ndarray:
+def _find_moved(old: Array, new: Array) -> np.ndarray:
     """Return a mask ``(k,)`` of the indices whose coordinates differ; a coordinate that is NaN (open) before and after
     does not differ."""
     differs: np.ndarray = ((old != new) & ~(np.isnan(old) & np.isnan(new))).any(axis=1)
     return differs
 
 
-def _nothing(n: int) -> FiniteSolution:
+def _make_empty_solution(n: int) -> FiniteSolution:
     zero = np.zeros(n)
     return FiniteSolution(
         "failed", zero, np.nan, -np.inf, np.zeros(0), np.zeros(0), zero, np.inf, np.inf, "nothing was evaluated"

@@ -35,14 +35,14 @@ class WarmProgram:
     def __init__(self, weights: Array, lower: Array, upper: Array) -> None:
         self.weights, self.lower, self.upper = weights, lower, upper
         self.G = np.zeros((0, weights.size))
-        self._begin()
+        self._reset_basis()
 
-    def _begin(self) -> None:
+    def _reset_basis(self) -> None:
         """The basis of no rows: everything is at 0."""
         n = self.weights.size
         self._rows, self._free = list[int](), list[int]()
-        self._side = list[int]()  # 1 where the slope of a free entry is at its weight, so that it is at most 0; or -1
-        self._place = np.zeros(n)  # -1, 0 or 1: at its lower bound, at 0, at its upper bound
+        self._sides = list[int]()  # 1 where the slope of a free entry is at its weight, so that it is at most 0; or -1
+        self._positions = np.zeros(n)  # -1, 0 or 1: at its lower bound, at 0, at its upper bound
 
     def add(self, G: Array) -> None:
         """More rows ``(r, n)``."""
@@ -63,13 +63,13 @@ class WarmProgram:
         optimum."""
         answer, closed = None, False
         try:
-            answer = self._pivoted(h)
-            closed = answer is not None and self._closed(h, *answer)
+            answer = self._pivot(h)
+            closed = answer is not None and self._is_closed(h, *answer)
         except np.linalg.LinAlgError:
             pass
         finally:  # a basis that is wrong, or that was interrupted, is none to go on from
             if not closed:
-                self._begin()
+                self._reset_basis()
         if closed:
             return answer
         n, none = self.weights.size, np.zeros(0)
@@ -77,28 +77,28 @@ class WarmProgram:
         corner = simplex(program)
         return (corner.x, corner.y) if corner.status == "optimal" else None
 
-    def _closed(self, h: Array, x: Array, y: Array) -> bool:
+    def _is_closed(self, h: Array, x: Array, y: Array) -> bool:
         """Return whether the multipliers prove a point optimal: its gap is at most `CLOSED` times the largest possible
         cost."""
         largest = float(self.weights @ np.maximum(-self.lower, self.upper))
         return float(self.weights @ np.abs(x)) - self.bound(h, y) <= CLOSED * largest
 
-    def _pivoted(self, h: Array) -> tuple[Array, Array] | None:
+    def _pivot(self, h: Array) -> tuple[Array, Array] | None:
         """The answer by steps from the last basis; ``None`` where they lead nowhere."""
         for _ in range(PIVOTS + MORE * h.size):
-            x = np.where(self._place > 0.0, self.upper, np.where(self._place < 0.0, self.lower, 0.0))
+            x = np.where(self._positions > 0.0, self.upper, np.where(self._positions < 0.0, self.lower, 0.0))
             x[self._free] = 0.0
             residual, columns = h - self.G @ x, self.G[:, self._free]
             inverse = np.linalg.inv(columns[self._rows])
             if not np.abs(inverse).max(initial=0.0) < SINGULAR:
                 return None
             x[self._free] = at = inverse @ residual[self._rows]
-            y = (self.weights[self._free] * self._side) @ inverse
+            y = (self.weights[self._free] * self._sides) @ inverse
             slack = residual - columns @ at
             slack[self._rows] = np.inf
             row = int(slack.argmin()) if slack.size else -1
             short = -float(slack[row]) if slack.size else 0.0
-            excess, entry, up = self._furthest(at.tolist())
+            excess, entry, up = self._find_largest_violation(at.tolist())
             if max(excess, short) <= FEASIBLE:
                 multipliers = np.zeros(h.size)
                 multipliers[self._rows] = np.maximum(y, 0.0)
@@ -109,9 +109,9 @@ class WarmProgram:
             else:  # the slope of the entry leaves its limit
                 change = inverse[entry] if up else -inverse[entry]
                 slope_change, kept = change @ self.G[self._rows], self._free[:entry] + self._free[entry + 1 :]
-                self._place[self._free[entry]] = (1 - self._side[entry]) // 2 - up
+                self._positions[self._free[entry]] = (1 - self._sides[entry]) // 2 - up
             slope_change[kept] = 0.0
-            end = self._end(y, change, slope_change, max(excess, short))
+            end = self._find_step_end(y, change, slope_change, max(excess, short))
             if end is None:
                 return None
             leaving, entering = end
@@ -120,32 +120,32 @@ class WarmProgram:
             if short >= excess:
                 self._rows.append(row)
             else:
-                del self._free[entry], self._side[entry]
+                del self._free[entry], self._sides[entry]
             if entering is not None:
                 self._free.append(entering[0])
-                self._side.append(entering[1])
+                self._sides.append(entering[1])
         return None
 
-    def _furthest(self, at: list[float]) -> tuple[float, int, bool]:
+    def _find_largest_violation(self, at: list[float]) -> tuple[float, int, bool]:
         """Return the largest violation of a free entry, its number among the free entries, and whether the entry is too
         low.
 
         A free entry must be between 0 and one of its bounds. The number is -1 where no entry is outside.
         """
         furthest = (0.0, -1, False)
-        for number, (value, free, side) in enumerate(zip(at, self._free, self._side, strict=True)):
+        for number, (value, free, side) in enumerate(zip(at, self._free, self._sides, strict=True)):
             low, high = (0.0, float(self.upper[free])) if side < 0 else (float(self.lower[free]), 0.0)
             furthest = max(furthest, (low - value, number, True), (value - high, number, False))
         return furthest
 
-    def _end(
+    def _find_step_end(
         self, y: Array, change: Array, moved: Array, rising: float
     ) -> tuple[int | None, tuple[int, int] | None] | None:
         """Move multipliers ``y`` along ``change``, and slopes along ``moved (n,)``, while the dual rises, at first by
         ``rising``: the place of the multiplier that comes to 0, or the entry whose slope comes to a limit, and the sign
         of that; ``None`` where it rises for ever."""
         slopes, size, signs = y @ self.G[self._rows], np.abs(moved), np.sign(moved)
-        ahead = signs * self._place  # 1: two limits are ahead of a slope; 0: one; -1: none
+        ahead = signs * self._positions  # 1: two limits are ahead of a slope; 0: one; -1: none
         second = np.flatnonzero((ahead >= 0.0) & (size > LEAST * size.max(initial=0.0)))
         first = second[ahead[second] > 0.0]
         entries = np.concatenate([first, second])
@@ -166,7 +166,7 @@ class WarmProgram:
         if soonest <= stop:
             passed = int(lengths[order].searchsorted(soonest))
         crossed = entries[order[:passed]]
-        np.subtract.at(self._place, crossed, signs[crossed])
+        np.subtract.at(self._positions, crossed, signs[crossed])
         if soonest <= stop:
             return leaving, None
         enters = order[passed]

@@ -48,7 +48,7 @@ class Closed(Exception):
 
 
 @final
-class _Other:
+class _SearchThread:
     """The maximiser's side of a search: a thread, the points that it needs, and the answers.
 
     The object holds no reference to `AskTell`, so that the thread ends when an `AskTell` is garbage collected.
@@ -83,7 +83,7 @@ class _Other:
 
 
 @final
-class _Values:
+class _UnusedValues:
     """Values that were received and not yet used, by their points.
 
     Values are used once, in the order of their arrival, so that a point that the search needs twice is evaluated twice.
@@ -130,28 +130,28 @@ class AskTell:
         state: Mapping[str, Any] | None,
         again: Callable[..., AskTell],
     ) -> None:
-        self.domain, self._ranges, self._about, self._again = ranges.domain, ranges, dict(about), again
+        self.domain, self._ranges, self._about, self._factory = ranges.domain, ranges, dict(about), again
         self._sign = -1.0 if self._about["minimise"] else 1.0
         self._search, self._lock = search, threading.RLock()
         self._points: list[Array] = []
         self._values: list[float] = []
         self._seconds: list[float] = []
         self._started = time.monotonic()
-        self._known = _Values(repeats=bool(ranges.integer))
-        evaluations, self._owed = ([], []) if state is None else _told(state, self._about, self.domain)
+        self._unused_values = _UnusedValues(repeats=bool(ranges.integer))
+        evaluations, self._owed_numbers = ([], []) if state is None else _parse_state(state, self._about, self.domain)
         for point, value in evaluations:
-            self._take(point, value)
+            self._record(point, value)
         self._batch: list[Key] | None = None  # points for which the search waits
         self._answers: list[float | None] = []  # their values, as far as they are known
-        self._ahead: list[Key] = []  # points given to idle workers before the search needs them
-        self._given: Counter[Key] = Counter()  # points given out, without a value yet
+        self._predictions: list[Key] = []  # points given to idle workers before the search needs them
+        self._open_points: Counter[Key] = Counter()  # points given out, without a value yet
         if state is not None:
-            out, ahead = _out(state, self.domain)
-            self._given.update(out)
-            self._ahead += ahead
+            out, ahead = _parse_open_points(state, self.domain)
+            self._open_points.update(out)
+            self._predictions += ahead
         self._end: Report | BaseException | None = None
-        self._other = _Other(search)
-        self._finalizer = weakref.finalize(self, self._other.close)
+        self._thread = _SearchThread(search)
+        self._finalizer = weakref.finalize(self, self._thread.close)
 
     def __repr__(self) -> str:
         """Return the progress of the search, without a call of the maximiser."""
@@ -163,7 +163,7 @@ class AskTell:
         """True where the search has ended, and no point is left to ask for; an error of the maximiser is raised
         here."""
         with self._lock:
-            return self._waiting() is None
+            return self._list_waiting() is None
 
     @property
     def evaluations(self) -> int:
@@ -174,12 +174,12 @@ class AskTell:
     def best_value(self) -> float:
         """Best value so far, with ``minimise`` the least; ``-inf`` (``inf``) before the first value. NaN is never the
         best."""
-        return self._sign * float(self._usable().max(initial=-np.inf))
+        return self._sign * float(self._convert_values().max(initial=-np.inf))
 
     @property
     def best_point(self) -> Array:
         """Best point so far ``(d,)``; NaN before the first value."""
-        return self._points[int(self._usable().argmax())].copy() if self._values else self.domain.lower * np.nan
+        return self._points[int(self._convert_values().argmax())].copy() if self._values else self.domain.lower * np.nan
 
     def ask(self, k: int | None = None, fresh: bool = False) -> Array:
         """Return the points whose values the search needs next.
@@ -210,14 +210,14 @@ class AskTell:
         if k is not None and not is_whole(k, 1):
             raise InputError(f"ask: expected a number of points of at least 1, got {k!r}")
         with self._lock:
-            waiting = self._waiting()
+            waiting = self._list_waiting()
             if waiting is None:
                 return np.empty((0, self.domain.dimension))
             if fresh:
-                keys = self._fresh(waiting, 1 if k is None else int(k))
+                keys = self._choose_points(waiting, 1 if k is None else int(k))
             else:
                 keys = waiting if k is None else waiting[: int(k)]
-                self._given |= Counter(keys)
+                self._open_points |= Counter(keys)
             return np.array(keys, dtype=float).reshape(-1, self.domain.dimension)
 
     def tell(self, points: Array, values: Array) -> None:
@@ -241,7 +241,9 @@ class AskTell:
                 np.atleast_1d(np.array(values, dtype=float)),
             )
         except (TypeError, ValueError):
-            raise InputError(f"tell: expected points and numbers, got {_short(points)} and {_short(values)}") from None
+            raise InputError(
+                f"tell: expected points and numbers, got {_shorten(points)} and {_shorten(values)}"
+            ) from None
         if (
             point_array.ndim != 2
             or point_array.shape[1] != self.domain.dimension
@@ -251,21 +253,21 @@ class AskTell:
                 f"tell: expected points of shape (j, {self.domain.dimension}), and as many values, "
                 f"got shapes {point_array.shape} and {value_array.shape}"
             )
-        keys = _keys(point_array)
+        keys = _make_keys(point_array)
         with self._lock:
-            if self._owed:  # values of a state, for which the search first asks again
-                self._waiting()
+            if self._owed_numbers:  # values of a state, for which the search first asks again
+                self._list_waiting()
             for key, count in Counter(keys).items():
-                if count > self._given[key]:
+                if count > self._open_points[key]:
                     raise InputError(
                         f"tell: expected points that were asked for and have no value yet, got {list(key)}"
                     )
             for key, value in zip(keys, value_array.tolist(), strict=True):
-                self._given -= Counter((key,))
-                if key in self._ahead:
-                    self._ahead.remove(key)
-                self._take(np.array(key), value)
-            self._answer()
+                self._open_points -= Counter((key,))
+                if key in self._predictions:
+                    self._predictions.remove(key)
+                self._record(np.array(key), value)
+            self._send_answers()
 
     def report(self) -> Report:
         """Return the report of the search, or before its end the results so far.
@@ -273,7 +275,7 @@ class AskTell:
         With ``minimise``, values are those that were received, and the best is the least. An error of the maximiser is
         raised here.
         """
-        return self._end if self.done and isinstance(self._end, Report) else self._so_far("the search has not ended")
+        return self._end if self.done and isinstance(self._end, Report) else self._report("the search has not ended")
 
     def state(self) -> dict[str, Any]:
         """Return everything that the search needs to continue, as plain data that JSON can hold.
@@ -293,9 +295,9 @@ class AskTell:
         with self._lock:
             numbers = [WORDS.get(value, None if np.isnan(value) else value) for value in self._values]
             rows = {"points": [point.tolist() for point in self._points], "values": numbers}
-            owed = set(self._owed)
-            aside = [number for number in self._known.unused if number not in owed]
-            out, waited = list(self._given.elements()), Counter(self._ahead)
+            owed = set(self._owed_numbers)
+            aside = [number for number in self._unused_values.unused if number not in owed]
+            out, waited = list(self._open_points.elements()), Counter(self._predictions)
             ahead = []
             for number, key in enumerate(out):
                 if waited[key]:
@@ -309,12 +311,12 @@ class AskTell:
         self._finalizer()
         with self._lock:
             if self._end is None:
-                self._end = self._so_far("the search was closed")
+                self._end = self._report("the search was closed")
             self._batch = None
 
     def __reduce__(self) -> tuple[Callable[..., AskTell], tuple[object, ...]]:
         closed = not self._finalizer.alive and isinstance(self._end, Report)
-        return _taken_out, (self._again, self.state(), closed)
+        return _unpickle, (self._factory, self.state(), closed)
 
     def __enter__(self) -> Self:
         return self
@@ -324,16 +326,16 @@ class AskTell:
     ) -> None:
         self.close()
 
-    def _waiting(self) -> list[Key] | None:
+    def _list_waiting(self) -> list[Key] | None:
         """Return the points of the batch that have no value yet; ``None`` when the search has ended."""
         while self._end is None and self._batch is None:
-            wanted = self._other.wanted.get()
+            wanted = self._thread.wanted.get()
             if isinstance(wanted, np.ndarray):
-                self._batch = _keys(self._ranges.shown(wanted))
+                self._batch = _make_keys(self._ranges.shown(wanted))
                 self._answers = [None] * len(self._batch)
             else:
-                self._end = self._turned(wanted) if isinstance(wanted, Report) else wanted
-            self._answer()
+                self._end = self._convert_report(wanted) if isinstance(wanted, Report) else wanted
+            self._send_answers()
         if isinstance(self._end, BaseException):
             raise self._end
         if self._batch is None:
@@ -341,22 +343,22 @@ class AskTell:
         waiting = [key for key, value in zip(self._batch, self._answers, strict=True) if value is None]
         return list(dict.fromkeys(waiting)) if self._ranges.integer else waiting
 
-    def _answer(self) -> None:
+    def _send_answers(self) -> None:
         """Send the search the values for which it waits, where all of them are known."""
         for row, key in enumerate(self._batch or ()):
-            if self._answers[row] is None and (number := self._known.use(key)) is not None:
+            if self._answers[row] is None and (number := self._unused_values.use(key)) is not None:
                 self._answers[row] = self._sign * self._values[number]
         missing = [key for key, value in zip(self._batch or (), self._answers, strict=False) if value is None]
         if missing or self._batch is None:
-            self._demand_owed(missing)
+            self._check_owed(missing)
         if self._batch is not None and not missing:
             values, self._batch = np.array(self._answers, dtype=float), None
-            self._other.answers.put(values)
+            self._thread.answers.put(values)
 
-    def _demand_owed(self, missing: list[Key]) -> None:
+    def _check_owed(self, missing: list[Key]) -> None:
         """Refuse a state whose values belong to points that the search does not ask for now."""
-        owed = [number for number in self._owed if number in self._known.unused]
-        self._owed = []
+        owed = [number for number in self._owed_numbers if number in self._unused_values.unused]
+        self._owed_numbers = []
         if not owed or isinstance(self._end, BaseException):
             return
         if missing:
@@ -367,35 +369,35 @@ class AskTell:
             f"state: {reason}it is another maximiser, another version, or one that is not repeatable"
         )
 
-    def _fresh(self, waiting: list[Key], k: int) -> list[Key]:
+    def _choose_points(self, waiting: list[Key], k: int) -> list[Key]:
         """Return at most ``k`` points that nobody has received: first those the search waits for, then predicted
         ones."""
-        out = Counter(self._given)
+        out = Counter(self._open_points)
         keys: list[Key] = []
         for key in waiting:
             if out[key]:
                 out[key] -= 1
             elif len(keys) < k:
                 keys.append(key)
-        self._given += Counter(keys)
-        while len(keys) < k and (predictions := self._wanted_next(waiting)[: k - len(keys)]):
+        self._open_points += Counter(keys)
+        while len(keys) < k and (predictions := self._predict_points(waiting)[: k - len(keys)]):
             keys += predictions
-            self._ahead += predictions
-            self._given += Counter(predictions)
+            self._predictions += predictions
+            self._open_points += Counter(predictions)
         return keys
 
-    def _wanted_next(self, waiting: list[Key]) -> list[Key]:
+    def _predict_points(self, waiting: list[Key]) -> list[Key]:
         """Return the points that another search needs next, which receives all values and the worst value for every
         open point."""
-        usable = self._usable()
+        usable = self._convert_values()
         worst = float(usable[np.isfinite(usable)].min(initial=np.inf))
         lie = worst if np.isfinite(worst) else -np.inf
-        known_values, out = _Values(repeats=bool(self._ranges.integer)), {*waiting, *self._ahead}
+        known_values, out = _UnusedValues(repeats=bool(self._ranges.integer)), {*waiting, *self._predictions}
         for number, point in enumerate(self._points):
-            known_values.add(_keys(point[np.newaxis])[0], number)
-        with _searching(self._search) as other_search:
+            known_values.add(_make_keys(point[np.newaxis])[0], number)
+        with _open_search(self._search) as other_search:
             while isinstance(wanted := other_search.wanted.get(), np.ndarray):
-                keys = _keys(self._ranges.shown(wanted))
+                keys = _make_keys(self._ranges.shown(wanted))
                 numbers = [known_values.use(key) for key in keys]
                 missing_keys = [
                     key for key, number in zip(keys, numbers, strict=True) if number is None and key not in out
@@ -407,19 +409,19 @@ class AskTell:
                 )
         return []
 
-    def _take(self, point: Array, value: float) -> None:
-        self._known.add(_keys(point[np.newaxis])[0], len(self._values))
+    def _record(self, point: Array, value: float) -> None:
+        self._unused_values.add(_make_keys(point[np.newaxis])[0], len(self._values))
         self._points.append(np.array(point))
         self._values.append(value)
         self._seconds.append(time.monotonic() - self._started)
 
-    def _so_far(self, stopped: str) -> Report:
+    def _report(self, stopped: str) -> Report:
         points = np.array(self._points).reshape(-1, self.domain.dimension)
-        values = self._usable()
+        values = self._convert_values()
         trace = Trace(points, self._sign * values, self._sign * np.maximum.accumulate(values), np.array(self._seconds))
         return Report(self.best_value, self.best_point, self.evaluations, np.inf, trace, stopped)
 
-    def _turned(self, report: Report) -> Report:
+    def _convert_report(self, report: Report) -> Report:
         """Return the maximiser's report in the caller's coordinates and with the caller's sign."""
         trace = replace(
             report.trace,
@@ -438,13 +440,13 @@ class AskTell:
             trace=trace,
         )
 
-    def _usable(self) -> Array:
+    def _convert_values(self) -> Array:
         """Return the values ``(n,)`` with the sign of a maximisation; NaN is ``-inf``."""
         values = self._sign * np.array(self._values, dtype=float)
         return np.where(np.isnan(values), -np.inf, values)
 
 
-def _taken_out(again: Callable[..., AskTell], state: Mapping[str, Any], closed: bool) -> AskTell:
+def _unpickle(again: Callable[..., AskTell], state: Mapping[str, Any], closed: bool) -> AskTell:
     """Return a search that was pickled."""
     search = again(state=state)
     if closed:
@@ -453,53 +455,55 @@ def _taken_out(again: Callable[..., AskTell], state: Mapping[str, Any], closed: 
 
 
 @contextmanager
-def _searching(search: Search) -> Iterator[_Other]:
-    other_search = _Other(search)
+def _open_search(search: Search) -> Iterator[_SearchThread]:
+    other_search = _SearchThread(search)
     try:
         yield other_search
     finally:
         other_search.close()
 
 
-def _keys(points: Array) -> list[Key]:
+def _make_keys(points: Array) -> list[Key]:
     """Return points as keys of a dictionary."""
     return [tuple(point) for point in points.tolist()]
 
 
-def _told(state: object, about: Mapping[str, Any], domain: Box) -> tuple[list[tuple[Array, float]], Iterable[int]]:
+def _parse_state(
+    state: object, about: Mapping[str, Any], domain: Box
+) -> tuple[list[tuple[Array, float]], Iterable[int]]:
     """Return the points and values of a state, and the numbers of those that the search must ask for again.
 
     Raises `InputError` where the state is malformed, or belongs to another search.
     """
     if not isinstance(state, Mapping) or state.get("format") != FORMAT:
-        raise InputError(path="state", expected=f"what `state()` gave, format {FORMAT}", got=_short(state))
+        raise InputError(path="state", expected=f"what `state()` gave, format {FORMAT}", got=_shorten(state))
     for key, ours in about.items():
         theirs = state.get(key, LATER.get(key))
         if key == "budget" and is_whole(theirs, 1) and theirs <= ours:
             continue
         if theirs != ours:
             least = "at most " if key == "budget" else ""
-            raise InputError(path=f"state.{key}", expected=f"{least}{_short(ours)}, as given", got=_short(theirs))
+            raise InputError(path=f"state.{key}", expected=f"{least}{_shorten(ours)}, as given", got=_shorten(theirs))
     points, values, aside = state.get("points"), state.get("values"), state.get("aside", [])
     if not isinstance(points, list) or not isinstance(values, list) or len(points) != len(values):
-        raise InputError(path="state.points", expected="a list of points, and a value for each", got=_short(points))
+        raise InputError(path="state.points", expected="a list of points, and a value for each", got=_shorten(points))
     if not isinstance(aside, list) or not all(is_whole(number, 0) and number < len(points) for number in aside):
-        raise InputError(path="state.aside", expected="numbers of points", got=_short(aside))
+        raise InputError(path="state.aside", expected="numbers of points", got=_shorten(aside))
     evaluations = []
     for row, (point, value) in enumerate(zip(points, values, strict=True)):
         try:
             position = np.array(point, dtype=float)
             number = float("nan" if value is None else value)
         except (TypeError, ValueError):
-            raise InputError(path=f"state.values.{row}", expected="a point and a number", got=_short(value)) from None
+            raise InputError(path=f"state.values.{row}", expected="a point and a number", got=_shorten(value)) from None
         if position.shape != domain.lower.shape or not ((position >= domain.lower) & (position <= domain.upper)).all():
-            raise InputError(path=f"state.points.{row}", expected="a point of the domain", got=_short(point))
+            raise InputError(path=f"state.points.{row}", expected="a point of the domain", got=_shorten(point))
         evaluations.append((position, number))
     same = state.get("budget") == about["budget"]
     return evaluations, [number for number in range(len(evaluations)) if number not in set(aside)] if same else []
 
 
-def _out(state: Mapping[str, Any], domain: Box) -> tuple[list[Key], list[Key]]:
+def _parse_open_points(state: Mapping[str, Any], domain: Box) -> tuple[list[Key], list[Key]]:
     """Return the open points of a state, and those of them for which the search does not wait.
 
     Raises `InputError` where they are malformed.
@@ -511,13 +515,13 @@ def _out(state: Mapping[str, Any], domain: Box) -> tuple[list[Key], list[Key]]:
     except (TypeError, ValueError):
         usable = False
     if not isinstance(out, list) or not usable:
-        raise InputError(path="state.out", expected="a list of points of the domain", got=_short(out))
+        raise InputError(path="state.out", expected="a list of points of the domain", got=_shorten(out))
     if not isinstance(ahead, list) or not all(is_whole(number, 0) and number < len(out) for number in ahead):
-        raise InputError(path="state.ahead", expected="numbers of points that are out", got=_short(ahead))
-    keys = _keys(points)
+        raise InputError(path="state.ahead", expected="numbers of points that are out", got=_shorten(ahead))
+    keys = _make_keys(points)
     return keys, [keys[number] for number in ahead]
 
 
-def _short(value: object) -> str:
+def _shorten(value: object) -> str:
     text = repr(value)
     return text if len(text) <= 80 else text[:77] + "..."

@@ -86,7 +86,7 @@ class IdleBlocks:
         self.others = np.flatnonzero(moves if linear is None else moves & ~linear.coordinates.reshape(shape)[0])
         self.faces = linear is None  # half of the distributed blocks go there: no uniform point is near a vertex
         self.beside, self.spread = 0, 0  # blocks placed so far near acting blocks, and over the box
-        self.shares = _kronecker(self.others.size)
+        self.shares = _compute_shares(self.others.size)
 
     def neighbours(self, acts: np.ndarray) -> float:
         """Return the number of neighbours that one step tries for each acting block in each coordinate; ``inf`` where
@@ -135,7 +135,7 @@ class IdleBlocks:
         return np.clip(blocks, lower, upper).ravel()
 
 
-def _kronecker(dimension: int) -> Array:
+def _compute_shares(dimension: int) -> Array:
     """Return shares ``(dimension,)`` whose multiples modulo 1 fill the unit box evenly.
 
     The shares are powers of the root of ``x^(d+1) = x + 1`` (Roberts 2018).

@@ -37,7 +37,7 @@ class FromAskTell(Maximiser):
 
     def search(self, objective: Objective, rng: np.random.Generator) -> float:
         """Spend the budget; return ``inf``, for nothing is proven."""
-        unit = _Unit(objective)
+        unit = _UnitObjective(objective)
         while objective.remaining:
             optimiser = self.create(objective.domain.dimension, objective.remaining, rng)
             stop: Callable[[], object] = getattr(optimiser, "stop", bool)
@@ -62,7 +62,7 @@ class FromMinimiser(Maximiser):
 
     def search(self, objective: Objective, rng: np.random.Generator) -> float:
         """Spend the budget; return ``inf``, for nothing is proven."""
-        unit = _Unit(objective)
+        unit = _UnitObjective(objective)
         start = unit.best if objective.evaluations else np.full(objective.domain.dimension, 0.5)
         while objective.remaining:
             before = objective.evaluations
@@ -117,7 +117,7 @@ def from_minimiser(minimise: Callable[[Callable[[Any], float], Array], object]) 
     return FromMinimiser(minimise)
 
 
-class _Unit:
+class _UnitObjective:
     """An objective in the unit box, with losses instead of values."""
 
     def __init__(self, objective: Objective) -> None:

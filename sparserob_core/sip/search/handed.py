@@ -168,46 +168,48 @@ class Moving(Handed):
 
     def __init__(self, objective: Objective, moves: NDArray[np.intp], asker: str) -> None:
         super().__init__(objective)
-        self._moves, self._asker = moves, asker
+        self._free_axes, self._asker = moves, asker
         self._fixed = objective.domain.lower.copy()
         self.domain = Box(objective.domain.lower[moves], objective.domain.upper[moves])
-        self.block = _block(objective.block, moves, objective.domain.dimension)
+        self.block = _count_moving(objective.block, moves, objective.domain.dimension)
 
     def full(self, points: Array) -> Array:
         """Return points ``(k, d)`` with the fixed coordinates filled in; raise `PluginError` for a wrong shape."""
         free_points = np.asarray(points, dtype=float)
-        if free_points.ndim != 2 or free_points.shape[1] != self._moves.size:
-            raise PluginError(f"{self._asker}: points: expected shape (k, {self._moves.size}), got {free_points.shape}")
+        if free_points.ndim != 2 or free_points.shape[1] != self._free_axes.size:
+            raise PluginError(
+                f"{self._asker}: points: expected shape (k, {self._free_axes.size}), got {free_points.shape}"
+            )
         full = np.repeat(self._fixed[np.newaxis], len(free_points), axis=0)
-        full[:, self._moves] = free_points
+        full[:, self._free_axes] = free_points
         return full
 
     def own(self, points: Array) -> Array:
         """Return the moving coordinates ``(k, c)`` of points ``(k, d)``."""
-        return points[:, self._moves]
+        return points[:, self._free_axes]
 
     def marked(self, truths: np.ndarray) -> np.ndarray:
         """Return the truth values ``(c,)`` of the moving coordinates."""
-        return truths[self._moves]
+        return truths[self._free_axes]
 
     def slope(self, gradient: Array) -> Array:
         """Return the gradient ``(c,)`` in the moving coordinates."""
-        return gradient[self._moves]
+        return gradient[self._free_axes]
 
     @property
-    def _whole(self) -> bool:
+    def _has_full_blocks(self) -> bool:
         """True where the blocks are those of the full objective, without their fixed coordinates."""
         return self.domain.dimension // self.block == self._fixed.size // self._objective.block
 
     @property
     def acting(self) -> Callable[[], np.ndarray] | None:
         """Function that returns the acting blocks; ``None`` where the blocks differ from those of the objective."""
-        return self._objective.acting if self._whole else None
+        return self._objective.acting if self._has_full_blocks else None
 
     @cached_property
     def linear(self) -> LinearBlocks | None:
         """Linear coordinates of the blocks; ``None`` where the blocks differ from those of the objective."""
-        return super().linear if self._whole else None
+        return super().linear if self._has_full_blocks else None
 
 
 @final
@@ -233,7 +235,7 @@ class Scaled(Handed):
         self.sides = power_of_two(domain.upper - domain.lower)
         self.domain = Box(domain.lower / self.sides, domain.upper / self.sides)
         self.value = 0.0  # the unit of the values; 0 while none is known
-        self._learn(values)
+        self._set_value_unit(values)
 
     def full(self, points: Array) -> Array:
         """Return points ``(k, d)`` in the user's units."""
@@ -245,7 +247,7 @@ class Scaled(Handed):
 
     def values(self, values: Array) -> Array:
         """Return values ``(k,)`` in their unit, which is set by the first value that is neither 0 nor infinite."""
-        self._learn(values)
+        self._set_value_unit(values)
         return values / (self.value or 1.0)
 
     def slope(self, gradient: Array) -> Array:
@@ -257,7 +259,7 @@ class Scaled(Handed):
         unit = self.value or 1.0
         return self._objective.accepts(current * unit, candidate * unit, temperature * unit, rng)
 
-    def _learn(self, values: Array) -> None:
+    def _set_value_unit(self, values: Array) -> None:
         """Set the unit of the values by the first of them that is neither 0 nor infinite."""
         usable = np.isfinite(values) & (values != 0.0)
         if not self.value and usable.any():
@@ -289,11 +291,11 @@ class Apart(Handed):
 
     def full(self, points: Array) -> Array:
         """Return the points ``(k, d)`` with every index shifted."""
-        return self._moved(points, self._shift)
+        return self._shift_points(points, self._shift)
 
     def own(self, points: Array) -> Array:
         """Return the points ``(k, d)`` with the shifts undone."""
-        return self._moved(points, -self._shift)
+        return self._shift_points(points, -self._shift)
 
     @cached_property
     def linear(self) -> LinearBlocks | None:
@@ -309,7 +311,7 @@ class Apart(Handed):
         low, high = (np.clip(middle + side, self.domain.lower, self.domain.upper) for side in (-half, half))
         self._objective.sketch(role, low, high, rounded)
 
-    def _moved(self, points: Array, shift: Array) -> Array:
+    def _shift_points(self, points: Array, shift: Array) -> Array:
         offsets = points - self.domain.lower + shift
         offsets = np.where(
             offsets < 0.0, offsets + self._sides, np.where(offsets > self._sides, offsets - self._sides, offsets)
@@ -317,7 +319,7 @@ class Apart(Handed):
         return np.clip(self.domain.lower + offsets, self.domain.lower, self.domain.upper)
 
 
-def _block(block: int, moves: NDArray[np.intp], dimension: int) -> int:
+def _count_moving(block: int, moves: NDArray[np.intp], dimension: int) -> int:
     """Return the number of moving coordinates of an index, where they are the same in every index; otherwise 1."""
     free = np.zeros(dimension, dtype=bool)
     free[moves] = True

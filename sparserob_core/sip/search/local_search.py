@@ -49,7 +49,7 @@ def polish(objective: Objective, points: Array, values: Array) -> None:
     if not finite.any():
         return
     order = np.flatnonzero(finite)[np.argsort(-values[finite], kind="stable")][:CONSIDERED]
-    evaluated_points = _Seen(objective, points[order], values[order])
+    evaluated_points = _Evaluations(objective, points[order], values[order])
     if objective.differentiable:
         if objective.acting is not None:
             _ascend_with_idle_blocks(evaluated_points, objective.acting)
@@ -57,10 +57,10 @@ def polish(objective: Objective, points: Array, values: Array) -> None:
     if evaluated_points.dimension <= MODELLED:
         _climb(evaluated_points)
     else:
-        _feel(evaluated_points)
+        _search_by_compass(evaluated_points)
 
 
-class _Seen:
+class _Evaluations:
     """Evaluated points in the unit box, and functions that add to them."""
 
     def __init__(self, objective: Objective, points: Array, values: Array) -> None:
@@ -119,7 +119,7 @@ class _Seen:
             self.points, self.values = np.vstack([self.points, point]), np.append(self.values, value)
 
 
-def _ascend(seen: _Seen) -> None:
+def _ascend(seen: _Evaluations) -> None:
     """Run L-BFGS-B from every start; a value of ``-inf`` is replaced by the lowest finite value."""
     lowest = float(seen.values.min())
 
@@ -133,7 +133,7 @@ def _ascend(seen: _Seen) -> None:
         _minimise(descent, start, seen.objective.remaining)
 
 
-def _ascend_with_idle_blocks(seen: _Seen, acting: Callable[[], np.ndarray]) -> None:
+def _ascend_with_idle_blocks(seen: _Evaluations, acting: Callable[[], np.ndarray]) -> None:
     """Run L-BFGS-B in the acting blocks from the best point, while every evaluation moves the idle blocks
     (`IdleBlocks`).
 
@@ -148,18 +148,18 @@ def _ascend_with_idle_blocks(seen: _Seen, acting: Callable[[], np.ndarray]) -> N
     value, _ = seen.with_gradient(best)
     acts = acting()
     while seen.objective.remaining and acts.any() and not acts.all():
-        ascent = _BlockLoss(seen, acting, idle, _Standing(best, value, acts))
-        with suppress(_NewcomerError):
+        ascent = _BlockLoss(seen, acting, idle, _AscentPoint(best, value, acts))
+        with suppress(_NewBlockError):
             _minimise(ascent, best[ascent.free], seen.objective.remaining)
         best, value, acts = ascent.best.point, ascent.best.value, ascent.best.acts
 
 
-class _NewcomerError(Exception):
+class _NewBlockError(Exception):
     """Exception that reports an idle block that acts at the best point."""
 
 
 @dataclass(frozen=True, eq=False)
-class _Standing:
+class _AscentPoint:
     """A point of an ascent.
 
     Parameters
@@ -181,7 +181,9 @@ class _BlockLoss:
     """Loss and its gradient in the coordinates ``free (d,)`` of the blocks that act at ``start``; ``best`` is the best
     point."""
 
-    def __init__(self, seen: _Seen, acting: Callable[[], np.ndarray], idle: IdleBlocks, start: _Standing) -> None:
+    def __init__(
+        self, seen: _Evaluations, acting: Callable[[], np.ndarray], idle: IdleBlocks, start: _AscentPoint
+    ) -> None:
         self.seen, self.acting, self.idle, self.start, self.best = seen, acting, idle, start, start
         self.free = np.repeat(start.acts, seen.objective.block)
         self.lowest = float(seen.values.min())
@@ -192,9 +194,9 @@ class _BlockLoss:
         point = self.idle.placed(point, self.start.acts)
         value, gradient = self.seen.with_gradient(point)
         if value > self.best.value:
-            self.best = _Standing(point, value, self.acting())
+            self.best = _AscentPoint(point, value, self.acting())
             if (self.best.acts & ~self.start.acts).any():
-                raise _NewcomerError
+                raise _NewBlockError
         return -max(value, self.lowest), -gradient[self.free] / LONGEST
 
 
@@ -212,7 +214,7 @@ def _minimise(loss: Callable[[Array], tuple[float, Array]], start: Array, most: 
     )
 
 
-def _climb(seen: _Seen) -> None:
+def _climb(seen: _Evaluations) -> None:
     """Climb by the trust region from every start, and cross each result with the best point.
 
     After the first start, the maxima of a separable function fitted to the values are crossed likewise. Where the
@@ -226,14 +228,14 @@ def _climb(seen: _Seen) -> None:
         _climb_and_cross(seen, start)
 
 
-def _climb_and_cross(seen: _Seen, start: Array) -> None:
+def _climb_and_cross(seen: _Evaluations, start: Array) -> None:
     """Climb from a start, then cross the result with the best point as long as that improves it."""
     end_point = _climb_from(seen, start)
     while _cross(seen, end_point):
         end_point = _climb_from(seen, seen.top)
 
 
-def _climb_from(seen: _Seen, start: Array) -> Array:
+def _climb_from(seen: _Evaluations, start: Array) -> Array:
     """Return the end ``(d,)`` of an ascent, which stops once it can no longer exceed the best value."""
     points, values = seen.below(start)
     region, progress, window = TrustRegion(2 * APART), [float(values.max())], 2 * seen.dimension + 4
@@ -251,7 +253,7 @@ def _climb_from(seen: _Seen, start: Array) -> Array:
     return np.asarray(points[values.argmax()])
 
 
-def _cross(seen: _Seen, other: Array) -> bool:
+def _cross(seen: _Evaluations, other: Array) -> bool:
     """Return whether blocks of another local maximum, each tried alone, improve the best point.
 
     Local maxima of a nearly separable function may exchange blocks.
@@ -267,14 +269,14 @@ def _cross(seen: _Seen, other: Array) -> bool:
     return has_improved
 
 
-def _feel(seen: _Seen) -> None:
+def _search_by_compass(seen: _Evaluations) -> None:
     """Run a compass search (Hooke and Jeeves 1961).
 
     The search moves one coordinate at a time up or down, by a step of its own that doubles or halves.
     """
     best, value = seen.top.copy(), float(seen.values.max())
     steps = np.full(seen.dimension, 0.1)
-    stride = _stride(seen.dimension)
+    stride = _choose_stride(seen.dimension)
     coordinate = 0
     while seen.objective.remaining and steps.max() > 1e-12:
         coordinate = (coordinate + stride) % seen.dimension
@@ -290,7 +292,7 @@ def _feel(seen: _Seen) -> None:
         steps[coordinate] = min(0.5, abs(steps[coordinate]) * 2.0) if is_better else 0.5 * steps[coordinate]
 
 
-def _stride(dimension: int) -> int:
+def _choose_stride(dimension: int) -> int:
     """Return a step through all coordinates whose order mixes them well: near the golden section, without a common
     factor."""
     stride = max(1, round(0.618 * dimension))

@@ -58,11 +58,11 @@ class Notifier:
         self.points: list[Array] = []
         self.values: list[Array] = []
         self.moments: list[tuple[int, float]] = []
-        self._noted: dict[str, int] = {}
+        self._note_counts: dict[str, int] = {}
         self._sketches: dict[str, Sketch] = {}
         self._origin: tuple[Array | None, float] = (None, np.nan)
-        self._last: tuple[Array | None, float] = (None, np.nan)
-        self._accepted: tuple[Array, float] | None = None
+        self._last_point: tuple[Array | None, float] = (None, np.nan)
+        self._accepted_point: tuple[Array, float] | None = None
 
     def due(self, evaluations: int, budget: int) -> bool:
         """Return whether an event is due: by the clock, after a share of the budget, or because many numbers wait.
@@ -91,12 +91,12 @@ class Notifier:
         self.values.append(values)
         self.moments.append((values.size, moment))
         self.numbers += points.size
-        self._last = points[-1], float(values[-1])
+        self._last_point = points[-1], float(values[-1])
 
     def note(self, scalars: Mapping[str, float]) -> None:
         """Make the last point the current point of the search, where the maximiser notes that it has accepted it."""
-        if scalars.get("accepted") and self._last[0] is not None:
-            self._accepted = self._last[0], self._last[1]
+        if scalars.get("accepted") and self._last_point[0] is not None:
+            self._accepted_point = self._last_point[0], self._last_point[1]
 
     def sketch(self, role: str, lower: Array, upper: Array | None, rounded: bool) -> None:
         """Keep a sketch for the next event; only the last sketch of a role is sent."""
@@ -115,9 +115,9 @@ class Notifier:
             Notes of the whole search: pairs (evaluations so far, value) for each name.
         """
         fresh = {
-            name: rows[self._noted.get(name, 0) :]
+            name: rows[self._note_counts.get(name, 0) :]
             for name, rows in notes.items()
-            if len(rows) > self._noted.get(name, 0)
+            if len(rows) > self._note_counts.get(name, 0)
         }
         batch = Batch(self.points, self.values, self.moments, fresh, self.notified, self.best, *self._origin)
         count, self.notified, self.notified_at = (
@@ -141,6 +141,6 @@ class Notifier:
         )
         self._sketches = {}
         self.points, self.values, self.moments, self.numbers, self.best = [], [], [], 0, standing.best_value
-        self._noted = {name: len(rows) for name, rows in notes.items()}
-        self._origin = self._last if self._accepted is None else self._accepted
+        self._note_counts = {name: len(rows) for name, rows in notes.items()}
+        self._origin = self._last_point if self._accepted_point is None else self._accepted_point
         self.notify(event)

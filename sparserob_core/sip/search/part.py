@@ -36,9 +36,9 @@ class SearchPart(Handed):
     def __init__(self, objective: Objective, budget: int, points: Array, values: Array) -> None:
         super().__init__(objective)
         self.domain, self.block = objective.domain, objective.block
-        self._budget, self._spent, self._recalls = budget, 0, 0
+        self._budget, self._spent, self._recall_count = budget, 0, 0
         self._points, self._values = points, values
-        self._before = {point.tobytes(): float(value) for point, value in zip(points, values, strict=True)}
+        self._stored_values = {point.tobytes(): float(value) for point, value in zip(points, values, strict=True)}
         self.found: list[tuple[Array, Array]] = []
         """Points ``(k, d)`` and values ``(k,)`` of every batch that was evaluated; only the best point where all would
         be too many."""
@@ -124,14 +124,14 @@ class SearchPart(Handed):
         """
         point_array = np.array(points, dtype=float)
         values = np.full(len(point_array), np.nan)
-        if self._before and self._recalls < self._budget:
-            values[:] = [self._before.get(point.tobytes(), np.nan) for point in point_array]
-            self._recalls += int((~np.isnan(values)).sum())
+        if self._stored_values and self._recall_count < self._budget:
+            values[:] = [self._stored_values.get(point.tobytes(), np.nan) for point in point_array]
+            self._recall_count += int((~np.isnan(values)).sum())
         unknown = np.flatnonzero(np.isnan(values))
         allowed = unknown[: self.remaining]
         if allowed.size:
             values[allowed] = self._objective.evaluate(point_array[allowed])
-            self._take(point_array[allowed], values[allowed])
+            self._record(point_array[allowed], values[allowed])
         if allowed.size < unknown.size:
             raise _PartEnded("the budget of the part is spent")
         return values
@@ -142,10 +142,10 @@ class SearchPart(Handed):
         if self.remaining <= 0:
             raise _PartEnded("the budget of the part is spent")
         value, gradient = self._objective.value_and_gradient(point)
-        self._take(np.array(point, dtype=float)[np.newaxis], np.array([value]))
+        self._record(np.array(point, dtype=float)[np.newaxis], np.array([value]))
         return value, gradient
 
-    def _take(self, points: Array, values: Array) -> None:
+    def _record(self, points: Array, values: Array) -> None:
         self._spent += len(values)
         top = int(values.argmax())
         if values[top] > self._best_value or np.isnan(self._best_point[0]):

@@ -44,7 +44,7 @@ class Ranges:
 
     def __post_init__(self) -> None:
         for name in ("integer", "logarithmic"):
-            object.__setattr__(self, name, self._coordinates(name, getattr(self, name)))
+            object.__setattr__(self, name, self._check_coordinates(name, getattr(self, name)))
         lower, upper = self.domain.lower, self.domain.upper
         for i in self.integer:
             if not (float(lower[i]).is_integer() and float(upper[i]).is_integer()):
@@ -55,7 +55,7 @@ class Ranges:
             if lower[i] <= 0.0:
                 raise InputError(path=f"logarithmic.{i}", expected="a positive lower bound", got=f"{float(lower[i])!r}")
 
-    def _coordinates(self, name: str, chosen: object) -> list[int]:
+    def _check_coordinates(self, name: str, chosen: object) -> list[int]:
         size = self.domain.dimension
         if (
             isinstance(chosen, str)

@@ -174,10 +174,10 @@ class CountedObjective:
         self.evaluations = 0
         self.missing = 0  # evaluations that gave NaN
         self.learnt = 0  # points that were known before, which are no evaluations of this search
-        self._gained = 0  # number of evaluations at the last gain
-        self._known = np.empty((0, self.domain.dimension)), np.empty(0)
-        self._before: dict[tuple[float, ...], float] = {}  # the known values by their points
-        self._recalls = 0
+        self._last_gain = 0  # number of evaluations at the last gain
+        self._known_evaluations = np.empty((0, self.domain.dimension)), np.empty(0)
+        self._stored_values: dict[tuple[float, ...], float] = {}  # the known values by their points
+        self._recall_count = 0
         own = rules or Rules()
         self._target, self._patience, self._halt = own.target, own.patience, own.halt
         self.searched: int | None = None
@@ -191,12 +191,12 @@ class CountedObjective:
         self._notes: dict[str, list[tuple[float, float]]] = {}
         self._notifier = None if notify is ignore else Notifier(notify, target.domain)
         self._started = time.monotonic()
-        self._ends = self._started + (rules or Rules()).seconds
+        self._end_time = self._started + (rules or Rules()).seconds
 
     @property
     def late(self) -> bool:
         """True where the time of the search is over."""
-        return time.monotonic() >= self._ends
+        return time.monotonic() >= self._end_time
 
     @property
     def remaining(self) -> int:
@@ -226,55 +226,55 @@ class CountedObjective:
             raise self.ended
         if self._notifier is not None and self._notifier.due(self.evaluations, self.budget):
             self.notify_observers()
-        point_array = self._checked(points)
-        values = self._recalled(point_array)
+        point_array = self._check_points(points)
+        values = self._recall_values(point_array)
         unknown = np.flatnonzero(np.isnan(values))
         allowed = unknown[: self.remaining]
         while len(allowed):  # in one batch, unless the search may end within it for lack of a gain
-            batch = allowed[: self._patient]
-            values[batch] = self._values_at(point_array[batch])
+            batch = allowed[: self._remaining_patience]
+            values[batch] = self._evaluate_function(point_array[batch])
             self._record(point_array[batch], values[batch])
             allowed = allowed[len(batch) :]
-            self._judge()
+            self._check_ends()
         if not len(unknown):
-            self._judge()
+            self._check_ends()
         if np.isnan(values).any():
-            raise self._end(SearchEnded("the budget is spent"))
+            raise self._record_end(SearchEnded("the budget is spent"))
         return values
 
-    def _recalled(self, points: Array) -> Array:
+    def _recall_values(self, points: Array) -> Array:
         """Return the values ``(k,)`` that are known from before; NaN elsewhere.
 
         At most as many values as the budget are recalled, so that a maximiser that asks for nothing else ends too.
         """
         values = np.full(len(points), np.nan)
-        if self._before and self._recalls < self.budget:
-            values[:] = [self._before.get(tuple(point), np.nan) for point in points.tolist()]
-            self._recalls += int((~np.isnan(values)).sum())
+        if self._stored_values and self._recall_count < self.budget:
+            values[:] = [self._stored_values.get(tuple(point), np.nan) for point in points.tolist()]
+            self._recall_count += int((~np.isnan(values)).sum())
         return values
 
     @property
-    def _patient(self) -> int:
+    def _remaining_patience(self) -> int:
         """Number of further evaluations that may bring no gain."""
-        return self.budget if self._patience is None else max(1, self._patience - self.evaluations + self._gained)
+        return self.budget if self._patience is None else max(1, self._patience - self.evaluations + self._last_gain)
 
-    def _judge(self) -> None:
+    def _check_ends(self) -> None:
         """End the search where there is a reason."""
         if self.best_value == np.inf:
-            raise self._end(SearchEnded("a value of +inf was found, which nothing can exceed"))
+            raise self._record_end(SearchEnded("a value of +inf was found, which nothing can exceed"))
         if self.best_value >= self._target:
             self.whole_end = True
-            raise self._end(SearchEnded(f"the target {self._target:.9g} is reached"))
-        if self._patience is not None and self.evaluations - self._gained >= self._patience:
+            raise self._record_end(SearchEnded(f"the target {self._target:.9g} is reached"))
+        if self._patience is not None and self.evaluations - self._last_gain >= self._patience:
             self.whole_end = True
-            raise self._end(SearchEnded(f"the last {self._patience} evaluations gained nothing"))
+            raise self._record_end(SearchEnded(f"the last {self._patience} evaluations gained nothing"))
         if self._halt is not None and self._halt():
             self.whole_end = True
-            raise self._end(SearchEnded("the callback says so"))
-        if self._stopped():
-            raise self._end(SearchEnded("the stopping rule of the search says so"))
+            raise self._record_end(SearchEnded("the callback says so"))
+        if self._is_stopped():
+            raise self._record_end(SearchEnded("the stopping rule of the search says so"))
         if self.late:
-            raise self._end(SearchEnded("the time limit of the search is reached"))
+            raise self._record_end(SearchEnded("the time limit of the search is reached"))
 
     def learn(self, points: Float[Array, "k d"], values: Float[Array, " k"]) -> None:
         """Accept points whose values are known from before; to be called before the first evaluation.
@@ -289,23 +289,25 @@ class CountedObjective:
             Their values; NaN counts as ``-inf``.
         """
         clean_values, self.learnt = np.where(np.isnan(values), -np.inf, values), len(values)
-        self._known = self._checked(points), clean_values
-        self._before = dict(zip(map(tuple, self._known[0].tolist()), clean_values.tolist(), strict=True))
-        self.budget, self.evaluations, self._gained = self.budget + self.learnt, self.learnt, self.learnt
+        self._known_evaluations = self._check_points(points), clean_values
+        self._stored_values = dict(
+            zip(map(tuple, self._known_evaluations[0].tolist()), clean_values.tolist(), strict=True)
+        )
+        self.budget, self.evaluations, self._last_gain = self.budget + self.learnt, self.learnt, self.learnt
         top = int(clean_values.argmax())
-        self.best_value, self.best_point = float(clean_values[top]), self._known[0][top].copy()
+        self.best_value, self.best_point = float(clean_values[top]), self._known_evaluations[0][top].copy()
         if self._notifier is not None:
             self._notifier.notified = self.learnt
-        self._judge()
+        self._check_ends()
 
     def begin(self, start: Float[Array, "k d"]) -> None:
         """Evaluate the points ``(k, d)`` at which the search starts."""
         self.evaluate(start)
-        self._known = self.seen()
+        self._known_evaluations = self.seen()
 
     def known(self) -> tuple[Float[Array, "k d"], Float[Array, " k"]]:
         """Return the points ``(k, d)`` that were known before the maximiser was called, and their values ``(k,)``."""
-        return self._known
+        return self._known_evaluations
 
     @shaped
     def value_and_gradient(self, point: Float[Array, " d"]) -> tuple[float, Float[Array, " d"]]:
@@ -316,14 +318,14 @@ class CountedObjective:
         slope = np.zeros(self.domain.dimension)
         if np.isfinite(value):
             slope = np.asarray(
-                self._called(self.target.gradient, np.array(point, dtype=float), slope.shape), dtype=float
+                self._call_function(self.target.gradient, np.array(point, dtype=float), slope.shape), dtype=float
             )
         return value, slope
 
     def accepts(self, current: float, candidate: float, temperature: float, rng: np.random.Generator) -> bool:
         """Return the answer of the rule ``SlCr`` (`Objective.accepts`)."""
         selection = (self.rules or Rules()).selection
-        return bool(_of_rule("slcr", lambda: selection(current, candidate, temperature, rng)))
+        return bool(_ask_rule("slcr", lambda: selection(current, candidate, temperature, rng)))
 
     def note(self, **scalars: float) -> None:
         """Record scalars in the trace, and pass them to observers."""
@@ -356,7 +358,7 @@ class CountedObjective:
         if not self._keeps:
             return self.best_point[np.newaxis], np.array([self.best_value])
         own = slice(0, self.learnt)
-        points, values = self._known[0][own], self._known[1][own]
+        points, values = self._known_evaluations[0][own], self._known_evaluations[1][own]
         return np.concatenate([points, *self._points]), np.concatenate([values, *self._values])
 
     def report(self, stopped: str, upper_bound: float = np.inf) -> Report:
@@ -390,17 +392,17 @@ class CountedObjective:
             standing = Standing(self.evaluations, self.budget, self.best_value, self.best_point, self.block, phase)
             self._notifier.publish(standing, self._notes)
 
-    def _last_notes(self) -> dict[str, float]:
+    def _collect_last_notes(self) -> dict[str, float]:
         return {name: rows[-1][1] for name, rows in self._notes.items()}
 
-    def _stopped(self) -> bool:
+    def _is_stopped(self) -> bool:
         stop = None if self.rules is None else self.rules.stop
         if stop is None:
             return False
-        progress = Progress(self.evaluations, self.best_value, self._last_notes(), self._improvements)
-        return bool(_of_rule("sc2", lambda: stop(progress)))
+        progress = Progress(self.evaluations, self.best_value, self._collect_last_notes(), self._improvements)
+        return bool(_ask_rule("sc2", lambda: stop(progress)))
 
-    def _checked(self, points: Array) -> Array:
+    def _check_points(self, points: Array) -> Array:
         point_array = np.array(points, dtype=float)
         if point_array.ndim != 2 or point_array.shape[1] != self.domain.dimension:
             raise PluginError(
@@ -409,25 +411,27 @@ class CountedObjective:
         if not ((point_array >= self.domain.lower).all() and (point_array <= self.domain.upper).all()):
             outside = ~((point_array >= self.domain.lower) & (point_array <= self.domain.upper)).all(axis=1)
             raise PluginError(
-                f"{self.asker}: points: {_shown(point_array[outside][0])} lies outside the domain, "
-                f"lower {_shown(self.domain.lower)}, upper {_shown(self.domain.upper)}"
+                f"{self.asker}: points: {_format_point(point_array[outside][0])} lies outside the domain, "
+                f"lower {_format_point(self.domain.lower)}, upper {_format_point(self.domain.upper)}"
             )
         return point_array
 
-    def _end(self, reason: SearchEnded | EvaluationError) -> SearchEnded | EvaluationError:
+    def _record_end(self, reason: SearchEnded | EvaluationError) -> SearchEnded | EvaluationError:
         self.ended = reason
         return reason
 
     @shaped
-    def _values_at(self, points: Float[Array, "k d"]) -> Float[Array, " k"]:
-        values = np.array(self._called(self.target.function, points.copy() if self._keeps else points, (len(points),)))
+    def _evaluate_function(self, points: Float[Array, "k d"]) -> Float[Array, " k"]:
+        values = np.array(
+            self._call_function(self.target.function, points.copy() if self._keeps else points, (len(points),))
+        )
         missing = np.isnan(values)
         if missing.any():
             values[missing] = -np.inf
             self.missing += int(missing.sum())
         return values
 
-    def _called(self, function: Function, argument: Array, shape: tuple[int, ...]) -> Array:
+    def _call_function(self, function: Function, argument: Array, shape: tuple[int, ...]) -> Array:
         """Return the values of the user's function, checked for shape; an error of the function ends the search."""
         try:
             returned = np.asarray(function(argument))
@@ -440,14 +444,14 @@ class CountedObjective:
             raise
         except BaseException as error:
             best = (
-                f"the best of them {self.best_value:.9g} at {_shown(self.best_point)}"
+                f"the best of them {self.best_value:.9g} at {_format_point(self.best_point)}"
                 if self.evaluations
                 else "none before"
             )
             reason = (
                 f"the function failed after {self.evaluations} evaluations ({best}): {type(error).__name__}: {error}"
             )
-            raise self._end(EvaluationError(reason, self.report("the function failed"))) from error
+            raise self._record_end(EvaluationError(reason, self.report("the function failed"))) from error
         return values
 
     @shaped
@@ -465,10 +469,10 @@ class CountedObjective:
         if values[top] > self.best_value or first:
             self.best_value, self.best_point = float(values[top]), points[top].copy()
             self._improvements.append((self.evaluations, self.best_value))
-            self._gained = self.evaluations - len(values) + top + 1
+            self._last_gain = self.evaluations - len(values) + top + 1
 
 
-def _of_rule(name: str, ask: Callable[[], object]) -> object:
+def _ask_rule(name: str, ask: Callable[[], object]) -> object:
     """Return the answer of a rule; raise `PluginError` in the rule's name where it fails."""
     try:
         return ask()
@@ -478,7 +482,7 @@ def _of_rule(name: str, ask: Callable[[], object]) -> object:
         raise PluginError(f"{name}: the rule raised {type(error).__name__}: {error}") from error
 
 
-def _shown(point: Array) -> str:
+def _format_point(point: Array) -> str:
     return str(point.tolist()) if point.size <= 12 else f"a point with {point.size} coordinates"
 
 
@@ -545,7 +549,7 @@ def maximise(
                 objective.learn(*known)
             if start is not None:
                 objective.begin(np.atleast_2d(start))
-            bound = ask(maximiser, shown, rng) if moves.size else _only_value(objective)
+            bound = ask(maximiser, shown, rng) if moves.size else _evaluate_only_point(objective)
             stopped = stopped if objective.remaining else "the budget is spent"
         except SearchEnded as end:
             stopped = str(end)
@@ -626,7 +630,7 @@ def name_of(maximiser: Maximiser) -> str:
     return str(getattr(maximiser, "origin", f"maximiser {type(maximiser).__name__}"))
 
 
-def _only_value(objective: CountedObjective) -> float:
+def _evaluate_only_point(objective: CountedObjective) -> float:
     """Return the value at the only point of a domain in which no coordinate can move."""
     if objective.evaluations:
         return objective.best_value

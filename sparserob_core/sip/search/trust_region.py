@@ -68,11 +68,11 @@ class TrustRegion:
         self.promise = 0.0
         """Gain over the best value that the model predicts for the last proposal."""
         self._best, self._length = -np.inf, 0.0
-        self._spanning, self._failed, self._hopeless = False, False, False
+        self._is_spanning, self._has_failed, self._is_hopeless = False, False, False
 
     def restart(self) -> None:
         """Forget the radius, since another point that is farther away than the radius has become the best."""
-        self.radius, self._failed, self._hopeless = 0.0, False, False
+        self.radius, self._has_failed, self._is_hopeless = 0.0, False, False
 
     def propose(self, points: Array, values: Array) -> Array | None:
         """Return the next point to evaluate.
@@ -91,43 +91,43 @@ class TrustRegion:
         """
         top = int(values.argmax())
         if values[top] > self._best:
-            self._best, self._hopeless = float(values[top]), False
-        offsets, distances, rises = _neighbours(points, values, top)
+            self._best, self._is_hopeless = float(values[top]), False
+        offsets, distances, rises = _find_neighbours(points, values, top)
         if not self.radius:
             self.radius = min(FIRST, 0.95 * float(distances.max(initial=0.0))) or FIRST
         lower, upper = -points[top], 1.0 - points[top]
         while self.radius >= SMALLEST:
-            step = _missing_direction(offsets, distances, self.radius, lower, upper) if self._failed else None
-            self._spanning = step is not None
+            step = _find_missing_direction(offsets, distances, self.radius, lower, upper) if self._has_failed else None
+            self._is_spanning = step is not None
             if step is None:
                 size = float(np.abs(rises).max(initial=0.0)) or 1.0
-                model = _fit(offsets, distances, rises / size, self.radius)
+                model = _fit_quadratic(offsets, distances, rises / size, self.radius)
                 step = highest_in_ball_and_box(model.gradient, model.hessian, self.radius, lower, upper)
                 self.promise = size * model.gain(step)
-            if self._spanning or self.promise > 1e-17 * abs(self._best):
+            if self._is_spanning or self.promise > 1e-17 * abs(self._best):
                 self._length = float(np.linalg.norm(step))
                 point: Array = np.clip(points[top] + step, 0.0, 1.0)
                 if not (point == points).all(axis=1).any():
                     return point
-            if self._hopeless:
+            if self._is_hopeless:
                 break
             # A model that predicts no gain is accepted only when another one, of a tenth of the size, agrees.
-            self.radius, self._failed, self._hopeless = 0.1 * self.radius, True, True
+            self.radius, self._has_failed, self._is_hopeless = 0.1 * self.radius, True, True
         return None
 
     def tell(self, value: float) -> None:
         """Receive the value at the point that was proposed last, and adapt the radius."""
-        if self._spanning:
+        if self._is_spanning:
             return
         ratio = (value - self._best) / self.promise
-        self._failed = not ratio >= 0.25
-        if self._failed:
+        self._has_failed = not ratio >= 0.25
+        if self._has_failed:
             self.radius = 0.5 * min(self.radius, max(self._length, 0.25 * self.radius))
         elif ratio > 0.75:
             self.radius = max(self.radius, min(LARGEST, 2.0 * self._length))
 
 
-def _neighbours(points: Array, values: Array, top: int) -> tuple[Array, Array, Array]:
+def _find_neighbours(points: Array, values: Array, top: int) -> tuple[Array, Array, Array]:
     """Return offsets, distances and differences of value of the points nearest to point ``top``, nearest first."""
     dimension = points.shape[1]
     offsets = points - points[top]
@@ -146,7 +146,7 @@ def _neighbours(points: Array, values: Array, top: int) -> tuple[Array, Array, A
     )
 
 
-def _fit(offsets: Array, distances: Array, rises: Array, radius: float) -> _Quadratic:
+def _fit_quadratic(offsets: Array, distances: Array, rises: Array, radius: float) -> _Quadratic:
     """Return the quadratic through the best point that fits its neighbours."""
     count, dimension = offsets.shape
     if count == 0:
@@ -165,7 +165,9 @@ def _fit(offsets: Array, distances: Array, rises: Array, radius: float) -> _Quad
     )
 
 
-def _missing_direction(offsets: Array, distances: Array, radius: float, lower: Array, upper: Array) -> Array | None:
+def _find_missing_direction(
+    offsets: Array, distances: Array, radius: float, lower: Array, upper: Array
+) -> Array | None:
     """Return a step of length ``radius`` in the direction that the near points span least; ``None`` where they span the
     space."""
     near_offsets = offsets[distances <= 5.0 * radius] / radius
@@ -252,10 +254,10 @@ def highest_in_ball(gradient: Array, hessian: Array, radius: float) -> Array:
     if missing >= 0.0:
         inner[0] += np.copysign(np.sqrt(inner[0] ** 2 + missing) - abs(inner[0]), slope[0])
         return np.asarray(basis @ inner, dtype=float)
-    return np.asarray(basis @ _on_the_sphere(slope, curvature, radius, least), dtype=float)
+    return np.asarray(basis @ _step_to_sphere(slope, curvature, radius, least), dtype=float)
 
 
-def _on_the_sphere(slope: Array, curvature: Array, radius: float, least: float) -> Array:
+def _step_to_sphere(slope: Array, curvature: Array, radius: float, least: float) -> Array:
     """Return ``slope / (curvature + shift)`` of length ``radius`` with ``shift >= least``.
 
     Newton's method on the inverse of the length finds the shift from the left.

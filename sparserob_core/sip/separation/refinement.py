@@ -81,13 +81,13 @@ def refine(function: VectorFunction, candidates: Candidates, least: float = -np.
     count, dimension = candidates.points.shape
     if dimension == 0 or count == 0:
         return candidates
-    offsets = _stencil(dimension)
+    offsets = _build_stencil(dimension)
     curvature = np.full((count, dimension), np.nan)
     active = np.arange(count)
     points, values, radius = candidates.points.copy(), candidates.values.copy(), candidates.radius.copy()
     for _ in range(STEPS):
         now = Candidates(points[active], candidates.rows[active], values[active], radius[active])
-        better, curved, is_done = _step(function, now, offsets, curvature[active], least)
+        better, curved, is_done = _take_step(function, now, offsets, curvature[active], least)
         points[active], values[active], radius[active], curvature[active] = (
             better.points,
             better.values,
@@ -100,24 +100,24 @@ def refine(function: VectorFunction, candidates: Candidates, least: float = -np.
     return replace(candidates, points=points, values=values, radius=radius)
 
 
-def _step(
+def _take_step(
     function: VectorFunction, now: Candidates, offsets: Array, curvature: Array, least: float
 ) -> tuple[Candidates, Array, Truths]:
     radius = np.minimum(now.radius, 0.5)[:, np.newaxis]
     middle = np.clip(now.points, radius, 1 - radius)
     stencil = inside(middle[:, np.newaxis] + radius[:, np.newaxis] * offsets)
-    stencil_values = _values(function, stencil, now.rows)
-    model = _fit(middle, stencil_values, offsets)
-    steps = _climb(model, np.maximum(-REACH, -middle / radius), np.minimum(REACH, (1 - middle) / radius))
+    stencil_values = _evaluate_points(function, stencil, now.rows)
+    model = _fit_models(middle, stencil_values, offsets)
+    steps = _maximise_models(model, np.maximum(-REACH, -middle / radius), np.minimum(REACH, (1 - middle) / radius))
     trial = inside(middle + radius * steps)
-    trial_values = _values(function, trial[:, np.newaxis], now.rows)
+    trial_values = _evaluate_points(function, trial[:, np.newaxis], now.rows)
     scale = np.maximum(1.0, np.abs(now.values))
     curved = np.einsum("aii->ai", model.hessian) / radius**2
     change = np.abs(np.nan_to_num(curved - curvature, nan=np.inf, posinf=np.inf)).max(axis=1) * radius[:, 0] ** 2
     is_smooth = (np.abs(trial_values[:, 0] - model.at(steps)) <= 0.05 * model.spread + ACCURACY * scale) & (
         change <= 0.1 * model.spread
     )
-    points, values = _best(
+    points, values = _keep_best(
         now,
         np.concatenate([stencil, trial[:, np.newaxis]], axis=1),
         np.concatenate([stencil_values, trial_values], axis=1),
@@ -130,7 +130,7 @@ def _step(
     return Candidates(points, now.rows, values, radius[:, 0] * shrink), curved, is_done
 
 
-def _stencil(dimension: int) -> Array:
+def _build_stencil(dimension: int) -> Array:
     """The middle, one step either way along every coordinate, and the four corners of every pair of coordinates."""
     unit = np.eye(dimension)
     offsets = [np.zeros(dimension), *unit, *-unit]
@@ -149,13 +149,13 @@ def inside(points: Array) -> Array:
     return np.where(points > 1 - 1e-15, 1.0, points)
 
 
-def _values(function: VectorFunction, points: Array, rows: Rows) -> Array:
+def _evaluate_points(function: VectorFunction, points: Array, rows: Rows) -> Array:
     count, size, dimension = points.shape
     values = function(points.reshape(count * size, dimension)).reshape(count, size, -1)
     return np.take_along_axis(values, rows[:, np.newaxis, np.newaxis], axis=2)[:, :, 0]
 
 
-def _fit(middle: Array, seen: Array, offsets: Array) -> _Model:
+def _fit_models(middle: Array, seen: Array, offsets: Array) -> _Model:
     count, dimension = middle.shape
     finite = np.asarray(np.isfinite(seen).all(axis=1))
     safe = np.where(finite[:, np.newaxis], seen, 0.0)
@@ -173,7 +173,7 @@ def _fit(middle: Array, seen: Array, offsets: Array) -> _Model:
     return _Model(middle, centre[:, 0], (ahead - behind) / 2, hessian, spread)
 
 
-def _climb(model: _Model, lower: Array, upper: Array) -> Array:
+def _maximise_models(model: _Model, lower: Array, upper: Array) -> Array:
     """Maximise the models over boxes: a Newton step with the curvature made concave, then coordinate ascent, exact for
     one coordinate."""
     dimension = lower.shape[1]
@@ -193,7 +193,7 @@ def _climb(model: _Model, lower: Array, upper: Array) -> Array:
     return steps
 
 
-def _best(now: Candidates, points: Array, values: Array) -> tuple[Array, Array]:
+def _keep_best(now: Candidates, points: Array, values: Array) -> tuple[Array, Array]:
     top = np.argmax(values, axis=1)
     indices = np.arange(len(top))
     better = values[indices, top] > now.values

@@ -99,8 +99,8 @@ class _Search:
     def __init__(self, family: ConstraintFamily, x: Array, tools: Tools, threshold: float) -> None:
         self.field = _Violation(family, x, tools.deadline)
         self.tools, self.threshold, self.kept, self.bound = tools, threshold, max(KEPT_PER_ROW, x.size), np.inf
-        self.survey = self._survey()
-        self.found = self._refined(self.survey)
+        self.survey = self._survey_index_set()
+        self.found = self._refine_peaks(self.survey)
         if self.field.dimension == 0:
             self.bound = self.highest
 
@@ -116,7 +116,7 @@ class _Search:
 
     def result(self) -> Separation:
         """Return the worst distinct maxima found so far, with the bound."""
-        worst = _distinct(self.found, self.kept)
+        worst = _select_distinct(self.found, self.kept)
         return Separation(self.field.indices(worst.points), worst.rows, worst.values, self.bound)
 
     def look_closer(self) -> None:
@@ -124,10 +124,10 @@ class _Search:
         from sparserob_core.sip.separation.survey import survey_grid
 
         dimension = self.field.dimension
-        side = _finer(dimension, POINTS_PER_ASKED * self.tools.budget) if dimension else 0
+        side = _choose_grid_side(dimension, POINTS_PER_ASKED * self.tools.budget) if dimension else 0
         if side:
             self.survey = survey_grid(self.field, dimension, side, self.threshold)
-            self.found = self.found.join(self._refined(self.survey))
+            self.found = self.found.join(self._refine_peaks(self.survey))
 
     def ask(self) -> None:
         """The local maxima of all indices that the maximiser asks for, beside those of the last survey."""
@@ -150,9 +150,9 @@ class _Search:
             raise KeyboardInterrupt(report.stopped)
         self.bound = report.upper_bound
         scattered = survey_scattered(np.concatenate(unit_points), np.concatenate(violations), self.survey)
-        self.found = self.found.join(self._refined(scattered))
+        self.found = self.found.join(self._refine_peaks(scattered))
 
-    def _survey(self) -> Survey:
+    def _survey_index_set(self) -> Survey:
         """The points of every round: a grid, or random points where a grid would have too many."""
         from sparserob_core.sip.separation.survey import GRID_SIDE, RANDOM_POINTS, survey_grid, survey_scattered
 
@@ -162,7 +162,7 @@ class _Search:
             return survey_scattered(unit, field(unit))
         return survey_grid(field, field.dimension, GRID_SIDE.get(field.dimension, 1), self.threshold)
 
-    def _refined(self, survey: Survey) -> Candidates:
+    def _refine_peaks(self, survey: Survey) -> Candidates:
         """The peaks of a survey, the most promising of every row refined; all that may exceed the threshold where those
         do not."""
         from sparserob_core.sip.separation.refinement import refine
@@ -212,11 +212,11 @@ class _Violation:
         portions, start = [], 0
         while start < len(indices):
             stop = start + (self.width if start or self.width < LARGEST_ARRAY else min(64, len(indices)))
-            portions.append(self._portion(indices[start:stop]))
+            portions.append(self._evaluate_portion(indices[start:stop]))
             self.width, start = max(16, LARGEST_ARRAY // max(1, portions[-1].shape[1] * self.x.size)), stop
         return np.concatenate(portions) if len(portions) != 1 else portions[0]
 
-    def _portion(self, indices: Array) -> Array:
+    def _evaluate_portion(self, indices: Array) -> Array:
         self.deadline.check()
         values = self.family.violations(self.x, indices)
         if np.isnan(values).any():
@@ -225,7 +225,7 @@ class _Violation:
         return values
 
 
-def _finer(dimension: int, most: int) -> int:
+def _choose_grid_side(dimension: int, most: int) -> int:
     """Points along every coordinate of the finest grid with at most so many points that halves the spacing of that of
     every round, or halves it again; 0 where there is none."""
     from sparserob_core.sip.separation.survey import GRID_SIDE
@@ -236,7 +236,7 @@ def _finer(dimension: int, most: int) -> int:
     return side if side > coarse else 0
 
 
-def _distinct(found: Candidates, kept: int) -> Candidates:
+def _select_distinct(found: Candidates, kept: int) -> Candidates:
     """Worst first; of every row at most so many maxima, each once."""
     found = found.take(np.argsort(-found.values, kind="stable"))
     chosen = np.zeros(found.rows.size, dtype=bool)

@@ -72,7 +72,7 @@ def survey_grid(function: VectorFunction, dimension: int, side: int, threshold: 
     Around every such point a block of half the spacing is laid, and so on, all blocks of a level in one batch.
     """
     spacing = 1.0 / max(1, side - 1)
-    level = _level(function, np.zeros((1, dimension)), side, spacing)
+    level = _evaluate_level(function, np.zeros((1, dimension)), side, spacing)
     worth, surveys = max(threshold, WORTH * float(level.values.max(initial=0.0))), [level.survey()]
     blocks = side**dimension // SHARED**dimension
     for halved in range(DEPTH if dimension and side > BLOCK_SIDE else 0):
@@ -81,9 +81,9 @@ def survey_grid(function: VectorFunction, dimension: int, side: int, threshold: 
             break
         corners = np.clip(centres - spacing, 0.0, 1.0 - 2.0 * spacing)
         spacing /= 2.0
-        level = _level(function, np.unique(corners, axis=0), BLOCK_SIDE, spacing)
+        level = _evaluate_level(function, np.unique(corners, axis=0), BLOCK_SIDE, spacing)
         surveys.append(level.survey())
-    return _joined(surveys)
+    return _join_surveys(surveys)
 
 
 def survey_scattered(points: Array, values: Array, known: Survey | None = None) -> Survey:
@@ -140,10 +140,10 @@ class _Level:
         highest, lowest, promise, reach = values, values, values.copy(), values.copy()
         is_complete = np.ones(self.points.shape[:-1], dtype=bool)
         for axis in self.axes:
-            highest = _window(highest, axis, np.maximum)
-            lowest = _window(lowest, axis, np.minimum)
-            promise += _peak_above(values, axis)
-            reach += _window(np.abs(_second_difference(values, axis)), axis, np.maximum)
+            highest = _find_extremes(highest, axis, np.maximum)
+            lowest = _find_extremes(lowest, axis, np.minimum)
+            promise += _estimate_peak_rise(values, axis)
+            reach += _find_extremes(np.abs(_compute_second_difference(values, axis)), axis, np.maximum)
             ends = np.zeros(values.shape[axis], dtype=bool)
             ends[[0, -1]] = True
             coordinate = self.points[..., axis - 1]
@@ -170,8 +170,8 @@ class _Level:
         values = self.values
         reach, is_coarse = values.copy(), np.zeros(values.shape, dtype=bool)
         for axis in self.axes:
-            bend = _second_difference(values, axis)
-            size = _window(np.abs(bend), axis, np.maximum)
+            bend = _compute_second_difference(values, axis)
+            size = _find_extremes(np.abs(bend), axis, np.maximum)
             change = np.zeros_like(bend)
             aligned, step = np.moveaxis(change, axis, 0), np.abs(np.diff(np.moveaxis(bend, axis, 0)[1:-1], axis=0))
             aligned[1:-2] = step
@@ -184,7 +184,7 @@ class _Level:
         return self.points.reshape(high.size, -1)[order]
 
 
-def _level(function: VectorFunction, corners: Array, side: int, spacing: float) -> _Level:
+def _evaluate_level(function: VectorFunction, corners: Array, side: int, spacing: float) -> _Level:
     """The values of blocks with these lower corners ``(p, d)``; points of several blocks are evaluated once."""
     count, dimension = corners.shape
     offsets = np.array(list(product(range(side), repeat=dimension)), dtype=float)
@@ -198,14 +198,14 @@ def _level(function: VectorFunction, corners: Array, side: int, spacing: float) 
     return _Level(flat.reshape(*shape, dimension), values.reshape(*shape, -1), spacing)
 
 
-def _joined(surveys: Sequence[Survey]) -> Survey:
+def _join_surveys(surveys: Sequence[Survey]) -> Survey:
     joined = surveys[0]
     for survey in surveys[1:]:
         joined = joined.join(survey)
     return joined
 
 
-def _window(values: Array, axis: int, of: Callable[..., Array]) -> Array:
+def _find_extremes(values: Array, axis: int, of: Callable[..., Array]) -> Array:
     """The maximum, or the minimum, of every entry and its two neighbours along an axis."""
     extremes = np.moveaxis(values.copy(), axis, 0)
     original = np.moveaxis(values, axis, 0)
@@ -214,7 +214,7 @@ def _window(values: Array, axis: int, of: Callable[..., Array]) -> Array:
     return np.moveaxis(extremes, 0, axis)
 
 
-def _second_difference(values: Array, axis: int) -> Array:
+def _compute_second_difference(values: Array, axis: int) -> Array:
     """The second difference at every entry along an axis; 0 at both ends, and where it is no number."""
     aligned = np.moveaxis(values, axis, 0)
     bend = np.zeros_like(aligned)
@@ -224,7 +224,7 @@ def _second_difference(values: Array, axis: int) -> Array:
     return np.moveaxis(bend, 0, axis)
 
 
-def _peak_above(values: Array, axis: int) -> Array:
+def _estimate_peak_rise(values: Array, axis: int) -> Array:
     """Return the rise of the parabola through three neighbours above the middle one, at most as far as both neighbours
     together lie below it."""
     aligned = np.moveaxis(values, axis, 0)

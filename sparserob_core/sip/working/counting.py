@@ -190,7 +190,7 @@ def share_of(program: SemiInfiniteProgram, counted: float) -> float:
     """Return a count as a share of the largest count."""
     prices = together(program)
     prices = prices[prices > 0.0]
-    price = _one(prices)
+    price = _find_common_price(prices)
     return float(np.rint(counted / price) / prices.size if price else counted / math.fsum(prices))
 
 
@@ -210,13 +210,13 @@ def whole(program: SemiInfiniteProgram, least: float) -> float:
         A multiple of the price, not more than the largest count; ``least`` itself, at least 0, where prices differ.
     """
     prices = together(program)
-    price = _one(prices[prices > 0.0])
+    price = _find_common_price(prices[prices > 0.0])
     if not price:
         return max(0.0, least)
     return float(min(np.count_nonzero(prices), max(0.0, np.ceil(least / price - MISSED)))) * price
 
 
-def _one(prices: Array) -> float:
+def _find_common_price(prices: Array) -> float:
     """Return the common price of all entries; 0 where prices differ."""
     return float(prices.mean()) if prices.size and np.ptp(prices) <= ROUNDED * prices.max() else 0.0
 

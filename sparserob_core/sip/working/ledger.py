@@ -131,8 +131,8 @@ class Ledger:
     history: list[RoundFinished] = field(default_factory=list)
     best: Answer | None = None
     proven: tuple[Answer, Found, Sequence[Proof]] | None = None
-    _found: Found = ()
-    _suggested: bool = False
+    _separations: Found = ()
+    _has_suggested: bool = False
 
     @property
     def lower(self) -> float:
@@ -151,7 +151,7 @@ class Ledger:
         """Return the relative gap between the lower bound and the cost of ``x (n,)``."""
         return relative_gap(self.lower, self.program.cost(x), self.program.added(x))
 
-    def _resolved_gap(self, x: Array) -> float:
+    def _compute_resolved_gap(self, x: Array) -> float:
         """Return the relative gap at ``x (n,)`` with the cost increased by its possible rounding error.
 
         Where squares cancel, nearly all of the cost may be rounding. Then the gap is not known to be closed.
@@ -176,7 +176,7 @@ class Ledger:
             Number of rows kept.
         """
         worst, x = worst_of(found), answer.solution.x
-        added, dropped = _change(self.history[-1].imposed if self.history else (), answer.rows.cuts)
+        added, dropped = _compare_cuts(self.history[-1].imposed if self.history else (), answer.rows.cuts)
         event = RoundFinished(
             round=number,
             epsilon=answer.epsilon,
@@ -201,14 +201,14 @@ class Ledger:
             proven=np.inf if self.proven is None else self.program.cost(self.proven[0].solution.x),
         )
         self.history.append(event)
-        if np.isfinite(upper) or not self._suggested:
+        if np.isfinite(upper) or not self._has_suggested:
             self.keep(answer, found)
-            self._suggested = bool(np.isfinite(upper))
+            self._has_suggested = bool(np.isfinite(upper))
         self.tools.notify(event)
 
     def keep(self, answer: Answer, found: Found = ()) -> None:
         """Keep the answer that is returned if the method is stopped now, with its most violated constraints."""
-        self.best, self._found = answer, found
+        self.best, self._separations = answer, found
 
     def prove(self, answer: Answer, found: Found, proofs: Sequence[Proof]) -> bool:
         """Keep an answer if these proofs show that it is feasible and it is the cheapest so far.
@@ -230,9 +230,9 @@ class Ledger:
         if len(proofs) != len(self.program.families) or any(proof.verdict != "proven" for proof in proofs):
             return False
         x = answer.solution.x
-        if any(excess > limit for _, excess, limit in self._fixed(x, strictly=True)):
+        if any(excess > limit for _, excess, limit in self._list_residuals(x, strictly=True)):
             return False
-        errors = self._errors(x)
+        errors = self._bound_equality_errors(x)
         if errors is not None and not errors.kept:
             return False
         if self.cheaper(answer):
@@ -264,11 +264,11 @@ class Ledger:
             The result.
         """
         x, deadline = answer.solution.x, self.tools.deadline
-        status, message = verdict(proofs, self._resolved_gap(x), self.tolerance)
-        for name, excess, limit in self._fixed(x, strictly=status in ("certified", "verified")):
+        status, message = verdict(proofs, self._compute_resolved_gap(x), self.tolerance)
+        for name, excess, limit in self._list_residuals(x, strictly=status in ("certified", "verified")):
             if excess > limit:
                 status, message = "failed", f"the decision misses {name} by {excess:.1e} of what they compare; {ADVICE}"
-        errors = self._errors(x) if status in ("certified", "verified") else None
+        errors = self._bound_equality_errors(x) if status in ("certified", "verified") else None
         if errors is not None and not errors.kept:
             status, message = "undecided", errors.advice
         proven = status in ("certified", "verified") and len(proofs) == len(self.program.families)
@@ -281,11 +281,11 @@ class Ledger:
         result = self.result(status, message, answer, witness(self.program, worst, proofs))
         return replace(result, proofs=tuple(proofs), errors=errors, stopped=ending if ending == deadline.reason else "")
 
-    def _errors(self, x: Array) -> EqualityErrors | None:
+    def _bound_equality_errors(self, x: Array) -> EqualityErrors | None:
         """Return the proven errors of the equalities at ``x (n,)``; ``None`` where the program offers none."""
         return None if self.program.errors is None else self.program.errors(x)
 
-    def _fixed(self, x: Array, strictly: bool) -> Iterator[tuple[str, float, float]]:
+    def _list_residuals(self, x: Array, strictly: bool) -> Iterator[tuple[str, float, float]]:
         """Yield the residuals of all constraints that are no family: a name, the residual at ``x (n,)``, and its limit.
 
         With ``strictly``, the limit is that of a claim; otherwise it is that of a decision worth returning.
@@ -293,7 +293,7 @@ class Ledger:
         finite = self.program.finite
         yield "its equalities", finite.missed(x), EQUALITY if strictly else CRUDE
         yield "its bounds or rows", finite.residual(x), TOLERANCE if strictly else CRUDE
-        yield "its bounds", _beyond(self.program, x) if strictly else 0.0, TOLERANCE
+        yield "its bounds", _find_largest_violation(self.program, x) if strictly else 0.0, TOLERANCE
 
     def stopped(self, error: KeyboardInterrupt, prover: Prover) -> Result:
         """Return the result after a deadline or an interrupt: the best proven decision, or else the best so far.
@@ -321,7 +321,7 @@ class Ledger:
                 status="undecided",
                 message=f"{reason}, before there was a decision; {more(self.tools.deadline)}",
                 lower_bound=self.lower,
-                counts=self._counts(0),
+                counts=self._count_work(0),
                 solved_by=dict(self.relaxed.solved_by),
                 dual=self.dual,
                 seconds=time.perf_counter() - self.started,
@@ -333,8 +333,8 @@ class Ledger:
         except KeyboardInterrupt:
             meaning = MEANING["undecided"]
             proven = [Proof(family.name, "undecided", np.inf, reason=meaning) for family in self.program.families]
-        proofs = as_bad_as_found(proven, self._found)
-        return self.judged(self.best, worst_of(self._found), proofs, reason)
+        proofs = as_bad_as_found(proven, self._separations)
+        return self.judged(self.best, worst_of(self._separations), proofs, reason)
 
     def without(self, answer: Answer) -> Result:
         """Return the result where the relaxed program has no usable answer.
@@ -398,14 +398,14 @@ class Ledger:
             missed=self.program.finite.missed(answer.solution.x) if decided and self.program.finite.b.size else None,
             worst=worst,
             indices=cuts,
-            counts=self._counts(len(cuts)),
+            counts=self._count_work(len(cuts)),
             solved_by=dict(self.relaxed.solved_by),
             history=tuple(self.history),
             dual=self.dual,
             seconds=time.perf_counter() - self.started,
         )
 
-    def _counts(self, active: int) -> dict[str, int]:
+    def _count_work(self, active: int) -> dict[str, int]:
         return {
             "relaxed_programs": self.relaxed.solves,
             "rounds": len(self.history),
@@ -414,7 +414,7 @@ class Ledger:
         }
 
 
-def _change(before: Sequence[Cut], now: Sequence[Cut]) -> tuple[tuple[Cut, ...], tuple[Cut, ...]]:
+def _compare_cuts(before: Sequence[Cut], now: Sequence[Cut]) -> tuple[tuple[Cut, ...], tuple[Cut, ...]]:
     """Return the constraints that were added and those that were dropped."""
     cuts_before, cuts_now = (
         {(cut.family, cut.index.tobytes(), cut.row): cut for cut in cuts} for cuts in (before, now)
@@ -460,8 +460,10 @@ def alarm(program: SemiInfiniteProgram, dual: Dual, x: Array) -> str:
     allowed = ROUNDING * base.magnitude(x)
     allowed += sum(cut.multiplier * TOLERANCE for cut in dual.cuts)
     if dual.z is not None and base.S is not None:
-        violations, rounding = _missed(base, x)
-        allowed += float(np.abs(dual.z) @ np.minimum(violations, TOLERANCE * _units(base.lower, base.upper) + rounding))
+        violations, rounding = _measure_bound_violations(base, x)
+        allowed += float(
+            np.abs(dual.z) @ np.minimum(violations, TOLERANCE * _choose_units(base.lower, base.upper) + rounding)
+        )
     if dual.mu.size:
         allowed += float(np.abs(dual.mu) @ np.abs(base.A @ x - base.b))
     if dual.fixed.size:
@@ -476,22 +478,22 @@ def alarm(program: SemiInfiniteProgram, dual: Dual, x: Array) -> str:
     )
 
 
-def _missed(base: FiniteProgram, x: Array) -> tuple[Array, Array]:
+def _measure_bound_violations(base: FiniteProgram, x: Array) -> tuple[Array, Array]:
     """Return the amounts ``(k,)`` by which the image of ``x (n,)`` violates its bounds, and their rounding errors
     ``(k,)``."""
     image, terms = base.image(x), np.abs(x) if base.S is None else abs(base.S) @ np.abs(x)
     return np.maximum(np.maximum(base.lower - image, image - base.upper), 0.0), ROUNDING * terms
 
 
-def _beyond(program: SemiInfiniteProgram, x: Array) -> float:
+def _find_largest_violation(program: SemiInfiniteProgram, x: Array) -> float:
     """Return the largest violation of a bound by the image of ``x (n,)``, in the bound's own unit, less rounding."""
-    violations, rounding = _missed(program.finite, x)
-    units = _units(program.finite.lower, program.finite.upper)
+    violations, rounding = _measure_bound_violations(program.finite, x)
+    units = _choose_units(program.finite.lower, program.finite.upper)
     shares = np.maximum(violations - rounding, 0.0) / np.where(units > 0.0, units, 1.0)
     return float(shares.max(initial=0.0))
 
 
-def _units(lower: Array, upper: Array) -> Array:
+def _choose_units(lower: Array, upper: Array) -> Array:
     """Return the units ``(k,)`` of bounds; 0 where there is none.
 
     The unit is the smallest number that is not 0 among the sizes of the two bounds and their distance (decision 16).

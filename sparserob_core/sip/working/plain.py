@@ -106,13 +106,13 @@ class PlainRows(Working):
         Without enough rows the cost may fall without bound. Then rows that prevent this are imposed, where there are
         any.
         """
-        answer = self._regularised(ledger)
+        answer = self._solve_regularised(ledger)
         while answer.solution.status == "failed" and not usable(answer.solution) and not last:
             from sparserob_core.sip.working.unbounded import bounding_rows, falls_for_ever, first_rows
 
             self.sheds = self.sheds and not self.size  # a dropped row may be the one that bounds the program
             if self.impose(first_rows(self.program)):
-                answer = self._regularised(ledger)
+                answer = self._solve_regularised(ledger)
                 continue
             assert self.close is not None
             ray, fresh = bounding_rows(self.program, ledger.tools, self.close)
@@ -120,10 +120,10 @@ class PlainRows(Working):
                 return falls_for_ever(ledger, self.close, prover, ray)
             if not self.impose(fresh):
                 break
-            answer = self._regularised(ledger)
+            answer = self._solve_regularised(ledger)
         return answer if usable(answer.solution) else ledger.without(answer)
 
-    def _regularised(self, ledger: Ledger) -> Answer:
+    def _solve_regularised(self, ledger: Ledger) -> Answer:
         """Return the optimum of the relaxed program with decreasing weights of the regulariser.
 
         The weight decreases while the cost still changes and the gap is open, by several steps of the continuation at
@@ -143,7 +143,7 @@ class PlainRows(Working):
             self.epsilon, solution = lighter, candidate
             has_converged = abs(cost_after - cost_before) <= regu.tolerance * max(1.0, abs(ledger.lower))
             if has_converged and self.exact and ledger.open(solution.x):
-                self._plain(ledger)
+                self._solve_unregularised(ledger)
         return Answer(solution, self.rows, self.epsilon, solution.value)
 
     def _solve(self, ledger: Ledger, epsilon: float) -> FiniteSolution:
@@ -157,7 +157,7 @@ class PlainRows(Working):
             self.pay(ledger, Answer(solution, self.rows, epsilon, solution.value))
         return solution
 
-    def _plain(self, ledger: Ledger) -> FiniteSolution:
+    def _solve_unregularised(self, ledger: Ledger) -> FiniteSolution:
         """Return the solution of the unregularised relaxed program; its multipliers improve the lower bound."""
         guess = self.guess if self.program.n >= MANY else None  # its multipliers are the start of the simplex method
         plain = ledger.relaxed.solve(self.rows, 0.0, self.margin, guess)
@@ -173,7 +173,7 @@ class PlainRows(Working):
         """
         if self.epsilon == 0.0 or not self.exact:
             return False
-        plain = self._plain(ledger)
+        plain = self._solve_unregularised(ledger)
         crude = answer.solution.status != "optimal"
         if not (crude or ledger.open(answer.solution.x)) or not usable(plain):
             return False
@@ -182,7 +182,7 @@ class PlainRows(Working):
 
     def exchange(self, answer: Answer, violated: Violated, number: int) -> int:
         """Impose violated rows, and drop rows that were idle for some rounds; return the number of new rows."""
-        fresh = self._unknown(violated)
+        fresh = self._find_new_rows(violated)
         if not fresh.h.size:
             return 0
         multipliers, zeros = answer.multipliers, np.zeros(fresh.h.size)
@@ -197,17 +197,17 @@ class PlainRows(Working):
 
     def impose(self, violated: Violated) -> int:
         """Impose rows that no answer contains yet; return the number of new rows."""
-        fresh = self._unknown(violated)
+        fresh = self._find_new_rows(violated)
         self.rows = self.rows.joined(fresh)
-        self.guess = None if self.guess is None else _with_more(self.guess, fresh.h.size)
+        self.guess = None if self.guess is None else _pad_multipliers(self.guess, fresh.h.size)
         self.idle = np.concatenate([self.idle, np.zeros(fresh.h.size, dtype=int)])
         return int(fresh.h.size)
 
     def knows(self, missed: Missed) -> bool:
         """Return whether a constraint is imposed."""
-        return not self._unknown([(missed.at, missed.row, missed.family)]).h.size
+        return not self._find_new_rows([(missed.at, missed.row, missed.family)]).h.size
 
-    def _unknown(self, violated: Violated) -> Rows:
+    def _find_new_rows(self, violated: Violated) -> Rows:
         """Return the rows of violated constraints that are not imposed."""
         keys, fresh = {(cut.family, cut.row, cut.index.tobytes()) for cut in self.rows.cuts}, Rows.none(self.program.n)
         for indices, rows, family in violated:
@@ -241,7 +241,7 @@ class PlainRows(Working):
 
     def tightened(self, ledger: Ledger, answer: Answer, margin: float) -> Answer | None:
         """Return the optimum of the imposed rows tightened by ``margin``; ``None`` where there is none."""
-        guess = _with_more(answer.solution, self.rows.h.size - answer.rows.h.size)
+        guess = _pad_multipliers(answer.solution, self.rows.h.size - answer.rows.h.size)
         solution = ledger.relaxed.solve(self.rows, self.epsilon, margin, guess)
         if not usable(solution):
             return None
@@ -264,12 +264,12 @@ class PlainRows(Working):
         The new answer is the old one without the small entries that solvers leave, or a vertex of the relaxed program
         where no regulariser selects another optimum.
         """
-        answer, found, violated = self._sparser(ledger, answer, found, number)
+        answer, found, violated = self._sparsify(ledger, answer, found, number)
         if not self.exact:
-            self._plain(ledger)
+            self._solve_unregularised(ledger)
         return answer, found, violated
 
-    def _sparser(self, ledger: Ledger, answer: Answer, found: Found, number: int) -> tuple[Answer, Found, Violated]:
+    def _sparsify(self, ledger: Ledger, answer: Answer, found: Found, number: int) -> tuple[Answer, Found, Violated]:
         """Return an answer with a smaller count, its violations, and the constraints that a rejected candidate
         violates."""
         program, x = self.program, answer.solution.x
@@ -302,7 +302,7 @@ class PlainRows(Working):
         return *kept, violated
 
 
-def _with_more(solution: FiniteSolution, rows: int) -> FiniteSolution:
+def _pad_multipliers(solution: FiniteSolution, rows: int) -> FiniteSolution:
     """Return a solution as a starting point for a program with ``rows`` further rows."""
     return replace(solution, y=np.concatenate([solution.y, np.zeros(rows)]))
 

@@ -166,31 +166,31 @@ class RobustRows(Working):
         Where tightened rows are infeasible, the margin is reduced; in the end infeasibility is proven. For a program
         with a guide, the best decision known is returned once, where it closes the gap.
         """
-        self._guide(ledger)
+        self._solve_guide(ledger)
         program = self.program
         size = program.largest_cost if ledger.best is None else size_of(program, ledger.best)
         while not (solution := self.solve(self.margin, self.accuracy * size, left(ledger.tools))).solved:
-            self._count(ledger)
+            self._record_calls(ledger)
             if ledger.tools.deadline.passed:
                 if solution.x.size:  # the solution was interrupted: its last decision is the best known
-                    ledger.best = ledger.best or self._told(ledger, solution)
+                    ledger.best = ledger.best or self._form_answer(ledger, solution)
                 ledger.tools.deadline.check()
             if isinstance(self.counterpart, Interior):
                 refuted = self.refuted(solution)
                 if refuted is not None:
-                    return self._refuted(ledger, solution, refuted)
+                    return self._report_infeasible(ledger, solution, refuted)
                 self.by_simplex()
             elif not self.thin():
-                return self._infeasible(ledger, solution.said)
-        self._count(ledger)
-        answer = self._told(ledger, solution)
+                return self._prove_infeasible(ledger, solution.said)
+        self._record_calls(ledger)
+        answer = self._form_answer(ledger, solution)
         self.price = self.priced(answer)
         self.pay(ledger, answer)
         if self.best.size and ledger.open(answer.solution.x) and (last or not ledger.open(self.best)):
-            answer, self.best = self._at(answer, self.best), np.zeros(0)
+            answer, self.best = self._replace_decision(answer, self.best), np.zeros(0)
         return answer
 
-    def _guide(self, ledger: Ledger) -> None:
+    def _solve_guide(self, ledger: Ledger) -> None:
         """Solve the program's guide, and impose its indices and the constraints that its optimum defines."""
         program, tools = self.program, ledger.tools
         if program.guide is None or self.guided:
@@ -209,9 +209,9 @@ class RobustRows(Working):
             indices = [cut.index for cut in imposed if cut.family == family.name and not cut.row]
             if not family.defines and indices:
                 self.add(family, np.array(indices))
-        self.impose(self._undefined(self.best, False))
+        self.impose(self._find_undefined(self.best, False))
 
-    def _undefined(self, x: Array, feasible: bool) -> Violated:
+    def _find_undefined(self, x: Array, feasible: bool) -> Violated:
         """Return violated constraints of families that define variables.
 
         The constraints are sought at the relaxed optimum before it is settled, and between it and the best decision
@@ -240,7 +240,7 @@ class RobustRows(Working):
 
     def candidate(self, answer: Answer) -> Answer | None:
         """Return the best decision known, for a program with a guide."""
-        return self._at(answer, self.best) if self.best.size else None
+        return self._replace_decision(answer, self.best) if self.best.size else None
 
     @property
     def size(self) -> int:
@@ -258,19 +258,19 @@ class RobustRows(Working):
             return 0
         changes = self.impose(violated)
         if self.program.guide is not None:
-            changes += self.impose(self._undefined(x, False))
+            changes += self.impose(self._find_undefined(x, False))
         worst = max(float(self.program.family(name).violations(x, at).max(initial=0.0)) for at, _, name in violated)
-        return changes + self._closer(answer, worst, bool(changes)) + self.counterpart.sharpen(x)
+        return changes + self._raise_accuracy(answer, worst, bool(changes)) + self.counterpart.sharpen(x)
 
     def sharpen(self, ledger: Ledger, answer: Answer) -> bool:
         """Add constraints that the guide does not contain, more accuracy, or the worst deviations; return false where
         none remain."""
         x, undefined = answer.solution.x, 0
         if self.program.guide is not None:
-            undefined = self.impose(self._undefined(x, True))
-        return bool(undefined + self._closer(answer, 0.0, bool(undefined)) + self.counterpart.sharpen(x))
+            undefined = self.impose(self._find_undefined(x, True))
+        return bool(undefined + self._raise_accuracy(answer, 0.0, bool(undefined)) + self.counterpart.sharpen(x))
 
-    def _closer(self, answer: Answer, violation: float, added: bool) -> bool:
+    def _raise_accuracy(self, answer: Answer, violation: float, added: bool) -> bool:
         """Return whether the next round can be more accurate; it is where new constraints change little."""
         if not self.counterpart.approximate or self.accuracy <= FINEST * self.tolerance:
             return False
@@ -323,18 +323,18 @@ class RobustRows(Working):
         """Return the optimum of the imposed rows tightened by ``margin``, no more accurate than its margin costs."""
         accuracy = min(self.accuracy, SHARPER * SPARED) * size_of(self.program, answer)
         solution = self.solve(margin, accuracy, left(ledger.tools))
-        self._count(ledger)
-        return self._told(ledger, solution) if solution.solved else None
+        self._record_calls(ledger)
+        return self._form_answer(ledger, solution) if solution.solved else None
 
-    def _told(self, ledger: Ledger, found: RobustAnswer) -> Answer:
+    def _form_answer(self, ledger: Ledger, found: RobustAnswer) -> Answer:
         """Return the decision of a solved counterpart; the bound of its multipliers improves the lower bound."""
         self.raw = np.clip(found.x, self.program.finite.lower, self.program.finite.upper)
         dual, none = self.dual(found, priced=True), np.zeros(0)
         ledger.improve(dual)
         solution = FiniteSolution("optimal", self.raw, np.inf, dual.bound, found.y, found.mu, none, np.inf, np.inf)
-        return self._at(Answer(solution, self._rows, 0.0, np.inf), self._settled(self.raw))
+        return self._replace_decision(Answer(solution, self._imposed_rows, 0.0, np.inf), self._settle(self.raw))
 
-    def _settled(self, x: Array) -> Array:
+    def _settle(self, x: Array) -> Array:
         """Return a decision within its bounds, with the variables that families define at their values."""
         settled = x if self.program.settle is None else self.program.settle(x)
         if self.program.finite.residual(settled) > TOLERANCE:
@@ -342,7 +342,7 @@ class RobustRows(Working):
             settled = np.clip(settled, self.program.finite.lower, self.program.finite.upper)
         return settled
 
-    def _at(self, answer: Answer, x: Array) -> Answer:
+    def _replace_decision(self, answer: Answer, x: Array) -> Answer:
         """Return an answer with another decision."""
         value, bound = self.program.cost(x), answer.solution.lower_bound
         residual = self.program.finite.residual(x)
@@ -350,7 +350,7 @@ class RobustRows(Working):
         return replace(answer, solution=solution, value=value)
 
     @property
-    def _rows(self) -> Rows:
+    def _imposed_rows(self) -> Rows:
         """Imposed rows by name; their coefficients depend on the deviations."""
         return Rows(np.zeros((len(self.cuts), 0)), np.zeros(len(self.cuts)), tuple(self.cuts))
 
@@ -402,7 +402,7 @@ class RobustRows(Working):
         dual = self.dual(replace(answer, y=answer.y / total, mu=answer.mu / total), priced=False)
         return dual if dual.bound > FARKAS else None
 
-    def _infeasible(self, ledger: Ledger, said: str) -> Result:
+    def _prove_infeasible(self, ledger: Ledger, said: str) -> Result:
         """Return the result ``infeasible`` where multipliers prove it, and ``failed`` otherwise."""
         none = np.zeros(0)
         relaxing = Counterpart(self.program.finite, self.counterpart.spread, elastic=True, asked=self.asked)
@@ -412,16 +412,16 @@ class RobustRows(Working):
         while elastic.solved and relaxing.sharpen(elastic.x):
             elastic = relaxing.solve(seconds=left(ledger.tools))
         self.calls += relaxing.answered
-        self._count(ledger)
+        self._record_calls(ledger)
         dual = self.refuted(elastic) if elastic.solved else None
         if dual is not None:
-            return self._refuted(ledger, elastic, dual)
+            return self._report_infeasible(ledger, elastic, dual)
         x = np.zeros(self.program.n)
         solution = FiniteSolution("failed", x, np.nan, -np.inf, none, none, none, np.inf, np.inf, said)
-        answer = Answer(solution, self._rows, 0.0, np.nan)
+        answer = Answer(solution, self._imposed_rows, 0.0, np.nan)
         return ledger.result("failed", f"the relaxed program was not solved: {said}", answer)
 
-    def _refuted(self, ledger: Ledger, answer: RobustAnswer, dual: Dual) -> Result:
+    def _report_infeasible(self, ledger: Ledger, answer: RobustAnswer, dual: Dual) -> Result:
         """Return the result ``infeasible`` with the multipliers that prove it."""
         solution = FiniteSolution(
             "infeasible",
@@ -438,11 +438,11 @@ class RobustRows(Working):
             dual.bound,
         )
         ledger.dual = dual
-        reason, worst = _reason(self.program, dual)
-        final_answer = Answer(solution, self._rows, 0.0, np.inf)
+        reason, worst = _describe_infeasibility(self.program, dual)
+        final_answer = Answer(solution, self._imposed_rows, 0.0, np.inf)
         return replace(ledger.result("infeasible", reason.sentence(), final_answer, worst), infeasible=reason)
 
-    def _count(self, ledger: Ledger) -> None:
+    def _record_calls(self, ledger: Ledger) -> None:
         """Record the number of answers in the accounts."""
         ledger.relaxed.solves = self.calls.total()
         if self.asked is None:
@@ -467,15 +467,17 @@ class RobustRows(Working):
             return answer, found, ()
         if not ledger.prove(answer, found, prover(x, GLANCE)):
             return answer, found, ()
-        decision = self._preferred(ledger, answer, *second)
+        decision = self._optimise_second(ledger, answer, *second)
         if decision is None or self.program.finite.residual(decision) > TOLERANCE or ledger.open(decision):
             return answer, found, ()
         separations = separate(self.program, decision, ledger.tools, ALLOWED, number)
         if any(above(*pair)[1].size for pair in separations):
             return answer, found, ()
-        return self._at(answer, decision), separations, ()
+        return self._replace_decision(answer, decision), separations, ()
 
-    def _preferred(self, ledger: Ledger, answer: Answer, second: SemiInfiniteProgram, shared: int) -> Array | None:
+    def _optimise_second(
+        self, ledger: Ledger, answer: Answer, second: SemiInfiniteProgram, shared: int
+    ) -> Array | None:
         """Return the optimum of the ``second`` program under the active rows and one more row of the cost.
 
         ``shared`` is the number of first entries that the two decisions share.
@@ -499,15 +501,15 @@ class RobustRows(Working):
             x = np.clip(solution.x, second.finite.lower, second.finite.upper)
             x = x if second.settle is None else second.settle(x)
             violated = [above(*pair) for pair in separate(second, x, tools, ALLOWED, number)]
-            if not (working.impose([*violated, *self._violated(second, x)]) or counterpart.sharpen(x)):
+            if not (working.impose([*violated, *self._find_violated(second, x)]) or counterpart.sharpen(x)):
                 break
         self.calls += working.calls
-        self._count(ledger)
+        self._record_calls(ledger)
         if any(rows.size for _, rows, _ in violated):
             return None
         return x[:shared] if program.settle is None else program.settle(x[:shared])
 
-    def _violated(self, second: SemiInfiniteProgram, x: Array) -> Violated:
+    def _find_violated(self, second: SemiInfiniteProgram, x: Array) -> Violated:
         """Return the indices imposed here that a decision of the ``second`` program violates."""
         violated = []
         for family in second.families:
@@ -524,7 +526,9 @@ def left(tools: Tools) -> float:
     return np.inf if tools.deadline.left is None else tools.deadline.left + ENDED
 
 
-def _reason(program: SemiInfiniteProgram, dual: Dual) -> tuple[InfeasibleSubsystem, WorstConstraint | None]:
+def _describe_infeasibility(
+    program: SemiInfiniteProgram, dual: Dual
+) -> tuple[InfeasibleSubsystem, WorstConstraint | None]:
     """Return the constraints that cannot hold together, those with the largest multipliers first, and the first of
     them."""
     families = {family.name: family for family in program.families}

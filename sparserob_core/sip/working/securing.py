@@ -246,7 +246,7 @@ def _secure(
     """
     program, margin, imposed = ledger.program, working.margin, 0
     kept: tuple[Answer, Found] | None = None  # a short proof left cells open, and no search finds a violation
-    cells, dear_margin = GLANCE, _dear(abs(program.cost(answer.solution.x)), working.priced(answer))
+    cells, dear_margin = GLANCE, _compute_dear_margin(abs(program.cost(answer.solution.x)), working.priced(answer))
     for _ in range(SECURED):
         cost, price = abs(program.cost(answer.solution.x)), working.priced(answer)
         fresh = working.impose(violated)
@@ -255,7 +255,7 @@ def _secure(
         margin = max(margin, working.margin + (spared * cost / price if price > 0.0 else 0.0))
         margin += 0.0 if fresh else addition
         addition = addition if fresh and addition * price < DEAR * cost else 0.0
-        tighter = _farther(working, ledger, answer, margin, addition)
+        tighter = _solve_tightened(working, ledger, answer, margin, addition)
         if tighter is None and kept is not None:  # no margin as large cells require: smaller cells, a margin that costs
             if dear_margin * price <= PAID * spared * cost:
                 break
@@ -268,7 +268,7 @@ def _secure(
             break
         answer = tighter
         x = tighter.solution.x
-        separations, missed, violated = _looked(ledger, x)
+        separations, missed, violated = _separate_violations(ledger, x)
         if missed:
             continue
         proofs = prover(x, cells)
@@ -282,12 +282,12 @@ def _secure(
     return imposed > 0
 
 
-def _dear(cost: float, price: float) -> float:
+def _compute_dear_margin(cost: float, price: float) -> float:
     """Return the margin that costs the share `DEAR` of a ``cost``; finite where the ``price`` is almost 0."""
     return float(DEAR * cost / max(price, max(cost, 1.0) * np.finfo(float).tiny))
 
 
-def _farther(working: Working, ledger: Ledger, answer: Answer, margin: float, more: float) -> Answer | None:
+def _solve_tightened(working: Working, ledger: Ledger, answer: Answer, margin: float, more: float) -> Answer | None:
     """Return the optimum of the imposed rows tightened by ``margin + more``, or by ``margin`` where that is infeasible.
 
     ``None`` where both are infeasible, or where the margin overflows.
@@ -300,7 +300,7 @@ def _farther(working: Working, ledger: Ledger, answer: Answer, margin: float, mo
     return None
 
 
-def _looked(ledger: Ledger, x: Array) -> tuple[Found, Sequence[Missed], Violated]:
+def _separate_violations(ledger: Ledger, x: Array) -> tuple[Found, Sequence[Missed], Violated]:
     """Return the separations at ``x (n,)``, the largest violations among them, and the constraints to impose."""
     separations = separate(ledger.program, x, ledger.tools, ALLOWED, max(1, len(ledger.history)))
     violated_pairs = [

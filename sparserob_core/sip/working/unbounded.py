@@ -53,11 +53,11 @@ def recession_program(program: SemiInfiniteProgram) -> SemiInfiniteProgram:
         h=h if h.size else None,
         A=A if len(A) else None,
         b=np.zeros(len(A)) if len(A) else None,
-        families=[_homogeneous(family) for family in program.families],
+        families=[_make_homogeneous(family) for family in program.families],
     )
 
 
-def _homogeneous(family: ConstraintFamily) -> ConstraintFamily:
+def _make_homogeneous(family: ConstraintFamily) -> ConstraintFamily:
     """Return the family with right-hand sides 0."""
 
     def rows(indices: Array) -> tuple[Array, Array]:
@@ -124,10 +124,10 @@ def bounding_rows(
     coefficient = max(float(np.abs(base.q).max(initial=0.0)), float(base.weights.max(initial=0.0)))
     if result.decision is not None and not result.stopped and result.cost < -FALLS * coefficient:
         return result.decision / np.abs(result.decision).max(), []
-    return None, _by_family(result.history[-1].imposed if result.history else ())
+    return None, _group_by_family(result.history[-1].imposed if result.history else ())
 
 
-def _by_family(cuts: Sequence[Cut]) -> list[tuple[Array, np.ndarray, str]]:
+def _group_by_family(cuts: Sequence[Cut]) -> list[tuple[Array, np.ndarray, str]]:
     """Return the constraints of cuts as indices, rows and names, grouped by families."""
     names = dict.fromkeys(cut.family for cut in cuts)
     groups = [[cut for cut in cuts if cut.family == name] for name in names]

@@ -360,14 +360,14 @@ class Working(ABC):
             return False
         distances = [self.distance(violation) for violation in left_open(self.program, proofs)]
         floor = self.margin + 1.25 * max(distances, default=np.inf)
-        if (floor > self.most and not self._affords(ledger, answer, floor)) or self.allowed >= ALLOWANCES:
+        if (floor > self.most and not self._is_affordable(ledger, answer, floor)) or self.allowed >= ALLOWANCES:
             return False
         self.floor = self.margin = floor
         self.most = max(self.most, floor)
         self.allowed += 1
         return True
 
-    def _affords(self, ledger: Ledger, answer: Answer, margin: float) -> bool:
+    def _is_affordable(self, ledger: Ledger, answer: Answer, margin: float) -> bool:
         """Return whether the tolerated gap pays for a margin above the largest, where no such margin left nothing
         feasible.
 

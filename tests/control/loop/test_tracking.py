@@ -68,7 +68,7 @@ def test_what_it_leaves_open_is_violated_or_not_told() -> None:
     for share in (0.0, 1e-9, 1e-7, 1e-4, 0.1):
         x = np.clip(best + share * rng.uniform(-1, 1, best.size), low, high)
         verdicts = [proof.verdict for proof in prove(from_state(own, state).program, x)]
-        open_ = tracking._open(x, *tracking._undriven(state))
+        open_ = tracking._find_unproven_instants(x, *tracking._propagate_uncontrolled(state))
         if open_ == []:
             assert "refuted" not in verdicts
         if verdicts == ["proven", "proven"]:
@@ -81,7 +81,7 @@ def test_new_rows_lie_at_the_peaks_of_what_is_violated() -> None:
     best, moved, seen = tracking.solve(state).decision, from_state(own, state), 0
     for share in (1e-6, 1e-4, 0.1):
         x, finest = (1.0 - share) * best, PARTS**SHARP
-        open_ = tracking._open(x, *tracking._undriven(state))
+        open_ = tracking._find_unproven_instants(x, *tracking._propagate_uncontrolled(state))
         assert open_
         for row, piece, level, number in open_:
             if piece == tracking.stop[row] == tracking.start[row]:
@@ -106,8 +106,8 @@ def test_its_bounds_lie_above_the_worst_case_between_the_instants() -> None:
     moved = from_state(own, state)
     nodes = (tracking.nodes @ x).reshape(9, 2) + tracking.powers @ state + tracking.fixed
     drives = x.reshape(1, 8).T @ tracking.B.T + tracking.drift
-    heights = nodes @ tracking.H.T + tracking._first
-    bent = tracking._curvature(nodes[:-1] @ tracking.A.T + drives, tracking.length) + tracking._bent
+    heights = nodes @ tracking.H.T + tracking._support_values
+    bent = tracking._bound_curvature(nodes[:-1] @ tracking.A.T + drives, tracking.length) + tracking._curvature_bounds
     above = np.maximum(heights[:-1], heights[1:]) + bent * tracking.length**2 / 8
     for piece in range(8):
         times = (piece + np.linspace(0, 1, 41)) * tracking.length
@@ -129,7 +129,7 @@ def test_many_states_do_not_let_it_grow() -> None:
     tracking, rng = Tracking(own), np.random.default_rng(3)
     for _ in range(60):
         assert tracking.solve((np.array([-1, 1]) + 0.1 * rng.uniform(-1, 1, 2)) / units.states) is not None
-    assert len(tracking._places) < 100
+    assert len(tracking._row_instants) < 100
 
 
 def test_what_it_does_not_know_it_leaves_to_the_exchange() -> None:
@@ -147,7 +147,7 @@ def test_rows_that_are_not_active_are_left_out_and_the_optimum_stays() -> None:
     assert kept[3]
     assert kept[y > 0.0].all()
     assert 2 <= kept.sum() < 9
-    with patch.object(WarmProgram, "_end", side_effect=AssertionError):  # the basis is one of what is left
+    with patch.object(WarmProgram, "_find_step_end", side_effect=AssertionError):  # the basis is one of what is left
         again, multipliers = warm.solve(h[kept])
     assert again == pytest.approx(x, abs=1e-9)
     assert multipliers == pytest.approx(y[kept], abs=1e-9)

@@ -15,7 +15,7 @@ from sparserob_core.sip.finite import FiniteProgram
 from sparserob_core.sip.inner.dual_newton import (
     DualNewton,
     _Dual,
-    _non_negative,
+    _solve_non_negative,
     from_nothing,
     newton_solve,
     not_separable,
@@ -144,9 +144,9 @@ def test_active_sets_that_go_round_are_given_up() -> None:
     """An indefinite matrix lets them; of rows that crowd, rounding does, and each step took 3 sets a row."""
     curved, linear, free = np.array([[1.3, 0.8], [0.3, -0.3]]), np.array([0.9, 0.4]), np.zeros(2, dtype=bool)
     with pytest.raises(np.linalg.LinAlgError, match="go round"):
-        _non_negative(curved, linear, ~free, free)
+        _solve_non_negative(curved, linear, ~free, free)
     definite = curved.T @ curved
-    found = _non_negative(definite, linear, ~free, free)
+    found = _solve_non_negative(definite, linear, ~free, free)
     assert (found >= 0.0).all() and (definite @ found - linear >= -1e-12).all()
 
 
@@ -172,7 +172,7 @@ def test_whose_answer_it_is_stands_in_the_solution() -> None:
 
 def test_the_searching_method_counts_every_relaxed_program_too(monkeypatch: pytest.MonkeyPatch) -> None:
     # without the program of the fewest active pieces, which answers are counted of too
-    monkeypatch.setattr(fewest, "_other", lambda *_: None)
+    monkeypatch.setattr(fewest, "_minimise_count", lambda *_: None)
     result = sr.run(
         ROOT / "configs/experiment1_reduced.yaml",
         {"maximiser.budget": 30, "method.sc1": {"name": "iterations", "count": 2}, "observers": []},

@@ -13,8 +13,8 @@ from scipy.sparse import csc_array, diags_array
 from sparserob_core.sip.finite import Blocks, FiniteProgram
 from sparserob_core.sip.inner.duality import (
     ROUND_OFF,
-    _terms,
-    _usable,
+    _clip_multipliers,
+    _compute_terms,
     dual_bound,
     farkas_margin,
     farkas_proof,
@@ -87,7 +87,7 @@ def test_a_bound_is_the_dual_function_less_its_own_rounding(kind: str, apart: fl
         program, y, mu = drawn(rng, kind, apart)
         at = rng.normal(size=program.n) if kind == "bent" else None
         bound, better, moved, _ = proving(program, y, mu, None, at)
-        truth = dual(program, _usable(program, better), moved, at)
+        truth = dual(program, _clip_multipliers(program, better), moved, at)
         size = 10.0 * (1.0 + np.abs(y).sum() * (2.0 + 2.0 * program.n) + program.n * 10.0)
         assert Fraction(bound) <= truth
         assert float(truth - Fraction(bound)) <= ROUND_OFF * size
@@ -102,7 +102,7 @@ def test_what_refutes_is_the_dual_function_of_the_rows_alone_per_size_of_the_mul
         for _ in range(8):
             program, y, mu = drawn(rng, kind)
             bound, magnitude = farkas_margin(program, y, mu)
-            y = _usable(program, y)
+            y = _clip_multipliers(program, y)
             total = y @ np.linalg.norm(program.G, axis=1) + np.abs(mu) @ np.linalg.norm(program.A, axis=1)
             truth = float(dual(homogeneous(program), y / total, mu / total))
             assert truth - 1e-12 <= bound <= truth + 1e-15
@@ -135,7 +135,7 @@ def test_norms_of_blocks_are_replaced_by_what_lies_below_them_and_meets_them() -
         weights[:2] = weights[0]
         program = replace(program, blocks=Blocks(number), weights=weights, lower=-np.ones(n), upper=np.ones(n))
         at = rng.normal(size=n)
-        terms = _terms(program, _usable(program, y), mu, None, at)
+        terms = _compute_terms(program, _clip_multipliers(program, y), mu, None, at)
         plain = without_norms(terms, program)
         assert (plain.weights[:2] == 0.0).all() and (plain.weights[2:] == terms.weights[2:]).all()
         offered = (plain.slope - terms.slope)[:2]

@@ -44,7 +44,7 @@ def test_a_run_with_feedback_and_one_without_pass_the_same_functions_of_the_driv
     # what secures a decision is asked for that by the course of a run, which is not the same
     met = [{one for one in each if not one.startswith("sip.working.securing._")} for each in passed]
     assert met[0] == met[1]
-    steps = {f"sip.methods.exchange.Rounds.{name}" for name in ("step", "_ending", "_earlier")}
+    steps = {f"sip.methods.exchange.Rounds.{name}" for name in ("step", "_explain_ending", "_choose_result")}
     assert steps | {"sip.methods.driver.drive", "sip.working.securing.proofs_of"} <= passed[0]
     assert {"sip.working.working.Working.pay", "sip.working.ledger.Ledger.tell"} <= passed[0]
 

@@ -196,7 +196,7 @@ def test_the_same_seed_gives_the_same_trace(tmp_path):
 
 def test_a_polish_is_written_down_and_read_back_and_replayed_as_one(tmp_path):
     from sparserob_core.experiment.run.inspection import Inspection
-    from sparserob_core.experiment.run.replay import BATCHES, _searches
+    from sparserob_core.experiment.run.replay import BATCHES, _replay_searches
 
     outcome = experiment1(
         tmp_path / "run",
@@ -208,7 +208,7 @@ def test_a_polish_is_written_down_and_read_back_and_replayed_as_one(tmp_path):
         read = sr.SearchTrace.stored(columns)
     assert trace.polished.tolist() == read.polished.tolist()
     assert np.flatnonzero(~read.polished).tolist() == [*range(21), *range(30, 51)]
-    told = [event for _, event in _searches(read, Inspection.read(outcome.directory))]
+    told = [event for _, event in _replay_searches(read, Inspection.read(outcome.directory))]
     for event in told:
         mine = read.polished[read.outer == event.round - 1][event.total - event.count : event.total]
         assert mine.tolist() == [event.phase == "polish"] * event.count

@@ -12,7 +12,14 @@ from sparserob_core.errors import NotEnclosable
 from sparserob_core.sip.limits.deadline import Deadline
 from sparserob_core.sip.program import TOLERANCE, ConstraintFamily, Enclosure, Separation
 from sparserob_core.sip.proof import branch_and_bound
-from sparserob_core.sip.proof.branch_and_bound import Course, _at_rest, _halved, _towards, prove_family, supremum
+from sparserob_core.sip.proof.branch_and_bound import (
+    Course,
+    _divide_towards_peaks,
+    _halve_cells,
+    _is_stalled,
+    prove_family,
+    supremum,
+)
 
 
 def family(bounds, violation=-1.0, **more):
@@ -122,12 +129,12 @@ def test_progress_knows_what_the_bound_was_half_a_minute_ago(monkeypatch):
 
 def test_rounding_is_at_rest_and_what_still_falls_is_not():
     falling = [1e-6 * 0.9**k for k in range(20)]
-    assert not _at_rest(falling)
-    assert _at_rest([1e-6] * 20)
-    assert not _at_rest([1e-6] * 16)
-    assert _at_rest([1e-6] * 17)
-    assert not _at_rest([1e-4] * 20)
-    assert not _at_rest([1.0] * 11 + [1e-6] * 8)
+    assert not _is_stalled(falling)
+    assert _is_stalled([1e-6] * 20)
+    assert not _is_stalled([1e-6] * 16)
+    assert _is_stalled([1e-6] * 17)
+    assert not _is_stalled([1e-4] * 20)
+    assert not _is_stalled([1.0] * 11 + [1e-6] * 8)
 
 
 def test_a_proof_ends_where_what_is_left_at_the_ends_of_a_cell_is_rounding() -> None:
@@ -147,19 +154,19 @@ def test_a_proof_ends_where_what_is_left_at_the_ends_of_a_cell_is_rounding() -> 
 
 def test_halves_cover_their_cell_and_cells_without_a_middle_have_none():
     lower, upper = np.array([[0.0, 0.0], [1.0, 5.0]]), np.array([[2.0, 1.0], [3.0, 9.0]])
-    low, high = _halved(lower, upper, np.array([0, 1]))
+    low, high = _halve_cells(lower, upper, np.array([0, 1]))
     assert low.tolist() == [[0.0, 0.0], [1.0, 5.0], [1.0, 0.0], [1.0, 7.0]]
     assert high.tolist() == [[1.0, 1.0], [3.0, 7.0], [2.0, 1.0], [3.0, 9.0]]
     thin = np.array([[1.0]])
-    assert _halved(thin, np.nextafter(thin, 2.0), np.array([0])) is None
-    assert _halved(thin, thin, np.array([0])) is None
+    assert _halve_cells(thin, np.nextafter(thin, 2.0), np.array([0])) is None
+    assert _halve_cells(thin, thin, np.array([0])) is None
 
 
 def test_cells_that_are_cut_towards_a_peak_fill_what_they_were_and_are_short_where_it_is():
     lower, upper = cells(0, 2, 4, 8)
     peaks = Separation(np.array([[3.1]]), np.array([0]), np.array([-1e-10]), np.inf)
     bend = np.array([0.5, 0.5, 2.0])
-    low, high = (ends.ravel() for ends in _towards(peaks, lower, upper, bend - 0.1, bend))
+    low, high = (ends.ravel() for ends in _divide_towards_peaks(peaks, lower, upper, bend - 0.1, bend))
     assert low[0] == 0.0 and high[-1] == 8.0
     assert (np.sort(low)[1:] == np.sort(high)[:-1]).all()
     assert (low < high).all()
@@ -167,10 +174,10 @@ def test_cells_that_are_cut_towards_a_peak_fill_what_they_were_and_are_short_whe
     at = int(np.flatnonzero((low <= 3.1) & (high >= 3.1))[0])
     assert 0.5 * ((high[at] - low[at]) / 2.0) ** 2 <= 1.2 * TOLERANCE
     assert np.diff(np.sort(low)).max() <= 4.0
-    assert _towards(branch_and_bound._NOWHERE, lower, upper, bend, bend) is None
+    assert _divide_towards_peaks(branch_and_bound._NOWHERE, lower, upper, bend, bend) is None
     # far from every peak, or without any bend, halves are enough: those are for others to make
     far = Separation(np.array([[3.1]]), np.array([0]), np.array([-1.0]), np.inf)
-    assert _towards(far, lower[:1], upper[:1], bend[:1], 1e-30 * bend[:1]) is None
+    assert _divide_towards_peaks(far, lower[:1], upper[:1], bend[:1], 1e-30 * bend[:1]) is None
 
 
 @pytest.mark.parametrize("ratio", [4.0, 9.0, 64.0])
@@ -190,7 +197,9 @@ def test_every_part_towards_a_smooth_peak_is_closed_by_its_bound_and_there_are_f
 
         bend = np.array([ratio * c * width**2 / 8.0])
         peaks = Separation(np.array([[at]]), np.array([0]), np.array([top]), np.inf)
-        parts = _towards(peaks, np.array([[low]]), np.array([[high]]), bounds(np.array([low]), np.array([high])), bend)
+        parts = _divide_towards_peaks(
+            peaks, np.array([[low]]), np.array([[high]]), bounds(np.array([low]), np.array([high])), bend
+        )
         assert parts is not None
         a, b = (ends.ravel() for ends in parts)
         allowed = max(
@@ -222,6 +231,6 @@ def test_batches_that_take_long_are_told_of_every_second(monkeypatch):
 
     course = Course(family(slow), told.append, 1000, Deadline(), started=0.0, told=0.0)
     lower, upper = cells(*np.linspace(0.0, 8.0, 11))
-    bounds, _, bend = branch_and_bound._bounded(course, np.zeros(1), lower, upper)
+    bounds, _, bend = branch_and_bound._bound_cells(course, np.zeros(1), lower, upper)
     assert bounds.tolist() == (-lower.ravel()).tolist() and bend is None
     assert [(one.examined, one.bound, one.cells) for one in told] == [(4, 0.0, 10), (8, 0.0, 10)]

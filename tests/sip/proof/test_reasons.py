@@ -10,7 +10,7 @@ from scipy.sparse import csr_matrix
 
 import sparserob_core as sr
 from sparserob_core.sip.evidence import Cut
-from sparserob_core.sip.proof.reasons import _looked_at, least_of, least_within, reasons
+from sparserob_core.sip.proof.reasons import _choose_indices, least_of, least_within, reasons
 from sparserob_core.sip.proof.verdict import infeasible_subsystem
 from sparserob_core.sip.relaxed.relaxed import Rows
 
@@ -83,12 +83,12 @@ def test_a_row_that_the_decision_does_not_enter_is_told_where_it_is_missed_most(
 
 def test_cells_are_looked_at_at_their_corners_and_centres_and_a_thinned_choice_keeps_both_ends():
     made = program(np.ones((9, 1, 1)), np.ones((9, 1))).families[0]
-    assert _looked_at(made).ravel().tolist() == TIMES.tolist()
+    assert _choose_indices(made).ravel().tolist() == TIMES.tolist()
     edges = np.linspace(0.0, 1.0, 3001)
     many = sr.ConstraintFamily(
         name="walls", index_set=made.index_set, rows=made.rows, cells=(edges[:-1, None], edges[1:, None])
     )
-    chosen = _looked_at(many).ravel()
+    chosen = _choose_indices(many).ravel()
     assert chosen.size == 2000 and (chosen[0], chosen[-1]) == (0.0, 1.0) and np.diff(chosen).max() < 4.5 / 6000
 
 

@@ -45,7 +45,7 @@ class Elsewhere(Executor):
         if self.broken is not None and self.calls > self.broken:
             future.set_exception(BrokenExecutor("a worker has died"))
         else:
-            batches._kept.g = None  # as on a worker that is new
+            batches._worker_state.g = None  # as on a worker that is new
             fn, args, kwargs = pickle.loads(call)
             future.set_result(pickle.loads(pickle.dumps(fn(*args, **kwargs))))
         return future
@@ -194,14 +194,14 @@ def test_chunks_are_shorter_than_long_batches():
 @pytest.mark.slow
 def test_a_run_with_processes_leaves_the_files_of_a_serial_one(tmp_path, worth, monkeypatch):
     """The workers' own rule does not matter: only this process decides what is sent."""
-    honest, helped = Batches._elsewhere, []
+    honest, helped = Batches._evaluate_on_workers, []
 
     def watched(self, chunks, best):
         found = honest(self, chunks, best)
         helped.append(self.executor is not None)
         return found
 
-    monkeypatch.setattr(Batches, "_elsewhere", watched)
+    monkeypatch.setattr(Batches, "_evaluate_on_workers", watched)
     runs = {
         name: sr.run({**CONFIG, "executor": executor}, out=tmp_path / name, figures=False)
         for name, executor in {"serial": "serial", "processes": {"name": "processes", "workers": 2}}.items()

@@ -118,11 +118,11 @@ def test_only_the_rows_of_changed_indices_are_built(tools):
 
 
 def test_an_index_whose_disturbance_stays_open_is_built_again_only_where_its_time_moves(tools):
-    from sparserob_core.experiment.run.inspection import _with_the_worst
+    from sparserob_core.experiment.run.inspection import _substitute_worst
 
     program, built = oscillator("literal"), []
     open_ = np.arange(25) > 0
-    worst = [_with_the_worst(family, open_) for family in program.families]
+    worst = [_substitute_worst(family, open_) for family in program.families]
 
     def watched(family):
         return replace(family, rows=lambda indices: built.append((family.name, len(indices))) or family.rows(indices))

@@ -75,8 +75,8 @@ def test_a_basis_that_is_wrong_costs_time_and_nothing_else():
     program, h = bent(rng)
     expected = optimum(program, h)
     for rows, free, side in (([0, 1], [3, 3], [1, 1]), ([2], [5], [-1]), ([0, 1, 2, 3], [0, 1, 2, 3], [1, -1, 1, -1])):
-        program._rows, program._free, program._side = rows, free, side
-        program._place = rng.integers(-1, 2, 20).astype(float)
+        program._rows, program._free, program._sides = rows, free, side
+        program._positions = rng.integers(-1, 2, 20).astype(float)
         x, y = program.solve(h)
         assert (program.G @ x - h).max() <= 1e-9
         assert program.weights @ np.abs(x) == pytest.approx(expected, abs=1e-9)
@@ -86,7 +86,7 @@ def test_a_basis_that_is_wrong_costs_time_and_nothing_else():
 def test_an_interrupt_leaves_no_basis_that_is_half_changed():
     program, h = bent(np.random.default_rng(3))
     expected = optimum(program, h)
-    first, calls = WarmProgram._end, []
+    first, calls = WarmProgram._find_step_end, []
 
     def pressed(self, *arguments):
         calls.append(first(self, *arguments))
@@ -94,7 +94,7 @@ def test_an_interrupt_leaves_no_basis_that_is_half_changed():
             raise KeyboardInterrupt
         return calls[-1]
 
-    with patch.object(WarmProgram, "_end", pressed), pytest.raises(KeyboardInterrupt):
+    with patch.object(WarmProgram, "_find_step_end", pressed), pytest.raises(KeyboardInterrupt):
         program.solve(h)
     with patch(f"{HOME}.simplex", side_effect=AssertionError):
         x, _ = program.solve(h)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import sparserob_core as sr
-from sparserob_core.sip.working.securing import DEAR, _dear
+from sparserob_core.sip.working.securing import DEAR, _compute_dear_margin
 
 
 @pytest.mark.parametrize("pieces", [50, 250])
@@ -29,5 +29,5 @@ def test_a_round_in_which_a_decision_is_secured_begins_with_what_is_known(pieces
 def test_a_distance_that_costs_next_to_nothing_is_a_number() -> None:
     for price in (0.0, 5e-324, np.finfo(float).tiny):
         for cost in (1e-3, 100.0, 1e12):
-            assert np.isfinite(_dear(np.float64(cost), np.float64(price)))
-    assert _dear(2.0, 0.5) == DEAR * 4.0
+            assert np.isfinite(_compute_dear_margin(np.float64(cost), np.float64(price)))
+    assert _compute_dear_margin(2.0, 0.5) == DEAR * 4.0

@@ -47,7 +47,7 @@ class Left:
         self.parts = parts
         self._total, self._cross = np.zeros((parts, parts)), np.zeros((parts, parts))
         self._diagonal = np.zeros(parts)
-        self._more, self._less = list[Array](), list[Array]()
+        self._added, self._subtracted = list[Array](), list[Array]()
 
     def at(self, columns: np.ndarray, values: Array) -> None:
         """Entries of the diagonal."""
@@ -62,16 +62,16 @@ class Left:
         if 4 * X.shape[0] > self.parts:
             self._total += X.T @ X
         elif X.size:
-            self._more.append(X)
+            self._added.append(X)
 
     def less(self, X: Array) -> None:
         """``- X' X``."""
         if X.size:
-            self._less.append(X)
+            self._subtracted.append(X)
 
     def total(self) -> Array:
         """The sum."""
-        for sign, matrices in ((1.0, self._more), (-1.0, self._less)):
+        for sign, matrices in ((1.0, self._added), (-1.0, self._subtracted)):
             if matrices:
                 tall = np.vstack(matrices)
                 self._total += sign * (tall.T @ tall)
@@ -94,7 +94,7 @@ class Whole:
 
     def forward(self, r: Array) -> tuple[State, Array]:
         """A right-hand side among the pivots, and what it makes of the parts."""
-        block, u = self.block, self._solved(r)
+        block, u = self.block, self._solve_with_factor(r)
         reduced_rhs: Array = np.bincount(block.columns, self.single * u[block.of], self.parts).astype(float)
         reduced_rhs += np.bincount(block.mixed, self.rows @ u, self.parts)
         return (r,), reduced_rhs
@@ -103,10 +103,10 @@ class Whole:
         """The variables."""
         block = self.block
         r = state[0] - np.bincount(block.of, self.single * parts[block.columns], state[0].size)
-        return self._solved(r - parts[block.mixed] @ self.rows)
+        return self._solve_with_factor(r - parts[block.mixed] @ self.rows)
 
-    def _solved(self, r: Array) -> Array:
-        lapack = _lapack()
+    def _solve_with_factor(self, r: Array) -> Array:
+        lapack = _import_lapack()
         intermediate, _ = lapack.dtrtrs(self.factor, r, lower=1)
         u, _ = lapack.dtrtrs(self.factor, intermediate, lower=1, trans=1)
         return np.asarray(u)
@@ -133,7 +133,7 @@ class Lean:
 
     def forward(self, r: Array) -> tuple[State, Array]:
         """A right-hand side among the pivots, and what it makes of the parts."""
-        lapack = _lapack()
+        lapack = _import_lapack()
         block, u = self.block, self.inverse * r
         reduced_rhs = np.zeros(self.Q.shape[1])
         reduced_rhs[block.columns] = self.single * u[block.of]
@@ -151,7 +151,7 @@ class Lean:
 
     def back(self, state: State, parts: Array) -> Array:
         """The variables."""
-        lapack = _lapack()
+        lapack = _import_lapack()
         block = self.block
         r = state[0] - np.bincount(block.of, self.single * parts[block.columns], self.inverse.size)
         if not block.at.size:
@@ -170,12 +170,12 @@ class Lean:
 def eliminate(block: Block, D: Array, weight: Array, lean: Array, left: Left) -> Eliminated:
     """A block eliminated, and what it leaves added to ``left``. ``D (n,)``: the diagonal; of all absolute values:
     ``weight (J,)``, and ``lean (J,)``, by which its part is coupled to it."""
-    lean_block = _lean(block, D, weight, lean, left) if block.once and D.size > LARGE else None
-    return _whole(block, D, weight, lean, left) if lean_block is None else lean_block
+    lean_block = _eliminate_lean(block, D, weight, lean, left) if block.once and D.size > LARGE else None
+    return _eliminate_whole(block, D, weight, lean, left) if lean_block is None else lean_block
 
 
-def _whole(block: Block, D: Array, weight: Array, lean: Array, left: Left) -> Whole:
-    lapack = _lapack()
+def _eliminate_whole(block: Block, D: Array, weight: Array, lean: Array, left: Left) -> Whole:
+    lapack = _import_lapack()
     n, A = D.size, block.A
     scaled = A * np.sqrt(weight[block.at])[:, None]
     M = scaled.T @ scaled
@@ -193,14 +193,14 @@ def _whole(block: Block, D: Array, weight: Array, lean: Array, left: Left) -> Wh
     return Whole(block, factor, single, rows, left.parts)
 
 
-def _lean(block: Block, D: Array, weight: Array, lean: Array, left: Left) -> Lean | None:
+def _eliminate_lean(block: Block, D: Array, weight: Array, lean: Array, left: Left) -> Lean | None:
     """The pivots, where they are few enough.
 
     A part is coupled by ``B = S + A' m``. ``[A' m; 0]`` is ``[D, A'; A, -W^-1] [0; m]`` and ``[0; W^-1 m]``, so that a
     row of great weight, of which the diagonal would leave a small difference of large numbers, takes a small right-hand
     side of its own instead (``m^2 / w`` is what is left then); of the other rows ``m`` is ``kept``.
     """
-    lapack = _lapack()
+    lapack = _import_lapack()
     A, w, m = block.A, weight[block.at], lean[block.at]
     k, n = A.shape
     unsafe = np.flatnonzero(~block.alone | (SAFE * (w @ (A * A)) > D))
@@ -244,7 +244,7 @@ def _lean(block: Block, D: Array, weight: Array, lean: Array, left: Left) -> Lea
 
 
 @cache
-def _lapack() -> Any:
+def _import_lapack() -> Any:
     """The routines, imported once: blocks ask for them ten thousand times in a step."""
     from scipy.linalg import lapack
 
@@ -253,7 +253,7 @@ def _lapack() -> Any:
 
 def cholesky(M: Array) -> Array:
     """The lower factor of a positive definite matrix, whose diagonal is enlarged until it is one."""
-    lapack = _lapack()
+    lapack = _import_lapack()
     diagonal, increase = M.reshape(-1)[:: M.shape[0] + 1], GREATER
     while increase < 1e-6:
         diagonal *= 1.0 + increase

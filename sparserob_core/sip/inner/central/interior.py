@@ -58,19 +58,19 @@ class Interior:
 
     def __post_init__(self) -> None:
         self._layout = Layout(self.program, self.spread)
-        self._begun, self._stale, none = False, True, np.zeros(0)
+        self._is_initialised, self._is_stale, none = False, True, np.zeros(0)
         self._z, self._f, self._s, self._y, self._mu = none, none, none, none, 0.0
         self._plus, self._minus, self._alpha, self._beta = none, none, none, none
-        self._went = 0.0  # share of the last direction that multipliers went
-        self._margin, self._tightened = 0.0, 0.0  # of the last solve, and by how much more rows are tightened now
-        self._elsewhere: tuple[float, Iterate] | None = None  # where the last solve with another margin ended
+        self._dual_step = 0.0  # share of the last direction that multipliers went
+        self._margin, self._tightening = 0.0, 0.0  # of the last solve, and by how much more rows are tightened now
+        self._stored_iterate: tuple[float, Iterate] | None = None  # where the last solve with another margin ended
 
     def add(self, block: UncertainRows) -> None:
         """Impose rows from now on."""
         if self.spread.is_box and not block.exact:
             self._layout.add(block)
         self.blocks.append(block)
-        self._stale = True
+        self._is_stale = True
 
     @property
     def approximate(self) -> bool:
@@ -100,42 +100,42 @@ class Interior:
         """The optimum with every row tightened by ``margin``, to about ``accuracy`` in the cost. It is not solved where
         ``seconds`` do not suffice, and says how far it has come."""
         until = time.monotonic() + seconds
-        if self._begun and margin != self._margin:
-            self._change(margin)
-        if self._stale:
-            self._extend(margin)
+        if self._is_initialised and margin != self._margin:
+            self._change_margin(margin)
+        if self._is_stale:
+            self._extend_iterate(margin)
         first, predicted_error = self._limits.size, np.inf
         self._h[first:] = self._layout.h - self._layout.rest - margin
         with np.errstate(all="ignore"), one_thread():  # threads for thousands of small matrices wait for each other
             for _ in range(STEPS):
-                gap, dual_error, primal_residual = self._residuals()
+                gap, dual_error, primal_residual = self._compute_residuals()
                 close = gap + dual_error <= accuracy or gap <= SPENT * accuracy
                 # half of the gap that is small enough: one that only tends to it is met by chance. Smaller products
                 # would make steps short while residuals are still large; where these are rounding, only they help
                 share = SPENT if dual_error > 2.0 * predicted_error else 1.0
                 self._floor = 0.5 * share * accuracy / (self._y.size + 2 * self._plus.size)
                 if close and primal_residual <= max(MET, SPENT * accuracy):
-                    return self._answer(True, "interior point method: optimal")
-                if not self._y.max() < ENDLESS or not self._step():
-                    return self._answer(False, "the interior point method came to a halt")
-                predicted_error = (1.0 - self._went) * dual_error
+                    return self._form_answer(True, "interior point method: optimal")
+                if not self._y.max() < ENDLESS or not self._take_step():
+                    return self._form_answer(False, "the interior point method came to a halt")
+                predicted_error = (1.0 - self._dual_step) * dual_error
                 if time.monotonic() > until:
-                    return self._answer(False, "the interior point method is out of time")
+                    return self._form_answer(False, "the interior point method is out of time")
                 self.steps += 1
-        return self._answer(False, f"the interior point method took {STEPS} steps")
+        return self._form_answer(False, f"the interior point method took {STEPS} steps")
 
-    def _change(self, margin: float) -> None:
+    def _change_margin(self, margin: float) -> None:
         """Go on with another margin: where the last solve with it ended, for the way back from rows that were tightened
         for one decision is as long as the way there, or else in the middle of rows that the difference violates."""
         current = self._mu, self._z, self._f, self._s, self._y, self._plus, self._minus, self._alpha, self._beta
-        stored, self._elsewhere = self._elsewhere, (self._margin, current)
+        stored, self._stored_iterate = self._stored_iterate, (self._margin, current)
         if stored is not None and stored[0] == margin:
             self._mu, self._z, self._f, self._s, self._y, self._plus, self._minus, self._alpha, self._beta = stored[1]
         else:
-            self._tightened = max(0.0, margin - self._margin)
-        self._margin, self._stale = margin, True
+            self._tightening = max(0.0, margin - self._margin)
+        self._margin, self._is_stale = margin, True
 
-    def _begin(self, margin: float) -> None:
+    def _initialise(self, margin: float) -> None:
         """Joint variables, absolute values of those that cost, and the rows that bound them."""
         from scipy.sparse import coo_array, csr_array
 
@@ -154,38 +154,38 @@ class Interior:
         value = np.concatenate([np.ones(up.size), -np.ones(down.size), np.ones(split.size), -np.ones(split.size)])
         row = np.concatenate([row, count + k, count + split.size + k])
         column, value = np.concatenate([column, n + k, n + k]), np.concatenate([value, -np.ones(2 * split.size)])
-        self._plain = csr_array(coo_array((value, (row, column)), shape=(count + 2 * split.size, self._size)))
+        self._bound_rows = csr_array(coo_array((value, (row, column)), shape=(count + 2 * split.size, self._size)))
         self._limits = np.concatenate([high[up], -low[down], np.zeros(2 * split.size)])
         self._z, self._f = np.zeros(self._size), np.zeros(self._layout.answering.size)
         self._z[:n], self._z[n:] = np.clip(0.0, low, high), ROOM
         reach = np.maximum(np.abs(program.lower), np.abs(program.upper))
         reach = np.where(np.isfinite(reach), reach, ROOM)
-        self._reach = np.concatenate([reach[joint], np.full(split.size, ROOM)]), reach[self._layout.answering]
+        self._variable_sizes = np.concatenate([reach[joint], np.full(split.size, ROOM)]), reach[self._layout.answering]
         self._mu = FIRST * max(float(np.abs(self._c).max(initial=0.0)), TINY)
-        self._s = np.maximum(self._limits - self._plain @ self._z, ROOM)
+        self._s = np.maximum(self._limits - self._bound_rows @ self._z, ROOM)
         self._y = self._mu / self._s
         self._plus = self._minus = self._alpha = self._beta = np.zeros(0)
-        self._begun, self._margin, self._elsewhere = True, margin, None
+        self._is_initialised, self._margin, self._stored_iterate = True, margin, None
 
-    def _extend(self, margin: float) -> None:
+    def _extend_iterate(self, margin: float) -> None:
         """Places, slacks and multipliers of what is new."""
         from scipy.sparse import csr_array, hstack, vstack
 
         kept, L = self._layout.arrange(), self._layout
-        if not (self._begun and kept):
-            self._begin(margin)
+        if not (self._is_initialised and kept):
+            self._initialise(margin)
         first = self._limits.size
         self._g = csr_array(hstack([L.g, csr_array((L.g.shape[0], self._size - self._n))]))
-        self._G = csr_array(vstack([self._plain, self._g]))
+        self._G = csr_array(vstack([self._bound_rows, self._g]))
         self._h = np.concatenate([self._limits, L.h - L.rest - margin])
         self._Phi = csr_array((L.scale, (np.arange(L.of.size), L.of)), shape=(L.of.size, L.parts))
-        self._room = np.bincount(L.of, np.abs(self._h[first:]), L.parts) / np.bincount(L.of, L.scale, L.parts)
+        self._part_sizes = np.bincount(L.of, np.abs(self._h[first:]), L.parts) / np.bincount(L.of, L.scale, L.parts)
         had = self._s.size - first
         a = L.C @ self._f + L.offset
         worst = np.bincount(L.part, L.radius * np.abs(a), L.parts)
         free = self._h[first:] - self._g @ self._z - L.scale * worst[L.of]
         counts = np.bincount(L.part, minlength=L.parts) + 2.0  # a slack is as large as that of each absolute value
-        violation = max(self._tightened, -float(free[had:].min(initial=0.0)))
+        violation = max(self._tightening, -float(free[had:].min(initial=0.0)))
         before: Array = np.bincount(L.of[:had], L.scale[:had] * self._y[first:], L.parts).astype(float)
         if had:
             aim = SLACK * violation * float(self._y[first:].max()) / float(counts.max())
@@ -195,10 +195,10 @@ class Interior:
             self._y = np.maximum(self._y, self._mu / self._s)
         else:
             violation = max(ROOM, AROUND * violation)
-        self._appear(had, before, a, free, np.maximum(free, violation) / counts[L.of])
-        self._stale, self._tightened = False, 0.0
+        self._add_slacks(had, before, a, free, np.maximum(free, violation) / counts[L.of])
+        self._is_stale, self._tightening = False, 0.0
 
-    def _appear(self, had: int, before: Array, a: Array, free: Array, room: Array) -> None:
+    def _add_slacks(self, had: int, before: Array, a: Array, free: Array, room: Array) -> None:
         """Slacks and multipliers of new rows, and those of all absolute values; ``room (r,)``: what a row of this
         freedom ``free`` has as slack in the middle."""
         L, first = self._layout, self._limits.size
@@ -226,7 +226,7 @@ class Interior:
         self._alpha = np.maximum(np.append(self._alpha, none), self._mu / self._plus)
         self._beta = np.maximum(np.append(self._beta, none), self._mu / self._minus)
 
-    def _residuals(self) -> tuple[float, float, float]:
+    def _compute_residuals(self) -> tuple[float, float, float]:
         """The gap, what the residuals of the dual take from a bound, and the largest of the primal."""
         L, first = self._layout, self._limits.size
         tau = np.bincount(L.part, L.radius * (self._plus + self._minus) / 2, L.parts)
@@ -238,13 +238,15 @@ class Interior:
         self._rp[first:] += L.scale * tau[L.of]
         gap = float(self._y @ self._s + self._alpha @ self._plus + self._beta @ self._minus)
         self._mu = gap / (self._y.size + 2 * self._plus.size)
-        weight, _, slope = self._balanced(eta)
+        weight, _, slope = self._balance_multipliers(eta)
         dual_error = float(
-            np.abs(self._rz) @ self._reach[0] + (weight - eta) @ self._room + np.abs(slope) @ self._reach[1]
+            np.abs(self._rz) @ self._variable_sizes[0]
+            + (weight - eta) @ self._part_sizes
+            + np.abs(slope) @ self._variable_sizes[1]
         )
         return gap, dual_error, float(np.abs(self._rp).max())
 
-    def _step(self) -> bool:
+    def _take_step(self) -> bool:
         """Take one step towards the optimum; return whether a step was possible."""
         try:
             self._factorise()
@@ -252,21 +254,21 @@ class Interior:
             return False
         values, prices = (self._s, self._plus, self._minus), (self._y, self._alpha, self._beta)
         products = [value * price for value, price in zip(values, prices, strict=True)]
-        predicted = self._direction(*(-product for product in products))
-        changes = list(zip(values, prices, *_moves(predicted), strict=True))
-        primal, dual = (_length(change, 1.0) for change in self._relative(predicted))
+        predicted = self._compute_direction(*(-product for product in products))
+        changes = list(zip(values, prices, *_split_changes(predicted), strict=True))
+        primal, dual = (_compute_step_length(change, 1.0) for change in self._compute_relative_changes(predicted))
         after = sum(float((s + primal * ds) @ (y + dual * dy)) for s, y, ds, dy in changes)
         share = after / sum(float(product.sum()) for product in products)
         aim = max(self._mu * min(1.0, max(share, 0.0)) ** 3, self._floor)
         terms = [aim - s * y - ds * dy for s, y, ds, dy in changes]
-        move, primal, dual = self._between(predicted, self._direction(*terms), primal * dual)
+        move, primal, dual = self._combine_directions(predicted, self._compute_direction(*terms), primal * dual)
         for _ in range(CORRECTIONS):  # products that a longer step would make far from the middle are brought back
             if min(primal, dual) > 0.9:
                 break
             longer = min(1.0, primal + FURTHER), min(1.0, dual + FURTHER)
-            changes = list(zip(values, prices, *_moves(move), strict=True))
-            terms = [s * dy + y * ds + _back(s, y, ds, dy, *longer, aim) for s, y, ds, dy in changes]
-            candidate, *lengths = self._between(move, self._direction(*terms), primal * dual)
+            changes = list(zip(values, prices, *_split_changes(move), strict=True))
+            terms = [s * dy + y * ds + _compute_corrections(s, y, ds, dy, *longer, aim) for s, y, ds, dy in changes]
+            candidate, *lengths = self._combine_directions(move, self._compute_direction(*terms), primal * dual)
             if not sum(lengths) > primal + dual + 0.01:
                 break
             move, (primal, dual) = candidate, lengths
@@ -276,19 +278,25 @@ class Interior:
         self._z, self._f, self._s = self._z + primal * dz, self._f + primal * df, self._s + primal * ds
         self._plus, self._minus = self._plus + primal * dplus, self._minus + primal * dminus
         self._y, self._alpha, self._beta = self._y + dual * dy, self._alpha + dual * dalpha, self._beta + dual * dbeta
-        self._went = dual
+        self._dual_step = dual
         return True
 
-    def _between(self, move: Direction, corrected: Direction, least: float) -> tuple[Direction, float, float]:
+    def _combine_directions(
+        self, move: Direction, corrected: Direction, least: float
+    ) -> tuple[Direction, float, float]:
         """Return a direction with a share of a correction, and the step lengths of the slacks and of the multipliers.
 
         For each of the two, the share of the correction is the one with the longest step. A correction is computed for
         a whole step, so that a short step needs less of it (Colombo and Gondzio 2008).
         """
         lengths, weights = list[float](), list[float]()
-        for before, after in zip(self._relative(move), self._relative(corrected), strict=True):
+        for before, after in zip(
+            self._compute_relative_changes(move), self._compute_relative_changes(corrected), strict=True
+        ):
             trial_shares = np.linspace(1.0, max(least, LEAST), SHARES).tolist()
-            length, weight = max((_length(before + share * (after - before), SHARE), share) for share in trial_shares)
+            length, weight = max(
+                (_compute_step_length(before + share * (after - before), SHARE), share) for share in trial_shares
+            )
             lengths.append(length)
             weights.append(weight)
         primal, dual = weights
@@ -296,9 +304,9 @@ class Interior:
         combined = tuple(a + share * (b - a) for a, b, share in zip(move, corrected, shares, strict=True))
         return cast(Direction, combined), lengths[0], lengths[1]
 
-    def _relative(self, move: Direction) -> tuple[Array, Array]:
+    def _compute_relative_changes(self, move: Direction) -> tuple[Array, Array]:
         """The changes of all slacks and of all multipliers, relative to what they are."""
-        slacks, prices = _moves(move)
+        slacks, prices = _split_changes(move)
         over = np.concatenate([d / v for v, d in zip((self._s, self._plus, self._minus), slacks, strict=True)])
         under = np.concatenate([d / v for v, d in zip((self._y, self._alpha, self._beta), prices, strict=True)])
         return over, under
@@ -311,11 +319,11 @@ class Interior:
         L, first = self._layout, self._limits.size
         e, b = self._alpha / self._plus, self._beta / self._minus
         both = e + b
-        self._both = both + PROXIMAL
-        self._lean = (e - b) / self._both
-        self._weight = (4.0 * e * b + PROXIMAL * both) / self._both
+        self._stiffness = both + PROXIMAL
+        self._lean = (e - b) / self._stiffness
+        self._weight = (4.0 * e * b + PROXIMAL * both) / self._stiffness
         lean = self._lean * L.radius
-        S = np.diag(np.bincount(L.part, L.radius**2 / self._both, L.parts))
+        S = np.diag(np.bincount(L.part, L.radius**2 / self._stiffness, L.parts))
         diagonal = PROXIMAL + L.squares @ self._weight
         self._eliminated: list[tuple[Block, Eliminated, np.ndarray]] = []
         for group in L.groups:
@@ -329,10 +337,10 @@ class Interior:
         W.reshape(-1)[:: L.of.size + 1] += 1.0 / self._D[first:]
         self._W = cholesky(W)
         self._Y, _ = lapack.dtrtrs(self._W, self._g.toarray(), lower=1)
-        table = (self._plain.T @ diags_array(self._D[:first]) @ self._plain).toarray()
+        table = (self._bound_rows.T @ diags_array(self._D[:first]) @ self._bound_rows).toarray()
         self._K = cholesky(table + self._Y.T @ self._Y)
 
-    def _direction(self, rows: Array, over: Array, under: Array) -> Direction:
+    def _compute_direction(self, rows: Array, over: Array, under: Array) -> Direction:
         """The Newton direction for these changes of the products of slacks and multipliers: of ``z``, ``f``, and the
         slacks and multipliers of rows and of both sides of absolute values."""
         from scipy.linalg import lapack
@@ -341,39 +349,39 @@ class Interior:
         k, kp, km = rows / self._s, over / self._plus, under / self._minus
         pull = -self._rt + kp + km
         rhs = -self._rf - L.C.T @ (kp - km - self._lean * pull)
-        kappa = np.bincount(L.part, L.radius * pull / self._both, L.parts)
+        kappa = np.bincount(L.part, L.radius * pull / self._stiffness, L.parts)
         states = list[State]()
         for block, eliminated, parts in self._eliminated:
             state, reduced_rhs = eliminated.forward(rhs[block.first : block.last])
             states.append(state)
             kappa[parts] += reduced_rhs
         lifted, _ = lapack.dtrtrs(self._W, self._rp[first:] + L.scale * kappa[L.of] + k[first:] / D[first:], lower=1)
-        right = self._rz + self._plain.T @ (D[:first] * self._rp[:first] + k[:first]) + self._Y.T @ lifted
+        right = self._rz + self._bound_rows.T @ (D[:first] * self._rp[:first] + k[:first]) + self._Y.T @ lifted
         dz, _ = lapack.dpotrs(self._K, -right, lower=1)
         dy = np.empty(k.size)
-        dy[:first] = D[:first] * (self._plain @ dz + self._rp[:first]) + k[:first]
+        dy[:first] = D[:first] * (self._bound_rows @ dz + self._rp[:first]) + k[:first]
         dy[first:], _ = lapack.dtrtrs(self._W, self._Y @ dz + lifted, lower=1, trans=1)
         deta = self._Phi.T @ dy[first:]
         df = np.empty(self._f.size)
         for (block, eliminated, parts), state in zip(self._eliminated, states, strict=True):
             df[block.first : block.last] = eliminated.back(state, deta[parts])
         da = L.C @ df
-        dt = (pull - L.radius * deta[L.part]) / self._both + self._lean * da
+        dt = (pull - L.radius * deta[L.part]) / self._stiffness + self._lean * da
         dplus, dminus = dt - da, dt + da
         dalpha, dbeta = kp - self._alpha / self._plus * dplus, km - self._beta / self._minus * dminus
         return dz, df, (k - dy) / D, dy, dplus, dminus, dalpha, dbeta
 
-    def _answer(self, solved: bool, said: str) -> RobustAnswer:
+    def _form_answer(self, solved: bool, said: str) -> RobustAnswer:
         L = self._layout
         x = np.zeros(self.program.n)
         for places, values, reach in zip(
-            (L.joint, L.answering), (self._z[: self._n], self._f), self._reach, strict=True
+            (L.joint, L.answering), (self._z[: self._n], self._f), self._variable_sizes, strict=True
         ):
             x[places] = np.where(np.abs(values) > ROUNDED * reach[: values.size], values, 0.0)
         y = self._y[self._limits.size :]
         y = np.where(y > NOTHING * y.max(), y, 0.0)
         eta: Array = np.bincount(L.of, L.scale * y, L.parts).astype(float)
-        weight, aim, _ = self._balanced(eta)
+        weight, aim, _ = self._balance_multipliers(eta)
         y = y + ((weight - eta) / np.maximum(np.bincount(L.of, L.scale, L.parts), TINY))[L.of]
         leaning = np.divide(aim, weight[L.part], out=np.zeros(aim.size), where=weight[L.part] > 0.0)
         table = L.at_rest.copy()
@@ -381,7 +389,7 @@ class Interior:
         signs = np.concatenate([np.sign(block.factor) for block in self.blocks])
         return RobustAnswer(solved, said, x, y, signs[:, None] * table[L.of], np.zeros(0))
 
-    def _balanced(self, eta: Array) -> tuple[Array, Array, Array]:
+    def _balance_multipliers(self, eta: Array) -> tuple[Array, Array, Array]:
         """Weights ``(p,)`` of parts that weigh ``eta``, with the multipliers ``(J,)`` of what is in their absolute
         values, such that variables that answer have no slope, and the slopes ``(n,)`` that some have all the same.
 
@@ -404,19 +412,21 @@ class Interior:
         return weight, aim, np.where(takes, 0.0, slope)
 
 
-def _length(changes: Array, share: float) -> float:
+def _compute_step_length(changes: Array, share: float) -> float:
     """A step of which these relative changes leave a share of the way to 0."""
     least = float(changes.min(initial=0.0))
     return min(1.0, share / -least) if least < 0.0 else 1.0
 
 
-def _moves(move: Direction) -> tuple[tuple[Array, Array, Array], tuple[Array, Array, Array]]:
+def _split_changes(move: Direction) -> tuple[tuple[Array, Array, Array], tuple[Array, Array, Array]]:
     """The changes of the slacks, and of their multipliers."""
     _, _, ds, dy, dplus, dminus, dalpha, dbeta = move
     return (ds, dplus, dminus), (dy, dalpha, dbeta)
 
 
-def _back(value: Array, price: Array, dvalue: Array, dprice: Array, primal: float, dual: float, aim: float) -> Array:
+def _compute_corrections(
+    value: Array, price: Array, dvalue: Array, dprice: Array, primal: float, dual: float, aim: float
+) -> Array:
     """Return corrections that bring products back to ``[0.1 aim, 10 aim]`` where a longer step would take them
     outside."""
     product = (value + primal * dvalue) * (price + dual * dprice)

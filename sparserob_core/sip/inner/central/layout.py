@@ -70,9 +70,9 @@ class Layout:
         self.program, self.spread = program, spread
         self.parts = 0
         self.taken = 0  # absolute values that stand in `blocks`
-        self._known: dict[bytes, int] = {}
-        self._rests: list[float] = []
-        self._still: list[Array] = []
+        self._part_numbers: dict[bytes, int] = {}
+        self._constants: list[float] = []
+        self._constant_deviations: list[Array] = []
         self._values: list[tuple[np.ndarray, np.ndarray, np.ndarray, Array]] = []
         self._entries: list[tuple[np.ndarray, np.ndarray, Array]] = []
         self._rows: list[tuple[csr_array, np.ndarray, Array, Array]] = []
@@ -82,16 +82,16 @@ class Layout:
 
     def add(self, block: UncertainRows) -> None:
         """Take rows apart."""
-        names = np.array([self._part(C, d) for C, d in zip(block.C, block.d, strict=True)], dtype=int)
+        names = np.array([self._add_part(C, d) for C, d in zip(block.C, block.d, strict=True)], dtype=int)
         self._rows.append((block.g, names[block.part], np.abs(block.factor), block.h))
 
-    def _part(self, C: csr_array, d: Array) -> int:
-        key = _digest(C.indptr, C.indices, C.data, d)
-        if key in self._known:
-            return self._known[key]
+    def _add_part(self, C: csr_array, d: Array) -> int:
+        key = _hash_arrays(C.indptr, C.indices, C.data, d)
+        if key in self._part_numbers:
+            return self._part_numbers[key]
         radii, counts = self.spread.radii, np.diff(C.indptr)
-        self._rests.append(float(radii[counts == 0] @ np.abs(d[counts == 0])))
-        self._still.append(np.where(counts == 0, np.sign(d) * radii, 0.0))
+        self._constants.append(float(radii[counts == 0] @ np.abs(d[counts == 0])))
+        self._constant_deviations.append(np.where(counts == 0, np.sign(d) * radii, 0.0))
         entries = np.flatnonzero((counts > 0) & (radii > 0.0))
         number = np.full(self.spread.size, -1)
         number[entries] = self.count + np.arange(entries.size)
@@ -99,7 +99,7 @@ class Layout:
         self._values.append((entries, np.full(entries.size, self.parts), d[entries], radii[entries]))
         self._entries.append((row[row >= 0], C.indices[row >= 0], C.data[row >= 0]))
         self.count += entries.size
-        self._known[key] = self.parts
+        self._part_numbers[key] = self.parts
         self.parts += 1
         return self.parts - 1
 
@@ -111,11 +111,11 @@ class Layout:
             np.concatenate(arrays) for arrays in zip(*self._values, strict=True)
         )
         row, variable, value = (np.concatenate(arrays) for arrays in zip(*self._entries, strict=True))
-        kept = self.label is not None and self._hang_together(row, variable)
+        kept = self.label is not None and self._has_same_blocks(row, variable)
         if not kept:
             self._partition(row, variable)
-        self.C = csr_array((value, (row, self._place[variable])), shape=(self.count, self.answering.size))
-        self._blocks()
+        self.C = csr_array((value, (row, self._positions[variable])), shape=(self.count, self.answering.size))
+        self._extend_blocks()
         self.single = np.flatnonzero(np.diff(self.C.indptr) == 1)
         alone = np.concatenate([block.single for block in self.blocks])
         at = self.C.indptr[alone]
@@ -125,16 +125,16 @@ class Layout:
             np.concatenate(arrays) for arrays in ([rows[i] for rows in self._rows] for i in (1, 2, 3))
         )
         self.g = csr_array(vstack([rows[0] for rows in self._rows]).tocsc()[:, self.joint])
-        self.rest = self.scale * np.array(self._rests)[self.of]
-        self.at_rest = np.array(self._still)
+        self.rest = self.scale * np.array(self._constants)[self.of]
+        self.at_rest = np.array(self._constant_deviations)
         return kept
 
-    def _hang_together(self, row: np.ndarray, variable: np.ndarray) -> bool:
+    def _has_same_blocks(self, row: np.ndarray, variable: np.ndarray) -> bool:
         assert self.label is not None
         is_new = row >= self.taken
         Q = self.spread.size
         return bool((self.label[Q + variable[is_new]] == self.label[self.entry[row[is_new]]]).all()) and bool(
-            (self._place[variable[is_new]] >= 0).all()
+            (self._positions[variable[is_new]] >= 0).all()
         )
 
     def _partition(self, row: np.ndarray, variable: np.ndarray) -> None:
@@ -148,18 +148,20 @@ class Layout:
         answers[variable] = True
         self.joint, answering = np.flatnonzero(~answers), np.flatnonzero(answers)
         self.answering = answering[np.argsort(self.label[Q + answering], kind="stable")]
-        self._place = np.full(n, -1)
-        self._place[self.answering] = np.arange(self.answering.size)
-        _, starts, self._of = np.unique(self.label[Q + self.answering], return_index=True, return_inverse=True)
+        self._positions = np.full(n, -1)
+        self._positions[self.answering] = np.arange(self.answering.size)
+        _, starts, self._block_numbers = np.unique(
+            self.label[Q + self.answering], return_index=True, return_inverse=True
+        )
         self.starts = np.concatenate([starts, [self.answering.size]])
         self.taken, self.blocks = 0, []
 
-    def _blocks(self) -> None:
+    def _extend_blocks(self) -> None:
         """Append the new absolute values of every block to its earlier ones, and form the groups anew."""
         fresh = np.arange(self.taken, self.count)
         fresh = fresh[np.diff(self.C.indptr)[self.taken :] > 0]
         is_single = np.diff(self.C.indptr)[fresh] == 1
-        number = self._of[self.C.indices[self.C.indptr[fresh]]]
+        number = self._block_numbers[self.C.indices[self.C.indptr[fresh]]]
         order = np.argsort(number, kind="stable")
         cuts = np.searchsorted(number[order], np.arange(self.starts.size))
         for b in range(self.starts.size - 1):
@@ -177,9 +179,9 @@ class Layout:
                 block.single, block.at = np.concatenate([block.single, single]), np.concatenate([block.at, at])
                 block.A = np.vstack([block.A, A])
         self.taken = self.count
-        self._group()
+        self._group_blocks()
 
-    def _group(self) -> None:
+    def _group_blocks(self) -> None:
         """Put blocks together, one after the other, as long as they have most parts in common."""
         self.groups: list[Group] = []
         open_, union = list[Block](), np.zeros(0, dtype=int)
@@ -187,12 +189,12 @@ class Layout:
             parts = np.unique(self.part[np.concatenate([block.single, block.at])])
             merged = np.union1d(union, parts)
             if open_ and merged.size > ALIKE * min(union.size, parts.size) + 4:
-                self._close(open_, union)
+                self._close_group(open_, union)
                 open_, merged = [], parts
             open_, union = [*open_, block], merged
-        self._close(open_, union)
+        self._close_group(open_, union)
 
-    def _close(self, blocks: list[Block], parts: np.ndarray) -> None:
+    def _close_group(self, blocks: list[Block], parts: np.ndarray) -> None:
         for block in blocks:
             places = self.C.indptr[block.single]
             block.of, block.value = self.C.indices[places] - block.first, self.C.data[places]
@@ -226,7 +228,7 @@ class Layout:
         return plain and answering.size >= WORTH and int(np.diff(self.starts).max()) <= LARGEST
 
 
-def _digest(*arrays: np.ndarray) -> bytes:
+def _hash_arrays(*arrays: np.ndarray) -> bytes:
     """A short name of arrays, the same for equal ones."""
     hasher = hashlib.blake2b(digest_size=16)
     for array in arrays:

@@ -124,7 +124,7 @@ class Counterpart:
     asked: Asked | None = None
     answered: Counter[str] = field(default_factory=Counter)
     blocks: list[UncertainRows] = field(default_factory=list)
-    _imposed: list[tuple[np.ndarray, Array, list[_Part]]] = field(default_factory=list, repr=False)
+    _imposed_rows: list[tuple[np.ndarray, Array, list[_Part]]] = field(default_factory=list, repr=False)
     _margin: float = 0.0
 
     def __post_init__(self) -> None:
@@ -143,11 +143,11 @@ class Counterpart:
             self._linear.variables(np.zeros(1), np.full(1, self.highest), -np.ones(1))
         curved = priced and (program.P is not None or program.blocks is not None)
         self._tangents = Tangents(program, self._linear) if curved else None
-        self._fixed = np.zeros(0, dtype=int)
+        self._equality_rows = np.zeros(0, dtype=int)
         if program.b.size:
             row, column = np.nonzero(program.A)
-            entries = _both(row, column, program.A[row, column], n)
-            self._fixed = self._linear.rows([entries], program.b, program.b)
+            entries = _split_signs(row, column, program.A[row, column], n)
+            self._equality_rows = self._linear.rows([entries], program.b, program.b)
 
         if self.ceiling is not None:
             (weights, limit), column = self.ceiling, np.flatnonzero(self.ceiling[0])
@@ -160,7 +160,7 @@ class Counterpart:
         if block.exact and not (self.elastic and self.lowest == 0.0):
             table, rhs = block.equations
             table = table.tocoo()
-            entries = [_both(table.row, table.col, table.data, self.program.n)]
+            entries = [_split_signs(table.row, table.col, table.data, self.program.n)]
             if self.scales:  # what answers deviations answers those of the factor 1, times the factor
                 answers = np.arange(rhs.size) % (1 + self.spread.size) > 0
                 scaled_rows = np.flatnonzero(answers & (rhs != 0.0))
@@ -168,11 +168,11 @@ class Counterpart:
                 rhs = np.where(answers, 0.0, rhs)
             at = self._linear.rows(entries, rhs, rhs)
             self.blocks.append(block)
-            self._imposed.append((at, rhs, []))
+            self._imposed_rows.append((at, rhs, []))
             return
-        parts = [self._part(C, d) for C, d in zip(block.C, block.d, strict=True)]
+        parts = [self._add_part(C, d) for C, d in zip(block.C, block.d, strict=True)]
         count, limits = block.h.size, block.h.copy()
-        entries = [_both(*entries_of(block.g), self.program.n)]
+        entries = [_split_signs(*entries_of(block.g), self.program.n)]
         for p, part in enumerate(parts):
             rows = np.flatnonzero(block.part == p)
             scale = np.abs(block.factor[rows])
@@ -186,11 +186,11 @@ class Counterpart:
             entries.append((np.arange(count), np.full(count, 2 * self.program.n), -np.ones(count)))
         where = self._linear.rows(entries, np.full(count, -np.inf), limits - self._margin)
         self.blocks.append(block)
-        self._imposed.append((where, limits, parts))
+        self._imposed_rows.append((where, limits, parts))
 
-    def _part(self, C: csr_array, d: Array) -> _Part:
+    def _add_part(self, C: csr_array, d: Array) -> _Part:
         if not self.spread.is_box:
-            return self._pointed(C, d)
+            return self._add_part_by_points(C, d)
         radii, counts, n = self.spread.radii, np.diff(C.indptr), self.program.n
         entries = np.flatnonzero(counts)
         constant = float(radii[counts == 0] @ np.abs(d[counts == 0]))
@@ -202,7 +202,7 @@ class Counterpart:
         free, nothing = np.full(count, np.inf), np.zeros(count)
         pairs = [self._linear.variables(nothing, free, nothing) for _ in range(2)]
         rows, ones = np.arange(count), np.ones(count)
-        inner = _both(np.repeat(rows, counts[entries]), C.indices, C.data, n)
+        inner = _split_signs(np.repeat(rows, counts[entries]), C.indices, C.data, n)
         split = [inner, (rows, pairs[0], -ones), (rows, pairs[1], ones)]
         if self.scales:
             split.append((rows, np.full(count, 2 * n), d[entries]))
@@ -212,7 +212,7 @@ class Counterpart:
             self._linear.enter(np.where((C @ self._x + d)[entries] >= 0.0, *pairs), at)
         return _Part(np.concatenate(pairs), np.tile(radii[entries], 2), constant, entries, at)
 
-    def _pointed(self, C: csr_array, d: Array) -> _Part:
+    def _add_part_by_points(self, C: csr_array, d: Array) -> _Part:
         """Return a part with one new variable for each block of the spread.
 
         The variable is at least the value of the block at each of its known points; at first only 0 is known.
@@ -238,11 +238,11 @@ class Counterpart:
         limits: list[float] = []
         first = self._linear.count
         coefficients = [
-            block.coefficients(x) for block, (_, _, parts) in zip(self.blocks, self._imposed, strict=True) if parts
+            block.coefficients(x) for block, (_, _, parts) in zip(self.blocks, self._imposed_rows, strict=True) if parts
         ]
         deviations = self.spread.worst(np.concatenate([*coefficients, np.zeros((0, self.spread.size))]))
         index = 0
-        for block, (_, _, parts) in zip(self.blocks, self._imposed, strict=True):
+        for block, (_, _, parts) in zip(self.blocks, self._imposed_rows, strict=True):
             for part, C, d in zip(parts, block.C, block.d, strict=False):  # none of an equality
                 worst, index = deviations[index], index + 1
                 for span, name, points, at in part.points:
@@ -254,7 +254,7 @@ class Counterpart:
                     row = (C[span].T @ point).reshape(-1)
                     column = np.flatnonzero(row)
                     number = np.full(column.size, len(limits))
-                    entries.append(_both(number, column, row[column], self.program.n))
+                    entries.append(_split_signs(number, column, row[column], self.program.n))
                     entries.append((np.array([len(limits)]), np.array([name]), -np.ones(1)))
                     offset = float(point @ d[span])
                     if self.scales:
@@ -284,7 +284,7 @@ class Counterpart:
         ``seconds`` do not suffice."""
         if margin != self._margin:
             self._margin = margin
-            for where, limits, parts in self._imposed:
+            for where, limits, parts in self._imposed_rows:
                 if parts:
                     self._linear.limit(where, limits - margin)
         until = time.monotonic() + seconds
@@ -300,20 +300,20 @@ class Counterpart:
             if shortfall <= max(accuracy, FLAT * self.program.added(decided)) or not rounds:
                 break  # the last ones are not sharpened: their multipliers are those of the rows that were solved with
             self._tangents.sharpen(decided, roots)
-        n, mu = self.program.n, rows[self._fixed]
+        n, mu = self.program.n, rows[self._equality_rows]
         x = self._x = columns[:n] - columns[n : 2 * n]
         at = None if self._tangents is None else self._tangents.touching(x, rows)
-        y, deviations = self._multipliers(rows, mu, at)
+        y, deviations = self._recover_multipliers(rows, mu, at)
         slack = float(columns[2 * n]) if self.elastic or self.scales else 0.0
         return RobustAnswer(True, message, x, y, deviations, mu, slack, at)
 
-    def _multipliers(self, even: Array, mu: Array, touched: Array | None) -> tuple[Array, Array]:
+    def _recover_multipliers(self, even: Array, mu: Array, touched: Array | None) -> tuple[Array, Array]:
         """The multipliers ``(r,)`` of all rows, and the deviations ``(r, Q)`` that those of the parts stand for."""
-        y, deviations = self._plain(even)
+        y, deviations = self._read_multipliers(even)
         terms = [(np.zeros(0, dtype=int), np.zeros(0))]
         late: list[tuple[UncertainRows, int, _Part, np.ndarray, float]] = []
         first = 0
-        for block, (where, _, parts) in zip(self.blocks, self._imposed, strict=True):
+        for block, (where, _, parts) in zip(self.blocks, self._imposed_rows, strict=True):
             multipliers = y[first : first + block.h.size]
             if not parts:
                 terms.append(weighted(even[where], block.equations[0]))
@@ -327,7 +327,7 @@ class Counterpart:
                 if part.single:
                     late.append((block, p, part, first + rows, total))
                     continue
-                w = self._at_rest(block, p)
+                w = self._find_constant_deviations(block, p)
                 limit = self.spread.radii[part.entries]
                 w[part.entries] = np.clip(even[part.at] / total, -limit, limit)
                 for span, _, points, at in part.points:
@@ -341,29 +341,29 @@ class Counterpart:
         priced = self.program if touched is None else self.program.tangent(touched)
         slope = mu @ self.program.A + (0.0 if self.elastic else priced.q)
         slope = slope + np.bincount(column, value, self.program.n)
-        self._balance(slope, deviations, late)
+        self._balance_slopes(slope, deviations, late)
         if not self.spread.is_box:
             deviations = deviations + DRAWN * (self.spread.inner - deviations)
         return y, deviations
 
-    def _plain(self, even: Array) -> tuple[Array, Array]:
+    def _read_multipliers(self, even: Array) -> tuple[Array, Array]:
         """The multipliers of all rows, and the deviations of exact ones, 0 for the others. The multipliers of equations
         are those of one row at a deviation and of its opposite at none."""
         y, deviations = [np.zeros(0)], [np.zeros((0, self.spread.size))]
-        for block, (where, _, parts) in zip(self.blocks, self._imposed, strict=True):
+        for block, (where, _, parts) in zip(self.blocks, self._imposed_rows, strict=True):
             multipliers, w = np.maximum(even[where], 0.0), np.zeros((block.h.size, self.spread.size))
             if not parts:
                 half = block.h.size // 2
                 table = even[where].reshape(half, -1)
                 multipliers = np.zeros(block.h.size)
                 for row, (plain, *answers) in enumerate(table):
-                    multipliers[row], w[row] = self._at_one(float(plain), np.array(answers))
+                    multipliers[row], w[row] = self._split_product(float(plain), np.array(answers))
                     multipliers[half + row] = multipliers[row] - plain
             y.append(multipliers)
             deviations.append(w)
         return np.concatenate(y), np.vstack(deviations)
 
-    def _at_one(self, plain: float, answers: Array) -> tuple[float, Array]:
+    def _split_product(self, plain: float, answers: Array) -> tuple[float, Array]:
         """A multiplier of at least ``plain`` and a deviation whose product is ``answers (Q,)``."""
         free = self.spread.radii > 0.0
         answers = np.where(free, answers, 0.0)
@@ -375,7 +375,7 @@ class Counterpart:
             multiplier *= 2.0
         return multiplier, answers / multiplier
 
-    def _at_rest(self, block: UncertainRows, p: int) -> Array:
+    def _find_constant_deviations(self, block: UncertainRows, p: int) -> Array:
         """The worst deviations where no decision enters a part; 0 elsewhere."""
         w = np.zeros(self.spread.size)
         if self.spread.is_box:
@@ -383,7 +383,7 @@ class Counterpart:
             w[bare] = np.sign(block.d[p][bare]) * self.spread.radii[bare]
         return w
 
-    def _balance(
+    def _balance_slopes(
         self, slope: Array, deviations: Array, late: list[tuple[UncertainRows, int, _Part, np.ndarray, float]]
     ) -> None:
         """Deviations of the parts whose entries are single variables: such that no slope is left in these, as far as
@@ -395,7 +395,7 @@ class Counterpart:
         np.divide(-slope, reach, out=share, where=reach > 0.0)
         share = np.clip(share, -1.0, 1.0)
         for block, p, part, rows, _ in late:
-            w = self._at_rest(block, p)
+            w = self._find_constant_deviations(block, p)
             w[part.entries] = np.sign(block.C[p].data) * share[block.C[p].indices] * self.spread.radii[part.entries]
             at = rows - rows[0] + np.flatnonzero(block.part == p)[0]
             deviations[rows] = np.sign(block.factor[at])[:, None] * w
@@ -414,7 +414,7 @@ class Growing:
             self.highs: Any = highspy.Highs()
         self.columns = self.count = 0
         self.refused = False
-        self._entering = list[tuple[np.ndarray, np.ndarray]]()
+        self._entering_pairs = list[tuple[np.ndarray, np.ndarray]]()
         self.work = 0.0  # of the last solution: entries times steps
         for name, value in {
             "output_flag": False,
@@ -446,16 +446,16 @@ class Growing:
     def enter(self, columns: np.ndarray, rows: np.ndarray) -> None:
         """Begin with ``columns``, which cost nothing, in the basis in place of as many ``rows``, equations that were
         added since: no reduced cost changes, and no step is needed for each of them."""
-        self._entering.append((columns, rows))
+        self._entering_pairs.append((columns, rows))
 
-    def _begin(self) -> None:
+    def _extend_basis(self) -> None:
         """Put what is to enter into the last basis."""
         import highspy
 
-        if not self._entering:
+        if not self._entering_pairs:
             return
-        columns, rows = (np.concatenate(arrays).tolist() for arrays in zip(*self._entering, strict=True))
-        self._entering, status = [], highspy.HighsBasisStatus
+        columns, rows = (np.concatenate(arrays).tolist() for arrays in zip(*self._entering_pairs, strict=True))
+        self._entering_pairs, status = [], highspy.HighsBasisStatus
         basis = self.highs.getBasis()
         if not basis.valid:  # the first solution: presolve takes out these equations, and begins in a better place
             return
@@ -483,22 +483,22 @@ class Growing:
             return False, "HiGHS: a row is refused", np.zeros(0), np.zeros(0)
         reason, self.by = "", HIGHS
         if self.asked is not None:
-            answer = self._posed(self.asked)
+            answer = self._ask_solver(self.asked)
             if not isinstance(answer, str):
                 self.by = self.asked.name
                 return answer
             reason = answer
-        self._begin()
+        self._extend_basis()
         self.highs.setOptionValue("time_limit", self.highs.getRunTime() + max(seconds, 0.0))  # none of an earlier call
         has_basis, large = bool(self.highs.getBasis().valid), self.highs.getNumNz() >= LARGE
         patience = PATIENT if has_basis and large else STALLED
         self.highs.setOptionValue("simplex_iteration_limit", int(patience * (self.columns + self.count)))
-        steps = self._run(inside=large and not has_basis)
+        steps = self._run_highs(inside=large and not has_basis)
         status, stalled = self.highs.getModelStatus(), highspy.HighsModelStatus
         if status in (stalled.kUnknown, stalled.kIterationLimit, stalled.kSolveError):
             self.highs.clearSolver()  # this way led nowhere: once more from nothing, and not by the same
             self.highs.setOptionValue("simplex_iteration_limit", highspy.kHighsIInf)
-            steps += self._run(inside=large == has_basis)
+            steps += self._run_highs(inside=large == has_basis)
             status = self.highs.getModelStatus()
         self.work = float(steps) * self.highs.getNumNz()
         message = f"HiGHS: {self.highs.modelStatusToString(status)}"
@@ -509,7 +509,7 @@ class Growing:
         solution = self.highs.getSolution()
         return True, message, np.array(solution.col_value), -np.array(solution.row_dual)
 
-    def _posed(self, asked: Asked) -> tuple[bool, str, Array, Array] | str:
+    def _ask_solver(self, asked: Asked) -> tuple[bool, str, Array, Array] | str:
         """The answer of who is asked, from nothing, where it holds; in words why it does not."""
         import highspy
         from scipy.sparse import csc_array, csr_array, diags_array, vstack
@@ -556,7 +556,7 @@ class Growing:
         multipliers[fixed] = claim.y
         return True, claim.message, np.clip(claim.x, posed.lower, posed.upper), kappa * multipliers / norms
 
-    def _run(self, inside: bool) -> int:
+    def _run_highs(self, inside: bool) -> int:
         """Solve it, by an interior point method where it is to be sought from ``inside``; the steps that this took."""
         if inside:
             self.highs.setOptionValue("solver", "ipm")
@@ -577,7 +577,7 @@ def weighted(weights: Array, table: csr_array) -> tuple[np.ndarray, Array]:
     return table.indices[used], row[used] * table.data[used]
 
 
-def _both(row: np.ndarray, column: np.ndarray, value: Array, n: int) -> tuple[np.ndarray, np.ndarray, Array]:
+def _split_signs(row: np.ndarray, column: np.ndarray, value: Array, n: int) -> tuple[np.ndarray, np.ndarray, Array]:
     """Entries of the decision in its positive and its negative part."""
     return np.concatenate([row, row]), np.concatenate([column, column + n]), np.concatenate([value, -value])
 

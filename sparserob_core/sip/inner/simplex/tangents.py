@@ -55,7 +55,7 @@ class Tangents:
 
     def __post_init__(self) -> None:
         blocks = self.program.blocks
-        self.roots = _roots(self.program)
+        self.roots = _factor_quadratic(self.program)
         count = self.roots.shape[1]
         none, free = np.zeros(count), np.full(count, np.inf)
         self._squares = self.linear.variables(none, free, np.ones(count))
@@ -65,14 +65,14 @@ class Tangents:
             value, n = self.roots.T[row, column], self.program.n
             split = [(row, column, value), (row, column + n, -value), (np.arange(count), self._t, -np.ones(count))]
             self.linear.rows(split, none, none)
-        self._at: list[np.ndarray] = [np.zeros(0, dtype=int)]  # numbers of the tangents' rows
-        self._which: list[np.ndarray] = [np.zeros(0, dtype=int)]  # the square of each
-        self._touched: list[Array] = [np.zeros(0)]  # and where it touches that
-        self._along: list[tuple[np.ndarray, Directions]] = []  # numbers of the rows of directions, and these
+        self._tangent_rows: list[np.ndarray] = [np.zeros(0, dtype=int)]  # numbers of the tangents' rows
+        self._square_numbers: list[np.ndarray] = [np.zeros(0, dtype=int)]  # the square of each
+        self._touching_points: list[Array] = [np.zeros(0)]  # and where it touches that
+        self._direction_rows: list[tuple[np.ndarray, Directions]] = []  # numbers of the rows of directions, and these
         if blocks is not None:
             weights = self.program.weights[blocks.first]
             self._norms = self.linear.variables(np.zeros(weights.size), np.full(weights.size, np.inf), weights)
-            self._directed(around(blocks))
+            self._add_directions(around(blocks))
 
     def sharpen(self, x: Array, squares: Array) -> None:
         """Touch every norm at ``x (n,)`` and every square at the root ``(c,)`` that the linear program has."""
@@ -81,17 +81,17 @@ class Tangents:
             numbers = np.arange(count)
             size = np.maximum(np.abs(squares), FINE)
             entries = [(numbers, self._t, squares / size), (numbers, self._squares, -1.0 / size)]
-            self._at.append(self.linear.rows(entries, np.full(count, -np.inf), squares**2 / size / 2.0))
-            self._which.append(numbers)
-            self._touched.append(squares / size)
+            self._tangent_rows.append(self.linear.rows(entries, np.full(count, -np.inf), squares**2 / size / 2.0))
+            self._square_numbers.append(numbers)
+            self._touching_points.append(squares / size)
         blocks = self.program.blocks
         if blocks is not None:
             table, unit = blocks.table, np.append(blocks.directions(x), 0.0)
             directions = Directions(np.arange(len(table)), unit[table])
             kept = directions.vectors.any(axis=1)
-            self._directed(Directions(directions.block[kept], directions.vectors[kept]))
+            self._add_directions(Directions(directions.block[kept], directions.vectors[kept]))
 
-    def _directed(self, directions: Directions) -> None:
+    def _add_directions(self, directions: Directions) -> None:
         """``d's`` is at most the norm of its block."""
         blocks, n = self.program.blocks, self.program.n
         assert blocks is not None
@@ -102,7 +102,7 @@ class Tangents:
         column, value = blocks.table[directions.block[row], entry], directions.vectors[row, entry]
         ones = np.arange(count), self._norms[directions.block], -np.ones(count)
         entries = [(row, column, value), (row, column + n, -value), ones]
-        self._along.append((self.linear.rows(entries, np.full(count, -np.inf), np.zeros(count)), directions))
+        self._direction_rows.append((self.linear.rows(entries, np.full(count, -np.inf), np.zeros(count)), directions))
 
     def below(self, columns: Array) -> tuple[float, Array, Array]:
         """Return the shortfall of the cost variables of a solution below the squares and norms that they stand for, as
@@ -126,18 +126,20 @@ class Tangents:
         if blocks is not None:
             answer = x.copy()
             answer[blocks.entries] = 0.0
-            for at, directions in self._along:
+            for at, directions in self._direction_rows:
                 row, entry = np.nonzero(directions.vectors)
                 shares = np.maximum(multipliers[at], 0.0)[row] * directions.vectors[row, entry]
                 np.add.at(answer, blocks.table[directions.block[row], entry], shares)
-        at, squares, touched = (np.concatenate(arrays) for arrays in (self._at, self._which, self._touched))
+        at, squares, touched = (
+            np.concatenate(arrays) for arrays in (self._tangent_rows, self._square_numbers, self._touching_points)
+        )
         wanted = np.bincount(squares, np.maximum(multipliers[at], 0.0) * touched, self.roots.shape[1])
         sizes = (self.roots**2).sum(axis=0)
         point: Array = answer + self.roots @ ((wanted - self.roots.T @ answer) / np.where(sizes > 0.0, sizes, 1.0))
         return point
 
 
-def _roots(program: FiniteProgram) -> Array:
+def _factor_quadratic(program: FiniteProgram) -> Array:
     """Columns ``(n, c)``, at right angles, whose squares along a decision add up to ``x'P x``."""
     if program.P is None:
         return np.zeros((program.n, 0))

@@ -173,8 +173,8 @@ def test_a_new_row_leaves_residuals_of_the_size_of_its_violation() -> None:
     fresh = replace(fresh, h=fresh.h + violated - 1e-3)
     assert fresh.excess(x, spread()).max() == pytest.approx(1e-3)
     central.add(fresh)
-    central._extend(0.0)
-    assert central._residuals()[2] < 10 * 1e-3
+    central._extend_iterate(0.0)
+    assert central._compute_residuals()[2] < 10 * 1e-3
 
 
 def test_what_costs_nothing_costs_exactly_nothing() -> None:
@@ -196,7 +196,7 @@ def test_rows_that_are_there_already_are_known_by_a_short_name() -> None:
     central.add(fresh)
     central.add(rows(rng, 2.0))
     layout_ = central._layout
-    assert layout_.parts == 2 and all(isinstance(name, bytes) and len(name) <= 32 for name in layout_._known)
+    assert layout_.parts == 2 and all(isinstance(name, bytes) and len(name) <= 32 for name in layout_._part_numbers)
 
 
 def test_equalities_and_sets_that_are_no_boxes_are_left_to_the_simplex_method() -> None:
@@ -235,13 +235,13 @@ def test_linear_algebra_has_one_thread_while_it_solves(monkeypatch: pytest.Monke
     central, rng, threads = Interior(program(), spread()), np.random.default_rng(0), list[int]()
     for block in [answering(k, k) for k in range(EACH)] + [rows(rng, 2.0) for _ in range(6)]:
         central.add(block)
-    step = Interior._step
+    step = Interior._take_step
 
     def counted(self: Interior) -> bool:
         threads.extend(one["num_threads"] for one in threadpool_info())
         return step(self)
 
-    monkeypatch.setattr(Interior, "_step", counted)
+    monkeypatch.setattr(Interior, "_take_step", counted)
     with threadpool_limits(limits=2):
         assert central.solve(0.0, 1e-9).solved
     assert threads and set(threads) == {1}

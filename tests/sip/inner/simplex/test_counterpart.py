@@ -259,8 +259,8 @@ def test_large_programs_are_begun_from_inside_and_end_at_the_same_optimum(
     steps = solved(Counterpart(base, SPREADS[name]), blocks)
     monkeypatch.setattr(simplex, "LARGE", 0)
     monkeypatch.setattr(simplex, "PATIENT", patient)
-    ways, run = list[bool](), Growing._run
-    monkeypatch.setattr(Growing, "_run", lambda self, inside: ways.append(inside) or run(self, inside))
+    ways, run = list[bool](), Growing._run_highs
+    monkeypatch.setattr(Growing, "_run_highs", lambda self, inside: ways.append(inside) or run(self, inside))
     large = Counterpart(base, SPREADS[name])
     first = solved(large, blocks[:1])
     again = solved(large, blocks[1:])
