@@ -195,12 +195,12 @@ def assemble_in_time(loaded: Loaded, deadline: Deadline) -> Experiment:
         return PlainExperiment(loaded, problem)
     try:
         with deadline.enforced():
-            return _transcribed(loaded, problem)
+            return _transcribe(loaded, problem)
     except OutOfTime as error:
         return UntranscribedExperiment(loaded, problem, LATE.format(error))
 
 
-def _transcribed(loaded: Loaded, problem: OptimalControlProblem) -> Experiment:
+def _transcribe(loaded: Loaded, problem: OptimalControlProblem) -> Experiment:
     from sparserob_core.control.transcription.transcribe import prepare
 
     policy: Policy = build(loaded, "policy", loaded.config.policy)
@@ -240,10 +240,10 @@ def dictionaries_of(loaded: Loaded, horizon: float) -> tuple[Dictionary, Diction
     The dictionary of the disturbance has one indicator function on each piece of the control where the config names
     none. Raises `ConfigError` with the place of the key at fault.
     """
-    control = _dictionary(loaded, "control", loaded.config.dictionaries.control, horizon)
+    control = _build_dictionary(loaded, "control", loaded.config.dictionaries.control, horizon)
     entry = loaded.config.dictionaries.disturbance
     if entry is not None:
-        return control, _dictionary(loaded, "disturbance", entry, horizon)
+        return control, _build_dictionary(loaded, "disturbance", entry, horizon)
     from sparserob_core.experiment.solve import indicators
 
     return control, indicators(control)
@@ -287,7 +287,7 @@ def build(loaded: Loaded, kind: str, entry: Entry) -> Any:
     return guarded(component, loaded.registry.get(kind, entry.name).origin)
 
 
-def _dictionary(loaded: Loaded, which: str, entry: Entry, horizon: float) -> Dictionary:
+def _build_dictionary(loaded: Loaded, which: str, entry: Entry, horizon: float) -> Dictionary:
     try:
         dictionary: Dictionary = build(loaded, "dictionary", entry).build(horizon)
     except InputError as error:

@@ -115,10 +115,13 @@ def maximise(
         raise InputError(f"{key}: expected an argument of maximise, got one of ask_tell, which takes it")
     if callback is not None and not callable(callback):
         raise InputError(f"callback: expected a function of points and values, got {callback!r}")
-    chosen, share = _chosen(box, name, options, polish)
-    limit, function = as_seconds(seconds), _Told(f, callback)
+    chosen, share = _build_maximiser(box, name, options, polish)
+    limit, function = as_seconds(seconds), _ReportedFunction(f, callback)
     rules = Rules(
-        polish=share, seconds=np.inf if limit is None else limit, halt=function.halted, **_ends(target, patience)
+        polish=share,
+        seconds=np.inf if limit is None else limit,
+        halt=function.halted,
+        **_collect_end_rules(target, patience),
     )
     report = search(
         Target(f if callback is None else function, box, gradient),
@@ -126,9 +129,9 @@ def maximise(
         whole("budget", budget, 1),
         np.random.default_rng(whole("seed", seed, 0)),
         rules,
-        _heard(notify),
-        _placed(start, box),
-        _known(known, box),
+        _wrap_notify(notify),
+        _check_points(start, box),
+        _check_known(known, box),
     )
     if report.missing and report.missing == report.evaluations and not report.interrupted:
         from sparserob_core.sip.maximiser import EvaluationError
@@ -199,8 +202,12 @@ def ask_tell(
     from sparserob_core.sip.search.search import Rules, Target
     from sparserob_core.sip.search.search import maximise as search
 
-    chosen, share = _chosen(box, name, options, polish)
-    start_points, earlier, ends = _placed(start, box), _known(known, box), _ends(target, patience)
+    chosen, share = _build_maximiser(box, name, options, polish)
+    start_points, earlier, ends = (
+        _check_points(start, box),
+        _check_known(known, box),
+        _collect_end_rules(target, patience),
+    )
     number, calls = whole("seed", seed, 0), whole("budget", budget, 1)
     Target(lambda points: points, box)  # raises InputError for a box without bounds
     if not isinstance(minimise, bool):
@@ -267,7 +274,7 @@ def ask_tell(
     return AskTell(ranges, run, description, state, restart)
 
 
-def _chosen(
+def _build_maximiser(
     box: object, name: Choice | Maximiser, options: Mapping[str, object], polish: float | None
 ) -> tuple[Maximiser, float]:
     """Return the maximiser, and the share of its budget that goes to a polish."""
@@ -280,7 +287,7 @@ def _chosen(
     return chosen, chosen.polished if polish is None else share("polish", polish)
 
 
-def _placed(start: object, box: Box, name: str = "start") -> Array | None:
+def _check_points(start: object, box: Box, name: str = "start") -> Array | None:
     """Return points ``(k, d)`` of the box to begin with; messages call them ``name``."""
     if start is None:
         return None
@@ -298,7 +305,7 @@ def _placed(start: object, box: Box, name: str = "start") -> Array | None:
     return points
 
 
-def _known(known: Any, box: Box) -> tuple[Array, Array] | None:
+def _check_known(known: Any, box: Box) -> tuple[Array, Array] | None:
     """Return points ``(k, d)`` of the box and their values ``(k,)`` from before."""
     if known is None:
         return None
@@ -309,13 +316,13 @@ def _known(known: Any, box: Box) -> tuple[Array, Array] | None:
         raise InputError(f"known: expected points and their values, got {known!r}") from None
     if not numbers.size and not np.size(points):
         return None
-    placed = _placed(points, box, "known")
+    placed = _check_points(points, box, "known")
     if placed is None or numbers.shape != (len(placed),):
         raise InputError(f"known: expected a value for each point, got shapes {np.shape(points)} and {numbers.shape}")
     return placed, numbers
 
 
-def _ends(target: object, patience: object) -> dict[str, Any]:
+def _collect_end_rules(target: object, patience: object) -> dict[str, Any]:
     """Return the rules that end a search before its budget."""
     ends: dict[str, Any] = {}
     if target is not None:
@@ -327,7 +334,7 @@ def _ends(target: object, patience: object) -> dict[str, Any]:
     return ends
 
 
-class _Told:
+class _ReportedFunction:
     """A function whose values a callback receives; the callback may ask for the end of the search."""
 
     def __init__(self, f: Callable[[Array], object], callback: Callable[[Array, Array], object] | None) -> None:
@@ -347,7 +354,7 @@ class _Told:
         return self.asked
 
 
-def _heard(notify: Notify) -> Notify:
+def _wrap_notify(notify: Notify) -> Notify:
     if notify is ignore:
         return ignore
     heard = careful("notify", notify)

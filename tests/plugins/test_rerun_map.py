@@ -356,7 +356,7 @@ def test_the_map_of_a_policy_goes_through_its_proven_bound_and_nowhere_above_its
         ((0.7, 4.0), 0.0, result.lower_bound - 0.1),
     ):
         moved = slots.copy()
-        for place, moving, to in zip((landscape.first, landscape.second), landscape._moving, at, strict=True):
+        for place, moving, to in zip((landscape.first, landscape.second), landscape._moving_indices, at, strict=True):
             moved[moving, place[1]] = to
             moved[moving, 1:] = np.nan
         assert least - 1e-6 <= g.at(moved) <= most + 1e-6

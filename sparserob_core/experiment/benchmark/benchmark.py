@@ -57,22 +57,22 @@ def benchmark(
     if not 0.0 < accuracy < 1.0:
         raise InputError(f"accuracy: expected a number above 0 and below 1, got {accuracy!r}")
     registry, rules = load_registry(), Rules(polish=share("polish", polish))
-    names = _labels(maximisers)
+    names = _label_maximisers(maximisers)
     chosen = [component(registry, "maximiser", choice, Maximiser) for choice in maximisers]
 
     def find() -> Benchmark:
-        suite_landscapes = list(landscapes(suites, _configs(configs) if "g" in suites else ()))
+        suite_landscapes = list(landscapes(suites, _resolve_configs(configs) if "g" in suites else ()))
         searches: list[Search] = []
         total, start = len(suite_landscapes) * len(names) * repeats, time.monotonic()
         for landscape in suite_landscapes:
             for name, maximiser in zip(names, chosen, strict=True):
                 for seed in range(repeats):
-                    searches.append(_search(landscape, name, maximiser, calls, seed, rules))
+                    searches.append(_run_search(landscape, name, maximiser, calls, seed, rules))
                     elapsed = time.monotonic() - start
                     remaining = elapsed / len(searches) * (total - len(searches))
                     text = f"{landscape.name}: {len(searches)} of {total} searches, {remaining:.0f} s left"
                     notify(StudyProgress(text=text, done=len(searches), total=total))
-        return _told(suite_landscapes, names, searches, calls, repeats, accuracy, suites)
+        return _build_benchmark(suite_landscapes, names, searches, calls, repeats, accuracy, suites)
 
     if out is None:
         return find()
@@ -80,7 +80,7 @@ def benchmark(
         return write(find(), directory)
 
 
-def _told(
+def _build_benchmark(
     every: Sequence[Landscape],
     names: Sequence[str],
     searches: Sequence[Search],
@@ -119,7 +119,7 @@ def _told(
     return Benchmark(profiles, searches, targets, budget)
 
 
-def _search(landscape: Landscape, name: str, maximiser: Maximiser, budget: int, seed: int, rules: Rules) -> Search:
+def _run_search(landscape: Landscape, name: str, maximiser: Maximiser, budget: int, seed: int, rules: Rules) -> Search:
     fresh = (landscape if landscape.fresh is None else landscape.fresh()).target
     inside = 0.0
 
@@ -140,13 +140,13 @@ def _search(landscape: Landscape, name: str, maximiser: Maximiser, budget: int, 
     return Search(landscape, name, seed, report.trace.best, own_seconds, report.best_point)
 
 
-def _configs(configs: Sequence[str | Path] | None) -> list[Path]:
+def _resolve_configs(configs: Sequence[str | Path] | None) -> list[Path]:
     if configs is not None:
         return [Path(config) for config in configs]
     return [shipped(name) for name in CONFIGS]
 
 
-def _labels(maximisers: Sequence[Choice | Maximiser]) -> list[str]:
+def _label_maximisers(maximisers: Sequence[Choice | Maximiser]) -> list[str]:
     names = []
     for choice in maximisers:
         if isinstance(choice, Mapping):

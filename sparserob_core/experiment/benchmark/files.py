@@ -50,16 +50,22 @@ def ioh_files(found: Benchmark) -> Iterator[tuple[str, str]]:
     """Names and texts in the format of IOHprofiler (de Nobel and others 2024): for every contender and function one
     file of facts, and one table for every dimension, in which a line is an improvement."""
     for name in found.profiles.contenders:
-        folder = f"ioh/{_plain(name)}"
-        contender_searches = sorted((search for search in found.searches if search.contender == name), key=_function)
-        for (number, title), group in groupby(contender_searches, key=_function):
+        folder = f"ioh/{_sanitise_name(name)}"
+        contender_searches = sorted(
+            (search for search in found.searches if search.contender == name), key=_identify_function
+        )
+        for (number, title), group in groupby(contender_searches, key=_identify_function):
             searches, scenarios = list(group), []
-            for size, runs in groupby(sorted(searches, key=_dimension), _dimension):
+            for size, runs in groupby(sorted(searches, key=_get_dimension), _get_dimension):
                 table = f"data_f{number}_{title}/IOHprofiler_f{number}_DIM{size}.dat"
                 searches_of_size = list(runs)
-                yield f"{folder}/{table}", "".join(_table(search) for search in searches_of_size)
+                yield f"{folder}/{table}", "".join(_format_table(search) for search in searches_of_size)
                 scenarios.append(
-                    {"dimension": size, "path": table, "runs": [_facts(search) for search in searches_of_size]}
+                    {
+                        "dimension": size,
+                        "path": table,
+                        "runs": [_describe_search(search) for search in searches_of_size],
+                    }
                 )
             facts = Facts(
                 version=IOH,
@@ -72,19 +78,19 @@ def ioh_files(found: Benchmark) -> Iterator[tuple[str, str]]:
             yield f"{folder}/IOHprofiler_f{number}_{title}.json", json.dumps(finite(asdict(facts)), indent="\t") + "\n"
 
 
-def _function(one: Search) -> tuple[int, str]:
-    return one.landscape.number, _plain(re.sub(r" \d+D$", "", one.landscape.name))
+def _identify_function(one: Search) -> tuple[int, str]:
+    return one.landscape.number, _sanitise_name(re.sub(r" \d+D$", "", one.landscape.name))
 
 
-def _dimension(one: Search) -> int:
+def _get_dimension(one: Search) -> int:
     return one.landscape.target.domain.dimension
 
 
-def _plain(name: str) -> str:
+def _sanitise_name(name: str) -> str:
     return re.sub(r"\W+", "_", name).strip("_")
 
 
-def _table(one: Search) -> str:
+def _format_table(one: Search) -> str:
     improvements = np.flatnonzero(np.diff(one.best, prepend=-np.inf) > 0.0)
     rows = [f"{index + 1} {one.best[index]:.12g}" for index in improvements]
     if improvements.size and improvements[-1] + 1 < one.best.size:
@@ -92,7 +98,7 @@ def _table(one: Search) -> str:
     return "\n".join(["evaluations raw_y", *rows]) + "\n"
 
 
-def _facts(one: Search) -> dict[str, Any]:
+def _describe_search(one: Search) -> dict[str, Any]:
     first = int(np.argmax(one.best)) + 1 if one.best.size else 0
     best = {"evals": first, "y": float(one.best[-1]) if one.best.size else None, "x": one.point.tolist()}
     return {"instance": one.landscape.instance, "evals": int(one.best.size), "best": best}

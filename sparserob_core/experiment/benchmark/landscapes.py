@@ -72,12 +72,12 @@ def standard() -> Iterator[Landscape]:
     """Six functions with their maxima off the centre of the box, where a method that begins there would meet them by
     luck."""
     shift = np.array([0.7123, -1.3391, 1.0417])
-    yield _standard("garland", functions.garland, Box(np.zeros(1), np.ones(1)), 101, functions.GARLAND_MAXIMUM)
-    yield _standard("holder table", functions.holder, _cube(10.0, 2), 102, functions.HOLDER_MAXIMUM)
-    yield _standard("himmelblau", functions.himmelblau, _cube(5.0, 2), 103)
-    yield _standard("ackley", lambda x: functions.ackley(x, shift[:2]), _cube(32.0, 2), 104)
-    yield _standard("rastrigin", lambda x: functions.rastrigin(x, shift), _cube(5.12, 3), 105)
-    yield _standard("rosenbrock", functions.rosenbrock, _cube(2.048, 5), 106)
+    yield _make_landscape("garland", functions.garland, Box(np.zeros(1), np.ones(1)), 101, functions.GARLAND_MAXIMUM)
+    yield _make_landscape("holder table", functions.holder, _make_cube(10.0, 2), 102, functions.HOLDER_MAXIMUM)
+    yield _make_landscape("himmelblau", functions.himmelblau, _make_cube(5.0, 2), 103)
+    yield _make_landscape("ackley", lambda x: functions.ackley(x, shift[:2]), _make_cube(32.0, 2), 104)
+    yield _make_landscape("rastrigin", lambda x: functions.rastrigin(x, shift), _make_cube(5.12, 3), 105)
+    yield _make_landscape("rosenbrock", functions.rosenbrock, _make_cube(2.048, 5), 106)
 
 
 def classic() -> Iterator[Landscape]:
@@ -92,18 +92,18 @@ def classic() -> Iterator[Landscape]:
         ("needle", functions.needle, Box(unit.lower[:2], unit.upper[:2]), 1.0220692642822948),
         ("hartmann 3", functions.hartmann, Box(unit.lower[:3], unit.upper[:3]), 3.8627797873326634),
         ("shekel", functions.shekel, Box(np.zeros(4), np.full(4, 10.0)), 10.536409816692046),
-        ("griewank", lambda x: functions.griewank(x, 60.0 * shift[:5]), _cube(60.0, 5), 0.0),
-        ("levy", functions.levy, _cube(10.0, 5), 0.0),
+        ("griewank", lambda x: functions.griewank(x, 60.0 * shift[:5]), _make_cube(60.0, 5), 0.0),
+        ("levy", functions.levy, _make_cube(10.0, 5), 0.0),
         ("michalewicz", functions.michalewicz, Box(np.zeros(5), np.full(5, np.pi)), 4.687658179088149),
-        ("schwefel", functions.schwefel, _cube(500.0, 5), 5 * 418.98288727243373),
+        ("schwefel", functions.schwefel, _make_cube(500.0, 5), 5 * 418.98288727243373),
         ("hartmann 6", functions.hartmann, unit, 3.3223680114155156),
-        ("ellipsoid", lambda x: functions.ellipsoid(x, shift), _cube(1.0, 20), 0.0),
+        ("ellipsoid", lambda x: functions.ellipsoid(x, shift), _make_cube(1.0, 20), 0.0),
     )
     for number, (name, function, box, maximum) in enumerate(rows, 107):
-        yield _standard(name, function, box, number, maximum, "classic")
+        yield _make_landscape(name, function, box, number, maximum, "classic")
 
 
-def _standard(
+def _make_landscape(
     name: str,
     function: Callable[[Array], Array],
     box: Box,
@@ -130,7 +130,7 @@ def bbob(instance: int = 1, dimensions: Sequence[int] = BBOB_DIMENSIONS) -> Iter
                 return -np.array([problem(point) for point in x], dtype=float)
 
             name = f"{problem.meta_data.name} {dimension}D"
-            target = Target(negated, _cube(5.0, dimension))
+            target = Target(negated, _make_cube(5.0, dimension))
             yield Landscape(name, target, -float(problem.optimum.y), number, "bbob", instance)
 
 
@@ -173,5 +173,5 @@ def landscape_of(
     return made()
 
 
-def _cube(half: float, dimension: int) -> Box:
+def _make_cube(half: float, dimension: int) -> Box:
     return Box(np.full(dimension, -half), np.full(dimension, half))

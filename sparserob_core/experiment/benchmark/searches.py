@@ -81,7 +81,7 @@ class Benchmark:
         """Column names, and one row per landscape: the expected running time of every contender, in evaluations."""
         names = self.profiles.contenders
         rows = [
-            [problem.label, *(_count(self.expected_running_time(index, name)) for name in names)]
+            [problem.label, *(_format_count(self.expected_running_time(index, name)) for name in names)]
             for index, problem in enumerate(self.profiles.problems)
         ]
         return ["expected evaluations", *names], rows
@@ -113,5 +113,5 @@ class Benchmark:
         }
 
 
-def _count(value: float) -> str:
+def _format_count(value: float) -> str:
     return f"{value:.0f}" if np.isfinite(value) else "never"

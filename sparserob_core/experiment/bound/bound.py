@@ -82,13 +82,13 @@ def bound(
     if seconds is not None and (not hasattr(seconds, "__float__") or not float(seconds) > 0.0):
         raise InputError(f"seconds: expected a positive number, got {seconds!r}")
     started = time.perf_counter()
-    control = _control(config)
+    control = _read_control(config)
     loaded = load_config(as_config(config), overrides)
     problem = control_problem_of(loaded, "config: expected a control problem, whose rows have worst cases")
     dictionaries = dictionaries_of(loaded, problem.horizon)
     problem, shape = accumulated(problem), (problem.system.controls, dictionaries[0].functions)
     if control is not None:
-        _require_fitting(control, shape, loaded, _answers(loaded, problem, dictionaries[0]))
+        _require_matching_control(control, shape, loaded, _has_answering_policy(loaded, problem, dictionaries[0]))
     deadline = Deadline(loaded.config.limits.seconds if seconds is None else float(seconds))
 
     def told(text: str, done: int, total: int) -> None:
@@ -124,16 +124,16 @@ def bound(
         directory.write_text(
             "config.yaml", write_yaml(loaded.config.plain(), "The experiment whose worst cases were bounded.")
         )
-        return _written(directory, found(), loaded)
+        return _write_files(directory, found(), loaded)
 
 
-def _answers(loaded: Loaded, problem: OptimalControlProblem, control: Dictionary) -> bool:
+def _has_answering_policy(loaded: Loaded, problem: OptimalControlProblem, control: Dictionary) -> bool:
     """Return whether the policy of a config answers any measurement."""
     policy = build(loaded, "policy", loaded.config.policy)
     return bool(answers_of(policy, control.breakpoints, problem.measurements).any())
 
 
-def _require_fitting(theta: Array, shape: tuple[int, int], loaded: Loaded, answering: bool) -> None:
+def _require_matching_control(theta: Array, shape: tuple[int, int], loaded: Loaded, answering: bool) -> None:
     """Raise `InputError` unless the control of a run belongs to the config, and answers no measurement."""
     if answering:
         expected = "open_loop, for worst cases with the control of a run"
@@ -145,7 +145,7 @@ def _require_fitting(theta: Array, shape: tuple[int, int], loaded: Loaded, answe
         )
 
 
-def _control(config: object) -> Array | None:
+def _read_control(config: object) -> Array | None:
     """Return the coefficients of the control of a run; ``None`` where no run was given."""
     if isinstance(config, Outcome | SolvedProblem):
         path = as_run(config)[0]
@@ -159,7 +159,7 @@ def _control(config: object) -> Array | None:
     return solution["theta"]
 
 
-def _written(directory: RunDirectory, found: Bound, loaded: Loaded) -> Bound:
+def _write_files(directory: RunDirectory, found: Bound, loaded: Loaded) -> Bound:
     """Write the files of worst cases, and return them with their directory.
 
     The figure is an extra: where it cannot be drawn, the numbers are written all the same, and there is a warning.

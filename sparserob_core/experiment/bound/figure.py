@@ -44,14 +44,14 @@ def draw_bound(found: Bound) -> Figure:
     shown = list(panels.values())[:MOST]
     figure, axes = look.panels(len(shown), 1.9, extra=0.3)
     for ax, rows in zip(axes, shown, strict=True):
-        _panel(ax, rows)
+        _draw_panel(ax, rows)
     axes[0].set_title(plain(found.title))
     axes[-1].set_xlabel(measured("time $t$", found.time_unit))
     look.draw_legend(figure, axes)
     return figure
 
 
-def _panel(ax: Axes, rows: list[WorstCase]) -> None:
+def _draw_panel(ax: Axes, rows: list[WorstCase]) -> None:
     finite = np.concatenate([band[np.isfinite(band)] for row in rows for band in (row.low, row.high)])
     walls = [row.wall for row in rows if row.wall is not None]
     low, high = float(finite.min(initial=0.0)), float(finite.max(initial=0.0))

@@ -141,7 +141,7 @@ def worst_case(problem: OptimalControlProblem, found: BoundedRow) -> WorstCase:
     )
 
 
-def _worst_of(rows: list[WorstCase]) -> WorstCase:
+def _merge_corners(rows: list[WorstCase]) -> WorstCase:
     """Return the worst case of one quantity over all corners of the parameters, with the witness of the worst
     corner."""
     is_supremum = rows[0].sense == "sup"
@@ -208,7 +208,7 @@ class Bound:
         for row in self.rows:
             direction = row.direction if row.stated is None else row.stated
             groups.setdefault((row.constraint, row.wall, row.start, row.stop, direction.tobytes()), []).append(row)
-        return tuple(_worst_of(rows) for rows in groups.values())
+        return tuple(_merge_corners(rows) for rows in groups.values())
 
 
 ENVELOPE = ("edges", "low", "high")
@@ -219,14 +219,14 @@ def summary_of_bound(found: Bound) -> dict[str, Any]:
 
     Numbers that are not finite become null.
     """
-    rows = [{name: _plain(value) for name, value in vars(row).items() if name not in ENVELOPE} for row in found.rows]
+    rows = [{name: _to_plain(value) for name, value in vars(row).items() if name not in ENVELOPE} for row in found.rows]
     summary: dict[str, Any] = finite(asdict(replace(found, directory=None, rows=())))
     decision = None if found.decision is None else found.decision.tolist()
     summary = {**summary, "rows": [finite(row) for row in rows], "decision": decision}
     return {"format": 1} | {name: value for name, value in summary.items() if name != "directory"}
 
 
-def _plain(value: Any) -> Any:
+def _to_plain(value: Any) -> Any:
     return value.tolist() if isinstance(value, np.ndarray) else value
 
 

@@ -96,9 +96,9 @@ def check(directory: GivenRun, plugins: Iterable[str | Path] = (), seconds: floa
 
     if type(seconds) not in (int, float) or not seconds > 0:
         raise InputError(path="seconds", expected="a positive number", got=repr(seconds))
-    started, clock, path = time.perf_counter(), Clock(float(seconds)), _place(directory)
+    started, clock, path = time.perf_counter(), Clock(float(seconds)), _locate_run(directory)
     if (path / "bound.json").is_file():
-        return _worst_cases(path, plugins, clock, started)
+        return _check_worst_cases(path, plugins, clock, started)
     stored = stored_run(path)
     if not (path / "certificate.json").is_file():
         raise InputError(f"{path}: expected the directory of a finished run, got one without certificate.json")
@@ -106,24 +106,24 @@ def check(directory: GivenRun, plugins: Iterable[str | Path] = (), seconds: floa
     loaded = stored.config(plugins)
     problem = control_problem_of(loaded, f"{path}: expected the run of a control problem, whose certificate is checked")
     control, disturbance = dictionaries_of(loaded, problem.horizon)
-    policy = _policy(loaded, data, control, problem.measurements)
+    policy = _find_policy(loaded, data, control, problem.measurements)
     title = loaded.config.title or path.name
     try:
         case = Case(problem, control, disturbance, data, clock, *counting(loaded), policy)
     except Unchecked as gap:
-        return _of_no_case(title, gap, started)
+        return _report_unchecked(title, gap, started)
     derived = derive(case, gap_tolerance(loaded))
-    files = compared(replace(stored, largest=_largest(path, case)), loaded, case, summary)
-    claims = (_config(loaded, data, summary), *derived, *files.claims)
+    files = compared(replace(stored, largest=_bound_array_bytes(path, case)), loaded, case, summary)
+    claims = (_check_config(loaded, data, summary), *derived, *files.claims)
     return Check(title, claims, time.perf_counter() - started, files.not_compared)
 
 
-def _of_no_case(title: str, gap: Unchecked, started: float) -> Check:
+def _report_unchecked(title: str, gap: Unchecked, started: float) -> Check:
     """Return the check of a problem that the checker cannot describe."""
     return Check(title, (Finding("problem", "not checked", str(gap)),), time.perf_counter() - started)
 
 
-def _worst_cases(path: Path, plugins: Iterable[str | Path], clock: Clock, started: float) -> Check:
+def _check_worst_cases(path: Path, plugins: Iterable[str | Path], clock: Clock, started: float) -> Check:
     """Return the verdicts on a directory that `bound` wrote."""
     from sparserob_core.checker.claims.case import Case
     from sparserob_core.checker.suprema.suprema import check_suprema
@@ -140,13 +140,13 @@ def _worst_cases(path: Path, plugins: Iterable[str | Path], clock: Clock, starte
     try:
         case = Case(problem, control, disturbance, data, clock)
     except Unchecked as gap:
-        return _of_no_case(title, gap, started)
+        return _report_unchecked(title, gap, started)
     claims = check_suprema(case)
     not_compared = tuple(name for name in ("envelopes.npz", "bound.png") if (path / name).is_file())
-    return Check(title, (_config(loaded, data, data), *claims), time.perf_counter() - started, not_compared)
+    return Check(title, (_check_config(loaded, data, data), *claims), time.perf_counter() - started, not_compared)
 
 
-def _policy(
+def _find_policy(
     loaded: Loaded, data: Mapping[str, Any], control: Dictionary, measured: Measurements | None
 ) -> Policy | None:
     """Return the policy of a config; ``None`` where it answers no measurement.
@@ -171,7 +171,7 @@ def _policy(
     return policy if answers_of(policy, control.breakpoints, measured).any() else None
 
 
-def _place(run: GivenRun) -> Path:
+def _locate_run(run: GivenRun) -> Path:
     """Return the directory of a run.
 
     The module that knows runs is imported only where a run was given: a check is mostly of a directory.
@@ -183,7 +183,7 @@ def _place(run: GivenRun) -> Path:
     return as_run(run)[0]
 
 
-def _largest(directory: Path, case: Case) -> int:
+def _bound_array_bytes(directory: Path, case: Case) -> int:
     """Return the largest number of bytes that the arrays of ``solution.npz`` may take.
 
     They repeat the numbers of certificate and config a few times (8 bytes for a number of at least 3 characters), and
@@ -193,7 +193,7 @@ def _largest(directory: Path, case: Case) -> int:
     return SPARE + REPEATED * (file_bytes + 8 * case.control.pieces * case.problem.system.controls)
 
 
-def _config(loaded: Loaded, data: Mapping[str, Any], summary: Mapping[str, Any]) -> Finding:
+def _check_config(loaded: Loaded, data: Mapping[str, Any], summary: Mapping[str, Any]) -> Finding:
     """Return the verdict on the claim that certificate and config belong together.
 
     An earlier version knew fewer keys, so that the digest may be that of the config as it is read today or as it is

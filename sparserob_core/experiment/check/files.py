@@ -64,19 +64,19 @@ def compared(stored: StoredRun, loaded: Loaded, case: Case, summary: Mapping[str
     from sparserob_core.checker.claims.claims import precision_of
 
     with ctx.workprec(precision_of(case)):
-        return _compared(stored, loaded, case, summary)
+        return _compare_files(stored, loaded, case, summary)
 
 
-def _compared(stored: StoredRun, loaded: Loaded, case: Case, summary: Mapping[str, Any]) -> Compared:
+def _compare_files(stored: StoredRun, loaded: Loaded, case: Case, summary: Mapping[str, Any]) -> Compared:
     comparison = Compared()
     for name, (different, agrees, uncompared) in (
-        ("result.json", _result(loaded, case, summary)),
-        ("solution.npz", _solution(stored, case)),
+        ("result.json", _compare_result(loaded, case, summary)),
+        ("solution.npz", _compare_solution(stored, case)),
     ):
         comparison.claims.append(Finding(name, "fails" if different else "holds", "; ".join(different) or agrees))
         if uncompared:
             comparison.left[name] = uncompared
-    unread = sorted(_unread(case))
+    unread = sorted(_list_unread(case))
     if unread:
         comparison.left["certificate.json"] = unread
     comparison.left |= {path.name: [] for path in sorted(stored.directory.iterdir()) if path.name not in READ}
@@ -104,7 +104,7 @@ NOISE = {"noise"}
 """Keys of both, where a policy measures outputs with a noise."""
 
 
-def _unread(case: Case) -> set[str]:
+def _list_unread(case: Case) -> set[str]:
     """Return the names ``key.key`` of the entries of a certificate on which none of its claims rests."""
     data, measured = case.certificate, case.problem.measurements
     noisy = case.answering and measured is not None and measured.noise is not None
@@ -114,14 +114,14 @@ def _unread(case: Case) -> set[str]:
     mixed_windows = {window.name for window in case.windows if window.is_mixed}
     proof, witness, fewest = (data.get(name) for name in ("proof", "witness", "fewest_active"))
     of_activity = fewest.get("multipliers") if isinstance(fewest, Mapping) else None
-    unread |= _besides("fewest_active", fewest, {"lower", "upper", "multipliers", "decision", "proof"})
+    unread |= _list_extra_keys("fewest_active", fewest, {"lower", "upper", "multipliers", "decision", "proof"})
     causal, policy = (data.get(name) if case.answering else None for name in ("causal", "policy"))
-    unread |= _besides("policy", policy, {"cost", "answers"})
+    unread |= _list_extra_keys("policy", policy, {"cost", "answers"})
     hidden = {"outputs", "initial_states"} if noisy else set()
-    unread |= _besides("causal", causal, {"lower_bound", "signals", "multipliers", "shares"} | hidden)
+    unread |= _list_extra_keys("causal", causal, {"lower_bound", "signals", "multipliers", "shares"} | hidden)
     rows = causal.get("multipliers") if isinstance(causal, Mapping) else None
     for entry in rows if isinstance(rows, list) else []:
-        unread |= _besides("causal.multipliers", entry, (MULTIPLIER - {"parameter"}) | {"signal"})
+        unread |= _list_extra_keys("causal.multipliers", entry, (MULTIPLIER - {"parameter"}) | {"signal"})
     for multipliers in (data.get("multipliers"), of_activity):
         if not isinstance(multipliers, Mapping):
             continue
@@ -137,7 +137,7 @@ def _unread(case: Case) -> set[str]:
         multiplier_keys |= (
             {"norms"} if multipliers is not of_activity and case.problem.cost.group is not None else set()
         )
-        unread |= _besides("multipliers", multipliers, multiplier_keys)
+        unread |= _list_extra_keys("multipliers", multipliers, multiplier_keys)
         entries = multipliers.get("constraints")
         for entry in entries if isinstance(entries, list) else []:
             is_mixed = isinstance(entry, Mapping) and str(entry.get("constraint")) in mixed_windows
@@ -145,25 +145,27 @@ def _unread(case: Case) -> set[str]:
             extra_keys |= BEGUN if case.answering and case.problem.initial_set is not None else set()
             extra_keys |= NOISE if noisy else set()
             extra_keys |= {"changes"} if case.measurable and case.answering else set()
-            unread |= _besides("multipliers.constraints", entry, MULTIPLIER | extra_keys)
-            unread |= {"multipliers.constraints.parameter"} if _of_a_curved_set_of_controls(case, entry) else set()
+            unread |= _list_extra_keys("multipliers.constraints", entry, MULTIPLIER | extra_keys)
+            unread |= {"multipliers.constraints.parameter"} if _has_unused_parameter(case, entry) else set()
     if "proof" in read and isinstance(proof, Mapping):
         shapes = {window.name: window.shape for window in case.windows}
-        unread |= _besides("proof", proof, set(shapes))
+        unread |= _list_extra_keys("proof", proof, set(shapes))
         for name, shape in shapes.items():
-            unread |= _besides(f"proof.{name}", proof.get(name), CELLS if _flat(shape) else CELLS | {"normals"})
+            unread |= _list_extra_keys(
+                f"proof.{name}", proof.get(name), CELLS if _is_flat(shape) else CELLS | {"normals"}
+            )
     witness_keys = WITNESS | (BEGUN if case.problem.initial_set is not None else set()) | (NOISE if noisy else set())
     is_mixed = isinstance(witness, Mapping) and str(witness.get("constraint")) in mixed_windows
     witness_keys = witness_keys | {"piece"} if is_mixed else witness_keys
     witness_keys = witness_keys - {"disturbance", *BEGUN} if case.measurable and not case.answering else witness_keys
-    return unread | (_besides("witness", witness, witness_keys) if "witness" in read else set())
+    return unread | (_list_extra_keys("witness", witness, witness_keys) if "witness" in read else set())
 
 
-def _besides(name: str, data: object, read: set[str]) -> set[str]:
+def _list_extra_keys(name: str, data: object, read: set[str]) -> set[str]:
     return {f"{name}.{key}" for key in data if key not in read} if isinstance(data, Mapping) else set()
 
 
-def _of_a_curved_set_of_controls(case: Case, entry: object) -> bool:
+def _has_unused_parameter(case: Case, entry: object) -> bool:
     """Return whether a multiplier of the set of controls, or of their steps, has a parameter.
 
     No parameter changes these sets, so that the entry means nothing.
@@ -174,7 +176,7 @@ def _of_a_curved_set_of_controls(case: Case, entry: object) -> bool:
     return has_no_window and bool(entry.get("parameter"))
 
 
-def _flat(shape: ConvexSet) -> bool:
+def _is_flat(shape: ConvexSet) -> bool:
     """Return whether the directions of a set follow from the set itself; those of a certificate are then not read."""
     try:
         return known(shape).facets is not None
@@ -186,7 +188,7 @@ Verdicts = tuple[list[str], str, list[str]]
 """The differences, the sentence where there are none, and the names of entries that were not compared."""
 
 
-def _result(loaded: Loaded, case: Case, summary: Mapping[str, Any]) -> Verdicts:
+def _compare_result(loaded: Loaded, case: Case, summary: Mapping[str, Any]) -> Verdicts:
     """Compare ``result.json`` key by key."""
     from sparserob_core.checker.outcome import Unchecked
 
@@ -202,14 +204,14 @@ def _result(loaded: Loaded, case: Case, summary: Mapping[str, Any]) -> Verdicts:
             "undecided": (None, case.certificate.get("cost")),
         }.get(str(status), (case.certificate.get("cost"),)),
         "J": (case.certificate.get("J"),),
-        **_causal(case),
+        **_list_causal_values(case),
         "seed": (loaded.config.seed,),
         "title": (loaded.config.title, loaded.config.title or summary.get("title")),
     }
     different = [
         f"{name} is {summary.get(name)!r}, not {' or '.join(dict.fromkeys(map(repr, values)))}"
         for name, values in expected_values.items()
-        if not any(_equal(summary.get(name), value) for value in values)
+        if not any(_is_equal(summary.get(name), value) for value in values)
     ]
     uncompared, compared_names = [], set(expected_values)
     for name, compare in COMPARED.items():
@@ -226,14 +228,14 @@ def _result(loaded: Loaded, case: Case, summary: Mapping[str, Any]) -> Verdicts:
         compared_names.add(name)
     uncompared += [name for name in summary if name not in compared_names]
     for name, read in (("worst", WORST), ("sparsity", SPARSITY)):
-        uncompared += sorted(_besides(name, summary.get(name), read)) if name not in uncompared else []
+        uncompared += sorted(_list_extra_keys(name, summary.get(name), read)) if name not in uncompared else []
     share = None if different or "sparsity" in uncompared else summary["sparsity"]["active_fraction"]
     channel_note = ", in at least one channel" if case.problem.system.controls > 1 else ""
     acts = "" if share is None else f"; its control acts {share:.1%} of the time{channel_note}"
     return different, f"it says what the certificate says{acts}", uncompared
 
 
-def _causal(case: Case) -> dict[str, tuple[object, ...]]:
+def _list_causal_values(case: Case) -> dict[str, tuple[object, ...]]:
     """Return the values that ``result.json`` may have for causal policies."""
     if not case.answering:
         return {}
@@ -244,7 +246,7 @@ def _causal(case: Case) -> dict[str, tuple[object, ...]]:
     return {"causal_lower_bound": least, "causal_infeasible": (none, *(() if none else (None,)))}
 
 
-def _gap(case: Case, summary: Mapping[str, Any]) -> list[str] | None:
+def _compare_gap(case: Case, summary: Mapping[str, Any]) -> list[str] | None:
     """Compare the gap with its definition, or with that of earlier versions."""
     from sparserob_core.checker.claims.claims import relative_gap
 
@@ -258,7 +260,7 @@ def _gap(case: Case, summary: Mapping[str, Any]) -> list[str] | None:
     return [] if close else [f"gap is {gap!r}, not {derived!r}"]
 
 
-def _cost_scale(case: Case, summary: Mapping[str, Any]) -> list[str] | None:
+def _compare_cost_scale(case: Case, summary: Mapping[str, Any]) -> list[str] | None:
     """Compare the size of the terms that are added up to the cost.
 
     Earlier versions wrote the largest possible cost, or nothing.
@@ -271,11 +273,11 @@ def _cost_scale(case: Case, summary: Mapping[str, Any]) -> list[str] | None:
     derived = added_up(case) if has_decision else 0.0
     rounded = AGREED * CANCELLED * compared(case) if has_decision else 0.0
     is_near = isinstance(cost_scale, float) and abs(cost_scale - derived) <= rounded
-    agrees = is_near or _same(cost_scale, derived, CLOSE) or _same(cost_scale, largest_cost(case), CLOSE)
+    agrees = is_near or _is_close(cost_scale, derived, CLOSE) or _is_close(cost_scale, largest_cost(case), CLOSE)
     return [] if agrees else [f"cost_scale is {cost_scale!r}, not {derived!r}"]
 
 
-def _sparsity(case: Case, summary: Mapping[str, Any]) -> list[str] | None:
+def _compare_sparsity(case: Case, summary: Mapping[str, Any]) -> list[str] | None:
     """Compare the share of time for which the certificate's control acts, and the number of its switches."""
     entry = summary.get("sparsity")
     if not isinstance(entry, Mapping):
@@ -298,11 +300,11 @@ def _sparsity(case: Case, summary: Mapping[str, Any]) -> list[str] | None:
     return [
         f"sparsity: {name} is {entry.get(name)!r}, not {value!r}"
         for name, value in derived.items()
-        if not _same(entry.get(name), value)
+        if not _is_close(entry.get(name), value)
     ]
 
 
-def _value(case: Case, summary: Mapping[str, Any]) -> list[str] | None:
+def _compare_value(case: Case, summary: Mapping[str, Any]) -> list[str] | None:
     """Compare the value of the regularised problem with the cost, where there is no regulariser.
 
     A difference within the rounding errors of a cost that is not small is allowed. With a regulariser the value is not
@@ -317,10 +319,10 @@ def _value(case: Case, summary: Mapping[str, Any]) -> list[str] | None:
     value, cost = summary.get("value"), summary.get("cost")
     slack = FIGURES * CANCELLED * compared(case)
     near = isinstance(value, float) and isinstance(cost, float) and abs(value - cost) <= slack
-    return [] if near or _same(value, cost) else [f"value is {value!r} without a regulariser, the cost {cost!r}"]
+    return [] if near or _is_close(value, cost) else [f"value is {value!r} without a regulariser, the cost {cost!r}"]
 
 
-def _worst(case: Case, summary: Mapping[str, Any]) -> list[str] | None:
+def _compare_worst(case: Case, summary: Mapping[str, Any]) -> list[str] | None:
     """Compare the worst constraint.
 
     It must be that of the witness. Without one it is computed anew at its time and parameter, where its set is flat.
@@ -332,24 +334,26 @@ def _worst(case: Case, summary: Mapping[str, Any]) -> list[str] | None:
         witness = case.certificate.get("witness")
         if not isinstance(witness, Mapping):
             return None
-        names = [name for name in ("violation", "constraint", "time") if not _same(entry.get(name), witness.get(name))]
-        if entry.get("parameter") and not _near(entry["parameter"], witness.get("parameter")):
+        names = [
+            name for name in ("violation", "constraint", "time") if not _is_close(entry.get(name), witness.get(name))
+        ]
+        if entry.get("parameter") and not _is_close_point(entry["parameter"], witness.get("parameter")):
             names.append("parameter")
-        names += [] if _begins(case, entry, witness) else ["initial_state"]
+        names += [] if _is_witness_initial_state(case, entry, witness) else ["initial_state"]
         return [f"worst: {name} is {entry.get(name)!r}, that of the witness {witness.get(name)!r}" for name in names]
     if status not in ("certified", "verified"):
         return None
     if entry.get("constraint") in (None, ""):  # a problem without constraints that can be violated
         return [] if entry.get("violation") is None and not case.windows else ["worst: no constraint is named"]
     try:
-        return _attained(case, entry)
+        return _compare_worst_violation(case, entry)
     except Unchecked:
         return None
     except Broken as error:
         return [f"worst: {error}"]
 
 
-def _outside(bound: ConvexSet, begun: Array, centre: Array) -> float:
+def _measure_excess(bound: ConvexSet, begun: Array, centre: Array) -> float:
     """Return how far an initial state lies outside a set of deviations from a centre, in the set's own unit.
 
     The rounding error of the sum of deviation and centre is not counted.
@@ -364,7 +368,7 @@ def _outside(bound: ConvexSet, begun: Array, centre: Array) -> float:
     return shape.excess(balls(shape.centre + np.copysign(distance, deviation - shape.centre)))[0]
 
 
-def _attained(case: Case, said: Mapping[str, Any]) -> list[str]:
+def _compare_worst_violation(case: Case, said: Mapping[str, Any]) -> list[str]:
     """Compare the worst violation with that of the worst uncertainty.
 
     Where there are several initial states, the one that is named must attain it too.
@@ -374,9 +378,12 @@ def _attained(case: Case, said: Mapping[str, Any]) -> list[str]:
 
     violations = [("", *exceeded(case, said))]
     if case.problem.initial_set is not None and not case.answering:
-        initial_state = numbers(_whole(case, said.get("initial_state")), "initial_state")
+        initial_state = numbers(_complete_state(case, said.get("initial_state")), "initial_state")
         centre = np.asarray(case.problem.initial_state)
-        if initial_state.shape != centre.shape or _outside(case.problem.initial_set, initial_state, centre) > CLOSE:
+        if (
+            initial_state.shape != centre.shape
+            or _measure_excess(case.problem.initial_set, initial_state, centre) > CLOSE
+        ):
             return [f"worst: {initial_state.tolist()} is no initial state"]
         violations.append((f" from {initial_state.tolist()}", *exceeded(case, said, initial_state)))
     elif "initial_state" in said:
@@ -389,7 +396,7 @@ def _attained(case: Case, said: Mapping[str, Any]) -> list[str]:
     ]
 
 
-def _begins(case: Case, said: Mapping[str, Any], witness: Mapping[str, Any]) -> bool:
+def _is_witness_initial_state(case: Case, said: Mapping[str, Any], witness: Mapping[str, Any]) -> bool:
     """Return whether the worst initial state in ``result.json`` is that of the witness."""
     if case.problem.initial_set is None or (case.answering and "initial_state" not in said):
         return "initial_state" not in said
@@ -397,11 +404,11 @@ def _begins(case: Case, said: Mapping[str, Any], witness: Mapping[str, Any]) -> 
     if not isinstance(deviation, list) or not all(isinstance(coordinate, int | float) for coordinate in deviation):
         return False
     centre = np.asarray(case.problem.initial_state, dtype=float)
-    initial_state = _whole(case, said.get("initial_state"))
-    return len(deviation) == centre.size and _near(initial_state, (centre + deviation).tolist())
+    initial_state = _complete_state(case, said.get("initial_state"))
+    return len(deviation) == centre.size and _is_close_point(initial_state, (centre + deviation).tolist())
 
 
-def _whole(case: Case, said: object) -> object:
+def _complete_state(case: Case, said: object) -> object:
     """Return an initial state of the user's coordinates together with those that integrals and parameters add.
 
     The added ones are known. A state that has all coordinates is returned as it is.
@@ -412,25 +419,25 @@ def _whole(case: Case, said: object) -> object:
     return [*said, *initial_state[len(said) :].tolist()]
 
 
-def _near(said: object, point: object) -> bool:
+def _is_close_point(said: object, point: object) -> bool:
     """Return whether two points agree, where one of them was moved into its set against rounding errors."""
     if not (isinstance(said, list) and isinstance(point, list) and len(said) == len(point)):
         return False
-    return all(_same(a, b, CLOSE) for a, b in zip(said, point, strict=True))
+    return all(_is_close(a, b, CLOSE) for a, b in zip(said, point, strict=True))
 
 
 WORST = {"violation", "constraint", "time", "parameter", "initial_state"}
 SPARSITY = {"active_fraction", "switches", "channels", "fewest_active"}
 
 
-def _added_up(case: Case, summary: Mapping[str, Any]) -> list[str] | None:
+def _compare_cost_terms(case: Case, summary: Mapping[str, Any]) -> list[str] | None:
     """Compare the terms of the cost, in words."""
     words = case.problem.cost.words()
     entry = summary.get("cost_of", words)
     return [] if entry == words else [f"cost_of is {entry!r}, not {words!r}"]
 
 
-def _units(case: Case, summary: Mapping[str, Any]) -> list[str]:
+def _compare_units(case: Case, summary: Mapping[str, Any]) -> list[str]:
     """Compare the units with those that the config names."""
     entry, names = summary.get("units") or {}, case.problem.names
     known_units = {"", *names.state_units, *names.control_units}
@@ -452,7 +459,7 @@ def _units(case: Case, summary: Mapping[str, Any]) -> list[str]:
     return wrong
 
 
-def _parameters(case: Case, summary: Mapping[str, Any]) -> list[str] | None:
+def _compare_parameters(case: Case, summary: Mapping[str, Any]) -> list[str] | None:
     """Compare the names of the uncertain parameters, in the order of their values."""
     names = [] if case.problem.system.parameters is None else list(case.problem.system.names)
     entry = summary.get("parameters", names)
@@ -460,23 +467,23 @@ def _parameters(case: Case, summary: Mapping[str, Any]) -> list[str] | None:
 
 
 COMPARED: dict[str, Callable[[Case, Mapping[str, Any]], list[str] | None]] = {
-    "gap": _gap,
-    "cost_scale": _cost_scale,
-    "cost_of": _added_up,
-    "sparsity": _sparsity,
-    "value": _value,
-    "worst": _worst,
-    "units": _units,
-    "parameters": _parameters,
+    "gap": _compare_gap,
+    "cost_scale": _compare_cost_scale,
+    "cost_of": _compare_cost_terms,
+    "sparsity": _compare_sparsity,
+    "value": _compare_value,
+    "worst": _compare_worst,
+    "units": _compare_units,
+    "parameters": _compare_parameters,
 }
 
 
-def _equal(said: object, value: object) -> bool:
+def _is_equal(said: object, value: object) -> bool:
     """Return whether two entries of JSON are equal; a truth value is no number."""
     return said == value and isinstance(said, bool) is isinstance(value, bool)
 
 
-def _same(said: object, value: object, figures: float = FIGURES) -> bool:
+def _is_close(said: object, value: object, figures: float = FIGURES) -> bool:
     """Return whether two entries of JSON agree, numbers up to rounding errors."""
     numbers = [entry for entry in (said, value) if isinstance(entry, int | float) and not isinstance(entry, bool)]
     if len(numbers) == 2:
@@ -487,12 +494,12 @@ def _same(said: object, value: object, figures: float = FIGURES) -> bool:
 STORED = ("theta", "control", "breakpoints", "decision")
 
 
-def _sizes(case: Case) -> int:
+def _count_size_bounds(case: Case) -> int:
     """Return how many bounds of the control's sizes follow its coefficients in a decision."""
     return 0 if case.problem.execution is None else case.problem.system.controls * case.control.pieces
 
 
-def _solution(stored: StoredRun, case: Case) -> Verdicts:
+def _compare_solution(stored: StoredRun, case: Case) -> Verdicts:
     """Compare the control in ``solution.npz`` with that of the certificate."""
     if case.certificate.get("decision") is None:
         return [], "there is no decision", []
@@ -505,7 +512,7 @@ def _solution(stored: StoredRun, case: Case) -> Verdicts:
         agrees = (
             np.array_equal(theta, decision)
             and np.array_equal(flat[: decision.size], decision.ravel())
-            and (case.answering or flat.size == decision.size + _sizes(case))
+            and (case.answering or flat.size == decision.size + _count_size_bounds(case))
             and all(np.array_equal(arrays[k], np.array(case.certificate.get(k, []), dtype=float)) for k in answered)
             and np.array_equal(breakpoints, case.control.breakpoints)
             and control.shape == size.shape
@@ -517,13 +524,13 @@ def _solution(stored: StoredRun, case: Case) -> Verdicts:
         return [f"it holds no array {error}"], "", []
     except (ValueError, TypeError, OverflowError):
         return ["its control and the certificate's are no arrays of one shape"], "", []
-    uncompared = sorted(set(arrays) - {*STORED, *answered} - set(_witnessed(case, arrays)))
+    uncompared = sorted(set(arrays) - {*STORED, *answered} - set(_compare_worst_disturbance(case, arrays)))
     different = [] if agrees else ["its control is not the certificate's"]
-    different += [text for text in _witnessed(case, arrays).values() if text]
+    different += [text for text in _compare_worst_disturbance(case, arrays).values() if text]
     return different, "it holds the certificate's control", uncompared
 
 
-def _witnessed(case: Case, arrays: Mapping[str, Any]) -> dict[str, str]:
+def _compare_worst_disturbance(case: Case, arrays: Mapping[str, Any]) -> dict[str, str]:
     """Compare the disturbance of the worst constraint with that of the witness, which was moved inwards against
     rounding."""
     witness = case.certificate.get("witness")

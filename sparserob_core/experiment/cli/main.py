@@ -58,40 +58,40 @@ def main(arguments: Sequence[str] | None = None) -> None:
     if command_line and QUESTIONS.isdisjoint(command_line):
         spare_imports()
     try:
-        status = _status(command_line)
+        status = _run_command_line(command_line)
     finally:
         hand_back_output()
     sys.exit(status)
 
 
-def _status(arguments: Sequence[str]) -> int:
+def _run_command_line(arguments: Sequence[str]) -> int:
     try:
         status = int(commands.main(args=list(arguments), prog_name="sparserob", standalone_mode=False) or 0)
         sys.stdout.flush()
         return status
     except click.Abort as error:
         cause = error.__cause__ or error
-        return _end(str(cause) or "interrupted from the keyboard", cause, INTERRUPTED)
+        return _report_error(str(cause) or "interrupted from the keyboard", cause, INTERRUPTED)
     except click.ClickException as error:
         if not arguments:  # the help
             error.show()
             return 2
-        return _end(_usage(error), error, 2)
+        return _report_error(_describe_usage_error(error), error, 2)
     except SparseRobError as error:
         if isinstance(error, OutputError):
             drop_output()
-        return _end(str(error), error, error.exit_status)
+        return _report_error(str(error), error, error.exit_status)
     except BrokenPipeError:
         drop_output()
         return 0
     except MemoryError as error:
-        return _end("out of memory; fewer pieces, cells or trajectories need less", error, 5)
+        return _report_error("out of memory; fewer pieces, cells or trajectories need less", error, 5)
     except Exception as error:  # noqa: BLE001  the last resort: a fault of the program is one line too
         description = named(error)
-        return _end(f"internal error: {description}; {DEBUG}=1 shows where", error, 5)
+        return _report_error(f"internal error: {description}; {DEBUG}=1 shows where", error, 5)
 
 
-def _usage(error: click.ClickException) -> str:
+def _describe_usage_error(error: click.ClickException) -> str:
     """Describe a fault of the command line in one line, with the command that prints the correct usage."""
     text = " ".join(error.format_message().split()).rstrip(".")
     text = re.sub(r"\\u(dc[89a-f][0-9a-f])", lambda byte: chr(int(byte[1], 16)), text)  # click names things by `repr`
@@ -101,7 +101,7 @@ def _usage(error: click.ClickException) -> str:
     )
 
 
-def _end(message: str, error: BaseException, status: int) -> int:
+def _report_error(message: str, error: BaseException, status: int) -> int:
     if os.environ.get(DEBUG):
         raise error
     for line in (f"error: {message}", *getattr(error, "__notes__", ())):

@@ -64,7 +64,7 @@ def compare(
             f"{run_directory}: expected a study beside {studies[0]}; a study is compared with studies only"
         )
     comparison: Comparison | Profiles
-    comparison = read_profiles(studies, accuracy, measure) if studies else _side_by_side(directories)
+    comparison = read_profiles(studies, accuracy, measure) if studies else _compare_runs(directories)
     if out is not None and (missing := missing_matplotlib()):
         comparison = replace(comparison, undrawn=missing)
     elif out is not None and isinstance(comparison, Profiles):
@@ -89,11 +89,11 @@ def events_of(comparison: Comparison) -> Iterator[Event]:
         arrangement="runs",
         runs=Path(),
     )
-    rows = {index: _row(curve) for index, curve in enumerate(comparison.curves)}
+    rows = {index: _make_row(curve) for index, curve in enumerate(comparison.curves)}
     yield SweepFinished(rows=rows, seconds=seconds, answer=next(comparison_remarks(comparison)))
 
 
-def _row(curve: Curve) -> dict[str, Any]:
+def _make_row(curve: Curve) -> dict[str, Any]:
     """The row of a run, as in the table of a study; what is not known is null."""
     values = {
         "cost": curve.cost,
@@ -106,7 +106,7 @@ def _row(curve: Curve) -> dict[str, Any]:
     return {"run": str(curve.directory.resolve()), "status": curve.status, "message": curve.message, **numbers}
 
 
-def _side_by_side(places: Sequence[Path]) -> Comparison:
+def _compare_runs(places: Sequence[Path]) -> Comparison:
     curves = [read_curve(directory) for directory in places]
     for curve in curves[1:]:
         _require_same_problem(curves[0], curve)
@@ -133,8 +133,8 @@ def comparison_table(comparison: Comparison) -> tuple[list[str], list[list[str]]
     for curve, label in zip(comparison.curves, comparison.labels, strict=True):
         relative_entries = (
             [
-                _text(comparison.share(curve.lower_bound), ".4%"),
-                *(_text(comparison.within(curve, share), ".0f") for share in SHARES),
+                _format_value(comparison.share(curve.lower_bound), ".4%"),
+                *(_format_value(comparison.within(curve, share), ".0f") for share in SHARES),
             ]
             if is_known
             else []
@@ -143,12 +143,12 @@ def comparison_table(comparison: Comparison) -> tuple[list[str], list[list[str]]
             [
                 label,
                 curve.status,
-                _text(curve.lower_bound, ".9g"),
-                _text(curve.cost, ".9g"),
+                _format_value(curve.lower_bound, ".9g"),
+                _format_value(curve.cost, ".9g"),
                 *relative_entries,
-                f"{_text(curve.violation, '.2e')} {curve.measured}".rstrip(),
-                _text(curve.all_evaluations, ".0f"),
-                _text(curve.all_seconds, ".3f"),
+                f"{_format_value(curve.violation, '.2e')} {curve.measured}".rstrip(),
+                _format_value(curve.all_evaluations, ".0f"),
+                _format_value(curve.all_seconds, ".3f"),
             ]
         )
     return columns, rows
@@ -170,7 +170,7 @@ def comparison_remarks(comparison: Comparison) -> Iterator[str]:
         above = best.upper_bound + SLACK * max(1.0, abs(best.upper_bound))
     for curve, label in zip(comparison.curves, comparison.labels, strict=True):
         if not curve.bound.size:
-            yield f"no curve of {label}: {_reason(curve)}"
+            yield f"no curve of {label}: {_explain_missing_curve(curve)}"
         elif curve.bound[-1] > above:
             yield (
                 f"the lower bound of {label} exceeds the certified upper bound {best.upper_bound:.9g}{unit}: one of"
@@ -206,11 +206,11 @@ def comparison_summary(comparison: Comparison) -> dict[str, Any]:
     }
 
 
-def _reason(curve: Curve) -> str:
+def _explain_missing_curve(curve: Curve) -> str:
     return f"{curve.status}: {curve.message}" if curve.status in WITHOUT_CURVE else "no finite lower bound was proven"
 
 
-def _text(value: float, form: str) -> str:
+def _format_value(value: float, form: str) -> str:
     return format(value, form) if np.isfinite(value) else "-"
 
 

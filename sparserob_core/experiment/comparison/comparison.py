@@ -57,10 +57,10 @@ class Comparison:
         configs = [
             {key: section for key, section in curve.config.items() if key not in BESIDE} for curve in self.curves
         ]
-        return list(_differences("", configs))
+        return list(_list_differences("", configs))
 
 
-def _differences(path: str, values: Sequence[Any]) -> Iterator[tuple[str, list[str]]]:
+def _list_differences(path: str, values: Sequence[Any]) -> Iterator[tuple[str, list[str]]]:
     """The keys below ``path`` at which the ``values`` differ; a missing one is none."""
     if all(value == values[0] for value in values):
         return
@@ -70,4 +70,4 @@ def _differences(path: str, values: Sequence[Any]) -> Iterator[tuple[str, list[s
         yield path, [str(value.get("name")) for value in values]
     else:
         for key in dict.fromkeys(key for value in values for key in value):
-            yield from _differences(f"{path}.{key}" if path else key, [value.get(key) for value in values])
+            yield from _list_differences(f"{path}.{key}" if path else key, [value.get(key) for value in values])

@@ -86,12 +86,15 @@ def spent_until(target: float, best: Array, spent: Array) -> float:
 
 def read_curve(directory: Path) -> Curve:
     """Read a run directory; raises `InputError` when it is none, or a file of it cannot be understood."""
-    summary, config = stored_run(directory).summary, _config(directory / "config.yaml")
-    counts, worst, units = (_mapping(summary, key) for key in ("counts", "worst", "units"))
+    summary, config = stored_run(directory).summary, _read_config(directory / "config.yaml")
+    counts, worst, units = (_get_mapping(summary, key) for key in ("counts", "worst", "units"))
     status, searched = str(summary["status"]), (directory / SEARCH[0]).is_file()
-    spent, lower = _number(counts, "evaluations" if searched else "relaxed_programs"), _number(summary, "lower_bound")
-    seconds, upper = _number(summary, "seconds"), _number(summary, "upper_bound")
-    evaluations, times, bound = _points(directory, searched) if status not in WITHOUT_CURVE else (np.empty(0),) * 3
+    spent, lower = (
+        _get_number(counts, "evaluations" if searched else "relaxed_programs"),
+        _get_number(summary, "lower_bound"),
+    )
+    seconds, upper = _get_number(summary, "seconds"), _get_number(summary, "upper_bound")
+    evaluations, times, bound = _read_points(directory, searched) if status not in WITHOUT_CURVE else (np.empty(0),) * 3
     if bound.size and lower > bound[-1]:  # the last relaxed program came after the last evaluation
         evaluations, times, bound = np.append(evaluations, spent), np.append(times, seconds), np.append(bound, lower)
     return Curve(
@@ -107,18 +110,18 @@ def read_curve(directory: Path) -> Curve:
         lower_bound=lower,
         upper_bound=upper,
         gap=relative_gap(lower, upper, summary.get("cost_scale") or 0.0),
-        cost=_number(summary, "cost"),
-        violation=_number(worst, "violation"),
+        cost=_get_number(summary, "cost"),
+        violation=_get_number(worst, "violation"),
         measured=str(units.get("worst") or ""),
         cost_unit=str(units.get("cost") or ""),
         all_evaluations=spent,
         all_seconds=seconds,
-        dimension=_dimension(directory, searched) if status not in WITHOUT_CURVE else 0,
+        dimension=_read_dimension(directory, searched) if status not in WITHOUT_CURVE else 0,
         counts="J" in summary,
     )
 
 
-def _dimension(directory: Path, searched: bool) -> int:
+def _read_dimension(directory: Path, searched: bool) -> int:
     """The last dimension of the points that were searched, or else of the decision."""
     for name, column in (("evaluations.npz", "points"), ("solution.npz", "decision"))[0 if searched else 1 :]:
         if (directory / name).is_file() and (array := read_arrays(directory / name).get(column)) is not None:
@@ -126,9 +129,9 @@ def _dimension(directory: Path, searched: bool) -> int:
     return 0
 
 
-def _points(directory: Path, searched: bool) -> tuple[Array, Array, Array]:
+def _read_points(directory: Path, searched: bool) -> tuple[Array, Array, Array]:
     name, columns = SEARCH if searched else ROUNDS
-    bound, seconds, *counted = _columns(directory / name, columns)
+    bound, seconds, *counted = _read_columns(directory / name, columns)
     evaluations = counted[0] if counted else np.arange(1.0, bound.size + 1)
     best = np.maximum.accumulate(bound) if bound.size else bound
     kept = np.isfinite(best)
@@ -137,7 +140,7 @@ def _points(directory: Path, searched: bool) -> tuple[Array, Array, Array]:
     return evaluations[kept], seconds[kept], best[kept]
 
 
-def _columns(file: Path, names: tuple[str, ...]) -> list[Array]:
+def _read_columns(file: Path, names: tuple[str, ...]) -> list[Array]:
     if not file.is_file():
         raise InputError(f"{file}: there is no such file; expected one, for the run has finished")
     stored = read_arrays(file)
@@ -150,7 +153,7 @@ def _columns(file: Path, names: tuple[str, ...]) -> list[Array]:
     return columns
 
 
-def _config(file: Path) -> dict[str, Any]:
+def _read_config(file: Path) -> dict[str, Any]:
     data = read_source(file).data
     for section in ("problem", "method", "maximiser"):
         if not isinstance(data.get(section), Mapping) or "name" not in data[section]:
@@ -158,11 +161,11 @@ def _config(file: Path) -> dict[str, Any]:
     return data
 
 
-def _mapping(data: Mapping[str, Any], key: str) -> Mapping[str, Any]:
+def _get_mapping(data: Mapping[str, Any], key: str) -> Mapping[str, Any]:
     entry = data.get(key)
     return entry if isinstance(entry, Mapping) else {}
 
 
-def _number(data: Mapping[str, Any], key: str) -> float:
+def _get_number(data: Mapping[str, Any], key: str) -> float:
     value = data.get(key)
     return float(value) if isinstance(value, int | float) else np.nan

@@ -58,7 +58,7 @@ def draw_comparison(comparison: Comparison) -> Figure:
     figure = Figure(figsize=(look.WIDTH, 3.2 + 0.165 * lines), layout="constrained")
     left_ax, right_ax = figure.subplots(1, 2, sharey=True)
     for number, (curve, text) in enumerate(zip(curves, texts, strict=True)):
-        pen = _pen(number, len(curves), curve.searched)
+        pen = _choose_pen(number, len(curves), curve.searched)
         _draw_curve(left_ax, curve.evaluations, curve.bound, curve.all_evaluations, {**pen, "label": text})
         _draw_curve(right_ax, curve.seconds, curve.bound, curve.all_seconds, pen)
     _draw_axes(left_ax, right_ax, comparison.exact, curves, comparison.cost_unit)
@@ -76,7 +76,7 @@ def draw_comparison(comparison: Comparison) -> Figure:
     return figure
 
 
-def _pen(number: int, count: int, searched: bool) -> dict[str, Any]:
+def _choose_pen(number: int, count: int, searched: bool) -> dict[str, Any]:
     """Later searches are thinner, so that those which coincide show as the edges of one another."""
     width = 1.2 + 1.4 * (count - 1 - number) / max(count - 1, 1)
     return {
@@ -98,7 +98,7 @@ def _draw_curve(ax: Axes, places: Array, bound: Array, end: float, pen: dict[str
 
 def _draw_axes(left: Axes, right: Axes, exact: float, curves: list[Curve], unit: str) -> None:
     for ax in (left, right):
-        _scale(ax)
+        _scale_axis(ax)
         ax.grid(axis="y", color=look.MIST, linewidth=0.6)
         ax.set_axisbelow(True)
         if np.isfinite(exact):
@@ -110,7 +110,7 @@ def _draw_axes(left: Axes, right: Axes, exact: float, curves: list[Curve], unit:
                 zorder=4,
                 label=f"exact optimum {exact:.9g}",
             )
-    left.set_ylim(*_view(exact, curves))
+    left.set_ylim(*_compute_limits(exact, curves))
     left.set_ylabel(measured("lower bound of the cost $J$", unit))
     searched = {curve.searched for curve in curves}
     left.set_xlabel(
@@ -123,7 +123,7 @@ def _draw_axes(left: Axes, right: Axes, exact: float, curves: list[Curve], unit:
     right.set_xlabel("seconds")
 
 
-def _scale(ax: Axes) -> None:
+def _scale_axis(ax: Axes) -> None:
     """Logarithmic from a decade on; with plain numbers at 1, 2 and 5 until there are two."""
     from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 
@@ -138,7 +138,7 @@ def _scale(ax: Axes) -> None:
         ax.xaxis.set_minor_formatter(NullFormatter())
 
 
-def _view(exact: float, curves: list[Curve]) -> tuple[float, float]:
+def _compute_limits(exact: float, curves: list[Curve]) -> tuple[float, float]:
     bounds = np.concatenate([curve.bound for curve in curves])
     top = float(np.nanmax([exact, bounds.max()]))
     low = max(float(bounds.min()), top - VIEW * abs(top)) if top else float(bounds.min())

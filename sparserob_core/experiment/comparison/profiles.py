@@ -66,7 +66,7 @@ class Profiles:
     def quantile(self, share: float) -> Array:
         """The least times ``(P, S)`` within which that share of the seeds had solved the problem."""
         if share not in self._cache:
-            self._cache[share] = np.array([[_quantile(times, share) for times in row] for row in self.times])
+            self._cache[share] = np.array([[_compute_quantile(times, share) for times in row] for row in self.times])
         return self._cache[share]
 
     def ratios(self, share: float = MIDDLE) -> Array:
@@ -116,7 +116,7 @@ class Profiles:
                 problem.label,
                 name,
                 str(self.times[p][s].size),
-                *(_text(quantile[p, s], self.measure) for quantile in quantiles),
+                *(_format_value(quantile[p, s], self.measure) for quantile in quantiles),
             ]
             for p, problem in enumerate(self.problems)
             for s, name in enumerate(self.contenders)
@@ -134,8 +134,9 @@ class Profiles:
         guessed = [problem.label or "the problem" for problem in self.problems if not problem.certified]
         if guessed:
             yield (
-                f"no certified run of {_some(guessed)}: the best bound of any run stands for the exact value, which"
-                " favours whoever found it; runs of the method exchange beside the others give the exact one"
+                f"no certified run of {_abbreviate_labels(guessed)}: the best bound of any run stands for the"
+                " exact value, which favours whoever found it; runs of the method exchange beside the others give the"
+                " exact one"
             )
         if self.measure == "seconds":
             yield "seconds are those of a clock: the first run of a process includes its imports; seeds even that out"
@@ -157,8 +158,8 @@ class Profiles:
                     "label": name,
                     "failed": int(self.failed[s]),
                     "runs_solved": float(self.solved()[s]),
-                    "performance_profile": _steps(self.ratios()[:, s], len(self.problems)),
-                    "data_profile": _steps(self.costs()[:, s], len(self.problems)),
+                    "performance_profile": _list_steps(self.ratios()[:, s], len(self.problems)),
+                    "data_profile": _list_steps(self.costs()[:, s], len(self.problems)),
                 }
                 for s, name in enumerate(self.contenders)
             ],
@@ -185,21 +186,21 @@ class Profiles:
         }
 
 
-def _quantile(times: Array, share: float) -> float:
+def _compute_quantile(times: Array, share: float) -> float:
     """The least time within which that share of the runs had come there (the inverse of the distribution)."""
     ordered = np.sort(times)
     return float(ordered[max(0, int(np.ceil(share * ordered.size - 1e-9)) - 1)])
 
 
-def _steps(values: Array, problems: int) -> dict[str, list[float]]:
+def _list_steps(values: Array, problems: int) -> dict[str, list[float]]:
     """A profile as its steps: from each place ``at`` on it has the ``share``."""
     positions, counts = np.unique(values[np.isfinite(values)], return_counts=True)
     return {"at": positions.tolist(), "share": (np.cumsum(counts) / problems).tolist()}
 
 
-def _some(labels: Sequence[str]) -> str:
+def _abbreviate_labels(labels: Sequence[str]) -> str:
     return "; ".join(labels[:3]) + (f"; and {len(labels) - 3} more" if len(labels) > 3 else "")
 
 
-def _text(value: float, measure: Measure) -> str:
+def _format_value(value: float, measure: Measure) -> str:
     return format(value, ".0f" if measure == "evaluations" else ".3f") if np.isfinite(value) else "never"

@@ -49,24 +49,28 @@ def draw_profiles(profiles: Profiles) -> Figure:
         }
         for ax, values in ((left_ax, profiles.ratios), (right_ax, profiles.costs)):
             contender_values = [values(share)[:, s] for share in (MIDDLE, LOWER, UPPER)]
-            _draw(
-                ax, contender_values, has_band, _ends(values(MIDDLE)), {**pen, "label": text} if ax is left_ax else pen
+            _draw_contender(
+                ax,
+                contender_values,
+                has_band,
+                _compute_ends(values(MIDDLE)),
+                {**pen, "label": text} if ax is left_ax else pen,
             )
-    _axes(left_ax, right_ax, profiles)
+    _draw_axes(left_ax, right_ax, profiles)
     figure.legend(*left_ax.get_legend_handles_labels(), loc="outside lower left", ncols=columns, fontsize=9)
     figure.suptitle(profiles.title, x=0.012, ha="left", fontsize=11.5)
     return figure
 
 
-def _ends(values: Array) -> tuple[float, float]:
+def _compute_ends(values: Array) -> tuple[float, float]:
     """Return the ends of the axis: a little before the first step of any contender, and after the last one."""
     finite_values = values[np.isfinite(values)]
     return (float(finite_values.min()) / 1.05, 1.3 * float(finite_values.max())) if finite_values.size else (1.0, 2.0)
 
 
-def _draw(ax: Axes, values: list[Array], band: bool, ends: tuple[float, float], pen: dict[str, Any]) -> None:
+def _draw_contender(ax: Axes, values: list[Array], band: bool, ends: tuple[float, float], pen: dict[str, Any]) -> None:
     """The steps of one contender, and the band between its quartiles."""
-    step_positions, share = _profile(values[0], ends)
+    step_positions, share = _compute_profile(values[0], ends)
     ax.plot(
         step_positions,
         share,
@@ -83,17 +87,17 @@ def _draw(ax: Axes, values: list[Array], band: bool, ends: tuple[float, float], 
         ax.fill_between(positions, late, early, step="post", color=pen["color"], alpha=0.15, linewidth=0, zorder=2)
 
 
-def _profile(values: Array, ends: tuple[float, float]) -> tuple[Array, Array]:
+def _compute_profile(values: Array, ends: tuple[float, float]) -> tuple[Array, Array]:
     positions, counts = np.unique(values[np.isfinite(values)], return_counts=True)
     share = np.cumsum(counts) / values.size
     return np.array([ends[0], *positions, ends[1]]), np.array([0.0, *share, share[-1] if positions.size else 0.0])
 
 
-def _axes(left: Axes, right: Axes, profiles: Profiles) -> None:
+def _draw_axes(left: Axes, right: Axes, profiles: Profiles) -> None:
     from matplotlib.ticker import LogLocator, NullFormatter, PercentFormatter, StrMethodFormatter
 
     for ax, values in ((left, profiles.ratios()), (right, profiles.costs())):
-        first, last = _ends(values)
+        first, last = _compute_ends(values)
         ax.set_xscale("log")
         ax.set_xlim(first, last)
         ax.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if last < 100.0 * first else (1.0,)))

@@ -55,15 +55,15 @@ def read_profiles(studies: Sequence[Path], accuracy: float, measure: Measure | N
         missing += len(run_directories) - len(existing_runs)
         curves += [read_curve(run_directory) for run_directory in existing_runs]
     notes = [f"{missing} points failed before they had a run; they count as not solved where their fellows have one"]
-    return _profiles(curves, accuracy, measure, _common(titles), notes if missing else [])
+    return _build_profiles(curves, accuracy, measure, _get_common_title(titles), notes if missing else [])
 
 
-def _profiles(
+def _build_profiles(
     curves: Sequence[Curve], accuracy: float, measure: Measure | None, title: str, notes: list[str]
 ) -> Profiles:
     contending, posed = (
-        [_key(_contender(curve.config)) for curve in curves],
-        [_key(_posed(curve.config)) for curve in curves],
+        [_make_key(_extract_contender(curve.config)) for curve in curves],
+        [_make_key(_extract_problem(curve.config)) for curve in curves],
     )
     contenders, problems = list(dict.fromkeys(contending)), list(dict.fromkeys(posed))
     if len(contenders) < 2:
@@ -87,19 +87,19 @@ def _profiles(
         absent = [
             names[k] for k, name in enumerate(contenders) if name not in {contender for contender, _ in problem_curves}
         ]
-        exact = _exact([curve for _, curve in problem_curves])
+        exact = _find_exact_value([curve for _, curve in problem_curves])
         if absent or exact is None:
             why = f"not every contender has run it ({', '.join(absent)} has not)" if absent else "no run has a bound"
             notes.append(f"left out: {label or 'the problem'}: {why}")
             continue
         repeated = dict.fromkeys(curve.config.get("seed") for _, curve in problem_curves)
-        notes += _contradictions(label, [curve for _, curve in problem_curves])
+        notes += _list_contradictions(label, [curve for _, curve in problem_curves])
         target = exact[0] - accuracy * abs(exact[0])
         kept.append(Instance(label, *exact, max(curve.dimension for _, curve in problem_curves) + 1.0))
         seeds.append(list(repeated))
         times.append(
             [
-                _times([curve for name, curve in problem_curves if name == contender], repeated, target, by)
+                _collect_times([curve for name, curve in problem_curves if name == contender], repeated, target, by)
                 for contender in contenders
             ]
         )
@@ -112,7 +112,7 @@ def _profiles(
     return Profiles(title, by, accuracy, names, kept, seeds, times, failed, notes)
 
 
-def _times(curves: Sequence[Curve], seeds: Mapping[Any, None], target: float, measure: Measure) -> np.ndarray:
+def _collect_times(curves: Sequence[Curve], seeds: Mapping[Any, None], target: float, measure: Measure) -> np.ndarray:
     """Return the times of one contender on one problem, seed by seed; infinite where a run did not reach the target, or
     is missing."""
     times = dict.fromkeys(seeds, np.inf)
@@ -123,7 +123,7 @@ def _times(curves: Sequence[Curve], seeds: Mapping[Any, None], target: float, me
     return np.array(list(times.values()))
 
 
-def _exact(curves: Sequence[Curve]) -> tuple[float, bool] | None:
+def _find_exact_value(curves: Sequence[Curve]) -> tuple[float, bool] | None:
     """The exact value, and whether it is certified."""
     certified = min(
         (curve for curve in curves if curve.status == "certified"), key=lambda curve: curve.gap, default=None
@@ -134,7 +134,7 @@ def _exact(curves: Sequence[Curve]) -> tuple[float, bool] | None:
     return (max(bounds), False) if bounds else None
 
 
-def _contradictions(label: str, curves: Sequence[Curve]) -> Iterator[str]:
+def _list_contradictions(label: str, curves: Sequence[Curve]) -> Iterator[str]:
     above = min((curve.upper_bound for curve in curves if curve.status == "certified"), default=np.inf)
     wrong = [curve for curve in curves if curve.bound.size and curve.bound[-1] > above + SLACK * max(1.0, abs(above))]
     for curve in wrong:
@@ -143,23 +143,23 @@ def _contradictions(label: str, curves: Sequence[Curve]) -> Iterator[str]:
         )
 
 
-def _contender(config: Mapping[str, Any]) -> dict[str, Any]:
+def _extract_contender(config: Mapping[str, Any]) -> dict[str, Any]:
     return {key: value for key, value in config.items() if key not in NEITHER}
 
 
-def _posed(config: Mapping[str, Any]) -> dict[str, Any]:
+def _extract_problem(config: Mapping[str, Any]) -> dict[str, Any]:
     return {key: config.get(key) for key in PROBLEM}
 
 
-def _key(data: Mapping[str, Any]) -> str:
+def _make_key(data: Mapping[str, Any]) -> str:
     return json.dumps(data, sort_keys=True, default=str)
 
 
 def problem_labels(configs: Sequence[Mapping[str, Any]]) -> list[str]:
     """Return one label per config: its title, where titles differ, and the options of the problem that differ."""
-    flat = [dict(_leaves(_posed(config))) for config in configs]
+    flat = [dict(_list_leaves(_extract_problem(config))) for config in configs]
     keys = list(dict.fromkeys(key for leaves in flat for key in leaves))
-    differing = [key for key in keys if len({_key({"": leaves.get(key)}) for leaves in flat}) > 1]
+    differing = [key for key in keys if len({_make_key({"": leaves.get(key)}) for leaves in flat}) > 1]
     titles = [str(config.get("title") or "") for config in configs]
     label_texts = []
     for leaves, title in zip(flat, titles, strict=True):
@@ -169,16 +169,16 @@ def problem_labels(configs: Sequence[Mapping[str, Any]]) -> list[str]:
     return [f"{label} ({k + 1})" if label_texts.count(label) > 1 else label for k, label in enumerate(label_texts)]
 
 
-def _leaves(value: Any, path: str = "") -> Iterator[tuple[str, Any]]:
+def _list_leaves(value: Any, path: str = "") -> Iterator[tuple[str, Any]]:
     if isinstance(value, Mapping):
         for key, child in value.items():
-            yield from _leaves(child, f"{path}.{key}" if path else str(key))
+            yield from _list_leaves(child, f"{path}.{key}" if path else str(key))
     elif isinstance(value, list) and any(isinstance(child, Mapping) for child in value):
         for number, child in enumerate(value):
-            yield from _leaves(child, f"{path}.{number}")
+            yield from _list_leaves(child, f"{path}.{number}")
     else:
         yield path, value
 
 
-def _common(titles: Sequence[str]) -> str:
+def _get_common_title(titles: Sequence[str]) -> str:
     return titles[0] if len(set(titles)) == 1 else ""

@@ -38,40 +38,40 @@ class Example:
 
 def shipped(name: str) -> Path:
     """Return the file of a config of this distribution; it need not exist."""
-    return _folder() / f"{name}.yaml"
+    return _find_folder() / f"{name}.yaml"
 
 
 def examples() -> list[Example]:
     """Return all configs of this distribution, by name."""
-    return [_read(file) for file in sorted(_folder().glob("*.yaml"))]
+    return [_read_example(file) for file in sorted(_find_folder().glob("*.yaml"))]
 
 
 def example(name: str) -> Example:
     """Return the config of that name; raises `InputError` where there is none."""
     from sparserob_core.experiment.plugins.messages import nearest
 
-    names = [file.stem for file in _folder().glob("*.yaml")]
+    names = [file.stem for file in _find_folder().glob("*.yaml")]
     if name not in names:
         raise InputError(f"examples: there is none called {name!r}{nearest(name, set(names))}")
-    return _read(shipped(name))
+    return _read_example(shipped(name))
 
 
-def _folder() -> Path:
+def _find_folder() -> Path:
     """Return the folder of the configs: next to the package in a repository, within it where it is installed."""
     package = Path(__file__).resolve().parents[2]
     folders = [folder / "configs" for folder in (package, package.parent)]
     return next((folder for folder in folders if folder.is_dir()), folders[-1])
 
 
-def _read(file: Path) -> Example:
-    text = _complete(file)
+def _read_example(file: Path) -> Example:
+    text = _complete_text(file)
     lines = [line for line in text.splitlines() if not line.startswith(SCHEMA)]
-    story = " ".join(line.lstrip("# ") for line in _leading(lines))
+    story = " ".join(line.lstrip("# ") for line in _take_leading_comments(lines))
     title = re.search(r"^title: *(.*?) *$", text, re.MULTILINE)
     return Example(file.stem, file.stem if title is None else title[1].strip("'\""), story, "\n".join(lines) + "\n")
 
 
-def _complete(file: Path) -> str:
+def _complete_text(file: Path) -> str:
     """Return the complete text of a config.
 
     A config that extends another one gets the keys that it lacks, as they are written there. Where that text would have
@@ -85,20 +85,20 @@ def _complete(file: Path) -> str:
         return text
     source = read_source(file)
     data = extended(source).data
-    own, base = _keys(text), _keys(_complete(source.folder / source.data[EXTENDS]))
+    own, base = _split_keys(text), _split_keys(_complete_text(source.folder / source.data[EXTENDS]))
     del own[EXTENDS]
-    story = "".join(f"{line}\n" for line in _leading(text.splitlines()))
+    story = "".join(f"{line}\n" for line in _take_leading_comments(text.splitlines()))
     composed = story + "".join({**base, **own}.values())
     return composed if read_value(composed) == data else story + write_yaml(data)
 
 
-def _keys(text: str) -> dict[str, str]:
+def _split_keys(text: str) -> dict[str, str]:
     """Return the lines of every key at the top of a config."""
     sections = re.split(r"^(?=[a-z_]+:)", text, flags=re.MULTILINE)[1:]
     return {section.partition(":")[0]: section if section.endswith("\n") else f"{section}\n" for section in sections}
 
 
-def _leading(lines: list[str]) -> Iterator[str]:
+def _take_leading_comments(lines: list[str]) -> Iterator[str]:
     for line in lines:
         if not line.startswith("#"):
             return

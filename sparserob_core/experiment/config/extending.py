@@ -30,7 +30,7 @@ def extended(source: Source) -> Source:
     Keys of sections, and of components of the same name, are taken one by one. Any other value, a list, a set or a
     system, replaces the other's. Raises `ConfigError` where there is no such file, or a circle.
     """
-    return _extended(source, ())
+    return _extend_source(source, ())
 
 
 def movable(source: Source) -> tuple[dict[str, Any], list[Complaint]]:
@@ -46,34 +46,34 @@ def movable(source: Source) -> tuple[dict[str, Any], list[Complaint]]:
     return data, faults
 
 
-def _extended(source: Source, above: tuple[File, ...]) -> Source:
+def _extend_source(source: Source, above: tuple[File, ...]) -> Source:
     if EXTENDS not in source.data:
         return source
     stated = source.data[EXTENDS]
     if not isinstance(stated, str) or not stated:
-        raise _fault(source, f"expected the file of a config (got {shown(stated)})")
+        raise _make_error(source, f"expected the file of a config (got {shown(stated)})")
     above = (*above, File(source.name).resolve())
     file = source.folder / path_of(stated)
     if file.resolve() in above:
         circle = " -> ".join(config.name for config in (*above[above.index(file.resolve()) :], file))
-        raise _fault(source, f"the configs extend one another in a circle: {circle}")
+        raise _make_error(source, f"the configs extend one another in a circle: {circle}")
     try:
         base = read_source(file)
     except ConfigError as error:
-        raise _fault(source, str(error)) from None
-    base = _extended(base, above)
+        raise _make_error(source, str(error)) from None
+    base = _extend_source(base, above)
     data, faults = movable(base)
     if faults:
         raise ConfigError("\n".join(f"{base.where(fault.path)}: {fault}" for fault in faults))
     own = {key: value for key, value in source.data.items() if key != EXTENDS}
-    return replace(source, data=_over(data, own, ()), base=base, own=own)
+    return replace(source, data=_merge_values(data, own, ()), base=base, own=own)
 
 
-def _fault(source: Source, said: str) -> ConfigError:
+def _make_error(source: Source, said: str) -> ConfigError:
     return ConfigError(f"{source.where((EXTENDS,))}: {EXTENDS}: {said}")
 
 
-def _over(base: object, own: object, path: Path) -> Any:
+def _merge_values(base: object, own: object, path: Path) -> Any:
     """Return the value at ``path`` of a config that extends another one, from the values of both."""
     slot = next((slot for slot_path, slot in SLOTS.items() if slot_path == path), None)
     if slot is not None:
@@ -86,5 +86,5 @@ def _over(base: object, own: object, path: Path) -> Any:
     if slot is not None and own.get("name", name) != name:
         return copy.deepcopy(own)
     component = {} if name is None else {"name": name}
-    both = {key: _over(base[key], own[key], (*path, key)) if key in base else own[key] for key in own}
+    both = {key: _merge_values(base[key], own[key], (*path, key)) if key in base else own[key] for key in own}
     return {**component, **base, **copy.deepcopy(both)}

@@ -37,20 +37,20 @@ class Loaded:
     def place(self, path: Path) -> str | None:
         """Return where the value at ``path`` is given: ``file:line:column``, or the override; ``None`` for a
         default."""
-        change = _override(self.source, self.overrides, Complaint(path, ""))
+        change = _find_override(self.source, self.overrides, Complaint(path, ""))
         if change is not None:
             return f"override {change.text}"
-        return None if _at(self.source.data, path) is None else self.source.where(path)
+        return None if _get_value(self.source.data, path) is None else self.source.where(path)
 
     def located(self, slot: Path, error: InputError) -> ConfigError:
         """Return an error of the component at ``slot`` as one that names the place of the key at fault."""
         plain = self.config.plain()
         path, remainder = (*slot, *error.path), list[str | int]()
-        while len(path) > len(slot) and _at(plain, path) is None:
+        while len(path) > len(slot) and _get_value(plain, path) is None:
             remainder.insert(0, path[-1])
             path = path[:-1]
         message = f"{dotted(tuple(remainder))}: {error.sentence}" if remainder else error.sentence
-        return ConfigError(_line(self.source, self.overrides, Complaint(path, message)))
+        return ConfigError(_format_line(self.source, self.overrides, Complaint(path, message)))
 
 
 def load_config(
@@ -89,39 +89,39 @@ def load_config(
     data = copy.deepcopy(source.data)
     faults = list(malformed(data))
     if faults:
-        raise _refusal(source, changes, faults)
+        raise _make_error(source, changes, faults)
     _spell_out(data)
     for change in changes:
         apply_override(data, change)
         _spell_out(data)
     faults = list(malformed(data))
     if known is None and not faults:  # a run directory has the numbers themselves: no file is read for it
-        faults = list(resolve(data, lambda path: _folder(path, source, changes)))
-    registry = _registry(data, source, changes) if known is None else known
-    resolved, key_faults = _checked(data, registry, strangers=known is not None)
+        faults = list(resolve(data, lambda path: _find_folder(path, source, changes)))
+    registry = _build_registry(data, source, changes) if known is None else known
+    resolved, key_faults = _check_data(data, registry, strangers=known is not None)
     if faults or key_faults or resolved is None:
-        raise _refusal(source, changes, faults or key_faults)
+        raise _make_error(source, changes, faults or key_faults)
     if not resolved.title:
         resolved = resolved.model_copy(update={"title": File(source.name).stem})
     return Loaded(resolved, registry, source, changes)
 
 
-def _folder(path: Path, source: Source, changes: tuple[Override, ...]) -> File:
+def _find_folder(path: Path, source: Source, changes: tuple[Override, ...]) -> File:
     """Return the folder that a file is relative to: that of the config, or the working directory for an override."""
-    changed = _override(source, changes, Complaint(path, "")) is not None
+    changed = _find_override(source, changes, Complaint(path, "")) is not None
     return File.cwd() if changed else source.folder
 
 
 def _spell_out(data: dict[str, Any]) -> None:
     for path, slot in SLOTS.items():
-        holder = _at(data, path[:-1])
+        holder = _get_value(data, path[:-1])
         if isinstance(holder, dict) and path[-1] in holder:
-            holder[path[-1]] = _entry(holder[path[-1]], slot.name)
+            holder[path[-1]] = _expand_entry(holder[path[-1]], slot.name)
     if isinstance(data.get("observers"), list):
-        data["observers"] = [_entry(entry, None) for entry in data["observers"]]
+        data["observers"] = [_expand_entry(entry, None) for entry in data["observers"]]
 
 
-def _entry(entry: object, default: str | None) -> object:
+def _expand_entry(entry: object, default: str | None) -> object:
     if isinstance(entry, str):
         return {"name": entry}
     if isinstance(entry, dict) and default and "name" not in entry:
@@ -129,7 +129,7 @@ def _entry(entry: object, default: str | None) -> object:
     return entry
 
 
-def _registry(data: dict[str, Any], source: Source, changes: tuple[Override, ...]) -> Registry:
+def _build_registry(data: dict[str, Any], source: Source, changes: tuple[Override, ...]) -> Registry:
     files = data.get("plugins") or []
     if not isinstance(files, list) or not all(isinstance(file, str) for file in files):
         return load_registry()
@@ -139,19 +139,19 @@ def _registry(data: dict[str, Any], source: Source, changes: tuple[Override, ...
     try:
         return load_registry(data["plugins"])
     except PluginError as error:
-        message = _line(source, changes, Complaint(("plugins",), str(error)))
+        message = _format_line(source, changes, Complaint(("plugins",), str(error)))
         raise (ConfigError if isinstance(error, InputError) else PluginError)(message) from error
 
 
-def _checked(data: dict[str, Any], registry: Registry, strangers: bool) -> tuple[RunConfig | None, list[Complaint]]:
+def _check_data(data: dict[str, Any], registry: Registry, strangers: bool) -> tuple[RunConfig | None, list[Complaint]]:
     wrong: list[Complaint] = []
     checked: RunConfig | None = None
     try:
         checked = RunConfig.model_validate(data)
     except ValidationError as error:
-        wrong += complaints(error, RunConfig, data, list(_below(data, registry)))
+        wrong += complaints(error, RunConfig, data, list(_list_nested_keys(data, registry)))
     plain = checked.plain() if checked else data
-    for path, kind, entry in _entries(plain):
+    for path, kind, entry in _list_entries(plain):
         options = {
             key: value for key, value in entry.items() if key != "name" and not (kind == "maximiser" and key in KEPT)
         }
@@ -168,10 +168,10 @@ def _checked(data: dict[str, Any], registry: Registry, strangers: bool) -> tuple
     return (RunConfig.model_validate(plain) if not wrong else None), wrong
 
 
-def _below(data: dict[str, Any], registry: Registry) -> Iterator[str]:
+def _list_nested_keys(data: dict[str, Any], registry: Registry) -> Iterator[str]:
     """Yield the keys of the sections, with the section in front; among them the options of their components."""
     for path, slot in SLOTS.items():
-        entry = _at(data, path)
+        entry = _get_value(data, path)
         name = entry.get("name") if isinstance(entry, dict) else slot.name
         if name in registry.names(slot.kind):
             fields = registry.get(slot.kind, str(name)).options_type().model_fields
@@ -181,7 +181,7 @@ def _below(data: dict[str, Any], registry: Registry) -> Iterator[str]:
             yield from (dotted((section, key)) for key in model.model_fields if key != "name")
 
 
-def _entries(data: dict[str, Any]) -> Iterator[tuple[Path, str, dict[str, Any]]]:
+def _list_entries(data: dict[str, Any]) -> Iterator[tuple[Path, str, dict[str, Any]]]:
     slots: list[tuple[Path, str]] = [(path, slot.kind) for path, slot in SLOTS.items()]
     observers = data.get("observers")
     slots += [
@@ -189,12 +189,12 @@ def _entries(data: dict[str, Any]) -> Iterator[tuple[Path, str, dict[str, Any]]]
         for position in range(len(observers) if isinstance(observers, list) else 0)
     ]
     for path, kind in slots:
-        entry = _at(data, path)
+        entry = _get_value(data, path)
         if isinstance(entry, dict) and isinstance(entry.get("name"), str):
             yield path, kind, entry
 
 
-def _at(data: Any, path: Path) -> Any:
+def _get_value(data: Any, path: Path) -> Any:
     for step in path:
         try:
             data = data[step]
@@ -203,16 +203,16 @@ def _at(data: Any, path: Path) -> Any:
     return data
 
 
-def _refusal(source: Source, changes: tuple[Override, ...], wrong: list[Complaint]) -> ConfigError:
+def _make_error(source: Source, changes: tuple[Override, ...], wrong: list[Complaint]) -> ConfigError:
     inside = {complaint: source.position(complaint.path) for complaint in wrong}
     ordered = sorted(
-        wrong, key=lambda complaint: (_override(source, changes, complaint) is not None, inside[complaint])
+        wrong, key=lambda complaint: (_find_override(source, changes, complaint) is not None, inside[complaint])
     )
-    return ConfigError("\n".join(dict.fromkeys(_line(source, changes, complaint) for complaint in ordered)))
+    return ConfigError("\n".join(dict.fromkeys(_format_line(source, changes, complaint) for complaint in ordered)))
 
 
-def _line(source: Source, changes: tuple[Override, ...], complaint: Complaint) -> str:
-    change = _override(source, changes, complaint)
+def _format_line(source: Source, changes: tuple[Override, ...], complaint: Complaint) -> str:
+    change = _find_override(source, changes, complaint)
     if change is None:
         return f"{source.where(complaint.path)}: {complaint}"
     unquoted = any(phrase in complaint.message for phrase in (NOT_TEXT, NOT_PLAIN))
@@ -220,12 +220,12 @@ def _line(source: Source, changes: tuple[Override, ...], complaint: Complaint) -
     return f"override {change.text}: {complaint}{hint}"
 
 
-def _override(source: Source, changes: tuple[Override, ...], complaint: Complaint) -> Override | None:
+def _find_override(source: Source, changes: tuple[Override, ...], complaint: Complaint) -> Override | None:
     """Return the override that gave a key: it set the key, or one below a key that was not written before."""
     path = [str(step) for step in complaint.path]
     for change in reversed(changes):
         changed = [str(step) for step in change.path]
-        is_created = path and changed[: len(path)] == path and _at(source.data, complaint.path) is None
+        is_created = path and changed[: len(path)] == path and _get_value(source.data, complaint.path) is None
         if is_created or path[: len(changed)] == changed:
             return change
     return None

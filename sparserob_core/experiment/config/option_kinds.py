@@ -39,7 +39,7 @@ FreeNumbers: TypeAlias = Annotated[list[float | None], Tag("list")]
 OneOrMore: TypeAlias = Annotated[Number | Numbers, one_of("a number or a list of numbers", number=NUMBER, list=LIST)]
 
 
-def _in_time(value: object) -> str | None:
+def _tag_value(value: object) -> str | None:
     """Return the tag of a value that may be rows of numbers: they are rows where any entry of the list is a list."""
     if isinstance(value, list | tuple):
         return "rows" if any(isinstance(row, list | tuple) for row in value) else "list"
@@ -49,7 +49,7 @@ def _in_time(value: object) -> str | None:
 NumbersInTime: TypeAlias = Annotated[
     Number | Numbers | Annotated[list[list[float]], Tag("rows")],
     Discriminator(
-        _in_time,
+        _tag_value,
         custom_error_type="kind",
         custom_error_message="expected a number, a list of numbers, or rows of a time and the numbers from then on",
     ),
@@ -63,7 +63,7 @@ class Sparse(Options):
     """Options that are written back without the keys that were not given."""
 
     @model_serializer(mode="wrap")
-    def _written(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
+    def _serialise(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
         return {key: value for key, value in handler(self).items() if value is not None}
 
 

@@ -42,12 +42,14 @@ def option_rows(record: Plugin, ask: bool = True) -> list[OptionRow]:
     schema = options_schema(record, ask)
     prefix = f"#/$defs/{record.kind}.{record.name}."
     return list(
-        _Rows({prefix + name: definition for name, definition in schema.get("$defs", {}).items()}).rows(schema, "")
+        _SchemaRows({prefix + name: definition for name, definition in schema.get("$defs", {}).items()}).rows(
+            schema, ""
+        )
     )
 
 
 @final
-class _Rows:
+class _SchemaRows:
     """The rows of a schema; ``parts`` are its definitions, ``seen`` the options at which each of them was listed."""
 
     def __init__(self, parts: Mapping[str, Any]) -> None:
@@ -56,22 +58,22 @@ class _Rows:
 
     def rows(self, schema: Mapping[str, Any], above: str) -> Iterator[OptionRow]:
         for name, field in schema.get("properties", {}).items():
-            members = [member for _, member in self._members(field)]
-            below = list(self._references(field, above + name))
+            members = [member for _, member in self._list_members(field)]
+            below = list(self._list_references(field, above + name))
             notes = [f"keys as in {self.seen[reference]}" for reference, _ in below if reference in self.seen]
             meaning = " ".join(str(field.get("description", "")).split())
             yield OptionRow(
                 name=above + name,
-                type=" or ".join(dict.fromkeys(self._type(member) for member in members)) or "anything",
-                default=_default(field, name in schema.get("required", [])),
-                range=", ".join(dict.fromkeys(_limits(field, members))),
+                type=" or ".join(dict.fromkeys(self._describe_type(member) for member in members)) or "anything",
+                default=_describe_default(field, name in schema.get("required", [])),
+                range=", ".join(dict.fromkeys(_describe_limits(field, members))),
                 meaning=" ".join([meaning, *(f"({notes[0]})" for _ in notes[:1])]).strip(),
             )
             for reference, key in below:
                 if self.seen.setdefault(reference, key) == key:
                     yield from self.rows(self.parts.get(reference, {}), f"{key}.")
 
-    def _members(self, field: Mapping[str, Any]) -> Iterator[tuple[str, Mapping[str, Any]]]:
+    def _list_members(self, field: Mapping[str, Any]) -> Iterator[tuple[str, Mapping[str, Any]]]:
         """Yield the alternatives of a type, each with the name of its definition."""
         reference = field.get("$ref", "")
         definition = self.parts.get(reference, {}) if reference else field
@@ -80,16 +82,16 @@ class _Rows:
             yield reference, definition
             return
         for member in alternatives:
-            yield from self._members(member)
+            yield from self._list_members(member)
 
-    def _references(self, field: Mapping[str, Any], place: str) -> Iterator[tuple[str, str]]:
-        for reference, member in self._members(field):
+    def _list_references(self, field: Mapping[str, Any], place: str) -> Iterator[tuple[str, str]]:
+        for reference, member in self._list_members(field):
             if reference and member.get("properties"):
                 yield reference, place
             elif member.get("type") == "array":
-                yield from self._references(member.get("items", {}), f"{place}.0")
+                yield from self._list_references(member.get("items", {}), f"{place}.0")
 
-    def _type(self, member: Mapping[str, Any]) -> str:
+    def _describe_type(self, member: Mapping[str, Any]) -> str:
         if "enum" in member:
             return ", ".join(str(value) for value in member["enum"])
         if "const" in member:
@@ -101,18 +103,20 @@ class _Rows:
             return f"{member['component']}{f' ({of})' if of else ''} by name, or with its options"
         kind = member.get("type")
         if kind == "array":
-            inside = " or ".join(dict.fromkeys(self._type(item) for _, item in self._members(member.get("items", {}))))
+            inside = " or ".join(
+                dict.fromkeys(self._describe_type(item) for _, item in self._list_members(member.get("items", {})))
+            )
             return f"list of ({inside})" if " or " in inside else f"list of {inside}"
         return TYPES.get(str(kind), str(kind or "anything"))
 
 
-def _default(field: Mapping[str, Any], required: bool) -> str:
+def _describe_default(field: Mapping[str, Any], required: bool) -> str:
     if required:
         return "required"
     return json.dumps(field["default"]) if "default" in field else ""
 
 
-def _limits(field: Mapping[str, Any], members: list[Mapping[str, Any]]) -> Iterator[str]:
+def _describe_limits(field: Mapping[str, Any], members: list[Mapping[str, Any]]) -> Iterator[str]:
     for definition in (field, *members):
         for key, words in LIMITS.items():
             if key in definition:

@@ -55,22 +55,22 @@ from sparserob_core.options import Options
 from sparserob_core.sip.convex_set import Array
 
 
-def _entry(value: object) -> object:
+def _check_entry(value: object) -> object:
     if isinstance(value, bool) or not isinstance(value, int | float | str | np.number):
         raise InputError(expected="a number or an expression in the parameters such as '-2 + p1'", got=f"{value!r}")
     return value
 
 
-Entry: TypeAlias = Annotated[float | str, BeforeValidator(_entry)]
+Entry: TypeAlias = Annotated[float | str, BeforeValidator(_check_entry)]
 
 
-def _interval(value: object) -> object:
+def _check_interval(value: object) -> object:
     if not isinstance(value, list | tuple) or len(value) != 2:
         raise InputError(expected="an interval [lower, upper]", got=f"{value!r}")
     return value
 
 
-Interval: TypeAlias = Annotated[tuple[float, float], BeforeValidator(_interval)]
+Interval: TypeAlias = Annotated[tuple[float, float], BeforeValidator(_check_interval)]
 Rows: TypeAlias = Annotated[list[Annotated[list[Entry], Field(min_length=1)]], Field(min_length=1), OrPacked()]
 Column: TypeAlias = Annotated[list[Entry], Field(min_length=1), OrPacked(column=True)]
 MOST_PIECES = 1_000_000  # the same limit as that of a dictionary of equal pieces
@@ -85,7 +85,7 @@ class ParameterSetOptions(SetOptions):
     """Names of the parameters, in the order of the set's coordinates."""
 
 
-def _parameters_kind(value: object) -> str | None:
+def _tag_parameters(value: object) -> str | None:
     if isinstance(value, ParameterSetOptions) or (isinstance(value, Mapping) and "names" in value):
         return "set"
     return "intervals" if isinstance(value, Mapping) else None
@@ -94,7 +94,7 @@ def _parameters_kind(value: object) -> str | None:
 Parameters: TypeAlias = Annotated[
     Annotated[dict[str, Interval], Tag("intervals")] | Annotated[ParameterSetOptions, Tag("set")],
     Discriminator(
-        _parameters_kind,
+        _tag_parameters,
         custom_error_type="kind",
         custom_error_message="expected {name: [lower, upper], ...} or {names: [...], polytope: ...}",
     ),
@@ -209,23 +209,23 @@ class SystemOptions(Options):
             If a key is at fault; the error begins with the key.
         """
         names = self.names()
-        parameters, pieces = self._parameter_set(names), self.matrices()
+        parameters, pieces = self._build_parameter_set(names), self.matrices()
         where, until, first = pieces[0]
-        if self._changes(names, pieces):
-            return self._varying(pieces, horizon, parameters)
+        if self._is_time_varying(names, pieces):
+            return self._build_varying_system(pieces, horizon, parameters)
         try:
             defined = parse_definitions(self.define or {}, names)
         except InputError as error:
             raise error.under("system") from None
         if until is None:
-            return _system(where, first, parameters, names, self.delay, defined)
+            return _build_system(where, first, parameters, names, self.delay, defined)
         phases = [
-            (float(stop or 0.0), _system(key, matrices, parameters, names, 0.0, defined))
+            (float(stop or 0.0), _build_system(key, matrices, parameters, names, 0.0, defined))
             for key, stop, matrices in pieces
         ]
         return SwitchedSystem(phases, self.delay)
 
-    def _changes(self, names: tuple[str, ...], every: list[tuple[str, float | None, Matrices]]) -> bool:
+    def _is_time_varying(self, names: tuple[str, ...], every: list[tuple[str, float | None, Matrices]]) -> bool:
         """Return whether an entry or a definition contains the time ``t``, where no parameter has that name."""
         if TIME in names:
             return False
@@ -234,7 +234,7 @@ class SystemOptions(Options):
             texts += [entry for rows in (A, B, E or []) for row in rows for entry in row] + (c or [])
         return any(TIME in re.findall(r"[A-Za-z_]\w*", text) for text in texts if isinstance(text, str))
 
-    def _varying(
+    def _build_varying_system(
         self, every: list[tuple[str, float | None, Matrices]], horizon: float | None, parameters: ConvexSet | None
     ) -> System:
         if horizon is None:
@@ -247,7 +247,7 @@ class SystemOptions(Options):
         phases = [(float(until or 0.0), matrices) for _, until, matrices in every]
         return VaryingSystem.taking_turns(phases, self.define, self.delay, parameters, self.names())
 
-    def _parameter_set(self, names: tuple[str, ...]) -> ConvexSet | None:
+    def _build_parameter_set(self, names: tuple[str, ...]) -> ConvexSet | None:
         if isinstance(self.parameters, ParameterSetOptions):
             return self.parameters.build("system.parameters", len(names))
         if not self.parameters:
@@ -433,7 +433,7 @@ def _check_shapes(where: str, of: Matrices) -> None:
         raise InputError(path=f"{where}.c", expected=f"{d} entries, one per state", got=f"{len(c)}")
 
 
-def _system(
+def _build_system(
     where: str,
     of: Matrices,
     parameters: ConvexSet | None,
@@ -687,7 +687,7 @@ class ControlKeys(ProblemKeys):
             terminal=self.ends(system.states),
             **self.constraints(),
             cost=self.cost.build(system.states),
-            initial_control=self._control_before(system.controls),
+            initial_control=self._expand_initial_control(system.controls),
             control_step=(
                 None if self.control_step is None else self.control_step.build("control_step", system.controls)
             ),
@@ -697,7 +697,7 @@ class ControlKeys(ProblemKeys):
             execution=None if self.execution is None else broadcast("execution", self.execution, system.controls),
         )
 
-    def _control_before(self, controls: int) -> list[float] | None:
+    def _expand_initial_control(self, controls: int) -> list[float] | None:
         control = self.initial_control
         if control is None or isinstance(control, list):
             return control

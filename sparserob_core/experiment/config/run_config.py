@@ -137,12 +137,12 @@ def digest(plain: object) -> str:
     return hashlib.sha256(json.dumps(plain, sort_keys=True).encode()).hexdigest()[:8]
 
 
-def _slots(model: type[Options], above: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], Slot]]:
+def _list_slots(model: type[Options], above: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], Slot]]:
     for name, field in model.model_fields.items():
         yield from (((*above, name), mark) for mark in field.metadata if isinstance(mark, Slot))
         if field.annotation is Dictionaries:
-            yield from _slots(Dictionaries, (*above, name))
+            yield from _list_slots(Dictionaries, (*above, name))
 
 
-SLOTS: Mapping[tuple[str, ...], Slot] = dict(_slots(RunConfig))
+SLOTS: Mapping[tuple[str, ...], Slot] = dict(_list_slots(RunConfig))
 """The keys at which a config names one component; the key ``observers``, a list, is not among them."""

@@ -17,7 +17,7 @@ from sparserob_core.experiment.plugins.records import Plugin
 from sparserob_core.options import meanings
 
 
-class _Lenient(GenerateJsonSchema):
+class _LenientGenerator(GenerateJsonSchema):
     """A schema generator that accepts any value of a type that JSON cannot describe, and adds the meaning of every
     field."""
 
@@ -51,26 +51,26 @@ def options_schema(record: Plugin, ask: bool = True) -> dict[str, Any]:
         The schema.
     """
     if record.open and not ask:
-        return {} if record.options is None else record.options.model_json_schema(schema_generator=_Lenient)
+        return {} if record.options is None else record.options.model_json_schema(schema_generator=_LenientGenerator)
     template = f"#/$defs/{record.kind}.{record.name}.{{model}}"
-    return record.options_type().model_json_schema(ref_template=template, schema_generator=_Lenient)
+    return record.options_type().model_json_schema(ref_template=template, schema_generator=_LenientGenerator)
 
 
 def config_schema(registry: Registry) -> dict[str, Any]:
     """Return the JSON schema (draft 2020-12) of the whole config."""
-    schema = RunConfig.model_json_schema(schema_generator=_Lenient)
+    schema = RunConfig.model_json_schema(schema_generator=_LenientGenerator)
     definitions: dict[str, Any] = schema["$defs"]
     for path, slot in SLOTS.items():
         holder = schema if len(path) == 1 else definitions["Dictionaries"]
         previous = holder["properties"][path[-1]]
-        choice = _choice(registry, Part(slot.kind), slot.name, definitions)
+        choice = _describe_choice(registry, Part(slot.kind), slot.name, definitions)
         if any(option.get("type") == "null" for option in previous.get("anyOf", [])):
             choice["anyOf"].append({"type": "null"})
         holder["properties"][path[-1]] = {
             **{key: previous[key] for key in ("default", "description") if key in previous},
             **choice,
         }
-    schema["properties"]["observers"]["items"] = _choice(registry, Part("observer"), None, definitions)
+    schema["properties"]["observers"]["items"] = _describe_choice(registry, Part("observer"), None, definitions)
     for unused in ("Entry", "MaximiserEntry"):
         definitions.pop(unused, None)
     _add_kinds(registry, definitions)
@@ -90,7 +90,7 @@ def _add_kinds(registry: Registry, parts: dict[str, Any]) -> None:
                 parts.update({f"{key}.{inner}": value for inner, value in entry.pop("$defs", {}).items()})
                 parts[key] = entry
             short = shorthand(record)
-            forms = [*_alternatives(parts[key]["properties"][short])] if short else []
+            forms = [*_list_alternatives(parts[key]["properties"][short])] if short else []
             holder.setdefault("properties", {})[name] = {
                 "anyOf": [*forms, {"$ref": f"#/$defs/{key}"}, {"type": "null"}],
                 "default": None,
@@ -99,11 +99,11 @@ def _add_kinds(registry: Registry, parts: dict[str, Any]) -> None:
         holder["additionalProperties"] = False
 
 
-def _alternatives(field: dict[str, Any]) -> list[dict[str, Any]]:
+def _list_alternatives(field: dict[str, Any]) -> list[dict[str, Any]]:
     return [form for form in field.get("anyOf", [field]) if form.get("type") != "null"]
 
 
-def _choice(
+def _describe_choice(
     registry: Registry, which: Part, default: str | None, parts: dict[str, Any], but: str | None = None
 ) -> dict[str, Any]:
     """Return the schema of a component of a kind, by name or with its options.
@@ -120,17 +120,19 @@ def _choice(
             described = entry["properties"][key]
             for extra in ("component", "of"):
                 described.pop(extra, None)
-            inner_choice = _choice(registry, component, None, parts, but=name if component.kind == kind else None)
+            inner_choice = _describe_choice(
+                registry, component, None, parts, but=name if component.kind == kind else None
+            )
             described["anyOf"] = [*inner_choice["anyOf"], {"type": "null"}]
         parts.update({f"{kind}.{name}.{inner}": value for inner, value in entry.pop("$defs", {}).items()})
-        entries.append(_named(entry, record, needs_name=name != default))
+        entries.append(_add_name(entry, record, needs_name=name != default))
     return {"anyOf": [{"enum": names, "description": f"A {kind} with its default options."}, *entries]}
 
 
-def _named(entry: dict[str, Any], record: Plugin, needs_name: bool) -> dict[str, Any]:
+def _add_name(entry: dict[str, Any], record: Plugin, needs_name: bool) -> dict[str, Any]:
     properties = {"name": {"const": record.name, "description": record.summary}, **entry.get("properties", {})}
     if record.kind == "maximiser":
-        own = MaximiserEntry.model_json_schema(schema_generator=_Lenient)["properties"]
+        own = MaximiserEntry.model_json_schema(schema_generator=_LenientGenerator)["properties"]
         properties |= {key: own[key] for key in own if key != "name"}
     required = (["name"] if needs_name else []) + entry.get("required", [])
     return {

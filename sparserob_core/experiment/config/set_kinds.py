@@ -52,7 +52,7 @@ class BoxFactory(SetFactory, Sparse):
     """Upper bounds; a number holds for every coordinate, and null or a missing side is free."""
 
     @model_validator(mode="after")
-    def _one_way(self) -> BoxFactory:
+    def _require_one_form(self) -> BoxFactory:
         if self.half_widths is not None and not (self.lower is None and self.upper is None):
             raise InputError(expected="half_widths, or lower and upper", got="both")
         return self
@@ -75,8 +75,8 @@ class BoxFactory(SetFactory, Sparse):
         if not isinstance(convex, Box):
             return None
         if np.array_equal(convex.lower, -convex.upper):
-            return {"half_widths": _or_free(convex.upper)}
-        return {"lower": _or_free(convex.lower), "upper": _or_free(convex.upper)}
+            return {"half_widths": _write_bounds(convex.upper)}
+        return {"lower": _write_bounds(convex.lower), "upper": _write_bounds(convex.upper)}
 
 
 @final
@@ -133,7 +133,9 @@ class EllipsoidFactory(SetFactory, Sparse):
 
     @staticmethod
     def options_of(convex: ConvexSet) -> Mapping[str, Any] | None:
-        return {**_centred(convex.centre), "shape": convex.shape.tolist()} if isinstance(convex, Ellipsoid) else None
+        return (
+            {**_write_centre(convex.centre), "shape": convex.shape.tolist()} if isinstance(convex, Ellipsoid) else None
+        )
 
 
 @final
@@ -158,15 +160,15 @@ class NormFactory(SetFactory, Sparse):
         if not isinstance(convex, NormBall):
             return None
         exponent = "inf" if np.isinf(convex.p) else convex.p
-        return {"p": exponent, "radius": convex.radius, **_centred(convex.centre)}
+        return {"p": exponent, "radius": convex.radius, **_write_centre(convex.centre)}
 
 
-def _or_free(bounds: Array) -> list[float | None]:
+def _write_bounds(bounds: Array) -> list[float | None]:
     """Return bounds as a config writes them, with null where there is none."""
     return [float(value) if np.isfinite(value) else None for value in bounds]
 
 
-def _centred(centre: Array) -> dict[str, Any]:
+def _write_centre(centre: Array) -> dict[str, Any]:
     """Return the key of a centre.
 
     There is none for the origin, so that a config can have the centre of the initial states as well as such a set.

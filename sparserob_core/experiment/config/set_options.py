@@ -48,10 +48,10 @@ KIND = SetPlugin.kind
 class SetOptions(Sparse, extra="allow", json_schema_extra={"kinds": KIND}):
     """A set: each key is a kind of set, its value the options of that kind; several keys mean the intersection."""
 
-    _made: dict[str, SetFactory] = PrivateAttr(default_factory=dict)
+    _factories: dict[str, SetFactory] = PrivateAttr(default_factory=dict)
 
     @model_validator(mode="after")
-    def _of_known_kinds(self, info: ValidationInfo) -> SetOptions:
+    def _check_kinds(self, info: ValidationInfo) -> SetOptions:
         """Check every key that is no field as a kind of set, with the registry of the context or the installed one."""
         extra = self.__pydantic_extra__ or {}
         registry: Registry = (info.context or {}).get("registry") or load_registry()
@@ -60,19 +60,19 @@ class SetOptions(Sparse, extra="allow", json_schema_extra={"kinds": KIND}):
             if value is None:
                 del extra[key]
                 continue
-            typed, faults = _checked(registry, key, value, self._keys())
+            typed, faults = _check_kind(registry, key, value, self._list_fields())
             wrong += [fault.under((key,)) for fault in faults]
             if typed is not None:
                 extra[key] = typed
-                self._made[key] = registry.get(KIND, key).create(typed)  # type: ignore[assignment]
+                self._factories[key] = registry.get(KIND, key).create(typed)  # type: ignore[assignment]
         if wrong:
-            raise ValidationError.from_exception_data(type(self).__name__, [_detail(fault) for fault in wrong])
-        if not self._given():
+            raise ValidationError.from_exception_data(type(self).__name__, [_make_detail(fault) for fault in wrong])
+        if not self._list_given_keys():
             raise InputError(expected=f"a set: {', '.join(registry.names(KIND))}", got="none of them")
         return self
 
     @model_serializer(mode="wrap")
-    def _written(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
+    def _serialise(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
         """Return the set as a config writes it: without keys that were not given, in the short form where there
         is one."""
         plain = {key: value for key, value in handler(self).items() if value is not None}
@@ -82,10 +82,10 @@ class SetOptions(Sparse, extra="allow", json_schema_extra={"kinds": KIND}):
                 plain[key] = plain[key][short]
         return plain
 
-    def _keys(self) -> set[str]:
+    def _list_fields(self) -> set[str]:
         return {field.alias or name for name, field in type(self).model_fields.items()}
 
-    def _given(self) -> list[str]:
+    def _list_given_keys(self) -> list[str]:
         return list(self.__pydantic_extra__ or {})
 
     def members(self, where: str, dimension: int) -> list[ConvexSet]:
@@ -109,7 +109,7 @@ class SetOptions(Sparse, extra="allow", json_schema_extra={"kinds": KIND}):
             If a set cannot be built, or has another dimension; the error begins with the key.
         """
         members = []
-        for kind, factory in self._made.items():
+        for kind, factory in self._factories.items():
             try:
                 member = factory.build(dimension)
             except InputError as error:
@@ -147,13 +147,14 @@ class SetOptions(Sparse, extra="allow", json_schema_extra={"kinds": KIND}):
             raise error.under(where) from None
         if isinstance(joined, tuple):
             raise InputError(
-                f"a curved set cannot be intersected except in path and terminal, got {' and '.join(self._given())}",
+                f"a curved set cannot be intersected except in path and terminal, got"
+                f" {' and '.join(self._list_given_keys())}",
                 path=where,
             )
         return joined
 
 
-def _checked(registry: Registry, kind: str, value: object, keys: set[str]) -> tuple[Options | None, list[Complaint]]:
+def _check_kind(registry: Registry, kind: str, value: object, keys: set[str]) -> tuple[Options | None, list[Complaint]]:
     """Return the typed options of one kind of set, or the faults in them; ``keys`` are the fields, which are no
     kinds."""
     kinds = registry.names(KIND)
@@ -168,7 +169,7 @@ def _checked(registry: Registry, kind: str, value: object, keys: set[str]) -> tu
     return typed, [replace(fault, path=fault.path[1:]) if fault.path[:1] == (short,) else fault for fault in faults]
 
 
-def _detail(fault: Complaint) -> InitErrorDetails:
+def _make_detail(fault: Complaint) -> InitErrorDetails:
     error = PydanticCustomError(COMPLAINT, "{said}", {"said": fault.message, "below": fault.path})
     return InitErrorDetails(type=error, input=None)
 
@@ -211,8 +212,8 @@ class PathOptions(SetOptions, populate_by_name=True):
     name: Annotated[str, Field(min_length=1)] | None = None
     """Name in messages, tables and figures; path, or path[0] and so on, unless given."""
 
-    def _given(self) -> list[str]:
-        return super()._given() + ["mixed"] * (self.mixed is not None)
+    def _list_given_keys(self) -> list[str]:
+        return super()._list_given_keys() + ["mixed"] * (self.mixed is not None)
 
     def entries(self, where: str, states: int, horizon: float) -> list[PathConstraint | MixedConstraint]:
         """Return one constraint per key.
@@ -246,7 +247,9 @@ class PathOptions(SetOptions, populate_by_name=True):
         members = self.members(where, states)
         if self.name is not None and len(members) + (self.mixed is not None) > 1:
             raise InputError(
-                path=f"{where}.name", expected="one set in an entry with a name", got=f"{' and '.join(self._given())}"
+                path=f"{where}.name",
+                expected="one set in an entry with a name",
+                got=f"{' and '.join(self._list_given_keys())}",
             )
         constraints: list[PathConstraint | MixedConstraint] = [
             PathConstraint(member, self.start, self.stop, self.name, self.relative_to) for member in members
@@ -339,7 +342,7 @@ class InitialStateOptions(SetOptions):
             raise InputError("the set must be bounded", path=where)
         if self.centre is None:
             centre = convex.middle()
-            return centre, _moved(convex, centre, where)
+            return centre, _translate_set(convex, centre, where)
         inside = [kind for kind, typed in (self.__pydantic_extra__ or {}).items() if _has_centre(typed)]
         if inside:
             raise InputError(
@@ -365,7 +368,7 @@ def _has_centre(typed: object) -> bool:
     return bool(getattr(typed, "centre", None) != type(typed).model_fields["centre"].default)
 
 
-def _moved(convex: ConvexSet, centre: Array, where: str) -> ConvexSet:
+def _translate_set(convex: ConvexSet, centre: Array, where: str) -> ConvexSet:
     """Return the set of all ``x - centre``."""
     if isinstance(convex, Box):
         return Box(convex.lower - centre, convex.upper - centre)
@@ -388,8 +391,8 @@ class TerminalOptions(SetOptions):
     equals: Annotated[FreeNumbers, Field(min_length=1)] | None = None
     """Final values, one per state, null where free."""
 
-    def _given(self) -> list[str]:
-        return super()._given() + ["equals"] * (self.equals is not None)
+    def _list_given_keys(self) -> list[str]:
+        return super()._list_given_keys() + ["equals"] * (self.equals is not None)
 
     def ends(self, where: str, dimension: int) -> list[ConvexSet | Equality]:
         """Return one set or equality per key; raises `InputError` that begins with the key below ``where``."""

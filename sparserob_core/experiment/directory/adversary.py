@@ -54,7 +54,7 @@ def adversaries(experiment: Experiment, decision: Array) -> dict[str, Array]:
     model, theta = experiment.model, np.asarray(decision, dtype=float).ravel()
     if model is None or not (kept := find_adversaries(model, theta)):
         return {}
-    arrays = _stacked(kept, model)
+    arrays = _stack_adversaries(kept, model)
     times, states = propagated(model, theta, arrays)
     return {**arrays, "state_times": times, "states": states}
 
@@ -201,7 +201,7 @@ def _require_shapes(file: Path, arrays: Mapping[str, Array], model: Transcriptio
             raise InputError(f"{file}: noises: expected finite numbers of shape {shape}, got shape {noises.shape}")
 
 
-def _stacked(found: Sequence[Adversary], model: Transcription) -> dict[str, Array]:
+def _stack_adversaries(found: Sequence[Adversary], model: Transcription) -> dict[str, Array]:
     """Return the arrays of adversaries, one row each, on the union of their breakpoints."""
     points = np.unique(np.concatenate([adversary.breakpoints for adversary in found]))
     middles = (points[:-1] + points[1:]) / 2

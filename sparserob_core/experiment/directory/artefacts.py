@@ -35,11 +35,11 @@ def write_whole(file: Path, content: bytes) -> None:
     except OSError as error:
         with suppress(OSError):
             temporary.unlink()
-        note = "the one that is there is what was written before" if _stands(file) else "nothing of it was kept"
+        note = "the one that is there is what was written before" if _is_present(file) else "nothing of it was kept"
         raise SparseRobError(f"{file}: cannot be written: {error.strerror}; {note}") from error
 
 
-def _stands(file: Path) -> bool:
+def _is_present(file: Path) -> bool:
     try:
         return file.exists()
     except OSError:  # the disk refuses everything
@@ -107,9 +107,9 @@ def create_directory(out: str | Path | None, name: str, digest: str, again: str 
     InputError
         If the directory is not empty, if another run writes into it, or if it cannot be written to.
     """
-    path = Path(out) if out is not None else _stamped(name, digest)
+    path = Path(out) if out is not None else _make_stamped_path(name, digest)
     lock = Lock(path)
-    with _faults_of(path):
+    with _convert_errors(path):
         path.mkdir(parents=True, exist_ok=True)
         _require_empty(path, unless=(lock.file.name, again))
         lock.acquire()
@@ -145,7 +145,7 @@ def share_directory(out: str | Path, first: str, text: str) -> RunDirectory:
         If the directory holds other files only, or cannot be written to.
     """
     path = Path(out)
-    with _faults_of(path):
+    with _convert_errors(path):
         path.mkdir(parents=True, exist_ok=True)
         _require_empty(path, unless=(first,))
         temporary = path / f".{first}.{platform.node()}.{os.getpid()}.tmp"
@@ -159,7 +159,7 @@ def share_directory(out: str | Path, first: str, text: str) -> RunDirectory:
 
 
 @contextmanager
-def _faults_of(path: Path) -> Iterator[None]:
+def _convert_errors(path: Path) -> Iterator[None]:
     """Raise errors of the system about a directory as `InputError`."""
     try:
         yield
@@ -182,7 +182,7 @@ def _require_empty(path: Path, unless: Sequence[str] = ()) -> None:
         raise InputError(f"{path}: expected a new or an empty directory, got one that holds files")
 
 
-def _stamped(name: str, digest: str) -> Path:
+def _make_stamped_path(name: str, digest: str) -> Path:
     parent = Path("runs") / name
     stem = f"{datetime.now(UTC):%Y%m%dT%H%M%SZ}-{digest}"
     candidates = (parent / (stem if count == 1 else f"{stem}-{count}") for count in range(1, 10_000))

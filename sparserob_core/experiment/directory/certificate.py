@@ -91,7 +91,10 @@ def certificate(experiment: Experiment, result: Result) -> dict[str, Any] | None
     feedback = experiment.transcription.feedback
     policy_keys: dict[str, Any] = {}
     if feedback is not None:
-        policy_keys["policy"] = {"cost": feedback.charge.cost, "answers": [_runs(row) for row in feedback.answers]}
+        policy_keys["policy"] = {
+            "cost": feedback.charge.cost,
+            "answers": [_find_ranges(row) for row in feedback.answers],
+        }
         policy_keys |= feedback.loop.written(None if result.decision is None else np.asarray(result.decision))
     causal = result.causal if isinstance(result, ControlResult) and result.causal and result.causal.rows else None
     return {
@@ -104,11 +107,11 @@ def certificate(experiment: Experiment, result: Result) -> dict[str, Any] | None
         **({"repeat": True} if experiment.transcription.problem.repeat else {}),
         "decision": theta,
         **policy_keys,
-        **_counted(experiment, result),
-        **_fewest(experiment, result.activity),
+        **_write_bound_proof(experiment, result),
+        **_write_fewest_active(experiment, result.activity),
         **({} if causal is None else {"causal": causal_data(causal)}),
-        "proof": _proofs(experiment, result.proofs),
-        "witness": _witness(experiment, result) if result.status == "refuted" else None,
+        "proof": _write_proofs(experiment, result.proofs),
+        "witness": _write_witness(experiment, result) if result.status == "refuted" else None,
     }
 
 
@@ -126,7 +129,7 @@ def bare_certificate(experiment: Experiment, result: Result) -> dict[str, Any]:
     }
 
 
-def _runs(row: np.ndarray) -> list[list[int]]:
+def _find_ranges(row: np.ndarray) -> list[list[int]]:
     """Return the ranges ``[first, last]`` of consecutive true values among ``(K,)``."""
     changes = np.flatnonzero(np.diff(np.concatenate([[0], row.astype(int), [0]])))
     return [[int(first), int(end) - 1] for first, end in changes.reshape(-1, 2)]
@@ -158,11 +161,11 @@ def causal_data(bound: CausalBound) -> dict[str, Any]:
     }
 
 
-def _counted(experiment: ControlExperiment, result: Result) -> dict[str, Any]:
+def _write_bound_proof(experiment: ControlExperiment, result: Result) -> dict[str, Any]:
     """Return the multipliers of the cost; or, where the time of action is the cost, the usual cost and the tree of
     parts."""
     if result.sparsest is None:
-        return {"multipliers": _multipliers(experiment, result.dual)}
+        return {"multipliers": _write_multipliers(experiment, result.dual)}
     numbers: dict[str, int] = {}
     distinct_constraints: list[dict[str, Any]] = []
     nodes: list[dict[str, Any]] = []
@@ -173,7 +176,7 @@ def _counted(experiment: ControlExperiment, result: Result) -> dict[str, Any]:
             nodes.append({"channel": channel, "piece": piece, "first": node.first, "second": node.second, **at})
             continue
         multipliers = (
-            _multipliers(experiment, node.dual) if node.dual.mu.size == experiment.program.finite.b.size else None
+            _write_multipliers(experiment, node.dual) if node.dual.mu.size == experiment.program.finite.b.size else None
         )
         if multipliers is None:
             return {"multipliers": None, "J": result.sparsest.norm}
@@ -190,35 +193,35 @@ def _counted(experiment: ControlExperiment, result: Result) -> dict[str, Any]:
     return {"multipliers": None, **norm, "tree": tree}
 
 
-def _fewest(experiment: ControlExperiment, activity: Activity | None) -> dict[str, dict[str, Any]]:
+def _write_fewest_active(experiment: ControlExperiment, activity: Activity | None) -> dict[str, dict[str, Any]]:
     if activity is None:
         return {}
     program = experiment.program
-    own = None if activity.dual is None else _multipliers(experiment, activity.dual)
+    own = None if activity.dual is None else _write_multipliers(experiment, activity.dual)
     entries: dict[str, Any] = {}
     if activity.decision is not None:
         theta = experiment.transcription.nominal(activity.decision)
         theta = theta.reshape(program.channels, experiment.control.functions)
-        entries = {"decision": theta, "proof": _proofs(experiment, activity.proofs)}
+        entries = {"decision": theta, "proof": _write_proofs(experiment, activity.proofs)}
     return {"fewest_active": {"lower": activity.lower, "upper": activity.upper, "multipliers": own, **entries}}
 
 
-def _proofs(experiment: ControlExperiment, proofs: Sequence[Proof]) -> dict[str, Any]:
+def _write_proofs(experiment: ControlExperiment, proofs: Sequence[Proof]) -> dict[str, Any]:
     """Return the proof of each constraint; under feedback constraints on the control have none, as they need no
     cells."""
     names = {constraint.name for constraint in experiment.transcription.constraints}
     kept = [proof for proof in proofs if experiment.transcription.feedback is None or proof.family in names]
-    return {proof.family: _cells(experiment, proof) for proof in kept if proof.verdict == "proven"}
+    return {proof.family: _write_cells(experiment, proof) for proof in kept if proof.verdict == "proven"}
 
 
-def _multipliers(experiment: ControlExperiment, dual: Dual) -> dict[str, Any] | None:
+def _write_multipliers(experiment: ControlExperiment, dual: Dual) -> dict[str, Any] | None:
     """Return the multipliers of a bound with their constraints, as plain data.
 
     Returns ``None`` unless every constraint can be written in numbers, which is not so for a sample of the scenario
     approach. Under feedback a constraint is at a disturbance, on its own pieces ``(mw, pieces)``.
     """
     problem, program = experiment.problem, experiment.program
-    z = dual.z if problem.execution is None or dual.z is None else _without_sizes(program, dual.z)
+    z = dual.z if problem.execution is None or dual.z is None else _remove_size_multipliers(program, dual.z)
     steps = Steps.of(problem, experiment.control)
     pairs = zip(dual.cuts, experiment.transcription.explained(dual.cuts), strict=True)
     explained = [(cut, explanation) for cut, explanation in pairs if explanation is not None]
@@ -229,13 +232,13 @@ def _multipliers(experiment: ControlExperiment, dual: Dual) -> dict[str, Any] | 
             {
                 "constraint": cut.family,
                 "time": explanation.time,
-                "parameter": [] if cut.family == "control_step" else _parameter(problem, explanation),
-                **_direction(explanation),
+                "parameter": [] if cut.family == "control_step" else _write_parameter(problem, explanation),
+                **_write_direction(explanation),
                 "multiplier": cut.multiplier,
-                **({} if program.spread is None else {"disturbance": _admissible(problem, explanation)}),
-                **({} if program.spread is None else _deviation(problem, explanation)),
+                **({} if program.spread is None else {"disturbance": _write_disturbance(problem, explanation)}),
+                **({} if program.spread is None else _write_deviations(problem, explanation)),
                 **({} if explanation.changes is None else {"changes": explanation.changes}),
-                **_noise(problem, explanation),
+                **_write_noise(problem, explanation),
             }
             for cut, explanation in explained
         ]
@@ -244,11 +247,11 @@ def _multipliers(experiment: ControlExperiment, dual: Dual) -> dict[str, Any] | 
             for t, c, y in ([] if z is None or not steps.count else steps.priced(z[-steps.count :]))
         ],
         "equalities": dual.mu,
-        "pieces": _on_pieces(problem, z, experiment.control.pieces),
+        "pieces": _sum_piece_multipliers(problem, z, experiment.control.pieces),
         **(
             {}
             if z is None or problem.cost.group is None
-            else {"norms": _of_norms(problem, z, experiment.control.pieces)}
+            else {"norms": _extract_norm_multipliers(problem, z, experiment.control.pieces)}
         ),
         **(
             {}
@@ -258,7 +261,7 @@ def _multipliers(experiment: ControlExperiment, dual: Dual) -> dict[str, Any] | 
     }
 
 
-def _without_sizes(program: SemiInfiniteProgram, z: Array) -> Array:
+def _remove_size_multipliers(program: SemiInfiniteProgram, z: Array) -> Array:
     """Return multipliers of the images without those of the bounds of the control's sizes.
 
     Two bounds limit each value, one from either side; their multipliers enter with opposite signs.
@@ -268,7 +271,7 @@ def _without_sizes(program: SemiInfiniteProgram, z: Array) -> Array:
     return np.concatenate([z[:size] - above + below, z[size : -2 * size]])
 
 
-def _on_pieces(problem: OptimalControlProblem, z: Array | None, pieces: int) -> Array | None:
+def _sum_piece_multipliers(problem: OptimalControlProblem, z: Array | None, pieces: int) -> Array | None:
     """Return the multipliers of the control ``(m, K)`` on its ``pieces``, with those of its set's slanted sides
     added."""
     if z is None:
@@ -279,7 +282,7 @@ def _on_pieces(problem: OptimalControlProblem, z: Array | None, pieces: int) -> 
     return answer
 
 
-def _of_norms(problem: OptimalControlProblem, z: Array, pieces: int) -> Array:
+def _extract_norm_multipliers(problem: OptimalControlProblem, z: Array, pieces: int) -> Array:
     """Return the multipliers of the control ``(m, K)`` on its ``pieces`` without those of its set's slanted sides.
 
     The bound replaces norms by them; neither slopes nor tangent give them accurately.
@@ -288,32 +291,34 @@ def _of_norms(problem: OptimalControlProblem, z: Array, pieces: int) -> Array:
     return answer
 
 
-def _parameter(problem: OptimalControlProblem, said: TimedExplanation) -> Array:
+def _write_parameter(problem: OptimalControlProblem, said: TimedExplanation) -> Array:
     """Return the parameter of a constraint, certainly inside its set; without uncertainty the middle one."""
     bound = problem.system.parameters
     if bound is None:
         return np.zeros(0)
     middle = bound.interior_point()
-    return _inside(bound, np.asarray(said.parameter_or(middle)), middle)
+    return _move_inside(bound, np.asarray(said.parameter_or(middle)), middle)
 
 
-def _direction(said: TimedExplanation) -> dict[str, Any]:
+def _write_direction(said: TimedExplanation) -> dict[str, Any]:
     """Return the normal of a constraint; for a mixed one also its part on the control, and the piece of that."""
     if said.gain is None:
         return {"direction": said.direction + 0.0}  # no negative zeros
     return {"direction": np.concatenate([said.direction, said.gain]) + 0.0, "piece": said.piece}
 
 
-def _admissible(problem: OptimalControlProblem, said: TimedExplanation) -> Array | None:
+def _write_disturbance(problem: OptimalControlProblem, said: TimedExplanation) -> Array | None:
     """Return the disturbance of a constraint, certainly in its set on every piece; ``None`` where there is none."""
     bound = problem.disturbance
     if bound is None or said.disturbance is None:
         return None
     middle = bound.interior_point()
-    return np.array([_inside(bound, column, middle) for column in said.disturbance.T]).reshape(-1, bound.dimension).T
+    return (
+        np.array([_move_inside(bound, column, middle) for column in said.disturbance.T]).reshape(-1, bound.dimension).T
+    )
 
 
-def _deviation(problem: OptimalControlProblem, said: TimedExplanation) -> dict[str, Array]:
+def _write_deviations(problem: OptimalControlProblem, said: TimedExplanation) -> dict[str, Array]:
     """Return the deviations of the initial states of this and of the next period, certainly in their set.
 
     The mapping is empty where the constraint has none.
@@ -323,18 +328,20 @@ def _deviation(problem: OptimalControlProblem, said: TimedExplanation) -> dict[s
         return {}
     deviations = {"deviation": said.deviation, "following": said.following}
     middle = bound.interior_point()
-    return {name: _inside(bound, deviation, middle) for name, deviation in deviations.items() if deviation is not None}
+    return {
+        name: _move_inside(bound, deviation, middle) for name, deviation in deviations.items() if deviation is not None
+    }
 
 
-def _noise(problem: OptimalControlProblem, said: TimedExplanation) -> dict[str, Array]:
+def _write_noise(problem: OptimalControlProblem, said: TimedExplanation) -> dict[str, Array]:
     """Return the noise ``(K, p)`` of a constraint, certainly in its set; the mapping is empty where there is none."""
     bound = None if problem.measurements is None else problem.measurements.noise
     if bound is None or said.noise is None:
         return {}
-    return {"noise": np.array([_inside(bound, row, bound.interior_point()) for row in said.noise])}
+    return {"noise": np.array([_move_inside(bound, row, bound.interior_point()) for row in said.noise])}
 
 
-def _inside(bound: ConvexSet, point: Array, middle: Array) -> Array:
+def _move_inside(bound: ConvexSet, point: Array, middle: Array) -> Array:
     if bound.is_box:
         box = bound.bounding_box()
         return np.asarray(np.clip(point, box.lower, box.upper))
@@ -344,18 +351,18 @@ def _inside(bound: ConvexSet, point: Array, middle: Array) -> Array:
     return answer
 
 
-def _cells(experiment: ControlExperiment, proof: Proof) -> dict[str, Any]:
+def _write_cells(experiment: ControlExperiment, proof: Proof) -> dict[str, Any]:
     lower, upper = proof.leaves if proof.leaves is not None else (np.zeros((0, 0)), np.zeros((0, 0)))
     constraint = next(
         (constraint for constraint in experiment.transcription.constraints if constraint.name == proof.family), None
     )
     normals = {} if constraint is None or constraint.shape is None else {"normals": constraint.shape.frame}
     if constraint is not None and lower.shape[0] >= MANY_CELLS and lower.shape[1] == 1:
-        lower, upper = _joined(lower[:, 0], upper[:, 0], *constraint.cells)
+        lower, upper = _join_cells(lower[:, 0], upper[:, 0], *constraint.cells)
     return {"tolerance": TOLERANCE, **normals, "lower": lower, "upper": upper}
 
 
-def _joined(lower: Array, upper: Array, first: Array, last: Array) -> tuple[Array, Array]:
+def _join_cells(lower: Array, upper: Array, first: Array, last: Array) -> tuple[Array, Array]:
     """Return cells of time ``[lower_i, upper_i]``, where neighbours that are whole pieces are joined.
 
     Whole pieces are those among ``[first_j, last_j]`` (``(k, 1)``). A check divides the cells wherever the signals have
@@ -368,31 +375,31 @@ def _joined(lower: Array, upper: Array, first: Array, last: Array) -> tuple[Arra
     return lower[begins, None], upper[np.append(begins[1:], True), None]
 
 
-def _witness(experiment: ControlExperiment, result: Result) -> dict[str, Any] | None:
+def _write_witness(experiment: ControlExperiment, result: Result) -> dict[str, Any] | None:
     worst, problem = result.worst, experiment.problem
     if worst is None:
         return None
     explanation = in_numbers(experiment.program, worst.constraint, worst.formulation, worst.index, worst.row)
     if explanation is None:
         return None
-    explanation = _driven(experiment, explanation, np.asarray(result.decision))
+    explanation = _apply_worst_deviations(experiment, explanation, np.asarray(result.decision))
     signal: Sequence[Any] | Array | None = explanation.disturbance
     if signal is not None and problem.disturbance is not None:
         middle = problem.disturbance.interior_point()
-        signal = np.array([_inside(problem.disturbance, column, middle) for column in np.asarray(signal).T]).T
+        signal = np.array([_move_inside(problem.disturbance, column, middle) for column in np.asarray(signal).T]).T
     return {
         "constraint": worst.constraint,
         "time": explanation.time,
-        "parameter": _parameter(problem, explanation),
-        **_direction(explanation),
+        "parameter": _write_parameter(problem, explanation),
+        **_write_direction(explanation),
         "disturbance": signal,
-        **_deviation(problem, explanation),
-        **_noise(problem, explanation),
+        **_write_deviations(problem, explanation),
+        **_write_noise(problem, explanation),
         "violation": worst.violation,
     }
 
 
-def _driven(experiment: ControlExperiment, said: TimedExplanation, decision: Array) -> TimedExplanation:
+def _apply_worst_deviations(experiment: ControlExperiment, said: TimedExplanation, decision: Array) -> TimedExplanation:
     """Return a constraint at the deviations that drive a closed loop to it most, where there is a loop."""
     feedback = experiment.transcription.feedback
     if feedback is None or experiment.problem.disturbance_class != "piecewise_constant":

@@ -104,14 +104,14 @@ class StoredRun:
                 RoundFinished(**{name: column[row].item() for name, column in columns.items()}) for row in range(count)
             ]
             arrays = self.arrays("rounds.npz")
-            return with_decisions(rounds, arrays, self._formulation(arrays))
+            return with_decisions(rounds, arrays, self._infer_formulation(arrays))
         except (KeyError, TypeError, ValueError, IndexError) as error:
             raise InputError(f"{self.directory}: trace.npz and rounds.npz do not fit together: {error}") from None
 
     @cached_property
     def cuts(self) -> tuple[Cut, ...]:
         """The imposed constraints in ``solution.npz``."""
-        return cuts_of(self.solution, self._formulation(self.solution)) if "families" in self.solution else ()
+        return cuts_of(self.solution, self._infer_formulation(self.solution)) if "families" in self.solution else ()
 
     @cached_property
     def proving(self) -> tuple[tuple[Cut, ...], Array]:
@@ -124,7 +124,7 @@ class StoredRun:
         cuts = cuts_of(columns, "literal") if {*CUTS} <= {*columns} else ()
         return cuts, np.ravel(columns.get("equalities", np.zeros(0)))
 
-    def _formulation(self, arrays: Mapping[str, Array]) -> Formulation:
+    def _infer_formulation(self, arrays: Mapping[str, Array]) -> Formulation:
         """Return the formulation of indices in arrays of a version that did not write it; it follows from the
         method."""
         if not arrays or FORMULATIONS in arrays:
@@ -199,7 +199,7 @@ class FinishedRun:
                     f"{self.directory / 'solution.npz'}: decision: expected finite numbers of shape {shape}, as"
                     f" config.yaml says, got {decision.dtype} of shape {decision.shape}"
                 )
-        self._agrees(decision)
+        self._require_agreement(decision)
         return decision
 
     def require_certified(self) -> None:
@@ -221,7 +221,7 @@ class FinishedRun:
                     " sparserob check says what holds of the run"
                 )
 
-    def _agrees(self, decision: Array) -> None:
+    def _require_agreement(self, decision: Array) -> None:
         """Raise `InputError` where the other arrays of ``solution.npz`` do not follow from the decision."""
         model = self.experiment.transcription
         derived = {"theta": model.nominal(decision), "control": model.pieces(decision)}
@@ -351,7 +351,7 @@ def read_json(file: Path) -> dict[str, Any]:
     finite, since a run writes null instead.
     """
     try:
-        data, has_suspects = _read(file)
+        data, has_suspects = _read_json(file)
     except InputError:
         raise
     except OSError as error:
@@ -362,14 +362,14 @@ def read_json(file: Path) -> dict[str, Any]:
         raise InputError(f"{file}: cannot be read: expected JSON: {error}") from None
     if not isinstance(data, dict):
         raise InputError(f"{file}: expected a JSON object, got {type(data).__name__}")
-    for location, value in _numbers(data) if has_suspects else ():
+    for location, value in _list_numbers(data) if has_suspects else ():
         if not abs(value) <= sys.float_info.max:
             written = repr(value) if isinstance(value, float) else f"a whole number of {value.bit_length()} bits"
             raise InputError(f"{file}: {location}: expected a finite number or null, got {written}")
     return data
 
 
-def _read(file: Path) -> tuple[object, bool]:
+def _read_json(file: Path) -> tuple[object, bool]:
     """Return the data of a JSON file, and whether any of its numbers may be infinite or NaN."""
     size, suspects = file.stat().st_size, list[str]()
     if size > LARGEST_TEXT:
@@ -394,7 +394,7 @@ def _read(file: Path) -> tuple[object, bool]:
     return data, bool(suspects) or LARGE.search(text) is not None
 
 
-def _numbers(data: dict[str, Any]) -> Iterator[tuple[str, int | float]]:
+def _list_numbers(data: dict[str, Any]) -> Iterator[tuple[str, int | float]]:
     """Yield every number of JSON data, each with its place."""
     stack: list[tuple[str, Any]] = [("", data)]
     while stack:

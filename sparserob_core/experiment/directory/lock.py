@@ -34,20 +34,20 @@ class Lock:
             try:
                 self.file.touch(exist_ok=False)
             except FileExistsError:
-                if self._taken_over():
+                if self._take_over():
                     return
             else:
-                self._sign()
+                self._write_owner()
                 return
-        raise self._held("")
+        raise self._make_error("")
 
-    def _sign(self) -> None:
+    def _write_owner(self) -> None:
         """Write the owner into a lock that was just created.
 
         Where the disk is full, the lock is removed: a lock without an owner would exclude everybody.
         """
         try:
-            self.file.write_text(_me(), encoding="utf-8")
+            self.file.write_text(_describe_process(), encoding="utf-8")
         except OSError:
             self.file.unlink(missing_ok=True)
             raise
@@ -55,44 +55,44 @@ class Lock:
     def release(self) -> None:
         """Release the lock; nothing happens where it belongs to somebody else, or does not exist."""
         with suppress(OSError):
-            if self._content() == _me():
+            if self._read_content() == _describe_process():
                 self.file.unlink()
 
-    def _taken_over(self) -> bool:
+    def _take_over(self) -> bool:
         """Return whether this process took over the lock of a process that is dead.
 
         The result is false, and the lock may be free, where it has just vanished. Only the process that creates the
         guard exclusively may replace the lock, and only after a second look at it. Two processes that find the same
         dead owner therefore cannot both take the lock.
         """
-        content = self._content()
+        content = self._read_content()
         if content is None:
             return False
         guard = self.file.with_name(GUARD)
         if not _is_dead(content):
-            raise self._held(content)
+            raise self._make_error(content)
         try:
             guard.touch(exist_ok=False)
         except FileExistsError:
-            raise self._held(content) from None
+            raise self._make_error(content) from None
         try:
-            if self._content() != content:
+            if self._read_content() != content:
                 return False
             temporary = self.file.with_name(f"{NAME}.{os.getpid()}.tmp")
-            temporary.write_text(_me(), encoding="utf-8")
+            temporary.write_text(_describe_process(), encoding="utf-8")
             temporary.replace(self.file)
             return True
         finally:
             guard.unlink()
 
-    def _content(self) -> str | None:
+    def _read_content(self) -> str | None:
         try:
             return self.file.read_text(encoding="utf-8", errors="replace")
         except FileNotFoundError:
             return None
 
-    def _held(self, found: str) -> InputError:
-        process, host = _owner(found)
+    def _make_error(self, found: str) -> InputError:
+        process, host = _parse_owner(found)
         who = f"process {process} on {host}" if process else "whose number is not written yet"
         return InputError(
             f"{self.file.parent}: another run is writing into it ({who}); expected a new or an empty directory "
@@ -103,16 +103,16 @@ class Lock:
 def owner_of(directory: Path) -> tuple[int, str]:
     """Return the process that holds the lock of a directory and its host; 0 and an empty text where nobody does."""
     try:
-        return _owner((directory / NAME).read_text(encoding="utf-8", errors="replace"))
+        return _parse_owner((directory / NAME).read_text(encoding="utf-8", errors="replace"))
     except OSError:
         return 0, ""
 
 
-def _me() -> str:
+def _describe_process() -> str:
     return json.dumps({"process": os.getpid(), "host": platform.node()})
 
 
-def _owner(content: str) -> tuple[int, str]:
+def _parse_owner(content: str) -> tuple[int, str]:
     """Return the number of the process, 0 where it is not known, and the host."""
     try:
         data = json.loads(content)
@@ -122,7 +122,7 @@ def _owner(content: str) -> tuple[int, str]:
 
 
 def _is_dead(content: str) -> bool:
-    return is_dead(*_owner(content))
+    return is_dead(*_parse_owner(content))
 
 
 def is_dead(process: int, host: str) -> bool:

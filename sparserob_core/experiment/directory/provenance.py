@@ -43,7 +43,7 @@ def provenance(plain: Mapping[str, Any], git: Mapping[str, Any] | None) -> dict[
             "cores": cores(),
             "python": f"{platform.python_implementation()} {platform.python_version()}",
         },
-        "plugins": {str(file): _digest(path_of(file)) for file in plain.get("plugins") or ()},
+        "plugins": {str(file): _compute_digest(path_of(file)) for file in plain.get("plugins") or ()},
     }
 
 
@@ -70,7 +70,7 @@ def git_revision(folder: Path) -> dict[str, Any] | None:
     return {"revision": description.removesuffix("-dirty"), "changed": description.endswith("-dirty")}
 
 
-def _digest(file: Path) -> str | None:
+def _compute_digest(file: Path) -> str | None:
     try:
         return sha256(file.read_bytes()).hexdigest()
     except OSError:

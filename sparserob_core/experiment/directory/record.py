@@ -51,11 +51,11 @@ def summary_of(result: Result, control: Array | None, model: Transcription | Non
         "gap": result.gap if result.status in PROVEN else None,
         "cost_scale": result.cost_scale,
         "stopped": result.stopped,
-        "worst": _witness(result.worst, None if model is None else model.stated.system.states),
+        "worst": _report_worst(result.worst, None if model is None else model.stated.system.states),
         **({"units": units} if units else {}),
         **({"parameters": list(parameters)} if parameters else {}),
-        "tolerances": {proof.family: _tolerance(proof) for proof in result.proofs if proof.verdict == "proven"},
-        **({} if result.errors is None else {"equalities": _equalities(result.errors)}),
+        "tolerances": {proof.family: _report_tolerance(proof) for proof in result.proofs if proof.verdict == "proven"},
+        **({} if result.errors is None else {"equalities": _report_equalities(result.errors)}),
         "sparsity": {
             **(acting or {"active_fraction": None, "switches": None}),
             **({} if model is None else {"channels": model.problem.system.controls}),
@@ -106,7 +106,7 @@ def units_of(model: Transcription, result: Result) -> dict[str, Any]:
     }
 
 
-def _tolerance(proof: Proof) -> dict[str, Any]:
+def _report_tolerance(proof: Proof) -> dict[str, Any]:
     """Return what was proven of one constraint.
 
     A violation is at most ``proven`` of each row's own unit (negative: a margin), and ``kept`` of every row in the
@@ -122,13 +122,13 @@ def _tolerance(proof: Proof) -> dict[str, Any]:
     }
 
 
-def _equalities(errors: EqualityErrors) -> dict[str, Any]:
+def _report_equalities(errors: EqualityErrors) -> dict[str, Any]:
     """Return the error bound of every fixed final state (``missed``), and the error that is allowed (``excused``), in
     its unit."""
     return {"missed": errors.missed, "excused": errors.allowed}
 
 
-def _witness(worst: WorstConstraint | None, states: int | None) -> dict[str, Any]:
+def _report_worst(worst: WorstConstraint | None, states: int | None) -> dict[str, Any]:
     """Return the worst constraint; its initial state has the first ``states`` coordinates, those of the user."""
     return {
         "violation": None if worst is None else worst.violation,
@@ -151,11 +151,11 @@ def control_of(result: Result, program: SemiInfiniteProgram, dictionary: Diction
     """
     if result.decision is None or dictionary is None:
         return None
-    theta = _nominal(result.decision, program, dictionary)
+    theta = _extract_nominal(result.decision, program, dictionary)
     return dictionary.control(theta)
 
 
-def _nominal(decision: Array | None, program: SemiInfiniteProgram, dictionary: Dictionary) -> Array:
+def _extract_nominal(decision: Array | None, program: SemiInfiniteProgram, dictionary: Dictionary) -> Array:
     """Return the coefficients ``(m, N)`` of the control; under feedback of the nominal one, with which a decision
     begins."""
     count = program.channels * dictionary.functions
@@ -194,7 +194,7 @@ def arrays_of(
         ``bound_indices``, ``bound_rows``, and so on; ``bound_equalities`` are the multipliers of the equalities. Under
         feedback the index of each constraint of the bound is followed by its deviation.
     """
-    columns = _told(result.indices)
+    columns = _stack_cuts(result.indices)
     count, width = columns["indices"].shape
     arrays = {
         "decision": np.zeros(0) if result.decision is None else result.decision,
@@ -202,7 +202,7 @@ def arrays_of(
         **columns,
     }
     if answers or result.dual.mu.size or result.dual.cuts:
-        proving = {**_told(result.dual.cuts), "equalities": result.dual.mu}
+        proving = {**_stack_cuts(result.dual.cuts), "equalities": result.dual.mu}
         arrays |= {f"{BOUND}{name}": column for name, column in proving.items()}
     if dictionary is not None:
         arrays["breakpoints"] = dictionary.breakpoints
@@ -212,12 +212,12 @@ def arrays_of(
     if control is not None and dictionary is not None:
         arrays |= {
             "control": control,
-            "theta": _nominal(result.decision, program, dictionary),
+            "theta": _extract_nominal(result.decision, program, dictionary),
         }
     return arrays
 
 
-def _told(cuts: Sequence[Cut]) -> dict[str, Array]:
+def _stack_cuts(cuts: Sequence[Cut]) -> dict[str, Array]:
     """Return constraints as arrays, one row each."""
     indices = np.full((len(cuts), max((np.size(cut.index) for cut in cuts), default=0)), np.nan)
     for position, cut in enumerate(cuts):
@@ -233,7 +233,7 @@ def _told(cuts: Sequence[Cut]) -> dict[str, Array]:
 
 def versions(packages: tuple[str, ...] = PACKAGES) -> dict[str, str]:
     """Return the versions of Python and of the packages that decide the numbers."""
-    installed = {package: _version(package) for package in packages}
+    installed = {package: _find_version(package) for package in packages}
     return {
         "python": platform.python_version(),
         **{name: version for name, version in installed.items() if version is not None},
@@ -241,7 +241,7 @@ def versions(packages: tuple[str, ...] = PACKAGES) -> dict[str, str]:
 
 
 @cache
-def _version(package: str) -> str | None:
+def _find_version(package: str) -> str | None:
     try:
         return metadata.version(package)
     except Exception:  # noqa: BLE001  not installed, or a broken folder, for which each Python raises another error

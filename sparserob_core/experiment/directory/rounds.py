@@ -91,12 +91,12 @@ def cuts_of(arrays: Mapping[str, Array], before: Formulation = "reduced") -> tup
     forms = arrays[FORMULATIONS] if FORMULATIONS in arrays else np.full(len(arrays["rows"]), before)
     columns = (arrays[name] for name in CUTS)
     return tuple(
-        Cut(str(family), index[~np.isnan(index)], int(row), float(multiplier), _formulation(str(form)))
+        Cut(str(family), index[~np.isnan(index)], int(row), float(multiplier), _parse_formulation(str(form)))
         for family, index, row, multiplier, form in zip(*columns, forms, strict=True)
     )
 
 
-def _formulation(name: str) -> Formulation:
+def _parse_formulation(name: str) -> Formulation:
     formulations: dict[str, Formulation] = {form: form for form in get_args(Formulation)}
     if name not in formulations:
         raise ValueError(f"{FORMULATIONS}: expected one of {', '.join(formulations)}, got {name!r}")

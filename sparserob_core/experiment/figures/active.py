@@ -35,7 +35,7 @@ class Active:
 def active_of(model: Transcription, cuts: Sequence[Cut]) -> Active:
     """Return the times of the imposed constraints that carry a multiplier; of a policy, only of constraints on the
     state."""
-    return marks_of(model, [cut for cut in cuts if cut.multiplier > 0.0 and _told(model, cut.family)])
+    return marks_of(model, [cut for cut in cuts if cut.multiplier > 0.0 and _has_time(model, cut.family)])
 
 
 def stored_active(model: Transcription, solution: Mapping[str, Array]) -> Active:
@@ -48,15 +48,15 @@ def stored_active(model: Transcription, solution: Mapping[str, Array]) -> Active
     multipliers = solution["multipliers"]
     kept = multipliers > NOTHING * multipliers.max(initial=0.0)
     entries = zip(*(solution[name][kept].tolist() for name in ("families", "times", "rows")), strict=True)
-    return _marks(model, [entry for entry in entries if _told(model, entry[0])])
+    return _collect_active(model, [entry for entry in entries if _has_time(model, entry[0])])
 
 
 def marks_of(model: Transcription, cuts: Sequence[Cut]) -> Active:
     """Return the times and states of constraints, whatever their multipliers."""
-    return _marks(model, [(cut.family, float(cut.index[0]), cut.row) for cut in cuts])
+    return _collect_active(model, [(cut.family, float(cut.index[0]), cut.row) for cut in cuts])
 
 
-def _marks(model: Transcription, found: Sequence[tuple[str, float, int]]) -> Active:
+def _collect_active(model: Transcription, found: Sequence[tuple[str, float, int]]) -> Active:
     """Return the times and states of constraints that are given as family, time and row."""
     times, time_indices = np.unique(np.array([time for _, time, _ in found], dtype=float), return_inverse=True)
     states = np.zeros((times.size, model.problem.system.states), dtype=bool)
@@ -69,7 +69,7 @@ def _marks(model: Transcription, found: Sequence[tuple[str, float, int]]) -> Act
     return Active(times, states)
 
 
-def _told(model: Transcription, family: str) -> bool:
+def _has_time(model: Transcription, family: str) -> bool:
     """Return whether the first coordinate of a family's indices is a time; under feedback only for constraints on the
     state."""
     return model.feedback is None or family in {constraint.name for constraint in model.constraints}

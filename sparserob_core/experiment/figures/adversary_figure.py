@@ -37,7 +37,7 @@ def draw_adversary(arrays: Mapping[str, Array], data: FigureData) -> Figure:
     disturbances = arrays["disturbances"]
     states, channels = len(data.drawn_states), disturbances.shape[1]
     figure, axes = panels(states + channels, 1.7, extra=0.35)
-    paths = [_path(*worst, data) for worst in zip(arrays["states"], arrays["directions"], strict=True)]
+    paths = [_select_corner(*worst, data) for worst in zip(arrays["states"], arrays["directions"], strict=True)]
     for number, name in enumerate(arrays["names"].tolist()):
         pen = {"color": COLOURS[number % len(COLOURS)], "linestyle": DASHES[number // len(COLOURS) % len(DASHES)]}
         index = int(np.abs(arrays["state_times"] - arrays["times"][number]).argmin())
@@ -78,17 +78,17 @@ def draw_adversary(arrays: Mapping[str, Array], data: FigureData) -> Figure:
         ax.axhline(0.0, color=look.GREY, linewidth=0.6, zorder=1)
         ax.set_ylabel(f"$w_{{{channel + 1}}}(t)$" if channels > 1 else "$w(t)$")
         ax.margins(y=0.15)
-    caption(figure, axes, data, f"the worst case of every constraint: {_uncertain(arrays, data)}")
+    caption(figure, axes, data, f"the worst case of every constraint: {_name_uncertainties(arrays, data)}")
     return figure
 
 
-def _path(states: Array, direction: Array, data: FigureData) -> Array:
+def _select_corner(states: Array, direction: Array, data: FigureData) -> Array:
     """The states ``(d, T)`` of a worst case, at the corner of the parameters beside the time that its direction is
     of."""
     return data.names.corners.stated(direction, states)
 
 
-def _uncertain(arrays: Mapping[str, Array], data: FigureData) -> str:
+def _name_uncertainties(arrays: Mapping[str, Array], data: FigureData) -> str:
     """Name the quantities in which the worst cases differ from the nominal case, such as the disturbance, in words."""
     is_known = ~np.isnan(data.state[:, 0])
     initial_state_varies = not np.allclose(

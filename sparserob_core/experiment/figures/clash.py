@@ -106,7 +106,7 @@ def clash_figure(experiment: Experiment, result: Result) -> Figure:
         figure = Figure(figsize=(look.WIDTH, 0.95 * len(strips) + 1.15), layout="constrained")
         axes = list(figure.subplots(len(strips), 1, squeeze=False)[:, 0])
         for ax, strip in zip(axes, strips, strict=True):
-            _draw(ax, strip)
+            _draw_strip(ax, strip)
         alone = any(strip.short > 0.0 for strip in strips)
         suffix = "" if alone else "\neach of them can be met, but not all by one control"
         figure.suptitle(plain(experiment.title) + suffix, x=0.01, ha="left", fontsize=11.5)
@@ -129,19 +129,19 @@ def clash_strips(program: SemiInfiniteProgram, result: Result) -> list[Strip]:
     strips: dict[str, Strip] = {}
     for cut in cuts:
         family = program.formulated(cut.family, cut.formulation)
-        strip = None if family is None else _strip(program, family, cut)
+        strip = None if family is None else _make_strip(program, family, cut)
         if strip is not None:
             strips.setdefault(strip.label, strip)
     return list(strips.values())[:SHOWN]
 
 
-def _strip(program: SemiInfiniteProgram, family: ConstraintFamily, cut: Cut) -> Strip | None:
+def _make_strip(program: SemiInfiniteProgram, family: ConstraintFamily, cut: Cut) -> Strip | None:
     explain_row = partial(in_numbers, program, cut.family, cut.formulation, cut.index)
     description = explain_row(cut.row)
     if description is None or not description.quantity:
         return None
     G, h = family.rows(cut.index[None])
-    row = rows_at(_reduced(program, family), family.name, cut.index[None], np.array([cut.row])).G[0]
+    row = rows_at(_isolate_family(program, family), family.name, cut.index[None], np.array([cut.row])).G[0]
     towards, away = (float(least_of(program.finite, sign * row[None], np.zeros(1))[0]) for sign in (1.0, -1.0))
     reach = sorted([description.free + description.sign * towards, description.free - description.sign * away])
     limits, sigmas = {description.sign: description.limit}, {description.sign: description.sigma}
@@ -171,17 +171,17 @@ def _strip(program: SemiInfiniteProgram, family: ConstraintFamily, cut: Cut) -> 
     )
 
 
-def _reduced(program: SemiInfiniteProgram, family: ConstraintFamily) -> SemiInfiniteProgram:
+def _isolate_family(program: SemiInfiniteProgram, family: ConstraintFamily) -> SemiInfiniteProgram:
     return SemiInfiniteProgram(n=program.n, families=[family])
 
 
-def _draw(ax: Axes, strip: Strip) -> None:
+def _draw_strip(ax: Axes, strip: Strip) -> None:
     view_left, view_right = strip.view
     ax.set_xlim(view_left, view_right)
-    _forbidden(ax, strip, 0.0, view_left, view_right)
+    _draw_forbidden(ax, strip, 0.0, view_left, view_right)
     worst = "what the worst disturbance makes of its best"
-    _bar(ax, strip.best - strip.sigma_low, strip.best + strip.sigma_high, -0.17, look.ORANGE, worst)
-    _bar(ax, strip.reach_low, strip.reach_high, 0.17, look.BLUE, "where the control can bring it")
+    _draw_bar(ax, strip.best - strip.sigma_low, strip.best + strip.sigma_high, -0.17, look.ORANGE, worst)
+    _draw_bar(ax, strip.reach_low, strip.reach_high, 0.17, look.BLUE, "where the control can bring it")
     ax.plot([strip.best], [-0.17], "|", color=look.INK, markersize=9, zorder=4, linewidth=0, label="its best")
     unit = f" {plain(strip.unit)}" if strip.unit else ""
     notes = [f"misses by {strip.short:.3g}{unit}"] if strip.short > 0.0 else []
@@ -194,14 +194,14 @@ def _draw(ax: Axes, strip: Strip) -> None:
     ax.set_xlabel(plain(strip.unit), labelpad=1)
 
 
-def _forbidden(ax: Axes, strip: Strip, y: float, left: float, right: float) -> None:
+def _draw_forbidden(ax: Axes, strip: Strip, y: float, left: float, right: float) -> None:
     for edge, end in ((strip.low, left), (strip.high, right)):
         if np.isfinite(edge):
             ax.fill_betweenx([y - 0.42, y + 0.42], edge, end, **look.EXCLUDED, label="forbidden")
             ax.plot([edge, edge], [y - 0.42, y + 0.42], color=look.VERMILLION, linewidth=1.6, zorder=1, label="wall")
 
 
-def _bar(ax: Axes, low: float, high: float, y: float, colour: str, label: str) -> None:
+def _draw_bar(ax: Axes, low: float, high: float, y: float, colour: str, label: str) -> None:
     """A bar, or a dot where there is nothing to it."""
     look_of: dict[str, Any] = {"color": colour, "zorder": 3}
     if high - low > 0:

@@ -48,13 +48,13 @@ def draw_climb(trace: SearchTrace, title: str, upper: float = np.inf, *, exact: 
     first."""
     from matplotlib.figure import Figure
 
-    note_names = _noted(trace)
+    note_names = _choose_notes(trace)
     heights = [2.6, 1.35, *[0.95] * len(note_names)]
     figure = Figure(figsize=(look.WIDTH, sum(heights) + 1.25), layout="constrained")
     axes: list[Axes] = list(
         figure.subplots(len(heights), 1, sharex=True, squeeze=False, height_ratios=heights)[:, 0],
     )
-    stages = list(_stages(trace))
+    stages = list(_list_stages(trace))
     _draw_climb(axes[0], trace, stages, unit)
     _draw_bound(axes[1], trace, upper, exact, unit)
     for ax, name in zip(axes[2:], note_names, strict=True):
@@ -63,7 +63,7 @@ def draw_climb(trace: SearchTrace, title: str, upper: float = np.inf, *, exact: 
     for ax in axes:
         for _, first, _ in stages[1:]:
             ax.axvline(first + 0.5, color=look.GREY, linewidth=0.6, linestyle=":", zorder=0)
-        for evaluation in _restarts(trace):
+        for evaluation in _find_restarts(trace):
             ax.axvline(evaluation + 0.5, color=look.PURPLE, linewidth=0.7, zorder=0, label="walk heated again")
     axes[-1].set_xlabel("evaluations of $g$")
     axes[-1].set_xlim(0.0, trace.value.size + 1.0)
@@ -74,7 +74,7 @@ def draw_climb(trace: SearchTrace, title: str, upper: float = np.inf, *, exact: 
     return figure
 
 
-def _stages(trace: SearchTrace) -> Iterator[tuple[float, int, int]]:
+def _list_stages(trace: SearchTrace) -> Iterator[tuple[float, int, int]]:
     """Every search: its epsilon, and its evaluations as ``first:last``."""
     starts = np.flatnonzero(np.diff(trace.outer, prepend=-1.0))
     for first, last in zip(starts, [*starts[1:], trace.outer.size], strict=True):
@@ -82,11 +82,11 @@ def _stages(trace: SearchTrace) -> Iterator[tuple[float, int, int]]:
 
 
 def _draw_climb(ax: Axes, trace: SearchTrace, stages: list[tuple[float, int, int]], unit: str) -> None:
-    distances, best_distances, tops = _below(trace, stages)
-    floor = _floor(np.concatenate([distances, best_distances]), tops)
+    distances, best_distances, tops = _compute_distances(trace, stages)
+    floor = _compute_floor(np.concatenate([distances, best_distances]), tops)
     distances, best_distances = np.maximum(distances, floor), np.maximum(best_distances, floor)
-    _dots(ax, trace, distances)
-    is_accepted = _accepted(trace)
+    _draw_dots(ax, trace, distances)
+    is_accepted = _find_accepted(trace)
     evaluations = np.arange(1, distances.size + 1)
     for k, (_, first, last) in enumerate(stages):
         accepted = np.flatnonzero(is_accepted[first:last]) + first
@@ -109,16 +109,16 @@ def _draw_climb(ax: Axes, trace: SearchTrace, stages: list[tuple[float, int, int
                 label="accepted walk",
                 **line_style,
             )
-        _stage_words(ax, k, stages, tops[k])
+        _label_stage(ax, k, stages, tops[k])
     ax.set_yscale("log")
-    ax.set_ylim(_deepest([*distances, *best_distances]) * 2.0, floor / 2.0)  # the highest value is at the top
+    ax.set_ylim(_find_largest([*distances, *best_distances]) * 2.0, floor / 2.0)  # the highest value is at the top
     ticks = [10.0**power for power in range(-15, 16) if 3.0 * floor <= 10.0**power <= ax.get_ylim()[0]]
     ax.set_yticks([floor, *ticks], ["highest", *(f"$10^{{{round(np.log10(tick))}}}$" for tick in ticks)], minor=False)
     ax.minorticks_off()
     ax.set_ylabel(measured("$g$ below the highest\nof its stage", unit))
 
 
-def _below(trace: SearchTrace, stages: list[tuple[float, int, int]]) -> tuple[Array, Array, list[float]]:
+def _compute_distances(trace: SearchTrace, stages: list[tuple[float, int, int]]) -> tuple[Array, Array, list[float]]:
     """Return the distance of every value, and of the best value so far, to the highest value of its stage, ``(n,)``
     each.
 
@@ -132,18 +132,18 @@ def _below(trace: SearchTrace, stages: list[tuple[float, int, int]]) -> tuple[Ar
     return distances, best_distances, tops
 
 
-def _floor(below: Array, tops: list[float]) -> float:
+def _compute_floor(below: Array, tops: list[float]) -> float:
     """The place of the highest values themselves, which a logarithmic axis does not have: under everything else."""
     finest = FINEST * max([abs(top) for top in tops if np.isfinite(top)], default=1.0)
     positive = below[below > finest]
     return float(positive.min()) / 4.0 if positive.size else max(finest, 1e-12)
 
 
-def _deepest(below: Sequence[float]) -> float:
+def _find_largest(below: Sequence[float]) -> float:
     return max((value for value in below if np.isfinite(value)), default=1.0)
 
 
-def _stage_words(ax: Axes, k: int, stages: list[tuple[float, int, int]], top: float) -> None:
+def _label_stage(ax: Axes, k: int, stages: list[tuple[float, int, int]], top: float) -> None:
     """The weight and the highest value above a stage, where there is room for them."""
     epsilon, first, last = stages[k]
     share = (last - first) / stages[-1][2]
@@ -160,13 +160,13 @@ def _stage_words(ax: Axes, k: int, stages: list[tuple[float, int, int]], top: fl
         )
 
 
-def _dots(ax: Axes, trace: SearchTrace, short: Array) -> None:
+def _draw_dots(ax: Axes, trace: SearchTrace, short: Array) -> None:
     accepted = trace.notes.get("accepted", np.full(short.size, np.nan))
     evaluations = np.arange(1, short.size + 1)
     refused = accepted == 0.0
     for mask, colour, label in (
         (refused, look.MIST, "proposal, refused"),
-        (~refused & ~_accepted(trace), "#A9CDE3", "evaluated"),
+        (~refused & ~_find_accepted(trace), "#A9CDE3", "evaluated"),
     ):
         if np.isfinite(short[mask]).any():
             ax.plot(
@@ -182,11 +182,11 @@ def _dots(ax: Axes, trace: SearchTrace, short: Array) -> None:
             )
 
 
-def _accepted(trace: SearchTrace) -> np.ndarray:
+def _find_accepted(trace: SearchTrace) -> np.ndarray:
     return np.asarray(trace.notes.get("accepted", np.full(trace.value.size, np.nan)) == 1.0)
 
 
-def _restarts(trace: SearchTrace) -> list[int]:
+def _find_restarts(trace: SearchTrace) -> list[int]:
     """Return the evaluations at which a walk was heated again within a search: its temperature rises more than tenfold
     from one note to the next."""
     temperatures = trace.notes.get("temperature", np.zeros(0))
@@ -228,7 +228,7 @@ def _draw_bound(ax: Axes, trace: SearchTrace, upper: float, exact: bool, unit: s
             share.set_ylabel("% of exact" if exact else "% of upper", fontsize=9)
 
 
-def _noted(trace: SearchTrace) -> list[str]:
+def _choose_notes(trace: SearchTrace) -> list[str]:
     """The notes that are drawn."""
     names = [name for name, column in trace.notes.items() if np.isfinite(column).any()]
     return sorted(names, key=lambda name: FIRST.index(name) if name in FIRST else len(FIRST))[:NOTES]
@@ -242,12 +242,12 @@ def _draw_note(ax: Axes, name: str, column: Array, stages: list[tuple[float, int
         ax.set_yscale("log")
     for _, first, last in stages:
         indices = np.flatnonzero(np.isfinite(column[first:last])) + first
-        values = _mean(column[indices]) if name == "accepted" else column[indices]
+        values = _average_recent(column[indices]) if name == "accepted" else column[indices]
         ax.plot(indices + 1, values, color=look.VERMILLION, linewidth=1.0)
     ax.set_ylabel(f"accepted, of the\nlast {MEAN} changes" if name == "accepted" else name.replace("_", " "))
 
 
-def _mean(values: Array) -> Array:
+def _average_recent(values: Array) -> Array:
     """The mean of the last `MEAN` values at every place."""
     sums, positions = np.concatenate([[0.0], np.cumsum(values)]), np.arange(1, values.size + 1)
     first = np.maximum(positions - MEAN, 0)

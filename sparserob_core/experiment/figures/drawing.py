@@ -65,7 +65,7 @@ def draw_experiment(
     from sparserob_core.experiment.figures.adversary_figure import write_adversary
     from sparserob_core.experiment.figures.run_figures import write_figures
 
-    shown = _shown(experiment, theta)
+    shown = _choose_states(experiment, theta)
     data = figure_data(experiment, theta, active, history, cost, draws=DRAWS, status=status, states=shown)
     data = replace(data, push=push)
     files = write_figures(directory / "figures", data)
@@ -115,14 +115,14 @@ def figure_data(
     InputError
         When the program is no control problem.
     """
-    data = _data(
+    data = _collect_data(
         experiment.of_control("figures: expected a control problem"), theta, active, history, cost, draws, states
     )
     unproven = f"{data.title}: {status}, not proven" if status not in ("", "certified", "verified") else data.title
     return replace(data, title=unproven)
 
 
-def _data(
+def _collect_data(
     experiment: ControlExperiment,
     theta: Array,
     active: Active | None,
@@ -135,10 +135,10 @@ def _data(
     control, dictionary = model.pieces(theta), model.control
     axes = np.eye(problem.system.controls)
     tolerance = experiment.loaded.config.method.options.get("tolerance")
-    decision, times = np.ravel(theta), _times(model.response.grid.breakpoints)
+    decision, times = np.ravel(theta), _choose_times(model.response.grid.breakpoints)
     states = problem.names.corners.own(problem.system.states) if states is None else states
-    around = _tube(model, decision, times, states)
-    answered = {} if model.feedback is None else _answered(model, decision, times, draws, states)
+    around = _compute_tube(model, decision, times, states)
+    answered = {} if model.feedback is None else _collect_feedback_data(model, decision, times, draws, states)
     longest = 0.0 if program.activity is None else float(program.activity.sum())
     counts = counting(experiment.loaded)[0] and longest > 0.0
     return FigureData(
@@ -151,7 +151,7 @@ def _data(
         state=around.nominal,
         tube_lower=around.lower,
         tube_upper=around.upper,
-        walls=list(_walls(model)),
+        walls=list(_list_walls(model)),
         active=active or Active(),
         history=history,
         cost_scale=program.added(decision) if decision.size == program.n and not counts else 0.0,
@@ -161,13 +161,13 @@ def _data(
         active_fraction=sparsity(control, dictionary.breakpoints).active_fraction,
         cost=cost,
         names=problem.names,
-        plane=_plane(model, decision, around.times),
+        plane=_project_onto_plane(model, decision, around.times),
         tolerance=tolerance if isinstance(tolerance, float) else None,
         **answered,
     )
 
 
-def _shown(experiment: Experiment, theta: Array) -> Sequence[int] | None:
+def _choose_states(experiment: Experiment, theta: Array) -> Sequence[int] | None:
     """The states that figures show of a system of very many, whose tubes would take longer than the control: of all of
     them the reach is told at a few times. ``None``: all."""
     model = experiment.model
@@ -176,12 +176,12 @@ def _shown(experiment: Experiment, theta: Array) -> Sequence[int] | None:
     problem, own_states = model.problem, model.problem.names.corners.own(model.problem.system.states)
     if len(own_states) <= MOST_STATES:
         return own_states
-    rough_tube = _tube(model, np.ravel(theta), np.linspace(0.0, problem.horizon, ROUGH), own_states)
+    rough_tube = _compute_tube(model, np.ravel(theta), np.linspace(0.0, problem.horizon, ROUGH), own_states)
     reach = rough_tube.upper.max(axis=1) - rough_tube.lower.min(axis=1)
-    return sorted({*telling(reach, [*_walls(model)])[:MOST_STATES], *(problem.names.in_plane or ())})
+    return sorted({*telling(reach, [*_list_walls(model)])[:MOST_STATES], *(problem.names.in_plane or ())})
 
 
-def _tube(model: Transcription, decision: Array, times: Array, states: Sequence[int]) -> Tube:
+def _compute_tube(model: Transcription, decision: Array, times: Array, states: Sequence[int]) -> Tube:
     """The tube of the ``states`` that are named, in rows of all of them; NaN stands in the others."""
     named_tube, rows = (
         tube(model, decision, times, states),
@@ -191,7 +191,9 @@ def _tube(model: Transcription, decision: Array, times: Array, states: Sequence[
     return Tube(times, *rows)
 
 
-def _answered(model: Transcription, decision: Array, times: Array, draws: int, states: Sequence[int]) -> dict[str, Any]:
+def _collect_feedback_data(
+    model: Transcription, decision: Array, times: Array, draws: int, states: Sequence[int]
+) -> dict[str, Any]:
     """Return the additional data of figures under feedback.
 
     These are the tube of the nominal control alone, the extremes of the control under the disturbance, the gains and
@@ -200,7 +202,7 @@ def _answered(model: Transcription, decision: Array, times: Array, draws: int, s
     """
     loop, nominal_tube = (
         model.answering.loop,
-        _tube(replace(model, feedback=None), model.nominal(decision), times, states),
+        _compute_tube(replace(model, feedback=None), model.nominal(decision), times, states),
     )
     nominal, effects = loop.nominal(decision), loop.effects(decision)
     # of all measurable functions none is drawn evenly
@@ -211,13 +213,13 @@ def _answered(model: Transcription, decision: Array, times: Array, draws: int, s
         "control_least": nominal - loop.spread.support(-effects).T,
         "control_most": nominal + loop.spread.support(effects).T,
         "gains": loop.gains(decision),
-        "outputs": _outputs(model, decision, times),
-        **(_drawn(loop, nominal, effects, draws) if draws and is_piecewise else {}),
-        **(_moved(model, decision) if draws else {}),
+        "outputs": _compute_outputs(model, decision, times),
+        **(_sample_effort(loop, nominal, effects, draws) if draws and is_piecewise else {}),
+        **(_compute_worst_answers(model, decision) if draws else {}),
     }
 
 
-def _outputs(model: Transcription, decision: Array, times: Array) -> Outputs | None:
+def _compute_outputs(model: Transcription, decision: Array, times: Array) -> Outputs | None:
     """The outputs that a policy measures with their noise; ``None`` where it measures states."""
     measured, loop, points = model.problem.measurements, model.answering.loop, model.control.breakpoints
     if measured is None:
@@ -238,7 +240,7 @@ def _outputs(model: Transcription, decision: Array, times: Array) -> Outputs | N
     )
 
 
-def _times(points: Array) -> Array:
+def _choose_times(points: Array) -> Array:
     """Breakpoints and times between them that show how a state moves; of very many breakpoints some."""
     if points.size > TIMES + 1:
         return np.asarray(points[np.unique(np.linspace(0, points.size - 1, TIMES + 1).round().astype(int))])
@@ -247,7 +249,7 @@ def _times(points: Array) -> Array:
     return np.append(times.ravel(), points[-1])
 
 
-def _drawn(loop: ClosedLoop, nominal: Array, effects: Array, draws: int) -> dict[str, Any]:
+def _sample_effort(loop: ClosedLoop, nominal: Array, effects: Array, draws: int) -> dict[str, Any]:
     """Quantiles of ``|u|`` over uniform draws from the sets of the deviations; always the same ones."""
     rng = np.random.default_rng(0)
     deviations = [
@@ -259,7 +261,7 @@ def _drawn(loop: ClosedLoop, nominal: Array, effects: Array, draws: int) -> dict
     return {"effort": np.stack(quantiles, axis=2), "draws": draws}
 
 
-def _moved(model: Transcription, decision: Array) -> dict[str, Any]:
+def _compute_worst_answers(model: Transcription, decision: Array) -> dict[str, Any]:
     """Return the term of every innovation in the control on every piece, in the worst case of the constraint that comes
     nearest to a violation."""
     worst = max(find_adversaries(model, decision), key=lambda one: one.violation, default=None)
@@ -272,7 +274,7 @@ def _moved(model: Transcription, decision: Array) -> dict[str, Any]:
     }
 
 
-def _plane(model: Transcription, decision: Array, times: Array) -> Plane | None:
+def _project_onto_plane(model: Transcription, decision: Array, times: Array) -> Plane | None:
     """Return the places of the system in its plane and the limits on them; ``None`` where the problem names no
     plane."""
     pair, problem = model.problem.names.in_plane, model.problem
@@ -289,17 +291,17 @@ def _plane(model: Transcription, decision: Array, times: Array) -> Plane | None:
     )
     # where the lines c'y = h of two neighbouring directions meet
     places = (next_heights[..., None] * tangents - heights[..., None] * next_tangents) / np.sin(2.0 * np.pi / CORNERS)
-    return Plane(states=pair, places=places.transpose(1, 0, 2), limits=tuple(_limits(model.stated, pair, normals)))
+    return Plane(states=pair, places=places.transpose(1, 0, 2), limits=tuple(_list_limits(model.stated, pair, normals)))
 
 
-def _limits(problem: OptimalControlProblem, pair: tuple[int, int], around: Array) -> Iterator[Limit]:
+def _list_limits(problem: OptimalControlProblem, pair: tuple[int, int], around: Array) -> Iterator[Limit]:
     """Yield the limits that path and terminal constraints set to the place alone; of a curved set, its sides
     ``around (q, 2)`` it."""
     end, names = problem.horizon, problem.called("path")
     for name, entry in zip(names, problem.path, strict=True):
         if not isinstance(entry, PathConstraint):
             continue
-        normals, bounds = _lines(entry.set, pair, around)
+        normals, bounds = _select_sides(entry.set, pair, around)
         stop, reference = end if entry.stop is None else float(entry.stop), Reference.of(entry.relative_to)
         times = np.unique(np.concatenate([np.linspace(entry.start, stop, STEPS), reference.kinks(entry.start, stop)]))
         offsets = reference.along(times, np.eye(entry.set.dimension)[list(pair)])
@@ -307,12 +309,12 @@ def _limits(problem: OptimalControlProblem, pair: tuple[int, int], around: Array
         if len(normals):
             yield replace(limit, is_wall=not limit.moves and entry.start <= 0.0 and stop >= end)
     for terminal in problem.ends:
-        normals, bounds = _lines(terminal, pair, around)
+        normals, bounds = _select_sides(terminal, pair, around)
         if len(normals):
             yield Limit(name="terminal", normals=normals, times=np.array([end]), bounds=bounds[None], is_final=True)
 
 
-def _lines(bounds: ConvexSet, pair: tuple[int, int], around: Array) -> tuple[Array, Array]:
+def _select_sides(bounds: ConvexSet, pair: tuple[int, int], around: Array) -> tuple[Array, Array]:
     """The sides of a set that are about two coordinates alone: ``normals (r, 2)``, ``bounds (r,)``."""
     sides = bounds.halfspaces()
     if sides is None:
@@ -325,7 +327,7 @@ def _lines(bounds: ConvexSet, pair: tuple[int, int], around: Array) -> tuple[Arr
     return H[is_planar][:, pair], h[is_planar]
 
 
-def _walls(model: Transcription) -> Iterator[Wall]:
+def _list_walls(model: Transcription) -> Iterator[Wall]:
     """Yield the bounds on single states: of the constraints as stated, and of integrals that are states of the solved
     problem."""
     problem, end = model.stated, model.problem.horizon
@@ -336,11 +338,11 @@ def _walls(model: Transcription) -> Iterator[Wall]:
         stop = end if entry.stop is None else entry.stop
         reference = Reference.of(entry.relative_to)
         if not reference.moves:
-            yield from (replace(wall, final=stop >= end) for wall in _sides(entry.set, entry.start, stop))
+            yield from (replace(wall, final=stop >= end) for wall in _list_set_walls(entry.set, entry.start, stop))
             continue
         times = np.concatenate([[entry.start], reference.kinks(entry.start, stop), [stop]])
         points = reference.at(times)
-        for wall in _sides(entry.set, entry.start, stop):
+        for wall in _list_set_walls(entry.set, entry.start, stop):
             for k in range(times.size - 1):
                 begin, last = points[k : k + 2, wall.state].tolist()
                 yield Wall(
@@ -353,10 +355,10 @@ def _walls(model: Transcription) -> Iterator[Wall]:
                     upper_end=wall.upper + last,
                 )
     for terminal in problem.ends:
-        yield from _sides(terminal, end, end)
+        yield from _list_set_walls(terminal, end, end)
 
 
-def _sides(bounds: ConvexSet, start: float, end: float) -> Iterator[Wall]:
+def _list_set_walls(bounds: ConvexSet, start: float, end: float) -> Iterator[Wall]:
     axes = np.eye(bounds.dimension)
     for state, (lower, upper) in enumerate(zip(-bounds.support(-axes), bounds.support(axes), strict=True)):
         if np.isfinite(lower) or np.isfinite(upper):

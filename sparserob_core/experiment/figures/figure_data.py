@@ -184,12 +184,12 @@ class FigureData:
     def output_label(self, output: int) -> str:
         """The axis label of an output: that of the state which is measured as it is, or else the letter."""
         assert self.outputs is not None
-        alone = self._measured_state(output)
+        alone = self._find_measured_state(output)
         return label((), (), "y", output, len(self.outputs.C)) if alone is None else self.state_label(alone)
 
     def gain_label(self, channel: int, component: int) -> str:
         """The label of a gain: of which control on which state or output, and its unit where both are known."""
-        measured_as = component if self.outputs is None else self._measured_state(component)
+        measured_as = component if self.outputs is None else self._find_measured_state(component)
         if measured_as is None:
             return f"gain on $y_{{{component + 1}}}$"
         u, x = self.names.control_units, self.names.state_units
@@ -197,7 +197,7 @@ class FigureData:
         unit = f" [{plain(u[channel])} per {plain(x[measured_as])}]" if has_units else ""
         return f"gain on {label(self.names.states, (), 'x', measured_as, self.state.shape[0])}{unit}"
 
-    def _measured_state(self, output: int) -> int | None:
+    def _find_measured_state(self, output: int) -> int | None:
         """The state that is an output as it is; ``None`` where there is none."""
         assert self.outputs is not None
         row = self.outputs.C[output]

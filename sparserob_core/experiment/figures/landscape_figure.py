@@ -78,18 +78,18 @@ def draw_landscape(data: LandscapeData) -> Figure:
     figure = Figure(figsize=(look.WIDTH, 5.2 if len(data.axes) == 2 else 3.6), layout="constrained")
     ax = figure.subplots()
     if len(data.axes) == 2:
-        _map(figure, ax, data)
+        _draw_map(figure, ax, data)
     else:
-        _curve(ax, data)
+        _draw_curve(ax, data)
     ax.set_xlabel(data.names[0])
     ax.set_title(data.title, pad=22)
-    ax.text(0.0, 1.02, _said(data), transform=ax.transAxes, fontsize=9.5, color=look.GREY, va="bottom")
+    ax.text(0.0, 1.02, _write_caption(data), transform=ax.transAxes, fontsize=9.5, color=look.GREY, va="bottom")
     handles, labels = ax.get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=4, columnspacing=1.4, handlelength=1.4)
     return figure
 
 
-def _said(data: LandscapeData) -> str:
+def _write_caption(data: LandscapeData) -> str:
     if data.flat:
         return f"$g$ does not depend on {' and '.join(data.names)} here: it is {data.best_value:.6g}"
     if data.best_value - data.own_value > VISIBLE * max(1.0, abs(data.best_value)):
@@ -100,7 +100,7 @@ def _said(data: LandscapeData) -> str:
     return f"all other coordinates as in the best tuple, where $g$ = {data.best_value:.7g}"
 
 
-def _map(figure: Figure, ax: Axes, data: LandscapeData) -> None:
+def _draw_map(figure: Figure, ax: Axes, data: LandscapeData) -> None:
     from matplotlib.patheffects import Normal, Stroke
 
     across, up = data.axes
@@ -124,7 +124,7 @@ def _map(figure: Figure, ax: Axes, data: LandscapeData) -> None:
     walked = np.flatnonzero(data.accepted == 1.0)
     refused, evaluated = data.accepted == 0.0, np.isnan(data.accepted)
     for mask, colour, label in ((refused, "#D9D9D9", "refused"), (evaluated, "white", "evaluated")):
-        few = _few(np.flatnonzero(mask))
+        few = _thin_out(np.flatnonzero(mask))
         if few.size:
             ax.plot(
                 *data.visited[few].T,
@@ -140,7 +140,7 @@ def _map(figure: Figure, ax: Axes, data: LandscapeData) -> None:
     if walked.size:
         path = data.visited[walked]
         has_moved = np.append(True, (np.diff(path, axis=0) != 0.0).any(axis=1))
-        few = _few(np.flatnonzero(has_moved))
+        few = _thin_out(np.flatnonzero(has_moved))
         edge = [Stroke(linewidth=2.6, foreground=look.INK), Normal()]  # white in ink: seen on dark and on bright ground
         ax.plot(*path[few].T, color="white", linewidth=1.1, zorder=4, label="accepted walk", path_effects=edge)
     ax.plot(
@@ -160,10 +160,10 @@ def _map(figure: Figure, ax: Axes, data: LandscapeData) -> None:
     ax.set_ylabel(data.names[1])
 
 
-def _curve(ax: Axes, data: LandscapeData) -> None:
+def _draw_curve(ax: Axes, data: LandscapeData) -> None:
     (across,) = data.axes
     ax.plot(across, np.where(np.isfinite(data.values), data.values, np.nan), color=look.BLUE, label="$g$ along it")
-    few = _few(np.flatnonzero(np.isfinite(data.visited_values)))
+    few = _thin_out(np.flatnonzero(np.isfinite(data.visited_values)))
     ax.plot(
         data.visited[few, 0], data.visited_values[few], ".", color=look.GREY, markersize=4, label="evaluated", zorder=1
     )
@@ -181,6 +181,6 @@ def _curve(ax: Axes, data: LandscapeData) -> None:
     ax.set_ylabel(rf"$g$ at $\varepsilon$ = {data.epsilon:.3g}")
 
 
-def _few(places: np.ndarray) -> np.ndarray:
+def _thin_out(places: np.ndarray) -> np.ndarray:
     """Return at most `MOST` of the places, evenly chosen, with the first and the last among them."""
     return places[np.unique(np.linspace(0, places.size - 1, MOST).astype(int))] if places.size > MOST else places

@@ -38,7 +38,7 @@ def draw_plane(data: FigureData) -> Figure:
     figure = Figure(figsize=(look.WIDTH, sum(talls) + 0.6 + 0.5 * len(talls)), layout="constrained")
     axes = figure.subplots(len(views), squeeze=False, height_ratios=talls)[:, 0].tolist()
     for ax, (low, high) in zip(axes, views, strict=True):
-        _draw(ax, data, low, high)
+        _draw_plane(ax, data, low, high)
     axes[0].set_title(data.title)
     if close is not None:
         axes[1].set_title("the same around the terminal set", fontsize="medium", color=look.GREY)
@@ -46,7 +46,7 @@ def draw_plane(data: FigureData) -> Figure:
     return figure
 
 
-def _draw(ax: Axes, data: FigureData, low: Array, high: Array) -> None:
+def _draw_plane(ax: Axes, data: FigureData, low: Array, high: Array) -> None:
     """All that is in the plane, as far as it is between two corners."""
     from matplotlib.patches import Polygon
 
@@ -55,7 +55,7 @@ def _draw(ax: Axes, data: FigureData, low: Array, high: Array) -> None:
     sides = high - low
     ax.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal")
     frame, colour = framed(low, high), iter((look.GREEN, look.PURPLE, look.INK))
-    _hatched(ax, frame, plane.walls)
+    _hatch_forbidden(ax, frame, plane.walls)
     for limit, allowed in plane.outlined(frame):
         if limit.is_final:
             goal = Polygon(allowed, fill=False, edgecolor=look.VERMILLION, linewidth=2.0, zorder=4)
@@ -66,7 +66,7 @@ def _draw(ax: Axes, data: FigureData, low: Array, high: Array) -> None:
             else:
                 ax.add_patch(goal)
         else:
-            _gate(ax, data, limit, path, allowed, next(colour, look.INK))
+            _draw_gate(ax, data, limit, path, allowed, next(colour, look.INK))
     pair = list(plane.states)
     if (data.tube_upper[pair] > data.tube_lower[pair]).any():
         label = "worst case" if data.gains is None else "worst case, with feedback"
@@ -76,12 +76,12 @@ def _draw(ax: Axes, data: FigureData, low: Array, high: Array) -> None:
     for number, arc in enumerate(data.arcs):
         ax.plot(*arc.T, color=look.ORANGE, linewidth=4.0, zorder=3.5, solid_capstyle="round",
                 label="" if number else "the control acts")  # fmt: skip
-    _marks(ax, data, path, frame)
+    _draw_marks(ax, data, path, frame)
     ax.set_xlabel(data.state_label(plane.states[0]))
     ax.set_ylabel(data.state_label(plane.states[1]))
 
 
-def _hatched(ax: Axes, frame: Array, walls: list[Limit]) -> None:
+def _hatch_forbidden(ax: Axes, frame: Array, walls: list[Limit]) -> None:
     """Hatch what is forbidden for the whole time."""
     from matplotlib.patches import PathPatch
     from matplotlib.path import Path
@@ -104,7 +104,7 @@ def _hatched(ax: Axes, frame: Array, walls: list[Limit]) -> None:
             ax.plot(*np.stack([corner, next_corner]).T, color=look.GREY, linewidth=1.0, zorder=1)
 
 
-def _gate(ax: Axes, data: FigureData, limit: Limit, path: Array, allowed: Array, colour: str) -> None:
+def _draw_gate(ax: Axes, data: FigureData, limit: Limit, path: Array, allowed: Array, colour: str) -> None:
     """A set that holds for a part of the time, or moves: the outline of what is ``allowed (k, 2)``, or where its sides
     are when the path is beside them, and that part of the path."""
     is_active = (data.times >= limit.times[0]) & (data.times <= limit.times[-1])
@@ -121,7 +121,7 @@ def _gate(ax: Axes, data: FigureData, limit: Limit, path: Array, allowed: Array,
         ax.plot(*side_positions.T, color=colour, linewidth=1.1, zorder=1.5)
 
 
-def _marks(ax: Axes, data: FigureData, path: Array, frame: Array) -> None:
+def _draw_marks(ax: Axes, data: FigureData, path: Array, frame: Array) -> None:
     """Times along the path from where it is in the ``frame (4, 2)`` for good, and those of the active constraints."""
     from matplotlib.patheffects import withStroke
 

@@ -79,11 +79,11 @@ def draw_control(data: FigureData) -> Figure:
                 label="under any disturbance",
             )
         ax.stairs(*edges, baseline=None, color=look.BLUE, linewidth=1.5, zorder=3, label="control")
-        _bounds(ax, float(data.control_lower[channel]), float(data.control_upper[channel]), steps)
-        _rug(ax, data.active.times)
+        _draw_control_bounds(ax, float(data.control_lower[channel]), float(data.control_upper[channel]), steps)
+        _draw_rug(ax, data.active.times)
         ax.set_ylabel(data.control_label(channel))
     draw_time_axis(axes[-1], data)
-    _title(axes[0], data.title, _summary(data))
+    _set_title(axes[0], data.title, _write_summary(data))
     draw_legend(figure, axes)
     return figure
 
@@ -107,11 +107,11 @@ def draw_switching(data: FigureData) -> Figure:
         ax.stairs(
             push, ends, baseline=None, color=look.PURPLE, linewidth=1.5, zorder=3, label="push of the constraints"
         )
-        _rug(ax, data.active.times)
+        _draw_rug(ax, data.active.times)
         ax.set_ylim(-reach, reach)
         ax.set_ylabel(f"push on {plain(data.names.control(channel))}")
     draw_time_axis(axes[-1], data)
-    _title(axes[0], data.title, "1 is what it costs to act: the control acts where the push leaves the band")
+    _set_title(axes[0], data.title, "1 is what it costs to act: the control acts where the push leaves the band")
     draw_legend(figure, axes)
     return figure
 
@@ -154,9 +154,9 @@ def draw_states(data: FigureData) -> Figure:
             label="nominal" if uncertain else "state",
         )
         walls = [wall for wall in data.walls if wall.state == component]
-        ax.set_ylim(*_limits(data, component, walls))
+        ax.set_ylim(*_compute_limits(data, component, walls))
         draw_walls(ax, walls)
-        _rug(ax, data.active.on(component))
+        _draw_rug(ax, data.active.on(component))
         ax.set_ylabel(data.state_label(component))
     draw_time_axis(axes[-1], data)
     axes[0].set_title(data.title + data.of_states)
@@ -192,7 +192,7 @@ def draw_outputs(data: FigureData) -> Figure:
     unit = f" {plain(data.names.time)}" if data.names.time else ""
     late = f"known {outputs.latency:g}{unit} later" if outputs.latency else "known at once"
     some = f"  ·  {count} of {len(outputs.C)} outputs" if count < len(outputs.C) else ""
-    _title(axes[0], data.title, f"measured at {outputs.instants.size} instants, {late}{some}")
+    _set_title(axes[0], data.title, f"measured at {outputs.instants.size} instants, {late}{some}")
     draw_legend(figure, axes)
     return figure
 
@@ -205,7 +205,7 @@ def draw_gains(data: FigureData) -> Figure:
     sizes = np.abs(data.gains).max(axis=(0, 1))
     shown = sorted(np.argsort(-sizes.ravel(), kind="stable")[:MOST_GAINS].tolist())
     across = 1 if len(shown) < 3 else d if d <= 4 and len(shown) == m * d else 4
-    figure, axes = _grid(len(shown), across)
+    figure, axes = _make_grid(len(shown), across)
     is_causal = np.tril(np.ones((K, K))) > 0
     for index, (number, ax) in enumerate(zip(shown, axes, strict=True)):
         channel, state = divmod(number, d)
@@ -237,7 +237,7 @@ def draw_answers(data: FigureData) -> Figure:
         )
         ax.set_ylabel(f"{data.control_label(channel)} answers at")
         figure.colorbar(mesh, ax=ax, pad=0.01).set_label(f"adds to {data.control_label(channel)}")
-    _title(axes[0], data.title, f"what every innovation adds to the control, in {data.worst_case}")
+    _set_title(axes[0], data.title, f"what every innovation adds to the control, in {data.worst_case}")
     axes[-1].set_xlabel(f"innovation seen at {data.time_label()}")
     return figure
 
@@ -271,7 +271,7 @@ def draw_effort(data: FigureData) -> Figure:
         ax.set_ylabel(f"size of {data.control_label(channel)}")
     draw_time_axis(axes[-1], data)
     off_share = float((~acts.any(axis=0) * lengths).sum() / lengths.sum())
-    _title(
+    _set_title(
         axes[0],
         data.title,
         f"off whatever happens for {100 * off_share:.1f} % of the time  ·  {data.draws} random draws",
@@ -280,7 +280,7 @@ def draw_effort(data: FigureData) -> Figure:
     return figure
 
 
-def _grid(count: int, across: int) -> tuple[Figure, list[Axes]]:
+def _make_grid(count: int, across: int) -> tuple[Figure, list[Axes]]:
     """A figure of ``count`` pictures, so many beside one another."""
     from matplotlib.figure import Figure
 
@@ -311,7 +311,7 @@ def draw_convergence(data: FigureData) -> Figure:
     bounds.set_title(data.title)
     gaps.set_xlim(0.6, len(data.history) + 0.4)
     gaps.xaxis.set_major_locator(MaxNLocator(integer=True))
-    _stages(bounds, gaps, [entry.epsilon for entry in data.history])
+    _draw_stages(bounds, gaps, [entry.epsilon for entry in data.history])
     for ax in (bounds, gaps):
         ax.legend(loc="center left", bbox_to_anchor=(1.01, 0.5))
     return figure
@@ -322,27 +322,27 @@ def _draw_bounds(ax: Axes, rounds: Array, lower: Array, upper: Array, best: floa
     if np.isfinite(best):
         ax.fill_between(rounds[shown], lower[shown], best, color=look.MIST, linewidth=0, zorder=1)
         ax.axhline(best, color=look.VERMILLION, linewidth=0.9, zorder=2)
-    _series(ax, rounds, upper, look.VERMILLION, "v", "upper bound")
-    _series(ax, rounds, lower, look.BLUE, "^", "lower bound")
+    _draw_series(ax, rounds, upper, look.VERMILLION, "v", "upper bound")
+    _draw_series(ax, rounds, lower, look.BLUE, "^", "lower bound")
 
 
 def _draw_gaps(ax: Axes, rounds: Array, gap: Array, data: FigureData) -> None:
     violation = np.array([entry.violation for entry in data.history])
     ax.set_yscale("log")
-    ax.set_ylim(*_decades(np.concatenate([violation, gap, [data.tolerance or np.nan]])))
-    _series(ax, rounds, _positive(violation), look.ORANGE, "s", "worst violation")
-    _series(ax, rounds, _positive(gap), look.GREEN, "o", "relative gap")
+    ax.set_ylim(*_find_decades(np.concatenate([violation, gap, [data.tolerance or np.nan]])))
+    _draw_series(ax, rounds, _mask_nonpositive(violation), look.ORANGE, "s", "worst violation")
+    _draw_series(ax, rounds, _mask_nonpositive(gap), look.GREEN, "o", "relative gap")
     if data.tolerance is not None:
         ax.axhline(data.tolerance, color=look.PURPLE, linewidth=0.9, linestyle=(0, (5, 3)), label="tolerance")
     ax.set_xlabel("round")
 
 
-def _title(ax: Axes, title: str, summary: str) -> None:
+def _set_title(ax: Axes, title: str, summary: str) -> None:
     ax.set_title(title, pad=20 if summary else 8)
     ax.text(0.0, 1.045, summary, transform=ax.transAxes, fontsize=9.5, color=look.GREY)
 
 
-def _summary(data: FigureData) -> str:
+def _write_summary(data: FigureData) -> str:
     terms = f" ({data.cost_of})" if data.cost_of else ""
     unit = f" {plain(data.cost_unit)}" if data.cost_unit else ""
     costs = [] if data.cost is None else [f"{data.cost:.6g}{unit}"]
@@ -352,7 +352,7 @@ def _summary(data: FigureData) -> str:
     return "  ·  ".join(phrases)
 
 
-def _bounds(ax: Axes, lower: float, upper: float, steps: Array) -> None:
+def _draw_control_bounds(ax: Axes, lower: float, upper: float, steps: Array) -> None:
     finite = [bound for bound in (lower, upper) if np.isfinite(bound)]
     for bound in finite:
         ax.axhline(bound, color=look.VERMILLION, linewidth=0.9, linestyle=(0, (5, 3)), zorder=1, label="control bound")
@@ -361,7 +361,7 @@ def _bounds(ax: Axes, lower: float, upper: float, steps: Array) -> None:
     ax.set_ylim(low - margin, high + margin)
 
 
-def _rug(ax: Axes, times: Array) -> None:
+def _draw_rug(ax: Axes, times: Array) -> None:
     if len(times):
         ax.plot(
             times,
@@ -384,7 +384,7 @@ def draw_time_axis(ax: Axes, data: FigureData) -> None:
     ax.set_xlabel(data.time_label())
 
 
-def _limits(data: FigureData, component: int, walls: list[Wall]) -> tuple[float, float]:
+def _compute_limits(data: FigureData, component: int, walls: list[Wall]) -> tuple[float, float]:
     edges = [edge for wall in walls for edge in wall.edges]
     low = min([*edges, float(data.tube_lower[component].min())])
     high = max([*edges, float(data.tube_upper[component].max())])
@@ -395,10 +395,10 @@ def _limits(data: FigureData, component: int, walls: list[Wall]) -> tuple[float,
 def draw_walls(ax: Axes, walls: Sequence[Wall]) -> None:
     """Hatch what path constraints forbid within the axis' limits, and bracket terminal sets."""
     for wall in walls:
-        _terminal(ax, wall) if wall.start == wall.end else _forbidden(ax, wall)
+        _draw_terminal(ax, wall) if wall.start == wall.end else _draw_forbidden(ax, wall)
 
 
-def _forbidden(ax: Axes, wall: Wall) -> None:
+def _draw_forbidden(ax: Axes, wall: Wall) -> None:
     low, high = ax.get_ylim()
     for side, outside in zip(wall.sides, (low, high), strict=True):
         if np.isfinite(side).all():
@@ -406,7 +406,7 @@ def _forbidden(ax: Axes, wall: Wall) -> None:
             ax.plot([wall.start, wall.end], side, color=look.GREY, linewidth=1.0, zorder=1)
 
 
-def _terminal(ax: Axes, wall: Wall) -> None:
+def _draw_terminal(ax: Axes, wall: Wall) -> None:
     low, high = ax.get_ylim()
     lower, upper = max(wall.lower, low), min(wall.upper, high)
     ax.plot(
@@ -433,18 +433,18 @@ def _terminal(ax: Axes, wall: Wall) -> None:
             )
 
 
-def _series(ax: Axes, rounds: Array, values: Array, colour: str, marker: str, label: str) -> None:
+def _draw_series(ax: Axes, rounds: Array, values: Array, colour: str, marker: str, label: str) -> None:
     shown = np.isfinite(values)
     ax.plot(
         rounds[shown], values[shown], color=colour, marker=marker, markersize=4.5, linewidth=1.2, label=label, zorder=3
     )
 
 
-def _positive(values: Array) -> Array:
+def _mask_nonpositive(values: Array) -> Array:
     return np.where(values > 0, values, np.nan)
 
 
-def _decades(values: Array) -> tuple[float, float]:
+def _find_decades(values: Array) -> tuple[float, float]:
     """Whole decades around the positive values, so that a single value still has an axis."""
     shown = values[np.isfinite(values) & (values > 0)]
     if not shown.size:
@@ -452,7 +452,7 @@ def _decades(values: Array) -> tuple[float, float]:
     return 10.0 ** np.floor(np.log10(shown.min()) - 0.3), 10.0 ** np.ceil(np.log10(shown.max()) + 0.3)
 
 
-def _stages(bounds: Axes, gaps: Axes, epsilons: list[float]) -> None:
+def _draw_stages(bounds: Axes, gaps: Axes, epsilons: list[float]) -> None:
     changes = [k + 0.5 for k in range(1, len(epsilons)) if epsilons[k] != epsilons[k - 1]]
     for ax in (bounds, gaps):
         for k, change in enumerate(changes):

@@ -43,7 +43,7 @@ KINDS: dict[str, dict[str, Any]] = {
 """Kinds of files, by their endings, and what is left out of them so that the same figure gives the same bytes."""
 
 logger = logging.getLogger("sparserob")
-_told = set[str]()
+_reported_letters = set[str]()
 
 _STYLE: dict[str, Any] = {
     "font.family": ["STIXGeneral", "DejaVu Sans"],
@@ -119,7 +119,7 @@ def write_figure(file: Path, figure: Figure) -> list[Path]:
     files = [file] if has_suffix else [file.with_name(f"{file.name}{kind}") for kind in (".pdf", ".png")]
     for path in files:
         stream, kind = BytesIO(), path.suffix.lower()
-        with _letters_told():
+        with _report_missing_letters():
             figure.savefig(stream, format=kind[1:], **KINDS[kind])
         figure.set_layout_engine("none")  # everything has its place now, in the next file too
         try:
@@ -130,7 +130,7 @@ def write_figure(file: Path, figure: Figure) -> list[Path]:
 
 
 @contextmanager
-def _letters_told() -> Iterator[None]:
+def _report_missing_letters() -> Iterator[None]:
     """Letters that no font here has, such as those of a title, are told once, in one line; matplotlib says it for every
     letter and file."""
     with warnings.catch_warnings(record=True) as caught:
@@ -143,8 +143,8 @@ def _letters_told() -> Iterator[None]:
             warnings.warn_explicit(warning.message, warning.category, warning.filename, warning.lineno)
         else:
             missing.add(chr(int(glyph[1])))
-    if new_letters := missing - _told:
-        _told.update(new_letters)
+    if new_letters := missing - _reported_letters:
+        _reported_letters.update(new_letters)
         logger.warning("figures: no font here has %s: boxes stand there", " ".join(sorted(new_letters)))
 
 

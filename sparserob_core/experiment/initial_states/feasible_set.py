@@ -100,7 +100,7 @@ class InitialStates:
     def where(self, point: npt.ArrayLike) -> Literal["inside", "outside", "open"]:
         """Return whether a point ``(2,)`` is proven to be in the set, proven to be outside, or open between the
         polygons."""
-        x = _point(point)
+        x = _check_point(point)
         if not self.outer.shape[0]:
             return "outside" if self.status == "infeasible" else "open"
         term_sizes = np.abs(self.directions) @ np.abs(self.outer).max(axis=0)  # what is added up to a bound
@@ -112,24 +112,24 @@ class InitialStates:
         """A proven upper bound of the optimal cost from a point ``(2,)``: the optimal cost is convex, so the least
         combination of measured costs that has the point as its mean is one (a linear program); infinite outside of the
         measured points."""
-        weights = _combination(self.points, _point(point), self.costs)
+        weights = _find_combination(self.points, _check_point(point), self.costs)
         return np.inf if weights is None else float(weights @ self.costs)
 
     def control(self, point: npt.ArrayLike) -> Array:
         """A control ``(m, K)`` that is proven for the initial state at a point ``(2,)`` of the inner polygon, under
         feedback the nominal one of `policy`; raises `InputError` outside."""
-        return np.asarray(np.tensordot(self._weights(point), self.controls, axes=1))
+        return np.asarray(np.tensordot(self._find_weights(point), self.controls, axes=1))
 
     def policy(self, point: npt.ArrayLike) -> tuple[Array, Array]:
         """The nominal control ``(m, K)`` and the gains ``(K, K, m, d)`` of a policy that is proven for the initial
         state at a point ``(2,)`` of the inner polygon; raises `InputError` outside, and without feedback."""
         if not self.gains.size:
             raise InputError("policy: expected a set that was found with policy: affine; without, use control")
-        return self.control(point), np.asarray(np.tensordot(self._weights(point), self.gains, axes=1))
+        return self.control(point), np.asarray(np.tensordot(self._find_weights(point), self.gains, axes=1))
 
-    def _weights(self, point: npt.ArrayLike) -> Array:
-        x = _point(point)
-        weights = _combination(self.inner, x, np.zeros(self.inner.shape[0]))
+    def _find_weights(self, point: npt.ArrayLike) -> Array:
+        x = _check_point(point)
+        weights = _find_combination(self.inner, x, np.zeros(self.inner.shape[0]))
         if weights is None:
             raise InputError(f"point: expected one in the inner polygon, got {x.tolist()}")
         return weights
@@ -204,7 +204,7 @@ class InitialStates:
         return [*rows, ("seconds", f"{self.seconds:.3f}")]
 
 
-def _point(point: npt.ArrayLike) -> Array:
+def _check_point(point: npt.ArrayLike) -> Array:
     try:
         x = np.asarray(point, dtype=float)
     except (TypeError, ValueError):
@@ -214,7 +214,7 @@ def _point(point: npt.ArrayLike) -> Array:
     return x
 
 
-def _combination(points: Array, x: Array, costs: Array) -> Array | None:
+def _find_combination(points: Array, x: Array, costs: Array) -> Array | None:
     """The cheapest weights ``(k,)``, at least 0 and of sum 1, with ``weights @ points = x``; ``None`` when there are
     none."""
     from scipy.optimize import linprog

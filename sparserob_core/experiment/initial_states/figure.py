@@ -55,15 +55,15 @@ def draw_initial_states(found: InitialStates) -> Figure:
     ax.set_xlim(middle[0] - half[0], middle[0] + half[0])
     ax.set_ylim(middle[1] - half[1], middle[1] + half[1])
     if (np.ptp(found.outer, axis=0) > FLAT * extent).all() and found.inner.shape[0] > 2:
-        _costs(figure, ax, found)
+        _draw_costs(figure, ax, found)
     elif found.costs.size:
-        _bar(
+        _draw_colour_bar(
             figure,
             ax,
             ax.scatter(found.points[:, 0], found.points[:, 1], c=found.costs, cmap=COLOURS, s=36, zorder=7),
             found.cost_unit,
         )
-    _boundaries(ax, found)
+    _draw_boundaries(ax, found)
     if near:
         ax.plot(
             *found.start,
@@ -94,7 +94,7 @@ def draw_initial_states(found: InitialStates) -> Figure:
     return figure
 
 
-def _costs(figure: Figure, ax: Axes, found: InitialStates) -> None:
+def _draw_costs(figure: Figure, ax: Axes, found: InitialStates) -> None:
     """Bands of the largest convex function below the measured costs: between them it lies above the optimal cost, which
     is convex too."""
     from matplotlib.patches import Polygon
@@ -113,10 +113,10 @@ def _costs(figure: Figure, ax: Axes, found: InitialStates) -> None:
     lines = ax.tricontour(mesh, found.costs, levels=levels[1:-1], colors="white", linewidths=0.5, alpha=0.7, zorder=3)
     for drawn in (bands, lines):
         drawn.set_clip_path(inside)
-    _bar(figure, ax, bands, found.cost_unit)
+    _draw_colour_bar(figure, ax, bands, found.cost_unit)
 
 
-def _bar(figure: Figure, ax: Axes, coloured: ScalarMappable, unit: str) -> None:
+def _draw_colour_bar(figure: Figure, ax: Axes, coloured: ScalarMappable, unit: str) -> None:
     bar = figure.colorbar(coloured, ax=ax, pad=0.02, aspect=28)
     bar.set_label(measured("cost $J$ of a proven control", unit))
     bar.outline.set_linewidth(0.0)
@@ -135,14 +135,14 @@ def envelope(points: Array, costs: Array) -> np.ndarray:
     return np.asarray(hull.simplices[downward & (hull.simplices < points.shape[0]).all(axis=1)])
 
 
-def _boundaries(ax: Axes, found: InitialStates) -> None:
+def _draw_boundaries(ax: Axes, found: InitialStates) -> None:
     (x_min, x_max), (y_min, y_max) = ax.get_xlim(), ax.get_ylim()
     visible_polygons = [
         polygon for polygon in found.path if ((polygon > [x_min, y_min]) & (polygon < [x_max, y_max])).all(axis=1).any()
     ]
     for number, polygon in enumerate(visible_polygons):
         ax.plot(
-            *_closed(polygon),
+            *_close_polygon(polygon),
             color=look.GREY,
             linewidth=1.1,
             linestyle=(0, (1, 1.4)),
@@ -150,7 +150,7 @@ def _boundaries(ax: Axes, found: InitialStates) -> None:
             label="path set at time 0" if not number else None,
         )
     ax.plot(
-        *_closed(found.outer),
+        *_close_polygon(found.outer),
         color=look.VERMILLION,
         linewidth=1.1,
         linestyle=(0, (5, 2.5)),
@@ -158,8 +158,8 @@ def _boundaries(ax: Axes, found: InitialStates) -> None:
         label=f"{'no affine policy' if found.gains.size else 'infeasible'} outside, proven",
     )
     if found.inner.shape[0]:
-        ax.plot(*_closed(found.inner), color=look.INK, linewidth=1.4, zorder=6, label="feasible inside, proven")
+        ax.plot(*_close_polygon(found.inner), color=look.INK, linewidth=1.4, zorder=6, label="feasible inside, proven")
 
 
-def _closed(vertices: Array) -> Array:
+def _close_polygon(vertices: Array) -> Array:
     return np.vstack([vertices, vertices[:1]]).T

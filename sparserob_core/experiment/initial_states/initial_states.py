@@ -59,7 +59,7 @@ def initial_states(
     """
     whole("directions", directions, 4)
     whole("values", values, 0)
-    limit = _limit(within)
+    limit = _check_limit(within)
     loaded = load_config(as_config(config), overrides)
     tools = tools_of(loaded)
     experiment = assemble(loaded, tools.deadline).of_control(
@@ -74,29 +74,31 @@ def initial_states(
         )
     if about is not None:
         added_states = np.asarray(model.problem.initial_state, dtype=float)[model.stated.system.states :]
-        model = from_state(model, np.append(_about(about, model.stated), added_states))
+        model = from_state(model, np.append(_check_about(about, model.stated), added_states))
     pair = check_states(states, model.stated.system.states)
     with transcribed_by(tools.deadline):
         own, units = in_own_units(model)  # what is looked at and what is told are in other units (docs/decisions/0016)
     x = units.states[list(pair)]
-    size = np.full(2, _far(own.problem)) if limit is None else limit / x
+    size = np.full(2, _choose_largest_size(own.problem)) if limit is None else limit / x
     least = THINNEST * size * np.minimum(1.0, walls(own.problem)[list(pair)])
     plane = InitialPlane(own, pair, np.zeros(2), size)
-    search = InitialStatesSearch(plane, tools, _tolerance(loaded), notify, least, x, limit is not None)
+    search = InitialStatesSearch(plane, tools, _get_tolerance(loaded), notify, least, x, limit is not None)
 
     def find() -> InitialStates:
         feasible_set = search.states(experiment.title, directions, values)
-        return _in_users_units(replace(feasible_set, path=_path(own.problem, feasible_set)), units, limit)
+        return _convert_to_user_units(
+            replace(feasible_set, path=_intersect_path_sets(own.problem, feasible_set)), units, limit
+        )
 
     if out is None:
         return find()
     with create_directory(out, name_of(loaded), loaded.config.digest()) as directory:
         heading = "The experiment whose feasible initial states were sought."
         directory.write_text("config.yaml", write_yaml(loaded.config.plain(), heading))
-        return _written(directory, find())
+        return _write_files(directory, find())
 
 
-def _in_users_units(own: InitialStates, units: Units, limit: float | None) -> InitialStates:
+def _convert_to_user_units(own: InitialStates, units: Units, limit: float | None) -> InitialStates:
     """Convert results from the problem's own units to the user's units; ``limit`` is the bound that the user gave."""
     x = units.states[list(own.states)]
     normals, outer = own.directions / x, own.outer * x
@@ -120,7 +122,7 @@ def _in_users_units(own: InitialStates, units: Units, limit: float | None) -> In
     )
 
 
-def _limit(within: object) -> float | None:
+def _check_limit(within: object) -> float | None:
     if within is None:
         return None
     if (
@@ -132,7 +134,7 @@ def _limit(within: object) -> float | None:
     return float(within)
 
 
-def _far(problem: OptimalControlProblem) -> float:
+def _choose_largest_size(problem: OptimalControlProblem) -> float:
     """A size beyond which a coordinate counts as unbounded."""
     halfspaces = [entry.set.halfspaces() for entry in problem.of_states]
     halfspaces += [end.halfspaces() for end in problem.terminal_sets]
@@ -147,7 +149,7 @@ def _far(problem: OptimalControlProblem) -> float:
     return FAR * max([1.0, float(np.abs(np.asarray(problem.initial_state)).max()), *sizes])
 
 
-def _about(about: Sequence[float], problem: OptimalControlProblem) -> Array:
+def _check_about(about: Sequence[float], problem: OptimalControlProblem) -> Array:
     try:
         state = np.asarray(about, dtype=float)
     except (TypeError, ValueError):
@@ -157,12 +159,12 @@ def _about(about: Sequence[float], problem: OptimalControlProblem) -> Array:
     return state
 
 
-def _tolerance(loaded: Loaded) -> float:
+def _get_tolerance(loaded: Loaded) -> float:
     """The relative gap that the config asks for, where its method has one."""
     return float(loaded.config.method.options.get("tolerance") or GAP_TOLERANCE)
 
 
-def _path(problem: OptimalControlProblem, found: InitialStates) -> tuple[Array, ...]:
+def _intersect_path_sets(problem: OptimalControlProblem, found: InitialStates) -> tuple[Array, ...]:
     """The sections of the path sets that hold at time 0."""
     if not found.outer.shape[0]:
         return ()
@@ -176,7 +178,7 @@ def _path(problem: OptimalControlProblem, found: InitialStates) -> tuple[Array, 
     return tuple(polygons)
 
 
-def _written(directory: RunDirectory, found: InitialStates) -> InitialStates:
+def _write_files(directory: RunDirectory, found: InitialStates) -> InitialStates:
     """The figure is an extra: where it cannot be drawn, the numbers are there all the same, with a remark."""
     from sparserob_core.experiment.initial_states.figure import write_initial_states
 

@@ -79,53 +79,55 @@ class InitialStatesSearch:
             called=problem.names,
             cost_unit=problem.cost_unit,
         )
-        limit = self._size(self.plane.radius)
+        limit = self._format_size(self.plane.radius)
         try:
             with self.tools.deadline.enforced():
-                framed = self._framed()
+                framed = self._fit_frame()
         except KeyboardInterrupt as pressed:
-            self._interrupt(pressed)
+            self._note_interrupt(pressed)
             if self.frame is None:
-                return self._finished(template, message="nothing is known of the set yet")
+                return self._finish_result(template, message="nothing is known of the set yet")
             self.plane, framed = self.frame
         if isinstance(framed, Result):
             # amounts would be relative to rows that hold the initial state in units of the box: of no use
             reason = framed.message if framed.infeasible is None else framed.infeasible.sentence(amounts=False)
-            message = f"no initial state of this plane, up to {limit} in size, is feasible{self._under}: {reason}"
-            return self._finished(template, status="infeasible", message=message)
+            message = f"no initial state of this plane, up to {limit} in size, is feasible{self._restriction}: {reason}"
+            return self._finish_result(template, status="infeasible", message=message)
         try:
-            self._tell("direction", len(framed), directions)
+            self._report_progress("direction", len(framed), directions)
             with self.tools.deadline.enforced():
-                supports = sandwich(self._ask, framed, 0 if self.interrupted else directions, 0.1 * CLOSED)
+                supports = sandwich(
+                    self._explore_direction, framed, 0 if self.interrupted else directions, 0.1 * CLOSED
+                )
         except KeyboardInterrupt as pressed:
-            self._interrupt(pressed)
+            self._note_interrupt(pressed)
             supports = sorted([*framed, *self.asked], key=lambda one: float(np.arctan2(*one.direction[::-1])))
         inner = inner_polygon(supports)
-        points, results = self._measured(inner, values)
+        points, results = self._compute_costs(inner, values)
         feasible_set = replace(
-            self._polygons(template, supports, inner),
+            self._add_polygons(template, supports, inner),
             points=self.plane.point(points),
             costs=np.array([r.upper_bound for r in results]),
             lower_bounds=np.array([r.lower_bound for r in results]),
         )
         if not inner.shape[0]:
-            return self._finished(
+            return self._finish_result(
                 feasible_set,
                 message="no initial state is proven feasible, and none in the outer polygon is proven infeasible",
             )
         size = polygon_area(outer_polygon(supports))
         if size <= max(SLIVER, self.plane.strip):
-            return self._finished(
+            return self._finish_result(
                 feasible_set, status="certified", message="proven from both sides; the set has no interior"
             )
         share = 1.0 - polygon_area(inner) / size
-        return self._finished(
+        return self._finish_result(
             feasible_set,
             status="certified" if share <= CLOSED else "verified",
-            message=f"between two polygons, both proven{self._under}, that differ by {share:.2%} of the area",
+            message=f"between two polygons, both proven{self._restriction}, that differ by {share:.2%} of the area",
         )
 
-    def _polygons(self, bare: InitialStates, supports: Sequence[Support], inner: Array) -> InitialStates:
+    def _add_polygons(self, bare: InitialStates, supports: Sequence[Support], inner: Array) -> InitialStates:
         """The polygons and half-planes in the units of the model's states."""
         plane, scaled = self.plane, np.array([s.direction for s in supports]) / self.plane.radius
         norms = np.linalg.norm(scaled, axis=1)
@@ -141,7 +143,7 @@ class InitialStatesSearch:
             reached=(normals @ vertices.T).max(axis=1, initial=-np.inf),
         )
 
-    def _finished(self, found: InitialStates, **changes: Any) -> InitialStates:
+    def _finish_result(self, found: InitialStates, **changes: Any) -> InitialStates:
         if self.interrupted:
             changes["message"] = f"{changes['message']}; {self.interrupted}"
         return replace(
@@ -153,35 +155,35 @@ class InitialStatesSearch:
         )
 
     @property
-    def _under(self) -> str:
+    def _restriction(self) -> str:
         """Restriction of a proof of infeasibility to affine policies, for messages; empty without feedback."""
         return "" if self.plane.model.feedback is None else " for affine policies"
 
-    def _size(self, radius: Array) -> str:
+    def _format_size(self, radius: Array) -> str:
         """The size of a box about 0 in the user's units."""
         first, second = (f"{size:.4g}" for size in radius * self.units)
         return first if first == second else f"{first} and {second}"
 
-    def _tell(self, what: str, done: int, total: int) -> None:
+    def _report_progress(self, what: str, done: int, total: int) -> None:
         self.notify(StudyProgress(text=f"{what} {done} of {total}", done=done, total=total))
 
-    def _interrupt(self, pressed: KeyboardInterrupt) -> None:
+    def _note_interrupt(self, pressed: KeyboardInterrupt) -> None:
         """Go on with what is known."""
         self.interrupted = str(pressed) or "interrupted from the keyboard"
 
-    def _framed(self) -> list[Support] | Result:
+    def _fit_frame(self) -> list[Support] | Result:
         """Fit the box of coordinates to the set; returns the supports along the axes, or the result that proves the set
         empty."""
         limit, least = self.plane.radius, self.least
         for number in range(FRAMES):
             supports = []
             for axis in AXES:
-                result = self._supported(axis)
+                result = self._solve_direction(axis)
                 if result.status == "infeasible":
                     return result
                 if not np.isfinite(result.lower_bound):
                     raise SolverError(f"the initial states could not be bounded: {result.message}")
-                supports.append(self._support(axis, result))
+                supports.append(self._make_support(axis, result))
             high, low = np.array([s.bound for s in supports[:2]]), -np.array([s.bound for s in supports[2:]])
             if not number and not self.bounded:
                 self._require_bounded(np.concatenate([high, -low]))
@@ -199,19 +201,19 @@ class InitialStatesSearch:
         if free.size:
             called = self.plane.model.problem.names
             names = [f"{called.state(self.plane.states[k % 2])}(0) {'above' if k < 2 else 'below'}" for k in free]
-            limit = self._size(self.plane.radius)
+            limit = self._format_size(self.plane.radius)
             raise InputError(
                 f"within: the set of feasible initial states has no bound on {', '.join(names)} up to {limit}; expected"
                 " path or terminal sets that bound it, or a size of the plane to look at, such as 10"
             )
 
-    def _ask(self, direction: Array) -> Support:
-        support = self._support(direction, self._supported(direction))
+    def _explore_direction(self, direction: Array) -> Support:
+        support = self._make_support(direction, self._solve_direction(direction))
         self.asked.append(support)
-        self._tell("direction", len(self.asked) + len(AXES), self.directions)
+        self._report_progress("direction", len(self.asked) + len(AXES), self.directions)
         return support
 
-    def _supported(self, direction: Array) -> Result:
+    def _solve_direction(self, direction: Array) -> Result:
         nearest_directions = sorted(
             self.cuts, key=lambda solved_direction: -float(np.dot(solved_direction, direction))
         )[:2]
@@ -229,7 +231,7 @@ class InitialStatesSearch:
         self.cuts[tuple(direction.tolist())] = result.indices or tuple(start_cuts.values())
         return result
 
-    def _support(self, direction: Array, result: Result) -> Support:
+    def _make_support(self, direction: Array, result: Result) -> Support:
         bound, proven = float(np.abs(direction).sum()), result.status in PROVEN
         # it is not: another direction has a point
         bound = bound if result.status == "infeasible" else min(-result.lower_bound, bound)
@@ -245,16 +247,16 @@ class InitialStatesSearch:
             )
         return Support(direction, bound, point, proven)
 
-    def _measured(self, inner: Array, values: int) -> tuple[Array, list[Result]]:
+    def _compute_costs(self, inner: Array, values: int) -> tuple[Array, list[Result]]:
         """Costs on a lattice within the inner polygon, and beside its vertices."""
-        points, kept, results = _lattice(inner, 0 if self.interrupted else values), [], []
+        points, kept, results = _make_lattice(inner, 0 if self.interrupted else values), [], []
         for number, z in enumerate(points):
             try:
-                self._tell("cost", number + 1, len(points))
+                self._report_progress("cost", number + 1, len(points))
                 result = self.plane.rounded(z, Exchange(tolerance=self.tolerance).solve(self.plane.at(z), self.tools))
                 self.tools.deadline.check()
             except KeyboardInterrupt as pressed:
-                self._interrupt(pressed)
+                self._note_interrupt(pressed)
                 break
             self.programs += result.counts.get("relaxed_programs", 0)
             if result.status in PROVEN:
@@ -267,7 +269,7 @@ class InitialStatesSearch:
         return np.array(kept).reshape(-1, 2), results
 
 
-def _lattice(inner: Array, values: int) -> Array:
+def _make_lattice(inner: Array, values: int) -> Array:
     """The points of a lattice that lie in a polygon, and points all around its edge, moved inwards a little; without
     interior, points on the segment."""
     if not values or not inner.shape[0]:

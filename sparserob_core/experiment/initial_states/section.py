@@ -17,7 +17,7 @@ def section(value: ConvexSet, origin: Array, states: tuple[int, int], middle: Ar
     points.
     """
     angles = np.linspace(-np.pi, np.pi, RAYS, endpoint=False)
-    corners = _corners(value, origin, states, middle)
+    corners = _intersect_sides(value, origin, states, middle)
     angles = np.sort(np.concatenate([angles, np.arctan2(*(corners - middle).T[::-1])]))
     rays = np.stack([np.cos(angles), np.sin(angles)], axis=1)
     points = np.tile(origin, (angles.size, 1))
@@ -30,7 +30,7 @@ def section(value: ConvexSet, origin: Array, states: tuple[int, int], middle: Ar
     return np.asarray(middle + high[:, None] * rays)
 
 
-def _corners(value: ConvexSet, origin: Array, states: tuple[int, int], middle: Array) -> Array:
+def _intersect_sides(value: ConvexSet, origin: Array, states: tuple[int, int], middle: Array) -> Array:
     """Return the points ``(k, 2)`` where two sides of a set with flat sides meet in the plane; none for a curved
     set."""
     flat = value.halfspaces()

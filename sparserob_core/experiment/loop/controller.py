@@ -64,7 +64,7 @@ def controller(
     limit = as_seconds(seconds)
     if limit is not None and not resolve:
         raise InputError("seconds: is the time of a re-solve; expected resolve=True beside it")
-    plan, experiment = _planned(config, plugins)
+    plan, experiment = _find_plan(config, plugins)
     return Controller(plan, resolving(experiment, limit) if resolve else None)
 
 
@@ -83,17 +83,17 @@ def resolving(experiment: ControlExperiment, seconds: float | None) -> Resolving
     return Resolving(experiment.transcription, tools_of(experiment.loaded), tolerance, seconds)
 
 
-def _planned(config: object, plugins: Iterable[str | Path]) -> tuple[Plan, ControlExperiment]:
+def _find_plan(config: object, plugins: Iterable[str | Path]) -> tuple[Plan, ControlExperiment]:
     if isinstance(config, Outcome | SolvedProblem):
         result = config.result if isinstance(config, Outcome) else config
-        return _plan(
+        return _make_plan(
             config.experiment.of_control(CONTROLLED), result.status, result.message, result.decision, result.indices
         )
     if isinstance(config, str | Path) and Path(config).is_dir():
         finished = read_finished(Path(config), plugins)
         finished.require_certified()
         status, message = str(finished.summary["status"]), str(finished.summary["message"])
-        return _plan(finished.experiment, status, message, finished.decision)
+        return _make_plan(finished.experiment, status, message, finished.decision)
     loaded = load_config(as_config(config))
     deadline = Deadline(loaded.config.limits.seconds)
     experiment = assemble(loaded, deadline).of_control(CONTROLLED)
@@ -103,10 +103,10 @@ def _planned(config: object, plugins: Iterable[str | Path]) -> tuple[Plan, Contr
     except InputError as error:
         raise loaded.located((), error) from error
     result = solve_in_own_units(method, experiment.program, tools_of(loaded))
-    return _plan(experiment, result.status, result.message, result.decision, result.indices)
+    return _make_plan(experiment, result.status, result.message, result.decision, result.indices)
 
 
-def _plan(
+def _make_plan(
     experiment: ControlExperiment, status: str, message: str, decision: Array | None, cuts: Iterable[Cut] = ()
 ) -> tuple[Plan, ControlExperiment]:
     if status not in PROVEN or decision is None:

@@ -111,7 +111,7 @@ def loop(
         raise InputError(f"periods: expected 1 of a plan that ends at its horizon, or problem.repeat, got {periods}")
     acting = controller(run, resolve, seconds=seconds, plugins=plugins)
     loops = replace(
-        _closed(finished, acting, resolve, (count, periods), seed, notify), seconds=clock.perf_counter() - start
+        _simulate_loops(finished, acting, resolve, (count, periods), seed, notify), seconds=clock.perf_counter() - start
     )
     RunDirectory(finished.directory).write_json("loop.json", loops.summary())
     if out is not None and (missing := missing_matplotlib()):
@@ -121,7 +121,7 @@ def loop(
     return loops
 
 
-def _closed(
+def _simulate_loops(
     finished: FinishedRun, acting: Controller, resolve: bool, counts: tuple[int, int], seed: int, notify: Notify
 ) -> ClosedLoops:
     periods, model = counts[1], finished.experiment.transcription
@@ -137,8 +137,8 @@ def _closed(
     shown = np.unique(np.linspace(0, times.size - 1, min(times.size, SHOWN)).round().astype(int))
     parameters_in_time = ParametersInTime.of(model.stated)
     draws = [
-        *_replayed(worst, parameters_in_time, periods),
-        *_sampled(model, worst, parameters_in_time, counts, np.random.default_rng(seed)),
+        *_replay_worst_cases(worst, parameters_in_time, periods),
+        *_sample_loops(model, worst, parameters_in_time, counts, np.random.default_rng(seed)),
     ]
     milliseconds, mean_costs, kept_loops, laws = (
         list[float](),
@@ -165,14 +165,16 @@ def _closed(
         costs, previous_control = list[float](), np.zeros((0, model.problem.system.controls))
         for period, (disturbance, noise) in enumerate(zip(disturbances, noise_signals, strict=True)):
             pieces = law_grid.control_piece if law == ADVERSARY else np.arange(law_grid.pieces)
-            closing = _Closing(model, acting, pieces, noise, period * model.problem.horizon, to_user_states)
+            closing = _LoopInput(model, acting, pieces, noise, period * model.problem.horizon, to_user_states)
             path = walk(fine, closing, parameter, disturbance, initial_state)
             states = np.stack(list(path if to_user_states is None else map(to_user_states, path)))
-            for name, largest in _violations(model, finished, states, times, closing.applied).items():
+            for name, largest in _measure_violations(model, finished, states, times, closing.applied).items():
                 largest_violations[name] = max(largest_violations[name], largest)
             control_violation = max(control_violation, float(model.problem.control.violation(closing.applied.T).max()))
-            step_violation = max(step_violation, _stepped(model, np.vstack([previous_control, closing.applied.T])))
-            costs.append(_paid(model, closing.applied))
+            step_violation = max(
+                step_violation, _measure_step_violation(model, np.vstack([previous_control, closing.applied.T]))
+            )
+            costs.append(_compute_control_cost(model, closing.applied))
             if laws[law] <= DRAWN and not period:
                 kept_loops.append((law, states[shown, :, 0].T, closing.applied))
             previous_control, initial_state = closing.applied[:, -1:].T, states[-1].T.copy()
@@ -201,7 +203,7 @@ def _closed(
         resolved=resolved,
         uncovered=uncovered,
         cost=float(finished.summary["cost"]),
-        planned=_paid(model, model.pieces(finished.decision)),
+        planned=_compute_control_cost(model, model.pieces(finished.decision)),
         costs=np.array(mean_costs),
         seconds=0.0,
         shown=times[shown],
@@ -217,7 +219,7 @@ def _closed(
     )
 
 
-class _Closing:
+class _LoopInput:
     """The input of a system: a controller, called at the breakpoints of the control in their order.
 
     Parameters
@@ -248,30 +250,30 @@ class _Closing:
         self.model, self.acting, self.which, self.noise, self.begins = model, acting, which, noise, begins
         self.told = told
         self.applied = np.zeros((model.problem.system.controls, model.control.pieces))
-        self._asked = 0
+        self._next_piece = 0
 
     def __call__(self, number: int, state: Array) -> Array:
         """Return the inputs ``(m + constants, 1)`` on a piece that begins in ``state (d, 1)``."""
         piece, points = int(self.which[number]), self.model.control.breakpoints
         grid = self.model.response.grid
         middle = (grid.breakpoints[piece] + grid.breakpoints[piece + 1]) / 2
-        if self._asked < points.size - 1 and middle > points[self._asked]:
-            time = self.begins + float(points[self._asked])
+        if self._next_piece < points.size - 1 and middle > points[self._next_piece]:
+            time = self.begins + float(points[self._next_piece])
             user_state = state if self.told is None else self.told(state)
-            self.applied[:, self._asked] = self.acting.step(time, self._measured(user_state[:, 0]))
-            self._asked += 1
+            self.applied[:, self._next_piece] = self.acting.step(time, self._measure_state(user_state[:, 0]))
+            self._next_piece += 1
         return np.asarray(grid.inputs(self.applied)[:, piece, None])
 
-    def _measured(self, state: Array) -> Array:
+    def _measure_state(self, state: Array) -> Array:
         """Return the measurement of a state ``(d,)``."""
         observer = self.model.observer
         if observer is None:
             return state[: self.model.stated.system.states]
-        noise = None if self.noise is None else self.noise[self._asked, :, None]
+        noise = None if self.noise is None else self.noise[self._next_piece, :, None]
         return observer.outputs(state[:, None], noise)[:, 0]
 
 
-def _replayed(worst: Mapping[str, Array], beside: ParametersInTime | None, periods: int) -> Iterator[Drawn]:
+def _replay_worst_cases(worst: Mapping[str, Array], beside: ParametersInTime | None, periods: int) -> Iterator[Drawn]:
     """Yield the worst case of every constraint under the plan; in the next period that of the next constraint
     follows."""
     count = worst["names"].size if worst else 0
@@ -293,7 +295,7 @@ def _replayed(worst: Mapping[str, Array], beside: ParametersInTime | None, perio
         )
 
 
-def _sampled(
+def _sample_loops(
     model: Transcription,
     worst: Mapping[str, Array],
     beside: ParametersInTime | None,
@@ -328,13 +330,13 @@ def _sampled(
             )
 
 
-def _stepped(model: Transcription, applied: Array) -> float:
+def _measure_step_violation(model: Transcription, applied: Array) -> float:
     """Return by how much the steps of consecutive controls ``(k, m)`` leave their set at most."""
     step = model.problem.control_step
     return -np.inf if step is None or len(applied) < 2 else float(step.violation(np.diff(applied, axis=0)).max())
 
 
-def _violations(
+def _measure_violations(
     model: Transcription, finished: FinishedRun, states: Array, times: Array, applied: Array
 ) -> dict[str, float]:
     """Return the largest violation of every constraint along states ``(T, d, 1)``.
@@ -342,7 +344,9 @@ def _violations(
     ``applied (m, K)`` is the control that was applied.
     """
     theta = applied.ravel() if model.control.is_indicators else finished.theta.ravel()
-    counts: Sequence[ViolationCount] = [_count(constraint, model, times, theta) for constraint in model.constraints]
+    counts: Sequence[ViolationCount] = [
+        _make_count(constraint, model, times, theta) for constraint in model.constraints
+    ]
     for position, state in enumerate(states):
         for count in counts:
             count.add(position, state)
@@ -351,13 +355,13 @@ def _violations(
     return {count.constraint.name: count.largest for count in counts}
 
 
-def _count(one: StateConstraint, model: Transcription, times: Array, theta: Array) -> ViolationCount:
+def _make_count(one: StateConstraint, model: Transcription, times: Array, theta: Array) -> ViolationCount:
     counted = ViolationCount(one, times, row_units(one, model.problem.control), theta)
     counted.begin(1)
     return counted
 
 
-def _paid(model: Transcription, control: Array) -> float:
+def _compute_control_cost(model: Transcription, control: Array) -> float:
     """Return the first term of the cost of a control ``(m, K)``."""
     problem, prices = model.problem, model.problem.prices(model.control.breakpoints)
     sizes = np.abs(control)

@@ -86,17 +86,17 @@ def critical_factor(
         The factor.
     """
     if joined is not None:
-        critical = _by_one_program(joined, scaling, tools, width)
+        critical = _solve_one_program(joined, scaling, tools, width)
         if critical.status != "unknown" or not scaling.nested:
             return critical
     if scaling.of == "disturbance":
-        critical = _by_scaled_gains(programs, scaling, tools)
+        critical = _solve_scaled_gains(programs, scaling, tools)
         if critical.status != "unknown":
             return critical
-    return _by_slack(programs, scaling, tools, width, notify, seen)
+    return _search_by_slack(programs, scaling, tools, width, notify, seen)
 
 
-def _by_scaled_gains(programs: ParametricProgram, scaling: Scaling, tools: Tools) -> Critical:
+def _solve_scaled_gains(programs: ParametricProgram, scaling: Scaling, tools: Tools) -> Critical:
     """Find the factor under feedback by one program, linear in the factor and in the product of gains and factor."""
     program = programs.program(1.0)
     program = program if program.own_units is None else program.own_units.program
@@ -108,7 +108,7 @@ def _by_scaled_gains(programs: ParametricProgram, scaling: Scaling, tools: Tools
     return Critical("found", factor, factor)
 
 
-def _by_one_program(programs: ParametricProgram, scaling: Scaling, tools: Tools, width: float) -> Critical:
+def _solve_one_program(programs: ParametricProgram, scaling: Scaling, tools: Tools, width: float) -> Critical:
     """Find the factor as a decision variable of one program, whose two bounds meet at the critical factor."""
     program = extreme_program(programs, scaling.sense, scaling.highest)
     result = Exchange(tolerance=max(0.05 * width, 1e-9)).solve(program, replace(tools, regulariser=None))
@@ -123,22 +123,22 @@ def _by_one_program(programs: ParametricProgram, scaling: Scaling, tools: Tools,
     if scaling.sense == "smallest" and good <= width:
         return Critical("always", good=0.0)
     bad = max(good, bad) if scaling.sense == "largest" else min(good, max(result.lower_bound, 0.0))
-    return Critical("found", good, bad, cuts=_in_users_units(programs.program(1.0), result.indices))
+    return Critical("found", good, bad, cuts=_convert_to_user_units(programs.program(1.0), result.indices))
 
 
-def _in_users_units(program: SemiInfiniteProgram, cuts: Sequence[Cut]) -> list[Cut]:
+def _convert_to_user_units(program: SemiInfiniteProgram, cuts: Sequence[Cut]) -> list[Cut]:
     """Return the ``cuts`` of a program in its own units in those of the user."""
     units = {family.name: 1.0 if family.index_units is None else family.index_units for family in program.families}
     return [replace(cut, index=cut.index * units[cut.family]) for cut in cuts]
 
 
-def _by_slack(
+def _search_by_slack(
     programs: ParametricProgram, scaling: Scaling, tools: Tools, width: float, notify: Notify, seen: dict[float, str]
 ) -> Critical:
     """Find a bracket of the factor at which the least relaxation for feasibility changes its sign."""
 
     def slack(factor: float) -> float:
-        value = _slack(programs, factor, tools)
+        value = _compute_slack(programs, factor, tools)
         answer = "feasible" if value <= 0 else "infeasible"
         seen[factor] = answer
         notify(StudyProgress(text=f"{scaling.of} at {factor:.9g}: {answer}"))
@@ -154,10 +154,10 @@ def _by_slack(
         at_bad = slack(bad)
     if at_bad <= 0.0:
         return Critical("always", good=bad)
-    return _bracketed(slack, (good, at_good), (bad, at_bad), width)
+    return _bracket_root(slack, (good, at_good), (bad, at_bad), width)
 
 
-def _slack(programs: ParametricProgram, factor: float, tools: Tools) -> float:
+def _compute_slack(programs: ParametricProgram, factor: float, tools: Tools) -> float:
     """Return the least relaxation of the rows that makes the program feasible.
 
     It is infinite where bounds or equalities cannot hold at all, or where the system is not defined.
@@ -167,7 +167,7 @@ def _slack(programs: ParametricProgram, factor: float, tools: Tools) -> float:
         program = program if program.own_units is None else program.own_units.program
         if program.spread is not None:
             return least_slack(program, tools)
-        bounds = _room(program)
+        bounds = _bound_slack(program)
         result = Exchange(tolerance=1e-9).close(
             slack_program(program, *bounds), replace(tools, regulariser=None), unproven
         )
@@ -179,7 +179,7 @@ def _slack(programs: ParametricProgram, factor: float, tools: Tools) -> float:
     return np.inf if result.decision is None else float(result.decision[-1])
 
 
-def _room(program: SemiInfiniteProgram) -> tuple[float, float]:
+def _bound_slack(program: SemiInfiniteProgram) -> tuple[float, float]:
     origin = np.zeros(program.n)
     violations = [
         float(family.worst(origin).violations.max()) for family in program.families if family.worst is not None
@@ -188,7 +188,7 @@ def _room(program: SemiInfiniteProgram) -> tuple[float, float]:
     return -size, size
 
 
-def _bracketed(
+def _bracket_root(
     slack: Callable[[float], float], good: tuple[float, float], bad: tuple[float, float], width: float
 ) -> Critical:
     """Return a bracket of the root of the slack, by the rule of false position.

@@ -43,7 +43,7 @@ def draw_margin(found: Margin, varied: Scaling) -> Figure:
     upper, lower = (np.array([getattr(point, name) for point in proven]) for name in ("upper_bound", "lower_bound"))
     convex = varied.affine  # the value of a convex program is convex in its right-hand sides
     ax.fill_between(
-        *_band(factors, lower, upper, found.sense == "largest"),
+        *_compute_band(factors, lower, upper, found.sense == "largest"),
         color=look.SKY,
         alpha=0.0 if convex else 0.35,
         linewidth=0,
@@ -71,7 +71,7 @@ def draw_margin(found: Margin, varied: Scaling) -> Figure:
         label="certified lower bound",
     )
     unproven_factors = [point.factor for point in found.curve if point.status not in FEASIBLE]
-    ax.set_ylim(*_view(np.concatenate([upper, lower])))
+    ax.set_ylim(*_compute_limits(np.concatenate([upper, lower])))
     if unproven_factors:
         ax.plot(
             unproven_factors,
@@ -82,11 +82,11 @@ def draw_margin(found: Margin, varied: Scaling) -> Figure:
             zorder=5,
             label="nothing proven feasible",
         )
-    _forbid(ax, found, np.array([point.factor for point in found.curve]))
+    _draw_infeasible(ax, found, np.array([point.factor for point in found.curve]))
     ax.set_ylabel(least_cost(found))
     ax.set_xlabel(varied.label)
     if varied.relative:
-        _unit_axis(ax, found)
+        _draw_unit_axis(ax, found)
     ax.set_title(plain(found.title), pad=8)
     figure.legend(
         *ax.get_legend_handles_labels(), loc="outside lower center", ncols=2, columnspacing=1.6, handlelength=1.6
@@ -99,7 +99,7 @@ def least_cost(found: Margin) -> str:
     return measured("least cost $J$", found.cost_unit)
 
 
-def _band(factors: Array, lower: Array, upper: Array, rising: bool) -> tuple[Array, Array, Array]:
+def _compute_band(factors: Array, lower: Array, upper: Array, rising: bool) -> tuple[Array, Array, Array]:
     """Return the band in which the cost lies: between two points it is monotone.
 
     It is therefore between the lower bound at one point and the upper bound at the other.
@@ -109,7 +109,7 @@ def _band(factors: Array, lower: Array, upper: Array, rising: bool) -> tuple[Arr
     return x, np.repeat(below, 2), np.repeat(above, 2)
 
 
-def _forbid(ax: Axes, found: Margin, factors: Array) -> None:
+def _draw_infeasible(ax: Axes, found: Margin, factors: Array) -> None:
     """Draw the side that is proven infeasible, as a hatched band beyond its edge."""
     low, high = float(factors.min()), float(factors.max())
     room = 0.12 * max(high - low, 1e-9)
@@ -123,7 +123,7 @@ def _forbid(ax: Axes, found: Margin, factors: Array) -> None:
     ax.set_xlim(left, right)
 
 
-def _unit_axis(ax: Axes, found: Margin) -> None:
+def _draw_unit_axis(ax: Axes, found: Margin) -> None:
     """Draw a second axis in the unit of the problem, where its quantity is a multiple of the factor."""
     share = found.amounts[0] / found.lower if np.isfinite(found.lower) and found.lower > 0 else np.nan
     is_linear = (
@@ -136,15 +136,15 @@ def _unit_axis(ax: Axes, found: Margin) -> None:
     unit_axis = ax.secondary_xaxis(
         "top", functions=(lambda x: share * np.asarray(x, dtype=float), lambda y: np.asarray(y, dtype=float) / share)
     )
-    unit_axis.set_xlabel(_mathematics(plain(found.quantity)))
+    unit_axis.set_xlabel(_format_mathematics(plain(found.quantity)))
     unit_axis.spines["top"].set_visible(True)
 
 
-def _mathematics(quantity: str) -> str:
+def _format_mathematics(quantity: str) -> str:
     return re.sub(r"\|?[wux]_i(\(0\))?\|?", lambda written: f"${written.group()}$", quantity)
 
 
-def _view(values: Array) -> tuple[float, float]:
+def _compute_limits(values: Array) -> tuple[float, float]:
     finite = values[np.isfinite(values)]
     low, high = (float(finite.min()), float(finite.max())) if finite.size else (0.0, 1.0)
     extent = max(high - low, 0.05 * abs(high), 1e-9)

@@ -49,11 +49,11 @@ class HorizonSearch:
     told: Points
     points: dict[float, Point] = field(default_factory=dict)
     covered: list[tuple[float, float]] = field(default_factory=list)
-    _farkas: dict[float, list[Multiplier]] = field(default_factory=dict)
+    _farkas_multipliers: dict[float, list[Multiplier]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        self._bare = replace(self.problem, control_step=None)
-        self._cells = Horizons(self._bare, self.control, self.disturbance)
+        self._problem_without_steps = replace(self.problem, control_step=None)
+        self._horizons = Horizons(self._problem_without_steps, self.control, self.disturbance)
 
     def margin(self, count: int) -> Margin:
         """Return the shortest feasible horizon, between those that are excluded and one that is proven.
@@ -65,16 +65,16 @@ class HorizonSearch:
         scan = longest * np.arange(1, max(count, SCAN) + 1) / max(count, SCAN)
         try:
             with self.tools.deadline.enforced():
-                reason = self._cover(scan.tolist())
+                reason = self._cover_horizons(scan.tolist())
                 if count:
                     for horizon in scan:
-                        self._run(float(horizon))
+                        self._run_horizon(float(horizon))
         except KeyboardInterrupt as interrupt:
             reason = str(interrupt) or "interrupted from the keyboard"
         proven = [point for point in self.points.values() if point.status in FEASIBLE]
         best = min(proven, key=lambda point: point.factor, default=None)
         low = self.covered[-1][1] if self.covered else 0.0
-        status, message = self._answer(best, low, reason)
+        status, message = self._conclude(best, low, reason)
         upper = best.factor if best is not None else np.nan
         curve = tuple(self.points[key] for key in sorted(self.points) if key in scan or self.points[key] is best)
         kept = f"{self.control.pieces} pieces at every horizon; windows begin at the times that the config says"
@@ -97,40 +97,52 @@ class HorizonSearch:
             cost_unit=self.problem.cost_unit,
         )
 
-    def _answer(self, best: Point | None, low: float, stuck: str) -> tuple[Answer, str]:
+    def _conclude(self, best: Point | None, low: float, stuck: str) -> tuple[Answer, str]:
         longest = self.problem.horizon
         cells = f"{len(self.covered)} cell{'s' if len(self.covered) != 1 else ''}"
         if best is None and low >= longest:
             return (
                 "infeasible",
-                f"no horizon up to {self._in(longest)} is feasible, proven on {cells}: {self._why(longest)}",
+                (
+                    f"no horizon up to {self._format_time(longest)} is feasible, proven on {cells}:"
+                    f" {self._explain_infeasibility(longest)}"
+                ),
             )
         if best is None:
-            return "undecided", f"no horizon up to {self._in(longest)} was found feasible; {stuck}"
+            return "undecided", f"no horizon up to {self._format_time(longest)} was found feasible; {stuck}"
         if low == 0.0 and best.factor <= MET * self.width:
             return (
                 "unbounded",
-                f"feasible at every horizon that was looked at on the way down to {self._in(best.factor)}",
+                f"feasible at every horizon that was looked at on the way down to {self._format_time(best.factor)}",
             )
         if best.factor - low <= MET * self.width:
-            return "certified", f"no horizon up to {self._in(low)} is feasible, proven on {cells}: {self._why(low)}"
-        return "undecided", f"what is between {low:.9g} and {self._in(best.factor)} could not be proven: {stuck}"
+            return (
+                "certified",
+                (
+                    f"no horizon up to {self._format_time(low)} is feasible, proven on {cells}:"
+                    f" {self._explain_infeasibility(low)}"
+                ),
+            )
+        return (
+            "undecided",
+            f"what is between {low:.9g} and {self._format_time(best.factor)} could not be proven: {stuck}",
+        )
 
-    def _in(self, time: float) -> str:
+    def _format_time(self, time: float) -> str:
         """Return a time with its unit."""
         return f"{time:.9g} {self.problem.names.time}".rstrip()
 
-    def _why(self, horizon: float) -> str:
+    def _explain_infeasibility(self, horizon: float) -> str:
         point = self.points.get(horizon)
         return point.message if point is not None else "the constraints clash"
 
-    def _cover(self, scan: list[float]) -> str:
+    def _cover_horizons(self, scan: list[float]) -> str:
         """Cover horizons from 0 on by cells in which nothing is feasible, until one is feasible.
 
         Returns the reason where that did not succeed, else an empty text.
         """
         starts = [entry.start for entry in self.problem.windows]
-        starts.append(self._cells.changes)
+        starts.append(self._horizons.changes)
         # a window that begins after 0 divides a cell, since its rows exist for longer horizons only
         points = sorted({0.0, *scan, *(start for start in starts if 0.0 < start < self.problem.horizon)})
         cells, best = list(pairwise(points))[::-1], np.inf
@@ -139,39 +151,41 @@ class HorizonSearch:
             if low >= best:
                 break
             high = min(high, best)
-            status = self._run(high).status
+            status = self._run_horizon(high).status
             if status in FEASIBLE:
                 best = min(best, high)
-            elif status == "infeasible" and self._excluded(low, high):
+            elif status == "infeasible" and self._is_excluded(low, high):
                 self.covered.append((low, high))
-                self.told.say(f"no horizon up to {self._in(high)} is feasible")
+                self.told.say(f"no horizon up to {self._format_time(high)} is feasible")
                 continue
             short = high - low <= self.width
             if short and status in FEASIBLE:
                 break
-            reason = self._stuck(low, high, short)
+            reason = self._explain_stop(low, high, short)
             if reason:
-                self._descend(low, [point for point in (*points, best) if low < point <= best and np.isfinite(point)])
+                self._bisect_points(
+                    low, [point for point in (*points, best) if low < point <= best and np.isfinite(point)]
+                )
                 return reason
             cells += [((low + high) / 2, high), (low, (low + high) / 2)]
         return ""
 
-    def _stuck(self, low: float, high: float, short: bool) -> str:
+    def _explain_stop(self, low: float, high: float, short: bool) -> str:
         """Return the reason why an interval that was not excluded is not halved again; empty where it is."""
         point = self.points[high]
         if point.status not in (*FEASIBLE, "infeasible"):
-            return f"the run at {self._in(high)} is {point.status}: {point.message}"
-        if point.status == "infeasible" and high > self._cells.changes:
-            at = self._in(self._cells.changes)
+            return f"the run at {self._format_time(high)} is {point.status}: {point.message}"
+        if point.status == "infeasible" and high > self._horizons.changes:
+            at = self._format_time(self._horizons.changes)
             return f"the system changes at {at}, and beyond horizons are looked at one by one only"
         if short:
             left_out = (
                 "" if self.problem.control_step is None else "; control_step is left out of what excludes horizons"
             )
-            return f"no multipliers exclude {low:.9g} to {self._in(high)}{left_out}"
+            return f"no multipliers exclude {low:.9g} to {self._format_time(high)}{left_out}"
         return f"{MOST} runs did not suffice" if len(self.points) > MOST else ""
 
-    def _descend(self, low: float, points: list[float]) -> None:
+    def _bisect_points(self, low: float, points: list[float]) -> None:
         """Find the first feasible one of ``points`` beyond ``low``, and by bisection the shortest feasible horizon
         before it.
 
@@ -179,41 +193,45 @@ class HorizonSearch:
         """
         before = low
         for point in points:
-            if self._run(point).status in FEASIBLE:
+            if self._run_horizon(point).status in FEASIBLE:
                 while point - before > self.width:
                     middle = (before + point) / 2
-                    before, point = (before, middle) if self._run(middle).status in FEASIBLE else (middle, point)
+                    before, point = (
+                        (before, middle) if self._run_horizon(middle).status in FEASIBLE else (middle, point)
+                    )
                 return
             before = point
 
-    def _excluded(self, low: float, high: float) -> bool:
+    def _is_excluded(self, low: float, high: float) -> bool:
         """Return whether multipliers of a run at one of the two ends prove that nothing is feasible between them."""
-        multipliers = [self._multipliers(end) for end in (high, low)]
-        return any(self._cells.amount(rows, low, high) > 0.0 for rows in multipliers if rows)
+        multipliers = [self._find_multipliers(end) for end in (high, low)]
+        return any(self._horizons.amount(rows, low, high) > 0.0 for rows in multipliers if rows)
 
-    def _run(self, horizon: float) -> Point:
+    def _run_horizon(self, horizon: float) -> Point:
         """Return the run at a horizon, which is made only once."""
         if horizon not in self.points:
-            model, result = self._solved(self.problem, horizon, self.told.begin(horizon))
+            model, result = self._solve_horizon(self.problem, horizon, self.told.begin(horizon))
             self.points[horizon] = Point(
                 horizon, horizon, result.status, result.message, result.lower_bound, result.upper_bound
             )
             self.told.end(self.points[horizon])
             if result.status == "infeasible" and self.problem.control_step is None:
-                self._farkas[horizon] = _multipliers_of(model, result)
+                self._farkas_multipliers[horizon] = _extract_multipliers(model, result)
             if result.stopped:
                 self.tools.deadline.check()
         return self.points[horizon]
 
-    def _multipliers(self, horizon: float) -> list[Multiplier]:
+    def _find_multipliers(self, horizon: float) -> list[Multiplier]:
         """Return the multipliers that prove a horizon infeasible, without limits on steps, which no proof on cells
         covers."""
-        if horizon not in self._farkas and horizon > 0.0:
-            model, result = self._solved(self._bare, horizon)
-            self._farkas[horizon] = _multipliers_of(model, result) if result.status == "infeasible" else []
-        return self._farkas.get(horizon, [])
+        if horizon not in self._farkas_multipliers and horizon > 0.0:
+            model, result = self._solve_horizon(self._problem_without_steps, horizon)
+            self._farkas_multipliers[horizon] = (
+                _extract_multipliers(model, result) if result.status == "infeasible" else []
+            )
+        return self._farkas_multipliers.get(horizon, [])
 
-    def _solved(
+    def _solve_horizon(
         self, problem: OptimalControlProblem, horizon: float, notify: Notify = ignore
     ) -> tuple[Transcription, Result]:
         from sparserob_core.control.transcription.transcribe import prepare
@@ -279,7 +297,7 @@ def horizon_search(
         raise error if not error.path else error.under("of", HORIZON) from None
 
 
-def _multipliers_of(model: Transcription, result: Result) -> list[Multiplier]:
+def _extract_multipliers(model: Transcription, result: Result) -> list[Multiplier]:
     """Return the multipliers that prove a horizon infeasible, row by row.
 
     Rows of a curved set of controls are left out, since the proof takes the least value over that set.

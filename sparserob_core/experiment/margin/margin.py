@@ -103,19 +103,19 @@ def margin(
 
     tools = tools_of(loaded)
     with transcribed_by(tools.deadline):
-        search = _search(loaded, tools, str(of), float(tolerance), heard if broadcast.heard else notify)
+        search = _build_search(loaded, tools, str(of), float(tolerance), heard if broadcast.heard else notify)
     answer, stopped, deadline = "", "", search.tools.deadline
     try:
         if out is None and not write:
-            broadcast(_opening(search, Path()))
+            broadcast(_make_start_event(search, Path()))
             result = search.margin(int(curve))
         else:
             with create_directory(out, f"{name_of(loaded)}-margin", loaded.config.digest()) as directory:
                 heading = f"The experiment whose margin of {of} was sought."
                 directory.write_text("config.yaml", write_yaml(loaded.config.plain(), heading))
-                broadcast(_opening(search, directory.path))
+                broadcast(_make_start_event(search, directory.path))
                 result = search.margin(int(curve))
-                result = _written(directory, result, None if isinstance(search, HorizonSearch) else search.scaling)
+                result = _write_files(directory, result, None if isinstance(search, HorizonSearch) else search.scaling)
         answer, stopped = "; ".join(f"{name}: {value}" for name, value in margin_rows(result)[:3]), deadline.reason
         return result
     except BaseException as error:
@@ -129,7 +129,7 @@ def margin(
             )
 
 
-def _opening(search: MarginSearch | HorizonSearch, directory: Path) -> SweepStarted:
+def _make_start_event(search: MarginSearch | HorizonSearch, directory: Path) -> SweepStarted:
     """Return the first event for observers of a margin: a study of one axis without points."""
     scaled = None if isinstance(search, HorizonSearch) else search.scaling
     return SweepStarted(
@@ -156,7 +156,7 @@ def margin_rows(found: Margin) -> list[tuple[str, str]]:
     unit = f" {found.cost_unit}" if found.cost_unit else ""
     if found.of == HORIZON:
         rows += [
-            (f"shortest {found.quantity}", _between(found.lower, found.upper)),
+            (f"shortest {found.quantity}", _format_interval(found.lower, found.upper)),
             ("excluded", f"(0, {found.lower:.9g}] on {len(found.covered)} cells" if found.covered else "nothing"),
         ]
         if found.feasible is not None:
@@ -164,8 +164,8 @@ def margin_rows(found: Margin) -> list[tuple[str, str]]:
             rows.append(("proven feasible", f"at {found.upper:.9g}: {found.feasible.status}, cost {cost}"))
         return [*rows, ("seconds", f"{found.seconds:.3f}")]
     rows += [
-        (f"{found.sense} factor", _between(found.lower, found.upper)),
-        (found.quantity, _between(*found.amounts)),
+        (f"{found.sense} factor", _format_interval(found.lower, found.upper)),
+        (found.quantity, _format_interval(*found.amounts)),
     ]
     if np.isfinite(found.causal_upper):
         over = " (the time for the search was over)" if found.causal_ended == "seconds" else ""
@@ -189,7 +189,7 @@ def curve_rows(found: Margin) -> list[tuple[str, str, str, str]]:
     ]
 
 
-def _between(lower: float, upper: float) -> str:
+def _format_interval(lower: float, upper: float) -> str:
     if np.isnan(upper):
         return "none" if np.isnan(lower) else f"more than {lower:.9g}"
     if np.isposinf(upper):
@@ -197,7 +197,9 @@ def _between(lower: float, upper: float) -> str:
     return f"{lower:.9g} to {upper:.9g}" if lower != upper else f"{lower:.9g}"
 
 
-def _search(loaded: Loaded, tools: Tools, of: str, tolerance: float, notify: Notify) -> MarginSearch | HorizonSearch:
+def _build_search(
+    loaded: Loaded, tools: Tools, of: str, tolerance: float, notify: Notify
+) -> MarginSearch | HorizonSearch:
     from sparserob_core.control.transcription.terms.accumulated import accumulated
     from sparserob_core.control.transcription.transcribe import in_own_units, like, prepare, transcribe
 
@@ -209,16 +211,18 @@ def _search(loaded: Loaded, tools: Tools, of: str, tolerance: float, notify: Not
     if of == HORIZON:
         if policy is not None:
             raise InputError(path="policy.name", expected="open_loop for the margin of the horizon", got="feedback")
-        dictionaries, method = (control, disturbance), _method(loaded)
+        dictionaries, method = (control, disturbance), _choose_method(loaded)
         return horizon_search(experiment.title, problem, dictionaries, method, tools, tolerance, notify)
-    chosen = scaling(problem, of, *_positions(loaded, problem))
+    chosen = scaling(problem, of, *_find_positions(loaded, problem))
     programs = ParametricProgram(lambda factor: transcribe(chosen.at(factor), control, disturbance, policy=policy))
     joined: ParametricProgram | None = None
     if chosen.affine and policy is None:  # one program for all factors, in the units of the factor 1
         own, units = in_own_units(prepare(chosen.at(1.0), control, disturbance))
         joined = ParametricProgram(lambda factor: like(own, units.of_problem(accumulated(chosen.at(factor)))))
     width = tolerance * (1.0 if chosen.relative else chosen.highest)
-    search = MarginSearch(experiment.title, programs, joined, chosen, _method(loaded), tools, width, Points(of, notify))
+    search = MarginSearch(
+        experiment.title, programs, joined, chosen, _choose_method(loaded), tools, width, Points(of, notify)
+    )
     if policy is None or of != "disturbance":
         return search
 
@@ -234,7 +238,7 @@ def _search(loaded: Loaded, tools: Tools, of: str, tolerance: float, notify: Not
     return replace(search, beyond=beyond)
 
 
-def _positions(loaded: Loaded, problem: OptimalControlProblem) -> tuple[list[list[int]], list[list[int]]]:
+def _find_positions(loaded: Loaded, problem: OptimalControlProblem) -> tuple[list[list[int]], list[list[int]]]:
     """Return for every entry of ``path`` and of ``terminal`` in the config the positions of its sets in the problem.
 
     An entry may have become no set, one or several.
@@ -244,12 +248,14 @@ def _positions(loaded: Loaded, problem: OptimalControlProblem) -> tuple[list[lis
         return [[i] for i in range(len(problem.path))], [[i] for i in range(len(problem.terminal))]
     states = problem.system.states
     entries = [item.entries(f"path.{i}", states, factory.horizon) for i, item in enumerate(factory.path)]
-    members = [[_restricts(constraint.set) for constraint in entry] for entry in entries]
-    ends = [[_restricts(end) for end in item.ends(f"terminal.{i}", states)] for i, item in enumerate(factory.terminal)]
-    return _counted(members), _counted(ends)
+    members = [[_is_restrictive(constraint.set) for constraint in entry] for entry in entries]
+    ends = [
+        [_is_restrictive(end) for end in item.ends(f"terminal.{i}", states)] for i, item in enumerate(factory.terminal)
+    ]
+    return _number_members(members), _number_members(ends)
 
 
-def _restricts(one: Any) -> bool:
+def _is_restrictive(one: Any) -> bool:
     """Return whether a set or an equality is more than the whole space; a problem drops those that are not."""
     if hasattr(one, "fixed"):
         return bool(one.fixed.size)
@@ -257,12 +263,12 @@ def _restricts(one: Any) -> bool:
     return flat is None or flat[1].size > 0
 
 
-def _counted(kept: Sequence[Sequence[bool]]) -> list[list[int]]:
+def _number_members(kept: Sequence[Sequence[bool]]) -> list[list[int]]:
     numbers = iter(range(sum(map(sum, kept))))
     return [[next(numbers) for keep in entry if keep] for entry in kept]
 
 
-def _method(loaded: Loaded) -> Exchange:
+def _choose_method(loaded: Loaded) -> Exchange:
     """Return the exchange method of the config, or one with default options where the config has another method.
 
     A margin asks which factors are feasible, not how well another method performs.
@@ -272,7 +278,7 @@ def _method(loaded: Loaded) -> Exchange:
     return built if isinstance(built, Exchange) else Exchange()
 
 
-def _written(directory: RunDirectory, found: Margin, varied: Scaling | None) -> Margin:
+def _write_files(directory: RunDirectory, found: Margin, varied: Scaling | None) -> Margin:
     """Write the files of a margin, and return it with its directory.
 
     The figure is an extra: where it cannot be drawn, the numbers are written all the same, and there is a warning.

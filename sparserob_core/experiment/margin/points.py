@@ -55,7 +55,7 @@ class Points:
         """Report the beginning of a run at a factor; returns the function that receives its events."""
         position, self.count = self.count, self.count + 1
         text = f"{self.of} at {factor:.9g} is run"
-        self._tell(text, found=[(float(factor),)], now=[position], running=1)
+        self._report_progress(text, found=[(float(factor),)], now=[position], running=1)
 
         def moved(number: int, lower: float, upper: float) -> None:
             self.notify(
@@ -72,9 +72,11 @@ class Points:
         self.rows[position] = finite(
             {**answer, "lower_bound": point.lower_bound, "upper_bound": point.upper_bound, "gap": gap}
         )
-        self._tell(f"{self.of} at {point.factor:.9g}: {point.status}", row=self.rows[position], places=[position])
+        self._report_progress(
+            f"{self.of} at {point.factor:.9g}: {point.status}", row=self.rows[position], places=[position]
+        )
 
-    def _tell(self, text: str, **more: Any) -> None:
+    def _report_progress(self, text: str, **more: Any) -> None:
         self.notify(
             SweepProgress(
                 text=text, done=len(self.rows), total=self.count, seconds=self.seconds, axes=[self.of], **more

@@ -92,9 +92,9 @@ def scaling(
     InputError
         If the problem has no such part (the message has the most similar name), or the part cannot be scaled.
     """
-    choices = dict(_choices(problem, members, ends))
+    choices = dict(_list_choices(problem, members, ends))
     if of in choices:
-        return _measured(choices[of](), problem)
+        return _add_units(choices[of](), problem)
     absent = {
         "disturbance": problem.disturbance,
         "parameters": problem.system.parameters,
@@ -111,7 +111,7 @@ def scaling(
     raise InputError(f"of: expected what is to be varied, got '{of}'{nearest(of, {*choices, 'horizon'})}")
 
 
-def _measured(chosen: Scaling, problem: OptimalControlProblem) -> Scaling:
+def _add_units(chosen: Scaling, problem: OptimalControlProblem) -> Scaling:
     """Return a scaling with the unit of its quantity, where the problem names a single one for it."""
     names = problem.names
     of_states = joined(set(names.state_units)) if len(set(names.state_units)) == 1 else ""
@@ -128,68 +128,71 @@ def _measured(chosen: Scaling, problem: OptimalControlProblem) -> Scaling:
     return replace(chosen, label=label, quantity=quantity, cost_unit=problem.cost_unit)
 
 
-def _choices(
+def _list_choices(
     problem: OptimalControlProblem, members: Sequence[Sequence[int]], ends: Sequence[Sequence[int]]
 ) -> Iterator[tuple[str, Callable[[], Scaling]]]:
     if problem.disturbance is not None:
         label = "factor on the disturbance set"
-        yield "disturbance", partial(_set, problem, "disturbance", label, "largest", "largest |w_i|")
+        yield "disturbance", partial(_scale_set, problem, "disturbance", label, "largest", "largest |w_i|")
     if problem.system.parameters is not None:
-        yield "parameters", partial(_parameters, problem)
-    yield "initial_state", partial(_initial_state, problem)
-    yield "control", partial(_control, problem)
+        yield "parameters", partial(_scale_parameters, problem)
+    yield "initial_state", partial(_scale_initial_state, problem)
+    yield "control", partial(_scale_control, problem)
     if problem.control_step is not None:
         label = "factor on the steps of the control"
-        yield "control_step", partial(_set, problem, "control_step", label, "smallest", "largest step of a control")
+        yield (
+            "control_step",
+            partial(_scale_set, problem, "control_step", label, "smallest", "largest step of a control"),
+        )
     if problem.execution is not None:
-        yield "execution", partial(_execution, problem)
+        yield "execution", partial(_scale_execution, problem)
     of_sums = {name: [[i] for i in range(len(entries))] for name, entries in problem.sums.items()}
     for name, places in {"path": members, **of_sums, "terminal": ends}.items():
         for of, positions in ((f"{name}.{i}", positions) for i, positions in enumerate(places) if positions):
-            yield of, partial(_listed, problem, name, of, positions)
+            yield of, partial(_scale_constraints, problem, name, of, positions)
             if name == "path":
-                yield f"{of}.from", partial(_window, problem, of, positions)
+                yield f"{of}.from", partial(_shift_window, problem, of, positions)
 
 
-def _set(problem: OptimalControlProblem, of: str, label: str, sense: Sense, quantity: str) -> Scaling:
+def _scale_set(problem: OptimalControlProblem, of: str, label: str, sense: Sense, quantity: str) -> Scaling:
     """Return the scaling of a set, the field ``of`` of the problem."""
-    resized = _resizing(of, getattr(problem, of))
+    resized = _make_scaler(of, getattr(problem, of))
     return Scaling(
-        of, label, sense, lambda f: replace(problem, **{of: resized(f)}), quantity, lambda f: _reach(resized(f))
+        of, label, sense, lambda f: replace(problem, **{of: resized(f)}), quantity, lambda f: _compute_reach(resized(f))
     )
 
 
-def _listed(problem: OptimalControlProblem, field: str, of: str, positions: Sequence[int]) -> Scaling:
+def _scale_constraints(problem: OptimalControlProblem, field: str, of: str, positions: Sequence[int]) -> Scaling:
     """Return the scaling of the constraints of a list of the problem that come from one entry of a config."""
     entries = list(getattr(problem, field))
-    resized = {i: _resizing(of, entries[i]) for i in positions}
+    resized = {i: _make_scaler(of, entries[i]) for i in positions}
 
     def at(factor: float) -> OptimalControlProblem:
         scaled: Any = [resized[i](factor) if i in resized else entry for i, entry in enumerate(entries)]
         return replace(problem, **{field: scaled})
 
-    width = max(_half_width(_bounds(entries[i])) for i in positions)
+    width = max(_compute_half_width(_get_bounds(entries[i])) for i in positions)
     kind = "bounds" if field in problem.sums else "set"
-    return Scaling(of, f"factor on the {kind} {of}", "smallest", at, "largest half-width", _times(width))
+    return Scaling(of, f"factor on the {kind} {of}", "smallest", at, "largest half-width", _multiply_by(width))
 
 
-def _parameters(problem: OptimalControlProblem) -> Scaling:
+def _scale_parameters(problem: OptimalControlProblem) -> Scaling:
     bound, system = problem.system.parameters, problem.system
     assert bound is not None
-    resized = _resizing("parameters", bound)
+    resized = _make_scaler("parameters", bound)
     return Scaling(
         "parameters",
         "factor on the set of parameters",
         "largest",
         lambda f: replace(problem, system=system.with_parameters(resized(f))),
         "largest half-width of a parameter",
-        _times(_half_width(bound)),
+        _multiply_by(_compute_half_width(bound)),
         affine=False,
         highest=MOST_UNCERTAIN,
     )
 
 
-def _initial_state(problem: OptimalControlProblem) -> Scaling:
+def _scale_initial_state(problem: OptimalControlProblem) -> Scaling:
     """Return the scaling of the set of deviations about the centre, or of the initial state where there is no set."""
     bound = problem.initial_set
     if problem.repeat:
@@ -206,8 +209,8 @@ def _initial_state(problem: OptimalControlProblem) -> Scaling:
             # scaled about the centre, which is the deviation 0, not about the middle of the deviations
             lambda f: replace(problem, initial_set=bound.in_units(ones / f) if f > 0.0 else None),
             "largest deviation of x_i(0)",
-            _times(float(reach.max())),
-            unit=_of_largest(problem, reach),
+            _multiply_by(float(reach.max())),
+            unit=_find_unit(problem, reach),
         )
     state = np.asarray(problem.initial_state, dtype=float)
     if not state.any():
@@ -218,28 +221,28 @@ def _initial_state(problem: OptimalControlProblem) -> Scaling:
         "largest",
         lambda f: replace(problem, initial_state=f * state),
         "largest |x_i(0)|",
-        _times(float(np.abs(state).max())),
+        _multiply_by(float(np.abs(state).max())),
         nested=False,
-        unit=_of_largest(problem, np.abs(state)),
+        unit=_find_unit(problem, np.abs(state)),
     )
 
 
-def _of_largest(problem: OptimalControlProblem, sizes: Array) -> str:
+def _find_unit(problem: OptimalControlProblem, sizes: Array) -> str:
     """Return the unit of the states with the largest of the ``sizes (d,)``, where they have the same one."""
     names, states = problem.names.state_units, np.flatnonzero(sizes == sizes.max()).tolist()
     units = {names[state] for state in states if names}
     return units.pop() if len(units) == 1 else ""
 
 
-def _control(problem: OptimalControlProblem) -> Scaling:
+def _scale_control(problem: OptimalControlProblem) -> Scaling:
     paths = problem.windows
     named = [i for i, entry in enumerate(paths) if entry.name == "control"]
     if named:  # where the rate is the input, the bounds of the control are constraints of the augmented state
-        return replace(_listed(problem, "path", "control", named), label=CONTROL)
-    return _set(problem, "control", CONTROL, "smallest", "largest |u_i|")
+        return replace(_scale_constraints(problem, "path", "control", named), label=CONTROL)
+    return _scale_set(problem, "control", CONTROL, "smallest", "largest |u_i|")
 
 
-def _execution(problem: OptimalControlProblem) -> Scaling:
+def _scale_execution(problem: OptimalControlProblem) -> Scaling:
     shares = np.atleast_1d(np.asarray(problem.execution, dtype=float))
     largest = float(shares.max())
     return Scaling(
@@ -248,13 +251,13 @@ def _execution(problem: OptimalControlProblem) -> Scaling:
         "largest",
         lambda f: replace(problem, execution=np.minimum(f * shares, 1.0)),
         "largest share of a command",
-        _times(largest),
+        _multiply_by(largest),
         affine=False,  # the factor multiplies the sizes of the decision
         highest=1.0 / largest,
     )
 
 
-def _window(problem: OptimalControlProblem, path: str, positions: Sequence[int]) -> Scaling:
+def _shift_window(problem: OptimalControlProblem, path: str, positions: Sequence[int]) -> Scaling:
     paths = problem.windows
     latest = min(problem.horizon if paths[i].stop is None else float(paths[i].stop or 0.0) for i in positions)
     if any(paths[i].lasting for i in positions):
@@ -274,27 +277,27 @@ def _window(problem: OptimalControlProblem, path: str, positions: Sequence[int])
             problem, path=[replace(entry, start=start) if i in positions else entry for i, entry in enumerate(paths)]
         ),
         "start of the window",
-        _times(1.0),
+        _multiply_by(1.0),
         affine=False,
         relative=False,
         highest=latest,
     )
 
 
-def _bounds(value: Any) -> ConvexSet:
+def _get_bounds(value: Any) -> ConvexSet:
     """Return a set, or the set of a constraint."""
     bounds: ConvexSet = getattr(value, "bounds", value)
     return bounds
 
 
-def _resizing(of: str, value: Any) -> Callable[[float], Any]:
+def _make_scaler(of: str, value: Any) -> Callable[[float], Any]:
     """Return a function that scales a set, or a constraint, by a factor about its middle.
 
     A curved set stays curved, however small the factor. Raises `InputError` for a single point, and for a set without a
     middle.
     """
     try:
-        bound = _bounds(value)
+        bound = _get_bounds(value)
     except InputError as error:
         raise InputError(f"of: {of} {error.sentence}") from None
     try:
@@ -311,15 +314,15 @@ def _resizing(of: str, value: Any) -> Callable[[float], Any]:
     return lambda factor: value.scaled(max(factor, least))
 
 
-def _reach(bound: ConvexSet) -> float:
+def _compute_reach(bound: ConvexSet) -> float:
     return float(bound.reach(np.eye(bound.dimension)).max())
 
 
-def _times(base: float) -> Callable[[float], float]:
+def _multiply_by(base: float) -> Callable[[float], float]:
     return lambda factor: factor * base
 
 
-def _half_width(bound: ConvexSet) -> float:
+def _compute_half_width(bound: ConvexSet) -> float:
     """Return half the width of the widest bounded side.
 
     It is the largest bound where a set is free on one side of every coordinate.

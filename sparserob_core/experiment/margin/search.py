@@ -177,14 +177,14 @@ class MarginSearch:
         try:
             self.told.say(f"looking for the {self.scaling.sense} factor of {self.scaling.of}")
             with self.tools.deadline.enforced():
-                critical = self._found()
+                critical = self._find_critical()
                 self.cuts = critical.cuts
-                sides = self._sides(critical)
+                sides = self._prove_sides(critical)
                 feasible = sides[2]
-                curve = self._curve(feasible, sides[0], count) if feasible is not None else ()
+                curve = self._trace_curve(feasible, sides[0], count) if feasible is not None else ()
         except KeyboardInterrupt as interrupt:
             reason = str(interrupt) or "interrupted from the keyboard"
-            sides, points = self._known(reason, sides)
+            sides, points = self._collect_known(reason, sides)
             curve = points if count else ()
         causal, ended = np.nan, None
         if self.beyond is not None:
@@ -218,7 +218,7 @@ class MarginSearch:
             seconds=time.perf_counter() - started,
         )
 
-    def _found(self) -> Critical:
+    def _find_critical(self) -> Critical:
         """Return the critical factor.
 
         For a largest factor the factor 0 is run first, so that a search that ends early knows whether anything is
@@ -229,7 +229,7 @@ class MarginSearch:
         arguments = self.programs, self.joined, self.scaling, self.tools, self.width
         return critical_factor(*arguments, self.told.notify, self.seen)
 
-    def _known(self, said: str, sides: Sides | None) -> tuple[Sides, tuple[Point, ...]]:
+    def _collect_known(self, said: str, sides: Sides | None) -> tuple[Sides, tuple[Point, ...]]:
         """Return the sides that an interrupted search knows, and every proven run on the feasible side as a curve.
 
         They are both sides where these were proven before. Otherwise they are the nearest two runs of which each proves
@@ -248,12 +248,12 @@ class MarginSearch:
         note = "" if proven or refused else ", of which none proves anything" if self.points else ": nothing is proven"
         return ("undecided", f"{said} after {len(self.points)} runs{note}{hint}", feasible, infeasible), tuple(proven)
 
-    def _sides(self, found: Critical) -> Sides:
+    def _prove_sides(self, found: Critical) -> Sides:
         largest = self.scaling.sense == "largest"
         if found.status == "unknown":
             return "undecided", f"no critical factor was found: {found.message}", None, None
         if found.status == "never":
-            return self._never(found)
+            return self._prove_infeasible(found)
         if found.status == "always":
             feasible = self.run(found.good)
             words = (
@@ -264,7 +264,10 @@ class MarginSearch:
             proven = feasible.status in FEASIBLE
             return ("unbounded" if proven else "undecided"), words if proven else feasible.message, feasible, None
         outward = 1.0 if largest else -1.0
-        good, bad = self._proven(found.good, -outward, FEASIBLE), self._proven(found.bad, outward, ("infeasible",))
+        good, bad = (
+            self._find_proven_run(found.good, -outward, FEASIBLE),
+            self._find_proven_run(found.bad, outward, ("infeasible",)),
+        )
         if good is None or bad is None:
             return (
                 "undecided",
@@ -274,7 +277,7 @@ class MarginSearch:
             )
         return "certified", f"beyond it: {bad.message}", good, bad
 
-    def _never(self, found: Critical) -> Sides:
+    def _prove_infeasible(self, found: Critical) -> Sides:
         """Return the sides where nothing is feasible; the run at the most favourable factor says why."""
         best_factor = (
             {"largest": 0.0, "smallest": self.scaling.highest}[self.scaling.sense] if self.scaling.nested else 1.0
@@ -289,13 +292,13 @@ class MarginSearch:
         at = f"even at {best_factor:g} " if self.scaling.nested else ""
         return "infeasible", f"{at}nothing is feasible: {point.message}", None, point
 
-    def _proven(self, factor: float, outward: float, wanted: tuple[Status, ...]) -> Point | None:
+    def _find_proven_run(self, factor: float, outward: float, wanted: tuple[Status, ...]) -> Point | None:
         """Return the run nearest to the critical factor whose status is one of those ``wanted`` on that side."""
         width = self.width * (max(1.0, abs(factor)) if self.scaling.affine else 1.0)
         candidates = [float(np.clip(factor + outward * step * width, 0.0, self.scaling.highest)) for step in FARTHER]
         first = None
         if "infeasible" in wanted:  # without this test, a run too close to the critical factor would take very long
-            first = next((i for i, candidate in enumerate(candidates) if self._excludes(candidate)), None)
+            first = next((i for i, candidate in enumerate(candidates) if self._is_excluded(candidate)), None)
         initial_cuts = () if first is None else self.cuts
         for candidate in candidates[: len(STEPS)] if first is None else candidates[first:]:
             point = self.run(candidate, initial_cuts)
@@ -303,7 +306,7 @@ class MarginSearch:
                 return point
         return None
 
-    def _excludes(self, factor: float) -> bool:
+    def _is_excluded(self, factor: float) -> bool:
         """Return whether the active constraints at the critical factor alone are infeasible at another factor."""
         if not self.cuts:
             return False
@@ -315,7 +318,7 @@ class MarginSearch:
         relaxed = RelaxedProgram(program, self.tools.solver, deadline=self.tools.deadline)
         return relaxed.solve(rows, 0.0).status == "infeasible"
 
-    def _close(self, begun: Sequence[Cut], program: SemiInfiniteProgram, tools: Tools) -> Result:
+    def _solve_from_cuts(self, begun: Sequence[Cut], program: SemiInfiniteProgram, tools: Tools) -> Result:
         """Return the result of a program in its own units, whose run begins with the constraints ``begun``."""
         return self.method.close(program, tools, prover_of(program, tools), shifted(begun, 0.0, program))
 
@@ -339,7 +342,7 @@ class MarginSearch:
                 return point
         amount, tools = self.scaling.amount(factor), replace(self.tools, notify=self.told.begin(factor))
         try:
-            result = answered_in_own_units(partial(self._close, begun), self.programs.program(factor), tools)
+            result = answered_in_own_units(partial(self._solve_from_cuts, begun), self.programs.program(factor), tools)
         except InputError as error:
             point = Point(factor, amount, "failed", str(error), -np.inf, np.inf)
             self.told.end(point)
@@ -352,7 +355,7 @@ class MarginSearch:
             self.tools.deadline.check()
         return point
 
-    def _curve(self, feasible: Point, status: Answer, count: int) -> tuple[Point, ...]:
+    def _trace_curve(self, feasible: Point, status: Answer, count: int) -> tuple[Point, ...]:
         """Return runs from the feasible side of the critical factor to no uncertainty, or to a set twice as large."""
         if count == 0:
             return ()

@@ -38,7 +38,7 @@ class Part:
     of: type | None = None
 
 
-def _clash(first: Plugin, second: Plugin) -> str:
+def _describe_duplicate(first: Plugin, second: Plugin) -> str:
     """Return the error of two records with one name: their plugins, and the setting that disables one of them."""
     who = [
         f"by plugin '{record.plugin}'" + (f" ({record.source})" if record.source else "") for record in (first, second)
@@ -53,13 +53,13 @@ def parts(model: type[Options]) -> dict[str, Part]:
     """Return the options that are components themselves, by name, as `sparserob_core.options.part` marks them."""
     extras = {key: field.json_schema_extra for key, field in model.model_fields.items()}
     return {
-        key: Part(str(extra["component"]), _class(str(extra["of"])) if "of" in extra else None)
+        key: Part(str(extra["component"]), _import_class(str(extra["of"])) if "of" in extra else None)
         for key, extra in extras.items()
         if isinstance(extra, dict) and "component" in extra
     }
 
 
-def _class(place: str) -> type:
+def _import_class(place: str) -> type:
     module, _, name = place.partition(":")
     component_class: type = getattr(import_module(module), name)
     return component_class
@@ -78,15 +78,15 @@ class Registry:
     ) -> None:
         self._hint = hint
         self.failures = tuple(failures)
-        self._disabled = tuple(disabled)
+        self._disabled_names = tuple(disabled)
         self._records: dict[str, dict[str, Plugin]] = {kind: {} for kind in RECORDS}
         for record in records:
-            self._add(record)
+            self._add_record(record)
 
-    def _add(self, record: Plugin) -> None:
+    def _add_record(self, record: Plugin) -> None:
         records = self._records[record.kind]
         if record.name in records:
-            raise UnknownPluginError(_clash(records[record.name], record))
+            raise UnknownPluginError(_describe_duplicate(records[record.name], record))
         records[record.name] = record
 
     def names(self, kind: str, of: type | None = None) -> list[str]:
@@ -168,7 +168,7 @@ class Registry:
         for key, component in parts(model).items():
             entry = values.get(key, model.model_fields[key].default)
             if isinstance(entry, str | Mapping):
-                values[key], faults = self._spelt_out(component, entry)
+                values[key], faults = self._spell_out(component, entry)
                 wrong += [fault.under((key,)) for fault in faults]
                 if faults:
                     del values[key]  # its errors are reported already
@@ -179,7 +179,7 @@ class Registry:
             return None, [*complaints(error, model, options), *wrong]
         return (None if wrong else checked), wrong
 
-    def _spelt_out(self, part: Part, entry: str | Mapping[str, Any]) -> tuple[object, list[Complaint]]:
+    def _spell_out(self, part: Part, entry: str | Mapping[str, Any]) -> tuple[object, list[Complaint]]:
         """Return a component within another one's options as a mapping with its name and all its options, and the
         errors."""
         name, options = (
@@ -221,13 +221,13 @@ class Registry:
         if checked is None:
             raise InputError("\n".join(f"{kind} {name}: {complaint}" for complaint in wrong))
         inner = {
-            key: self._part(component, value)
+            key: self._build_part(component, value)
             for key, component in parts(type(checked)).items()
             if isinstance(value := getattr(checked, key), Mapping)
         }
         return self.get(kind, name).create(checked.model_copy(update=inner))
 
-    def _part(self, part: Part, entry: Mapping[str, Any]) -> object:
+    def _build_part(self, part: Part, entry: Mapping[str, Any]) -> object:
         """Return a component within another one's options, wrapped in the check of its kind."""
         record = self.get(part.kind, entry["name"], part.of)
         built = self.build(part.kind, entry["name"], {key: entry[key] for key in entry if key != "name"})
@@ -252,5 +252,5 @@ class Registry:
         """Return the reasons why a name may be missing, one line each: plugins that failed, are disabled, or are not
         loaded."""
         notes = [f"\n  note: {failure}" for failure in self.failures]
-        notes += [f"\n  note: plugin '{plugin}' is disabled by {DISABLE}" for plugin in self._disabled]
+        notes += [f"\n  note: plugin '{plugin}' is disabled by {DISABLE}" for plugin in self._disabled_names]
         return "".join([*notes, f"\n  note: {self._hint}" if self._hint else ""])

@@ -235,7 +235,7 @@ class _Regulariser(Regulariser):
             raise InputError(f"{self.origin}: quadratic: {error}") from error
 
 
-def _rule(kind: type, expected: tuple[type, ...], words: str) -> Callable[[Any, str], object]:
+def _make_rule_guard(kind: type, expected: tuple[type, ...], words: str) -> Callable[[Any, str], object]:
     """Return the check of a kind of rules, which are functions."""
 
     def guard(rule: Callable[..., object], origin: str) -> object:
@@ -259,8 +259,8 @@ GUARDS: dict[type, Callable[[Any, str], Any]] = {
     Solver: _Solver,
     Maximiser: _Maximiser,
     Regulariser: _Regulariser,
-    Schedule: _rule(Schedule, NUMBER, "a number"),
-    OuterStop: _rule(OuterStop, TRUTH, "true or false"),
-    InnerStop: _rule(InnerStop, TRUTH, "true or false"),
-    Selection: _rule(Selection, TRUTH, "true or false"),
+    Schedule: _make_rule_guard(Schedule, NUMBER, "a number"),
+    OuterStop: _make_rule_guard(OuterStop, TRUTH, "true or false"),
+    InnerStop: _make_rule_guard(InnerStop, TRUTH, "true or false"),
+    Selection: _make_rule_guard(Selection, TRUTH, "true or false"),
 }

@@ -98,7 +98,7 @@ def hookimpl(function: Function) -> Function:
     return _implementation(function)
 
 
-def _specification(record: type[Plugin]) -> object:
+def _make_specification(record: type[Plugin]) -> object:
     def hook() -> Iterable[Plugin]:
         return ()
 
@@ -116,7 +116,7 @@ own."""
 SchedulePlugin = OuterStopPlugin = InnerStopPlugin = SelectionPlugin = RulePlugin
 
 SPECIFICATIONS = type(
-    "Specifications", (), {name: _specification(record) for name, record in {**FORMER, **HOOKS}.items()}
+    "Specifications", (), {name: _make_specification(record) for name, record in {**FORMER, **HOOKS}.items()}
 )
 
 

@@ -104,18 +104,18 @@ def complaints(
     items = error.errors(include_url=False)
     misspelt = [item["loc"] for item in items if item["type"] == "extra_forbidden"]
     for item in items:
-        if item["type"] == "missing" and any(_meant(loc, item["loc"]) for loc in misspelt):
+        if item["type"] == "missing" and any(_is_misspelling(loc, item["loc"]) for loc in misspelt):
             continue  # the error of the unknown key with a similar name shows this one
         path = visible(item["loc"], data, missing=item["type"] == "missing")
         path += tuple(item.get("ctx", {}).get("below", ())) if item["type"] == COMPLAINT else ()
         faults = faults_by_path.setdefault(path, [])
-        fault = _fault(dict(item), model, below)
+        fault = _describe_fault(dict(item), model, below)
         if fault not in faults:
             faults.append(fault)
-    return [Complaint(path, _joined(faults)) for path, faults in faults_by_path.items()]
+    return [Complaint(path, _join_faults(faults)) for path, faults in faults_by_path.items()]
 
 
-def _joined(faults: list[tuple[str, str]]) -> str:
+def _join_faults(faults: list[tuple[str, str]]) -> str:
     """Return the errors of one key as one sentence; a value that several of them name stands once, at the end."""
     last = faults[-1][1]
     return " or ".join(
@@ -124,7 +124,7 @@ def _joined(faults: list[tuple[str, str]]) -> str:
     )
 
 
-def _meant(written: Path, missing: Path) -> bool:
+def _is_misspelling(written: Path, missing: Path) -> bool:
     """Return whether an unknown key is similar to a missing one at the same level."""
     near = difflib.get_close_matches(str(written[-1]).lower(), [str(missing[-1])], n=1, cutoff=0.6)
     return written[:-1] == missing[:-1] and bool(near)
@@ -145,7 +145,7 @@ def visible(loc: Path, data: object, missing: bool = False) -> Path:
     return tuple(path)
 
 
-def _fault(item: dict[str, Any], model: type[BaseModel], below: Sequence[str]) -> tuple[str, str]:
+def _describe_fault(item: dict[str, Any], model: type[BaseModel], below: Sequence[str]) -> tuple[str, str]:
     """Return the error in words, and the value that was given.
 
     The value is empty where the sentence names it, or there is none.
@@ -155,7 +155,7 @@ def _fault(item: dict[str, Any], model: type[BaseModel], below: Sequence[str]) -
         case "missing":
             return "missing, and it has no default", ""
         case "extra_forbidden":
-            keys = _known_keys(model, item["loc"][:-1])
+            keys = _list_known_keys(model, item["loc"][:-1])
             lower_keys = below if len(item["loc"]) == 1 else ()
             sentence = nearest(str(item["loc"][-1]), keys, lower_keys) if keys else "; it has no options"
             return f"unknown key{sentence}", ""
@@ -174,7 +174,7 @@ def _fault(item: dict[str, Any], model: type[BaseModel], below: Sequence[str]) -
             return sentence, got
 
 
-def _known_keys(model: type[BaseModel], loc: Path) -> set[str]:
+def _list_known_keys(model: type[BaseModel], loc: Path) -> set[str]:
     models = {model}
     for step in loc:
         named = {inner for inner in models if inner.__name__ == step}

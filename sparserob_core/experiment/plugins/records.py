@@ -223,8 +223,8 @@ class Plugin:
         expected = getattr(import_module(module), attribute)
         if factory is type(options):
             return asked(self.origin, "building it", lambda: options, expected)
-        return asked(self.origin, "building it", lambda: factory(**_fields(options)), expected)
+        return asked(self.origin, "building it", lambda: factory(**_get_fields(options)), expected)
 
 
-def _fields(options: Options) -> Mapping[str, object]:
+def _get_fields(options: Options) -> Mapping[str, object]:
     return {name: getattr(options, name) for name in type(options).model_fields}

@@ -35,7 +35,7 @@ Finder: TypeAlias = Callable[[Sequence[str], list[Failure]], list[metadata.Entry
 
 OWN = "sparserob"  # the name of this distribution
 
-_free: list[pluggy.PluginManager] = []
+_free_managers: list[pluggy.PluginManager] = []
 """Managers that know the hooks and hold no plugin. They are kept, since adding the hooks takes as long as all the rest.
 """
 
@@ -63,7 +63,7 @@ def load_own_registry(extra_paths: Iterable[str | Path] = ()) -> Registry:
     PluginError
         If a plugin file fails.
     """
-    return _with_files(_own(_disabled()), extra_paths, UNTRUSTED)
+    return _add_files(_load_own(_list_disabled()), extra_paths, UNTRUSTED)
 
 
 def load_registry(extra_paths: Iterable[str | Path] = (), entry_points: bool = True) -> Registry:
@@ -90,31 +90,31 @@ def load_registry(extra_paths: Iterable[str | Path] = (), entry_points: bool = T
         If a plugin file fails, as the user has named it.
     """
     if not entry_points:
-        return _with_files(_load(_disabled(), lambda disabled, failures: []), extra_paths)
-    return _with_files(_installed(_disabled()), extra_paths)
+        return _add_files(_load_plugins(_list_disabled(), lambda disabled, failures: []), extra_paths)
+    return _add_files(_load_installed(_list_disabled()), extra_paths)
 
 
-def _with_files(known: Registry, extra_paths: Iterable[str | Path], hint: str = "") -> Registry:
+def _add_files(known: Registry, extra_paths: Iterable[str | Path], hint: str = "") -> Registry:
     paths = tuple(path_of(path).resolve() for path in extra_paths)
-    return Registry([*known.records(), *_of_files(paths)], known.failures, _disabled(), hint) if paths else known
+    return Registry([*known.records(), *_load_files(paths)], known.failures, _list_disabled(), hint) if paths else known
 
 
-def _disabled() -> tuple[str, ...]:
+def _list_disabled() -> tuple[str, ...]:
     return tuple(sorted({name.strip() for name in os.environ.get(DISABLE, "").split(",")} - {""}))
 
 
 @cache
-def _installed(disabled: tuple[str, ...]) -> Registry:
-    return _load(disabled, _entry_points)
+def _load_installed(disabled: tuple[str, ...]) -> Registry:
+    return _load_plugins(disabled, _list_entry_points)
 
 
 @cache
-def _own(disabled: tuple[str, ...]) -> Registry:
-    return _load(disabled, _own_entry_points, UNTRUSTED)
+def _load_own(disabled: tuple[str, ...]) -> Registry:
+    return _load_plugins(disabled, _list_own_entry_points, UNTRUSTED)
 
 
 @dataclass(frozen=True)
-class _Loaded:
+class _LoadedPlugin:
     """A plugin: its name, its file or distribution, and its module."""
 
     name: str
@@ -122,56 +122,58 @@ class _Loaded:
     module: ModuleType
 
 
-def _load(disabled: Sequence[str], installed: Finder, hint: str = "") -> Registry:
+def _load_plugins(disabled: Sequence[str], installed: Finder, hint: str = "") -> Registry:
     from sparserob_core.experiment.plugins import builtin
 
-    plugins, failures = [_Loaded("core", "", builtin)], list[Failure]()
+    plugins, failures = [_LoadedPlugin("core", "", builtin)], list[Failure]()
     for entry in installed(disabled, failures):
-        with _noted(failures, _identity(entry)):
+        with _collect_failures(failures, _describe_entry(entry)):
             module = entry.load()
             if module is not builtin:
-                plugins.append(_Loaded(entry.name, _source(entry), module))
+                plugins.append(_LoadedPlugin(entry.name, _describe_source(entry), module))
     records: list[Plugin] = []
     for plugin in plugins:
-        with _noted(failures, plugin.name):
-            records += _records(plugin)
+        with _collect_failures(failures, plugin.name):
+            records += _collect_records(plugin)
     return Registry(records, failures, disabled, hint)
 
 
-def _of_files(paths: Sequence[Path]) -> Iterator[Plugin]:
+def _load_files(paths: Sequence[Path]) -> Iterator[Plugin]:
     """Yield the records of plugin files, which are executed anew.
 
     The user has named these files, so that a failure is an error.
     """
     for file in paths:
-        yield from _records(_Loaded(file.stem, str(file), _module(file)))
+        yield from _collect_records(_LoadedPlugin(file.stem, str(file), _load_module(file)))
 
 
 @contextmanager
-def _noted(failures: list[Failure], plugin: str) -> Iterator[None]:
+def _collect_failures(failures: list[Failure], plugin: str) -> Iterator[None]:
     """Add any error of a plugin inside the context to the ``failures``, so that the other plugins are loaded."""
     try:
         yield
     except KeyboardInterrupt:
         raise
     except BaseException as error:  # noqa: BLE001  SystemExit too
-        failures.append(Failure(plugin, str(error) if isinstance(error, PluginError) else _said(error)))
+        failures.append(Failure(plugin, str(error) if isinstance(error, PluginError) else _describe_error(error)))
 
 
-def _said(error: BaseException) -> str:
+def _describe_error(error: BaseException) -> str:
     return f"{type(error).__name__}: {error}"
 
 
-def _entry_points(disabled: Sequence[str], failures: list[Failure]) -> list[metadata.EntryPoint]:
-    allowed = (entry for entry in _found(failures) if not {entry.name, _distribution(entry)} & set(disabled))
+def _list_entry_points(disabled: Sequence[str], failures: list[Failure]) -> list[metadata.EntryPoint]:
+    allowed = (
+        entry for entry in _find_entry_points(failures) if not {entry.name, _get_distribution(entry)} & set(disabled)
+    )
     return sorted(allowed, key=lambda entry: entry.name)
 
 
-def _own_entry_points(disabled: Sequence[str], failures: list[Failure]) -> list[metadata.EntryPoint]:
-    return [entry for entry in _entry_points(disabled, failures) if _distribution(entry) == OWN]
+def _list_own_entry_points(disabled: Sequence[str], failures: list[Failure]) -> list[metadata.EntryPoint]:
+    return [entry for entry in _list_entry_points(disabled, failures) if _get_distribution(entry) == OWN]
 
 
-def _found(failures: list[Failure]) -> Iterator[metadata.EntryPoint]:
+def _find_entry_points(failures: list[Failure]) -> Iterator[metadata.EntryPoint]:
     """Yield the entry points of every distribution that can be read.
 
     Of distributions with one name it takes the first on the path, which is the one that is imported.
@@ -182,16 +184,16 @@ def _found(failures: list[Failure]) -> Iterator[metadata.EntryPoint]:
     names = set[str]()
     for distribution in metadata.distributions():
         folder = getattr(distribution, "_path", None)
-        with _noted(failures, f"{folder or 'a distribution'}"):
+        with _collect_failures(failures, f"{folder or 'a distribution'}"):
             if folder is not None and str(folder.name).startswith("~"):
                 raise PluginError("it is what an interrupted installation left behind; delete this folder")
-            name = _normalised(distribution)
+            name = _normalise_name(distribution)
             if name not in names:
                 names.add(name)
                 yield from list(distribution.entry_points.select(group=GROUP))
 
 
-def _normalised(distribution: metadata.Distribution) -> str:
+def _normalise_name(distribution: metadata.Distribution) -> str:
     try:
         name = distribution.name
     except Exception:  # noqa: BLE001  without a file of metadata each Python raises another error
@@ -201,17 +203,17 @@ def _normalised(distribution: metadata.Distribution) -> str:
     return re.sub(r"[-_.]+", "-", name).lower()
 
 
-def _distribution(entry: metadata.EntryPoint) -> str:
-    return _name_and_version(entry.dist)[0] if entry.dist else "?"
+def _get_distribution(entry: metadata.EntryPoint) -> str:
+    return _read_name_and_version(entry.dist)[0] if entry.dist else "?"
 
 
-def _source(entry: metadata.EntryPoint) -> str:
-    version = f" {_name_and_version(entry.dist)[1]}" if entry.dist else ""
-    return f"{_distribution(entry)}{version}, {entry.value}"
+def _describe_source(entry: metadata.EntryPoint) -> str:
+    version = f" {_read_name_and_version(entry.dist)[1]}" if entry.dist else ""
+    return f"{_get_distribution(entry)}{version}, {entry.value}"
 
 
 @cache
-def _name_and_version(distribution: metadata.Distribution) -> tuple[str, str]:
+def _read_name_and_version(distribution: metadata.Distribution) -> tuple[str, str]:
     """Return name and version of a distribution.
 
     They are kept, as each request parses the metadata anew and all entry points of a distribution need them.
@@ -219,36 +221,36 @@ def _name_and_version(distribution: metadata.Distribution) -> tuple[str, str]:
     return distribution.name, distribution.version
 
 
-def _identity(entry: metadata.EntryPoint) -> str:
-    return f"{entry.name} ({_source(entry)})"
+def _describe_entry(entry: metadata.EntryPoint) -> str:
+    return f"{entry.name} ({_describe_source(entry)})"
 
 
-def _module(file: Path) -> ModuleType:
+def _load_module(file: Path) -> ModuleType:
     if file.suffix != ".py" or not file.is_file():
         raise UnknownPluginError(f"{file}: no such plugin; expected a Python file")
     with attributed(f"plugin '{file.stem}' ({file})", "loading it", but=()):
         return files.load(file)
 
 
-def _records(plugin: _Loaded) -> Sequence[Plugin]:
+def _collect_records(plugin: _LoadedPlugin) -> Sequence[Plugin]:
     """Return the records of a plugin, which is the only one in its manager."""
     who = f"plugin '{plugin.name}'" + (f" ({plugin.source})" if plugin.source else "")
-    manager = _free.pop() if _free else _manager()
+    manager = _free_managers.pop() if _free_managers else _make_manager()
     with attributed(who, "registering it", but=()):
         manager.register(plugin.module, name=plugin.name)
-    records = list(_yielded(plugin, who, manager.get_hookcallers(plugin.module) or []))
+    records = list(_call_hooks(plugin, who, manager.get_hookcallers(plugin.module) or []))
     manager.unregister(plugin.module)
-    _free.append(manager)
+    _free_managers.append(manager)
     return records
 
 
-def _manager() -> pluggy.PluginManager:
+def _make_manager() -> pluggy.PluginManager:
     manager = pluggy.PluginManager(GROUP)
     manager.add_hookspecs(SPECIFICATIONS)
     return manager
 
 
-def _yielded(plugin: _Loaded, who: str, callers: Sequence[pluggy.HookCaller]) -> Iterator[Plugin]:
+def _call_hooks(plugin: _LoadedPlugin, who: str, callers: Sequence[pluggy.HookCaller]) -> Iterator[Plugin]:
     for caller in callers:
         if not caller.has_spec():
             raise PluginError(f"{who}: unknown hook '{caller.name}'{nearest(caller.name, HOOKS)}")

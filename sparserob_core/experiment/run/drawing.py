@@ -156,9 +156,9 @@ def drawings(
             plain(experiment.title),
             result.upper_bound,
             exact=exact,
-            unit=_cost_unit(experiment),
+            unit=_get_cost_unit(experiment),
         )
-        yield lambda: _landscape(experiment, result, directory, notify)
+        yield lambda: _draw_landscape(experiment, result, directory, notify)
 
 
 def pictures(experiment: Experiment, result: Result) -> dict[str, Callable[[], Figure | None]]:
@@ -188,7 +188,7 @@ def pictures(experiment: Experiment, result: Result) -> dict[str, Callable[[], F
     if trace is not None and np.isfinite(trace.value).any():
         title, exact = plain(experiment.title), result.status == "certified"
         figures["climb"] = lambda: draw_climb(
-            trace, title, result.upper_bound, exact=exact, unit=_cost_unit(experiment)
+            trace, title, result.upper_bound, exact=exact, unit=_get_cost_unit(experiment)
         )
 
         def landscape() -> Figure | None:
@@ -234,11 +234,11 @@ def plot(experiment: Experiment, result: Result, name: str | None) -> Figure:
         figure = figures[name]()
     if figure is None:
         raise InputError(f"name: there is no {name} to draw: nothing can move in it")
-    figure._repr_png_ = partial(_png, figure)  # type: ignore[attr-defined]  # notebooks without pyplot show it as well
+    figure._repr_png_ = partial(_render_png, figure)  # type: ignore[attr-defined]  # notebooks without pyplot show it as well
     return figure
 
 
-def _png(figure: Figure) -> bytes:
+def _render_png(figure: Figure) -> bytes:
     stream = BytesIO()
     figure.savefig(stream, format="png", dpi=PAGE)
     return stream.getvalue()
@@ -254,12 +254,12 @@ def picture(experiment: Experiment, result: Result) -> bytes | None:
     if missing_matplotlib():
         return None
     try:
-        return _png(plot(experiment, result, "clash" if result.status == "infeasible" else "control"))
+        return _render_png(plot(experiment, result, "clash" if result.status == "infeasible" else "control"))
     except InputError:
         return None
 
 
-def _cost_unit(experiment: Experiment) -> str:
+def _get_cost_unit(experiment: Experiment) -> str:
     return "" if experiment.problem is None else experiment.problem.cost_unit
 
 
@@ -277,7 +277,7 @@ def switching(experiment: Experiment, result: Result) -> Array | None:
     return function.push([cut for cut in result.indices if cut.multiplier > 0.0], None) if values is None else values
 
 
-def _landscape(experiment: Experiment, result: Result, directory: Path, notify: Notify) -> list[Path]:
+def _draw_landscape(experiment: Experiment, result: Result, directory: Path, notify: Notify) -> list[Path]:
     assert result.trace is not None
     inspection = Inspection(experiment.loaded, experiment)
     data = landscape_of(inspection, result.trace, plain(experiment.title), notify)
@@ -343,7 +343,7 @@ def landscape_of(
         if not moving_of(g):
             return None
         c = moving_of(g)[0]
-        across, along = _curve(g, anchor, c)
+        across, along = _evaluate_curve(g, anchor, c)
         return LandscapeData(
             title=title,
             epsilon=epsilon,
@@ -358,7 +358,7 @@ def landscape_of(
             accepted=accepted,
         )
     landscape = Landscape(g, anchor, *axes.places(pair, anchor), GRID, epsilon, axes)
-    _fill(landscape, notify)
+    _fill_landscape(landscape, notify)
     notes = {name: column[evaluations] for name, column in trace.notes.items()}
     coordinates, (across, up, values) = list(g.coordinates), landscape.shown
     widths = (g.slot.upper - g.slot.lower)[coordinates]
@@ -383,7 +383,7 @@ def landscape_of(
     )
 
 
-def _fill(landscape: Landscape, notify: Notify) -> None:
+def _fill_landscape(landscape: Landscape, notify: Notify) -> None:
     """Evaluate a landscape to its finest grid, or to the one that is complete in time."""
     start = time.monotonic()
     for complete in landscape.evaluate():
@@ -394,7 +394,7 @@ def _fill(landscape: Landscape, notify: Notify) -> None:
             return
 
 
-def _curve(g: RelaxedValue, anchor: Array, c: int) -> tuple[Array, Array]:
+def _evaluate_curve(g: RelaxedValue, anchor: Array, c: int) -> tuple[Array, Array]:
     """Return the values of g of a tuple with one index along its coordinate ``c``, at `GRID` values and at its own."""
     across = np.union1d(np.linspace(g.slot.lower[c], g.slot.upper[c], GRID), anchor[0, c])
     slots, values = anchor.copy(), list[float]()

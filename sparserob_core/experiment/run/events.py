@@ -351,11 +351,11 @@ class _Listener:
 
 
 @final
-class _Detached(Observer):
+class _DetachedObserver(Observer):
     """The substitute for an observer that was closed."""
 
     def receive(self, event: Event) -> None:
         """Ignore the event."""
 
 
-_DETACHED = _Detached()
+_DETACHED = _DetachedObserver()

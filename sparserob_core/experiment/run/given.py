@@ -79,10 +79,10 @@ def as_config(config: object) -> str | Path | Mapping[str, Any] | Source:
     if isinstance(config, OptimalControlProblem):
         return source_of(config)
     if isinstance(config, Outcome | SolvedProblem):
-        return _stated(config.experiment.loaded)
+        return _make_source(config.experiment.loaded)
     if isinstance(config, str | Path):
         path = Path(config)
-        return _stated(read_config(path), files=False) if (path / "config.yaml").is_file() else config
+        return _make_source(read_config(path), files=False) if (path / "config.yaml").is_file() else config
     if isinstance(config, Mapping | Source):
         return config
     raise InputError(
@@ -91,6 +91,6 @@ def as_config(config: object) -> str | Path | Mapping[str, Any] | Source:
     )
 
 
-def _stated(loaded: Loaded, files: bool = True) -> Source:
+def _make_source(loaded: Loaded, files: bool = True) -> Source:
     plain = loaded.config.plain()
     return Source(loaded.source.name, loaded.source.folder, plain if files else {**plain, "plugins": []})

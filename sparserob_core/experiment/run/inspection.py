@@ -91,7 +91,7 @@ class Inspection:
 
     def __init__(self, loaded: Loaded, experiment: Experiment | None = None) -> None:
         """Keep the config, and the ``experiment`` where it is built already and no method works on it."""
-        self._loaded, self._built = loaded, experiment
+        self._loaded, self._given_experiment = loaded, experiment
 
     @staticmethod
     def read(directory: Path) -> Inspection:
@@ -200,11 +200,15 @@ class Inspection:
             rows = family.uncertain(index[:size])
             group, factor = int(rows.part[cut.row]), float(rows.factor[cut.row])
             return np.asarray(rows.g[[cut.row]].toarray()[0] + factor * (index[size:] @ rows.C[group]))
-        imposed = self._sampled.get(cut.family) if cut.formulation == "sampled" else family.formulated(cut.formulation)
+        imposed = (
+            self._scenario_families.get(cut.family)
+            if cut.formulation == "sampled"
+            else family.formulated(cut.formulation)
+        )
         return None if imposed is None else imposed.rows(index[np.newaxis])[0][0, cut.row]
 
     @cached_property
-    def _sampled(self) -> Mapping[str, ConstraintFamily]:
+    def _scenario_families(self) -> Mapping[str, ConstraintFamily]:
         """The constraint families of the method ``scenario`` by name, at its own samples."""
         method = self._loaded.config.method
         built: Method = self._loaded.registry.build("method", method.name, method.options)
@@ -250,7 +254,7 @@ class Inspection:
         from sparserob_core.sip.solver import quickest
 
         if self.program.spread is not None:
-            return self._policy_value()
+            return self._build_policy_value()
         formulation: Literal["literal", "reduced"] = "literal" if self.literal else "reduced"
         users, tools = imposed_program(self.program, formulation), tools_of(self._loaded)
         if not users.families:
@@ -261,7 +265,7 @@ class Inspection:
         if self.literal:
             is_disturbance = np.array([kind == "disturbance" for kind in self.kinds(self.width)])
             program = replace(
-                program, families=[_with_the_worst(family, is_disturbance) for family in program.families]
+                program, families=[_substitute_worst(family, is_disturbance) for family in program.families]
             )
         value = TupleValue(program, RelaxedProgram(program, quickest(tools.solver), tools.regulariser), count)
         value.epsilon = epsilon if tools.regulariser is not None and np.isfinite(epsilon) else 0.0
@@ -294,7 +298,7 @@ class Inspection:
             optimum=optimum,
         )
 
-    def _policy_value(self) -> RelaxedValue:
+    def _build_policy_value(self) -> RelaxedValue:
         from sparserob_core.sip.relaxed.policy_value import PolicyValue
 
         assert self.program.spread is not None
@@ -306,7 +310,7 @@ class Inspection:
         units = np.ones(width) if own is None else UsersUnits(own).tuple_units(width, width)
         times = [family.index_set for family in self.program.families if not family.defines]
         lower, upper = min(float(box.lower[0]) for box in times), max(float(box.upper[0]) for box in times)
-        kinds: tuple[CoordinateKind, ...] = ("time", *_repeated("disturbance", deviations))
+        kinds: tuple[CoordinateKind, ...] = ("time", *_repeat_kind("disturbance", deviations))
         radii = np.full(deviations, 1.0 / TOLERANCE)  # no coefficient of a deviation is an axis: any large box will do
 
         def deciding() -> np.ndarray:
@@ -352,19 +356,19 @@ class Inspection:
         """Return the kinds of the ``width`` coordinates of one index; ``index`` where there is no control problem."""
         problem = self.problem
         if problem is None:
-            return tuple(_repeated("index", width))
-        parameters = _repeated("parameter", problem.system.parameter_count)
+            return tuple(_repeat_kind("index", width))
+        parameters = _repeat_kind("parameter", problem.system.parameter_count)
         count = width - 1 - len(parameters)
         if self.literal:  # in the order of LiteralConstraint: time, coefficients, then the rest of the reduced index
-            return ("time", *_repeated("disturbance", count), *parameters)
-        return ("time", *parameters, *_repeated("direction", count))
+            return ("time", *_repeat_kind("disturbance", count), *parameters)
+        return ("time", *parameters, *_repeat_kind("direction", count))
 
     @cached_property
     def _experiment(self) -> Experiment:
-        return self._built or assemble(self._loaded)
+        return self._given_experiment or assemble(self._loaded)
 
 
-def _with_the_worst(family: ConstraintFamily, coefficients: np.ndarray) -> ConstraintFamily:
+def _substitute_worst(family: ConstraintFamily, coefficients: np.ndarray) -> ConstraintFamily:
     """Return a literal family in which NaN in place of all ``coefficients (width,)`` of a disturbance means the worst
     one.
 
@@ -386,5 +390,5 @@ def _with_the_worst(family: ConstraintFamily, coefficients: np.ndarray) -> Const
     return replace(family, rows=rows)
 
 
-def _repeated(kind: CoordinateKind, count: int) -> list[CoordinateKind]:
+def _repeat_kind(kind: CoordinateKind, count: int) -> list[CoordinateKind]:
     return [kind] * count

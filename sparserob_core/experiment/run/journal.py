@@ -55,9 +55,9 @@ class Journal(Observer):
         summary = {
             "title": self.experiment.title,
             **summary_of(result, control, self.experiment.model),
-            **self._added_up(result),
-            **self._causal(result),
-            "notes": list(_notes(self.experiment.loaded, result, self.asked)),
+            **self._describe_cost(result),
+            **self._report_causal_bound(result),
+            "notes": list(_list_notes(self.experiment.loaded, result, self.asked)),
             "seed": config.seed,
             "versions": versions(),
             "config": config.digest(),
@@ -66,7 +66,7 @@ class Journal(Observer):
         self.directory.write_json("result.json", summary)
         return control, summary
 
-    def _added_up(self, result: Result) -> dict[str, str]:
+    def _describe_cost(self, result: Result) -> dict[str, str]:
         """Return the terms of the cost in words, where it is not the L1 norm alone."""
         problem = self.experiment.problem
         if problem is None or result.sparsest is not None:
@@ -74,7 +74,7 @@ class Journal(Observer):
         words = problem.cost.words()
         return {"cost_of": words} if words else {}
 
-    def _causal(self, result: Result) -> dict[str, Any]:
+    def _report_causal_bound(self, result: Result) -> dict[str, Any]:
         """Return the entries of ``result.json`` about causal policies; there are none without feedback.
 
         They are the least cost of any causal policy, whether none exists, and the reason for which the search ended.
@@ -116,7 +116,7 @@ class Journal(Observer):
             return None
         multipliers = last.multipliers if len(last.multipliers) == len(last.imposed) else np.zeros(len(last.imposed))
         return replace(
-            self._unfinished(said, seconds),
+            self._build_unfinished_result(said, seconds),
             status="undecided",
             message=f"{said} after round {last.round}; nothing is proven of its control",
             stopped=said,
@@ -128,12 +128,12 @@ class Journal(Observer):
     def record_unfinished(self, said: str, seconds: float) -> None:
         """Write the results of a run that ended early, with the reason ``said``."""
         try:
-            self.record(self._unfinished(said, seconds))
+            self.record(self._build_unfinished_result(said, seconds))
             self.directory.write_arrays("trace.npz", trace_columns(self.rounds))
         except SparseRobError:
             return  # the error that ended the run is the one to be shown
 
-    def _unfinished(self, said: str, seconds: float) -> Result:
+    def _build_unfinished_result(self, said: str, seconds: float) -> Result:
         result = Result(status="failed", message=said, history=tuple(self.rounds), seconds=seconds)
         if not self.rounds:
             return result
@@ -190,10 +190,10 @@ class Journal(Observer):
         drawn: tuple[str, ...] = (STOPPED,) if figures else ()
         if not result.stopped:  # what is drawn may take longer than what was solved
             notify(StudyProgress(text="figures: the worst cases, and what there is to draw", phase=True))
-            drawn = time_left.attempt(lambda: self._illustrated(result, control, figures, notify), lambda: drawn)
+            drawn = time_left.attempt(lambda: self._write_figures(result, control, figures, notify), lambda: drawn)
         return control, summary, drawn
 
-    def _illustrated(self, result: Result, control: Array | None, figures: bool, notify: Notify) -> tuple[str, ...]:
+    def _write_figures(self, result: Result, control: Array | None, figures: bool, notify: Notify) -> tuple[str, ...]:
         """Write the worst cases and the figures; returns warnings about figures that could not be drawn."""
         worst = adversaries(self.experiment, np.asarray(result.decision)) if control is not None else {}
         if worst:
@@ -205,25 +205,27 @@ class Journal(Observer):
         return drawn(self.experiment, result, self.directory.path, worst, notify)
 
 
-def _notes(loaded: Loaded, result: Result, asked: bool) -> Iterator[Mapping[str, str]]:
+def _list_notes(loaded: Loaded, result: Result, asked: bool) -> Iterator[Mapping[str, str]]:
     """Yield notes on components that the config of a run names: the key, its place and the note.
 
     There is a note where a component had nothing to do, or where a solver left programs to another. ``asked`` says
     whether the maximiser was called.
     """
-    yield from _on_solver(loaded, result)
+    yield from _list_solver_notes(loaded, result)
     if not result.history:
         return  # the run ended before any component was needed
     if not asked:
         note = "it was never asked: the worst cases of this problem are known in closed form, or nothing can be moved"
-        yield from _of(loaded, ("maximiser",), note)
+        yield from _list_component_notes(loaded, ("maximiser",), note)
     weights = [event.epsilon for event in result.history]
     searched = [] if result.trace is None else list(result.trace.epsilon)
     if not any(weight > 0.0 for weight in (*weights, *searched, result.epsilon)):
-        yield from _of(loaded, ("regulariser",), "it had no effect: every program was solved without it (epsilon is 0)")
+        yield from _list_component_notes(
+            loaded, ("regulariser",), "it had no effect: every program was solved without it (epsilon is 0)"
+        )
 
 
-def _on_solver(loaded: Loaded, result: Result) -> Iterator[Mapping[str, str]]:
+def _list_solver_notes(loaded: Loaded, result: Result) -> Iterator[Mapping[str, str]]:
     chosen = loaded.config.solver.name
     name = whole_name(build(loaded, "solver", loaded.config.solver), chosen)
     groups: dict[tuple[str, str], list[Unanswered]] = {}
@@ -234,24 +236,26 @@ def _on_solver(loaded: Loaded, result: Result) -> Iterator[Mapping[str, str]]:
             items[0].reason if len(items) == 1 else "; ".join(f"{item.count} of them: {item.reason}" for item in items)
         )
         note = f"{name} did not answer {sum(item.count for item in items)} of the {kind} programs, {by} did: {reason}"
-        yield from _of(loaded, ("solver",), note)
+        yield from _list_component_notes(loaded, ("solver",), note)
     if chosen != AUTO and not result.counts.get("solver_calls"):
-        yield from _of(loaded, ("solver",), f"{name} was not asked: this run came to its end without a finite program")
+        yield from _list_component_notes(
+            loaded, ("solver",), f"{name} was not asked: this run came to its end without a finite program"
+        )
 
 
-def _of(loaded: Loaded, slot: Path, note: str) -> Iterator[Mapping[str, str]]:
+def _list_component_notes(loaded: Loaded, slot: Path, note: str) -> Iterator[Mapping[str, str]]:
     """Yield a note on a component, where the config or an override names it.
 
     A complete config, such as that of a run directory, names every component. A note is then given only for one that is
     not the default.
     """
     location, written = loaded.place(slot), loaded.config.plain()
-    if set(written) <= set(loaded.source.data) and written[str(slot[0])]["name"] == _default(slot):
+    if set(written) <= set(loaded.source.data) and written[str(slot[0])]["name"] == _find_default(slot):
         location = None
     if location is not None:
         yield {"key": dotted((*slot, "name")), "place": location, "note": note}
 
 
-def _default(slot: Path) -> str:
+def _find_default(slot: Path) -> str:
     """Return the name of the component that is the default of a slot."""
     return str(RunConfig.model_fields[str(slot[0])].default.name)

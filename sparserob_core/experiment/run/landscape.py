@@ -94,34 +94,41 @@ class Landscape:
     spent: int = 0
 
     def __post_init__(self) -> None:
-        self._open = np.array([kind == "disturbance" for kind in self.g.kinds])
+        self._disturbance_mask = np.array([kind == "disturbance" for kind in self.g.kinds])
         heads = (self.first[0], self.second[0])
-        coordinates = [k for k in range(self.g.slot.dimension) if not self._open[k] and k != self.first[1]]
+        coordinates = [k for k in range(self.g.slot.dimension) if not self._disturbance_mask[k] and k != self.first[1]]
         is_equal = bool((self.anchor[heads[0], coordinates] == self.anchor[heads[1], coordinates]).all())
         # the axes are one coordinate of two indices that can be exchanged: each value holds for both orders
-        self._mirrored = self.first[1] == self.second[1] and is_equal and self.g.interchangeable
-        across, up = self._axis(self.first), self._axis(self.second)
-        self.axes, self._bases, self._always = (across[0], up[0]), (across[1], up[1]), (across[2], up[2])
+        self._is_mirrored = self.first[1] == self.second[1] and is_equal and self.g.interchangeable
+        across, up = self._make_axis(self.first), self._make_axis(self.second)
+        self.axes, self._grid_positions, self._anchor_positions = (
+            (across[0], up[0]),
+            (across[1], up[1]),
+            (across[2], up[2]),
+        )
         self.at = (
             int(np.searchsorted(across[0], self.anchor[self.first])),
             int(np.searchsorted(up[0], self.anchor[self.second])),
         )
-        self._moving = [[k for k in range(len(self.anchor)) if self._beside(k, heads) == head] for head in heads]
-        self._found: dict[tuple[float, float], float] = {}
+        self._moving_indices = [
+            [k for k in range(len(self.anchor)) if self._find_head(k, heads) == head] for head in heads
+        ]
+        self._known_values: dict[tuple[float, float], float] = {}
         self.values = np.full((self.axes[0].size, self.axes[1].size), np.nan)
 
-    def _beside(self, slot: int, heads: tuple[int, int]) -> int:
+    def _find_head(self, slot: int, heads: tuple[int, int]) -> int:
         """Return the head to which an index is `NEAR` and with which it moves; -1 where there is none."""
         widths = np.where(self.g.slot.upper > self.g.slot.lower, self.g.slot.upper - self.g.slot.lower, np.inf)
         distances = {
-            head: (np.abs(self.anchor[slot] - self.anchor[head]) / widths)[~self._open].max() for head in heads
+            head: (np.abs(self.anchor[slot] - self.anchor[head]) / widths)[~self._disturbance_mask].max()
+            for head in heads
         }
         if not self.g.interchangeable:
             return slot if slot in heads else -1
         nearest = slot if slot in heads else min(heads, key=lambda head: distances[head])
         return nearest if distances[nearest] < NEAR else -1
 
-    def _axis(self, place: Place) -> tuple[Array, np.ndarray, np.ndarray]:
+    def _make_axis(self, place: Place) -> tuple[Array, np.ndarray, np.ndarray]:
         """Return the values along an axis, those of them in the even grid, and those of the anchor.
 
         On a symmetric map the axis has the values of both indices, since a ridge through either is on both axes. A
@@ -129,7 +136,7 @@ class Landscape:
         """
         even = np.linspace(self.g.slot.lower[place[1]], self.g.slot.upper[place[1]], self.grid)
         anchor_values = np.unique(
-            [self.anchor[at] for at in ((self.first, self.second) if self._mirrored else (place,))]
+            [self.anchor[at] for at in ((self.first, self.second) if self._is_mirrored else (place,))]
         )
         for value in anchor_values:
             nearest = int(np.abs(even - value).argmin())
@@ -147,14 +154,14 @@ class Landscape:
         """Return the positions on either axis of the grid with a stride; the ends and the anchor always belong
         to it."""
         across, up = (
-            np.union1d(base[np.union1d(np.arange(0, self.grid, stride), [self.grid - 1])], always)
-            for base, always in zip(self._bases, self._always, strict=True)
+            np.union1d(even[np.union1d(np.arange(0, self.grid, stride), [self.grid - 1])], anchor)
+            for even, anchor in zip(self._grid_positions, self._anchor_positions, strict=True)
         )
         return across, up
 
     def evaluate(self) -> Iterator[bool]:
         """Evaluate one point at each step, the anchor first; yields ``True`` where a level has become complete."""
-        self._fill(*self.at)
+        self._fill_value(*self.at)
         yield False
         for stride in self.strides:
             across, up = self.lines(stride)
@@ -162,7 +169,7 @@ class Landscape:
                 # the next point is a neighbour of the last one, whose optimum is a good start
                 for j in up if number % 2 == 0 else up[::-1]:
                     if np.isnan(self.values[i, j]):
-                        self._fill(int(i), int(j))
+                        self._fill_value(int(i), int(j))
                         yield False
             self.level = stride
             yield True
@@ -170,7 +177,7 @@ class Landscape:
     def cross(self) -> Iterator[None]:
         """Evaluate the line of ``first`` through the anchor, one point at each step."""
         for i in range(self.axes[0].size):
-            self._fill(i, self.at[1])
+            self._fill_value(i, self.at[1])
             yield
 
     @property
@@ -180,31 +187,31 @@ class Landscape:
         finite = values[np.isfinite(values)]
         return float(np.mean(values == np.inf)), float(np.ptp(finite)) if finite.size else 0.0
 
-    def _fill(self, i: int, j: int) -> None:
-        point = self._order(float(self.axes[0][i]), float(self.axes[1][j]))
-        if point not in self._found:
-            self._found[point] = self.g.at(self._tuple(point))
+    def _fill_value(self, i: int, j: int) -> None:
+        point = self._order_coordinates(float(self.axes[0][i]), float(self.axes[1][j]))
+        if point not in self._known_values:
+            self._known_values[point] = self.g.at(self._make_tuple(point))
             self.spent += 1
-        value = self._found[point]
+        value = self._known_values[point]
         self.values[i, j] = value if not np.isnan(value) else -np.inf
 
-    def _order(self, one: float, other: float) -> tuple[float, float]:
+    def _order_coordinates(self, one: float, other: float) -> tuple[float, float]:
         """Return the coordinates of the first and the second index at a point.
 
         Where g does not depend on their order, they are in the order of the anchor.
         """
         ordered = (one <= other) == bool(self.anchor[self.first] <= self.anchor[self.second])
-        return (other, one) if self._mirrored and not ordered else (one, other)
+        return (other, one) if self._is_mirrored and not ordered else (one, other)
 
-    def _tuple(self, to: tuple[float, float]) -> Array:
+    def _make_tuple(self, to: tuple[float, float]) -> Array:
         """Return the tuple ``(D, width)`` whose two indices have the coordinates ``to``."""
         slots = self.anchor.copy()
-        for place, moving, end in zip((self.first, self.second), self._moving, to, strict=True):
+        for place, moving, end in zip((self.first, self.second), self._moving_indices, to, strict=True):
             # indices that move together keep their distance: at the anchor the tuple must be the anchor itself
             c, shift = place[1], end - self.anchor[place]
             slots[moving, c] = np.clip(self.anchor[moving, c] + shift, self.g.slot.lower[c], self.g.slot.upper[c])
             slots[place] = end
-            slots[np.ix_(np.array(moving), self._open)] = np.nan
+            slots[np.ix_(np.array(moving), self._disturbance_mask)] = np.nan
         return slots
 
     @property

@@ -156,7 +156,7 @@ class SolvedProblem(ControlResult):
         """The run directory: the last one that was saved, else a temporary one that is removed with the result."""
         path = Path(tempfile.mkdtemp(prefix="sparserob-"))
         weakref.finalize(self, shutil.rmtree, path, ignore_errors=True)
-        return self._saved(path / "run", figures=False).directory
+        return self._save_result(path / "run", figures=False).directory
 
     def save(self, directory: str | Path, *, figures: bool = True) -> Outcome:
         """Write a run directory like that of `run`.
@@ -182,7 +182,7 @@ class SolvedProblem(ControlResult):
             If no config can describe the problem, for example one with a function of the parameters that is no
             arithmetic. Also if the directory cannot be made.
         """
-        outcome = self._saved(Path(directory), figures)
+        outcome = self._save_result(Path(directory), figures)
         self.__dict__["directory"] = outcome.directory
         return outcome
 
@@ -214,9 +214,9 @@ class SolvedProblem(ControlResult):
     @property
     def _loaded(self) -> Loaded:
         experiment = self.__dict__.get("experiment")
-        return load_config(_source(self.origin)) if experiment is None else experiment.loaded
+        return load_config(_get_source(self.origin)) if experiment is None else experiment.loaded
 
-    def _saved(self, path: Path, figures: bool) -> Outcome:
+    def _save_result(self, path: Path, figures: bool) -> Outcome:
         experiment = self.experiment
         loaded, tools = experiment.loaded, tools_of(experiment.loaded)
         if isinstance(tools.solver, Named):  # the counts of solver calls go on from those of the result
@@ -253,7 +253,7 @@ class SolvedProblem(ControlResult):
     def __reduce__(self) -> tuple[Callable[..., Any], tuple[Any, ...]]:
         model = self.model
         arguments = (model.problem, model.control, model.disturbance, model.formulation, model.policy)
-        return _reread, (self.plain, *arguments, self.causal, self.origin)
+        return _rebuild_result, (self.plain, *arguments, self.causal, self.origin)
 
 
 def concluded(experiment: Experiment, result: Result, tools: Tools, notify: Notify = ignore) -> Result:
@@ -293,11 +293,11 @@ def concluded(experiment: Experiment, result: Result, tools: Tools, notify: Noti
     return conclusion
 
 
-def _source(origin: Source | Asked) -> Source:
+def _get_source(origin: Source | Asked) -> Source:
     return origin.source() if isinstance(origin, Asked) else origin
 
 
-def _reread(
+def _rebuild_result(
     result: Result,
     problem: OptimalControlProblem,
     control: Dictionary,
@@ -368,11 +368,11 @@ class Outcome:
     def tube(self, times: npt.ArrayLike) -> Tube:
         """Return the states at ``times (T,)`` with the bounds that the disturbance can bring them to
         (`ControlResult.tube`)."""
-        return self._of_control().tube(times)
+        return self._get_solved_problem().tube(times)
 
     def worst(self, constraint: str) -> Adversary:
         """Return the worst case of the ``constraint`` of that name (`ControlResult.adversary`)."""
-        return self._of_control().adversary(constraint)
+        return self._get_solved_problem().adversary(constraint)
 
     def plot(self, name: str | None = None) -> Figure:
         """Return a figure of the run, for matplotlib.
@@ -384,7 +384,7 @@ class Outcome:
 
         return plot(self.experiment, self.result, name)
 
-    def _of_control(self) -> SolvedProblem:
+    def _get_solved_problem(self) -> SolvedProblem:
         if not isinstance(self.result, SolvedProblem):
             raise InputError("this is a semi-infinite program that is no control problem: it has no states")
         return self.result
@@ -407,7 +407,7 @@ class Outcome:
         loaded = self.experiment.loaded
         stated = Source(loaded.source.name, loaded.source.folder, loaded.config.plain())
         kept = (self.directory, self.control, self.summary, self.remarks, self.interrupted)
-        return _read, (stated, plain, *kept, causal)
+        return _rebuild_outcome, (stated, plain, *kept, causal)
 
     def show(self, save: str | Path | None = None, *, serve: bool = False, connect: str | None = None) -> None:
         """Show the run in the viewer of Rerun.
@@ -441,7 +441,7 @@ class Outcome:
         )
 
 
-def _read(
+def _rebuild_outcome(
     stated: Source,
     result: Result,
     directory: Path,

@@ -121,7 +121,7 @@ def events(inspection: Inspection, title: str, directory: Path | None, result: R
         quiet=True,
         inspection=inspection,
     )
-    searches = [] if result.trace is None else list(_searches(result.trace, inspection))
+    searches = [] if result.trace is None else list(_replay_searches(result.trace, inspection))
     for entry in result.history:
         while searches and searches[0][0] <= entry.round:
             yield searches.pop(0)[1]
@@ -139,16 +139,16 @@ def stored_result(run: StoredRun) -> Result:
             status=summary["status"],
             message=summary["message"],
             decision=decision if decision.size else None,
-            cost=_number(summary, "cost"),
-            value=_number(summary, "value"),
-            epsilon=_number(summary, "epsilon"),
-            lower_bound=_number(summary, "lower_bound", -np.inf),
-            upper_bound=_number(summary, "upper_bound", np.inf),
-            cost_scale=_number(summary, "cost_scale", 0.0),
+            cost=_get_number(summary, "cost"),
+            value=_get_number(summary, "value"),
+            epsilon=_get_number(summary, "epsilon"),
+            lower_bound=_get_number(summary, "lower_bound", -np.inf),
+            upper_bound=_get_number(summary, "upper_bound", np.inf),
+            cost_scale=_get_number(summary, "cost_scale", 0.0),
             stopped=str(summary.get("stopped") or ""),
-            worst=_worst(summary["worst"], solution),
+            worst=_read_worst(summary["worst"], solution),
             proofs=[
-                Proof(str(name), "proven", _number(tolerance, "proven"))
+                Proof(str(name), "proven", _get_number(tolerance, "proven"))
                 for name, tolerance in summary.get("tolerances", {}).items()
             ],
             counts={str(name): int(count) for name, count in summary["counts"].items() if isinstance(count, int)},
@@ -159,7 +159,7 @@ def stored_result(run: StoredRun) -> Result:
             dual=Dual(-np.inf, *run.proving),
             history=run.history,
             trace=run.evaluations,
-            seconds=_number(summary, "seconds", 0.0),
+            seconds=_get_number(summary, "seconds", 0.0),
         )
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise InputError(
@@ -167,7 +167,7 @@ def stored_result(run: StoredRun) -> Result:
         ) from error
 
 
-def _worst(said: Mapping[str, Any], solution: Mapping[str, Array]) -> WorstConstraint | None:
+def _read_worst(said: Mapping[str, Any], solution: Mapping[str, Array]) -> WorstConstraint | None:
     """Return the worst constraint; its index is empty, since no file keeps it."""
     if said.get("violation") is None:
         return None
@@ -186,11 +186,11 @@ def _worst(said: Mapping[str, Any], solution: Mapping[str, Array]) -> WorstConst
     )
 
 
-def _number(summary: Mapping[str, Any], name: str, missing: float = np.nan) -> float:
+def _get_number(summary: Mapping[str, Any], name: str, missing: float = np.nan) -> float:
     return missing if summary.get(name) is None else float(summary[name])
 
 
-def _searches(trace: SearchTrace, inspection: Inspection) -> Iterator[tuple[int, EvaluationsFinished]]:
+def _replay_searches(trace: SearchTrace, inspection: Inspection) -> Iterator[tuple[int, EvaluationsFinished]]:
     """Yield every search in batches, each with the number of its round.
 
     The events have the tuples of indices as far as these were kept.
@@ -213,7 +213,7 @@ def _searches(trace: SearchTrace, inspection: Inspection) -> Iterator[tuple[int,
         search_size = int((~trace.polished[evaluations]).sum())
         ends = [indices[-1] + 1 for indices in np.array_split(np.arange(evaluations.size), batches)]
         for indices in np.split(np.arange(evaluations.size), sorted({*ends, search_size} - {0, evaluations.size})):
-            previous_best, standing = -np.inf if not total else float(best[total - 1]), _standing(notes, total)
+            previous_best, standing = -np.inf if not total else float(best[total - 1]), _find_standing(notes, total)
             moments = [(1, float(moment)) for moment in seconds[indices]]
             note_points = {
                 name: [(k + 1.0, column[k]) for k in indices if not np.isnan(column[k])]
@@ -253,7 +253,7 @@ def _searches(trace: SearchTrace, inspection: Inspection) -> Iterator[tuple[int,
             )
 
 
-def _standing(notes: Mapping[str, np.ndarray], done: int) -> int:
+def _find_standing(notes: Mapping[str, np.ndarray], done: int) -> int:
     """Return the evaluation at which the search stood after ``done`` evaluations (`Batch`).
 
     It is the last one that was accepted or, where none was, the last one of all.

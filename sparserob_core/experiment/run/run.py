@@ -127,12 +127,12 @@ def _run(
     deadline = Deadline(loaded.config.limits.seconds)  # the time of the transcription is part of the limit
     experiment = assemble_in_time(loaded, deadline)
     if isinstance(experiment, UntranscribedExperiment):
-        return _untranscribed(experiment, origin, out)
+        return _write_untranscribed(experiment, origin, out)
     why = None if experiment.problem is None else unprovable(experiment.problem)
     if why is not None:
         deadline, why = (deadline if deadline.bounded else Deadline(SECONDS)), announced(why, deadline.bounded)
     tools = replace(tools, deadline=deadline)
-    watching = [*_observers(loaded), *((type(observer).__name__, observer) for observer in observers)]
+    watching = [*_build_observers(loaded), *((type(observer).__name__, observer) for observer in observers)]
     method: Method = build(loaded, "method", loaded.config.method)
     try:
         require_suited(method, experiment.program, loaded.config.method.name)
@@ -160,7 +160,7 @@ def _run(
             )
             try:
                 with deadline.enforced():
-                    result = solve_in_own_units(method, experiment.program, _notifying(tools, broadcast))
+                    result = solve_in_own_units(method, experiment.program, _connect_broadcast(tools, broadcast))
                     result = result.accounted(tools.solver)
             except KeyboardInterrupt as interrupt:  # a method that returns no result when it is interrupted
                 reason = deadline.interrupt(interrupt)
@@ -183,7 +183,9 @@ def _run(
                 error.add_note(f"the run itself came to its end, {result.status}: {result.message}")
             error.add_note(f"what was done until then is in {directory.path}")
             if result is None or not isinstance(error, KeyboardInterrupt):
-                ending = RunFinished(status="failed", message=_said(error), seconds=time.perf_counter() - started)
+                ending = RunFinished(
+                    status="failed", message=_describe_error(error), seconds=time.perf_counter() - started
+                )
             ending = replace(ending, pressed=ending.pressed or isinstance(error, KeyboardInterrupt))
             if result is None:
                 journal.record_unfinished(ending.message, ending.seconds)
@@ -192,7 +194,9 @@ def _run(
             broadcast(ending)
 
 
-def _untranscribed(experiment: UntranscribedExperiment, origin: Mapping[str, Any], out: str | Path | None) -> Outcome:
+def _write_untranscribed(
+    experiment: UntranscribedExperiment, origin: Mapping[str, Any], out: str | Path | None
+) -> Outcome:
     """Write the directory of a problem that was not transcribed in time, and return its outcome."""
     loaded = experiment.loaded
     result = Result(status="undecided", message=experiment.reason, lower_bound=0.0, stopped=experiment.reason)
@@ -202,7 +206,7 @@ def _untranscribed(experiment: UntranscribedExperiment, origin: Mapping[str, Any
         return Outcome(result, directory.path, experiment, control, summary, remarks)
 
 
-def _said(error: BaseException) -> str:
+def _describe_error(error: BaseException) -> str:
     """Return the reason for which a run ended without its method.
 
     The text of an interrupt is its own; one from the keyboard has none and is named here.
@@ -212,7 +216,7 @@ def _said(error: BaseException) -> str:
     return named(error)
 
 
-def _notifying(tools: Tools, broadcast: Broadcast) -> Tools:
+def _connect_broadcast(tools: Tools, broadcast: Broadcast) -> Tools:
     def notify(event: object) -> None:
         if isinstance(event, Event):
             broadcast(event)
@@ -220,5 +224,5 @@ def _notifying(tools: Tools, broadcast: Broadcast) -> Tools:
     return replace(tools, notify=notify)
 
 
-def _observers(loaded: Loaded) -> list[tuple[str, Observer]]:
+def _build_observers(loaded: Loaded) -> list[tuple[str, Observer]]:
     return [(entry.name, build(loaded, "observer", entry)) for entry in loaded.config.observers]

@@ -152,24 +152,24 @@ def solve(
     deadline, registry = Deadline(as_seconds(seconds)), load_registry()
     stated = problem.origin if isinstance(problem, SemiInfiniteProgram) else problem
     if isinstance(stated, OptimalControlProblem | Transcription):
-        deadline = _announced(stated if isinstance(stated, OptimalControlProblem) else stated.problem, deadline)
-    model = _stated(registry, problem, control, disturbance, policy)
+        deadline = _warn_unprovable(stated if isinstance(stated, OptimalControlProblem) else stated.problem, deadline)
+    model = _prepare_program(registry, problem, control, disturbance, policy)
     program = model if isinstance(model, SemiInfiniteProgram) else model.program
     if regulariser == "default":
         regulariser = None if program.lengths is None else "ridge"
-    steps = continuation if isinstance(continuation, Continuation) else _continuation(continuation or {})
+    steps = continuation if isinstance(continuation, Continuation) else _check_continuation(continuation or {})
     tools = Tools(
-        solver=_solver(registry, solver),
+        solver=_build_solver(registry, solver),
         maximiser=component(registry, "maximiser", maximiser, Maximiser),
         regulariser=None if regulariser is None else component(registry, "regulariser", regulariser, Regulariser),
         continuation=steps,
         budget=whole("budget", budget, 1),
         polish=None if polish is None else share("polish", polish),
         rng=np.random.default_rng(whole("seed", seed, 0)),
-        notify=_heard(notify),
+        notify=_wrap_notify(notify),
         deadline=deadline,
     )
-    chosen: Method = component(registry, "method", _with_tolerance(registry, method, tolerance), Method)
+    chosen: Method = component(registry, "method", _add_tolerance(registry, method, tolerance), Method)
     require_suited(chosen, program)
     require_separable(program, tools.solver, tools.regulariser)
     result = solve_in_own_units(chosen, program, tools).accounted(tools.solver)
@@ -184,7 +184,7 @@ def solve(
     arguments = Asked(
         problem=model.stated,
         choices={
-            "method": _with_tolerance(registry, method, tolerance),
+            "method": _add_tolerance(registry, method, tolerance),
             "maximiser": maximiser,
             "solver": solver,
             "regulariser": regulariser,
@@ -208,7 +208,7 @@ def solve(
     return SolvedProblem.asked(result, model, arguments)
 
 
-def _announced(problem: OptimalControlProblem, deadline: Deadline) -> Deadline:
+def _warn_unprovable(problem: OptimalControlProblem, deadline: Deadline) -> Deadline:
     """Log a warning before anything is solved if no control of a problem can ever be certified.
 
     Returns the deadline, which is then bounded, so that the search for a witness ends.
@@ -222,22 +222,24 @@ def _announced(problem: OptimalControlProblem, deadline: Deadline) -> Deadline:
     return deadline if deadline.bounded else Deadline(SECONDS)
 
 
-def _named(choice: object) -> str:
+def _get_name(choice: object) -> str:
     """Return the name of a component that was chosen: the name in the choice, or its class."""
     named = choice.get("name") if isinstance(choice, Mapping) else choice
     return named if isinstance(named, str) else type(choice).__name__
 
 
-def _solver(registry: Registry, choice: object) -> Solver:
+def _build_solver(registry: Registry, choice: object) -> Solver:
     """Return the chosen solver.
 
     A solver that is named is asked for every program; `Auto` answers those that it does not solve.
     """
     solver: Solver = component(registry, "solver", choice, Solver)
-    return solver if isinstance(solver, Auto) else named_solver(solver, _named(choice), registry.build("solver", AUTO))
+    return (
+        solver if isinstance(solver, Auto) else named_solver(solver, _get_name(choice), registry.build("solver", AUTO))
+    )
 
 
-def _stated(
+def _prepare_program(
     registry: Registry, problem: object, control: object, disturbance: object, policy: object
 ) -> SemiInfiniteProgram | Transcription:
     chosen: Policy = component(registry, "policy", policy, Policy)
@@ -258,7 +260,7 @@ def _stated(
     return prepare(problem, controls, disturbances, policy=chosen)
 
 
-def _continuation(given: Mapping[str, float]) -> Continuation:
+def _check_continuation(given: Mapping[str, float]) -> Continuation:
     from pydantic import ValidationError
 
     from sparserob_core.experiment.plugins.messages import complaints
@@ -269,7 +271,7 @@ def _continuation(given: Mapping[str, float]) -> Continuation:
         raise InputError("\n".join(f"continuation.{item}" for item in complaints(error, Continuation, given))) from None
 
 
-def _with_tolerance(registry: Registry, method: object, tolerance: float | None) -> object:
+def _add_tolerance(registry: Registry, method: object, tolerance: float | None) -> object:
     if isinstance(method, Method) or tolerance is None:
         return method
     entry = {"name": method} if isinstance(method, str) else method
@@ -279,7 +281,7 @@ def _with_tolerance(registry: Registry, method: object, tolerance: float | None)
     return {"tolerance": tolerance, **entry} if takes_it else entry
 
 
-def _heard(notify: Notify) -> Callable[[Any], None]:
+def _wrap_notify(notify: Notify) -> Callable[[Any], None]:
     if notify is ignore:
         return ignore
     heard = careful("notify", notify)

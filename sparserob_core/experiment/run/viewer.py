@@ -55,7 +55,7 @@ def recorder(save: str | Path | None, serve: bool, connect: str | None, patience
         )
     options: dict[str, object] = {"spawn": spawn, "serve": serve, "connect": connect, "keep": KEEP if serve else 0.0}
     if save is not None:
-        options["save"] = str(_writable(Path(save)))
+        options["save"] = str(_require_writable(Path(save)))
     if patience is not None:
         options.update(landscape={"patience": patience}, waits=True)
     observer: Observer = load_own_registry().build("observer", "rerun", options)
@@ -71,7 +71,7 @@ def recorded(observer: Observer, save: str | Path | None) -> tuple[str, ...]:
     return (f"{save} is not complete: {reason}" if reason else f"recorded into {save}",)
 
 
-def _writable(file: Path) -> Path:
+def _require_writable(file: Path) -> Path:
     """Return the absolute path of a file that can be written, in a folder that exists.
 
     A recording that exists is never overwritten: raises `InputError`.

@@ -51,9 +51,9 @@ def new_plugin(kind: str, name: str, out: str | Path = ".") -> Path:
         "kind": chosen.replace("_", " "),
         "article": "An" if chosen[0] in "aeiou" else "A",
         "hook": record.hook,
-        "Class": _camel(name).removesuffix(_camel(chosen)) + _camel(chosen),
+        "Class": _to_camel_case(name).removesuffix(_to_camel_case(chosen)) + _to_camel_case(chosen),
     }
-    texts = {**_files(PACKAGE, words), **_files(chosen, words)}
+    texts = {**_fill_template(PACKAGE, words), **_fill_template(chosen, words)}
     try:
         for path, text in texts.items():
             file = folder / path
@@ -98,7 +98,7 @@ def _check_name(kind: str, name: str) -> None:
         )
 
 
-def _files(template: str, words: Mapping[str, str]) -> dict[str, str]:
+def _fill_template(template: str, words: Mapping[str, str]) -> dict[str, str]:
     """The files that a template holds, by path, with the words put in."""
     text = (files(__package__) / "templates" / f"{template}.txt").read_text(encoding="utf-8")
     filled = Template(text).substitute(words)
@@ -107,5 +107,5 @@ def _files(template: str, words: Mapping[str, str]) -> dict[str, str]:
     return {path: f"{body}\n" if body else "" for path, body in zip(sections[::2], bodies, strict=True)}
 
 
-def _camel(name: str) -> str:
+def _to_camel_case(name: str) -> str:
     return "".join(word[:1].upper() + word[1:] for word in name.split("_"))

@@ -81,10 +81,10 @@ def draw_simulation(simulation: Simulation, data: FigureData) -> Figure:
                 label=f"envelope of all {simulation.trajectories}" if number == 0 else None,
             )
         finish_panel(ax, data, component, (simulation.lower[component], simulation.upper[component]))
-    caption(figure, axes, data, f"{simulation.law}: {_said(simulation)}")
+    caption(figure, axes, data, f"{simulation.law}: {_write_caption(simulation)}")
     return figure
 
 
-def _said(simulation: Simulation) -> str:
+def _write_caption(simulation: Simulation) -> str:
     rows = [simulation.any_violated or simulation.constraints[0]]
     return f"{rows[0].violated} of {simulation.trajectories} trajectories violate a constraint; a sample is no proof"

@@ -100,7 +100,7 @@ def simulate(
     from sparserob_core.experiment.figures.style import missing_matplotlib, require_writable
     from sparserob_core.experiment.simulation.figure import write_simulation
 
-    count = _checked(law, trajectories, seed)
+    count = _check_arguments(law, trajectories, seed)
     if out is not None:
         require_writable(Path(out))
     directory, experiment = as_run(run)
@@ -126,9 +126,9 @@ def simulate(
                 ]
             )
         replayed = {**replayed, "state_times": moments, "states": states}
-        simulation = _replayed(finished, replayed, started)
+        simulation = _replay_worst_cases(finished, replayed, started)
     else:
-        simulation = _sampled(finished, worst, cast(LawName, law), count, seed, notify, started)
+        simulation = _simulate_samples(finished, worst, cast(LawName, law), count, seed, notify, started)
     RunDirectory(finished.directory).write_json(f"simulation-{law}.json", simulation.summary())
     if out is not None and (missing := missing_matplotlib()):
         return replace(simulation, undrawn=missing)
@@ -137,7 +137,7 @@ def simulate(
     return simulation
 
 
-def _sampled(
+def _simulate_samples(
     finished: FinishedRun,
     worst: Mapping[str, Array],
     law: LawName,
@@ -148,7 +148,7 @@ def _sampled(
 ) -> Simulation:
     model = finished.experiment.transcription
     response, parameters = model.response, model.parameters
-    acting, parameters_in_time = _Acting(), ParametersInTime.of(model.stated)
+    acting, parameters_in_time = _FeedbackControl(), ParametersInTime.of(model.stated)
     ends = [moment for constraint in model.constraints for moment in (constraint.start, constraint.stop)]
     times = fine_times(response, parameters, np.concatenate([ends, worst.get("times", np.zeros(0))]))
     fine = Response(response.system, finer(response.grid, times), response.initial_state)
@@ -193,7 +193,7 @@ def _sampled(
         violating += int(np.any([violation_count.close() for violation_count in violation_counts], axis=0).sum())
         simulated += size
         notify(StudyProgress(text=f"{simulated} of {count} trajectories", done=simulated, total=count))
-    shares = _shares(violation_counts, worst, count)
+    shares = _compute_shares(violation_counts, worst, count)
     return Simulation(
         title=finished.experiment.title,
         directory=finished.directory,
@@ -204,7 +204,7 @@ def _sampled(
         times=times.size,
         inside=times_inside(times, response.grid.breakpoints),
         constraints=shares,
-        any_violated=_together(shares, violating) if len(shares) > 1 else None,
+        any_violated=_merge_shares(shares, violating) if len(shares) > 1 else None,
         shown=times[shown],
         fan=envelope.fan(),
         lower=envelope.lower,
@@ -213,51 +213,51 @@ def _sampled(
     )
 
 
-class _Acting:
+class _FeedbackControl:
     """The control of each trajectory at a moment, where it answers the states."""
 
     def __init__(self) -> None:
-        self._now: Array | None = None
+        self._current_control: Array | None = None
 
     def of(self, control: Callable[[int, Array], Array]) -> Callable[[int, Array], Array]:
         """Return the same control as a function whose last value is kept."""
 
         def answered(piece: int, state: Array) -> Array:
-            self._now = control(piece, state)
-            return self._now
+            self._current_control = control(piece, state)
+            return self._current_control
 
         return answered
 
     def now(self, position: int, channels: int) -> Array | None:
         """Return the control ``(m, n)`` that acted until a position; ``None`` at the beginning, and without
         feedback."""
-        return None if self._now is None or position == 0 else self._now[:channels]
+        return None if self._current_control is None or position == 0 else self._current_control[:channels]
 
 
 class _Envelope:
     """The part of many trajectories that is drawn: the first few, and the envelope of all, at some of the times."""
 
     def __init__(self, shown: np.ndarray, states: int) -> None:
-        self._column = {int(position): column for column, position in enumerate(shown)}
+        self._columns = {int(position): column for column, position in enumerate(shown)}
         self.lower, self.upper = np.full((states, shown.size), np.inf), np.full((states, shown.size), -np.inf)
-        self._first: list[Array] = []
+        self._first_states: list[Array] = []
 
     def add(self, position: int, state: Array) -> None:
         """Add the states ``(d, n)`` at one of the times."""
-        column = self._column.get(position)
+        column = self._columns.get(position)
         if column is None:
             return
-        if len(self._first) < len(self._column):
-            self._first.append(state[:, :FAN].copy())
+        if len(self._first_states) < len(self._columns):
+            self._first_states.append(state[:, :FAN].copy())
         np.minimum(self.lower[:, column], state.min(axis=1), out=self.lower[:, column])
         np.maximum(self.upper[:, column], state.max(axis=1), out=self.upper[:, column])
 
     def fan(self) -> Array:
         """Return the first few trajectories ``(n, d, S)``."""
-        return np.ascontiguousarray(np.stack(self._first).transpose(2, 1, 0))
+        return np.ascontiguousarray(np.stack(self._first_states).transpose(2, 1, 0))
 
 
-def _replayed(finished: FinishedRun, stored: Mapping[str, Array], started: float) -> Simulation:
+def _replay_worst_cases(finished: FinishedRun, stored: Mapping[str, Array], started: float) -> Simulation:
     times, states = stored["state_times"], stored["states"]
     attained_violations = attained(stored, times, states)
     shares = []
@@ -280,7 +280,7 @@ def _replayed(finished: FinishedRun, stored: Mapping[str, Array], started: float
                 worst=float(stored["violations"][position]),
                 worst_time=worst_time,
                 worst_parameter=stored["parameters"][position].tolist(),
-                **_measured(constraint),
+                **_get_units(constraint),
             )
         )
     shown = np.unique(np.linspace(0, times.size - 1, min(times.size, SHOWN)).round().astype(int))
@@ -303,7 +303,7 @@ def _replayed(finished: FinishedRun, stored: Mapping[str, Array], started: float
     )
 
 
-def _shares(counts: Sequence[ViolationCount], worst: Mapping[str, Array], count: int) -> list[ConstraintShare]:
+def _compute_shares(counts: Sequence[ViolationCount], worst: Mapping[str, Array], count: int) -> list[ConstraintShare]:
     rows = {name: position for position, name in enumerate(worst["names"].tolist())} if worst else {}
     shares = []
     for violation_count in counts:
@@ -324,18 +324,18 @@ def _shares(counts: Sequence[ViolationCount], worst: Mapping[str, Array], count:
                 worst=np.nan if row is None else float(worst["violations"][row]),
                 worst_time=np.nan if row is None else float(worst["times"][row]),
                 worst_parameter=() if row is None else worst["parameters"][row].tolist(),
-                **_measured(violation_count.constraint),
+                **_get_units(violation_count.constraint),
             )
         )
     return shares
 
 
-def _measured(constraint: StateConstraint) -> dict[str, str]:
+def _get_units(constraint: StateConstraint) -> dict[str, str]:
     """Return the unit of a constraint's violations, and that of times."""
     return {"unit": joined(constraint.measured).strip(), "time_unit": constraint.functionals.names.time}
 
 
-def _together(shares: Sequence[ConstraintShare], violated: int) -> ConstraintShare:
+def _merge_shares(shares: Sequence[ConstraintShare], violated: int) -> ConstraintShare:
     """Return all constraints as one, which a trajectory violates when it violates any of them."""
     most_violated, worst = max(shares, key=lambda share: share.largest), max(shares, key=lambda share: share.worst)
     lower, upper = clopper_pearson(violated, most_violated.trajectories)
@@ -356,7 +356,7 @@ def _together(shares: Sequence[ConstraintShare], violated: int) -> ConstraintSha
     )
 
 
-def _checked(law: str, trajectories: int | None, seed: int) -> int:
+def _check_arguments(law: str, trajectories: int | None, seed: int) -> int:
     if law not in LAWS:
         raise InputError(f"law: there is none called {law!r}{nearest(str(law), LAWS)}")
     if law == ADVERSARY and trajectories is not None:

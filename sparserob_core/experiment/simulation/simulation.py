@@ -169,10 +169,10 @@ class Simulation:
             return names, [
                 [
                     share.name,
-                    _number(share.worst_time, ".6g", share.time_unit),
-                    _vector(share.worst_parameter),
-                    _number(share.worst, ".6e", share.unit),
-                    _number(share.largest, ".6e", share.unit),
+                    _format_number(share.worst_time, ".6g", share.time_unit),
+                    _format_vector(share.worst_parameter),
+                    _format_number(share.worst, ".6e", share.unit),
+                    _format_number(share.largest, ".6e", share.unit),
                     f"{share.largest - share.worst:.1e}",
                 ]
                 for share in self.constraints
@@ -191,11 +191,11 @@ class Simulation:
             [
                 share.name,
                 str(share.violated),
-                _percent(share.share),
-                f"{_percent(share.lower)} to {_percent(share.upper)}",
-                _violation(share),
-                _number(share.worst, ".3e", share.unit),
-                _number(share.worst_time, ".6g", share.time_unit),
+                _format_percent(share.share),
+                f"{_format_percent(share.lower)} to {_format_percent(share.upper)}",
+                _format_violation(share),
+                _format_number(share.worst, ".3e", share.unit),
+                _format_number(share.worst_time, ".6g", share.time_unit),
             ]
             for share in rows
         ]
@@ -230,7 +230,7 @@ class Simulation:
         else:
             yield (
                 f"the run proves nothing of its constraints (status {self.status}): the worst case found is a violation"
-                f" of {'nothing' if worst is None else _number(worst.worst, '.3g', worst.unit)}"
+                f" of {'nothing' if worst is None else _format_number(worst.worst, '.3g', worst.unit)}"
             )
         if self.undrawn:
             yield self.undrawn
@@ -260,18 +260,18 @@ def clopper_pearson(successes: int, trials: int, confidence: float = CONFIDENCE)
     return lower, upper
 
 
-def _percent(share: float) -> str:
+def _format_percent(share: float) -> str:
     return f"{100 * share:.4g} %"
 
 
-def _number(value: float, form: str, unit: str) -> str:
+def _format_number(value: float, form: str, unit: str) -> str:
     return f"{value:{form}} {unit}".rstrip() if np.isfinite(value) else "-"
 
 
-def _violation(one: ConstraintShare) -> str:
+def _format_violation(one: ConstraintShare) -> str:
     text = f"{one.largest:.3e} {one.unit}".rstrip()
-    return f"{text} at t = {_number(one.time, '.6g', one.time_unit)}" if np.isfinite(one.time) else text
+    return f"{text} at t = {_format_number(one.time, '.6g', one.time_unit)}" if np.isfinite(one.time) else text
 
 
-def _vector(values: Sequence[float]) -> str:
+def _format_vector(values: Sequence[float]) -> str:
     return "(" + ", ".join(f"{value:.6g}" for value in values) + ")" if len(values) else "-"

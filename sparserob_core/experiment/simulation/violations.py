@@ -25,11 +25,11 @@ class ViolationCount:
         slack = SAME_TIME * times[-1]
         self.constraint, self.times = constraint, times
         self._is_curved = constraint.sides is None
-        self.units, self._in_own_units = units, constraint.divided(units)
-        self._inside = (times >= constraint.start - slack) & (times <= constraint.stop + slack)
-        self._beside, self._beside_own = constraint.beside(x, times), self._in_own_units.beside(x, times)
+        self.units, self._own_constraint = units, constraint.divided(units)
+        self._is_inside = (times >= constraint.start - slack) & (times <= constraint.stop + slack)
+        self._offsets, self._own_offsets = constraint.beside(x, times), self._own_constraint.beside(x, times)
         self.violated, self.largest, self.time = 0, -np.inf, np.nan
-        self._last = np.zeros((constraint.functionals.response.initial_state.size, 0))
+        self._last_state = np.zeros((constraint.functionals.response.initial_state.size, 0))
 
     @property
     def tolerance(self) -> float:
@@ -38,9 +38,9 @@ class ViolationCount:
 
     def begin(self, count: int) -> None:
         """Begin a new block of ``count`` trajectories."""
-        self._best, self._when = np.full(count, -np.inf), np.zeros(count, dtype=int)
-        self._own = np.full(count, -np.inf)
-        self._states = np.zeros((self.constraint.functionals.response.initial_state.size, count))
+        self._largest_values, self._worst_positions = np.full(count, -np.inf), np.zeros(count, dtype=int)
+        self._own_violations = np.full(count, -np.inf)
+        self._worst_states = np.zeros((self.constraint.functionals.response.initial_state.size, count))
 
     def add(self, position: int, state: Array, control: Array | None = None) -> None:
         """Add the states ``(d, n)`` at one of the times.
@@ -49,43 +49,46 @@ class ViolationCount:
         """
         gains = self.constraint.gains
         if control is None or gains is None:
-            if self._inside[position]:
-                value = self.constraint.outwardness(state, self._beside[position])
+            if self._is_inside[position]:
+                value = self.constraint.outwardness(state, self._offsets[position])
                 own = None
                 if not self._is_curved:
-                    own = self._in_own_units.outwardness(state, self._beside_own[position])
-                self._take(position, state, value, own)
-        elif position and self._inside[position - 1] and self._inside[position]:
-            for index, x in ((position - 1, self._last), (position, state)):
-                value, own = (_mixed(constraint, x, control) for constraint in (self.constraint, self._in_own_units))
-                self._take(index, x, value, own)
-        self._last = state
+                    own = self._own_constraint.outwardness(state, self._own_offsets[position])
+                self._update_largest(position, state, value, own)
+        elif position and self._is_inside[position - 1] and self._is_inside[position]:
+            for index, x in ((position - 1, self._last_state), (position, state)):
+                value, own = (
+                    _compute_mixed_violation(constraint, x, control)
+                    for constraint in (self.constraint, self._own_constraint)
+                )
+                self._update_largest(index, x, value, own)
+        self._last_state = state
 
-    def _take(self, position: int, state: Array, value: Array, own: Array | None) -> None:
+    def _update_largest(self, position: int, state: Array, value: Array, own: Array | None) -> None:
         if own is not None:
-            np.maximum(self._own, own, out=self._own)
-        better = value > self._best
+            np.maximum(self._own_violations, own, out=self._own_violations)
+        better = value > self._largest_values
         if better.any():
-            np.copyto(self._best, value, where=better)
-            self._when[better] = position
+            np.copyto(self._largest_values, value, where=better)
+            self._worst_positions[better] = position
             if self._is_curved:
-                np.copyto(self._states, state + self._beside[position][:, None], where=better)
+                np.copyto(self._worst_states, state + self._offsets[position][:, None], where=better)
 
     def close(self) -> np.ndarray:
         """End the block, and return which of its trajectories ``(n,)`` violate the constraint."""
-        violations = self._best
+        violations = self._largest_values
         if self._is_curved:  # outwardness increases outwards, but it is no distance
-            violations = self.constraint.excess(self._states)
-            self._own = violations / self.units.max()
-        is_violated = self._own > TOLERANCE
+            violations = self.constraint.excess(self._worst_states)
+            self._own_violations = violations / self.units.max()
+        is_violated = self._own_violations > TOLERANCE
         self.violated += int(is_violated.sum())
         top = int(violations.argmax())
         if violations[top] > self.largest:
-            self.largest, self.time = float(violations[top]), float(self.times[self._when[top]])
+            self.largest, self.time = float(violations[top]), float(self.times[self._worst_positions[top]])
         return is_violated
 
 
-def _mixed(constraint: StateConstraint, state: Array, control: Array) -> Array:
+def _compute_mixed_violation(constraint: StateConstraint, state: Array, control: Array) -> Array:
     """Return the largest ``H x + G u - h`` of a mixed constraint, ``(n,)``."""
     assert constraint.sides is not None and constraint.gains is not None
     H, h = constraint.sides

@@ -137,33 +137,35 @@ def parse_axes(given: Mapping[str, object] | Sequence[str] | None) -> list[Axis]
             pairs.append((key.strip(), text))
         else:
             pairs.append((str(entry[0]), entry[1]))
-    axes = [axis for key, value in pairs for axis in _axes(key, value)]
+    axes = [axis for key, value in pairs for axis in _make_axes(key, value)]
     for position, axis in enumerate(axes):
         if axis.path in (earlier.path for earlier in axes[:position]):
             raise InputError(path=axis.key, expected="every key once", got="it twice")
     return axes
 
 
-def _axes(key: str, value: Any) -> list[Axis]:
+def _make_axes(key: str, value: Any) -> list[Axis]:
     """Return the axis of a key, or the axes of several keys that are paired."""
     keys = [name.strip() for name in key.split(",")]
     if len(keys) == 1:
-        return [_axis(key, value)]
-    entries = _rows(key, value) if isinstance(value, str) else value
-    rows = [_plain(row) for row in entries] if isinstance(entries, list | tuple) or hasattr(entries, "tolist") else []
+        return [_make_axis(key, value)]
+    entries = _parse_rows(key, value) if isinstance(value, str) else value
+    rows = (
+        [_to_plain(row) for row in entries] if isinstance(entries, list | tuple) or hasattr(entries, "tolist") else []
+    )
     if not rows or not all(isinstance(row, list) and len(row) == len(keys) for row in rows):
         raise InputError(
             path=key,
             expected=f"lists of {len(keys)} values, one for each key, such as [1, 2], [3, 4]",
             got=shown(value),
         )
-    _counted(key, tuple(rows))
+    _check_values(key, tuple(rows))
     axes = []
     for name, column in zip(keys, zip(*rows, strict=True), strict=True):
         if path_of(name)[0] in FIXED:
             raise InputError(path=name, expected="a key that decides a result, where keys are paired", got="this one")
         paired = tuple(keys) if len(rows) > 1 else ()
-        axes.append(Axis(name, column, list(column), log=_geometric(column), paired=paired))
+        axes.append(Axis(name, column, list(column), log=_is_geometric(column), paired=paired))
     return axes
 
 
@@ -180,29 +182,29 @@ def require_whole(axes: Sequence[Axis]) -> None:
                 )
 
 
-def _axis(key: str, value: object) -> Axis:
+def _make_axis(key: str, value: object) -> Axis:
     if path_of(key)[0] in FIXED:
-        value = _plain(_value(key, value, 1) if isinstance(value, str) else value)
+        value = _to_plain(_parse_entry(key, value, 1) if isinstance(value, str) else value)
         return Axis(key, (value,), value)
     if hasattr(value, "tolist"):
         value = value.tolist()
     if isinstance(value, str):
-        return _written(key, value)
+        return _parse_axis(key, value)
     if isinstance(value, list | tuple | range):
-        values = tuple(_plain(entry) for entry in value)
-        return Axis(key, _counted(key, values), list(values), log=_geometric(values))
-    return Axis(key, (_plain(value),), _plain(value))
+        values = tuple(_to_plain(entry) for entry in value)
+        return Axis(key, _check_values(key, values), list(values), log=_is_geometric(values))
+    return Axis(key, (_to_plain(value),), _to_plain(value))
 
 
-def _rows(key: str, text: str) -> list[Any]:
+def _parse_rows(key: str, text: str) -> list[Any]:
     """Return the values of paired keys from one line of text."""
     tokens = list(split(text))
-    rows = [_value(key.partition(",")[0], token, len(tokens)) for token in tokens]
+    rows = [_parse_entry(key.partition(",")[0], token, len(tokens)) for token in tokens]
     inner_rows = rows[0] if len(rows) == 1 and isinstance(rows[0], list) else []
     return inner_rows if inner_rows and all(isinstance(row, list) for row in inner_rows) else rows
 
 
-def _written(key: str, text: str) -> Axis:
+def _parse_axis(key: str, text: str) -> Axis:
     """Return the axis of a key from one line of text."""
     values, logs, span = list[Any](), list[bool](), None
     tokens = list(split(text))
@@ -211,19 +213,19 @@ def _written(key: str, text: str) -> Axis:
         if match is None and token.startswith("log:"):
             raise InputError(path=key, expected=AS_WRITTEN, got=shown(token))
         if match is None:
-            values.append(_value(key, token, len(tokens)))
+            values.append(_parse_entry(key, token, len(tokens)))
             continue
         logs.append(bool(match[1]))
         if match[4] is not None:
-            values += _range(key, token, match)
+            values += _expand_range(key, token, match)
         elif len(tokens) == 1:
-            span = _span(key, token, match)
+            span = _make_span(key, token, match)
         else:
             raise InputError(path=key, expected=f"one range, or {AS_WRITTEN}", got=shown(text))
-    if len(values) == 1 and span is None and isinstance(values[0], list) and _of_components(key):
+    if len(values) == 1 and span is None and isinstance(values[0], list) and _is_component(key):
         values = values[0]  # a component is never a list, so that the list holds the values
-    log = all(logs) if logs else _geometric(values)
-    return Axis(key, () if span else _counted(key, tuple(values)), text.strip(), span, log)
+    log = all(logs) if logs else _is_geometric(values)
+    return Axis(key, () if span else _check_values(key, tuple(values)), text.strip(), span, log)
 
 
 def split(text: str) -> Iterator[str]:
@@ -245,7 +247,7 @@ def split(text: str) -> Iterator[str]:
     yield text[start:].strip()
 
 
-def _value(key: str, part: str, of: int) -> object:
+def _parse_entry(key: str, part: str, of: int) -> object:
     if not part and of > 1:
         raise InputError(path=key, expected="a value between commas", got="nothing")
     try:
@@ -254,7 +256,7 @@ def _value(key: str, part: str, of: int) -> object:
         raise InputError(f"{key}: {error}") from None
 
 
-def _range(key: str, part: str, found: re.Match[str]) -> list[float] | list[int]:
+def _expand_range(key: str, part: str, found: re.Match[str]) -> list[float] | list[int]:
     low, high, log = float(found[2]), float(found[3]), bool(found[1])
     if not WHOLE.fullmatch(found[4]) or not 1 <= int(found[4]) <= MOST or (int(found[4]) == 1 and low != high):
         raise InputError(
@@ -274,7 +276,7 @@ def _range(key: str, part: str, found: re.Match[str]) -> list[float] | list[int]
     return [low, *(float(f"{value:.15g}") for value in values[1:-1]), *([high] if count > 1 else [])]
 
 
-def _span(key: str, part: str, found: re.Match[str]) -> Span:
+def _make_span(key: str, part: str, found: re.Match[str]) -> Span:
     low, high, log = float(found[2]), float(found[3]), bool(found[1])
     _check_ends(key, part, low, high, log)
     if not low < high:
@@ -289,7 +291,7 @@ def _check_ends(key: str, part: str, low: float, high: float, log: bool) -> None
         raise InputError(path=key, expected="positive numbers in a logarithmic range", got=shown(part))
 
 
-def _counted(key: str, values: tuple[Any, ...]) -> tuple[Any, ...]:
+def _check_values(key: str, values: tuple[Any, ...]) -> tuple[Any, ...]:
     if not 1 <= len(values) <= MOST:
         raise InputError(path=key, expected=f"1 to {MOST} values", got=str(len(values)))
     reprs = set[str]()
@@ -300,7 +302,7 @@ def _counted(key: str, values: tuple[Any, ...]) -> tuple[Any, ...]:
     return values
 
 
-def _geometric(values: Sequence[Any]) -> bool:
+def _is_geometric(values: Sequence[Any]) -> bool:
     """Return whether listed numbers are meant for a logarithmic axis: at least three, over at least two decades."""
     numbers = [
         float(value) for value in values if isinstance(value, int | float) and not isinstance(value, bool) and value > 0
@@ -308,14 +310,14 @@ def _geometric(values: Sequence[Any]) -> bool:
     return len(numbers) == len(values) >= 3 and max(numbers) >= 100.0 * min(numbers)
 
 
-def _of_components(key: str) -> bool:
+def _is_component(key: str) -> bool:
     return key.strip() in {dotted(path) for path in SLOTS}
 
 
-def _plain(value: Any) -> Any:
+def _to_plain(value: Any) -> Any:
     """Return a value from Python as a config has it."""
     if hasattr(value, "tolist"):
         return value.tolist()
     if isinstance(value, Mapping):
-        return {str(key): _plain(item) for key, item in value.items()}
-    return [_plain(item) for item in value] if isinstance(value, list | tuple) else value
+        return {str(key): _to_plain(item) for key, item in value.items()}
+    return [_to_plain(item) for item in value] if isinstance(value, list | tuple) else value

@@ -65,17 +65,21 @@ def draw_study(study: Study) -> Figure:
     if study.arrangement == "zip":  # one line through the values, drawn over the first axis
         numeric, categorical = numeric[:1], categorical[:1] if not numeric else []
     drawn = study.arrangement in ("random", "sobol")
-    if len(numeric) == 2 and not categorical and (drawn or min(_size(study, axis) for axis in numeric) >= CELLS):
-        return _map(study, numeric)
+    if (
+        len(numeric) == 2
+        and not categorical
+        and (drawn or min(_count_values(study, axis) for axis in numeric) >= CELLS)
+    ):
+        return _draw_map(study, numeric)
     if numeric:
-        numeric.sort(key=lambda axis: -_size(study, axis))
-        return _curves(study, numeric[0], [*numeric[1:], *categorical])
-    return _categories(study, categorical)
+        numeric.sort(key=lambda axis: -_count_values(study, axis))
+        return _draw_curves(study, numeric[0], [*numeric[1:], *categorical])
+    return _draw_categories(study, categorical)
 
 
 @final
 @dataclass(frozen=True)
-class _Spread:
+class _Quartiles:
     """The median and the quartiles of rows that differ in the seed only; nan where there are none."""
 
     middle: float
@@ -83,32 +87,32 @@ class _Spread:
     high: float
 
 
-def _spread(values: Sequence[float | None]) -> _Spread:
+def _compute_quartiles(values: Sequence[float | None]) -> _Quartiles:
     known_values = [value for value in values if value is not None]
     if not known_values:
-        return _Spread(np.nan, np.nan, np.nan)
+        return _Quartiles(np.nan, np.nan, np.nan)
     low, middle, high = (float(quantile) for quantile in np.quantile(known_values, (0.25, 0.5, 0.75)))
-    return _Spread(middle, low, high)
+    return _Quartiles(middle, low, high)
 
 
-def _grouped(rows: Sequence[Row], axes: Sequence[Axis]) -> dict[str, list[Row]]:
+def _group_rows(rows: Sequence[Row], axes: Sequence[Axis]) -> dict[str, list[Row]]:
     """Return rows by the values of axes, in words."""
     groups: dict[str, list[Row]] = {}
     for row in rows:
         alone = len(axes) == 1 and not axes[0].numeric
-        label = ", ".join(value_text(row[axis.key]) if alone else _named(axis, row[axis.key]) for axis in axes)
+        label = ", ".join(value_text(row[axis.key]) if alone else _name_value(axis, row[axis.key]) for axis in axes)
         groups.setdefault(plain(shorten(label, LETTERS, placeholder="...")) if axes else "", []).append(row)
     return groups
 
 
-def _named(axis: Axis, value: object) -> str:
+def _name_value(axis: Axis, value: object) -> str:
     steps = [str(step) for step in axis.path if step != "name"]
     return f"{steps[-1] if steps else axis.key} {value_text(value)}"
 
 
-def _curves(study: Study, along: Axis, others: Sequence[Axis]) -> Figure:
+def _draw_curves(study: Study, along: Axis, others: Sequence[Axis]) -> Figure:
     """Return curves of the cost and of the lower bound along an axis, one pair for each combination of the others."""
-    groups = _grouped(study.table, others)
+    groups = _group_rows(study.table, others)
     legend_rows = -(-(len(groups) + 2) // 2) if len(groups) <= len(COLOURS) * len(DASHES) else 1
     figure, (ax,) = look.panels(1, 2.9, extra=0.2 * legend_rows)
     has_legend = len(groups) <= len(COLOURS) * len(DASHES)
@@ -119,25 +123,27 @@ def _curves(study: Study, along: Axis, others: Sequence[Axis]) -> Figure:
         for row in rows:
             by_value.setdefault(float(row[along.key]), []).append(row)
         x = np.array(sorted(by_value))
-        cost = [_spread([row.get("cost") for row in by_value[value]]) for value in x]
-        lower = [_spread([row.get("lower_bound") for row in by_value[value]]) for value in x]
-        middle, below = _values(cost, "middle"), _values(lower, "middle")
+        cost = [_compute_quartiles([row.get("cost") for row in by_value[value]]) for value in x]
+        lower = [_compute_quartiles([row.get("lower_bound") for row in by_value[value]]) for value in x]
+        middle, below = _extract_values(cost, "middle"), _extract_values(lower, "middle")
         ax.fill_between(x, below, middle, color=colour, alpha=0.15, linewidth=0, zorder=1)
         if max(map(len, by_value.values())) > 1:
-            ax.fill_between(x, _values(cost, "low"), _values(cost, "high"), color=colour, alpha=0.3, linewidth=0)
+            ax.fill_between(
+                x, _extract_values(cost, "low"), _extract_values(cost, "high"), color=colour, alpha=0.3, linewidth=0
+            )
         ax.plot(x, middle, color=colour, linestyle=dash, linewidth=1.4, zorder=3, label=label or "cost")
         ax.plot(x, below, color=colour, linestyle=dash, linewidth=0.8, zorder=2)
-        _marks(ax, x, middle, [_worst_status(by_value[value]) for value in x], colour)
+        _draw_marks(ax, x, middle, [_find_worst_status(by_value[value]) for value in x], colour)
     ax.plot([], [], color=look.INK, linewidth=0.8, label="proven lower bound (thin)")
-    _scale(ax.set_xscale, along, [float(row[along.key]) for row in study.table])
-    _cost_scale(ax.set_yscale, study.table)
+    _scale_axis(ax.set_xscale, along, [float(row[along.key]) for row in study.table])
+    _scale_costs(ax.set_yscale, study.table)
     ax.set_xlabel(measured(along.key, axis_unit(along.key, study.table)))
     ax.set_ylabel(measured("cost $J$", study.cost_unit))
-    _finish(figure, ax, study, has_legend)
+    _finish_figure(figure, ax, study, has_legend)
     return figure
 
 
-def _marks(ax: Axes, x: Array, y: Array, statuses: Sequence[str], colour: str) -> None:
+def _draw_marks(ax: Axes, x: Array, y: Array, statuses: Sequence[str], colour: str) -> None:
     """Draw the status of every point: on its cost, or at the lower edge where there is none."""
     edge = ax.get_xaxis_transform()
     for status in dict.fromkeys(statuses):
@@ -162,7 +168,7 @@ def _marks(ax: Axes, x: Array, y: Array, statuses: Sequence[str], colour: str) -
                 ax.plot(x[mask], height[mask], **looks)[0].set_in_layout(False)
 
 
-def _map(study: Study, axes: Sequence[Axis]) -> Figure:
+def _draw_map(study: Study, axes: Sequence[Axis]) -> Figure:
     """Return a map of the cost over two axes: cells of a grid, or points that were drawn."""
     from matplotlib.figure import Figure
 
@@ -173,11 +179,11 @@ def _map(study: Study, axes: Sequence[Axis]) -> Figure:
     for row in study.table:
         cells.setdefault((float(row[first.key]), float(row[second.key])), []).append(row)
     x, y = (np.array(sorted({pair[k] for pair in cells})) for k in (0, 1))
-    _scale(ax.set_xscale, first, x)
-    _scale(ax.set_yscale, second, y)
+    _scale_axis(ax.set_xscale, first, x)
+    _scale_axis(ax.set_yscale, second, y)
     if study.arrangement in ("random", "sobol"):
         points = np.array(list(cells))
-        costs = np.array([_spread([row.get("cost") for row in rows]).middle for rows in cells.values()])
+        costs = np.array([_compute_quartiles([row.get("cost") for row in rows]).middle for rows in cells.values()])
         is_finite = np.isfinite(costs)
         drawn: Any = ax.scatter(
             points[is_finite, 0], points[is_finite, 1], c=costs[is_finite], cmap="viridis", s=26, linewidths=0
@@ -185,13 +191,15 @@ def _map(study: Study, axes: Sequence[Axis]) -> Figure:
     else:
         costs = np.full((y.size, x.size), np.nan)
         for (first_value, second_value), rows in cells.items():
-            costs[np.searchsorted(y, second_value), np.searchsorted(x, first_value)] = _spread(
+            costs[np.searchsorted(y, second_value), np.searchsorted(x, first_value)] = _compute_quartiles(
                 [r.get("cost") for r in rows]
             ).middle
-        drawn = ax.pcolormesh(_edges(x, first.log), _edges(y, second.log), costs, cmap="viridis", linewidth=0)
+        drawn = ax.pcolormesh(
+            _compute_edges(x, first.log), _compute_edges(y, second.log), costs, cmap="viridis", linewidth=0
+        )
         drawn.set_edgecolor("face")
     for status in MARKS:
-        marked = [pair for pair, rows in cells.items() if _worst_status(rows) == status]
+        marked = [pair for pair, rows in cells.items() if _find_worst_status(rows) == status]
         if marked and status != "certified":
             places = np.array(marked)
             kind: dict[str, Any] = {"facecolors": "none"} if MARKS[status] in FILLED else {}
@@ -203,18 +211,18 @@ def _map(study: Study, axes: Sequence[Axis]) -> Figure:
     ax.set_ylabel(measured(second.key, axis_unit(second.key, study.table)))
     for spine in ("top", "right"):
         ax.spines[spine].set_visible(True)
-    _finish(figure, ax, study, told=False, marked=[status for status in MARKS if status != "certified"])
+    _finish_figure(figure, ax, study, told=False, marked=[status for status in MARKS if status != "certified"])
     return figure
 
 
-def _categories(study: Study, axes: Sequence[Axis]) -> Figure:
+def _draw_categories(study: Study, axes: Sequence[Axis]) -> Figure:
     """Return the costs down to their lower bounds, and the seconds, one line for each combination of values.
 
     Several seeds are shown as a box.
     """
     from matplotlib.figure import Figure
 
-    groups = _grouped(study.table, axes)
+    groups = _group_rows(study.table, axes)
     figure = Figure(figsize=(look.WIDTH, 0.32 * len(groups) + 1.6), layout="constrained")
     left_ax, right_ax = figure.subplots(1, 2, sharey=True, width_ratios=(3, 2))
     for position, rows in enumerate(groups.values()):
@@ -244,7 +252,7 @@ def _categories(study: Study, axes: Sequence[Axis]) -> Figure:
             right_ax.plot(seconds, [position] * len(seconds), "o", color=look.VERMILLION, markersize=4)
     left_ax.set_yticks(range(len(groups)), [label or "all" for label in groups])
     left_ax.set_ylim(len(groups) - 0.5, -0.5)
-    _cost_scale(left_ax.set_xscale, study.table)
+    _scale_costs(left_ax.set_xscale, study.table)
     times = [float(row["seconds"]) for row in study.table if row.get("seconds")]
     if times and max(times) > 20.0 * min(times):
         right_ax.set_xscale("log")
@@ -252,7 +260,7 @@ def _categories(study: Study, axes: Sequence[Axis]) -> Figure:
         right_ax.set_xlim(left=0.0)
     left_ax.set_xlabel(measured("cost $J$", study.cost_unit) + ", down to its proven lower bound")
     right_ax.set_xlabel("seconds of the method (s)")
-    _finish(figure, left_ax, study, told=False)
+    _finish_figure(figure, left_ax, study, told=False)
     return figure
 
 
@@ -266,7 +274,7 @@ _BOX: dict[str, Any] = {
 }
 
 
-def _finish(figure: Figure, ax: Axes, study: Study, told: bool, marked: Iterable[str] = MARKS) -> None:
+def _finish_figure(figure: Figure, ax: Axes, study: Study, told: bool, marked: Iterable[str] = MARKS) -> None:
     """Add the title, and below the figure a legend of the markers that occur."""
     from matplotlib.lines import Line2D
 
@@ -290,16 +298,16 @@ def _finish(figure: Figure, ax: Axes, study: Study, told: bool, marked: Iterable
     figure.legend(handles, labels, loc="outside lower center", ncols=columns, columnspacing=1.6, handlelength=1.8)
 
 
-def _worst_status(rows: Sequence[Row]) -> str:
+def _find_worst_status(rows: Sequence[Row]) -> str:
     """Return the status of several seeds that proves least."""
     return max((str(row["status"]) for row in rows), key=list(MARKS).index)
 
 
-def _values(spreads: Sequence[_Spread], name: str) -> Array:
+def _extract_values(spreads: Sequence[_Quartiles], name: str) -> Array:
     return np.array([getattr(spread, name) for spread in spreads])
 
 
-def _edges(values: Array, log: bool) -> Array:
+def _compute_edges(values: Array, log: bool) -> Array:
     """Return the edges of cells about values, half-way between them."""
     centres = np.log(values) if log else values
     if centres.size == 1:
@@ -310,19 +318,19 @@ def _edges(values: Array, log: bool) -> Array:
     return np.exp(edges) if log else edges
 
 
-def _scale(set_scale: Any, axis: Axis, values: Sequence[float] | Array) -> None:
+def _scale_axis(set_scale: Any, axis: Axis, values: Sequence[float] | Array) -> None:
     if axis.log and min(values) > 0.0:
         set_scale("log")
 
 
-def _cost_scale(set_scale: Any, rows: Sequence[Row]) -> None:
+def _scale_costs(set_scale: Any, rows: Sequence[Row]) -> None:
     """Use a logarithmic axis for costs over three decades and more."""
     costs = [float(row["cost"]) for row in rows if row.get("cost") is not None]
     if costs and min(costs) > 0.0 and max(costs) >= 1000.0 * min(costs):
         set_scale("log")
 
 
-def _size(study: Study, axis: Axis) -> int:
+def _count_values(study: Study, axis: Axis) -> int:
     """Return the number of values of an axis that occur."""
     return len({float(row[axis.key]) for row in study.table})
 

@@ -102,7 +102,7 @@ class Plan:
         Raises `InputError` where the axes do not fit the arrangement, or have too many combinations.
         """
         if self.points in ("random", "sobol"):
-            return self._drawn()
+            return self._draw_points()
         for axis in self.axes:
             if axis.span is not None:
                 raise InputError(
@@ -116,10 +116,10 @@ class Plan:
                 counts_text = ", ".join(f"{count} of {key}" for key, count in counts.items())
                 raise InputError(path="zip", expected="axes with equally many values", got=counts_text)
             return list(zip(*(axis.values for axis in self.axes), strict=True)) if self.axes else [()]
-        places = list(product(*(range(len(axis.values)) for axis in self._leading(MOST))))
-        return [self._values_at(row) for row in places]
+        places = list(product(*(range(len(axis.values)) for axis in self._list_leading_axes(MOST))))
+        return [self._get_values(row) for row in places]
 
-    def _leading(self, most: float = np.inf) -> list[Axis]:
+    def _list_leading_axes(self, most: float = np.inf) -> list[Axis]:
         """Return the axes without those that follow another one; raises `InputError` for more than ``most``
         combinations."""
         leading = [axis for axis in self.axes if not axis.follows]
@@ -128,13 +128,13 @@ class Plan:
             raise InputError(path="axes", expected=f"at most {MOST} points", got=str(count))
         return leading
 
-    def _values_at(self, places: Sequence[int]) -> tuple[Any, ...]:
+    def _get_values(self, places: Sequence[int]) -> tuple[Any, ...]:
         """Return the values of all axes, where the leading ones are at these ``places``."""
-        index_of_key = dict(zip((axis.key for axis in self._leading()), places, strict=True))
+        index_of_key = dict(zip((axis.key for axis in self._list_leading_axes()), places, strict=True))
         return tuple(axis.values[index_of_key[axis.paired[0] if axis.paired else axis.key]] for axis in self.axes)
 
-    def _drawn(self) -> list[tuple[Any, ...]]:
-        leading = self._leading()
+    def _draw_points(self) -> list[tuple[Any, ...]]:
+        leading = self._list_leading_axes()
         count, dimension = int(self.number or 0), len(leading)
         if not any(axis.span for axis in self.axes):
             expected = "at least one range to draw from, such as key=0.01:0.06"
@@ -145,7 +145,7 @@ class Plan:
         if self.points == "random":
             shares = rng.random((count, dimension))
         else:
-            shares = _sobol(dimension, count, rng)
+            shares = _draw_sobol(dimension, count, rng)
         columns = {axis.key: column for axis, column in zip(leading, shares.T.tolist(), strict=True)}
         drawn = []
         for axis in self.axes:
@@ -176,7 +176,7 @@ class Plan:
         axes: dict[str, Any] = {}
         for axis in self.changes:
             if not axis.paired:
-                axes[axis.key] = _listed(axis)
+                axes[axis.key] = _write_axis(axis)
             elif not axis.follows:
                 group = [next(change for change in self.changes if change.key == key) for key in axis.paired]
                 axes[",".join(axis.paired)] = [
@@ -234,9 +234,9 @@ def make_plan(
         If an argument is at fault.
     """
     source = read_source(config)
-    plan = _stored(source) if {"base", "axes"} & set(source.data) else Plan(_based(source), ())
+    plan = _parse_plan(source) if {"base", "axes"} & set(source.data) else Plan(_resolve_base(source), ())
     kept = list(plan.changes)
-    changes = _changes(overrides)
+    changes = _parse_changes(overrides)
     new_axes = parse_axes(list(axes) if isinstance(axes, Iterable) and not isinstance(axes, str | Mapping) else axes)
     for path in {change.path for change in changes} & {axis.path for axis in new_axes}:
         raise InputError(path=path, expected="an axis or an override", got="both")
@@ -248,21 +248,21 @@ def make_plan(
     require_whole(kept)
     plan = replace(
         plan,
-        changes=tuple(map(_absolute, kept)),
+        changes=tuple(map(_resolve_files, kept)),
         points=points or plan.points,
         number=number if points else plan.number,
     )
     drawn = plan.points in ("random", "sobol")
-    return replace(plan, seed=_seed(plan)) if drawn and plan.seed is None else plan
+    return replace(plan, seed=_find_seed(plan)) if drawn and plan.seed is None else plan
 
 
-def _changes(overrides: Mapping[str, object] | Iterable[str] | None) -> list[Axis]:
+def _parse_changes(overrides: Mapping[str, object] | Iterable[str] | None) -> list[Axis]:
     """Return overrides as changes with a single value each, lists and texts with commas included."""
     parsed_overrides = parse_overrides(overrides, read_value)
     return [Axis(".".join(map(str, override.path)), (override.value,), override.value) for override in parsed_overrides]
 
 
-def _listed(axis: Axis) -> object:
+def _write_axis(axis: Axis) -> object:
     """Return an axis as it stands in ``sweep.yaml``.
 
     A single value is a list of one, unless its key is never an axis.
@@ -278,21 +278,23 @@ def read_plan(file: Path) -> Plan:
     return make_plan(file)
 
 
-def _stored(source: Source) -> Plan:
+def _parse_plan(source: Source) -> Plan:
     """Return the study in a file, with its keys checked."""
     data = source.data
     for key in data:
         if key not in KEYS:
-            raise _fault(source, key, f"unknown key{nearest(str(key), KEYS)}")
+            raise _make_error(source, key, f"unknown key{nearest(str(key), KEYS)}")
     base = data.get("base")
     if not isinstance(base, str | Mapping) or not base:
-        raise _fault(source, "base", f"must be a config, or the name of its file (got {shown(base)})")
+        raise _make_error(source, "base", f"must be a config, or the name of its file (got {shown(base)})")
     for key in ("axes", "overrides"):
         if not isinstance(data.get(key, {}), Mapping):
-            raise _fault(source, key, f"must be a mapping of keys of the config to values (got {shown(data[key])})")
-    points, number, seed = _arrangement(source)
+            raise _make_error(
+                source, key, f"must be a mapping of keys of the config to values (got {shown(data[key])})"
+            )
+    points, number, seed = _parse_arrangement(source)
     try:
-        changes = [*_changes(data.get("overrides")), *parse_axes(data.get("axes"))]
+        changes = [*_parse_changes(data.get("overrides")), *parse_axes(data.get("axes"))]
     except InputError as error:
         raise ConfigError(f"{source.where(('axes', *error.path))}: {error}") from None
     below = (
@@ -300,31 +302,31 @@ def _stored(source: Source) -> Plan:
         if isinstance(base, str)
         else replace(source, data=dict(base), text="")
     )
-    return Plan(_based(below), tuple(changes), points, number, seed, source.name)
+    return Plan(_resolve_base(below), tuple(changes), points, number, seed, source.name)
 
 
-def _arrangement(source: Source) -> tuple[Arrangement, int | None, int | None]:
+def _parse_arrangement(source: Source) -> tuple[Arrangement, int | None, int | None]:
     """Return how the points of a study's file are chosen, how many are drawn, and with which seed."""
     points = source.data.get("points", "grid")
     if points not in ARRANGEMENTS:
-        raise _fault(source, "points", f"must be one of {', '.join(ARRANGEMENTS)} (got {shown(points)})")
+        raise _make_error(source, "points", f"must be one of {', '.join(ARRANGEMENTS)} (got {shown(points)})")
     drawn = points in ("random", "sobol")
     numbers = list[int | None]()
     for key, least in (("number", 1), ("seed", 0)):
         value = source.data.get(key)
         if value is not None and not drawn:
-            raise _fault(source, key, f"is for points that are drawn (random, sobol), not for {points}")
+            raise _make_error(source, key, f"is for points that are drawn (random, sobol), not for {points}")
         if (value is not None or (drawn and key == "number")) and not is_whole(value, least):
-            raise _fault(source, key, f"must be a whole number of at least {least} (got {shown(value)})")
+            raise _make_error(source, key, f"must be a whole number of at least {least} (got {shown(value)})")
         numbers.append(value)
     return points, numbers[0], numbers[1]
 
 
-def _fault(source: Source, key: str, said: str) -> ConfigError:
+def _make_error(source: Source, key: str, said: str) -> ConfigError:
     return ConfigError(f"{source.where((key,))}: {key}: {said}")
 
 
-def _based(source: Source) -> Source:
+def _resolve_base(source: Source) -> Source:
     """Return the base of a study in a form that holds in any folder.
 
     Files of plugins have their absolute names, the numbers of matrices replace their files, and its own name is the
@@ -337,21 +339,21 @@ def _based(source: Source) -> Source:
     return replace(source, data=data)
 
 
-def _absolute(axis: Axis) -> Axis:
+def _resolve_files(axis: Axis) -> Axis:
     if axis.path != ("plugins",) or not isinstance(axis.values[0], list):
         return axis
     files = [name_of(path_of(str(file)).resolve()) for file in axis.values[0]]
     return replace(axis, values=(files,), written=files)
 
 
-def _seed(plan: Plan) -> int:
+def _find_seed(plan: Plan) -> int:
     """Return the seed of the base config, with which points are drawn."""
     fixed = (axis.values[0] for axis in plan.changes if axis.single and axis.path == ("seed",))
     changed = next(fixed, plan.base.data.get("seed", 0))
     return changed if is_whole(changed, 0) else 0
 
 
-def _sobol(dimension: int, count: int, rng: np.random.Generator) -> np.ndarray:
+def _draw_sobol(dimension: int, count: int, rng: np.random.Generator) -> np.ndarray:
     """Return the first points ``(count, dimension)`` of a scrambled sequence; a larger number begins with the same
     points."""
     from scipy.stats import qmc

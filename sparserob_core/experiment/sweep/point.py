@@ -25,7 +25,7 @@ ACCURACY = 1e-6  # of a program that is solved only so that its imports are made
 TRIES = 5  # attempts to rename a directory while another process may give the same name to another one
 
 
-_solved_with = set[tuple[str, str]]()  # in this process
+_imported_solvers = set[tuple[str, str]]()  # in this process
 
 
 @final
@@ -118,22 +118,22 @@ def run_point(task: Task, observers: Iterable[Observer] = ()) -> Answer:
     try:
         partial.parent.mkdir(parents=True, exist_ok=True)
         loaded = load_config(task.config)
-        _import_what_runs(loaded)
+        _import_packages(loaded)
         outcome = run_loaded(loaded, task.git, partial, quiet=True, figures=task.figures, observers=observers)
         if outcome.interrupted and outcome.result.stopped:
             raise KeyboardInterrupt(outcome.result.stopped)
         keep(partial, ends)
         return Answer(finite(outcome.summary), interrupted=outcome.interrupted)
     except OutOfTime as error:
-        return _failed(partial, ends, str(error))
+        return _keep_failure(partial, ends, str(error))
     except KeyboardInterrupt:
         shutil.rmtree(partial, ignore_errors=True)
         raise
     except (Exception, SystemExit) as error:  # noqa: BLE001  one point must not end the study
-        return _failed(partial, ends, str(error) if isinstance(error, SparseRobError) else named(error))
+        return _keep_failure(partial, ends, str(error) if isinstance(error, SparseRobError) else named(error))
 
 
-def _import_what_runs(loaded: Loaded) -> None:
+def _import_packages(loaded: Loaded) -> None:
     """Import the packages that a run imports when it needs them, the solver's included.
 
     Otherwise the column ``seconds`` of the first run in every process would be half a second larger.
@@ -143,9 +143,9 @@ def _import_what_runs(loaded: Loaded) -> None:
 
     assert scipy.optimize
     entry = loaded.config.solver
-    if (entry.name, repr(entry.options)) in _solved_with:
+    if (entry.name, repr(entry.options)) in _imported_solvers:
         return
-    _solved_with.add((entry.name, repr(entry.options)))
+    _imported_solvers.add((entry.name, repr(entry.options)))
     unit, empty = csc_array(np.ones((1, 1))), csc_array((0, 1))
     smallest = QuadraticProgram(unit, -np.ones(1), unit, np.ones(1), empty, np.zeros(0), np.zeros(1), np.ones(1))
     with suppress(SparseRobError):  # the run itself reports the error
@@ -170,7 +170,7 @@ def keep(partial: Path, ends: Path) -> None:
                 raise
 
 
-def _failed(partial: Path, ends: Path, said: str) -> Answer:
+def _keep_failure(partial: Path, ends: Path, said: str) -> Answer:
     """Keep the directory of a run that ended in an error, and return an answer with the reason."""
     if (partial / "result.json").is_file():
         keep(partial, ends)

@@ -103,7 +103,7 @@ def shown(study: Study) -> tuple[list[str], list[list[str]]]:
     many."""
     unit = f" [{study.cost_unit}]" if study.cost_unit else ""
     if len(study.table) > LINES:
-        return _by_status(study.table, unit)
+        return _summarise_by_status(study.table, unit)
     keys = [axis.key for axis in study.axes]
     columns = [name + unit if name == "cost" else name for name in COLUMNS]
     return [*keys, *columns], [[*(value_text(row[key]) for key in keys), *short(row)] for row in study.table]
@@ -113,10 +113,10 @@ def short(row: Mapping[str, Any]) -> list[str]:
     """Return the columns of a point on a terminal: status, cost, gap, share of time active, seconds."""
     return [
         str(row["status"]),
-        _number(row.get("cost"), ".9g"),
-        _number(row.get("gap"), ".1e"),
-        _number(row.get("sparsity.active_fraction"), ".1%"),
-        _number(row.get("seconds"), ".2f"),
+        _format_number(row.get("cost"), ".9g"),
+        _format_number(row.get("gap"), ".1e"),
+        _format_number(row.get("sparsity.active_fraction"), ".1%"),
+        _format_number(row.get("seconds"), ".2f"),
     ]
 
 
@@ -138,18 +138,18 @@ def remarks_of(study: Study) -> Iterator[str]:
         yield f"{study.stopped}; what is left: sparserob sweep --resume {quote(str(study.directory))}"
 
 
-def _by_status(table: Sequence[Row], unit: str) -> tuple[list[str], list[list[str]]]:
+def _summarise_by_status(table: Sequence[Row], unit: str) -> tuple[list[str], list[list[str]]]:
     rows = []
     for status in sorted({str(row["status"]) for row in table}):
         rows_of_status = [row for row in table if row["status"] == status]
         costs = [row["cost"] for row in rows_of_status if row.get("cost") is not None]
         seconds = sum(row.get("seconds") or 0.0 for row in rows_of_status)
-        smallest, largest = (_number(pick(costs), ".9g") if costs else "-" for pick in (min, max))
+        smallest, largest = (_format_number(pick(costs), ".9g") if costs else "-" for pick in (min, max))
         rows.append([status, str(len(rows_of_status)), smallest, largest, f"{seconds:.2f}"])
     return ["status", "points", f"least cost{unit}", f"largest cost{unit}", "seconds"], rows
 
 
-def _number(value: Any, form: str) -> str:
+def _format_number(value: Any, form: str) -> str:
     return "-" if value is None else format(value, form)
 
 

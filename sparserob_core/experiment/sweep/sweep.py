@@ -168,35 +168,35 @@ def sweep(
     InputError
         If an axis, a point's config or the directory is at fault. It is raised before anything is run.
     """
-    stated, out = _found(config, out)
-    plan = make_plan(as_config(stated), axes, overrides, points=points, number=_number(points, number))
+    stated, out = _resolve_study(config, out)
+    plan = make_plan(as_config(stated), axes, overrides, points=points, number=_check_number(points, number))
     if point is not None:
-        _check_one(out, executor)
+        _check_single_point(out, executor)
     checked = plan.checked(notify)
-    factory = _executors(checked[0], executor if point is None else "serial")
+    factory = _build_executors(checked[0], executor if point is None else "serial")
     if point is not None:
-        checked = [_one_of(checked, point)]
+        checked = [_find_point(checked, point)]
     broadcast = Broadcast([(type(observer).__name__, observer) for observer in observers])
-    walk = None
+    sweep_call = None
     try:
         if point is not None and out is not None:
             study_directory = share_directory(out, FILE, plan.written())
             _require_same_study(study_directory.path, plan)
-            walk = _Walk(plan, checked, study_directory, figures, notify, broadcast, alone=True)
-            return walk.run(factory)
+            sweep_call = _SweepCall(plan, checked, study_directory, figures, notify, broadcast, alone=True)
+            return sweep_call.run(factory)
         with create_directory(out, f"{plan.name}-sweep", checked[0].hash[:8], again=FILE) as study_directory:
             _require_same_base(study_directory.path, plan)
             study_directory.write_text(FILE, plan.written())
-            walk = _Walk(plan, checked, study_directory, figures, notify, broadcast)
-            return _drawn(walk.run(factory))
+            sweep_call = _SweepCall(plan, checked, study_directory, figures, notify, broadcast)
+            return _draw_figure(sweep_call.run(factory))
     except BaseException as error:
-        if walk is not None:
-            walk.stopped = walk.stopped or named(error)
+        if sweep_call is not None:
+            sweep_call.stopped = sweep_call.stopped or named(error)
         raise
     finally:
-        if walk is not None:
+        if sweep_call is not None:
             with suppress(KeyboardInterrupt):  # an interrupt ends the observers: the study is over
-                broadcast(walk.ending())  # the lock is released before, since a page may be served for hours
+                broadcast(sweep_call.ending())  # the lock is released before, since a page may be served for hours
 
 
 def outline(
@@ -226,19 +226,19 @@ def outline(
     InputError
         If an axis, a point's config or the directory is at fault.
     """
-    stated, out = _found(config, out)
-    plan = make_plan(as_config(stated), axes, points=points, number=_number(points, number))
+    stated, out = _resolve_study(config, out)
+    plan = make_plan(as_config(stated), axes, points=points, number=_check_number(points, number))
     checked = plan.checked(notify)
-    _executors(checked[0], executor)
+    _build_executors(checked[0], executor)
     directory = None if out is None else Path(out)
     if directory is not None:
         _require_same_base(directory, plan)
-    walk = _Walk(plan, checked, RunDirectory(directory or Path()), False, notify, Broadcast([]))
-    unfinished = walk.left() if directory is not None else walk.by_hash
-    return Outline(plan, checked, walk.names, frozenset(unfinished))
+    sweep_call = _SweepCall(plan, checked, RunDirectory(directory or Path()), False, notify, Broadcast([]))
+    unfinished = sweep_call.left() if directory is not None else sweep_call.by_hash
+    return Outline(plan, checked, sweep_call.names, frozenset(unfinished))
 
 
-def _found(config: GivenConfig, out: str | Path | None) -> tuple[GivenConfig, str | Path | None]:
+def _resolve_study(config: GivenConfig, out: str | Path | None) -> tuple[GivenConfig, str | Path | None]:
     """Return the config and the directory of a study; of a study's directory its own file, and that directory."""
     if not isinstance(config, str | Path) or not Path(config).is_dir():
         return config, out
@@ -248,7 +248,7 @@ def _found(config: GivenConfig, out: str | Path | None) -> tuple[GivenConfig, st
     return directory / FILE, directory if out is None else out
 
 
-def _check_one(out: str | Path | None, executor: str | Mapping[str, Any] | None) -> None:
+def _check_single_point(out: str | Path | None, executor: str | Mapping[str, Any] | None) -> None:
     """Raise `InputError` for arguments that exclude the number of a point."""
     if out is None:
         raise InputError(path="point", expected="the directory of the study beside it (out)", got="none")
@@ -256,14 +256,14 @@ def _check_one(out: str | Path | None, executor: str | Mapping[str, Any] | None)
         raise InputError(path="executor", expected="none beside a point, which is run here", got=repr(executor))
 
 
-def _one_of(points: Sequence[Point], number: int) -> Point:
+def _find_point(points: Sequence[Point], number: int) -> Point:
     """Return a point by its number; of equal configs it is the first one, which names the run."""
     if not is_whole(number, 0) or number >= len(points):
         raise InputError(path="point", expected=f"a whole number from 0 to {len(points) - 1}", got=repr(number))
     return next(point for point in points if point.hash == points[number].hash)
 
 
-def _number(points: Arrangement | None, number: int | None) -> int | None:
+def _check_number(points: Arrangement | None, number: int | None) -> int | None:
     drawn = points in ("random", "sobol")
     if points not in (None, "grid", "zip", "random", "sobol"):
         raise InputError(path="points", expected="grid, zip, random or sobol", got=repr(points))
@@ -276,7 +276,7 @@ def _number(points: Arrangement | None, number: int | None) -> int | None:
     return number
 
 
-def _executors(point: Point, chosen: str | Mapping[str, Any] | None) -> ExecutorFactory:
+def _build_executors(point: Point, chosen: str | Mapping[str, Any] | None) -> ExecutorFactory:
     loaded = load_config(point.config, None if chosen is None else {"executor": chosen})
     factory: ExecutorFactory = build(loaded, "executor", loaded.config.executor)
     return factory
@@ -301,18 +301,18 @@ def _require_same_study(directory: Path, plan: Plan) -> None:
     )
     if read_plan(directory / FILE).written() != plan.written():
         raise InputError(
-            f"{directory / FILE}: expected the same study, got {_axes_text(stored_axes)} there and "
-            f"{_axes_text(own_axes)} here, or another title or arrangement; "
+            f"{directory / FILE}: expected the same study, got {_format_axes(stored_axes)} there and "
+            f"{_format_axes(own_axes)} here, or another title or arrangement; "
             "a point of what stands there: --resume DIR --point N"
         )
 
 
-def _axes_text(changes: Mapping[str, Axis]) -> str:
+def _format_axes(changes: Mapping[str, Axis]) -> str:
     return " ".join(f"{key}={value_text(axis.written)}" for key, axis in changes.items()) or "no axes"
 
 
 @final
-class _Walk:
+class _SweepCall:
     """A call of `sweep`: the points by their hash, and the answers that are known.
 
     ``alone`` means a single point, while other processes may run others: the table is then not written.
@@ -347,33 +347,33 @@ class _Walk:
 
     def run(self, factory: ExecutorFactory) -> Study:
         """Run every point that is not finished, and write the table."""
-        self._clear()
+        self._remove_partial_runs()
         waiting = self.left()
         self.pending = set(waiting)
         self.done = sum(self.copies[digest] for digest in self.answers if digest not in self.pending)
-        self._write()
+        self._write_table()
         self.parallel = factory.parallel
         try:
-            self.broadcast(self._opening())
-            self._tell("")
-            self._solve(factory, waiting)
+            self.broadcast(self._make_start_event())
+            self._report_progress("")
+            self._run_points(factory, waiting)
         except KeyboardInterrupt as pressed:
             self.stopped, self.pressed = str(pressed) or "interrupted from the keyboard", True
         finally:
-            self._clear()
-            self._read(sorted(self.pending))  # runs that are over, whose workers could not report it any more
-            self._write()
+            self._remove_partial_runs()
+            self._read_answers(sorted(self.pending))  # runs that are over, whose workers could not report it any more
+            self._write_table()
         return Study(
             directory=self.made.path,
             title=str(self.plan.base.data["title"]),
             axes=self.plan.axes,
-            table=self._rows(),
+            table=self._list_rows(),
             points=len(self.points),
             arrangement=self.plan.points,
             stopped=self.stopped,
         )
 
-    def _opening(self) -> SweepStarted:
+    def _make_start_event(self) -> SweepStarted:
         return SweepStarted(
             title=str(self.plan.base.data["title"]),
             directory=self.directory,
@@ -381,7 +381,7 @@ class _Walk:
             logarithmic=[axis.log for axis in self.plan.axes],
             points=[point.values for point in self.points],
             arrangement=self.plan.points,
-            rows=self._known(self.pending),
+            rows=self._list_known_rows(self.pending),
             parallel=self.parallel,
             runs=self.directory / RUNS,
         )
@@ -389,17 +389,20 @@ class _Walk:
     def ending(self) -> SweepFinished:
         """Return the last event for observers of the study."""
         return SweepFinished(
-            rows=self._known(), seconds=time.monotonic() - self.began, stopped=self.stopped, pressed=self.pressed
+            rows=self._list_known_rows(),
+            seconds=time.monotonic() - self.began,
+            stopped=self.stopped,
+            pressed=self.pressed,
         )
 
-    def _known(self, but: Collection[str] = ()) -> dict[int, Row]:
+    def _list_known_rows(self, but: Collection[str] = ()) -> dict[int, Row]:
         """Return the rows that are known, by the places of their points, without the hashes ``but``."""
         digests = [digest for digest in self.answers if digest not in but and digest in self.places]
-        return {index: self._row(self.points[index]) for digest in digests for index in self.places[digest]}
+        return {index: self._make_row(self.points[index]) for digest in digests for index in self.places[digest]}
 
     def left(self) -> list[str]:
         """Return the hashes of the points that must be run; the answers of the others are read."""
-        self._read(dict.fromkeys(point.hash for point in self.points))
+        self._read_answers(dict.fromkeys(point.hash for point in self.points))
         unfinished = []
         for digest in dict.fromkeys(point.hash for point in self.points):
             summary = self.answers[digest].summary if digest in self.answers else None
@@ -407,16 +410,16 @@ class _Walk:
                 unfinished.append(digest)
         return unfinished
 
-    def _read(self, digests: Iterable[str]) -> None:
+    def _read_answers(self, digests: Iterable[str]) -> None:
         """Read the answers of these points from the directory."""
-        names_by_digest = {name.rpartition("-")[2]: name for name in _directories(self.directory / RUNS)}
+        names_by_digest = {name.rpartition("-")[2]: name for name in _list_directories(self.directory / RUNS)}
         for digest in digests:
             name = names_by_digest.get(digest[:DIGITS])
-            summary = None if name is None else _readable(self.directory / RUNS / name, digest)
+            summary = None if name is None else _read_result(self.directory / RUNS / name, digest)
             if name is not None and summary is not None:
                 self.names[digest], self.answers[digest] = name, Answer(summary)
 
-    def _solve(self, factory: ExecutorFactory, waiting: list[str]) -> None:
+    def _run_points(self, factory: ExecutorFactory, waiting: list[str]) -> None:
         """Run points until each has an answer.
 
         Where a worker dies, its executor is replaced, and the points that had begun are tried again one by one. Only a
@@ -426,41 +429,41 @@ class _Walk:
         while waiting or suspects:
             if suspects:
                 digest = suspects.pop(0)
-                if self._round(factory, [digest]):
-                    self._take(digest, Answer(failure="the process that ran it died, twice"))
+                if self._run_batch(factory, [digest]):
+                    self._record_answer(digest, Answer(failure="the process that ran it died, twice"))
                 continue
-            unanswered, before = self._round(factory, waiting), len(waiting)
-            suspects = [digest for digest in unanswered if self._partial(digest).exists()]
+            unanswered, before = self._run_batch(factory, waiting), len(waiting)
+            suspects = [digest for digest in unanswered if self._get_partial_path(digest).exists()]
             waiting = [digest for digest in unanswered if digest not in set(suspects)]
             stillborn = stillborn + 1 if len(waiting) == before else 0
             if stillborn >= STILLBORN:
                 raise SparseRobError("the executor's workers die before they begin a point; is there memory for them?")
 
-    def _round(self, factory: ExecutorFactory, batch: list[str]) -> list[str]:
+    def _run_batch(self, factory: ExecutorFactory, batch: list[str]) -> list[str]:
         """Run a batch on a new executor; returns the points that have no answer since a worker died."""
         unanswered: list[str] = []
-        with _workers(factory) as executor:
+        with _open_workers(factory) as executor:
             ended: SimpleQueue[Future[Answer]] = SimpleQueue()
             open_ones: dict[Future[Answer], str] = {}
             for digest in batch:
-                shutil.rmtree(self._partial(digest), ignore_errors=True)
+                shutil.rmtree(self._get_partial_path(digest), ignore_errors=True)
                 try:
-                    future = executor.submit(run_point, self._task(digest), self._watching(digest))
+                    future = executor.submit(run_point, self._make_task(digest), self._make_observers(digest))
                 except BrokenExecutor:
                     unanswered.append(digest)
                     continue
                 open_ones[future] = digest
                 future.add_done_callback(ended.put)
                 while not ended.empty():
-                    self._collect(ended.get(), open_ones, unanswered)
+                    self._collect_answer(ended.get(), open_ones, unanswered)
             while open_ones:
                 try:
-                    self._collect(ended.get(timeout=PAUSE), open_ones, unanswered)
+                    self._collect_answer(ended.get(timeout=PAUSE), open_ones, unanswered)
                 except Empty:
-                    self._tell("", open_ones)
+                    self._report_progress("", open_ones)
         return unanswered
 
-    def _watching(self, digest: str) -> list[Observer]:
+    def _make_observers(self, digest: str) -> list[Observer]:
         """Return the observer of a point's run: one that reports its bounds, where the run is in this process and
         observed."""
         if self.parallel or not self.broadcast.heard:
@@ -475,7 +478,7 @@ class _Walk:
 
         return [Bounds(tell)]
 
-    def _collect(self, future: Future[Answer], open_ones: dict[Future[Answer], str], lost: list[str]) -> None:
+    def _collect_answer(self, future: Future[Answer], open_ones: dict[Future[Answer], str], lost: list[str]) -> None:
         digest = open_ones.pop(future)
         try:
             answer = future.result()
@@ -484,55 +487,57 @@ class _Walk:
             return
         except Exception as error:  # noqa: BLE001  what the executor could not send or fetch is this point's failure
             answer = Answer(failure=named(error))
-        self._take(digest, answer, open_ones)
+        self._record_answer(digest, answer, open_ones)
         if answer.interrupted:
             raise KeyboardInterrupt
 
-    def _take(self, digest: str, answer: Answer, open_ones: Mapping[Future[Answer], str] | None = None) -> None:
+    def _record_answer(
+        self, digest: str, answer: Answer, open_ones: Mapping[Future[Answer], str] | None = None
+    ) -> None:
         """Keep an answer, and report it."""
         self.answers[digest] = answer
         self.pending.discard(digest)
         self.new += 1
         self.done += self.copies[digest]
         self.failed += answer.failed
-        self._tell(digest, open_ones)
+        self._report_progress(digest, open_ones)
         if time.monotonic() >= self.due:
-            self._write()
+            self._write_table()
 
-    def _task(self, digest: str) -> Task:
+    def _make_task(self, digest: str) -> Task:
         return Task(
             config={**self.by_hash[digest].config, "executor": {"name": "serial"}},
-            partial=str(self._partial(digest)),
+            partial=str(self._get_partial_path(digest)),
             final=str(self.directory / RUNS / self.names[digest]),
             git=self.git,
             figures=self.figures,
         )
 
-    def _partial(self, digest: str) -> Path:
+    def _get_partial_path(self, digest: str) -> Path:
         return self.directory / RUNS / f".{self.names[digest]}.{platform.node()}.{os.getpid()}{PARTIAL}"
 
-    def _rows(self) -> list[Row]:
-        rows = [self._row(point) for point in self.points if point.hash in self.answers]
+    def _list_rows(self) -> list[Row]:
+        rows = [self._make_row(point) for point in self.points if point.hash in self.answers]
         names = columns_of([axis.key for axis in self.plan.axes], rows)
         return [{name: row.get(name) for name in names} for row in rows]
 
-    def _row(self, point: Point) -> Row:
+    def _make_row(self, point: Point) -> Row:
         answer = self.answers[point.hash]
         values = dict(zip((axis.key for axis in self.plan.axes), point.values, strict=True))
         return row_of(values, answer.summary, self.names[point.hash], point.hash, answer.failure)
 
-    def _write(self) -> None:
+    def _write_table(self) -> None:
         """Write the table as it is known now."""
         if self.alone:
             return
-        began, keys, rows = time.monotonic(), [axis.key for axis in self.plan.axes], self._rows()
+        began, keys, rows = time.monotonic(), [axis.key for axis in self.plan.axes], self._list_rows()
         self.made.write_text(TABLE, table_text(keys, rows))
         self.made.write_text(COLUMNS, columns_text(keys, rows))
         self.due = time.monotonic() + RENEWED + 10.0 * (time.monotonic() - began)  # a long table is written less often
 
-    def _clear(self) -> None:
+    def _remove_partial_runs(self) -> None:
         """Remove the partial run directories of dead processes, and of this one."""
-        for name in _directories(self.directory / RUNS, hidden=True):
+        for name in _list_directories(self.directory / RUNS, hidden=True):
             path = self.directory / RUNS / name
             match = BEGUN_BY.search(name)
             # a run has no lock before its first file and after its last one: the process in its name is checked as well
@@ -540,21 +545,21 @@ class _Walk:
             if all(not owner[0] or owner == (os.getpid(), platform.node()) or is_dead(*owner) for owner in owners):
                 shutil.rmtree(path, ignore_errors=True)
 
-    def _tell(self, digest: str, open_ones: Mapping[Future[Answer], str] | None = None) -> None:
+    def _report_progress(self, digest: str, open_ones: Mapping[Future[Answer], str] | None = None) -> None:
         running = [
             point_hash
             for future, point_hash in (open_ones or {}).items()
-            if future.running() and self._partial(point_hash).exists()
+            if future.running() and self._get_partial_path(point_hash).exists()
         ]
         seconds_left = (time.monotonic() - self.began) / self.new * len(self.pending) if self.new else None
         event = SweepProgress(
-            text=_said(self.done, len(self.points), len(running), self.failed, seconds_left),
+            text=_format_progress(self.done, len(self.points), len(running), self.failed, seconds_left),
             done=self.done,
             total=len(self.points),
             running=len(running),
             failed=self.failed,
             left=seconds_left,
-            row=self._row(self.by_hash[digest]) if digest else None,
+            row=self._make_row(self.by_hash[digest]) if digest else None,
             axes=[axis.key for axis in self.plan.axes],
             places=self.places[digest] if digest else (),
             now=[self.places[point_hash][0] for point_hash in running],
@@ -576,7 +581,7 @@ def run_name(axes: Sequence[Axis], point: Point) -> str:
 
 
 @contextmanager
-def _workers(factory: ExecutorFactory) -> Iterator[Any]:
+def _open_workers(factory: ExecutorFactory) -> Iterator[Any]:
     """Open an executor, and ignore the error at its end that its workers died, which is handled elsewhere."""
     try:
         with factory.open() as executor:
@@ -585,13 +590,13 @@ def _workers(factory: ExecutorFactory) -> Iterator[Any]:
         return
 
 
-def _directories(folder: Path, hidden: bool = False) -> list[str]:
+def _list_directories(folder: Path, hidden: bool = False) -> list[str]:
     if not folder.is_dir():
         return []
     return sorted(path.name for path in folder.iterdir() if path.name.startswith(".") == hidden and path.is_dir())
 
 
-def _readable(directory: Path, digest: str) -> dict[str, Any] | None:
+def _read_result(directory: Path, digest: str) -> dict[str, Any] | None:
     """Return the result of a run, if it is complete and belongs to this config."""
     try:
         summary = read_summary(directory / "result.json")
@@ -602,21 +607,21 @@ def _readable(directory: Path, digest: str) -> dict[str, Any] | None:
     return dict(finite(summary)) if same and summary["message"] != UNFINISHED else None
 
 
-def _said(done: int, total: int, running: int, failed: int, left: float | None) -> str:
+def _format_progress(done: int, total: int, running: int, failed: int, left: float | None) -> str:
     phrases = [f"{done} of {total} points done"]
     phrases += [f"{failed} failed"] if failed else []
     phrases += [f"{running} running"] if running else []
-    phrases += [f"about {_duration(left)} left"] if left is not None and done < total else []
+    phrases += [f"about {_format_duration(left)} left"] if left is not None and done < total else []
     return ", ".join(phrases)
 
 
-def _duration(seconds: float) -> str:
+def _format_duration(seconds: float) -> str:
     if seconds < 100:
         return f"{max(1, round(seconds))} s"
     return f"{round(seconds / 60)} min" if seconds < 6000 else f"{seconds / 3600:.1f} h"
 
 
-def _drawn(study: Study) -> Study:
+def _draw_figure(study: Study) -> Study:
     """Draw the figure of a study; where it cannot be drawn, there is a warning."""
     from sparserob_core.experiment.sweep.figure import write_study_figure
 

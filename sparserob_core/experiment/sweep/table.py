@@ -92,14 +92,14 @@ def row_of(axes: Mapping[str, Any], summary: Mapping[str, Any] | None, run: str,
     """
     entries: Row = {"status": "failed", "message": said} if summary is None else {}
     for name, value in (summary or {}).items():
-        inside = dict(_entries(name, value))
+        inside = dict(_list_entries(name, value))
         if name not in LEFT:
             entries |= {
                 key: entry for key, entry in inside.items() if key not in LEFT and not isinstance(entry, list | Mapping)
             }
     units = (summary or {}).get("units") or {}
     entries |= {name: units[name.partition(".")[2]] for name in UNITS.values() if units.get(name.partition(".")[2])}
-    axis_columns = {**_numbers(axes), **axes}
+    axis_columns = {**_split_lists(axes), **axes}
     return {
         **axis_columns,
         **{key: entry for key, entry in entries.items() if key not in axis_columns},
@@ -108,7 +108,7 @@ def row_of(axes: Mapping[str, Any], summary: Mapping[str, Any] | None, run: str,
     }
 
 
-def _numbers(axes: Mapping[str, Any]) -> Row:
+def _split_lists(axes: Mapping[str, Any]) -> Row:
     """Return the entries of values that are lists of numbers, each under the key that the config has for it."""
     lists = {key: value for key, value in axes.items() if isinstance(value, list | tuple)}
     return {
@@ -119,7 +119,7 @@ def _numbers(axes: Mapping[str, Any]) -> Row:
     }
 
 
-def _entries(name: str, value: Any) -> Iterator[tuple[str, Any]]:
+def _list_entries(name: str, value: Any) -> Iterator[tuple[str, Any]]:
     """Yield the entries of a value with their full names.
 
     An object within an object is entered only in ``sparsity``.
@@ -129,7 +129,7 @@ def _entries(name: str, value: Any) -> Iterator[tuple[str, Any]]:
         return
     for key, entry in value.items():
         if name == "sparsity" and isinstance(entry, Mapping):
-            yield from _entries(f"{name}.{key}", entry)
+            yield from _list_entries(f"{name}.{key}", entry)
         else:
             yield f"{name}.{key}", entry
 
@@ -142,7 +142,7 @@ def columns_of(axes: Sequence[str], rows: Iterable[Row]) -> list[str]:
     """
     kept = list(rows)
     entries = {
-        axis: max((sum(_entry_of(name, axes) == axis for name in row) for row in kept), default=0) for axis in axes
+        axis: max((sum(_find_axis(name, axes) == axis for name in row) for row in kept), default=0) for axis in axes
     }
     axis_columns = [
         name
@@ -155,7 +155,7 @@ def columns_of(axes: Sequence[str], rows: Iterable[Row]) -> list[str]:
     return [*axis_columns, *(name for name in (*FIRST, *other_columns, *LAST) if name not in axis_columns)]
 
 
-def _entry_of(name: str, axes: Sequence[str]) -> str | None:
+def _find_axis(name: str, axes: Sequence[str]) -> str | None:
     """Return the axis of whose value a column holds one number."""
     axis, _, index = name.rpartition(".")
     return axis if axis in axes and index.isdigit() and name not in axes else None
@@ -167,7 +167,7 @@ def table_text(axes: Sequence[str], rows: Sequence[Row]) -> str:
     Numbers are as short as they can be read back exactly, lists and mappings are JSON, and unknown values are empty.
     """
     names = columns_of(axes, rows)
-    return _csv([names, *([_cell(row.get(name)) for name in names] for row in rows)])
+    return _format_csv([names, *([_format_cell(row.get(name)) for name in names] for row in rows)])
 
 
 def shared_unit(rows: Iterable[Row], kind: str = "cost") -> str:
@@ -195,10 +195,10 @@ def columns_text(axes: Sequence[str], rows: Sequence[Row]) -> str:
         if name in axes:
             unit, meaning = axis_unit(name, rows), "an axis: this key of the config"
         unit = (shared_unit(rows, unit) or unit) if unit in UNITS else unit
-        if axis := _entry_of(name, axes):
+        if axis := _find_axis(name, axes):
             unit, meaning = "", f"the number at place {name.rpartition('.')[2]} of {axis}"
         lines.append([name, unit, meaning or (f"{name.partition('.')[2]} of {name.partition('.')[0]} in result.json")])
-    return _csv(lines)
+    return _format_csv(lines)
 
 
 def read_table(directory: Path) -> list[Row]:
@@ -216,16 +216,16 @@ def read_table(directory: Path) -> list[Row]:
     for number, line in enumerate(lines[1:], 2):
         if len(line) != len(lines[0]):
             raise InputError(f"{file}:{number}: expected {len(lines[0])} cells, as in the first line, got {len(line)}")
-    return [{name: _read(name, cell) for name, cell in zip(lines[0], line, strict=True)} for line in lines[1:]]
+    return [{name: _parse_cell(name, cell) for name, cell in zip(lines[0], line, strict=True)} for line in lines[1:]]
 
 
-def _csv(lines: Iterable[Sequence[str]]) -> str:
+def _format_csv(lines: Iterable[Sequence[str]]) -> str:
     stream = io.StringIO()
     csv.writer(stream, lineterminator="\n").writerows(lines)
     return stream.getvalue()
 
 
-def _cell(value: object) -> str:
+def _format_cell(value: object) -> str:
     if value is None or (isinstance(value, float) and not math.isfinite(value)):
         return ""
     if isinstance(value, bool | list | Mapping):
@@ -233,7 +233,7 @@ def _cell(value: object) -> str:
     return repr(value) if isinstance(value, float) else str(value)
 
 
-def _read(name: str, cell: str) -> Any:
+def _parse_cell(name: str, cell: str) -> Any:
     if cell == "":
         return None
     if name in ("message", "stopped", "run", "hash", "status", "worst.constraint", *UNITS.values()):

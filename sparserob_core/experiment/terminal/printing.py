@@ -31,7 +31,7 @@ def printable(text: str) -> str:
 
 
 @final
-class _Others:
+class _OtherOutput:
     """The standard output of everybody but the command: the standard error stream."""
 
     def __init__(self, own: TextIO) -> None:
@@ -44,13 +44,13 @@ class _Others:
 @contextmanager
 def own_output() -> Iterator[None]:
     """Meanwhile the standard output takes what is said by `say`, `print_json` and tables, and nothing else."""
-    with redirect_stdout(cast("TextIO", _Others(output()))):
+    with redirect_stdout(cast("TextIO", _OtherOutput(output()))):
         yield
 
 
 def output() -> TextIO:
     """The standard output of the command."""
-    return sys.stdout.own if isinstance(sys.stdout, _Others) else sys.stdout
+    return sys.stdout.own if isinstance(sys.stdout, _OtherOutput) else sys.stdout
 
 
 def say(text: str) -> None:

@@ -14,11 +14,11 @@ KNOWN = {"lower bound", "upper bound", "relative gap"}
 
 def print_table(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
     """Print rows under column names; empty ``columns`` make a list of keys and values."""
-    show = _draw if output().isatty() else _write
+    show = _draw_table if output().isatty() else _write_table
     show(printable(title), columns, [[printable(cell).replace("\n", " ") for cell in row] for row in rows])
 
 
-def _draw(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
+def _draw_table(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
     from rich.box import SIMPLE
     from rich.console import Console
     from rich.table import Table
@@ -32,7 +32,7 @@ def _draw(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]]) -> 
     Console(file=output()).print(table)
 
 
-def _write(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
+def _write_table(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
     lines = [list(columns), *map(list, rows)] if columns else list(map(list, rows))
     widths = [max(len(line[position]) for line in lines) for position in range(len(lines[0]))] if lines else []
     text = [
@@ -51,23 +51,26 @@ def result_rows(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
     units = summary.get("units") or {}
     rows = [
         ("status", f"{summary['status']}: {summary['message']}"),
-        ("cost", _amount(summary["cost"], units.get("cost"))),
+        ("cost", _format_cost(summary["cost"], units.get("cost"))),
         ("cost of", summary.get("cost_of") or "unknown"),
-        ("lower bound", _amount(summary["lower_bound"], units.get("cost"))),
-        ("upper bound", _amount(summary["upper_bound"], units.get("cost"))),
-        ("relative gap", _number(summary["gap"], ".2e")),
-        ("any causal policy", _causal(summary, units.get("cost"))),
-        ("worst violation", _worst(worst, units, summary.get("parameters") or ())),
-        ("kept", _kept(summary.get("tolerances") or {}, summary.get("equalities"), units.get("rows") or {})),
+        ("lower bound", _format_cost(summary["lower_bound"], units.get("cost"))),
+        ("upper bound", _format_cost(summary["upper_bound"], units.get("cost"))),
+        ("relative gap", _format_number(summary["gap"], ".2e")),
+        ("any causal policy", _format_causal_bound(summary, units.get("cost"))),
+        ("worst violation", _format_worst(worst, units, summary.get("parameters") or ())),
+        (
+            "kept",
+            _format_tolerances(summary.get("tolerances") or {}, summary.get("equalities"), units.get("rows") or {}),
+        ),
         ("active indices", str(counts["active_indices"])),
         ("rounds", str(counts["rounds"])),
-        ("solved by", _solved_by(counts.get("solved_by"))),
-        ("share of time active", _active(sparsity)),
-        ("J", _amount(summary.get("J"), units.get("J"))),
+        ("solved by", _name_solvers(counts.get("solved_by"))),
+        ("share of time active", _format_active_share(sparsity)),
+        ("J", _format_cost(summary.get("J"), units.get("J"))),
         ("sparsest", sparsity.get("verdict") or "unknown"),
-        ("fewest active", _fewest(sparsity.get("fewest_active"), sparsity.get("channels"))),
-        ("switches", _number(sparsity["switches"], "d")),
-        ("seconds", f"{_number(summary['seconds'], '.3f')} of the method, which solves and proves"),
+        ("fewest active", _format_fewest_active(sparsity.get("fewest_active"), sparsity.get("channels"))),
+        ("switches", _format_number(sparsity["switches"], "d")),
+        ("seconds", f"{_format_number(summary['seconds'], '.3f')} of the method, which solves and proves"),
         *(("note", f"{note['place']}: {note['key']}: {note['note']}") for note in summary.get("notes") or ()),
     ]
     return [(name, value) for name, value in rows if value != "unknown" or name in KNOWN]
@@ -82,51 +85,51 @@ WHO = {
 }
 
 
-def _solved_by(counts: Mapping[str, int] | None) -> str:
+def _name_solvers(counts: Mapping[str, int] | None) -> str:
     """Name the solvers of the relaxed programs, each with the number that it solved."""
     if not counts:
         return "unknown"
     return ", ".join(f"{count} {WHO.get(name, f'by {name}')}" for name, count in counts.items())
 
 
-def _active(sparsity: Mapping[str, Any]) -> str:
+def _format_active_share(sparsity: Mapping[str, Any]) -> str:
     """Format the share of the time in which the control acts."""
     share, is_multichannel = sparsity["active_fraction"], (sparsity.get("channels") or 1) > 1
-    return _number(share, ".1%") + (", in at least one channel" if is_multichannel and share is not None else "")
+    return _format_number(share, ".1%") + (", in at least one channel" if is_multichannel and share is not None else "")
 
 
-def _fewest(known: Mapping[str, Any] | None, channels: int | None) -> str:
+def _format_fewest_active(known: Mapping[str, Any] | None, channels: int | None) -> str:
     """State the least share of the time that any admissible control must act, in the words of the checker."""
     if not known:
         return "unknown"
-    lower, upper = _number(known["lower"], ".1%"), known["upper"]
+    lower, upper = _format_number(known["lower"], ".1%"), known["upper"]
     above = (
         ""
         if upper is None
-        else f", and {_number(upper, '.1%')} suffice" + (": none acts less" if upper == known["lower"] else "")
+        else f", and {_format_number(upper, '.1%')} suffice" + (": none acts less" if upper == known["lower"] else "")
     )
     mean = ", the mean over its channels" if (channels or 1) > 1 else ""
     return f"every admissible control acts at least {lower} of the time{mean}{above}"
 
 
-def _amount(value: float | None, unit: str | None) -> str:
+def _format_cost(value: float | None, unit: str | None) -> str:
     """A cost with its unit, where both are known."""
-    return "unknown" if value is None else _measured(value, unit or "", ".9g")
+    return "unknown" if value is None else _format_quantity(value, unit or "", ".9g")
 
 
-def _causal(summary: Mapping[str, Any], unit: str | None) -> str:
+def _format_causal_bound(summary: Mapping[str, Any], unit: str | None) -> str:
     """State the lower bound of the cost of every causal policy, or that none exists."""
     if summary.get("causal_infeasible"):
         return "none exists: proven"
     lower = summary.get("causal_lower_bound")
-    return "unknown" if lower is None else f"costs at least {_amount(lower, unit)}"
+    return "unknown" if lower is None else f"costs at least {_format_cost(lower, unit)}"
 
 
-def _number(value: Any, form: str) -> str:
+def _format_number(value: Any, form: str) -> str:
     return "unknown" if value is None else format(value, form)
 
 
-def _kept(
+def _format_tolerances(
     tolerances: Mapping[str, Any], equalities: Mapping[str, Any] | None, units: Mapping[str, Sequence[str]]
 ) -> str:
     """Return to what every constraint is kept, with what is excused, in the user's units: of rows with the same unit
@@ -136,10 +139,13 @@ def _kept(
     }
     if equalities:
         entries["equals"] = equalities["missed"], equalities["excused"], None
-    return ", ".join(_kept_to(name, *entry, units.get(name) or [""]) for name, entry in entries.items()) or "unknown"
+    return (
+        ", ".join(_format_tolerance(name, *entry, units.get(name) or [""]) for name, entry in entries.items())
+        or "unknown"
+    )
 
 
-def _kept_to(name: str, kept: Any, excused: Any, share: float | None, units: Sequence[str]) -> str:
+def _format_tolerance(name: str, kept: Any, excused: Any, share: float | None, units: Sequence[str]) -> str:
     if kept is None or excused is None:
         kept, excused, units = [share or 0.0], [0.0], [""]
     measured = list(units) * len(kept) if len(units) == 1 else list(units)
@@ -148,37 +154,41 @@ def _kept_to(name: str, kept: Any, excused: Any, share: float | None, units: Seq
         before = largest.get(unit, (float("-inf"), 0.0))
         largest[unit] = max(before[0], kept_value), max(before[1], excused_value)
     if max(kept, default=0.0) <= 0.0:
-        spared = [_measured(abs(kept_value), unit, ".1e") for unit, (kept_value, _) in largest.items()]
+        spared = [_format_quantity(abs(kept_value), unit, ".1e") for unit, (kept_value, _) in largest.items()]
         return f"{name} with {', '.join(spared)} to spare"
     phrases = [
-        f"{_measured(max(kept_value, 0.0), unit, '.1e')} ({excused_value:.1e} excused)"
+        f"{_format_quantity(max(kept_value, 0.0), unit, '.1e')} ({excused_value:.1e} excused)"
         for unit, (kept_value, excused_value) in largest.items()
     ]
     return f"{name} to {', '.join(phrases)}"
 
 
-def _worst(worst: Mapping[str, Any], units: Mapping[str, Any], parameters: Sequence[str]) -> str:
+def _format_worst(worst: Mapping[str, Any], units: Mapping[str, Any], parameters: Sequence[str]) -> str:
     if worst["violation"] is None:
         return "unknown"
     unit, time, states = (units.get(key) or "" for key in ("worst", "time", "states"))
-    description = "" if worst["time"] is None else f" at t = {_measured(worst['time'], time)}"
+    description = "" if worst["time"] is None else f" at t = {_format_quantity(worst['time'], time)}"
     if worst["parameter"] is not None and len(worst["parameter"]):
         values = [f"{value:.6g}" for value in worst["parameter"]]
         assignments = [f"{name} = {value}" for name, value in zip(parameters, values, strict=False)]
-        description += ", " + (_listed(assignments) if len(assignments) == len(values) else f"p = ({_listed(values)})")
+        description += ", " + (
+            _join_values(assignments) if len(assignments) == len(values) else f"p = ({_join_values(values)})"
+        )
     description += f", {worst['corner']}" if worst.get("corner") else ""
     if worst.get("initial_state") is not None:
         initial_state = worst["initial_state"]
         measured = zip(initial_state, states or [""] * len(initial_state), strict=True)
-        description += f", from ({_listed([_measured(value, state_unit) for value, state_unit in measured])})"
+        description += (
+            f", from ({_join_values([_format_quantity(value, state_unit) for value, state_unit in measured])})"
+        )
     return f"{worst['violation']:.2e}{f' {unit}' if unit else ''} in {worst['constraint']}{description}"
 
 
-def _listed(values: Sequence[str]) -> str:
+def _join_values(values: Sequence[str]) -> str:
     """Numbers for a row of a table; of more than `ENTRIES` the first, and how many more ``result.json`` has."""
     some = list(values) if len(values) <= ENTRIES else [*values[:ENTRIES], f"and {len(values) - ENTRIES} more"]
     return ", ".join(some)
 
 
-def _measured(value: float, unit: str, form: str = ".6g") -> str:
+def _format_quantity(value: float, unit: str, form: str = ".6g") -> str:
     return f"{value:{form}} {unit}".rstrip()

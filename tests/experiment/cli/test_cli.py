@@ -190,8 +190,9 @@ def test_a_small_run_imports_neither_an_optimiser_nor_the_checker_nor_what_draws
 ) -> None:
     arguments = [str(repository / "configs" / "experiment1_repaired.yaml"), "--no-figures", "--quiet"]
     program = (
-        "import sys\nfrom sparserob_core.experiment.cli.main import _status\n"
-        f"assert _status(['run', *{arguments!r}, '--out', {str(tmp_path / 'run')!r}]) == 0\nprint(*sorted(sys.modules))"
+        "import sys\nfrom sparserob_core.experiment.cli.main import _run_command_line\n"
+        f"assert _run_command_line(['run', *{arguments!r}, '--out', {str(tmp_path / 'run')!r}]) == 0\n"
+        "print(*sorted(sys.modules))"
     )
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
     loaded = set(done.stdout.split())
@@ -213,8 +214,8 @@ def test_the_check_of_a_small_run_imports_neither_sparse_matrices_nor_what_trans
     directory = str(tmp_path / "run")
     command("run", repository / "configs" / "double_integrator.yaml", "--no-figures", "--quiet", "--out", directory)
     program = (
-        "import sys\nfrom sparserob_core.experiment.cli.main import _status\n"
-        f"assert _status(['check', {directory!r}]) == 0\nprint(*sorted(sys.modules))"
+        "import sys\nfrom sparserob_core.experiment.cli.main import _run_command_line\n"
+        f"assert _run_command_line(['check', {directory!r}]) == 0\nprint(*sorted(sys.modules))"
     )
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
     loaded = set(done.stdout.split())

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from sparserob_core.experiment.config.examples import _complete, examples
+from sparserob_core.experiment.config.examples import _complete_text, examples
 from sparserob_core.experiment.config.load import load_config
 from sparserob_core.experiment.config.reading.reader import read_value
 from tests.support.stub import Command
@@ -38,7 +38,7 @@ def test_every_example_is_complete_and_means_what_its_config_does(repository: Pa
 def test_what_cannot_be_composed_of_two_texts_is_written_as_data(tmp_path: Path):
     (tmp_path / "base.yaml").write_text("# base\nmethod: {name: exchange, tolerance: 1.0e-3}\nseed: 1\n")
     (tmp_path / "child.yaml").write_text("# child\nextends: base.yaml\nmethod: {name: exchange, rounds: 7}")
-    text = _complete(tmp_path / "child.yaml")
+    text = _complete_text(tmp_path / "child.yaml")
     assert text.startswith("# child\n")
     assert read_value(text) == {"method": {"name": "exchange", "tolerance": 1e-3, "rounds": 7}, "seed": 1}
 

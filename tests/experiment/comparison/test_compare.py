@@ -418,7 +418,8 @@ def test_a_command_at_fault_is_status_2_and_one_message(
 
 def test_help_needs_neither_numpy_nor_matplotlib() -> None:
     program = (
-        "import sys\nfrom sparserob_core.experiment.cli.main import _status\n_status(['compare', '--help'])\n"
+        "import sys\nfrom sparserob_core.experiment.cli.main import _run_command_line\n"
+        "_run_command_line(['compare', '--help'])\n"
         "print('heavy:', *sorted(name for name in sys.modules if '.' not in name))"
     )
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)

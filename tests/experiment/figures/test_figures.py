@@ -19,7 +19,7 @@ from sparserob_core.experiment.figures import drawing
 from sparserob_core.experiment.figures.active import Active, active_of, stored_active
 from sparserob_core.experiment.figures.figure_data import MOST_STATES, FigureData, Wall
 from sparserob_core.experiment.figures.run_figures import draw_control, draw_convergence, draw_states, write_figures
-from sparserob_core.experiment.figures.style import _letters_told, draw_legend, held, panels, style
+from sparserob_core.experiment.figures.style import _report_missing_letters, draw_legend, held, panels, style
 from sparserob_core.sip.events import RoundFinished
 from tests.support.drafts import whole
 from tests.support.problems import double_integrator
@@ -201,7 +201,7 @@ def test_of_very_many_states_no_more_is_computed_than_is_drawn(policy: str, monk
 
     monkeypatch.setattr(drawing, "tube", counted)
     experiment, decision = result.experiment, np.asarray(result.decision)
-    shown = drawing._shown(experiment, decision)
+    shown = drawing._choose_states(experiment, decision)
     assert shown is not None and set(shown) == {*range(MOST_STATES)}
     data = drawing.figure_data(experiment, decision, None, (), None, states=shown)
     assert data.drawn_states == tuple(shown) and data.of_states == f", {MOST_STATES} of {n} states"
@@ -275,7 +275,7 @@ def test_letters_that_no_font_has_are_told_once_and_other_warnings_are_kept(tmp_
         write_figures(tmp_path, odd)
         write_figures(tmp_path, odd)
     assert [record.getMessage() for record in caplog.records] == ["figures: no font here has \uf8ff: boxes stand there"]
-    with pytest.warns(UserWarning, match="something else"), _letters_told():
+    with pytest.warns(UserWarning, match="something else"), _report_missing_letters():
         warnings.warn("something else", UserWarning, stacklevel=1)
 
 

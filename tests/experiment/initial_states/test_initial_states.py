@@ -279,7 +279,7 @@ def test_the_command_ends_with_3_for_an_empty_set_and_2_for_a_fault(tmp_path: Pa
 @pytest.mark.parametrize(("programs", "known"), [(0, False), (3, False), (4, True), (6, True)])
 def test_an_interrupt_before_the_box_fits_returns_what_is_known(programs, known, monkeypatch) -> None:
     """Four programs bound the set; the box is then fitted to it by others."""
-    supported, asked = InitialStatesSearch._supported, []
+    supported, asked = InitialStatesSearch._solve_direction, []
 
     def pressed(self: InitialStatesSearch, direction: np.ndarray) -> sr.Result:
         if len(asked) >= programs:
@@ -288,7 +288,7 @@ def test_an_interrupt_before_the_box_fits_returns_what_is_known(programs, known,
         return supported(self, direction)
 
     whole = sr.initial_states(CART, directions=4, values=0)
-    monkeypatch.setattr(InitialStatesSearch, "_supported", pressed)
+    monkeypatch.setattr(InitialStatesSearch, "_solve_direction", pressed)
     found = sr.initial_states(CART, directions=12, values=3)
     assert "interrupted by SIGTERM" in found.message
     assert found.where(whole.inner.mean(axis=0)) != "outside"

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import sparserob_core as sr
-from sparserob_core.experiment.cli.main import _status
+from sparserob_core.experiment.cli.main import _run_command_line
 
 HEAD = "import sys\nimport numpy as np\nimport sparserob_core as sr\n"
 KINDS = {
@@ -103,7 +103,7 @@ def status(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Callable[..., 
         (tmp_path / "odd.py").write_text(text)
         config = {"problem": PROBLEM, "observers": [], "plugins": ["odd.py"], **chosen}
         (tmp_path / "odd.yaml").write_text(json.dumps(config))
-        code = _status(["run", str(tmp_path / "odd.yaml"), "--out", str(tmp_path / "run"), "--no-figures"])
+        code = _run_command_line(["run", str(tmp_path / "odd.yaml"), "--out", str(tmp_path / "run"), "--no-figures"])
         said = capsys.readouterr()
         return code, said.out + said.err
 

@@ -147,14 +147,14 @@ class Entry:
 @pytest.fixture
 def entry_points(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
     def use(*entries: Entry) -> None:
-        monkeypatch.setattr(discovery, "_found", lambda failures: list(entries))
-        discovery._installed.cache_clear()
-        discovery._own.cache_clear()
+        monkeypatch.setattr(discovery, "_find_entry_points", lambda failures: list(entries))
+        discovery._load_installed.cache_clear()
+        discovery._load_own.cache_clear()
 
     yield use
     monkeypatch.undo()
-    discovery._installed.cache_clear()
-    discovery._own.cache_clear()
+    discovery._load_installed.cache_clear()
+    discovery._load_own.cache_clear()
 
 
 SEARCH = """
@@ -269,8 +269,8 @@ def site(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Path]
         return folder
 
     def forget() -> None:
-        discovery._installed.cache_clear()
-        discovery._own.cache_clear()
+        discovery._load_installed.cache_clear()
+        discovery._load_own.cache_clear()
 
     forget()
     yield write

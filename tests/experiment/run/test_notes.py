@@ -77,7 +77,7 @@ def test_a_run_says_who_answered_and_what_the_named_solver_did_not(tmp_path: Pat
 
 
 def test_notes_count_as_many_programs_as_the_table_whatever_the_reasons(tmp_path: Path) -> None:
-    from sparserob_core.experiment.run.journal import _on_solver
+    from sparserob_core.experiment.run.journal import _list_solver_notes
     from sparserob_core.sip.solver import Unanswered
 
     outcome = run(tmp_path, solver={"name": "piqp", "max_iterations": 1})
@@ -86,7 +86,7 @@ def test_notes_count_as_many_programs_as_the_table_whatever_the_reasons(tmp_path
     loaded = load_config(tmp_path / "small.yaml", {"solver": {"name": "piqp"}})
     missed = [Unanswered("relaxed", 7, "no digits", "highs"), Unanswered("relaxed", 2, "slow", "dual_newton")]
     missed.append(Unanswered("relaxed", 1, "no rows", "highs"))
-    told = [note["note"] for note in _on_solver(loaded, replace(outcome.result, unanswered=tuple(missed)))]
+    told = [note["note"] for note in _list_solver_notes(loaded, replace(outcome.result, unanswered=tuple(missed)))]
     assert counted(told) == {"highs": 8, "dual_newton": 2}
     assert told[0].endswith("highs did: 7 of them: no digits; 1 of them: no rows") and told[1].endswith("did: slow")
 

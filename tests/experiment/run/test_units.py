@@ -16,7 +16,7 @@ import sparserob_core as sr
 from sparserob_core.experiment.comparison.compare import comparison_table
 from sparserob_core.experiment.margin.horizon_figure import draw_horizons
 from sparserob_core.experiment.margin.margin import margin_rows
-from sparserob_core.experiment.terminal.table import _worst, result_rows
+from sparserob_core.experiment.terminal.table import _format_worst, result_rows
 
 NAMES = {
     "states": ["place", "speed"],
@@ -117,12 +117,12 @@ def test_a_parameter_is_told_by_its_name(tmp_path: Path) -> None:
 
 def test_of_many_numbers_a_row_of_the_table_has_the_first() -> None:
     worst = {"violation": 0.5, "constraint": "path", "time": 1.0, "parameter": None, "initial_state": [0.0, 0.5] * 135}
-    said = _worst(worst, {"states": [], "time": "s"}, ())
+    said = _format_worst(worst, {"states": [], "time": "s"}, ())
     assert said == "5.00e-01 in path at t = 1 s, from (0, 0.5, 0, 0.5, 0, 0.5, and 264 more)"
     few = {**worst, "initial_state": None, "parameter": [0.25] * 6}
-    assert _worst(few, {}, ()).endswith("p = (0.25, 0.25, 0.25, 0.25, 0.25, 0.25)")
+    assert _format_worst(few, {}, ()).endswith("p = (0.25, 0.25, 0.25, 0.25, 0.25, 0.25)")
     many = {**few, "parameter": [0.25] * 8}
-    assert _worst(many, {}, [f"k{i}" for i in range(8)]).endswith("k4 = 0.25, k5 = 0.25, and 2 more")
+    assert _format_worst(many, {}, [f"k{i}" for i in range(8)]).endswith("k4 = 0.25, k5 = 0.25, and 2 more")
 
 
 def test_shares_of_several_channels_say_of_what_they_are(outcome: sr.Outcome) -> None:
@@ -241,10 +241,10 @@ def test_nothing_is_said_of_units_that_nobody_has_named(tmp_path: Path) -> None:
 
 
 def test_the_table_says_who_answered_how_many_programs_each_under_the_name_it_is_known_by() -> None:
-    from sparserob_core.experiment.terminal.table import _solved_by
+    from sparserob_core.experiment.terminal.table import _name_solvers
 
     counts = {"closed_form": 1, "osqp": 6, "dual_newton": 2, "highs": 3, "nobody": 1}
-    said = _solved_by(counts).split(", ")
+    said = _name_solvers(counts).split(", ")
     assert [int(part.split()[0]) for part in said if part[0].isdigit()] == list(counts.values())
     assert (
         "6 by osqp" in said
@@ -252,4 +252,4 @@ def test_the_table_says_who_answered_how_many_programs_each_under_the_name_it_is
         and "3 by HiGHS" in said
         and "1 not solved" in said
     )
-    assert _solved_by(None) == _solved_by({}) == "unknown"
+    assert _name_solvers(None) == _name_solvers({}) == "unknown"

@@ -14,7 +14,7 @@ import pytest
 from click.testing import CliRunner
 
 import sparserob_core as sr
-from sparserob_core.experiment.cli.main import _status, commands
+from sparserob_core.experiment.cli.main import _run_command_line, commands
 from sparserob_core.experiment.scaffold import new_plugin as module
 from sparserob_core.experiment.scaffold.new_plugin import LONGEST, RULES, kinds, new_plugin
 from tests.support.places import ROOT
@@ -129,11 +129,11 @@ def test_a_disk_that_is_full_leaves_no_half_of_a_package(tmp_path, monkeypatch):
 
 
 def test_the_command_says_where_the_package_is_and_how_to_go_on(tmp_path, capsys):
-    assert _status(["new-plugin", "outer-stop", "trial", "--out", str(tmp_path)]) == 0
+    assert _run_command_line(["new-plugin", "outer-stop", "trial", "--out", str(tmp_path)]) == 0
     said = capsys.readouterr().out
     assert f"written to {tmp_path / 'sparserob-trial'}; next: cd " in said
-    assert _status(["new-plugin", "outer-stop", "trial", "--out", str(tmp_path)]) == 2
-    assert _status(["new-plugin", "thing", "trial", "--out", str(tmp_path)]) == 2
+    assert _run_command_line(["new-plugin", "outer-stop", "trial", "--out", str(tmp_path)]) == 2
+    assert _run_command_line(["new-plugin", "thing", "trial", "--out", str(tmp_path)]) == 2
 
 
 @pytest.mark.slow

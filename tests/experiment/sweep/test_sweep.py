@@ -127,7 +127,7 @@ def two_processes(monkeypatch: pytest.MonkeyPatch) -> Any:
                 yield pool
 
     with monkeypatch.context() as patch:
-        patch.setattr("sparserob_core.experiment.sweep.sweep._executors", lambda point, chosen: Pool())
+        patch.setattr("sparserob_core.experiment.sweep.sweep._build_executors", lambda point, chosen: Pool())
         yield
 
 
@@ -476,7 +476,7 @@ def test_workers_that_never_begin_end_the_study_with_one_sentence(
         def open(self) -> Any:
             yield Stillborn()
 
-    monkeypatch.setattr("sparserob_core.experiment.sweep.sweep._executors", lambda point, chosen: Factory())
+    monkeypatch.setattr("sparserob_core.experiment.sweep.sweep._build_executors", lambda point, chosen: Factory())
     with pytest.raises(sr.SparseRobError, match="workers die before they begin a point"):
         sr.sweep(counting, {"method.number": [1, 2]}, out=tmp_path / "out")
 

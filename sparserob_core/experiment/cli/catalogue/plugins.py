@@ -30,7 +30,7 @@ def plugins(name: str | None, files: tuple[Path, ...]) -> int:
 
     registry = load_registry(files)
     if name is not None:
-        return _describe(registry, name)
+        return _describe_component(registry, name)
     records = list(registry.records())
     rows = [
         (record.kind, record.name, record.plugin, record.distribution, record.summary)
@@ -46,7 +46,7 @@ def plugins(name: str | None, files: tuple[Path, ...]) -> int:
     return 0
 
 
-def _describe(registry: Registry, name: str) -> int:
+def _describe_component(registry: Registry, name: str) -> int:
     from sparserob_core.experiment.config.option_rows import option_rows
     from sparserob_core.experiment.terminal.table import print_table
 

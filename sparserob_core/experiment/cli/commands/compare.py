@@ -135,7 +135,7 @@ def benchmark(
     from sparserob_core.experiment.directory.artefacts import finite
     from sparserob_core.experiment.terminal.table import print_table
 
-    choices = [_choice(text) for text in maximisers]
+    choices = [_parse_choice(text) for text in maximisers]
     with LiveLine() as line:
         results = side_by_side(
             choices,
@@ -160,7 +160,7 @@ def benchmark(
     return 0
 
 
-def _choice(text: str) -> str | Mapping[str, Any]:
+def _parse_choice(text: str) -> str | Mapping[str, Any]:
     """A name, or a mapping with a name and options."""
     from sparserob_core.experiment.config.reading.reader import read_value
 

@@ -73,7 +73,7 @@ def initial_states(
     from sparserob_core.experiment.initial_states.initial_states import initial_states as find
     from sparserob_core.experiment.terminal.table import print_table
 
-    chosen = [int(number) - 1 for number in _numbers("states", states)]
+    chosen = [int(number) - 1 for number in _parse_numbers("states", states)]
     try:
         with LiveLine() as line:
             feasible_set = find(
@@ -82,7 +82,7 @@ def initial_states(
                 chosen,
                 directions=directions,
                 values=values,
-                about=None if about is None else _numbers("about", about),
+                about=None if about is None else _parse_numbers("about", about),
                 within=within,
                 out=out,
                 notify=line.receive,
@@ -100,7 +100,7 @@ def initial_states(
     return status_unless_interrupted(EXIT[feasible_set.status])
 
 
-def _numbers(name: str, text: str) -> list[float]:
+def _parse_numbers(name: str, text: str) -> list[float]:
     try:
         numbers = [float(token) for token in text.split(",")]
     except ValueError:

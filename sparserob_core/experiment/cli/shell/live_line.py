@@ -21,26 +21,26 @@ class LiveLine:
     in one line, which is renewed and disappears in the end; anywhere else in a plain line now and then."""
 
     def __init__(self) -> None:
-        self._started = self._last = time.monotonic()
-        self._terminal, self._shown = sys.stderr.isatty(), False
+        self._start_time = self._last_time = time.monotonic()
+        self._is_terminal, self._has_output = sys.stderr.isatty(), False
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:
-        if self._shown and self._terminal:
+        if self._has_output and self._is_terminal:
             sys.stderr.write("\r\x1b[K")
             sys.stderr.flush()
 
     def receive(self, event: Event) -> None:
         """Show an event of a study, whose ``notify`` this method is; events other than `StudyProgress` are ignored."""
         now = time.monotonic()
-        pause = RENEWED if self._terminal else WRITTEN
-        if not isinstance(event, StudyProgress) or now - self._started < PATIENCE:
+        pause = RENEWED if self._is_terminal else WRITTEN
+        if not isinstance(event, StudyProgress) or now - self._start_time < PATIENCE:
             return
-        if self._shown and now - self._last < pause:
+        if self._has_output and now - self._last_time < pause:
             return
         text = printable(event.text)
-        sys.stderr.write(f"\r\x1b[K{text}" if self._terminal else f"{text}\n")
+        sys.stderr.write(f"\r\x1b[K{text}" if self._is_terminal else f"{text}\n")
         sys.stderr.flush()
-        self._last, self._shown = now, True
+        self._last_time, self._has_output = now, True

@@ -29,36 +29,36 @@ class LiveTable:
     def __init__(self) -> None:
         self._line = LiveLine()
         self._rows: deque[list[str]] = deque(maxlen=LAST)
-        self._live: Live | None = None
-        self._last = 0.0
+        self._display: Live | None = None
+        self._last_time = 0.0
 
     def __enter__(self) -> Self:
         if sys.stderr.isatty():
             from rich.console import Console
             from rich.live import Live
 
-            self._live = Live(console=Console(stderr=True), transient=True, auto_refresh=False)
-            self._live.start()
+            self._display = Live(console=Console(stderr=True), transient=True, auto_refresh=False)
+            self._display.start()
         return self
 
     def __exit__(self, *_: object) -> None:
-        if self._live is not None:
-            self._live.stop()
+        if self._display is not None:
+            self._display.stop()
 
     def receive(self, event: Event) -> None:
         """Show an event of a sweep, whose ``notify`` this method is: rows and progress in the table, or in a line
         without one."""
-        if self._live is None:
+        if self._display is None:
             self._line.receive(event)
         elif isinstance(event, SweepProgress):
             if event.row is not None:
                 self._rows.append([*(value_text(event.row[key]) for key in event.axes), *short(event.row)])
-            if time.monotonic() - self._last >= RENEWED:
-                self._show(self._live, event)
+            if time.monotonic() - self._last_time >= RENEWED:
+                self._show_rows(self._display, event)
         elif isinstance(event, StudyProgress):
-            self._live.update(printable(event.text), refresh=True)
+            self._display.update(printable(event.text), refresh=True)
 
-    def _show(self, live: Live, event: SweepProgress) -> None:
+    def _show_rows(self, live: Live, event: SweepProgress) -> None:
         from rich.box import SIMPLE
         from rich.table import Table
         from rich.text import Text
@@ -69,4 +69,4 @@ class LiveTable:
         for row in self._rows:
             table.add_row(*(Text(printable(cell).replace("\n", " ")) for cell in row))
         live.update(table, refresh=True)
-        self._last = time.monotonic()
+        self._last_time = time.monotonic()

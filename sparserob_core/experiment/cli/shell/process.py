@@ -22,7 +22,7 @@ from sparserob_core.errors import SparseRobError
 INTERRUPTED = 130
 """The exit status of a command that was interrupted, whatever it knew by then."""
 
-_caught: list[int] = []
+_caught_signals: list[int] = []
 _masks = threading.local()
 
 
@@ -35,9 +35,9 @@ def listen() -> None:
     """
     with suppress(ValueError):  # not in the main thread
         if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
-            signal.signal(signal.SIGINT, _interrupted)
+            signal.signal(signal.SIGINT, _handle_signal)
         if signal.getsignal(signal.SIGTERM) is signal.SIG_DFL:
-            signal.signal(signal.SIGTERM, _interrupted)
+            signal.signal(signal.SIGTERM, _handle_signal)
             if hasattr(os, "register_at_fork"):
                 _fork_safely()
 
@@ -46,21 +46,21 @@ def listen() -> None:
 def _fork_safely() -> None:
     """A SIGTERM for a child waits until it has the default action again: Python forgets in a forked child the signals
     that came before its first instruction, and a pool whose worker has died waits for the others to end."""
-    os.register_at_fork(before=_hold, after_in_parent=_release, after_in_child=_release_in_child)
+    os.register_at_fork(before=_block_sigterm, after_in_parent=_restore_mask, after_in_child=_restore_mask_in_child)
 
 
-def _hold() -> None:
+def _block_sigterm() -> None:
     _masks.before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGTERM})
 
 
-def _release() -> None:
+def _restore_mask() -> None:
     signal.pthread_sigmask(signal.SIG_SETMASK, _masks.before)
 
 
-def _release_in_child() -> None:
-    if signal.getsignal(signal.SIGTERM) is _interrupted:
+def _restore_mask_in_child() -> None:
+    if signal.getsignal(signal.SIGTERM) is _handle_signal:
         signal.signal(signal.SIGTERM, signal.SIG_DFL)
-    _release()
+    _restore_mask()
 
 
 def spare_imports() -> None:
@@ -85,7 +85,7 @@ def spare_imports() -> None:
 
 def status_unless_interrupted(status: int) -> int:
     """The exit status of a command that has a result: its own, unless a signal has cut it short."""
-    return INTERRUPTED if _caught else status
+    return INTERRUPTED if _caught_signals else status
 
 
 class OutputError(SparseRobError):
@@ -98,16 +98,16 @@ class Output(io.TextIOWrapper):
     reading is a `BrokenPipeError` as ever."""
 
     def write(self, text: str) -> int:
-        with _as_output_error():
+        with _convert_output_errors():
             return super().write(text)
 
     def flush(self) -> None:
-        with _as_output_error():
+        with _convert_output_errors():
             super().flush()
 
 
 @contextmanager
-def _as_output_error() -> Iterator[None]:
+def _convert_output_errors() -> Iterator[None]:
     try:
         yield
     except BrokenPipeError:
@@ -132,15 +132,15 @@ def open_streams() -> None:
     if sys.stderr is None:
         sys.stderr = open(2, "w", closefd=False)  # noqa: SIM115
     if sys.stdout is None:
-        sys.stdout = Output(open(_own_descriptor(), "wb"))  # noqa: SIM115
+        sys.stdout = Output(open(_redirect_to_error_stream(), "wb"))  # noqa: SIM115
     elif type(sys.stdout) is io.TextIOWrapper:
-        sys.stdout = _rewrapped(sys.stdout, Output)
+        sys.stdout = _rewrap_stream(sys.stdout, Output)
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
-            _give_letters(stream)
+            _set_encoding(stream)
 
 
-def _give_letters(stream: io.TextIOWrapper) -> None:
+def _set_encoding(stream: io.TextIOWrapper) -> None:
     """Let a stream take every title and path. ASCII says nothing of the other bytes: there they are UTF-8, as they are
     in configs and nearly always in names of files, so that a path that was printed can be pasted. What another encoding
     has no letters for is written out: the bytes of UTF-8 may be control characters there."""
@@ -148,7 +148,7 @@ def _give_letters(stream: io.TextIOWrapper) -> None:
     stream.reconfigure(encoding="utf-8" if narrow else None, errors="backslashreplace")
 
 
-def _own_descriptor() -> int:
+def _redirect_to_error_stream() -> int:
     """Return a new descriptor of the present standard output, and redirect the standard output to the error stream."""
     descriptor = os.dup(1)
     os.dup2(2, 1)
@@ -165,23 +165,23 @@ def hand_back_output() -> None:
         sys.stdout.flush()
     except (BrokenPipeError, OutputError):  # said before, or nobody reads
         drop_output()
-    if _descriptor(sys.stdout) is None:
-        sys.stdout = _rewrapped(sys.stdout, io.TextIOWrapper)
+    if _get_descriptor(sys.stdout) is None:
+        sys.stdout = _rewrap_stream(sys.stdout, io.TextIOWrapper)
         return
     encoding = sys.stdout.encoding
     os.dup2(sys.stdout.fileno(), 1)
     sys.stdout.close()
-    atexit.register(_leave_output)  # called before whatever components have registered
+    atexit.register(_close_output)  # called before whatever components have registered
     sys.stdout = open(1, "w", encoding=encoding, errors="backslashreplace", closefd=False)  # noqa: SIM115
 
 
-def _leave_output() -> None:
+def _close_output() -> None:
     with suppress(OSError, ValueError):  # nobody reads it any more, or it is closed
         sys.stdout.flush()
     os.dup2(2, 1)
 
 
-def _rewrapped(stream: io.TextIOWrapper, kind: type[io.TextIOWrapper]) -> io.TextIOWrapper:
+def _rewrap_stream(stream: io.TextIOWrapper, kind: type[io.TextIOWrapper]) -> io.TextIOWrapper:
     """Return a text stream of the given kind that takes over the buffer of a stream.
 
     An `Output` over the standard output gets a descriptor of its own.
@@ -191,25 +191,25 @@ def _rewrapped(stream: io.TextIOWrapper, kind: type[io.TextIOWrapper]) -> io.Tex
     buffer = stream.detach()
     if stream is sys.__stdout__:  # a component that keeps to the first stream would meet one without a buffer
         sys.__stdout__ = sys.stderr  # type: ignore[misc, assignment]
-    if kind is Output and _descriptor(buffer) == 1:
+    if kind is Output and _get_descriptor(buffer) == 1:
         buffer.flush()
-        buffer = open(_own_descriptor(), "wb")  # noqa: SIM115
+        buffer = open(_redirect_to_error_stream(), "wb")  # noqa: SIM115
     return kind(buffer, encoding=encoding, errors=errors, line_buffering=line_buffering, write_through=write_through)
 
 
 def drop_output() -> None:
     """Let what is still to be written to the standard output go nowhere."""
-    descriptor = _descriptor(sys.stdout)
+    descriptor = _get_descriptor(sys.stdout)
     os.dup2(os.open(os.devnull, os.O_WRONLY), 1 if descriptor is None else descriptor)
 
 
-def _descriptor(stream: Any) -> int | None:
+def _get_descriptor(stream: Any) -> int | None:
     try:
         return int(stream.fileno())
     except (OSError, ValueError):  # it has none
         return None
 
 
-def _interrupted(number: int, frame: FrameType | None) -> None:
-    _caught.append(number)
+def _handle_signal(number: int, frame: FrameType | None) -> None:
+    _caught_signals.append(number)
     raise KeyboardInterrupt(*([] if number == signal.SIGINT else [f"interrupted by {signal.Signals(number).name}"]))

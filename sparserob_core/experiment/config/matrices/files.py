@@ -32,10 +32,10 @@ def resolve(data: dict[str, Any], folder: Callable[[Path], File]) -> Iterator[Co
     """
     cache: dict[File, dict[str, Array]] = {}
     size = 0
-    for path, holder, key in list(_references(data.get("problem"), ("problem",))):
+    for path, holder, key in list(_find_references(data.get("problem"), ("problem",))):
         reference = holder[key]
         try:
-            holder[key] = pack(_read(reference, folder(path), cache).array)
+            holder[key] = pack(_read_matrix(reference, folder(path), cache).array)
             size += sum(len(text) for text in holder[key].values() if isinstance(text, str))
             if size > MOST_TEXT:
                 expected = f"matrices of at most {MOST_TEXT} characters together, as a run directory holds them"
@@ -44,7 +44,7 @@ def resolve(data: dict[str, Any], folder: Callable[[Path], File]) -> Iterator[Co
             yield Complaint(path, str(error))
 
 
-def _references(data: Any, path: Path) -> Iterator[tuple[Path, Any, Any]]:
+def _find_references(data: Any, path: Path) -> Iterator[tuple[Path, Any, Any]]:
     """Yield the places of matrices from files: the path, the list or mapping that holds the entry, and its key
     there."""
     entries = data.items() if isinstance(data, dict) else enumerate(data) if isinstance(data, list) else ()
@@ -52,10 +52,10 @@ def _references(data: Any, path: Path) -> Iterator[tuple[Path, Any, Any]]:
         if isinstance(value, Mapping) and set(value) == KEYS:
             yield (*path, key), data, key
         else:
-            yield from _references(value, (*path, key))
+            yield from _find_references(value, (*path, key))
 
 
-def _read(given: Mapping[str, object], folder: File, known: dict[File, dict[str, Array]]) -> Packed:
+def _read_matrix(given: Mapping[str, object], folder: File, known: dict[File, dict[str, Array]]) -> Packed:
     name, stated = given["name"], given["file"]
     if not isinstance(stated, str) or not stated.endswith(SUFFIX):
         raise InputError(path="file", expected=f"a file whose name ends with {SUFFIX}", got=shown(stated))
@@ -79,7 +79,7 @@ def matrix_in(arrays: Mapping[str, Array], name: str) -> Packed:
     An array of one axis is a column. Raises `InputError` that begins with the name of the array at fault.
     """
     if name in arrays:
-        dense = _numbers(arrays, name, "fiu")
+        dense = _require_numbers(arrays, name, "fiu")
         if dense.ndim not in (1, 2) or not dense.size:
             raise InputError(path=name, expected="a matrix, rows by columns", got=f"an array of shape {dense.shape}")
         matrix = dense.reshape(-1, 1) if dense.ndim == 1 else dense
@@ -90,13 +90,13 @@ def matrix_in(arrays: Mapping[str, Array], name: str) -> Packed:
         available = ", ".join(sorted(arrays)) or "nothing"
         expected = f"an array {name}, or a sparse matrix as {', '.join(f'{name}_{suffix}' for suffix in PARTS)}"
         raise InputError(path=name, expected=expected, got=available)
-    shape = shape_of(_numbers(arrays, f"{name}_shape", "iu").tolist(), f"{name}_shape")
-    values = _numbers(arrays, f"{name}_data", "fiu").astype(float)
-    indices, pointers = (_numbers(arrays, f"{name}_{suffix}", "iu") for suffix in ("indices", "indptr"))
+    shape = shape_of(_require_numbers(arrays, f"{name}_shape", "iu").tolist(), f"{name}_shape")
+    values = _require_numbers(arrays, f"{name}_data", "fiu").astype(float)
+    indices, pointers = (_require_numbers(arrays, f"{name}_{suffix}", "iu") for suffix in ("indices", "indptr"))
     return checked(spread(shape, values, indices, pointers, f"{name}_indptr"), f"{name}_data")
 
 
-def _numbers(arrays: Mapping[str, Array], name: str, kinds: str) -> npt.NDArray[Any]:
+def _require_numbers(arrays: Mapping[str, Array], name: str, kinds: str) -> npt.NDArray[Any]:
     if arrays[name].dtype.kind not in kinds:
         expected = "real numbers" if "f" in kinds else "whole numbers"
         raise InputError(path=name, expected=expected, got=f"an array of {arrays[name].dtype}")

@@ -155,9 +155,9 @@ class OrPacked:
 
     def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> core_schema.CoreSchema:
         return core_schema.no_info_wrap_validator_function(
-            self._read,
+            self._unpack_value,
             handler(source),
-            serialization=core_schema.wrap_serializer_function_ser_schema(_written, schema=core_schema.any_schema()),
+            serialization=core_schema.wrap_serializer_function_ser_schema(_pack_value, schema=core_schema.any_schema()),
         )
 
     def __get_pydantic_json_schema__(self, schema: core_schema.CoreSchema, handler: GetJsonSchemaHandler) -> Any:
@@ -169,7 +169,7 @@ class OrPacked:
         }
         return {"anyOf": [handler(schema), from_file]}
 
-    def _read(self, value: object, handler: Any) -> object:
+    def _unpack_value(self, value: object, handler: Any) -> object:
         if isinstance(value, Packed):
             return value
         if not isinstance(value, Mapping):
@@ -177,7 +177,7 @@ class OrPacked:
         return handler(unpack(value).column) if self.column else unpack(value)
 
 
-def _written(value: object, handler: SerializerFunctionWrapHandler) -> object:
+def _pack_value(value: object, handler: SerializerFunctionWrapHandler) -> object:
     return pack(value.array) if isinstance(value, Packed) else handler(value)
 
 

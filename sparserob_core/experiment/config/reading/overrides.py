@@ -72,17 +72,17 @@ def parse_overrides(
     if given is None:
         return []
     if isinstance(given, Mapping):
-        return [Override(_path(key), value, f"{key}={value}") for key, value in given.items()]
+        return [Override(_parse_path(key), value, f"{key}={value}") for key, value in given.items()]
     overrides = []
     for text in (as_utf8(argument, "strict") for argument in given):
         key, equals, _ = text.partition("=")
         if not equals:
             raise ConfigError(f"override {shown(text)}: expected key=value, for example method.name=nominal")
-        overrides.append(Override(_path(key), parse_value(text, parse), text))
+        overrides.append(Override(_parse_path(key), parse_value(text, parse), text))
     return overrides
 
 
-def _path(key: str) -> Path:
+def _parse_path(key: str) -> Path:
     steps = tuple(int(step) if step.isdigit() else step for step in key.strip().split("."))
     if "" in steps:
         raise ConfigError(f"override {shown(key)}: expected a key such as problem.horizon, got {shown(key)}")
@@ -97,9 +97,9 @@ def apply_override(data: dict[str, Any], override: Override) -> None:
     node: Any = data
     for position, key in enumerate(override.path):
         last = position == len(override.path) - 1
-        step: Any = _fitting(node, key, override, position)
+        step: Any = _convert_step(node, key, override, position)
         if last:
-            _put(node, step, override.value)
+            _put_value(node, step, override.value)
             return
         below = (
             node[step]
@@ -110,18 +110,18 @@ def apply_override(data: dict[str, Any], override: Override) -> None:
         )
         if below is None:
             below = [] if override.path[position + 1] == 0 else {}
-            _put(node, step, below)
+            _put_value(node, step, below)
         node = below
 
 
-def _put(node: Any, step: Any, value: object) -> None:
+def _put_value(node: Any, step: Any, value: object) -> None:
     if isinstance(node, list) and step == len(node):
         node.append(value)
     else:
         node[step] = value
 
 
-def _fitting(node: object, step: str | int, override: Override, position: int) -> str | int:
+def _convert_step(node: object, step: str | int, override: Override, position: int) -> str | int:
     at = dotted(override.path[:position])
     if isinstance(node, dict):
         return str(step)

@@ -61,13 +61,13 @@ class Source:
         from ruamel.yaml.error import YAMLError
 
         try:
-            return _yaml("rt").load(self.text) if self.text else None
+            return _make_yaml("rt").load(self.text) if self.text else None
         except (YAMLError, ValueError):
             return None
 
     def writer(self, path: Path) -> Source:
         """Return the config of the chain that gives the value at ``path``; this config, where none does."""
-        if self.base is None or _decides(self.own, path) or not _decides(self.base.data, path):
+        if self.base is None or _is_decided(self.own, path) or not _is_decided(self.base.data, path):
             return self
         return self.base.writer(path)
 
@@ -80,7 +80,7 @@ class Source:
         """Return line and column of a key, counted from 0; ``(0, 0)`` where positions are unknown."""
         node, position = self.writer(path).marks, (0, 0)
         for step in path:
-            entry = _position(node, step)
+            entry = _find_position(node, step)
             if entry is None:
                 break
             position, node = entry
@@ -95,10 +95,10 @@ def read_source(config: str | File | Mapping[str, Any] | Source) -> Source:
     if isinstance(config, Source):
         return config
     if isinstance(config, Mapping):
-        return Source("config", File.cwd(), _plain(config))
+        return Source("config", File.cwd(), _to_plain(config))
     file = File(config)
-    text = _text(file)
-    data = _parsed(file, text)
+    text = _read_text(file)
+    data = _parse_text(file, text)
     if data is None:
         raise ConfigError(f"{file}: the file is empty; expected at least the key 'problem'")
     if not isinstance(data, dict):
@@ -106,7 +106,7 @@ def read_source(config: str | File | Mapping[str, Any] | Source) -> Source:
             f"{file}: expected a mapping of keys to values, got"
             f" {'a list' if isinstance(data, list) else repr(data)[:60]}"
         )
-    if _counted(data, {}) > MOST_VALUES:
+    if _count_values(data, {}) > MOST_VALUES:
         raise ConfigError(
             f"{file}: expected at most {MOST_VALUES} values, aliases counted as what they stand for, got more"
         )
@@ -115,7 +115,7 @@ def read_source(config: str | File | Mapping[str, Any] | Source) -> Source:
 
 def require_readable(data: Mapping[str, Any], text: str) -> None:
     """Raise `ConfigError` where a config that was written as ``text`` is larger than `read_source` accepts."""
-    size, values = len(text.encode()), _counted(data, {})
+    size, values = len(text.encode()), _count_values(data, {})
     if size > LARGEST or values > MOST_VALUES:
         raise ConfigError(
             f"the problem cannot be written: expected at most {LARGEST} bytes and {MOST_VALUES} values, got {size} and"
@@ -130,19 +130,19 @@ def read_value(text: str) -> object:
     if len(text) > LARGEST:
         raise ConfigError(f"override value {text[:40]!r}...: expected at most {LARGEST} characters, got {len(text)}")
     try:
-        value = _yaml("safe").load(text)
+        value = _make_yaml("safe").load(text)
     except MarkedYAMLError as error:
-        raise ConfigError(f"override value {text!r}: {_problem(error)}") from error
+        raise ConfigError(f"override value {text!r}: {_describe_problem(error)}") from error
     except (YAMLError, RecursionError) as error:
         raise ConfigError(f"override value {text[:60]!r}: not valid YAML: {type(error).__name__}") from None
-    if _counted(value, {}) > MOST_VALUES:
+    if _count_values(value, {}) > MOST_VALUES:
         raise ConfigError(f"override value {text[:40]!r}...: expected at most {MOST_VALUES} values, got more")
     return value
 
 
 def write_yaml(data: Mapping[str, Any], heading: str = "") -> str:
     """Return a mapping as YAML with the ``heading`` as a comment; lists of plain values are written on one line."""
-    yaml = _yaml("safe")
+    yaml = _make_yaml("safe")
     yaml.version = None  # still version 1.2, but without the directive
     yaml.default_flow_style = None
     yaml.width = 140
@@ -152,7 +152,7 @@ def write_yaml(data: Mapping[str, Any], heading: str = "") -> str:
     return "".join(f"# {line}\n" for line in heading.splitlines()) + stream.getvalue()
 
 
-def _yaml(kind: str) -> YAML:
+def _make_yaml(kind: str) -> YAML:
     from ruamel.yaml import YAML
 
     yaml = YAML(typ=kind, pure=True)
@@ -160,7 +160,7 @@ def _yaml(kind: str) -> YAML:
     return yaml
 
 
-def _text(file: File) -> str:
+def _read_text(file: File) -> str:
     try:
         size = file.stat().st_size
         if size > LARGEST:
@@ -178,7 +178,7 @@ def _text(file: File) -> str:
         raise ConfigError(f"{file}: cannot be read: {error.strerror}") from None
 
 
-def _parsed(file: File, text: str) -> Any:
+def _parse_text(file: File, text: str) -> Any:
     from ruamel.yaml.error import MarkedYAMLError, YAMLError
     from ruamel.yaml.reader import ReaderError
 
@@ -187,11 +187,11 @@ def _parsed(file: File, text: str) -> Any:
             return tomllib.loads(text)
         if file.suffix == ".json":
             return json.loads(text)
-        return _yaml("safe").load(text)
+        return _make_yaml("safe").load(text)
     except MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
         at = f":{mark.line + 1}:{mark.column + 1}" if mark else ""
-        raise ConfigError(f"{file}{at}: {_problem(error)}") from None
+        raise ConfigError(f"{file}{at}: {_describe_problem(error)}") from None
     except json.JSONDecodeError as error:
         raise ConfigError(f"{file}:{error.lineno}:{error.colno}: not valid JSON: {error.msg}") from None
     except ReaderError as error:
@@ -207,7 +207,7 @@ def _parsed(file: File, text: str) -> Any:
         raise ConfigError(f"{file}: {error}") from None
 
 
-def _counted(data: object, known: dict[int, int]) -> int:
+def _count_values(data: object, known: dict[int, int]) -> int:
     """Return the number of values, where an alias counts whenever it is used; a value that contains itself
     counts once."""
     if not isinstance(data, Mapping | list):
@@ -215,17 +215,17 @@ def _counted(data: object, known: dict[int, int]) -> int:
     if id(data) not in known:
         known[id(data)] = 1
         below = data.values() if isinstance(data, Mapping) else data
-        known[id(data)] = 1 + sum(_counted(value, known) for value in below)
+        known[id(data)] = 1 + sum(_count_values(value, known) for value in below)
     return known[id(data)]
 
 
-def _problem(error: Any) -> str:
+def _describe_problem(error: Any) -> str:
     message = " ".join(str(text) for text in (error.context, error.problem) if text)
     hint = "; indent with spaces" if "'\\t'" in message else ""
     return f"not valid YAML: {' '.join(message.split())}{hint}"
 
 
-def _position(node: Any, step: str | int) -> tuple[tuple[int, int], object] | None:
+def _find_position(node: Any, step: str | int) -> tuple[tuple[int, int], object] | None:
     try:
         if isinstance(node, Mapping):
             return node.lc.key(step), node[step]  # type: ignore[attr-defined]
@@ -236,7 +236,7 @@ def _position(node: Any, step: str | int) -> tuple[tuple[int, int], object] | No
     return None
 
 
-def _decides(data: Any, path: Path) -> bool:
+def _is_decided(data: Any, path: Path) -> bool:
     """Return whether there is a value at ``path``, or one above it that excludes keys below it."""
     for step in path:
         if not isinstance(data, Mapping):
@@ -247,11 +247,11 @@ def _decides(data: Any, path: Path) -> bool:
     return True
 
 
-def _plain(value: Any) -> Any:
+def _to_plain(value: Any) -> Any:
     if isinstance(value, Mapping):
-        return {key: _plain(item) for key, item in value.items()}
+        return {key: _to_plain(item) for key, item in value.items()}
     if hasattr(value, "toarray"):  # a sparse matrix
         return pack(np.asarray(value.toarray(), dtype=float))
     if hasattr(value, "tolist"):
         return value.tolist()
-    return [_plain(item) for item in value] if isinstance(value, list | tuple) else value
+    return [_to_plain(item) for item in value] if isinstance(value, list | tuple) else value

@@ -54,23 +54,23 @@ def problem_keys(problem: OptimalControlProblem) -> dict[str, Any]:
     ends = problem.terminal[: len(problem.terminal) - fixed]  # the key repeat adds its own end again
     keys: dict[str, Any] = {
         "name": "linear",
-        "system": _system_keys(problem.system),
+        "system": _write_system(problem.system),
         "horizon": problem.horizon,
-        "initial_state": _initial_keys(problem),
+        "initial_state": _write_initial_state(problem),
         "control": set_keys("control", problem.control),
         "weights": np.asarray(problem.weights).tolist(),
-        "disturbance_class": _class_of(problem, 0),
-        "terminal": [_terminal_keys(f"terminal.{i}", entry) for i, entry in enumerate(ends)],
-        **{name: [_term_keys(f"{name}.{i}", term) for i, term in enumerate(terms)] for name, terms in stated.items()},
-        **_cost_keys(problem.cost),
-        **_names_keys(problem.names),
+        "disturbance_class": _get_class(problem, 0),
+        "terminal": [_write_terminal(f"terminal.{i}", entry) for i, entry in enumerate(ends)],
+        **{name: [_write_term(f"{name}.{i}", term) for i, term in enumerate(terms)] for name, terms in stated.items()},
+        **_write_cost(problem.cost),
+        **_write_names(problem.names),
     }
     if problem.disturbance is not None:
-        keys["disturbance"] = _disturbance_keys(problem, keys["system"])
+        keys["disturbance"] = _write_disturbance(problem, keys["system"])
     if problem.control_step is not None:
         keys["control_step"] = set_keys("control_step", problem.control_step)
     if problem.measurements is not None:
-        keys["measurements"] = _term_keys("measurements", problem.measurements)
+        keys["measurements"] = _write_term("measurements", problem.measurements)
     if problem.initial_control is not None and (problem.control_step is not None or problem.system.delay > 0.0):
         keys["initial_control"] = np.asarray(problem.initial_control).tolist()
     if problem.repeat:
@@ -80,7 +80,7 @@ def problem_keys(problem: OptimalControlProblem) -> dict[str, Any]:
     return keys
 
 
-def _disturbance_keys(problem: OptimalControlProblem, system: dict[str, Any]) -> Any:
+def _write_disturbance(problem: OptimalControlProblem, system: dict[str, Any]) -> Any:
     """Return the key of the disturbance: its set, or a list where no kind of set is such a product of others.
 
     A list takes the columns of ``E`` out of the keys of the ``system``.
@@ -99,13 +99,13 @@ def _disturbance_keys(problem: OptimalControlProblem, system: dict[str, Any]) ->
     for i, factor in enumerate(bound.parts):
         columns = [row[begin : begin + factor.dimension] for row in rows]
         begin += factor.dimension
-        keys = {"set": set_keys(f"disturbance.{i}.set", factor), "E": columns, "class": _class_of(problem, i)}
+        keys = {"set": set_keys(f"disturbance.{i}.set", factor), "E": columns, "class": _get_class(problem, i)}
         own = None if problem.disturbance_breakpoints is None else problem.disturbance_breakpoints[i]
         entries.append(keys if own is None else {**keys, "breakpoints": own.tolist()})
     return entries
 
 
-def _class_of(problem: OptimalControlProblem, part: int) -> str:
+def _get_class(problem: OptimalControlProblem, part: int) -> str:
     """Return the class of a part of the disturbance."""
     kinds = problem.disturbance_class
     return kinds if isinstance(kinds, str) else kinds[part]
@@ -126,34 +126,34 @@ def set_keys(where: str, convex: ConvexSet) -> dict[str, Any]:
     raise InputError(path=where, expected=f"a set that a config can name ({kinds})", got=type(convex).__name__)
 
 
-def _system_keys(system: System) -> dict[str, Any]:
+def _write_system(system: System) -> dict[str, Any]:
     unknown = {field.name for field in fields(system)} - WRITTEN_OF_SYSTEM
     if unknown or system.stated is not system:
         raise InputError(path="system", expected="a system in the units of the user", got="another")
     phases = system.phases
-    shared: dict[str, Any] = {**({"delay": system.delay} if system.delay else {}), **_defined_keys(phases)}
+    shared: dict[str, Any] = {**({"delay": system.delay} if system.delay else {}), **_write_definitions(phases)}
     if system.parameters is not None:
-        shared["parameters"] = _parameter_keys(system.parameters, system.names)
+        shared["parameters"] = _write_parameters(system.parameters, system.names)
     if len(phases) == 1 and (system.varies or system.horizon == np.inf):
-        return {**_matrix_keys(phases[0]), **shared}
-    return {"pieces": [{"until": phase.until, **_matrix_keys(phase)} for phase in phases], **shared}
+        return {**_write_matrices(phases[0]), **shared}
+    return {"pieces": [{"until": phase.until, **_write_matrices(phase)} for phase in phases], **shared}
 
 
-def _matrix_keys(phase: Phase) -> dict[str, Any]:
-    keys: dict[str, Any] = {name: _rows(phase, name) for name in ("A", "B", "E")}
+def _write_matrices(phase: Phase) -> dict[str, Any]:
+    keys: dict[str, Any] = {name: _write_rows(phase, name) for name in ("A", "B", "E")}
     if phase.c is not None:
-        keys["c"] = [row[0] for row in _rows(phase, "c")]
+        keys["c"] = [row[0] for row in _write_rows(phase, "c")]
     return keys
 
 
-def _defined_keys(phases: Sequence[Phase]) -> dict[str, Any]:
+def _write_definitions(phases: Sequence[Phase]) -> dict[str, Any]:
     """Return the definitions that the entries of phases use; all phases share them."""
     entries = [getattr(phase, name) for phase in phases for name in PARTS]
     defined = next((entry.defined for entry in entries if isinstance(entry, ExpressionMatrix) and entry.defined), ())
     return {"define": {name: expression.text for name, expression in defined}} if defined else {}
 
 
-def _rows(phase: Phase, name: str) -> Any:
+def _write_rows(phase: Phase, name: str) -> Any:
     """Return the rows of numbers and expressions of a matrix; a large matrix is packed into one text."""
     value = getattr(phase, name)
     if isinstance(value, ExpressionMatrix):
@@ -164,14 +164,14 @@ def _rows(phase: Phase, name: str) -> Any:
     return pack(matrix) if matrix.size > MANY else matrix.tolist()
 
 
-def _parameter_keys(parameters: ConvexSet, names: Sequence[str]) -> dict[str, Any]:
+def _write_parameters(parameters: ConvexSet, names: Sequence[str]) -> dict[str, Any]:
     if isinstance(parameters, Box):
         bounds = zip(parameters.lower.tolist(), parameters.upper.tolist(), strict=True)
         return {name: list(interval) for name, interval in zip(names, bounds, strict=True)}
     return {"names": list(names), **set_keys("system.parameters", parameters)}
 
 
-def _initial_keys(problem: OptimalControlProblem) -> Any:
+def _write_initial_state(problem: OptimalControlProblem) -> Any:
     centre = np.asarray(problem.initial_state).tolist()
     if problem.initial_set is None:
         return centre
@@ -185,7 +185,7 @@ def _initial_keys(problem: OptimalControlProblem) -> Any:
     return {"centre": centre, **deviations}
 
 
-def _term_keys(where: str, term: Term) -> dict[str, Any]:
+def _write_term(where: str, term: Term) -> dict[str, Any]:
     """Return a key for every field of a term that has a value, and for a set the key of its kind.
 
     An infinite bound is null, and an end that follows the horizon is not written.
@@ -196,12 +196,12 @@ def _term_keys(where: str, term: Term) -> dict[str, Any]:
     keys: dict[str, Any] = {}
     if isinstance(term, MixedConstraint):
         kept = np.isfinite(np.asarray(term.h))
-        keys["mixed"] = {name: _listed(values.pop(name)[kept]) for name in ("H", "G", "h")}
+        keys["mixed"] = {name: _write_numbers(values.pop(name)[kept]) for name in ("H", "G", "h")}
     for name, value in values.items():
         if isinstance(value, UntilHorizon):
             continue
         if not isinstance(value, ConvexSet):
-            keys[CALLED.get(name, name)] = value if isinstance(value, str) else _listed(value)
+            keys[CALLED.get(name, name)] = value if isinstance(value, str) else _write_numbers(value)
         elif name == "set":
             keys |= set_keys(where, value)
         else:
@@ -209,7 +209,7 @@ def _term_keys(where: str, term: Term) -> dict[str, Any]:
     return keys
 
 
-def _listed(value: Any) -> Any:
+def _write_numbers(value: Any) -> Any:
     """Return numbers as nested lists, with null where they are not finite."""
     numbers = np.asarray(value, dtype=float)
     entries = numbers.astype(object)
@@ -217,23 +217,23 @@ def _listed(value: Any) -> Any:
     return entries.tolist()
 
 
-def _terminal_keys(where: str, entry: ConvexSet | Equality) -> dict[str, Any]:
+def _write_terminal(where: str, entry: ConvexSet | Equality) -> dict[str, Any]:
     if isinstance(entry, Equality):
-        return {"equals": _listed(entry.values)}
+        return {"equals": _write_numbers(entry.values)}
     return set_keys(where, entry)
 
 
-def _cost_keys(cost: Cost) -> dict[str, Any]:
+def _write_cost(cost: Cost) -> dict[str, Any]:
     keys: dict[str, Any] = {} if cost.l1 == 1.0 else {"l1": cost.l1}
     if cost.group:
         keys["group"] = [list(group) for group in cost.group]
     for key, term in zip(("state", "control", "final"), cost.terms, strict=True):
         if term is not None:
-            keys[key] = {"R": np.asarray(term.Q).tolist()} if key == "control" else _term_keys(key, term)
+            keys[key] = {"R": np.asarray(term.Q).tolist()} if key == "control" else _write_term(key, term)
     return {"cost": keys} if keys else {}
 
 
-def _names_keys(names: Names) -> dict[str, Any]:
+def _write_names(names: Names) -> dict[str, Any]:
     keys: dict[str, Any] = {kind: list(getattr(names, kind)) for kind in ("states", "controls", "disturbances")}
     units = {kind: list(getattr(names, f"{kind[:-1]}_units")) for kind in keys}
     stated = {**units, "time": names.time}

@@ -39,7 +39,7 @@ def bounded(experiment: ControlExperiment, result: Result, deadline: Deadline) -
     if result.status == "undecided" and not np.isfinite(result.dual.bound):
         result = replace(result, lower_bound=0.0)  # no term of a cost is negative, and nothing else is proven
     proven = with_final_states(model, result, experiment.gap_tolerance)
-    return remarked(experiment.problem, _bounded(experiment, proven, deadline), model.feedback is not None)
+    return remarked(experiment.problem, _derive_bound(experiment, proven, deadline), model.feedback is not None)
 
 
 def unbounded(result: Result) -> Result:
@@ -56,7 +56,7 @@ def unbounded(result: Result) -> Result:
     return bare
 
 
-def _bounded(experiment: ControlExperiment, result: Result, deadline: Deadline) -> Result:
+def _derive_bound(experiment: ControlExperiment, result: Result, deadline: Deadline) -> Result:
     """Return a result with the lower bound that its multipliers prove.
 
     Running bounds of rounding errors are cheap. Where multipliers are large, as those of nearly parallel rows are,
@@ -93,7 +93,7 @@ def _bounded(experiment: ControlExperiment, result: Result, deadline: Deadline) 
         if not exact:
             deadline.check()
         return rounded
-    if derived - result.cost > _allowed(result):
+    if derived - result.cost > _compute_allowance(result):
         return replace(rounded, status="failed", message=CROSSED.format(derived, result.cost, ADVICE))
     lowered = min(derived - INWARDS * abs(derived), result.cost)
     if not np.isfinite(lowered) or (lowered <= rounded.lower_bound if exact else lowered == rounded.lower_bound):
@@ -105,7 +105,7 @@ def _bounded(experiment: ControlExperiment, result: Result, deadline: Deadline) 
     return replace(improved, status=status, message=message)
 
 
-def _allowed(result: Result) -> float:
+def _compute_allowance(result: Result) -> float:
     """Return by how much the lower bound may be above the cost: the sum of multiplier times tolerance over all rows.
 
     `sip.working.ledger.alarm` has judged the bound before, in the program's own units.

@@ -69,7 +69,7 @@ def with_causal(result: ControlResult, tools: Tools) -> ControlResult:
     return replace(result, causal=replace(stated, lower=min(derived, cost)))
 
 
-def _from(rest: Array, signal: Array) -> Array:
+def _subtract_rest(rest: Array, signal: Array) -> Array:
     """Return the deviations of a disturbance ``signal (mw, blocks)`` from its rest, as one vector.
 
     ``rest`` holds the values at rest of the disturbance, followed by those of the initial state.
@@ -85,7 +85,7 @@ def active(model: Transcription, result: Result) -> list[tuple[str, float, Array
         if explanation is not None:
             signal = None if model.answering.loop.measurable is not None else explanation.disturbance
             constraints.append(
-                (cut.family, explanation.time, None if signal is None else _from(middle, np.asarray(signal)))
+                (cut.family, explanation.time, None if signal is None else _subtract_rest(middle, np.asarray(signal)))
             )
     return constraints
 

@@ -48,41 +48,44 @@ def with_activity(experiment: ControlExperiment, result: Result, tools: Tools) -
     base = program.finite
     norm = base.P is None and base.blocks is None and not base.q.any()
     if result.sparsest is not None and result.sparsest.letters is None:  # its own bounds are those of the count
-        upper = _share(program, result.cost) if proven else None
-        return replace(result, activity=Activity(_share(program, result.lower_bound) or 0.0, upper, norm=norm))
+        upper = _compute_share(program, result.cost) if proven else None
+        return replace(result, activity=Activity(_compute_share(program, result.lower_bound) or 0.0, upper, norm=norm))
     # a cut of a sample is known by its number only, from which a check cannot derive its row
     is_checkable = result.sparsest is None and all(cut.formulation != "sampled" for cut in result.dual.cuts)
-    factor = _factor(experiment) if is_checkable else None
-    lower_count = -np.inf if factor is None else _safe(program, factor * result.lower_bound)
+    factor = _compute_factor(experiment) if is_checkable else None
+    lower_count = -np.inf if factor is None else _round_down(program, factor * result.lower_bound)
     upper_count, count_result = count(program, np.asarray(result.decision)) if proven else np.inf, None
     if factor is None or (proven and not is_vertex(program, result)):
-        count_result = _other(experiment, result, tools, upper_count)
+        count_result = _minimise_count(experiment, result, tools, upper_count)
     if count_result is not None:  # only the account of the solver changes, not the relaxed programs of the method
         result = replace(result, solved_by=result.charged([count_result]).solved_by)
-    activity = Activity(_share(program, lower_count) or 0.0, _share(program, upper_count), norm=norm)
-    if count_result is not None and _safe(program, count_result.lower_bound) > lower_count:
-        lower_count = _safe(program, count_result.lower_bound)
-        activity = replace(activity, lower=_share(program, lower_count) or 0.0, dual=count_result.dual)
+    activity = Activity(_compute_share(program, lower_count) or 0.0, _compute_share(program, upper_count), norm=norm)
+    if count_result is not None and _round_down(program, count_result.lower_bound) > lower_count:
+        lower_count = _round_down(program, count_result.lower_bound)
+        activity = replace(activity, lower=_compute_share(program, lower_count) or 0.0, dual=count_result.dual)
     if (
         count_result is not None
         and count_result.decision is not None
-        and _admissible(program, count_result, upper_count)
+        and _is_proven_better(program, count_result, upper_count)
     ):
         upper_count = count(program, count_result.decision)
         activity = replace(
-            activity, upper=_share(program, upper_count), decision=count_result.decision, proofs=count_result.proofs
+            activity,
+            upper=_compute_share(program, upper_count),
+            decision=count_result.decision,
+            proofs=count_result.proofs,
         )
     lower = activity.lower if activity.upper is None else min(activity.lower, activity.upper)
     return replace(result, activity=replace(activity, lower=lower))
 
 
-def _admissible(program: SemiInfiniteProgram, other: Result, most: float) -> bool:
+def _is_proven_better(program: SemiInfiniteProgram, other: Result, most: float) -> bool:
     """Return whether another decision counts less than ``most`` and is proven for every family of constraints."""
     proven = other.status in PROVEN and len(other.proofs) == len(program.families)
     return proven and np.isfinite(most) and count(program, np.asarray(other.decision)) < most * (1.0 - INWARDS)
 
 
-def _factor(experiment: ControlExperiment) -> float | None:
+def _compute_factor(experiment: ControlExperiment) -> float | None:
     """Return a factor such that the count is at least this factor times the cost; ``None`` where the cost gives no
     bound.
 
@@ -113,15 +116,15 @@ def longest(bound: ConvexSet, channels: Sequence[int]) -> float:
     return reach
 
 
-def _safe(program: SemiInfiniteProgram, least: float) -> float:
+def _round_down(program: SemiInfiniteProgram, least: float) -> float:
     return whole(program, least - INWARDS * abs(least)) if np.isfinite(least) else -np.inf
 
 
-def _share(program: SemiInfiniteProgram, counted: float) -> float | None:
+def _compute_share(program: SemiInfiniteProgram, counted: float) -> float | None:
     return share_of(program, counted) if np.isfinite(counted) else None
 
 
-def _other(experiment: ControlExperiment, result: Result, tools: Tools, most: float) -> Result | None:
+def _minimise_count(experiment: ControlExperiment, result: Result, tools: Tools, most: float) -> Result | None:
     """Return the result of the program whose cost is below the count; ``None`` where it gives nothing."""
     if result.stopped or tools.deadline.passed:
         return None

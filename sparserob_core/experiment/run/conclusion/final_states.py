@@ -34,7 +34,7 @@ def with_final_states(model: Transcription, result: Result, tolerance: float | N
     errors = result.errors
     if errors is None or errors.kept or result.decision is None or result.status != "undecided":
         return result
-    error_bounds = _enclosed(model, result)
+    error_bounds = _enclose_errors(model, result)
     if error_bounds is None:
         return result
     improved = replace(result, errors=replace(errors, missed=np.minimum(errors.missed, error_bounds)))
@@ -47,7 +47,7 @@ def with_final_states(model: Transcription, result: Result, tolerance: float | N
     return replace(bounded, status=status, message=message)
 
 
-def _enclosed(model: Transcription, result: Result) -> np.ndarray | None:
+def _enclose_errors(model: Transcription, result: Result) -> np.ndarray | None:
     """Return the largest errors of the fixed final states ``(e,)``, in the user's units; ``None`` where they are not
     found."""
     from flint import ctx
