@@ -40,7 +40,7 @@ class Term:
 
     def in_units(self, units: Any) -> Self:
         """Return the term with every number converted to these `Units`."""
-        return self._changed("in_units", units)
+        return self._map_fields("in_units", units)
 
     def remaining(self, begin: float, horizon: float, **given: Any) -> Self | None:
         """Return the term from the time ``begin`` on, over a ``horizon``, with times counted from ``begin``.
@@ -48,12 +48,12 @@ class Term:
         The result is ``None`` where nothing of the term is left. ``given`` holds new values of fields, which are taken
         as they are.
         """
-        return self._changed("remaining", begin, horizon, **given)
+        return self._map_fields("remaining", begin, horizon, **given)
 
-    def _changed(self, verb: str, *how: Any, **given: Any) -> Self:
+    def _map_fields(self, verb: str, *how: Any, **given: Any) -> Self:
         kept: Any = self
         changes = {
-            field.name: _each(field.metadata[verb], getattr(self, field.name), *how)
+            field.name: _map_values(field.metadata[verb], getattr(self, field.name), *how)
             for field in fields(kept)
             if field.name not in given
         }
@@ -61,10 +61,10 @@ class Term:
         return changed
 
 
-def _each(change: Callable[..., Any], value: Any, *how: Any) -> Any:
+def _map_values(change: Callable[..., Any], value: Any, *how: Any) -> Any:
     """A value that is changed, or each of a tuple, without those of which nothing is left; of ``None`` nothing is."""
     if isinstance(value, tuple):
-        pairs = [(item, _each(change, item, *how)) for item in value]
+        pairs = [(item, _map_values(change, item, *how)) for item in value]
         return tuple(changed for item, changed in pairs if changed is not None or item is None)
     return None if value is None else change(value, *how)
 
@@ -96,19 +96,19 @@ def timed(unit: Unit, remaining: Remaining) -> Quantity:
     return {"in_units": in_units, "remaining": remaining}
 
 
-def _clipped(time: float, begin: float, horizon: float) -> float:
+def _clip_time(time: float, begin: float, horizon: float) -> float:
     return min(max(0.0, time - begin), horizon)
 
 
-def _of_term(value: Any, begin: float, horizon: float) -> Any:
+def _take_remaining(value: Any, begin: float, horizon: float) -> Any:
     return value.remaining(begin, horizon)
 
 
 UNITLESS: Quantity = {"in_units": unchanged, "remaining": unchanged}
-TIME = measured(lambda of: of.time, _clipped)
+TIME = measured(lambda of: of.time, _clip_time)
 STATES = measured(lambda of: of.states)
 CONTROLS = measured(lambda of: of.controls)
-TERMS = measured(lambda of: of, _of_term)
+TERMS = measured(lambda of: of, _take_remaining)
 KIND = "kind"
 
 

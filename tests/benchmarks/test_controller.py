@@ -45,7 +45,7 @@ def test_a_warm_re_solve_of_250_pieces_is_ten_times_faster_than_the_exchange(tmp
         quick += [time.perf_counter() - began] if number >= WARMED else []
         assert answer.plan is not None
         assert answer.cost - answer.lower <= 1e-7 * answer.cost
-    resolver._tracking[0] = None
+    resolver._trackers[0] = None
     for _ in range(5):
         state, began = np.array([-1, 1]) + 0.02 * rng.standard_normal(2), time.perf_counter()
         resolver.answer(plan, 0, state, None, [np.zeros(2)])

@@ -356,13 +356,13 @@ BENT = {**PLANE, "system": {**PLANE["system"], "A": [*PLANE["system"]["A"][:3], 
 
 def missing(monkeypatch: pytest.MonkeyPatch, shares: Callable[[np.ndarray], np.ndarray]) -> None:
     """Signals that miss their points, since their parts have these shares, and nobody derives the bound anew."""
-    plain = Zonoid._made_of
+    plain = Zonoid._decompose_points
 
     def made(zonoid: Zonoid, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         directions, found = plain(zonoid, points)
         return directions, shares(found)
 
-    monkeypatch.setattr(Zonoid, "_made_of", made)
+    monkeypatch.setattr(Zonoid, "_decompose_points", made)
     monkeypatch.setattr(bound, "SECONDS", 0.0)
 
 

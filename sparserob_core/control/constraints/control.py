@@ -182,14 +182,14 @@ class ControlConstraint(Source):
         """The derivative ``(k, 1 + m)`` of ``row x - rhs`` in the index: 0 in time, since the control is constant on
         every piece."""
         z = np.asarray(indices, dtype=float)[:, 1:]
-        point = self._points(x)[self.places.at(indices[:, 0])]
+        point = self._evaluate_places(x)[self.places.at(indices[:, 0])]
         slopes = across(self.set, z, (point - self.set.support_point(unit(self.set, z))) @ self.set.frame.T)
         return np.hstack([np.zeros((z.shape[0], 1)), slopes])
 
     def worst(self, x: Array) -> Separation:
         """The places furthest outside, each with its worst direction; the bound is exact, since the places are finitely
         many."""
-        points = self._points(x)
+        points = self._evaluate_places(x)
         outside = self.set.gauge(points) - 1.0
         places = np.argsort(-outside, kind="stable")[:CLIMBED]
         z = sampled(self.set.dimension)
@@ -214,7 +214,7 @@ class ControlConstraint(Source):
         text = f"{self.name}: {self.places.words(time)} in the {self.set.kind}"
         return TimedExplanation(text, self.name, text, time, unit(self.set, index[None, 1:])[0])
 
-    def _points(self, x: Array) -> Array:
+    def _evaluate_places(self, x: Array) -> Array:
         """Return the values of the control, or its changes, at every place, ``(q, m)``."""
         coefficients = x[: x.size - self.beside].reshape(self.set.dimension, -1)
         answer: Array = (coefficients @ self.values).T + self.places.offset

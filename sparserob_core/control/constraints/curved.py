@@ -70,7 +70,7 @@ class CurvedConstraint(StateConstraint):
 
     @property
     def index_set(self) -> Box:
-        box, cube = self._flat.index_set, np.ones(self._b)
+        box, cube = self._outer_constraint.index_set, np.ones(self._cube_dimension)
         return Box(np.concatenate([box.lower, -cube]), np.concatenate([box.upper, cube]))
 
     @shaped
@@ -90,59 +90,63 @@ class CurvedConstraint(StateConstraint):
     def violations(
         self, x: Float[Array, " n"], indices: Float[Array, "k j"], rows: Int[np.ndarray, " k"]
     ) -> Float[Array, " k"]:
-        return self._height(x, indices)
+        return self._compute_violations(x, indices)
 
     @shaped
     def worst(self, x: Float[Array, " n"]) -> Separation:
         """The largest local maxima over a lattice of times, parameters and directions, climbed from until the steps
         vanish."""
-        flat, box, times = self._flat, self.index_set, self._flat.times
+        flat, box, times = self._outer_constraint, self.index_set, self._outer_constraint.times
         values = flat.on_lattice(x)
-        worst_indices, heights = self._profile(x, values)
+        worst_indices, heights = self._find_worst_indices(x, values)
         samples = local_maxima(values, flat.lattice[1], SAMPLED)
         samples = samples[np.argsort(-values[tuple(samples.T)], kind="stable")][:SAMPLED]
-        sample_points = self._at(vertices(values, samples, times)[0], samples)
+        sample_points = self._build_indices(vertices(values, samples, times)[0], samples)
         step = np.concatenate(
             [
                 [np.max(np.diff(times), initial=0.0)],
                 (box.upper - box.lower)[1 : 1 + self.parameters.count] / 4,
-                np.full(self._b, STEP),
+                np.full(self._cube_dimension, STEP),
             ]
         )
 
         def climbed(points: Array) -> tuple[Array, Array]:
             starts = np.vstack([points, sample_points])
-            ends, violations = climb(lambda at, _: self._height(x, at, self._rough), starts, step, self._inside)
-            return ends, self._height(x, ends) if self._rough else violations
+            ends, violations = climb(
+                lambda at, _: self._compute_violations(x, at, self._has_integrals), starts, step, self._project_indices
+            )
+            return ends, self._compute_violations(x, ends) if self._has_integrals else violations
 
         indices, violations = ridden(
-            worst_indices, heights, flat.pieces, flat.kinks, lambda points: self._turned(x, points), climbed
+            worst_indices, heights, flat.pieces, flat.kinks, lambda points: self._climb_directions(x, points), climbed
         )
         return Separation(indices, np.zeros(violations.size, dtype=int), violations)
 
     @shaped
-    def _profile(
+    def _find_worst_indices(
         self, x: Float[Array, " n"], values: Float[Array, "v r t"]
     ) -> tuple[Float[Array, "t j"], Float[Array, " t"]]:
         """The worst index at every sampled time and its violation, at the worst sampled parameter, in a direction that
         is climbed to from the sampled ones wherever these say that the set may be left. Samples are lower by what lies
         between directions, which hides where along a wall that is ridden it is left."""
-        places, likely = turns(values.max(axis=0), neighbours(self._b), self.unit)
+        places, likely = turns(values.max(axis=0), neighbours(self._cube_dimension), self.unit)
         rows, at = places.T
         heights = values[:, rows, at].max(axis=0)
-        worst_indices = self._at(self._flat.times[at], np.stack([values[:, rows, at].argmax(axis=0), rows], axis=1))
-        worst_indices[:likely], heights[:likely] = self._turned(x, worst_indices[:likely])
+        worst_indices = self._build_indices(
+            self._outer_constraint.times[at], np.stack([values[:, rows, at].argmax(axis=0), rows], axis=1)
+        )
+        worst_indices[:likely], heights[:likely] = self._climb_directions(x, worst_indices[:likely])
         best = highest_at(at, heights)
         return worst_indices[best], heights[best]
 
     @shaped
-    def _turned(
+    def _climb_directions(
         self, x: Float[Array, " n"], indices: Float[Array, "k j"]
     ) -> tuple[Float[Array, "k j"], Float[Array, " k"]]:
         """Indices at the same times and parameters, their directions climbed from, and the violations there."""
         if not indices.size:
             return indices, np.zeros(0)
-        indices, first = self._inside(indices), 1 + self.parameters.count
+        indices, first = self._project_indices(indices), 1 + self.parameters.count
         times = indices[:, 0]
         along = self.functionals.turning(x, times, self.parameters.clamp(indices[:, 1:first]))
         moves = self.reference.at(times)
@@ -151,23 +155,31 @@ class CurvedConstraint(StateConstraint):
             c = unit(self.set, z) / self.unit
             return np.asarray(along(c, which) - self.set.support(c) - (c * moves[which]).sum(axis=1))
 
-        start = np.full(self._b, STEP)
+        start = np.full(self._cube_dimension, STEP)
         z, violations = climb(height, indices[:, first:], start, lambda z: on_surface(np.clip(z, -1.0, 1.0)))
         ends = np.hstack([indices[:, :first], z])
-        return ends, self._height(x, ends) if self._rough else violations
+        return ends, self._compute_violations(x, ends) if self._has_integrals else violations
 
     @shaped
-    def _at(self, times: Float[Array, " k"], positions: Int[np.ndarray, "k q"]) -> Float[Array, "k j"]:
+    def _build_indices(self, times: Float[Array, " k"], positions: Int[np.ndarray, "k q"]) -> Float[Array, "k j"]:
         """Indices ``(t, p, z)`` of positions on the lattice, at these times."""
-        return np.hstack([times[:, None], self._flat.lattice[0][positions[:, 0]], sampled(self._b)[positions[:, 1]]])
+        return np.hstack(
+            [
+                times[:, None],
+                self._outer_constraint.lattice[0][positions[:, 0]],
+                sampled(self._cube_dimension)[positions[:, 1]],
+            ]
+        )
 
     @shaped
-    def _height(self, x: Float[Array, " n"], indices: Float[Array, "k j"], roughly: bool = False) -> Float[Array, " k"]:
+    def _compute_violations(
+        self, x: Float[Array, " n"], indices: Float[Array, "k j"], roughly: bool = False
+    ) -> Float[Array, " k"]:
         times, directions, parameters, rhs = self.functionals_at(indices)
         return self.functionals.values(x, times, directions, parameters, roughly) - rhs
 
     @property
-    def _rough(self) -> bool:
+    def _has_integrals(self) -> bool:
         """True where measurable disturbances or errors of execution add integrals to the rows.
 
         Climbs then use approximate integrals, so that the directions they reach are approximate. The violations there
@@ -176,7 +188,7 @@ class CurvedConstraint(StateConstraint):
         return self.functionals.measurable is not None or self.functionals.execution is not None
 
     @shaped
-    def _inside(self, points: Float[Array, "k j"]) -> Float[Array, "k j"]:
+    def _project_indices(self, points: Float[Array, "k j"]) -> Float[Array, "k j"]:
         """The nearest indices to points ``(k, j)``, directions on the surface of their cube."""
         box, count = self.index_set, self.parameters.count
         inside = np.clip(points, box.lower, box.upper)
@@ -188,8 +200,8 @@ class CurvedConstraint(StateConstraint):
     @shaped
     def cells(self) -> tuple[Float[Array, "k j"], Float[Array, "k j"]]:
         """The cells of times and parameters, times the faces of the cube of directions."""
-        lower, upper = self._flat.cells
-        low, high = faces(self._b)
+        lower, upper = self._outer_constraint.cells
+        low, high = faces(self._cube_dimension)
         return (
             np.hstack([np.repeat(lower, low.shape[0], axis=0), np.tile(low, (lower.shape[0], 1))]),
             np.hstack([np.repeat(upper, high.shape[0], axis=0), np.tile(high, (upper.shape[0], 1))]),
@@ -201,15 +213,15 @@ class CurvedConstraint(StateConstraint):
         of the cube's directions."""
         nu = self.parameters.count
         touched = self.parameters.touches(lower[:, 1 : 1 + nu], upper[:, 1 : 1 + nu])
-        enclosure = enclose(lower, upper, touched, nu, lambda low, high: self._cell(x, low, high))
+        enclosure = enclose(lower, upper, touched, nu, lambda low, high: self._enclose_cell(x, low, high))
         with np.errstate(divide="ignore"):
-            rooms = np.maximum(self._rooms(lower[:, 1 + nu :], upper[:, 1 + nu :]), 0.0)
+            rooms = np.maximum(self._bound_extents(lower[:, 1 + nu :], upper[:, 1 + nu :]), 0.0)
             return replace(
                 enclosure, bounds=np.where(enclosure.bounds > 0.0, enclosure.bounds / rooms, enclosure.bounds)
             )
 
     @shaped
-    def _rooms(self, low: Float[Array, "k b"], high: Float[Array, "k b"]) -> Float[Array, " k"]:
+    def _bound_extents(self, low: Float[Array, "k b"], high: Float[Array, "k b"]) -> Float[Array, " k"]:
         """Lower bounds ``(k,)`` of ``h(c) - c'm`` for the directions of cells: a point ``p`` of the set far out in the
         middle direction gives at least ``c'(p - m)``."""
         frame = self.set.frame
@@ -219,7 +231,7 @@ class CurvedConstraint(StateConstraint):
         return answer
 
     @shaped
-    def _lengthening(self, H: Float[Array, "r d"], shortest: float) -> Float[Array, " j"]:
+    def _compute_lengthening(self, H: Float[Array, "r d"], shortest: float) -> Float[Array, " j"]:
         """Return the share by which ``h(c) - c'm`` exceeds ``shortest`` where one coordinate of the directions
         ``c = H[0] + sum_j eta_j H[j]`` is at an end."""
         ends = np.maximum(*(self.set.support(c) - c @ self.set.interior_point() for c in (H[0] + H[1:], H[0] - H[1:])))
@@ -238,10 +250,10 @@ class CurvedConstraint(StateConstraint):
     @property
     @shaped
     def sized_rows(self) -> tuple[Float[Array, "q d"], Float[Array, " q"]]:
-        rows = self._flat.H if self.unit > 1.0 else np.zeros((0, self.set.dimension))
+        rows = self._outer_constraint.H if self.unit > 1.0 else np.zeros((0, self.set.dimension))
         return rows, np.full(len(rows), 1.0 / self.unit)
 
-    def _along(self, x: Array, rows: Array) -> Array:
+    def _compute_row_sizes(self, x: Array, rows: Array) -> Array:
         return np.asarray(np.abs(rows) @ nominal_sizes(self.functionals, x, np.eye(self.set.dimension)))
 
     def nominal(self) -> CurvedConstraint:
@@ -251,7 +263,7 @@ class CurvedConstraint(StateConstraint):
     @shaped
     def from_state(self, initial_state: Float[Array, " d"]) -> CurvedConstraint:
         functionals = self.functionals.from_state(initial_state)
-        return replace(self, functionals=functionals, shared=self._sharing or self)
+        return replace(self, functionals=functionals, shared=self._shareable_constraint or self)
 
     @shaped
     def directions(
@@ -277,18 +289,18 @@ class CurvedConstraint(StateConstraint):
         return sizes if np.isfinite(sizes).all() else self.set.violation(states.T)
 
     @shaped
-    def _cell(self, x: Float[Array, " n"], low: Float[Array, " j"], high: Float[Array, " j"]) -> Bounded:
+    def _enclose_cell(self, x: Float[Array, " n"], low: Float[Array, " j"], high: Float[Array, " j"]) -> Bounded:
         key = x.tobytes() + low.tobytes() + high.tobytes()
-        if key not in self._cells:
+        if key not in self._cell_enclosures:
             nu = self.parameters.count
             centre, radius = (low + high)[nu:] / 2, (high - low)[nu:] / 2
             free = np.flatnonzero(radius > 0)
             H = np.vstack([centre, np.diag(radius)[free]]) @ self.set.frame / self.unit
             legs = self.functionals.legs(low[:nu], high[:nu])
-            joined = self._combination(legs[0], free.size)
-            rhs, looseness = self._minorant(H, joined, nu)
-            shortest = self._rooms(low[None, nu:], high[None, nu:])[0]
-            lengthening = np.concatenate([np.zeros(nu), self._lengthening(H, shortest / self.unit)])
+            joined = self._build_combination(legs[0], free.size)
+            rhs, looseness = self._compute_minorant(H, joined, nu)
+            shortest = self._bound_extents(low[None, nu:], high[None, nu:])[0]
+            lengthening = np.concatenate([np.zeros(nu), self._compute_lengthening(H, shortest / self.unit)])
             control = self.functionals.control(x)
             cuts = self.parameters.cuts(low[:nu], high[:nu])
             moving = Moving(self.reference, H) if self.reference.moves else None
@@ -298,11 +310,11 @@ class CurvedConstraint(StateConstraint):
                 sigma = self.functionals.delivered_over(supports, x, H, leg, joined)
                 return CellEnclosure(leg, sigma, H, rhs, control, joined, looseness, lengthening, cuts, moving)
 
-            remember(self._cells, key, over_legs(legs, cell), kept(control))
-        return self._cells[key]
+            remember(self._cell_enclosures, key, over_legs(legs, cell), kept(control))
+        return self._cell_enclosures[key]
 
     @shaped
-    def _minorant(
+    def _compute_minorant(
         self, H: Float[Array, "r d"], joined: Combination, nu: int
     ) -> tuple[Float[Array, "1 M"], Float[Array, " j"]]:
         """A quadratic polynomial below ``h(c_0 + sum_j eta_j c_j)``, ``(1, M')``, and how far below at the ends of
@@ -321,22 +333,22 @@ class CurvedConstraint(StateConstraint):
         ]
         return rhs, np.concatenate([np.zeros(nu), np.maximum(*ends)])
 
-    def _combination(self, lifted: Leg, free: int) -> Combination:
+    def _build_combination(self, lifted: Leg, free: int) -> Combination:
         if free not in self._combinations:
             self._combinations[free] = combination(lifted.space, free)
         return self._combinations[free]
 
     @cached_property
     def _combinations(self) -> dict[int, Combination]:
-        return {} if self._sharing is None else self._sharing._combinations
+        return {} if self._shareable_constraint is None else self._shareable_constraint._combinations
 
     @property
     def outer(self) -> FlatConstraint:
         """The half-spaces of sampled directions: an outer polytope of the set."""
-        return self._flat
+        return self._outer_constraint
 
     @property
-    def _sharing(self) -> CurvedConstraint | None:
+    def _shareable_constraint(self) -> CurvedConstraint | None:
         """The ``shared`` constraint where it is the same but for its initial state."""
         shared = self.shared
         if shared is None or (shared.start, shared.stop) != (self.start, self.stop):
@@ -354,19 +366,19 @@ class CurvedConstraint(StateConstraint):
         return shared if same else None
 
     @cached_property
-    def _cells(self) -> dict[bytes, Bounded]:
+    def _cell_enclosures(self) -> dict[bytes, Bounded]:
         return {}
 
     @property
-    def _b(self) -> int:
+    def _cube_dimension(self) -> int:
         return int(self.set.normals.shape[0])
 
     @cached_property
-    def _flat(self) -> FlatConstraint:
+    def _outer_constraint(self) -> FlatConstraint:
         """The half-spaces of the sampled directions: an outer polytope of the set, on which the search starts."""
-        if self._sharing is not None:
-            return self._sharing._flat.from_state(self.functionals.response.initial_state)
-        H = unit(self.set, sampled(self._b)) / self.unit
+        if self._shareable_constraint is not None:
+            return self._shareable_constraint._outer_constraint.from_state(self.functionals.response.initial_state)
+        H = unit(self.set, sampled(self._cube_dimension)) / self.unit
         return FlatConstraint(
             self.name,
             self.functionals,

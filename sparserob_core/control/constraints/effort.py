@@ -31,7 +31,7 @@ class FeedbackEffort(Source):
     loop: ClosedLoop
     prices: Array
     bound: int
-    _known: dict[bytes, Effort] = field(default_factory=dict, repr=False)
+    _efforts: dict[bytes, Effort] = field(default_factory=dict, repr=False)
 
     def normals_in(self, units: Units) -> tuple[Array, Array]:
         """Return one normal ``(1,)`` for each of two rows, and the unit of the cost: the rows are costs, whatever the
@@ -64,10 +64,10 @@ class FeedbackEffort(Source):
         return replace(family, literal=literal)
 
     @property
-    def _sides(self) -> Array:
+    def _row_signs(self) -> Array:
         return np.array([1.0, -1.0] if self.loop.spread.is_box else [1.0])
 
-    def _control(self, x: Array) -> tuple[Array, Array]:
+    def _price_control(self, x: Array) -> tuple[Array, Array]:
         """Return the entries of the control without deviations, and the coefficients of the deviations in them, both
         times the prices: ``(m K,)`` and ``(m K, Q)``."""
         effects = self.loop.effects(x)
@@ -77,38 +77,38 @@ class FeedbackEffort(Source):
 
     def excess(self, x: Array, indices: Array) -> Array:
         """Violations ``(k, r)`` for signs ``(k, m K)`` under the worst disturbances."""
-        a, A = self._control(x)
-        signs = indices[:, None] * self._sides[:, None]
+        a, A = self._price_control(x)
+        signs = indices[:, None] * self._row_signs[:, None]
         return np.asarray(signs @ a + self.loop.spread.support(signs @ A) - x[self.bound])
 
     def uncertain(self, index: Array) -> UncertainRows:
         """The rows of one sign of every entry."""
         from scipy.sparse import csr_array
 
-        loop, weight, count = self.loop, self.prices * index, self._sides.size
+        loop, weight, count = self.loop, self.prices * index, self._row_signs.size
         position, variable, value = loop.answers.effect
         _, m, Q, _ = loop.answers.shape
         piece, channel = np.divmod(position // Q, m)
         data = weight.reshape(m, -1)[channel, piece] * value
         C = csr_array((data, (position % Q, loop.nominal_size + variable)), shape=(Q, loop.variables))
         g = np.zeros((count, loop.variables))
-        g[:, : weight.size] = self._sides[:, None] * weight
+        g[:, : weight.size] = self._row_signs[:, None] * weight
         g[:, self.bound] = -1.0
         return UncertainRows(
-            csr_array(g), np.zeros(count), np.zeros(count, dtype=int), self._sides, (C,), np.zeros((1, Q))
+            csr_array(g), np.zeros(count), np.zeros(count, dtype=int), self._row_signs, (C,), np.zeros((1, Q))
         )
 
     def effort(self, x: Array) -> Effort:
         """Return bounds of the largest effort at the decision ``x (n,)``."""
         key = x[: self.bound].tobytes()
-        if key not in self._known:
-            self._known.clear()
-            self._known[key] = largest_effort(*self._control(x), self.loop.spread)
-        return self._known[key]
+        if key not in self._efforts:
+            self._efforts.clear()
+            self._efforts[key] = largest_effort(*self._price_control(x), self.loop.spread)
+        return self._efforts[key]
 
     def settled(self, x: Array) -> Array:
         """Return the same decision with the variable ``bound`` at a proven upper bound of the effort."""
-        answer, (a, A) = x.copy(), self._control(x)
+        answer, (a, A) = x.copy(), self._price_control(x)
         size = float(np.abs(a).sum() + (np.abs(A) @ self.loop.spread.radii).sum())
         answer[self.bound] = self.effort(x).upper + ROUND_OFF * size
         return answer
@@ -128,5 +128,5 @@ class FeedbackEffort(Source):
         """Return the description of one constraint for a reader."""
         signs = index[: self.prices.size]
         text = f"{self.name}: the control against {signs.size} signs <= the cost"
-        description = TimedExplanation(text, self.name, text, 0.0, self._sides[row] * signs)
+        description = TimedExplanation(text, self.name, text, 0.0, self._row_signs[row] * signs)
         return told(description, self.loop, index[self.prices.size :])

@@ -181,7 +181,7 @@ class TimedExplanation(Explanation):
         return middle if self.parameter is None or self.parameter.size == 0 else self.parameter
 
     def short(self) -> str:
-        return f"{self.statement}{self._at}"
+        return f"{self.statement}{self._where_clause}"
 
     @property
     def alike(self) -> str:
@@ -201,11 +201,13 @@ class TimedExplanation(Explanation):
         value, shift = (self.free + self.sign * self.sigma) / self.scale, self.sigma / self.scale
         also = "" if " and " in self.cause else "s"
         clause = (
-            f" under the worst {self.cause}, which move{also} it by {shift:.4g}{self._in}," if self.sigma > 0 else ""
+            f" under the worst {self.cause}, which move{also} it by {shift:.4g}{self._unit_suffix},"
+            if self.sigma > 0
+            else ""
         )
         return (
-            f"{self.quantity} = {value:.6g}{self._in}{clause} is outside {self.bound} ({self.constraint}), "
-            f"whatever the decision{self._at}"
+            f"{self.quantity} = {value:.6g}{self._unit_suffix}{clause} is outside {self.bound} ({self.constraint}), "
+            f"whatever the decision{self._where_clause}"
         )
 
     def apart(self, other: Explanation, share: float, amount: float) -> str:
@@ -223,17 +225,19 @@ class TimedExplanation(Explanation):
         allowed = self.sign * self.limit + share * other.sign * other.limit
         shift = self.sigma + share * other.sigma
         if residual.any():
-            return self._uncontrollable(other, residual, share, allowed, shift)
+            return self._describe_uncontrollable(other, residual, share, allowed, shift)
         if shift > 0:
             shift_words, room_words = told_apart(shift / 2 / self.scale, allowed / 2 / self.scale)
             verb = "move" if " and " in self.cause else "moves"
             return (
-                f"the {self.cause} alone {verb} {self.quantity} by {shift_words}{self._in}, {self._set} allows"
-                f" {room_words}{self._in}{self._at}"
+                f"the {self.cause} alone {verb} {self.quantity} by {shift_words}{self._unit_suffix}, {self._set_name}"
+                f" allows {room_words}{self._unit_suffix}{self._where_clause}"
             )
-        return f"{self.text} and {other.text} leave nothing between them{self._at}"
+        return f"{self.text} and {other.text} leave nothing between them{self._where_clause}"
 
-    def _uncontrollable(self, other: TimedExplanation, rest: Array, share: float, allowed: float, moved: float) -> str:
+    def _describe_uncontrollable(
+        self, other: TimedExplanation, rest: Array, share: float, allowed: float, moved: float
+    ) -> str:
         """Return the sentence for two rows whose quantities the control moves alike, so that it cannot change their
         combination ``rest'x``."""
         side = -1.0 if rest[np.flatnonzero(rest)[0]] < 0 else 1.0
@@ -243,11 +247,13 @@ class TimedExplanation(Explanation):
         unit = measured_in(rest, self.names)
         note = f" less {moved:.4g}{unit} for the worst {self.cause}s" if moved > 0 and side > 0 else ""
         note = f" and {moved:.4g}{unit} more for the worst {self.cause}s" if moved > 0 and side < 0 else note
-        stated, corner = _stated(rest, self.names)
-        quantity, at = combination(side * stated, self.names, f"({self.time:.6g})"), self._at
+        stated, corner = _separate_corner(rest, self.names)
+        quantity, at = combination(side * stated, self.names, f"({self.time:.6g})"), self._where_clause
         asking = f"{self.statement} and {other.statement} ask"
         if self.names.corners and corner is None:  # the two are about different corners
-            first, second = sorted([self._share(side), other._share(side * share)], key=lambda term: term[0] == "-")
+            first, second = sorted(
+                [self._describe_share(side), other._describe_share(side * share)], key=lambda term: term[0] == "-"
+            )
             single = second[0] == "-" and not any(joint in second for joint in (" + ", " - "))
             quantity, at = f"{first} less {second[1:]}" if single else f"{first} plus {second}", ""
             asking = f"{self.short()}, and {other.short()}, ask"
@@ -256,9 +262,9 @@ class TimedExplanation(Explanation):
             f"but {asking} for {relation} {side * allowed:.6g}{unit}{note}{at}"
         )
 
-    def _share(self, share: float) -> str:
+    def _describe_share(self, share: float) -> str:
         """Return ``share`` times the bounded quantity in words, with the parameters that it belongs to."""
-        normal = share / self.scale * _stated(self.direction, self.names)[0]
+        normal = share / self.scale * _separate_corner(self.direction, self.names)[0]
         return combination(normal, self.names, f"({self.time:.6g})") + (f" at {self.where}" if self.where else "")
 
     def out_of_reach(self, amount: float, needed: float) -> str:
@@ -266,32 +272,39 @@ class TimedExplanation(Explanation):
             return super().out_of_reach(amount, needed)
         amount, needed = amount / self.scale, needed / self.scale
         if needed - amount < 0:
-            return f"{self.text} is violated by at least {amount:.4g}{self._in}, whatever the control{self._at}"
+            return (
+                f"{self.text} is violated by at least {amount:.4g}{self._unit_suffix}, whatever the control"
+                f"{self._where_clause}"
+            )
         verb = "raise" if self.sign < 0 else "lower"
-        note = f", {self.sigma / self.scale:.4g}{self._in} of it for the worst {self.cause}" if self.sigma > 0 else ""
+        note = (
+            f", {self.sigma / self.scale:.4g}{self._unit_suffix} of it for the worst {self.cause}"
+            if self.sigma > 0
+            else ""
+        )
         can, must = told_apart(needed - amount, needed)
         return (
-            f"the control can {verb} {self.quantity} by at most {can}{self._in}, and {must}{self._in} is needed"
-            f"{note}: without control it is {self.free / self.scale:.4g}{self._in}, {self._set} asks for"
-            f" {self.bound}{self._at}"
+            f"the control can {verb} {self.quantity} by at most {can}{self._unit_suffix}, and {must}{self._unit_suffix}"
+            f" is needed{note}: without control it is {self.free / self.scale:.4g}{self._unit_suffix}, {self._set_name}"
+            f" asks for {self.bound}{self._where_clause}"
         )
 
     @property
     def unit(self) -> str:
         """Unit of the quantity; empty where it is not known."""
-        return self._in.strip()
+        return self._unit_suffix.strip()
 
     @property
-    def _in(self) -> str:
+    def _unit_suffix(self) -> str:
         normal = self.direction if self.gain is None else np.concatenate([self.direction, self.gain])
         return measured_in(normal, self.names, self.direction.size)
 
     @property
-    def _at(self) -> str:
+    def _where_clause(self) -> str:
         return f", at {self.where}" if self.where and self.time else ""
 
     @property
-    def _set(self) -> str:
+    def _set_name(self) -> str:
         return {"terminal": "the terminal set", "path": "the path set"}.get(self.constraint, self.constraint)
 
 
@@ -347,7 +360,7 @@ def explanation(
     direction, system = H[row], functionals.response.system
     gain = None if mixed is None else mixed[0][row]
     normal = direction if gain is None else np.concatenate([direction, gain])
-    stated, corner = _stated(normal, functionals.names)
+    stated, corner = _separate_corner(normal, functionals.names)
     sign = -1.0 if np.count_nonzero(stated) == 1 and stated.sum() < 0 else 1.0
     contributions = functionals.parts(time, direction, parameter)
     sigma = contributions.sigma
@@ -371,7 +384,7 @@ def explanation(
     )
     remarks += [f"at {where}"] if where else []
     statement = f"{name}: {quantity} {'>=' if sign < 0 else '<='} {limit / scale:.6g}{unit}"
-    opposite = _opposite(H if mixed is None else np.hstack([H, mixed[0]]), h, row)
+    opposite = _find_opposite_limit(H if mixed is None else np.hstack([H, mixed[0]]), h, row)
     return TimedExplanation(
         f"{statement} ({', '.join(remarks)})" if remarks else statement,
         name,
@@ -384,7 +397,7 @@ def explanation(
         contributions.deviation,
         cause,
         quantity=quantity,
-        bound=_bound(
+        bound=_format_bound(
             combination(sign * stated / scale, functionals.names, states=direction.size),
             limit / scale,
             None if opposite is None else opposite / scale,
@@ -403,7 +416,7 @@ def explanation(
     )
 
 
-def _stated(normal: Array, names: Names) -> tuple[Array, str | None]:
+def _separate_corner(normal: Array, names: Names) -> tuple[Array, str | None]:
     """A normal on the states that were stated, and the corner of the parameters beside the time that it is about;
     itself, and ``None``, where it is about several at once."""
     corner = names.corners.at(normal)
@@ -429,13 +442,13 @@ def combination(direction: Array, names: Names, suffix: str = "", states: int | 
     return " ".join(words) or "0"
 
 
-def _opposite(H: Array, h: Array, row: int) -> float | None:
+def _find_opposite_limit(H: Array, h: Array, row: int) -> float | None:
     """The least right-hand side of the rows that look the other way; ``None`` without one."""
     limits = h[(-H[row] == H).all(axis=1)]
     return float(limits.min()) if limits.size else None
 
 
-def _bound(words: str, limit: float, opposite: float | None, sign: float) -> str:
+def _format_bound(words: str, limit: float, opposite: float | None, sign: float) -> str:
     """``|x1| <= 0.7``, ``-0.2 <= x1 <= 0.3`` or ``x1 >= -0.7``, of a quantity in words."""
     if opposite is None:
         return f"{words} {'>=' if sign < 0 else '<='} {limit:.6g}"

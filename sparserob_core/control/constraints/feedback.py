@@ -166,14 +166,14 @@ class FeedbackConstraint(Source):
 
     def excess(self, x: Array, indices: Array) -> Array:
         """Violations ``(k, r)`` at times ``(k, 1)`` under the worst disturbances."""
-        violations = self.loop.height(self._along(x, indices[:, 0])) - self.flat.h
+        violations = self.loop.height(self._compute_left_sides(x, indices[:, 0])) - self.flat.h
         measurable = self.loop.measurable
         if measurable is not None:
-            for rows, pieces in self._halves(indices[:, 0]):
+            for rows, pieces in self._group_rows(indices[:, 0]):
                 violations[:, rows] += measurable.within(indices[:, 0], self.flat.H[rows], self.loop.origin[pieces])
         return violations
 
-    def _halves(self, times: Array) -> list[tuple[slice, np.ndarray]]:
+    def _group_rows(self, times: Array) -> list[tuple[slice, np.ndarray]]:
         """The rows that look at the state at times ``(k,)`` in the same pieces of the grid, and these pieces: those of
         a mixed constraint before and after the control jumps."""
         flat, loop = self.flat, self.loop
@@ -185,11 +185,11 @@ class FeedbackConstraint(Source):
             (slice(half, None), loop.seen_from(times, commanded[:, -1])),
         ]
 
-    def _along(self, x: Array, times: Array) -> Array:
+    def _compute_left_sides(self, x: Array, times: Array) -> Array:
         """Return the left-hand sides at times ``(k,)`` and their responses to the deviations, ``(k, r, 1 + Q)``."""
         flat = self.flat
         values = np.concatenate(
-            [flat.H[rows] @ self.loop.states(x, times, pieces) for rows, pieces in self._halves(times)], axis=1
+            [flat.H[rows] @ self.loop.states(x, times, pieces) for rows, pieces in self._group_rows(times)], axis=1
         )
         values[:, :, 0] += flat.moved(times)
         if flat.gains is not None:
@@ -201,10 +201,10 @@ class FeedbackConstraint(Source):
         flat, time = self.flat, index[:1]
         allowed = flat.h - flat.moved(time)[0]
         if flat.gains is None:
-            rows = self.loop.state_rows(float(time[0]), flat.H, allowed, *self._shared)
+            rows = self.loop.state_rows(float(time[0]), flat.H, allowed, *self._row_parts)
             # what cannot deviate need not be answered
             return replace(rows, exact=True, d=rows.d * (self.loop.spread.radii > 0.0)) if self.exact else rows
-        pieces, (part, factor) = flat.commanded(time)[0], self._shared
+        pieces, (part, factor) = flat.commanded(time)[0], self._row_parts
         if pieces[0] != pieces[-1]:  # the rows of a control that jumps are others before and after
             half = part.size // 2
             part = np.concatenate([part[:half], part[half:] + 1 + part.max()])
@@ -216,7 +216,7 @@ class FeedbackConstraint(Source):
         """A deviation ``(Q,)`` that is the worst at an index, what the control adds to the row then, and the piece of
         the control that does so."""
         time, gains = index[:1], self.flat.gains
-        w = self.loop.spread.worst(self._along(x, time)[0, row, 1:])
+        w = self.loop.spread.worst(self._compute_left_sides(x, time)[0, row, 1:])
         if gains is None:
             return w, 0.0, None
         acting = int(self.flat.commanded(time)[0, row])
@@ -234,7 +234,7 @@ class FeedbackConstraint(Source):
         return x
 
     @cached_property
-    def _shared(self) -> tuple[np.ndarray, Array]:
+    def _row_parts(self) -> tuple[np.ndarray, Array]:
         gains = self.flat.gains
         if gains is None:
             return shared(self.flat.H, self.loop.spread)
@@ -244,7 +244,7 @@ class FeedbackConstraint(Source):
 
     def worst(self, x: Array) -> Separation:
         """The largest local maxima of the violation over the window, refined between the samples."""
-        times, values = self._sampled(x)
+        times, values = self._sample_violations(x)
         positions = local_maxima(values.T[None], (1,), KEPT)
         rows, at = positions[:, 1], positions[:, 2]
         best, violations = times[at].copy(), values[at, rows].copy()
@@ -272,7 +272,7 @@ class FeedbackConstraint(Source):
             order = order[(rows[order] < self.flat.h.size // 2) | (pieces[:, 0] != pieces[:, -1])]
         return Separation(best[order][:, None], rows[order], violations[order])
 
-    def _sampled(self, x: Array) -> tuple[Array, Array]:
+    def _sample_violations(self, x: Array) -> tuple[Array, Array]:
         """Times ``(k,)`` in order and the violations there ``(k, r)``: halfway between two of them again and again,
         where a larger violation can be."""
         times = self.flat.times
@@ -323,7 +323,7 @@ class FeedbackConstraint(Source):
         """Return the description of one constraint for a reader, for every disturbance, or at the deviations that the
         index holds."""
         description = told(self.flat.explain(index[:1], row), self.loop, index[1:])
-        if not self._unanswered[row]:
+        if not self._unanswered_rows[row]:
             return description
         last = float(self.loop.functionals.dictionary.breakpoints[-2])
         at = f"{last:.6g} {self.loop.functionals.names.time}".rstrip()
@@ -331,7 +331,7 @@ class FeedbackConstraint(Source):
         return replace(description, text=text)
 
     @cached_property
-    def _unanswered(self) -> np.ndarray:
+    def _unanswered_rows(self) -> np.ndarray:
         """The rows ``(r,)`` of an equality that deviations reach which no control answers."""
         if not self.exact:
             return np.zeros(self.flat.h.size, dtype=bool)

@@ -93,11 +93,11 @@ class Turning(ABC):
 
     def family(self) -> ConstraintFamily:
         """The constraint as a family."""
-        cube = np.ones(self._b)
+        cube = np.ones(self._cube_dimension)
         low, high = (ends[position] for ends, position in zip(self.spans, (0, -1), strict=True))
         index_set = Box(np.append(low, -cube), np.append(high, cube))
         positions = np.unique(np.linspace(0, self.times.size - 1, min(BEGUN, self.times.size)).round().astype(int))
-        axes = np.vstack([np.eye(self._b), -np.eye(self._b)])
+        axes = np.vstack([np.eye(self._cube_dimension), -np.eye(self._cube_dimension)])
         start = np.hstack([np.repeat(self.times[positions], len(axes))[:, None], np.tile(axes, (positions.size, 1))])
         family = indexed(self, index_set, start, self.source)
         return replace(family, scaled=self.scaled) if self.loop.scales else family
@@ -107,14 +107,14 @@ class Turning(ABC):
         return replace(self, loop=self.loop.scaled(factor)).family()
 
     @property
-    def _b(self) -> int:
+    def _cube_dimension(self) -> int:
         return int(self.set.normals.shape[0])
 
     @cached_property
     def _lattice(self) -> tuple[Array, Array, Array]:
         """Sampled directions as points of the cube ``(r, b)`` and normalised ``(r, d)``, and the support function of
         the set there, ``(r,)``."""
-        z = sampled(self._b)
+        z = sampled(self._cube_dimension)
         c = self.normals(z)
         return z, c, self.set.support(c)
 
@@ -141,10 +141,10 @@ class Turning(ABC):
             [self.loop.height(c @ self.answers(x, times[first : first + step])) for first in range(0, times.size, step)]
         )
         values = values - reach
-        places, likely = turns(values.T, neighbours(self._b), self.unit)
+        places, likely = turns(values.T, neighbours(self._cube_dimension), self.unit)
         rows, at = places.T
         heights, worst_indices = values[at, rows], np.hstack([times[at, None], z[rows]])
-        worst_indices[:likely], heights[:likely] = self._turned(x, worst_indices[:likely])
+        worst_indices[:likely], heights[:likely] = self._climb_directions(x, worst_indices[:likely])
         best = highest_at(at, heights)
         worst_indices, heights = worst_indices[best], heights[best]
         largest_step, pieces = float(np.max(np.diff(times), initial=0.0)), np.searchsorted(self.spans[0], times)
@@ -153,17 +153,17 @@ class Turning(ABC):
             heights,
             pieces,
             np.flatnonzero(np.isin(times, np.concatenate(self.spans))),
-            lambda points: self._turned(x, points),
-            lambda points: self._climbed(x, points, largest_step),
+            lambda points: self._climb_directions(x, points),
+            lambda points: self._climb_points(x, points, largest_step),
         )
         return Separation(indices, np.zeros(violations.size, dtype=int), violations)
 
-    def _turned(self, x: Array, points: Array) -> tuple[Array, Array]:
+    def _climb_directions(self, x: Array, points: Array) -> tuple[Array, Array]:
         """Return the ends of climbs over directions alone from points ``(k, 1 + b)``, and the violations there."""
         if not points.size:
             return points, np.zeros(0)
         times = np.clip(points[:, :1], self.spans[0][0], self.spans[1][-1])
-        responses, step = self.answers(x, times[:, 0]), np.full(self._b, STEP)
+        responses, step = self.answers(x, times[:, 0]), np.full(self._cube_dimension, STEP)
 
         def excess(z: Array, which: np.ndarray) -> Array:
             c = self.normals(z)
@@ -175,23 +175,23 @@ class Turning(ABC):
         z, violations = climb(excess, points[:, 1:], step, lambda z: on_surface(np.clip(z, -1.0, 1.0)))
         return np.hstack([times, z]), violations
 
-    def _climbed(self, x: Array, points: Array, wide: float) -> tuple[Array, Array]:
+    def _climb_points(self, x: Array, points: Array, wide: float) -> tuple[Array, Array]:
         """Return the ends of climbs from points ``(k, 1 + b)``, and the violations there; for a single time, climb over
         directions alone."""
         first, last = self.spans[0][0], self.spans[1][-1]
         if first == last:
-            return self._turned(x, points)
+            return self._climb_directions(x, points)
 
         def project(inside: Array) -> Array:
             return np.hstack([np.clip(inside[:, :1], first, last), on_surface(np.clip(inside[:, 1:], -1.0, 1.0))])
 
-        sizes = np.append(wide, np.full(self._b, STEP))
+        sizes = np.append(wide, np.full(self._cube_dimension, STEP))
         return climb(lambda at, _: self.excess(x, at)[:, 0], points, sizes, project)
 
     @property
     def cells(self) -> tuple[Array, Array]:
         """The spans of time, times the faces of the cube of directions."""
-        low, high = faces(self._b)
+        low, high = faces(self._cube_dimension)
         corner_lists = []
         for ends, corners in zip(self.spans, (low, high), strict=True):
             corner_lists.append(np.hstack([np.repeat(ends, len(low))[:, None], np.tile(corners, (ends.size, 1))]))
@@ -201,7 +201,9 @@ class Turning(ABC):
         """Proven upper bounds of the violation on cells of times and directions, by a point ``p`` of the set for
         each."""
         frame, low, high = self.set.frame / self.unit, lower[:, 1:], upper[:, 1:]
-        ends = np.stack([np.where(side, high, low) for side in product((False, True), repeat=self._b)], axis=1)
+        ends = np.stack(
+            [np.where(side, high, low) for side in product((False, True), repeat=self._cube_dimension)], axis=1
+        )
         H, centre = ends @ frame, (low + high) / 2 @ frame
         p = self.set.support_point(centre)
         bounds, chord_distances = self.between(x, lower[:, 0], upper[:, 0], H)
@@ -229,7 +231,7 @@ class Turning(ABC):
     def explain(self, index: Array, row: int) -> Explanation:
         """Return the description of one constraint for a reader, for every disturbance, or at the deviations that the
         index holds."""
-        return told(self.explained(index[: 1 + self._b]), self.loop, index[1 + self._b :])
+        return told(self.explained(index[: 1 + self._cube_dimension]), self.loop, index[1 + self._cube_dimension :])
 
 
 @final
@@ -257,16 +259,16 @@ class FeedbackCurved(Turning):
         return self.curved
 
     @cached_property
-    def _flat(self) -> FeedbackConstraint:
+    def _outer_constraint(self) -> FeedbackConstraint:
         return FeedbackConstraint(self.curved.outer, self.loop)
 
     @property
     def times(self) -> Array:
-        return self._flat.flat.times
+        return self._outer_constraint.flat.times
 
     @property
     def spans(self) -> tuple[Array, Array]:
-        lower, upper = self._flat.cells
+        lower, upper = self._outer_constraint.cells
         return lower[:, 0], upper[:, 0]
 
     def answers(self, x: Array, times: Array) -> Array:
@@ -344,7 +346,9 @@ class FeedbackCurvedControl(Turning, Source):
             along = np.einsum("kd,kdq->kq", directions, controls[which])
             return np.asarray(self.loop.height(along) - self.set.support(directions))
 
-        z, violations = climb(excess, start, np.full(self._b, STEP), lambda at: on_surface(np.clip(at, -1.0, 1.0)))
+        z, violations = climb(
+            excess, start, np.full(self._cube_dimension, STEP), lambda at: on_surface(np.clip(at, -1.0, 1.0))
+        )
         order = np.argsort(-violations, kind="stable")
         indices = np.hstack([self.times[order, None], z[order]])
         return Separation(indices, np.zeros(order.size, dtype=int), violations[order])

@@ -147,22 +147,22 @@ class Samples:
     def outputs(self) -> Outputs:
         """``H x`` at the sampled times and parameters; of rows that are opposite to others by these. The states
         themselves where there are fewer of them than rows."""
-        rows = np.eye(self.H.shape[1]) if self._by_states else self.H[self._apart[0]]
+        rows = np.eye(self.H.shape[1]) if self._has_fewer_states else self.H[self._distinct_rows[0]]
         return Outputs(self._response.propagator, rows, self.times, self.lattice[0])
 
     def along(self, response: Response, control: Array) -> Array:
         """``H x (v, r, times)`` from the initial state of a response, under a control ``(m, K)``."""
         if self.undivided is not None:
             return self.undivided[0].along(response, control) / self.undivided[1][None, :, None]
-        outputs, (_, inverse, signs) = self.outputs.at(response, control), self._apart
-        return np.asarray(self.H @ outputs if self._by_states else outputs[:, inverse] * signs[:, None])
+        outputs, (_, inverse, signs) = self.outputs.at(response, control), self._distinct_rows
+        return np.asarray(self.H @ outputs if self._has_fewer_states else outputs[:, inverse] * signs[:, None])
 
     @property
-    def _by_states(self) -> bool:
-        return bool(self._apart[0].size > self.H.shape[1])
+    def _has_fewer_states(self) -> bool:
+        return bool(self._distinct_rows[0].size > self.H.shape[1])
 
     @cached_property
-    def _apart(self) -> tuple[np.ndarray, np.ndarray, Array]:
+    def _distinct_rows(self) -> tuple[np.ndarray, np.ndarray, Array]:
         """The rows of ``H`` without copies and opposites, which of them every row is, and with which sign."""
         signs = np.where(self.H[np.arange(self.h.size), np.abs(self.H).argmax(axis=1)] < 0.0, -1.0, 1.0)
         _, first, inverse = np.unique(self.H * signs[:, None], axis=0, return_index=True, return_inverse=True)
@@ -311,10 +311,14 @@ class FlatConstraint(StateConstraint):
         """The largest local maxima of the violation over the index set, times refined between the nodes, parameters
         between lattice points; remembered, since the proof asks for them again."""
         key = x.tobytes()
-        return self._found[key] if key in self._found else remember(self._found, key, self._worst(x), FOUND_KEPT)
+        return (
+            self._separations[key]
+            if key in self._separations
+            else remember(self._separations, key, self._compute_separation(x), FOUND_KEPT)
+        )
 
     @shaped
-    def _worst(self, x: Float[Array, " n"]) -> Separation:
+    def _compute_separation(self, x: Float[Array, " n"]) -> Separation:
         values = self.on_lattice(x)
         positions = local_maxima(values, self.lattice[1], KEPT)
         spans = max(1, min(KEPT, SPANNED // x.size))
@@ -336,14 +340,14 @@ class FlatConstraint(StateConstraint):
             between = between[promised[between] >= min(0.0, heights.max(initial=-np.inf))]
         if between.size:
             at = np.hstack([times[between, None], indices[between, 1:]])
-            refined = self._refined(x, at, rows[between], predicted[between], violations)
+            refined = self._refine_times(x, at, rows[between], predicted[between], violations)
             higher = refined[1] >= violations[between]  # at a kink a parabola is no guide
             between = between[higher]
             indices[between, 0], violations[between] = (array[higher] for array in refined)
         if self.parameters.count:
             likely = np.argsort(-violations, kind="stable")[:CLIMBED]
             # a maximum at a breakpoint is a kink: it is climbed along, not across
-            indices[likely], violations[likely] = self._climbed(x, indices[likely], rows[likely])
+            indices[likely], violations[likely] = self._climb_candidates(x, indices[likely], rows[likely])
         order = np.argsort(-violations, kind="stable")
         if self.gains is not None:  # where nothing jumps, both halves of the rows say the same
             pieces = self.commanded(indices[order, 0])
@@ -405,12 +409,12 @@ class FlatConstraint(StateConstraint):
         """Proven upper bounds of the violation on cells ``(k, 1 + nu)``, each within one piece; cells of parameters
         share their work."""
         touched = self.parameters.touches(lower[:, 1:], upper[:, 1:])
-        return enclose(lower, upper, touched, self.parameters.count, lambda low, high: self._cell(x, low, high))
+        return enclose(lower, upper, touched, self.parameters.count, lambda low, high: self._enclose_cell(x, low, high))
 
     @shaped
-    def _cell(self, x: Float[Array, " n"], low: Float[Array, " j"], high: Float[Array, " j"]) -> Bounded:
+    def _enclose_cell(self, x: Float[Array, " n"], low: Float[Array, " j"], high: Float[Array, " j"]) -> Bounded:
         key = x.tobytes() + low.tobytes() + high.tobytes()
-        if key not in self._cells:
+        if key not in self._cell_enclosures:
             legs = self.functionals.legs(low, high)
             control, cuts = self.functionals.control(x), self.parameters.cuts(low, high)
             rows = self.samples.proven
@@ -427,15 +431,15 @@ class FlatConstraint(StateConstraint):
                     leg, next(delivered), H, rhs, control, cuts=cuts, moving=moving, direct=direct
                 ),
             )
-            remember(self._cells, key, bounded, kept(control))
-        return self._cells[key]
+            remember(self._cell_enclosures, key, bounded, kept(control))
+        return self._cell_enclosures[key]
 
     @cached_property
-    def _cells(self) -> dict[bytes, Bounded]:
+    def _cell_enclosures(self) -> dict[bytes, Bounded]:
         return {}
 
     @cached_property
-    def _found(self) -> dict[bytes, Separation]:
+    def _separations(self) -> dict[bytes, Separation]:
         return {}
 
     @property
@@ -459,11 +463,11 @@ class FlatConstraint(StateConstraint):
         along = self.samples.along(self.functionals.response, self.functionals.control(x))
         answer: Array = along - self.samples.margins
         if self.functionals.execution is not None:
-            answer = answer + self._executed(self.functionals.execution, x)
+            answer = answer + self._compute_execution_errors(self.functionals.execution, x)
         has_additions = self.reference.moves or self.gains is not None
         return answer + self.beside(x, self.times).T if has_additions else answer
 
-    def _executed(self, execution: Execution, x: Array) -> Array:
+    def _compute_execution_errors(self, execution: Execution, x: Array) -> Array:
         """Return the contribution of the worst errors of execution to all rows at every lattice point and sampled time,
         ``(v, r, times)``."""
         rows, copies = self.H[: self.samples.proven], self.h.size // max(1, self.samples.proven)
@@ -474,7 +478,7 @@ class FlatConstraint(StateConstraint):
         return np.tile(contributions.reshape(v, k, r).swapaxes(1, 2), (1, copies, 1))
 
     @shaped
-    def _refined(
+    def _refine_times(
         self,
         x: Float[Array, " n"],
         indices: Float[Array, "k j"],
@@ -515,12 +519,12 @@ class FlatConstraint(StateConstraint):
             live = live[is_unfinished]
         kinks = live[np.argsort(-violations[live], kind="stable")][:CLIMBED]
         if kinks.size and not self.parameters.count:
-            points, violations[kinks] = self._climbed(x, indices[kinks], rows[kinks])
+            points, violations[kinks] = self._climb_candidates(x, indices[kinks], rows[kinks])
             middle[kinks] = points[:, 0]
         return middle, violations
 
     @shaped
-    def _climbed(
+    def _climb_candidates(
         self, x: Float[Array, " n"], indices: Float[Array, "k j"], rows: Int[np.ndarray, " k"]
     ) -> tuple[Float[Array, "k j"], Float[Array, " k"]]:
         """Climb from every candidate ``(t, p)``; the set of parameters is never left."""

@@ -41,7 +41,7 @@ class LiteralConstraint:
             rows=self.rows,
             worst=self.worst,
             gradient=self.gradient,
-            linear=np.concatenate([[False], np.tile(self._movable, count), np.zeros(lower.size - 1, dtype=bool)]),
+            linear=np.concatenate([[False], np.tile(self._is_movable, count), np.zeros(lower.size - 1, dtype=bool)]),
             steepest=self.steepest,
             reduced=reduced,
             explain=self.explain,
@@ -53,14 +53,14 @@ class LiteralConstraint:
 
     def explain(self, index: Array, row: int) -> Explanation:
         """The reduced constraint at the time and the parameter of the index."""
-        return self.base.explain(self._split(index[None])[0][0], row)
+        return self.base.explain(self._split_indices(index[None])[0][0], row)
 
     def rows(self, indices: Array) -> tuple[Array, Array]:
         """``G (k, r, n)``, ``rhs (k, r)`` at indices ``(k, 1 + beta + ...)``."""
-        reduced, beta = self._split(indices)
+        reduced, beta = self._split_indices(indices)
         times, directions, parameters, rhs = self.base.functionals_at(reduced)
         per_index = times.size // indices.shape[0]
-        signals = np.repeat(self._signals(beta), per_index, axis=0)
+        signals = np.repeat(self._compute_signals(beta), per_index, axis=0)
         G, offset = self.base.functionals.rows_under(times, directions, parameters, signals)
         direct = self.base.direct(reduced[:, 0])
         G = G if direct is None else G + direct
@@ -82,9 +82,9 @@ class LiteralConstraint:
     def gradient(self, x: Array, indices: Array, rows: Array) -> Array:
         """The derivative ``(k, d)`` of ``row x - rhs`` in the index (`Sensitivity`); in ``Beta``: the functional on
         every block."""
-        reduced, beta = self._split(np.asarray(indices, dtype=float))
-        slopes, weights = self._sensitivity.slopes(x, reduced, rows, self._signals(beta))
-        size, moves = self.disturbance.set.dimension, np.tile(self._movable, self.disturbance.block_count)
+        reduced, beta = self._split_indices(np.asarray(indices, dtype=float))
+        slopes, weights = self._sensitivity.slopes(x, reduced, rows, self._compute_signals(beta))
+        size, moves = self.disturbance.set.dimension, np.tile(self._is_movable, self.disturbance.block_count)
         in_beta = self._blocks.pulled_back(
             beta.reshape(-1, size), self.disturbance.blocks(weights).reshape(-1, size)
         ).reshape(beta.shape)
@@ -92,7 +92,7 @@ class LiteralConstraint:
 
     def steepest(self, x: Array, indices: Array, rows: np.ndarray) -> Separation:
         """The worst disturbance of every index for one row, ``rows (k,)``; for -1 of the row that is violated most."""
-        reduced, beta = self._split(np.asarray(indices, dtype=float))
+        reduced, beta = self._split_indices(np.asarray(indices, dtype=float))
         times, directions, parameters, _ = self.base.functionals_at(reduced)
         r = times.size // len(reduced)
         values = self.base.violations(x, np.repeat(reduced, r, axis=0), np.tile(np.arange(r), len(reduced)))
@@ -108,7 +108,7 @@ class LiteralConstraint:
         return Sensitivity(self.base)
 
     @cached_property
-    def _movable(self) -> np.ndarray:
+    def _is_movable(self) -> np.ndarray:
         """True for each coefficient of a block that has more than one value."""
         box = self._blocks.box
         return np.asarray(box.upper > box.lower)
@@ -117,14 +117,14 @@ class LiteralConstraint:
     def _blocks(self) -> ParameterIndex:
         return ParameterIndex(self.disturbance.set)
 
-    def _split(self, indices: Array) -> tuple[Array, Array]:
+    def _split_indices(self, indices: Array) -> tuple[Array, Array]:
         """The reduced index, and the coefficients of the disturbance."""
         beta = self.disturbance.block_count * self.disturbance.set.dimension
         if indices.shape[1] == 1 + beta:
             return indices[:, :1], indices[:, 1:]
         return np.hstack([indices[:, :1], indices[:, 1 + beta :]]), indices[:, 1 : 1 + beta]
 
-    def _signals(self, beta: Array) -> Array:
+    def _compute_signals(self, beta: Array) -> Array:
         blocks = self._blocks.clamp(beta.reshape(-1, self.disturbance.set.dimension))
         return self.disturbance.signals(
             blocks.reshape(beta.shape[0], self.disturbance.block_count, self.disturbance.set.dimension)

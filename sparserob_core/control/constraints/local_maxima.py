@@ -177,15 +177,17 @@ def ridden(
     first, remaining = order[:CLIMBED], order[CLIMBED:]
     remaining = remaining[promised[remaining] > 0.0]
     sample_positions = np.concatenate([peaks[:, 2], spans])  # at a kink a parabola is no guide
-    nearer = _narrowed(points[remaining], float(np.diff(times).max(initial=0.0)), turned)
+    nearer = _move_to_vertices(points[remaining], float(np.diff(times).max(initial=0.0)), turned)
     groups = [climbed(points[first]), nearer, (held[sample_positions], heights[sample_positions])]
     indices, violations = np.vstack([group[0] for group in groups]), np.concatenate([group[1] for group in groups])
-    order = _distinct(indices, violations)
+    order = _select_distinct(indices, violations)
     order = order[(violations[order] > 0.0) | (np.arange(order.size) < TOLD)][:MOST]
     return indices[order], violations[order]
 
 
-def _narrowed(points: Array, spacing: float, turned: Callable[[Array], tuple[Array, Array]]) -> tuple[Array, Array]:
+def _move_to_vertices(
+    points: Array, spacing: float, turned: Callable[[Array], tuple[Array, Array]]
+) -> tuple[Array, Array]:
     """Points ``(k, j)`` moved along time to the vertices of parabolas through nearer and nearer ones, ``turned``."""
     if not points.size:
         return points, np.zeros(0)
@@ -201,7 +203,7 @@ def _narrowed(points: Array, spacing: float, turned: Callable[[Array], tuple[Arr
     return turned(points)
 
 
-def _distinct(indices: Array, found: Array) -> np.ndarray:
+def _select_distinct(indices: Array, found: Array) -> np.ndarray:
     """Positions of different maxima, highest first."""
     remaining, kept = np.argsort(-found, kind="stable"), []
     while remaining.size:

@@ -71,7 +71,7 @@ class ScenarioConstraint:
 
     def worst(self, x: Array) -> Separation:
         """Local maxima in time of the worst sample's violation, at the breakpoints and between them."""
-        values, sample = self._worst_samples(x)
+        values, sample = self._find_worst_samples(x)
         positions = local_maxima(values[None], (1,), KEPT)
         times = vertices(values[None], positions, self._times)[0]
         rows = positions[:, 1]
@@ -81,20 +81,22 @@ class ScenarioConstraint:
         order = np.argsort(-violations, kind="stable")
         return Separation(indices[order], rows[order], violations[order])
 
-    def _worst_samples(self, x: Array) -> tuple[Array, np.ndarray]:
+    def _find_worst_samples(self, x: Array) -> tuple[Array, np.ndarray]:
         """Largest violation over the samples, ``(r, times)``, and the sample that has it."""
         additions = self.base.beside(x, self._times).T
         if self.parameters.shape[1] == 0:
-            margins, sample = self._known
-            undisturbed = self._states(x, slice(0, 1), None, None)[0]
-            return self.H @ undisturbed.T - margins + additions + self._missed(x, slice(0, 1))[0], sample
-        values, sample = self._maximum(
-            lambda chunk: self._states(x, chunk, self.disturbances, self.deviations),
-            lambda chunk: self._missed(x, chunk),
+            margins, sample = self._margins
+            undisturbed = self._compute_states(x, slice(0, 1), None, None)[0]
+            return self.H @ undisturbed.T - margins + additions + self._compute_execution_errors(x, slice(0, 1))[
+                0
+            ], sample
+        values, sample = self._maximise_over_samples(
+            lambda chunk: self._compute_states(x, chunk, self.disturbances, self.deviations),
+            lambda chunk: self._compute_execution_errors(x, chunk),
         )
         return values + additions, sample
 
-    def _missed(self, x: Array, part: slice) -> Array:
+    def _compute_execution_errors(self, x: Array, part: slice) -> Array:
         """Return the contribution of the worst errors of execution in some samples, ``(s, r, times)``; the worst is
         known, so that no errors are drawn."""
         functionals, parameters = self.base.functionals, self.parameters[part]
@@ -107,7 +109,7 @@ class ScenarioConstraint:
         return np.asarray(contributions.reshape(samples, times, r).swapaxes(1, 2))
 
     @cached_property
-    def _known(self) -> tuple[Array, np.ndarray]:
+    def _margins(self) -> tuple[Array, np.ndarray]:
         """Margins ``h - max_s H d_s(t)`` of a known system, and the maximising samples, ``(r, times)`` each; they do
         not depend on the decision."""
         if self.disturbances is None and self.deviations is None:
@@ -115,13 +117,13 @@ class ScenarioConstraint:
                 (self.h.size, self._times.size), dtype=int
             )
         zero_decision = np.zeros(self.base.functionals.variables)
-        undisturbed = self._states(zero_decision, slice(0, 1), None, None)
-        worst, sample = self._maximum(
-            lambda chunk: self._states(zero_decision, chunk, self.disturbances, self.deviations) - undisturbed
+        undisturbed = self._compute_states(zero_decision, slice(0, 1), None, None)
+        worst, sample = self._maximise_over_samples(
+            lambda chunk: self._compute_states(zero_decision, chunk, self.disturbances, self.deviations) - undisturbed
         )
         return -worst, sample
 
-    def _maximum(
+    def _maximise_over_samples(
         self, states: Callable[[slice], Array], more: Callable[[slice], Array] | None = None
     ) -> tuple[Array, np.ndarray]:
         """Return ``max_s H x_s(t) - h`` over the samples, plus the term ``more``, block by block, and the maximising
@@ -139,14 +141,14 @@ class ScenarioConstraint:
             best = np.maximum(best, height)
         return best, best_sample
 
-    def _states(self, x: Array, part: slice, disturbances: Array | None, deviations: Array | None) -> Array:
+    def _compute_states(self, x: Array, part: slice, disturbances: Array | None, deviations: Array | None) -> Array:
         """States ``(s, times, d)`` of some samples."""
         signal, deviation = (None if samples is None else samples[part] for samples in (disturbances, deviations))
-        path = self._fine.states(self.base.functionals.on_grid(x), self.parameters[part], signal, deviation)
-        return path[:, self._kept]
+        path = self._fine_response.states(self.base.functionals.on_grid(x), self.parameters[part], signal, deviation)
+        return path[:, self._window_positions]
 
     @cached_property
-    def _fine(self) -> Response:
+    def _fine_response(self) -> Response:
         """The response on the grid's breakpoints, the window's ends and the middles between them."""
         response, base = self.base.functionals.response, self.base
         points = distinct_times(
@@ -156,14 +158,16 @@ class ScenarioConstraint:
         return Response(response.system, response.grid.refined(points), response.initial_state)
 
     @cached_property
-    def _kept(self) -> np.ndarray:
-        points = self._fine.grid.breakpoints
+    def _window_positions(self) -> np.ndarray:
+        points = self._fine_response.grid.breakpoints
         slack = SAME_TIME * points[-1]
         return np.flatnonzero((points >= self.base.start - slack) & (points <= self.base.stop + slack))
 
     @cached_property
     def _times(self) -> Array:
-        answer: Array = np.clip(self._fine.grid.breakpoints[self._kept], self.base.start, self.base.stop)
+        answer: Array = np.clip(
+            self._fine_response.grid.breakpoints[self._window_positions], self.base.start, self.base.stop
+        )
         return answer
 
 

@@ -48,17 +48,17 @@ class Functional:
     @cached_property
     def direction(self) -> Array:
         """``c (k, d)``."""
-        return self._joined(self.directions)
+        return self._combine_directions(self.directions)
 
     @cached_property
     def free(self) -> Array:
         """Weights ``(k, 1 + nu, d)`` on the initial state: ``e^{A't} c`` and its derivatives."""
-        return self._joined(self.along)
+        return self._combine_directions(self.along)
 
     @cached_property
     def driven(self) -> Array:
         """Weights ``(k, L, 1 + nu, d)`` on what drives every piece."""
-        return self._joined(self.gains)
+        return self._combine_directions(self.gains)
 
     def force(self, control: Array, signals: Array | None) -> Array:
         """``B u + E w`` and its derivatives, ``(k, L, 1 + nu, d)``, from inputs on the pieces, ``(m, L)`` and
@@ -93,7 +93,7 @@ class Functional:
             + np.einsum("kbld,kld->kb", self.gains[:, :, :, 0], force[:, :, 0])
         )
 
-    def _joined(self, parts: Array) -> Array:
+    def _combine_directions(self, parts: Array) -> Array:
         return parts[:, 0] if parts.shape[1] == 1 else np.einsum("kb,kb...->k...", self.shares, parts)
 
 
@@ -127,40 +127,46 @@ class Sensitivity:
         ``signals (k, mw, L)``: the disturbance of every index; the worst one if not given.
         """
         indices, rows = np.asarray(indices, dtype=float), np.asarray(rows, dtype=int)
-        size = self._response.grid.pieces * self._tangent.initial_state.size * max(1, indices.shape[1] - 1 - self._nu)
+        size = (
+            self._response.grid.pieces
+            * self._tangent_response.initial_state.size
+            * max(1, indices.shape[1] - 1 - self._nu)
+        )
         step = max(1, CHUNK // size)
         chunks = [slice(start, start + step) for start in range(0, indices.shape[0], step)]
         if not chunks:
             return indices, np.zeros((0, self._response.grid.pieces, self._response.system.disturbances))
         pairs = [
-            self._slopes(x, indices[chunk], rows[chunk], None if signals is None else signals[chunk])
+            self._compute_slopes(x, indices[chunk], rows[chunk], None if signals is None else signals[chunk])
             for chunk in chunks
         ]
-        return np.vstack([slope for slope, _ in pairs]) * self._moves, np.concatenate([weights for _, weights in pairs])
+        return np.vstack([slope for slope, _ in pairs]) * self._coordinate_factors, np.concatenate(
+            [weights for _, weights in pairs]
+        )
 
-    def _slopes(self, x: Array, indices: Array, rows: Array, signals: Array | None) -> tuple[Array, Array]:
+    def _compute_slopes(self, x: Array, indices: Array, rows: Array, signals: Array | None) -> tuple[Array, Array]:
         times, points, z = np.split(indices, [1, 1 + self._nu], axis=1)
         parameters, model = self.constraint.parameters.clamp(points), self.constraint.functionals.disturbance
-        at = self._functional(times[:, 0], parameters, z, rows)
+        at = self._build_functional(times[:, 0], parameters, z, rows)
         weights = at.pushed
         by_block, support = None if model is None else model.on_blocks, self.constraint.functionals.measurable
         closed = signals is None and support is not None
         if signals is None and by_block is not None:
-            signals = by_block.worst(self._entered(weights, at))
+            signals = by_block.worst(self._fill_entered_pieces(weights, at))
         force = at.force(self.constraint.functionals.on_grid(x), signals)
         in_time, in_parameters, states = at.in_time(force), at.in_parameters(force), at.states(force)
         if self._response.system.varies:
-            in_time = self._changing(times[:, 0], parameters, at, x, signals)
-            in_parameters = self._differing(times[:, 0], parameters, at, x, signals)
+            in_time = self._differentiate_in_time(times[:, 0], parameters, at, x, signals)
+            in_parameters = self._differentiate_in_parameters(times[:, 0], parameters, at, x, signals)
         if closed:
-            sigma = self._sigma_slopes(times[:, 0], parameters, at)
+            sigma = self._differentiate_support(times[:, 0], parameters, at)
             in_time, in_parameters, states = in_time + sigma[0], in_parameters + sigma[1], states + sigma[2]
         execution = self.constraint.functionals.execution
         if execution is not None:
             control = self.constraint.functionals.control(x)
             along = execution.seen(at.direction, parameters)
             in_time = in_time + execution.slope(control, times[:, 0], along)[:, None]
-            states = states + self._in_shares(
+            states = states + self._differentiate_in_shares(
                 at, lambda c, of: execution.added(control, times[of, 0], execution.seen(c, parameters[of]))
             )
             if self._nu:
@@ -180,13 +186,17 @@ class Sensitivity:
         in_direction = self.constraint.turned(z, at.direction, states)
         return np.hstack([in_time, in_parameters, in_direction]), weights
 
-    def _functional(self, times: Array, parameters: Array, z: Array, rows: np.ndarray) -> Functional:
+    def _build_functional(self, times: Array, parameters: Array, z: Array, rows: np.ndarray) -> Functional:
         directions, shares = self.constraint.directions(z, rows)
-        (k, b, d), response = directions.shape, self._tangent
+        (k, b, d), response = directions.shape, self._tangent_response
         blocks = response.initial_state.size // d
         larger = np.concatenate([directions, np.zeros((k, b, (blocks - 1) * d))], axis=2).reshape(k * b, -1)
         free, gains, B, W = response.adjoint(np.repeat(times, b), larger, np.repeat(parameters, b, axis=0))
-        along, gains, pieces = free.reshape(k, b, blocks, d), gains.reshape(k, b, -1, blocks, d), self._pieces(times)
+        along, gains, pieces = (
+            free.reshape(k, b, blocks, d),
+            gains.reshape(k, b, -1, blocks, d),
+            self._locate_pieces(times),
+        )
         start, initial = np.broadcast_to(self._response.initial_state, (k, d)), self.constraint.functionals.initial
         if initial is not None:
             start = start + initial.support_point(np.einsum("kb,kbd->kd", shares, along[:, :, 0]))
@@ -197,7 +207,7 @@ class Sensitivity:
             shares,
             along,
             gains,
-            self._moving(
+            self._compute_rate_weights(
                 times, parameters, np.einsum("kb,kbd->kd", shares, directions), (along, gains, shares), pieces
             ),
             B[::b].reshape(k, blocks, d, -1),
@@ -205,7 +215,7 @@ class Sensitivity:
             pieces,
         )
 
-    def _moving(
+    def _compute_rate_weights(
         self, times: Array, parameters: Array, c: Array, known: tuple[Array, Array, Array], pieces: np.ndarray
     ) -> tuple[Array, Array]:
         """The weights of ``c'A x(t)``: those of ``c'x(t)`` times ``A``, which commutes with ``e^{As}``; of a system
@@ -223,38 +233,42 @@ class Sensitivity:
         A = np.stack(matrices, axis=1)[np.arange(times.size), mode_of_piece[pieces]]
         return response.adjoint(times, (c[:, None] @ A)[:, 0], parameters)[:2]
 
-    def _differing(self, times: Array, parameters: Array, at: Functional, x: Array, signals: Array | None) -> Array:
+    def _differentiate_in_parameters(
+        self, times: Array, parameters: Array, at: Functional, x: Array, signals: Array | None
+    ) -> Array:
         """`Functional.in_parameters` of a system that changes with time, by differences of ``c'x(t)``."""
         control, box = self.constraint.functionals.on_grid(x), self.constraint.parameters
 
         def value(p: Array, of: np.ndarray) -> Array:
             weights = self._response.weights(times[of], at.direction[of], p)
-            return _seen(weights, at.start[of], control, None if signals is None else signals[of])
+            return _evaluate_functionals(weights, at.start[of], control, None if signals is None else signals[of])
 
         if not self._nu:
             return np.zeros((times.size, 0))
         return differences(value, parameters, box.box.lower, box.box.upper)
 
-    def _changing(self, times: Array, parameters: Array, at: Functional, x: Array, signals: Array | None) -> Array:
+    def _differentiate_in_time(
+        self, times: Array, parameters: Array, at: Functional, x: Array, signals: Array | None
+    ) -> Array:
         """`Functional.in_time` of a system that changes with time, ``c'(A(t) x(t) + B(t) u + E(t) w)``."""
         A, inputs = self._response.propagator.law.entries(times, parameters)
         along, pushes = (at.direction[:, None] @ A)[:, 0], (at.direction[:, None] @ inputs)[:, 0]
         weights = self._response.weights(times, along, parameters)
         control = self.constraint.functionals.on_grid(x)
         acting = control[:, at.now].T
-        values = _seen(weights, at.start, control, signals)
+        values = _evaluate_functionals(weights, at.start, control, signals)
         if signals is not None:
             acting = np.hstack([acting, signals[np.arange(times.size), :, at.now]])
         return np.asarray(values + (pushes[:, : acting.shape[1]] * acting).sum(axis=1))[:, None]
 
-    def _pieces(self, times: Array) -> np.ndarray:
+    def _locate_pieces(self, times: Array) -> np.ndarray:
         """The pieces on which the times are approached: from the left, but from the right at the start of the
         window."""
         grid = self._response.grid
         right_pieces = np.clip(np.searchsorted(grid.breakpoints, times, side="right") - 1, 0, grid.pieces - 1)
         return np.where(times <= self.constraint.start, right_pieces, grid.locate(times))
 
-    def _entered(self, weights: Array, at: Functional) -> Array:
+    def _fill_entered_pieces(self, weights: Array, at: Functional) -> Array:
         """The weights on the disturbance, with a trace of a piece that is only just entered and has none yet."""
         fresh = np.flatnonzero(~at.driven[np.arange(at.now.size), at.now, 0].any(axis=1))
         if not fresh.size:
@@ -268,7 +282,7 @@ class Sensitivity:
         filled_weights[fresh, at.now[fresh]] = trace_weights[np.arange(fresh.size), at.now[fresh]]
         return filled_weights
 
-    def _sigma_slopes(self, times: Array, parameters: Array, at: Functional) -> tuple[Array, Array, Array]:
+    def _differentiate_support(self, times: Array, parameters: Array, at: Functional) -> tuple[Array, Array, Array]:
         """Return the derivatives of the contribution of measurable disturbances in time, in parameters and in the
         shares of directions."""
         support, grid = self.constraint.functionals.measurable, self._response.grid
@@ -288,9 +302,13 @@ class Sensitivity:
             in_parameters = differences(
                 lambda p, of: support(times[of], at.direction[of], p), parameters, box.lower, box.upper
             )
-        return in_time, in_parameters, self._in_shares(at, lambda c, of: support(times[of], c, parameters[of]))
+        return (
+            in_time,
+            in_parameters,
+            self._differentiate_in_shares(at, lambda c, of: support(times[of], c, parameters[of])),
+        )
 
-    def _in_shares(self, at: Functional, value: Callable[[Array, np.ndarray], Array]) -> Array:
+    def _differentiate_in_shares(self, at: Functional, value: Callable[[Array, np.ndarray], Array]) -> Array:
         """Return the derivatives ``(k, b)`` of a function of directions in the shares of the normals that make up a
         direction of a curved set; 0 for flat sides.
 
@@ -310,17 +328,17 @@ class Sensitivity:
         return self.constraint.parameters.count
 
     @cached_property
-    def _tangent(self) -> Response:
+    def _tangent_response(self) -> Response:
         return tangent(self._response)
 
     @cached_property
-    def _moves(self) -> Array:
+    def _coordinate_factors(self) -> Array:
         """Factors ``(d,)`` of the coordinates of the index: 1 for those that can move, 0 for the others."""
         box = self.constraint.index_set
         return np.asarray(box.upper > box.lower, dtype=float)
 
 
-def _seen(known: Weights, start: Array, control: Array, signals: Array | None) -> Array:
+def _evaluate_functionals(known: Weights, start: Array, control: Array, signals: Array | None) -> Array:
     """The functionals ``(k,)`` with these weights, from states ``start (k, d)``, under inputs on the pieces, ``(m, L)``
     and ``(k, mw, L)``."""
     values = (known.free * start).sum(axis=1) + np.einsum("klm,ml->k", known.control, control)

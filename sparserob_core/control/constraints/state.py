@@ -169,7 +169,7 @@ class StateConstraint(Source):
     def sizes(self, x: Float[Array, " n"]) -> Float[Array, " q"]:
         """The sizes ``(q,)`` of `sized_rows` at a decision ``x (n,)``: a claim may excuse a billionth of them."""
         rows, sizes = self.sized_rows
-        return np.maximum(sizes, self._along(x, rows))
+        return np.maximum(sizes, self._compute_row_sizes(x, rows))
 
     def scale(self, x: Array) -> float:
         """The least of the `sizes` at a decision ``x (n,)``, 1 where none is below that."""
@@ -180,11 +180,11 @@ class StateConstraint(Source):
         key = x.tobytes()
         if key not in self._scales:
             self._scales.clear()
-            least = float(np.maximum(sizes, self._along(x, rows))[small].min(initial=1.0))
+            least = float(np.maximum(sizes, self._compute_row_sizes(x, rows))[small].min(initial=1.0))
             self._scales[key] = max(least, NOTHING)
         return self._scales[key]
 
-    def _along(self, x: Array, rows: Array) -> Array:
+    def _compute_row_sizes(self, x: Array, rows: Array) -> Array:
         return nominal_sizes(self.functionals, x, rows, self.gains)
 
     @cached_property

@@ -82,7 +82,7 @@ class NormBounds:
         if self.which.size < FEW * self.matrices.shape[0] and self.matrices[0].size * self.which.size <= MOST:
             return np.asarray(product(self.matrices[self.which], norms[..., None])[..., 0])
         bounds = np.empty((*norms.shape[:-1], self.matrices.shape[1]))
-        for number, indices in enumerate(self._places):
+        for number, indices in enumerate(self._duration_indices):
             bounds[..., indices, :] = product(norms[..., indices, :], self.matrices[number].T)
         return bounds
 
@@ -129,7 +129,7 @@ class NormBounds:
             found[..., step + 1, :] += found[..., step, :] @ flow
 
     @cached_property
-    def _places(self) -> list[np.ndarray]:
+    def _duration_indices(self) -> list[np.ndarray]:
         order = np.argsort(self.which, kind="stable")
         return np.split(order, np.cumsum(np.bincount(self.which, minlength=self.matrices.shape[0]))[:-1])
 
@@ -150,7 +150,7 @@ class ComparisonSystem:
 
     metzler: Array
     sizes: Array
-    _known: dict[bytes, tuple[Array, Array, Array, Array]] = field(default_factory=dict, repr=False)
+    _cached_bounds: dict[bytes, tuple[Array, Array, Array, Array]] = field(default_factory=dict, repr=False)
 
     def over(self, widths: Array, cells: bool = False) -> Reach:
         """Return the bounds for ``widths (k,)``; the bounds of ``cells``, which may be halved, are rougher where they
@@ -164,10 +164,10 @@ class ComparisonSystem:
         else:
             shortest, longest, groups = alike(widths, self.sizes.size, rough=cells)
         key = shortest.tobytes() + longest.tobytes()
-        if key not in self._known:
+        if key not in self._cached_bounds:
             capacity = MOST // max(1, shortest.size * self.sizes.size)
-            remember(self._known, key, self._over(shortest, longest), max(1, min(KEPT, capacity)))
-        return Reach(*(NormBounds(bounds, groups) for bounds in self._known[key]))
+            remember(self._cached_bounds, key, self._compute_bounds(shortest, longest), max(1, min(KEPT, capacity)))
+        return Reach(*(NormBounds(bounds, groups) for bounds in self._cached_bounds[key]))
 
     @cached_property
     def rising(self) -> Array:
@@ -190,7 +190,7 @@ class ComparisonSystem:
             flow, integral = (matrices[:, :q, q:] for matrices in flows_between(both, shortest, longest))
         return NormBounds(flow, groups), NormBounds(integral, groups)
 
-    def _over(self, shortest: Array, longest: Array) -> tuple[Array, Array, Array, Array]:
+    def _compute_bounds(self, shortest: Array, longest: Array) -> tuple[Array, Array, Array, Array]:
         identity = np.eye(self.metzler.shape[0])
         with np.errstate(over="ignore", invalid="ignore"):
             rates = np.diagonal(self.metzler)
@@ -236,11 +236,11 @@ def alike(
     first = np.flatnonzero(np.diff(group, prepend=-1))
     shortest, longest = distinct[first], distinct[np.append(first, distinct.size)[1:] - 1]
     differ = shortest < longest
-    shortest = np.where(differ, _rounded(shortest, np.floor), shortest)
-    return shortest, np.where(differ, _rounded(longest, np.ceil), longest), group[inverse.reshape(-1)]
+    shortest = np.where(differ, _round_to_side(shortest, np.floor), shortest)
+    return shortest, np.where(differ, _round_to_side(longest, np.ceil), longest), group[inverse.reshape(-1)]
 
 
-def _rounded(values: Array, to: np.ufunc) -> Array:
+def _round_to_side(values: Array, to: np.ufunc) -> Array:
     """Numbers with ``BITS`` bits, all of them rounded ``to`` one side, so that what differs by rounding is the same."""
     mantissa, exponent = np.frexp(values)
     return np.asarray(np.ldexp(to(np.ldexp(mantissa, BITS)), exponent - BITS))
@@ -277,27 +277,29 @@ def flows_apart(rates: Array, coupling: Array, shortest: Array, longest: Array) 
     largest coupling ``s``.
     """
     q, early, late = rates.size, shortest[:, None], longest[:, None]
-    diagonal_flow, diagonal_integral = np.exp(rates * np.where(rates < 0, early, late)), _grown(rates, late)
+    diagonal_flow, diagonal_integral = np.exp(rates * np.where(rates < 0, early, late)), _integrate_growth(rates, late)
     larger, difference = np.maximum.outer(rates, rates), -np.abs(np.subtract.outer(rates, rates))
     early, late = early[..., None], late[..., None]
-    share = np.exp(larger * np.where(larger < 0, early, late)) * _grown(difference, late)
+    share = np.exp(larger * np.where(larger < 0, early, late)) * _integrate_growth(difference, late)
     triangle = late**2 / 2 * np.exp(np.maximum(larger, 0.0) * late)
     twice = np.minimum(diagonal_integral[:, :, None] * diagonal_integral[:, None, :], triangle)
     third = (q * coupling.max() * late) ** 3 / (5 * q)  # e^x - 1 - x - x^2 / 2 <= x^3 / 5 where x <= 1/2
-    higher = _scaled(late**2 / 2 * product(coupling, coupling) + third, np.exp(max(0.0, float(rates.max())) * late))
-    flow, integral = _scaled(coupling, share) + higher, _scaled(coupling, twice) + late * higher
+    higher = _scale_couplings(
+        late**2 / 2 * product(coupling, coupling) + third, np.exp(max(0.0, float(rates.max())) * late)
+    )
+    flow, integral = _scale_couplings(coupling, share) + higher, _scale_couplings(coupling, twice) + late * higher
     indices = np.arange(q)
     flow[:, indices, indices] += diagonal_flow
     integral[:, indices, indices] += diagonal_integral
     return finite(SAFE * flow), finite(SAFE * integral)
 
 
-def _scaled(couplings: Array, growth: Array) -> Array:
+def _scale_couplings(couplings: Array, growth: Array) -> Array:
     """Couplings times what they grow by, where nothing stays nothing however large the growth is."""
     return np.asarray(np.where(couplings > 0, couplings * growth, 0.0))
 
 
-def _grown(rates: Array, durations: Array | float) -> Array:
+def _integrate_growth(rates: Array, durations: Array | float) -> Array:
     """The integrals ``(e^{a r} - 1) / a`` of what grows at ``rates`` ``a`` over ``durations`` ``r``."""
     safe = np.where(rates == 0, 1.0, rates)
     return np.asarray(np.where(rates == 0, durations, np.expm1(safe * durations) / safe))

@@ -70,19 +70,19 @@ class Decoupling:
         """``V b`` for columns ``b (..., d, e)``, and a bound of ``|T^-1 b - V b|``, entry by entry."""
         if self.is_identity:
             return columns, np.zeros(columns.shape)
-        return self._rounded(self.inverse @ columns.astype(np.longdouble), np.abs(columns))
+        return self._round_to_double(self.inverse @ columns.astype(np.longdouble), np.abs(columns))
 
     def matrix(self, A: Array) -> tuple[Array, Array]:
         """``V A T`` for matrices ``A (..., d, d)``, and a bound of ``|T^-1 A T - V A T|``, entry by entry."""
         if self.is_identity:
             return A, np.zeros(A.shape)
         transformed = self.inverse @ A.astype(np.longdouble) @ self.transform
-        return self._rounded(transformed, np.abs(A) @ np.abs(self.transform))
+        return self._round_to_double(transformed, np.abs(A) @ np.abs(self.transform))
 
-    def _rounded(self, moved: LongArray, sizes: Array) -> tuple[Array, Array]:
+    def _round_to_double(self, moved: LongArray, sizes: Array) -> tuple[Array, Array]:
         """``moved`` in double precision, and how far it may be from the truth; ``sizes`` bound what the inverse was
         multiplied with."""
-        products = _long_rounding(2 * moved.shape[-2]) * (np.abs(self.inverse) @ sizes)
+        products = _bound_long_rounding(2 * moved.shape[-2]) * (np.abs(self.inverse) @ sizes)
         result = moved.astype(float)
         bound = products + self.defect @ (np.abs(moved) + products) + np.abs(moved - result)
         return result, 1.001 * bound.astype(float)
@@ -110,8 +110,8 @@ def decoupled(A: Array) -> Decoupling:
         return identity(d)
     scale = balance(A)
     balanced = A * scale / scale[:, None]
-    for candidate in _candidates(balanced):
-        checked = _checked(scale[:, None] * candidate[0], *candidate[1:])
+    for candidate in _generate_candidates(balanced):
+        checked = _verify_inverse(scale[:, None] * candidate[0], *candidate[1:])
         if checked is not None:
             return checked
     return identity(d)
@@ -122,7 +122,7 @@ def identity(d: int) -> Decoupling:
     return Decoupling(np.eye(d), np.eye(d, dtype=np.longdouble), np.zeros((d, d)), np.arange(d), np.zeros(1, dtype=int))
 
 
-def _checked(T: Array, starts: np.ndarray, groups: np.ndarray) -> Decoupling | None:
+def _verify_inverse(T: Array, starts: np.ndarray, groups: np.ndarray) -> Decoupling | None:
     """The decoupling with a bound of what is wrong with the inverse; ``None`` where it is no inverse."""
     try:
         V = np.asarray(np.linalg.inv(T), dtype=float)
@@ -130,7 +130,7 @@ def _checked(T: Array, starts: np.ndarray, groups: np.ndarray) -> Decoupling | N
         return None
     d = T.shape[0]
     inverse = V + (np.eye(d) - V.astype(np.longdouble) @ T) @ V  # one step of Newton's method (Schulz 1933)
-    long_residual = np.abs(inverse @ T - np.eye(d)) + _long_rounding(d) * (np.abs(inverse) @ np.abs(T))
+    long_residual = np.abs(inverse @ T - np.eye(d)) + _bound_long_rounding(d) * (np.abs(inverse) @ np.abs(T))
     residual = 1.001 * long_residual.astype(float)
     size = float(residual.sum(axis=1).max())
     if not size < 0.5:
@@ -140,12 +140,12 @@ def _checked(T: Array, starts: np.ndarray, groups: np.ndarray) -> Decoupling | N
     return Decoupling(T, inverse, defect, starts, groups)
 
 
-def _long_rounding(terms: int) -> float:
+def _bound_long_rounding(terms: int) -> float:
     """`rounding` in extended precision."""
     return rounding(terms) * float(np.finfo(np.longdouble).eps) / EPSILON
 
 
-def _candidates(A: Array) -> Iterator[tuple[Array, np.ndarray, np.ndarray]]:
+def _generate_candidates(A: Array) -> Iterator[tuple[Array, np.ndarray, np.ndarray]]:
     """Transforms of a balanced matrix with the starts of their blocks and groups, the finest first."""
     values, vectors = np.linalg.eig(A)
     columns: list[Array] = []
@@ -163,29 +163,29 @@ def _candidates(A: Array) -> Iterator[tuple[Array, np.ndarray, np.ndarray]]:
     from scipy.linalg import schur
 
     form, basis = schur(A, output="real")
-    values = _eigenvalues(form)
+    values = _read_eigenvalues(form)
     for closeness in SEPARATED:
-        clusters = _clusters(values, closeness * np.abs(values).max())
+        clusters = _cluster_eigenvalues(values, closeness * np.abs(values).max())
         if len(clusters) == 1:
             break
-        candidate = _grouped(form, basis, clusters)
+        candidate = _build_group_bases(form, basis, clusters)
         if candidate is not None and np.linalg.cond(candidate[0]) < WELL_CONDITIONED:
             yield candidate
     if len(A) >= MANY and condition < POORLY_CONDITIONED:
         yield modal, np.array(starts), np.array(starts)
-    candidate = _grouped(form, basis, [np.ones(values.size, dtype=bool)])
+    candidate = _build_group_bases(form, basis, [np.ones(values.size, dtype=bool)])
     if candidate is not None:
         yield candidate
 
 
-def _eigenvalues(form: Array) -> np.ndarray:
+def _read_eigenvalues(form: Array) -> np.ndarray:
     """The eigenvalues of a quasi-triangular matrix, in the order of its diagonal."""
     below = np.append(np.diag(form, -1), 0.0)
     turning = np.sqrt(np.abs(below * np.append(np.diag(form, 1), 0.0))) * (below != 0)
     return np.asarray(np.diag(form) + 1j * (turning - np.append(0.0, turning[:-1])))
 
 
-def _clusters(values: np.ndarray, distance: float) -> list[np.ndarray]:
+def _cluster_eigenvalues(values: np.ndarray, distance: float) -> list[np.ndarray]:
     """Return the masks of clusters of eigenvalues, in the order of their first eigenvalues.
 
     Eigenvalues within ``distance`` of each other are in one cluster, also in chains, and conjugates always together.
@@ -198,7 +198,9 @@ def _clusters(values: np.ndarray, distance: float) -> list[np.ndarray]:
     return [labels == label for label in np.unique(labels)]
 
 
-def _grouped(form: Array, basis: Array, clusters: list[np.ndarray]) -> tuple[Array, np.ndarray, np.ndarray] | None:
+def _build_group_bases(
+    form: Array, basis: Array, clusters: list[np.ndarray]
+) -> tuple[Array, np.ndarray, np.ndarray] | None:
     """Orthonormal bases of the invariant subspaces of the clusters, side by side, each by bringing its eigenvalues to
     the front of one Schur form (Bai and Demmel 1993)."""
     from scipy.linalg.lapack import dtrsen
@@ -236,12 +238,12 @@ def pace(A: Array) -> float:
 
 def balance(A: Array) -> Array:
     """Powers of two ``s (d,)`` such that rows and columns of ``A s_j / s_i`` are equally large (Osborne 1960)."""
-    scale, start = _swept(A, np.ones(A.shape[0])), _near_one(A)
+    scale, start = _sweep_scales(A, np.ones(A.shape[0])), _fit_scales(A)
     # where many states are in a row, each next to its like, the sweeps stop early
-    return scale if np.ptp(np.log2(scale / start)) <= FAR else _swept(A, start)
+    return scale if np.ptp(np.log2(scale / start)) <= FAR else _sweep_scales(A, start)
 
 
-def _swept(A: Array, scale: Array) -> Array:
+def _sweep_scales(A: Array, scale: Array) -> Array:
     """The powers of two after some sweeps from ``scale (d,)``."""
     size = np.abs(A - np.diag(np.diag(A))) * scale / scale[:, None]
     scale = scale.copy()
@@ -261,7 +263,7 @@ def _swept(A: Array, scale: Array) -> Array:
     return scale
 
 
-def _near_one(A: Array) -> Array:
+def _fit_scales(A: Array) -> Array:
     """Powers of two ``s (d,)`` for which the logarithms of the entries ``A_ij s_j / s_i`` have the least squares
     (Curtis and Reid 1972)."""
     i, j = np.nonzero(A - np.diag(np.diag(A)))
@@ -280,7 +282,7 @@ def decoupled_transitions(decoupling: Decoupling, D: Array, durations: Array) ->
     d = D.shape[-1]
     flow, integral = np.zeros((*durations.shape, d, d)), np.zeros((*durations.shape, d, d))
     for block, single in decoupling.parts:
-        blocks = (_mode if single else transitions)(D[block, block], durations)
+        blocks = (_exponentiate_mode if single else transitions)(D[block, block], durations)
         flow[..., block, block], integral[..., block, block] = blocks
     return flow, integral
 
@@ -303,7 +305,7 @@ def decoupled_rounding(decoupling: Decoupling, D: Array, durations: Array) -> Ar
     return worst
 
 
-def _mode(D: Array, durations: Array) -> tuple[Array, Array]:
+def _exponentiate_mode(D: Array, durations: Array) -> tuple[Array, Array]:
     """A real eigenvalue ``a``, or a rotation ``[[a, b], [-b, a]]``, which is the complex number ``a + ib``."""
     rotates = D.shape[0] == 2
     rate = complex(D[0, 0], D[0, 1]) if rotates else D[0, 0]

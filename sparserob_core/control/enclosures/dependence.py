@@ -40,11 +40,13 @@ Part: TypeAlias = "dict[Exponents, Value]"
 class AnyNumber:
     """A number of which nothing is known: whatever is made of it is one too."""
 
-    def _one(self, *_: object) -> AnyNumber:
+    def _return_unknown(self, *_: object) -> AnyNumber:
         return self
 
-    __add__ = __radd__ = __sub__ = __rsub__ = __mul__ = __rmul__ = __truediv__ = __rtruediv__ = __pow__ = _one
-    __rpow__ = __neg__ = __pos__ = sin = cos = tan = exp = sqrt = log = tanh = kepler = _one
+    __add__ = __radd__ = __sub__ = __rsub__ = __mul__ = __rmul__ = __truediv__ = __rtruediv__ = __pow__ = (
+        _return_unknown
+    )
+    __rpow__ = __neg__ = __pos__ = sin = cos = tan = exp = sqrt = log = tanh = kepler = _return_unknown
 
 
 def _is_array(other: object) -> bool:
@@ -74,10 +76,10 @@ class Dependent:
         """True where the series depends on no parameter."""
         return not self.others and not self.beyond
 
-    def _like(self, other: object) -> Dependent:
+    def _convert_to_series(self, other: object) -> Dependent:
         return other if isinstance(other, Dependent) else Dependent(other, {}, self.degree)
 
-    def _each(self, of: Callable[[Value], Value]) -> Dependent:
+    def _map_coefficients(self, of: Callable[[Value], Value]) -> Dependent:
         """Return the series with a linear function applied to every coefficient."""
         return Dependent(
             of(self.value), {key: of(coefficient) for key, coefficient in self.others.items()}, self.degree, self.beyond
@@ -86,12 +88,12 @@ class Dependent:
     def __add__(self, other: object) -> Dependent:
         if _is_array(other):
             return NotImplemented
-        summand = self._like(other)
-        sums = _added([dict(self.others), dict(summand.others)])
+        summand = self._convert_to_series(other)
+        sums = _add_parts([dict(self.others), dict(summand.others)])
         return Dependent(self.value + summand.value, sums, self.degree, self.beyond or summand.beyond)
 
     def __neg__(self) -> Dependent:
-        return self._each(lambda value: -value)
+        return self._map_coefficients(lambda value: -value)
 
     def __pos__(self) -> Dependent:
         return self
@@ -99,7 +101,7 @@ class Dependent:
     def __sub__(self, other: object) -> Dependent:
         if _is_array(other):
             return NotImplemented
-        return self + -self._like(other)
+        return self + -self._convert_to_series(other)
 
     def __rsub__(self, other: object) -> Dependent:
         if _is_array(other):
@@ -109,12 +111,12 @@ class Dependent:
     def __mul__(self, other: object) -> Dependent:
         if _is_array(other):
             return NotImplemented
-        factor = self._like(other)
+        factor = self._convert_to_series(other)
         if factor.free:
-            return self._each(lambda value: value * factor.value)
+            return self._map_coefficients(lambda value: value * factor.value)
         if self.free:
             return factor * self
-        products = _added([
+        products = _add_parts([
             {key: coefficient * factor.value for key, coefficient in self.others.items()},
             {key: self.value * coefficient for key, coefficient in factor.others.items()},
         ])  # fmt: skip
@@ -131,16 +133,18 @@ class Dependent:
     def __truediv__(self, other: object) -> Dependent:
         if _is_array(other):
             return NotImplemented
-        divisor = self._like(other)
-        return self._each(lambda value: value / divisor.value) if divisor.free else self * divisor.raised(-1.0)
+        divisor = self._convert_to_series(other)
+        return (
+            self._map_coefficients(lambda value: value / divisor.value) if divisor.free else self * divisor.raised(-1.0)
+        )
 
     def __rtruediv__(self, other: object) -> Dependent:
         if _is_array(other):
             return NotImplemented
-        return self._like(other) / self
+        return self._convert_to_series(other) / self
 
     def __pow__(self, other: object) -> Dependent:
-        exponent = self._like(other)
+        exponent = self._convert_to_series(other)
         if self.free and exponent.free:
             return Dependent(self.value**exponent.value, {}, self.degree)
         power = exponent.value
@@ -148,14 +152,14 @@ class Dependent:
             return (exponent * self.log()).exp()
         if power < 0 or power != int(power):
             return self.raised(float(power))
-        product, base, count = self._like(1.0), self, int(power)
+        product, base, count = self._convert_to_series(1.0), self, int(power)
         while count:
             product, count = product * base if count & 1 else product, count >> 1
             base = base * base if count else base
         return product
 
     def __rpow__(self, other: object) -> Dependent:
-        return self._like(other) ** self
+        return self._convert_to_series(other) ** self
 
     __radd__, __rmul__ = __add__, __mul__
 
@@ -168,40 +172,42 @@ class Dependent:
             by_degree[sum(key)][key] = coefficient
         return by_degree
 
-    def _made(self, parts: Sequence[Part]) -> Dependent:
+    def _build_series(self, parts: Sequence[Part]) -> Dependent:
         """The series with these coefficients, which goes on."""
         (first,) = parts[0].values()
         return Dependent(
             first, {key: coefficient for part in parts[1:] for key, coefficient in part.items()}, self.degree, True
         )
 
-    def _solved(self, first: Value, step: Callable[[int, list[Part]], Part]) -> Dependent:
+    def _solve_recurrence(self, first: Value, step: Callable[[int, list[Part]], Part]) -> Dependent:
         """The series that begins with a number and of which every ``step`` makes the coefficients of a degree from
         those before: along a line through the centre they are those of powers of one number, and obey what these do."""
         (constant,) = self.parts[0]
         parts: list[Part] = [{constant: first}]
         for n in range(1, self.degree + 1):
             parts.append(step(n, parts))
-        return self._made(parts)
+        return self._build_series(parts)
 
     def exp(self) -> Dependent:
         """The exponential, from ``g' = f' g``."""
         if self.free:
-            return self._each(np.exp)
+            return self._map_coefficients(np.exp)
         f = self.parts
-        return self._solved(np.exp(self.value), lambda n, g: _convolved((k / n, f[k], g[n - k]) for k in _upto(n)))
+        return self._solve_recurrence(
+            np.exp(self.value), lambda n, g: _convolve_parts((k / n, f[k], g[n - k]) for k in _list_orders(n))
+        )
 
     def log(self) -> Dependent:
         """The natural logarithm, from ``f g' = f'``."""
         if self.free:
-            return self._each(np.log)
+            return self._map_coefficients(np.log)
         f, inverse = self.parts, 1.0 / self.value
 
         def step(n: int, g: list[Part]) -> Part:
-            before = _convolved((-k / n, g[k], f[n - k]) for k in _upto(n - 1))
-            return _scaled(_added([f[n], before]), inverse)
+            before = _convolve_parts((-k / n, g[k], f[n - k]) for k in _list_orders(n - 1))
+            return _scale_part(_add_parts([f[n], before]), inverse)
 
-        return self._solved(np.log(self.value), step)
+        return self._solve_recurrence(np.log(self.value), step)
 
     def raised(self, power: float) -> Dependent:
         """A power that need be no natural number, from ``f g' = power f' g``."""
@@ -211,53 +217,55 @@ class Dependent:
         f, inverse = self.parts, 1.0 / self.value
 
         def step(n: int, g: list[Part]) -> Part:
-            return _scaled(_convolved(((k * power - (n - k)) / n, f[k], g[n - k]) for k in _upto(n)), inverse)
+            return _scale_part(
+                _convolve_parts(((k * power - (n - k)) / n, f[k], g[n - k]) for k in _list_orders(n)), inverse
+            )
 
-        return self._solved(first, step)
+        return self._solve_recurrence(first, step)
 
     def sqrt(self) -> Dependent:
         """The square root."""
-        return self._each(np.sqrt) if self.free else self.raised(0.5)
+        return self._map_coefficients(np.sqrt) if self.free else self.raised(0.5)
 
-    def _turned(self) -> tuple[Dependent, Dependent]:
+    def _compute_sine_cosine(self) -> tuple[Dependent, Dependent]:
         """Sine and cosine, from ``s' = f' c`` and ``c' = -f' s``."""
         f, (constant,) = self.parts, self.parts[0]
         s, c = [{constant: np.sin(self.value)}], [{constant: np.cos(self.value)}]
-        for n in _upto(self.degree):
-            s.append(_convolved((k / n, f[k], c[n - k]) for k in _upto(n)))
-            c.append(_convolved((-k / n, f[k], s[n - k]) for k in _upto(n)))
-        return self._made(s), self._made(c)
+        for n in _list_orders(self.degree):
+            s.append(_convolve_parts((k / n, f[k], c[n - k]) for k in _list_orders(n)))
+            c.append(_convolve_parts((-k / n, f[k], s[n - k]) for k in _list_orders(n)))
+        return self._build_series(s), self._build_series(c)
 
     def sin(self) -> Dependent:
         """The sine."""
-        return self._each(np.sin) if self.free else self._turned()[0]
+        return self._map_coefficients(np.sin) if self.free else self._compute_sine_cosine()[0]
 
     def cos(self) -> Dependent:
         """The cosine."""
-        return self._each(np.cos) if self.free else self._turned()[1]
+        return self._map_coefficients(np.cos) if self.free else self._compute_sine_cosine()[1]
 
     def tan(self) -> Dependent:
         """The tangent."""
         if self.free:
-            return self._each(np.tan)
-        sine, cosine = self._turned()
+            return self._map_coefficients(np.tan)
+        sine, cosine = self._compute_sine_cosine()
         return sine / cosine
 
     def tanh(self) -> Dependent:
         """The hyperbolic tangent, from ``g' = h f'`` with ``h = 1 - g^2``."""
         if self.free:
-            return self._each(np.tanh)
+            return self._map_coefficients(np.tanh)
         f, first = self.parts, np.tanh(self.value)
         (constant,) = f[0]
         h = [{constant: 1.0 - first * first}]
 
         def step(n: int, g: list[Part]) -> Part:
-            next_part = _convolved((k / n, f[k], h[n - k]) for k in _upto(n))
+            next_part = _convolve_parts((k / n, f[k], h[n - k]) for k in _list_orders(n))
             parts = [*g, next_part]
-            h.append(_convolved((-1.0, parts[k], parts[n - k]) for k in range(n + 1)))
+            h.append(_convolve_parts((-1.0, parts[k], parts[n - k]) for k in range(n + 1)))
             return next_part
 
-        return self._solved(first, step)
+        return self._solve_recurrence(first, step)
 
     def kepler(self, eccentricity: float) -> Dependent:
         """The eccentric anomaly, from ``E' = M' + e E' cos E``."""
@@ -270,21 +278,21 @@ class Dependent:
         inverse = 1.0 / (1.0 - eccentricity * c[0][constant])
 
         def step(n: int, E: list[Part]) -> Part:
-            before = _convolved((eccentricity * k / n, E[k], c[n - k]) for k in _upto(n - 1))
-            next_part = _scaled(_added([M[n], before]), inverse)
+            before = _convolve_parts((eccentricity * k / n, E[k], c[n - k]) for k in _list_orders(n - 1))
+            next_part = _scale_part(_add_parts([M[n], before]), inverse)
             parts = [*E, next_part]
-            s.append(_convolved((k / n, parts[k], c[n - k]) for k in _upto(n)))
-            c.append(_convolved((-k / n, parts[k], s[n - k]) for k in _upto(n)))
+            s.append(_convolve_parts((k / n, parts[k], c[n - k]) for k in _list_orders(n)))
+            c.append(_convolve_parts((-k / n, parts[k], s[n - k]) for k in _list_orders(n)))
             return next_part
 
-        return self._solved(first, step)
+        return self._solve_recurrence(first, step)
 
 
-def _upto(n: int) -> range:
+def _list_orders(n: int) -> range:
     return range(1, n + 1)
 
 
-def _added(parts: Iterable[Mapping[Exponents, Value]]) -> Part:
+def _add_parts(parts: Iterable[Mapping[Exponents, Value]]) -> Part:
     """The sum of coefficients."""
     total: Part = {}
     for part in parts:
@@ -293,11 +301,11 @@ def _added(parts: Iterable[Mapping[Exponents, Value]]) -> Part:
     return total
 
 
-def _scaled(part: Part, factor: Value) -> Part:
+def _scale_part(part: Part, factor: Value) -> Part:
     return {key: coefficient * factor for key, coefficient in part.items()}
 
 
-def _convolved(terms: Iterable[tuple[float, Part, Part]]) -> Part:
+def _convolve_parts(terms: Iterable[tuple[float, Part, Part]]) -> Part:
     """The sum of products of coefficients of two degrees each, each times its number."""
     total: Part = {}
     for factor, first, second in terms:
@@ -382,7 +390,7 @@ class Split:
     @property
     def degree(self) -> int:
         """The largest degree of an entry that is a polynomial and other than 0 at `AnyNumber`."""
-        masks = {key: _there(table) for key, table in self.parts.items()}
+        masks = {key: _mark_nonzeros(table) for key, table in self.parts.items()}
         for mask in masks.values():
             mask[tuple(np.array(self.beyond, dtype=int).reshape(-1, 2).T)] = False
         return max((sum(key) for key, mask in masks.items() if mask.any()), default=0)
@@ -390,7 +398,7 @@ class Split:
     @property
     def there(self) -> np.ndarray:
         """True where the `whole` is other than 0 at `AnyNumber`, an array of the same shape."""
-        return _there(self.whole)
+        return _mark_nonzeros(self.whole)
 
 
 def single(nu: int, j: int) -> Exponents:
@@ -398,7 +406,7 @@ def single(nu: int, j: int) -> Exponents:
     return tuple(int(i == j) for i in range(nu))
 
 
-def _there(table: Table) -> np.ndarray:
+def _mark_nonzeros(table: Table) -> np.ndarray:
     is_nonzero = np.array(
         [isinstance(number, AnyNumber) or float(number) != 0.0 for number in table.ravel()], dtype=bool
     )

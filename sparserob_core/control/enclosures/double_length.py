@@ -26,13 +26,13 @@ def product(hi: Array, lo: Array | None, other_hi: Array, other_lo: Array | None
     become too large, the product of floats."""
     if not max(np.abs(hi).max(), np.abs(other_hi).max()) < LARGE:
         return hi @ other_hi, np.zeros_like(hi)
-    rows, columns = _leading(hi, 1), _leading(other_hi, 0)
+    rows, columns = _extract_leading_digits(hi, 1), _extract_leading_digits(other_hi, 0)
     exact, correction = rows @ columns, rows @ (other_hi - columns) + (hi - rows) @ other_hi
     if other_lo is not None:
         correction += hi @ other_lo
     if lo is not None:
         correction += lo @ other_hi
-    return _two(exact, correction)
+    return _add_with_error(exact, correction)
 
 
 def flows(A: Array) -> tuple[Array, Array, Array]:
@@ -48,14 +48,14 @@ def flows(A: Array) -> tuple[Array, Array, Array]:
         share = Fraction(1, factorial(order))
         rounded_share = float(share)
         # what is added to is larger than any entry of what is added, or 0
-        hi, error = _two(identity * rounded_share, hi)
+        hi, error = _add_with_error(identity * rounded_share, hi)
         lo = lo + error + identity * float(share - Fraction(rounded_share))
     flow, flow_lo = product(A, None, hi, lo)
-    flow, error = _two(identity, flow)
+    flow, error = _add_with_error(identity, flow)
     return flow, flow_lo + error, hi
 
 
-def _leading(A: Array, axis: int) -> Array:
+def _extract_leading_digits(A: Array, axis: int) -> Array:
     """The leading digits of the entries of ``A (d, d)``, of their largest along an axis: few enough that a sum of ``d``
     products of two has no more than a float."""
     kept = (DIGITS - int(np.ceil(np.log2(A.shape[0])))) // 2
@@ -64,7 +64,7 @@ def _leading(A: Array, axis: int) -> Array:
     return np.asarray((A + shift) - shift)
 
 
-def _two(large: Array, small: Array) -> tuple[Array, Array]:
+def _add_with_error(large: Array, small: Array) -> tuple[Array, Array]:
     """The rounded sum, and what was rounded away (Knuth 1997, section 4.2.2)."""
     total = large + small
     included = total - large

@@ -62,57 +62,57 @@ class Leaps:
     @cached_property
     def step(self) -> float:
         """The short time."""
-        size = _norm(self._own)
+        size = _compute_norm(self._scaled_matrix)
         return float(2.0 ** np.floor(-np.log2(size))) if size > 0.0 else 1.0
 
     @cached_property
     def _scale(self) -> Array:
         """The units ``s (d,)``: ``e^{A r} = S e^{(S^-1 A S) r} S^-1``."""
         scale = balance(self.A)
-        return scale if _norm(self.A * scale / scale[:, None]) < _norm(self.A) else np.ones_like(scale)
+        return scale if _compute_norm(self.A * scale / scale[:, None]) < _compute_norm(self.A) else np.ones_like(scale)
 
     @cached_property
-    def _own(self) -> Array:
+    def _scaled_matrix(self) -> Array:
         """The matrix in these units."""
         return np.asarray(self.A * self._scale / self._scale[:, None])
 
     @cached_property
-    def _doubled(self) -> list[tuple[Array, Array]]:
+    def _doubled_transitions(self) -> list[tuple[Array, Array]]:
         """Transitions and their integrals over 1, 2, 4, ... short times, as far as they were asked for."""
         return []
 
     @cached_property
-    def _lost(self) -> list[Array]:
-        """Low-order part of the last transition of `_doubled`, in twice the digits: a list of one matrix, or an empty
-        list."""
+    def _low_order_parts(self) -> list[Array]:
+        """Low-order part of the last transition of `_doubled_transitions`, in twice the digits: a list of one matrix,
+        or an empty list."""
         return []
 
     @cached_property
-    def _products(self):  # type: ignore[no-untyped-def]
-        return products(self._own)
+    def _product_form(self):  # type: ignore[no-untyped-def]
+        return products(self._scaled_matrix)
 
     @cached_property
-    def _table(self) -> Array:
+    def _series_table(self) -> Array:
         """Coefficients ``(TERMS, 2 d^2)`` of ``e^{A r}`` and ``int_0^r e^{A s} ds / r`` in powers of the share of the
         short time that ``r`` is."""
         terms = [np.eye(self.A.shape[0])]
         for order in range(1, TERMS):
-            terms.append(terms[-1] @ (self._own * self.step) / order)
+            terms.append(terms[-1] @ (self._scaled_matrix * self.step) / order)
         return np.array([[term, term / (order + 1)] for order, term in enumerate(terms)]).reshape(TERMS, -1)
 
-    def _over(self, count: int) -> list[tuple[Array, Array]]:
+    def _compute_transitions(self, count: int) -> list[tuple[Array, Array]]:
         """Transitions and their integrals over 1, 2, 4, ... short times, ``count`` of them, in own units."""
-        while len(self._doubled) < count:
-            if not self._doubled:
-                flow, flow_lo, integral = flows(self._own * self.step)
+        while len(self._doubled_transitions) < count:
+            if not self._doubled_transitions:
+                flow, flow_lo, integral = flows(self._scaled_matrix * self.step)
                 integral = integral * self.step
             else:
-                (flow, integral), flow_lo = self._doubled[-1], self._lost.pop()
+                (flow, integral), flow_lo = self._doubled_transitions[-1], self._low_order_parts.pop()
                 integral = integral + flow @ integral
                 flow, flow_lo = product(flow, flow_lo, flow, flow_lo)
-            self._doubled.append((flow, integral))
-            self._lost.append(flow_lo)
-        return self._doubled[:count]
+            self._doubled_transitions.append((flow, integral))
+            self._low_order_parts.append(flow_lo)
+        return self._doubled_transitions[:count]
 
     @shaped
     def rows(
@@ -123,39 +123,39 @@ class Leaps:
         stacked = np.empty((2, *rows.shape))
         for start in range(0, len(rows), count):
             batch = slice(start, start + count)
-            stacked[0, batch], stacked[1, batch] = self._rows(rows[batch] * self._scale, durations[batch])
+            stacked[0, batch], stacked[1, batch] = self._propagate_rows(rows[batch] * self._scale, durations[batch])
         stacked /= self._scale
         return stacked[0], stacked[1]
 
-    def _rows(self, rows: Array, durations: Array) -> tuple[Array, Array]:
-        steps, remainders = self._parted(durations)
+    def _propagate_rows(self, rows: Array, durations: Array) -> tuple[Array, Array]:
+        steps, remainders = self._split_durations(durations)
         propagated, integrals = np.array(rows, dtype=float), np.zeros(rows.shape)
-        for bit, (flow, integral) in enumerate(self._over(int(steps.max(initial=0)).bit_length())):
+        for bit, (flow, integral) in enumerate(self._compute_transitions(int(steps.max(initial=0)).bit_length())):
             indices = np.flatnonzero(steps >> bit & 1)
             if indices.size:
                 integrals[indices] += propagated[indices] @ integral
                 propagated[indices] = propagated[indices] @ flow
-        return self._through(propagated, integrals, remainders)
+        return self._propagate_remainders(propagated, integrals, remainders)
 
-    def _parted(self, durations: Array) -> tuple[np.ndarray, Array]:
+    def _split_durations(self, durations: Array) -> tuple[np.ndarray, Array]:
         """Return the number of whole short times in each of ``durations (k,)``, and the rest of each."""
         durations = np.maximum(durations, 0.0)  # differences of times may be less by rounding
         steps = np.floor(durations / self.step).astype(int)
         return steps, durations - steps * self.step
 
-    def _through(self, flown: Array, driven: Array, rest: Array) -> tuple[Array, Array]:
+    def _propagate_remainders(self, flown: Array, driven: Array, rest: Array) -> tuple[Array, Array]:
         """Return rows and their integrals, ``(k, d)`` each, propagated over the last part ``rest (k,)`` of the
         durations."""
         rest = rest[:, None]
         if self.A.shape[0] <= FEW_STATES:
-            matrices = ((rest / self.step) ** np.arange(TERMS) @ self._table).reshape(-1, 2, *self.A.shape)
+            matrices = ((rest / self.step) ** np.arange(TERMS) @ self._series_table).reshape(-1, 2, *self.A.shape)
             propagated = (flown[:, None, None] @ matrices)[:, :, 0]
             return propagated[:, 0], driven + propagated[:, 1] * rest
         order, term_bound = 1, 1.0
         size = float(rest.max(initial=0.0)) / self.step  # |A r| is at most this
         term, driven = flown, driven + rest * flown
         while term_bound > LAST and size:
-            term = np.asarray(term @ self._products) * (rest / order)
+            term = np.asarray(term @ self._product_form) * (rest / order)
             flown, driven = flown + term, driven + term * (rest / (order + 1))
             term_bound, order = term_bound * size / order, order + 1
         return flown, driven
@@ -165,11 +165,11 @@ class Leaps:
         self, rows: Float[Array, "r d"], durations: Float[Array, " k"]
     ) -> tuple[Float[Array, "k r d"], Float[Array, "k r d"]]:
         """`rows` where each goes over every duration: what durations begin with, in short times, is gone over once."""
-        steps, remainders = self._parted(durations)
+        steps, remainders = self._split_durations(durations)
         distinct_steps, inverse = np.unique(steps, return_inverse=True)
         propagated = np.array(rows[None] * self._scale, dtype=float)
         integrals, prefixes = np.zeros(propagated.shape), np.zeros(1, dtype=int)
-        doubled = self._over(int(distinct_steps.max(initial=0)).bit_length())
+        doubled = self._compute_transitions(int(distinct_steps.max(initial=0)).bit_length())
         for bit in range(len(doubled) - 1, -1, -1):
             beginnings, prefixes = prefixes, np.unique(distinct_steps >> bit)
             parents, odd = np.searchsorted(beginnings, prefixes >> 1), np.flatnonzero(prefixes & 1)
@@ -183,7 +183,7 @@ class Leaps:
             batch = slice(start, start + count)
             beginnings, shape = inverse.reshape(-1)[batch], (-1, rows.shape[1])
             row_remainders = np.repeat(remainders[batch], len(rows))
-            values = self._through(
+            values = self._propagate_remainders(
                 propagated[beginnings].reshape(shape), integrals[beginnings].reshape(shape), row_remainders
             )
             stacked[:, batch] = np.stack(values).reshape(2, beginnings.size, *rows.shape)
@@ -196,7 +196,7 @@ class Leaps:
         return self.orbits(np.eye(self.A.shape[0]), durations)
 
 
-def _norm(A: Array) -> float:
+def _compute_norm(A: Array) -> float:
     return float(np.abs(A).sum(axis=0).max())
 
 
@@ -209,7 +209,7 @@ class Flows:
     D: Array
 
     @cached_property
-    def _singles(self) -> tuple[np.ndarray, Array, np.ndarray, np.ndarray]:
+    def _single_modes(self) -> tuple[np.ndarray, Array, np.ndarray, np.ndarray]:
         """Indices of the real modes, and their rates; and the first indices of rotations ``[[a, b], [-b, a]]``, and
         ``a + ib``."""
         singles = [block for block, single in self.decoupling.parts if single]
@@ -229,7 +229,7 @@ class Flows:
     ) -> tuple[Float[Array, "k r d"], Float[Array, "k r d"]]:
         """``c'e^{D r}`` and ``c'int_0^r e^{D s} ds``, ``(k, r, d)`` each, of ``rows (k, r, d)`` over ``durations
         (k,)``."""
-        return self._applied(rows, durations, transposed=False)
+        return self._apply_exponentials(rows, durations, transposed=False)
 
     @shaped
     def columns(
@@ -237,15 +237,15 @@ class Flows:
     ) -> Float[Array, "k d"]:
         """Return the states ``(k, d)`` after ``durations (k,)`` under constant ``drives (k, d)``, from
         ``states (k, d)``."""
-        propagated, integrals = self._applied(np.stack([states, drives], axis=1), durations, transposed=True)
+        propagated, integrals = self._apply_exponentials(np.stack([states, drives], axis=1), durations, transposed=True)
         return propagated[:, 0] + integrals[:, 1]
 
-    def _applied(self, rows: Array, durations: Array, transposed: bool) -> tuple[Array, Array]:
+    def _apply_exponentials(self, rows: Array, durations: Array, transposed: bool) -> tuple[Array, Array]:
         propagated, integrals = np.empty((2, *rows.shape))
-        real, rates, turning, spins = self._singles
+        real, rates, turning, spins = self._single_modes
         late = durations[:, None]
         if real.size:
-            exponentials, exponential_integrals = np.exp(rates * late), _integrals(rates, late)
+            exponentials, exponential_integrals = np.exp(rates * late), _integrate_exponentials(rates, late)
             propagated[..., real], integrals[..., real] = (
                 rows[..., real] * exponentials[:, None],
                 rows[..., real] * exponential_integrals[:, None],
@@ -253,7 +253,10 @@ class Flows:
         if turning.size:
             spins = spins.conj() if transposed else spins
             points = rows[..., turning] + 1j * rows[..., turning + 1]
-            for target, factor in ((propagated, np.exp(spins * late)), (integrals, _integrals(spins, late))):
+            for target, factor in (
+                (propagated, np.exp(spins * late)),
+                (integrals, _integrate_exponentials(spins, late)),
+            ):
                 values = points * factor[:, None]
                 target[..., turning], target[..., turning + 1] = values.real, values.imag
         for block, along, across in self._groups:
@@ -266,7 +269,7 @@ class Flows:
         return propagated, integrals
 
 
-def _integrals(rates: np.ndarray, durations: Array) -> np.ndarray:
+def _integrate_exponentials(rates: np.ndarray, durations: Array) -> np.ndarray:
     """``int_0^r e^{a s} ds`` of rates ``a (q,)`` over durations ``r (k, 1)``, ``(k, q)``."""
     safe = np.where(rates == 0, 1.0, rates)
     return np.where(rates == 0, durations, np.expm1(safe * durations) / safe)

@@ -32,7 +32,7 @@ def polynomial_bound(
         return coefficients[..., 0].copy(), np.zeros((*shape, nu))
     flat = coefficients.reshape(-1, space.size)
     gradient, hessian = quadratic_part(space, flat)
-    tail, steepness = _tail(space, flat)
+    tail, steepness = _bound_tail(space, flat)
     bound = flat[:, 0] + tail
     slope = np.abs(hessian).sum(axis=2)
     ends = np.where(np.abs(gradient) >= slope + steepness, np.sign(gradient), 0.0)
@@ -40,7 +40,7 @@ def polynomial_bound(
     inner = (ends == 0) & ((gradient != 0) | (slope > 0))
     gradient = np.where(inner, gradient + np.einsum("kij,kj->ki", hessian, ends), 0.0)
     hessian = np.where(inner[:, :, None] & inner[:, None, :], hessian, 0.0)
-    bound += np.minimum(_separable(gradient, hessian), _concave(gradient, hessian, inner))
+    bound += np.minimum(_bound_by_variable(gradient, hessian), _bound_as_concave(gradient, hessian, inner))
     spread = np.abs(gradient) + steepness + slope
     return bound.reshape(shape), spread.reshape(*shape, nu)
 
@@ -54,7 +54,7 @@ def monotone_ends(
     if space.nu == 0 or space.degree == 0:
         return np.zeros((coefficients.shape[0], space.nu))
     gradient, hessian = quadratic_part(space, coefficients)
-    certain = np.abs(gradient) > np.abs(hessian).sum(axis=2) + _tail(space, coefficients)[1] + steepness
+    certain = np.abs(gradient) > np.abs(hessian).sum(axis=2) + _bound_tail(space, coefficients)[1] + steepness
     return np.where(certain, np.sign(gradient), 0.0)
 
 
@@ -70,10 +70,10 @@ def distinct_patterns(ends: Float[Array, "k r nu"]) -> tuple[Float[Array, "u nu"
 def face_of(space: TaylorSpace, ends: Array) -> Face:
     """The face on which the variables with ``ends (nu,)`` not 0 are at them; remembered."""
     key = ends.tobytes()
-    return space.faces.get(key) or remember(space.faces, key, _face(space, ends), FACES_KEPT)
+    return space.faces.get(key) or remember(space.faces, key, _build_face(space, ends), FACES_KEPT)
 
 
-def _face(space: TaylorSpace, ends: Array) -> Face:
+def _build_face(space: TaylorSpace, ends: Array) -> Face:
     fixed = ends != 0
     sign = np.prod(np.where(fixed, ends, 1.0) ** space.exponents, axis=1)
     return Face(space.places(np.where(fixed, 0, space.exponents)), sign)
@@ -97,7 +97,7 @@ def quadratic_part(
 
 
 @shaped
-def _tail(space: TaylorSpace, flat: Float[Array, "k M"]) -> tuple[Float[Array, " k"], Float[Array, "k nu"]]:
+def _bound_tail(space: TaylorSpace, flat: Float[Array, "k M"]) -> tuple[Float[Array, " k"], Float[Array, "k nu"]]:
     """Bounds of the terms of degree three and more, ``(k,)``, and of their partial derivatives, ``(k, nu)``."""
     high = space.degrees >= 3
     terms = flat[:, high]
@@ -106,7 +106,7 @@ def _tail(space: TaylorSpace, flat: Float[Array, "k M"]) -> tuple[Float[Array, "
 
 
 @shaped
-def _separable(gradient: Float[Array, "k d"], hessian: Float[Array, "k d d"]) -> Float[Array, " k"]:
+def _bound_by_variable(gradient: Float[Array, "k d"], hessian: Float[Array, "k d d"]) -> Float[Array, " k"]:
     """``sum_i max_s g_i s + h_ii s^2 / 2`` plus the modulus of the mixed terms."""
     square = np.einsum("kii->ki", hessian) / 2
     inside = (square < 0) & (np.abs(gradient) < -2 * square)
@@ -116,7 +116,7 @@ def _separable(gradient: Float[Array, "k d"], hessian: Float[Array, "k d d"]) ->
 
 
 @shaped
-def _concave(
+def _bound_as_concave(
     gradient: Float[Array, "k d"], hessian: Float[Array, "k d d"], inner: Bool[np.ndarray, "k d"]
 ) -> Float[Array, " k"]:
     """An upper bound of ``g's + s'H s / 2`` over the box in the inner variables, exact where ``H`` is negative definite
@@ -134,11 +134,11 @@ def _concave(
     size = np.abs(values).max(axis=1)
     lowered = np.maximum(values[:, -1], 0.0) + DEFINITE * size
     H = np.where(free[:, :, None] & free[:, None, :], H - lowered[:, None, None] * np.eye(H.shape[1]), 0.0)
-    top[indices] = _highest(gradient[indices], H, free, size) + lowered * free.sum(axis=1) / 2
+    top[indices] = _bound_concave_maximum(gradient[indices], H, free, size) + lowered * free.sum(axis=1) / 2
     return top
 
 
-def _solved(matrices: Array, right: Array) -> Array:
+def _solve_systems(matrices: Array, right: Array) -> Array:
     """``matrices^-1 right``, ``(k, d)``; in the least-squares sense for all where one is singular, since a tangent at
     any point will do."""
     try:
@@ -148,7 +148,7 @@ def _solved(matrices: Array, right: Array) -> Array:
 
 
 @shaped
-def _highest(
+def _bound_concave_maximum(
     gradient: Float[Array, "k d"],
     hessian: Float[Array, "k d d"],
     inner: Bool[np.ndarray, "k d"],
@@ -163,7 +163,7 @@ def _highest(
     top = np.full(rows.size, np.inf)
     for _ in range(ROUNDS * gradient.shape[1]):
         pull = np.where(free, gradient + np.einsum("kij,kj->ki", hessian, fixed), 0.0)
-        stationary = fixed - _solved(np.where(free[:, :, None] & free[:, None, :], hessian, filler), pull)
+        stationary = fixed - _solve_systems(np.where(free[:, :, None] & free[:, None, :], hessian, filler), pull)
         point = np.clip(np.nan_to_num(stationary), -1.0, 1.0)
         hessian_product = np.einsum("kij,kj->ki", hessian, point)
         slope = np.where(inner, gradient + hessian_product, 0.0)

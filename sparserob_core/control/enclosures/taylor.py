@@ -188,13 +188,13 @@ class TaylorModel:
         high = float(self.coefficients[0] + np.maximum(nonconstant[even], 0.0).sum()) + odd
         return low, high
 
-    def _magnitude(self) -> float:
+    def _sum_magnitudes(self) -> float:
         return float(np.abs(self.coefficients).sum())
 
-    def _shifted(self, number: float) -> TaylorModel:
+    def _shift(self, number: float) -> TaylorModel:
         coefficients = self.coefficients.copy()
         coefficients[0] += number
-        return _rounded(self.space, coefficients, self.remainder)
+        return _add_rounding(self.space, coefficients, self.remainder)
 
     def __neg__(self) -> TaylorModel:
         return TaylorModel(self.space, -self.coefficients, self.remainder)
@@ -204,8 +204,8 @@ class TaylorModel:
 
     def __add__(self, other: object) -> TaylorModel:
         if isinstance(other, TaylorModel):
-            return _rounded(self.space, self.coefficients + other.coefficients, self.remainder + other.remainder)
-        return self._shifted(float(other)) if isinstance(other, _NUMBERS) else NotImplemented
+            return _add_rounding(self.space, self.coefficients + other.coefficients, self.remainder + other.remainder)
+        return self._shift(float(other)) if isinstance(other, _NUMBERS) else NotImplemented
 
     __radd__ = __add__
 
@@ -217,10 +217,10 @@ class TaylorModel:
 
     def __mul__(self, other: object) -> TaylorModel:
         if isinstance(other, TaylorModel):
-            return self._product(other)
+            return self._multiply(other)
         if not isinstance(other, _NUMBERS):
             return NotImplemented
-        return _rounded(self.space, float(other) * self.coefficients, abs(float(other)) * self.remainder)
+        return _add_rounding(self.space, float(other) * self.coefficients, abs(float(other)) * self.remainder)
 
     __rmul__ = __mul__
 
@@ -241,25 +241,25 @@ class TaylorModel:
             return NotImplemented
         power = float(exponent)
         if not power.is_integer() or abs(power) > _LARGEST_POWER:
-            return self._compose(power_series(power, *self._domain()))
-        return self._power(int(power)) if power >= 0 else self.reciprocal()._power(int(-power))
+            return self._compose(power_series(power, *self._describe_domain()))
+        return self._raise_to_power(int(power)) if power >= 0 else self.reciprocal()._raise_to_power(int(-power))
 
     def __rpow__(self, base: object) -> TaylorModel:
         if not isinstance(base, _NUMBERS):
             return NotImplemented
         return (self * math.log(base)).exp() if base > 0 else undefined(f"a power of {base}")
 
-    def _product(self, other: TaylorModel) -> TaylorModel:
+    def _multiply(self, other: TaylorModel) -> TaylorModel:
         left, right, target = self.space.products
         a, b = self.coefficients, other.coefficients
         products = a[left] * b[right]
         coefficients = np.bincount(target, weights=products, minlength=self.space.size).astype(float)
-        cross = self._magnitude() * other.remainder + self.remainder * (other._magnitude() + other.remainder)
+        cross = self._sum_magnitudes() * other.remainder + self.remainder * (other._sum_magnitudes() + other.remainder)
         if a[1:].any() or b[1:].any():
             cross += float(self.space.rounded @ np.abs(products))
         return TaylorModel(self.space, coefficients, (self.space.overflow(a, b) + cross) * OUTWARD)
 
-    def _power(self, count: int) -> TaylorModel:
+    def _raise_to_power(self, count: int) -> TaylorModel:
         result, base = self.space.constant(1.0), self
         while count:
             result = result * base if count & 1 else result
@@ -278,7 +278,7 @@ class TaylorModel:
         coefficients, bound = series
         if not math.isfinite(bound):
             raise NotEnclosable("values this large have no enclosure")
-        y = self._shifted(-float(self.coefficients[0]))
+        y = self._shift(-float(self.coefficients[0]))
         result = self.space.constant(coefficients[-1])
         for coefficient in reversed(coefficients[:-1]):
             result = result * y + coefficient
@@ -291,16 +291,16 @@ class TaylorModel:
             )
         return TaylorModel(self.space, result.coefficients, result.remainder + remainder)
 
-    def _domain(self) -> tuple[int, float, float, float]:
+    def _describe_domain(self) -> tuple[int, float, float, float]:
         return self.space.degree, float(self.coefficients[0]), *self.bounds()
 
     def exp(self) -> TaylorModel:
         """Exponential."""
-        return self._compose(exp_series(*self._domain()))
+        return self._compose(exp_series(*self._describe_domain()))
 
     def sin(self) -> TaylorModel:
         """Sine."""
-        return self._compose(sin_series(*self._domain()))
+        return self._compose(sin_series(*self._describe_domain()))
 
     def cos(self) -> TaylorModel:
         """Cosine."""
@@ -312,19 +312,19 @@ class TaylorModel:
 
     def tanh(self) -> TaylorModel:
         """Hyperbolic tangent."""
-        return self._compose(tanh_series(*self._domain()))
+        return self._compose(tanh_series(*self._describe_domain()))
 
     def log(self) -> TaylorModel:
         """Natural logarithm of positive values."""
-        return self._compose(log_series(*self._domain()))
+        return self._compose(log_series(*self._describe_domain()))
 
     def sqrt(self) -> TaylorModel:
         """Square root of positive values."""
-        return self._compose(power_series(0.5, *self._domain()))
+        return self._compose(power_series(0.5, *self._describe_domain()))
 
     def kepler(self, eccentricity: float) -> TaylorModel:
         """The ``E`` with ``E - e sin E`` equal to these values, for a number ``0 <= e < 1``."""
-        model = self._compose(kepler_series(eccentricity, *self._domain()))
+        model = self._compose(kepler_series(eccentricity, *self._describe_domain()))
         centre = abs(float(self.coefficients[0]))  # Newton's method ends where the equation holds to its rounding
         model.remainder += rounding(4) * (centre + 1.0) / (1.0 - eccentricity * math.cos(float(model.coefficients[0])))
         return model
@@ -333,23 +333,23 @@ class TaylorModel:
         """``1 / self``, for values of one sign."""
         if self.bounds()[1] < 0:
             return -(-self).reciprocal()
-        return self._compose(power_series(-1.0, *self._domain()))
+        return self._compose(power_series(-1.0, *self._describe_domain()))
 
     def square(self) -> TaylorModel:
         """``self ** 2``."""
         return self * self
 
-    def _compared(self, other: object) -> NoReturn:
+    def _refuse_comparison(self, other: object) -> NoReturn:
         raise NotEnclosable("a function of the parameters may not branch on their values (a comparison was met)")
 
-    __lt__ = __le__ = __gt__ = __ge__ = _compared
-    __eq__ = __ne__ = _compared
+    __lt__ = __le__ = __gt__ = __ge__ = _refuse_comparison
+    __eq__ = __ne__ = _refuse_comparison
 
     def __bool__(self) -> bool:
         raise NotEnclosable("a function of the parameters may not branch on their values (a truth value was asked for)")
 
 
-def _rounded(space: TaylorSpace, coefficients: Array, remainder: float) -> TaylorModel:
+def _add_rounding(space: TaylorSpace, coefficients: Array, remainder: float) -> TaylorModel:
     """A model of which every coefficient has been rounded once."""
     if coefficients[1:].any():
         remainder += HALF * float(np.abs(coefficients).sum())

@@ -45,7 +45,7 @@ class Cuts:
         ``rest (k, r, M)`` are low; and how much of their range halving each variable would take away,
         ``(k, r, nu')``."""
         total = polynomials + rest
-        additions, multipliers = self._additions(space, total)
+        additions, multipliers = self._build_additions(space, total)
         bounds = [polynomial_bound(space, total + addition) for addition in additions]
         spreads = [spread for _, spread in bounds]
         if self.slack.size:
@@ -55,7 +55,7 @@ class Cuts:
         lowered = polynomials + np.take_along_axis(np.array(additions), best, axis=0)[0]
         return lowered, np.take_along_axis(np.array(spreads), best, axis=0)[0]
 
-    def _additions(self, space: TaylorSpace, total: Array) -> tuple[list[Array], Array]:
+    def _build_additions(self, space: TaylorSpace, total: Array) -> tuple[list[Array], Array]:
         """The polynomials that are tried: none, those of the half-spaces, of their products, of the ball; and the
         multipliers ``(k, r, q)``."""
         count = self.bent.size
@@ -68,17 +68,17 @@ class Cuts:
         if self.slack.size:
             multipliers = cheapest_multipliers(self.slopes, self.slack, gradient)
             additions.append(
-                _quadratic(space, multipliers @ self.slack, -multipliers @ self.slopes, np.zeros_like(hessian))
+                _build_quadratic(space, multipliers @ self.slack, -multipliers @ self.slopes, np.zeros_like(hessian))
             )
-            additions.append(_quadratic(space, *self._products(multipliers)))
+            additions.append(_build_quadratic(space, *self._expand_products(multipliers)))
         if self.ball is not None:
             additions += [
-                _quadratic(space, *self._of_ball(multiplier))
-                for multiplier in self._ball_multipliers(gradient, hessian)
+                _build_quadratic(space, *self._expand_ball(multiplier))
+                for multiplier in self._compute_ball_multipliers(gradient, hessian)
             ]
         return additions, multipliers
 
-    def _products(self, multipliers: Array) -> tuple[Array, Array, Array]:
+    def _expand_products(self, multipliers: Array) -> tuple[Array, Array, Array]:
         """``sum lambda (s - a'd)(a'd + |a|_1) / (s + |a|_1)``: nowhere on the cell above ``sum lambda (s - a'd)``. As
         value, gradient, Hessian."""
         reach = np.abs(self.slopes).sum(axis=1)
@@ -86,10 +86,10 @@ class Cuts:
         return (
             weights @ (self.slack * reach),
             (weights * (self.slack - reach)) @ self.slopes,
-            -2.0 * _squares(weights, self.slopes),
+            -2.0 * _sum_outer_products(weights, self.slopes),
         )
 
-    def _of_ball(self, multiplier: Array) -> tuple[Array, Array, Array]:
+    def _expand_ball(self, multiplier: Array) -> tuple[Array, Array, Array]:
         assert self.ball is not None
         base, image = self.ball
         return (
@@ -98,12 +98,12 @@ class Cuts:
             -multiplier[..., None, None] * (image.T @ image),
         )
 
-    def _ball_multipliers(self, gradient: Array, hessian: Array) -> list[Array]:
+    def _compute_ball_multipliers(self, gradient: Array, hessian: Array) -> list[Array]:
         """``(k, r)`` each: the best one for the quadratic part on the whole set, and the one that balances it next to
         the cell."""
         assert self.ball is not None
         base, _ = self.ball
-        inverse = self._inverse
+        inverse = self._inverse_image
         bend = inverse.T @ hessian @ inverse
         slope = gradient @ inverse - bend @ base
         length = np.linalg.norm(base)
@@ -121,7 +121,7 @@ class Cuts:
         return [high, local]
 
     @cached_property
-    def _inverse(self) -> Array:
+    def _inverse_image(self) -> Array:
         assert self.ball is not None
         return np.asarray(np.linalg.inv(self.ball[1]), dtype=float)
 
@@ -150,36 +150,36 @@ def cheapest_multipliers(slopes: Array, slack: Array, gradient: Array) -> Array:
     trials = [np.zeros((*gradient.shape[:-1], q))]
     largest_size = min(q, nu) if q <= TOGETHER else 1
     for chosen in chain.from_iterable(combinations(range(q), size) for size in range(1, largest_size + 1)):
-        trials.append(_placed(trials[0], chosen, gradient @ np.linalg.pinv(slopes[list(chosen)])))
+        trials.append(_place_multipliers(trials[0], chosen, gradient @ np.linalg.pinv(slopes[list(chosen)])))
     for row, coordinate in np.argwhere(slopes != 0.0):
-        trials.append(_placed(trials[0], (row,), gradient[..., [coordinate]] / slopes[row, coordinate]))
+        trials.append(_place_multipliers(trials[0], (row,), gradient[..., [coordinate]] / slopes[row, coordinate]))
     multipliers = np.stack(trials, axis=-2)
     heights = multipliers @ slack + np.abs(gradient[..., None, :] - multipliers @ slopes).sum(axis=-1)
     best: Array = np.take_along_axis(multipliers, heights.argmin(axis=-1)[..., None, None], axis=-2)[..., 0, :]
     return best
 
 
-def _placed(zeros: Array, chosen: tuple[int, ...], values: Array) -> Array:
+def _place_multipliers(zeros: Array, chosen: tuple[int, ...], values: Array) -> Array:
     trial = zeros.copy()
     trial[..., list(chosen)] = np.maximum(np.where(np.isfinite(values), values, 0.0), 0.0)
     return trial
 
 
-def _squares(weights: Array, rows: Array) -> Array:
+def _sum_outer_products(weights: Array, rows: Array) -> Array:
     """``sum_j weights_j rows_j rows_j'``, ``(..., nu, nu)``."""
     return np.asarray(np.einsum("...q,qi,qj->...ij", weights, rows, rows))
 
 
-def _linear(space: TaylorSpace, count: int) -> list[int]:
+def _find_linear_monomials(space: TaylorSpace, count: int) -> list[int]:
     """Return the indices of the first ``count`` variables of a space among its monomials."""
     return [space.index[tuple(unit)] for unit in np.eye(space.nu, dtype=int)[:count].tolist()]
 
 
-def _quadratic(space: TaylorSpace, value: Array, gradient: Array, hessian: Array) -> Array:
+def _build_quadratic(space: TaylorSpace, value: Array, gradient: Array, hessian: Array) -> Array:
     """The coefficients ``(..., M)`` of ``value + gradient'd + d'hessian d / 2`` in the first variables of a space."""
     coefficients = np.zeros((*value.shape, space.size))
     coefficients[..., 0] = value
-    coefficients[..., _linear(space, gradient.shape[-1])] = gradient
+    coefficients[..., _find_linear_monomials(space, gradient.shape[-1])] = gradient
     units = np.eye(space.nu, dtype=int)[: gradient.shape[-1]]
     for i, first in enumerate(units):
         for j, second in enumerate(units):

@@ -248,19 +248,19 @@ class ClosedLoop:
         grid: ``(k, d, 1 + Q)``."""
         pieces = self.grid.locate(times) if pieces is None else pieces
         nodes, drives = self.path(x)
-        flow, input_flow = self._flows_in(pieces, np.clip(times - self.grid.breakpoints[pieces], 0.0, None))
+        flow, input_flow = self._compute_flows(pieces, np.clip(times - self.grid.breakpoints[pieces], 0.0, None))
         return np.asarray(flow @ nodes[pieces] + input_flow @ drives[pieces])
 
-    def _enclosed(self, x: Array, times: Array, pieces: np.ndarray) -> tuple[Array, Array]:
+    def _enclose_states(self, x: Array, times: Array, pieces: np.ndarray) -> tuple[Array, Array]:
         """The `states` at ``times (k,)`` on these pieces, and their rounding error under any deviation, ``(k, d)``."""
         nodes, drives = self.path(x)
-        flow, input_flow = self._flows_in(pieces, np.clip(times - self.grid.breakpoints[pieces], 0.0, None))
-        sizes, drive_sizes, errors = self._rounded(x)
+        flow, input_flow = self._compute_flows(pieces, np.clip(times - self.grid.breakpoints[pieces], 0.0, None))
+        sizes, drive_sizes, errors = self._bound_rounding_errors(x)
         magnitudes = np.abs(flow) @ sizes[pieces, :, None] + np.abs(input_flow) @ drive_sizes[pieces, :, None]
         rounding_errors = ROUND_OFF * magnitudes + np.abs(flow) @ errors[pieces, :, None]
         return np.asarray(flow @ nodes[pieces] + input_flow @ drives[pieces]), rounding_errors[:, :, 0]
 
-    def _rounded(self, x: Array) -> tuple[Array, Array, Array]:
+    def _bound_rounding_errors(self, x: Array) -> tuple[Array, Array, Array]:
         """The sizes of the nodes ``(L + 1, d)`` and of what drives them ``(L, ..)`` under any deviation, and the
         rounding error of every node.
 
@@ -268,7 +268,7 @@ class ClosedLoop:
         that changes with time are counted by its motion.
         """
         key = x.tobytes()
-        if key not in self._errors:
+        if key not in self._rounding_bounds:
             (nodes, drives), radii = self.path(x), np.concatenate([[1.0], self.spread.radii])
             sizes, drive_sizes = np.abs(nodes) @ radii, np.abs(drives) @ radii
             errors = np.zeros_like(sizes)
@@ -285,12 +285,12 @@ class ClosedLoop:
                     errors[piece + 1] = np.einsum(
                         "kij,kj->i", np.abs(transitions[: piece + 1]), step_errors[: piece + 1]
                     )
-            self._errors.clear()
-            self._errors[key] = sizes, drive_sizes, errors
-        return self._errors[key]
+            self._rounding_bounds.clear()
+            self._rounding_bounds[key] = sizes, drive_sizes, errors
+        return self._rounding_bounds[key]
 
     @cached_property
-    def _errors(self) -> dict[bytes, tuple[Array, Array, Array]]:
+    def _rounding_bounds(self) -> dict[bytes, tuple[Array, Array, Array]]:
         return {}
 
     def sizes(self, x: Array, rows: Array) -> Array:
@@ -298,7 +298,7 @@ class ClosedLoop:
         along = rows @ self.path(x)[0]
         return np.asarray(np.maximum(self.height(along), self.height(-along)).max(axis=0))
 
-    def _flows_in(self, pieces: np.ndarray, durations: Array) -> tuple[Array, Array]:
+    def _compute_flows(self, pieces: np.ndarray, durations: Array) -> tuple[Array, Array]:
         """Return the matrices that propagate a state, and the terms that drive it, over the first ``durations (k,)`` of
         ``pieces (k,)`` of the grid."""
         if self.motion is None:
@@ -341,11 +341,11 @@ class ClosedLoop:
         support function of a chord lies below the chord of the support functions.
         """
         pieces = self.grid.locate((lower + upper) / 2)
-        states, rounding_errors = self._enclosed(x, np.concatenate([lower, upper]), np.tile(pieces, 2))
+        states, rounding_errors = self._enclose_states(x, np.concatenate([lower, upper]), np.tile(pieces, 2))
         ends, rounding_errors = np.split(states, 2), np.maximum(*np.split(rounding_errors, 2))
         along = [H @ end for end in ends]
         radii = np.concatenate([[1.0], self.spread.radii])
-        chord_distances = self._late(x, H, lower, upper - lower, pieces, ends[0])
+        chord_distances = self._bound_chord_errors(x, H, lower, upper - lower, pieces, ends[0])
         sizes = np.abs(H) @ np.maximum(np.abs(ends[0]), np.abs(ends[1]))
         for end, addition in zip(along, beside or (), strict=False):
             end[..., : addition.shape[-1]] += addition
@@ -353,7 +353,7 @@ class ClosedLoop:
         heights, error_bounds = [self.height(functional) for functional in along], ROUND_OFF * (sizes @ radii)
         error_bounds += (np.abs(H) @ rounding_errors[:, :, None])[:, :, 0]
         if self.motion is not None:
-            error_bounds += (np.abs(H) @ self._left_out(x, self.motion)[pieces][:, :, None])[:, :, 0]
+            error_bounds += (np.abs(H) @ self._bound_transition_errors(x, self.motion)[pieces][:, :, None])[:, :, 0]
         if self.measurable is not None:
             origins = self.origin[pieces]
             inside = (self.measurable.within(end, H, origins) for end in (lower, upper))
@@ -362,7 +362,9 @@ class ClosedLoop:
         bounds = np.maximum(*heights) + chord_distances + error_bounds
         return np.where(np.isnan(bounds), np.inf, bounds), chord_distances
 
-    def _late(self, x: Array, H: Array, start: Array, width: Array, pieces: np.ndarray, states: Array) -> Array:
+    def _bound_chord_errors(
+        self, x: Array, H: Array, start: Array, width: Array, pieces: np.ndarray, states: Array
+    ) -> Array:
         """Bound the distance of ``H x(t)`` from its chord on every cell ``[start, start + width]``, for any deviations:
         ``(k, r)``. Each cell lies within one of the ``pieces (k,)`` of the grid and begins in
         ``states (k, d, 1 + Q)``."""
@@ -387,7 +389,7 @@ class ClosedLoop:
             )
         return np.asarray((h[..., 0] ** 2 / 8.0) * ((second + tail) @ radii))
 
-    def _left_out(self, x: Array, motion: VaryingMotion) -> Array:
+    def _bound_transition_errors(self, x: Array, motion: VaryingMotion) -> Array:
         """Bound the error that inexact transitions of a system that changes with time cause in the state on every
         piece, ``(L, d)``."""
         nodes, inputs = self.path(x)
@@ -520,12 +522,12 @@ class ClosedLoop:
         """Return the entries of `Answers.effect` that belong to one piece: positions in ``(m, Q)``, variables and
         values."""
         position, variable, value = self.answers.effect
-        first, last = self._bounds_of_pieces[piece : piece + 2]
+        first, last = self._piece_offsets[piece : piece + 2]
         m, Q = self.answers.shape[1], self.spread.size
         return position[first:last] - piece * m * Q, variable[first:last], value[first:last]
 
     @cached_property
-    def _bounds_of_pieces(self) -> np.ndarray:
+    def _piece_offsets(self) -> np.ndarray:
         """Positions ``(K + 1,)`` at which the entries of `Answers.effect` of every piece begin; the entries are sorted
         by piece."""
         K, m, Q, _ = self.answers.shape

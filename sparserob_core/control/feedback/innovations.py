@@ -47,9 +47,9 @@ def innovations_seen(
     if model is None:
         return initial_innovations
     if pieces is not None:
-        return np.concatenate([_measurable(response, control, pieces), initial_innovations], axis=2)
+        return np.concatenate([_build_measurable_innovations(response, control, pieces), initial_innovations], axis=2)
     grid, steps = response.grid, response.steps(KNOWN)
-    block, pushes = _pushes(response, model)
+    block, pushes = _build_disturbance_matrices(response, model)
     commanded = grid.commanded(control.breakpoints)
     D = np.zeros((K, d, model.block_count, pushes.shape[2]))
     for piece in range(int(np.searchsorted(commanded, K - 1))):  # what happens on the last one is seen when all is over
@@ -60,7 +60,7 @@ def innovations_seen(
     return np.concatenate([D.reshape(K, d, -1), initial_innovations], axis=2)
 
 
-def _pushes(response: Response, model: DisturbanceModel) -> tuple[np.ndarray, Array]:
+def _build_disturbance_matrices(response: Response, model: DisturbanceModel) -> tuple[np.ndarray, Array]:
     """Return the block that acts on every piece of the grid, ``(L,)``, and the state at the end of the piece per unit
     of each of its entries, ``(L, d, mw)``."""
     grid, steps = response.grid, response.steps(KNOWN)
@@ -92,7 +92,7 @@ def unfelt(
     """
     grid, steps, first = response.grid, response.steps(KNOWN), 0
     if model is not None:
-        block, pushes = _pushes(response, model)
+        block, pushes = _build_disturbance_matrices(response, model)
         first, pushes = model.block_count * far.size, pushes * far
         columns = block[:, None] * far.size + np.arange(far.size)
     nodes = np.zeros((response.initial_state.size, first + begun.size))
@@ -107,7 +107,7 @@ def unfelt(
     return ~is_felt
 
 
-def _measurable(response: Response, control: Dictionary, pieces: MeasurablePieces) -> Array:
+def _build_measurable_innovations(response: Response, control: Dictionary, pieces: MeasurablePieces) -> Array:
     """Return the matrices ``D`` of `innovations_seen` for measurable disturbances, whose deviations are their effects
     on the state at the end of every piece."""
     grid, K = response.grid, control.pieces
@@ -199,7 +199,7 @@ def answers(D: Array, mask: np.ndarray, channels: int, seen: Array | None = None
         Variables of the gains.
     """
     K, d, Q = D.shape
-    groups = list(_alike(D, mask, D if seen is None else seen))
+    groups = list(_group_pieces(D, mask, D if seen is None else seen))
     sizes = np.zeros((K, 1 + max((group.cluster for group in groups), default=0)), dtype=int)
     for group in groups:
         sizes[group.pieces, group.cluster] = channels * group.free.size
@@ -213,18 +213,22 @@ def answers(D: Array, mask: np.ndarray, channels: int, seen: Array | None = None
         variables = starts[group.pieces, group.cluster][:, None, None] + i * r + np.arange(r)
         piece[variables], channel[variables], entry[variables] = k, i, group.free
         rows, cols = np.nonzero(group.Z)
-        effect.append(_listed((k * channels + i) * Q + group.columns[cols], variables[..., rows], group.Z[rows, cols]))
+        effect.append(
+            _flatten_entries((k * channels + i) * Q + group.columns[cols], variables[..., rows], group.Z[rows, cols])
+        )
         rows, cols = np.nonzero(group.G)
         positions = ((k * K + group.seen[cols // d]) * channels + i) * d + cols % d
-        gain.append(_listed(positions, variables[..., rows], group.G[rows, cols]))
-    return Answers((K, channels, Q, d), piece, channel, entry, np.ones(entry.size), _joined(effect), _joined(gain))
+        gain.append(_flatten_entries(positions, variables[..., rows], group.G[rows, cols]))
+    return Answers(
+        (K, channels, Q, d), piece, channel, entry, np.ones(entry.size), _join_entries(effect), _join_entries(gain)
+    )
 
 
 @final
 @dataclass(frozen=True, eq=False)
-class _Alike:
+class _PieceGroup:
     """``pieces`` of the control that answer the same breakpoints ``seen`` of one ``cluster``, by number, and
-    `_coordinates` of these."""
+    `_compute_coordinates` of these."""
 
     pieces: np.ndarray
     cluster: int
@@ -235,31 +239,31 @@ class _Alike:
     G: Array
 
 
-def _alike(D: Array, mask: np.ndarray, every: Array) -> Iterator[_Alike]:
+def _group_pieces(D: Array, mask: np.ndarray, every: Array) -> Iterator[_PieceGroup]:
     """Yield the pieces of the control that respond to any innovation, cluster by cluster."""
     plain = np.array_equal(D, every)
-    for cluster_number, cluster in enumerate(_clusters((D != 0.0).any(axis=1))):
+    for cluster_number, cluster in enumerate(_cluster_breakpoints((D != 0.0).any(axis=1))):
         choices, choice_of_piece = np.unique(mask[:, cluster], axis=0, return_inverse=True)
         for choice, is_answered in enumerate(choices):
             if not is_answered.any():
                 continue
             breakpoints = cluster[is_answered]
-            columns, free, Z, G = _coordinates(D[breakpoints])
+            columns, free, Z, G = _compute_coordinates(D[breakpoints])
             if not plain:
                 flat = every[breakpoints].reshape(-1, every.shape[2])
                 columns = np.flatnonzero(flat.any(axis=0))
                 Z = G @ flat[:, columns]
             if free.size:
-                yield _Alike(
+                yield _PieceGroup(
                     np.flatnonzero(choice_of_piece.ravel() == choice), cluster_number, breakpoints, columns, free, Z, G
                 )
 
 
-def _listed(at: Array, which: Array, value: Array) -> tuple[np.ndarray, np.ndarray, Array]:
+def _flatten_entries(at: Array, which: Array, value: Array) -> tuple[np.ndarray, np.ndarray, Array]:
     return at.ravel(), which.ravel(), np.broadcast_to(value, which.shape).ravel()
 
 
-def _clusters(where: np.ndarray) -> list[np.ndarray]:
+def _cluster_breakpoints(where: np.ndarray) -> list[np.ndarray]:
     """The breakpoints ``(K, Q)`` that see something in common, together; those that see nothing are left out."""
     clusters: list[tuple[set[int], np.ndarray]] = []
     for j in np.flatnonzero(where.any(axis=1)):
@@ -273,7 +277,7 @@ def _clusters(where: np.ndarray) -> list[np.ndarray]:
     return [np.array(sorted(members)) for members, _ in sorted(clusters, key=lambda cluster: min(cluster[0]))]
 
 
-def _coordinates(seen: Array) -> tuple[np.ndarray, np.ndarray, Array, Array]:
+def _compute_coordinates(seen: Array) -> tuple[np.ndarray, np.ndarray, Array, Array]:
     """Return coordinates of the effects of gains on innovations ``seen (J, d, Q)``.
 
     Returns
@@ -305,7 +309,7 @@ def _coordinates(seen: Array) -> tuple[np.ndarray, np.ndarray, Array, Array]:
     return columns, columns[independent], Z * scale / scale[independent][:, None], inverse / scale[independent][:, None]
 
 
-def _joined(parts: list[tuple[np.ndarray, np.ndarray, Array]]) -> tuple[np.ndarray, np.ndarray, Array]:
+def _join_entries(parts: list[tuple[np.ndarray, np.ndarray, Array]]) -> tuple[np.ndarray, np.ndarray, Array]:
     """Positions, variables and values, in the order of the variables."""
     if not parts:
         return np.zeros(0, dtype=int), np.zeros(0, dtype=int), np.zeros(0)

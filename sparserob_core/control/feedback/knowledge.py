@@ -157,14 +157,14 @@ class OfDisturbances(Knowledge):
 
     def gives(self, signals: Array, beside: Array) -> Array:
         """Return the contribution of the signal's own blocks, plus that of the worst blocks from every report on."""
-        return sums(self.by_block(self.N * signals[:, None]).sum(axis=3)) + self._pushed
+        return sums(self.by_block(self.N * signals[:, None]).sum(axis=3)) + self._later_support_values
 
     def changed(self, signal: Array, row: int, report: int) -> tuple[float, Array]:
         """Return the largest contribution to the row, and the signal with the blocks that are the worst for the row
         from ``report`` on."""
         stop, start, z = self.begun[row] * self.width, report * self.width, signal.copy()
         z[start:stop] = self.worst[row, start:stop]
-        return float(self.N[row, :start] @ z[:start]) + float(self._pushed[row, report]), z
+        return float(self.N[row, :start] @ z[:start]) + float(self._later_support_values[row, report]), z
 
     def leaving(
         self, signals: Array, own: Array, answered: Array | None, scale: float, units: Array
@@ -175,8 +175,8 @@ class OfDisturbances(Knowledge):
         closed = np.where(np.abs(closed) > NONE * np.abs(self.N), closed, self.N * NONE)
         worst = extreme(self.spread, closed)
         past_values = sums(self.by_block(self.N * signals[:, None]).sum(axis=-1))
-        later_responses = self._after(responses * signals[:, None])
-        excess = own[:, :, None] + scale * (past_values - later_responses + self._after(closed * worst))
+        later_responses = self._sum_later_blocks(responses * signals[:, None])
+        excess = own[:, :, None] + scale * (past_values - later_responses + self._sum_later_blocks(closed * worst))
         excess = excess / units[:, None]
         excess[:, :, -1] = -np.inf
         excess = np.where(np.arange(excess.shape[2]) < self.begun[:, None], excess, -np.inf)
@@ -192,12 +192,12 @@ class OfDisturbances(Knowledge):
         """Return the deviations, which are the signal."""
         return z
 
-    def _after(self, a: Array) -> Array:
+    def _sum_later_blocks(self, a: Array) -> Array:
         past = sums(self.by_block(a).sum(axis=-1))
         return np.asarray(past[..., -1:] - past)
 
     @cached_property
-    def _pushed(self) -> Array:
+    def _later_support_values(self) -> Array:
         """The most that the disturbance from every block on gives to every row, ``(R, blocks + 1)``."""
         gives = self.by_block(self.N * self.worst).sum(axis=2)
         return sums(gives[:, ::-1])[:, ::-1]
@@ -251,33 +251,33 @@ class OfOutputs(Knowledge):
     limit: float = np.inf
     passed: Callable[[], bool] = lambda: False
     work: float = 0.0
-    _held: dict[tuple[bytes, int], tuple[float, Array]] = field(default_factory=dict, repr=False)
+    _worst_cases: dict[tuple[bytes, int], tuple[float, Array]] = field(default_factory=dict, repr=False)
 
     def __post_init__(self) -> None:
-        self._linear, (H, h) = Growing(), self.hidden
-        self._imposed: bytes | None = None
+        self._program, (H, h) = Growing(), self.hidden
+        self._imposed_history: bytes | None = None
         for entries, count, convex, middle in self.spread.parts:
             low, high = np.full(convex.dimension, -np.inf), np.full(convex.dimension, np.inf)
             if convex.is_box:
                 box = convex.bounding_box()
                 low, high = box.lower - middle, box.upper - middle
-            units = self._far[entries]
+            units = self._column_units[entries]
             none = np.zeros(units.size)
-            columns = self._linear.variables(np.tile(low, count) / units, np.tile(high, count) / units, none)
+            columns = self._program.variables(np.tile(low, count) / units, np.tile(high, count) / units, none)
             flat = None if convex.is_box else about(convex)
             if flat is None:
                 continue
             row, channel = np.nonzero(flat[0])
             for copy in columns.reshape(count, -1):
-                coefficients = flat[0][row, channel] * self._far[copy[channel]] / flat[1][row]
+                coefficients = flat[0][row, channel] * self._column_units[copy[channel]] / flat[1][row]
                 none = np.full(flat[1].size, -np.inf)
-                self._linear.rows([(row, copy[channel], coefficients)], none, np.ones(flat[1].size))
-        self._rows = np.zeros((self.reports, h.size), dtype=int)
+                self._program.rows([(row, copy[channel], coefficients)], none, np.ones(flat[1].size))
+        self._row_numbers = np.zeros((self.reports, h.size), dtype=int)
         for report, output_matrix in enumerate(self.C):
-            coefficients = -(H @ output_matrix) * self._far / h[:, None]
+            coefficients = -(H @ output_matrix) * self._column_units / h[:, None]
             row, column = np.nonzero(coefficients)
             free = np.full(h.size, np.inf)
-            self._rows[report] = self._linear.rows([(row, column, coefficients[row, column])], -free, free)
+            self._row_numbers[report] = self._program.rows([(row, column, coefficients[row, column])], -free, free)
 
     @staticmethod
     def of(
@@ -367,8 +367,8 @@ class OfOutputs(Knowledge):
             for report in range(1, self.reports + 1):
                 history = self.history(signal, report)
                 for row in np.flatnonzero(bounds[:, report] + offset[:, report] > 0.0).tolist():
-                    if (history, row) in self._held:
-                        bounds[row, report], is_known[row, report] = self._worst(signal, row, report)[0], True
+                    if (history, row) in self._worst_cases:
+                        bounds[row, report], is_known[row, report] = self._find_worst_case(signal, row, report)[0], True
             is_known[:, 0] = True
             signal_values[is_known] = bounds[is_known]
             bounds = np.minimum.accumulate(bounds, axis=1)  # what is hidden for longer gives no more
@@ -378,22 +378,22 @@ class OfOutputs(Knowledge):
                 row, report = divmod(flat_index, self.reports + 1)
                 if not promise[row, report] > 0.0 or (is_above and solved >= LOOKED):
                     break
-                signal_values[row, report] = self._worst(signal, row, report)[0]
+                signal_values[row, report] = self._find_worst_case(signal, row, report)[0]
                 is_above, solved = is_above or bool(signal_values[row, report] + offset[row, report] > 0.0), solved + 1
         return values
 
     def changed(self, signal: Array, row: int, report: int) -> tuple[float, Array]:
         """Return the largest contribution to the row, and the signal of the worst deviations that a noise within its
         set hides for ``report`` reports."""
-        worst = self._worst(signal, row, report)
+        worst = self._find_worst_case(signal, row, report)
         return worst[0], self.signal(worst[1], signal, np.zeros(self.C.shape[:2]), report)
 
-    def _worst(self, signal: Array, row: int, report: int) -> tuple[float, Array]:
+    def _find_worst_case(self, signal: Array, row: int, report: int) -> tuple[float, Array]:
         key = self.history(signal, report), row
-        if key not in self._held:
+        if key not in self._worst_cases:
             worst = self.along(self.N[row], signal, report)
-            self._held[key] = (-np.inf, np.zeros(0)) if worst is None else worst
-        return self._held[key]
+            self._worst_cases[key] = (-np.inf, np.zeros(0)) if worst is None else worst
+        return self._worst_cases[key]
 
     def along(self, direction: Array, signal: Array, reports: int) -> tuple[float, Array] | None:
         """Return the largest value of ``direction (Q,)`` over all deviations whose first outputs can be those of a
@@ -404,20 +404,20 @@ class OfOutputs(Knowledge):
         if self.work > self.limit or self.passed():
             return None
         history = self.history(signal, reports)
-        if history != self._imposed:
+        if history != self._imposed_history:
             H, h = self.hidden
             limits = 1.0 - self.outputs(signal) @ H.T / h
             limits[reports:] = np.inf
-            self._linear.limit(self._rows.ravel(), limits.ravel())
-            self._imposed = history
-        cost = -direction * self._far
+            self._program.limit(self._row_numbers.ravel(), limits.ravel())
+            self._imposed_history = history
+        cost = -direction * self._column_units
         cost = cost / (float(np.abs(cost).max(initial=0.0)) or 1.0)
-        self._linear.highs.changeColsCost(cost.size, np.arange(cost.size, dtype=np.int32), cost)
-        is_solved, _, x, _ = self._linear.solve()
-        self.work += self._linear.work + self.C.size
+        self._program.highs.changeColsCost(cost.size, np.arange(cost.size, dtype=np.int32), cost)
+        is_solved, _, x, _ = self._program.solve()
+        self.work += self._program.work + self.C.size
         if not is_solved:
             return None
-        z = self._inside(x * self._far)
+        z = self._move_into_set(x * self._column_units)
         H, h = self.hidden
         noise_values = (self.outputs(signal) - self.C @ z)[:reports] @ H.T
         return (float(direction @ z), z) if (noise_values <= KEPT * h).all() else None
@@ -431,9 +431,9 @@ class OfOutputs(Knowledge):
         if z.size > self.N.shape[1]:
             return z
         z = np.concatenate([z, np.zeros(self.N.shape[1] - z.size)])
-        return self.signal(z, self.nominal, self._nearest(-(self.C @ z)), 0)
+        return self.signal(z, self.nominal, self._clip_noise(-(self.C @ z)), 0)
 
-    def _nearest(self, noise: Array) -> Array:
+    def _clip_noise(self, noise: Array) -> Array:
         """Return the noise ``(J, p)`` in a box that is nearest to ``noise``; the middle of a set that is no box."""
         radii = ROOM * self.noise.radii.reshape(noise.shape)
         return np.clip(noise, -radii, radii) if self.noise.is_box else np.zeros(noise.shape)
@@ -471,18 +471,18 @@ class OfOutputs(Knowledge):
             noise = ROOM * extreme(self.noise, acting)
             excess = (offset + scale * (worst[0] + float(acting @ noise))) / units[row]
             if excess > NONE:
-                nearest_noise = self._nearest(self.outputs(signals[number]) - self.C @ worst[1])
+                nearest_noise = self._clip_noise(self.outputs(signals[number]) - self.C @ worst[1])
                 noise_part = np.where(acting.reshape(J, p) == 0.0, nearest_noise, noise.reshape(J, p))
                 children.append((excess, number, report, self.signal(worst[1], signals[number], noise_part, report)))
         for _, number, report, child in sorted(children, key=lambda item: -item[0]):
             yield number, report, child
 
     @cached_property
-    def _far(self) -> Array:
+    def _column_units(self) -> Array:
         radii = self.spread.radii
         return np.where(radii > 0.0, radii, 1.0)
 
-    def _inside(self, z: Array) -> Array:
+    def _move_into_set(self, z: Array) -> Array:
         """Return the deviations moved back into their set, which rounding may have left."""
         for entries, _, convex, middle in self.spread.parts if z.size else ():
             if convex.is_box:

@@ -201,10 +201,10 @@ class MeasurablePieces:
         ``time``, and the middle for the rest of the piece.
         """
         grid = self.functionals.response.grid
-        arcs, ends, values = self._arcs(deviation), [], []
+        arcs, ends, values = self._compose_arcs(deviation), [], []
         for piece, (start, stop) in enumerate(zip(grid.breakpoints[:-1], grid.breakpoints[1:], strict=True)):
             if direction is not None and piece == over and time > start:
-                arc = self._last(piece, time).best(direction)
+                arc = self._build_partial_zonoid(piece, time).best(direction)
                 ends += [start + arc.ends[:-1] * (time - start), [min(time, stop)]]
                 values.append(arc.values)
                 if time < stop:
@@ -235,11 +235,11 @@ class MeasurablePieces:
         """Return the deviation ``(Q,)`` of the `signal` of a given deviation; the two differ by the residual of
         composing the signal."""
         effects = np.zeros(self.size)
-        for piece, (zonoid, arc) in enumerate(zip(self.zonoids, self._arcs(deviation), strict=True)):
+        for piece, (zonoid, arc) in enumerate(zip(self.zonoids, self._compose_arcs(deviation), strict=True)):
             effects[self.at(piece)[0]] = zonoid.reached(arc)
         return effects
 
-    def _arcs(self, deviation: Array) -> list[Arc]:
+    def _compose_arcs(self, deviation: Array) -> list[Arc]:
         """The signals on all pieces that have a deviation ``(Q,)``."""
         self.compose([deviation])
         zero_arc = Arc(np.ones(1), np.zeros((1, self.middle.size)))
@@ -248,7 +248,7 @@ class MeasurablePieces:
             self.composed.get((id(zonoid), point), zero_arc) for zonoid, point in zip(self.zonoids, points, strict=True)
         ]
 
-    def _last(self, piece: int, time: float) -> Zonoid:
+    def _build_partial_zonoid(self, piece: int, time: float) -> Zonoid:
         """Return the set of effects of a piece on the state at a time within it, in the coordinates of the state."""
         model, identity = self.functionals.disturbance, np.eye(self.states.size)
         assert model is not None
@@ -284,7 +284,7 @@ class VaryingPieces(MeasurablePieces):
         """The system between all marks."""
         return self.errors.motion
 
-    def _alone(self, piece: int) -> Array:
+    def _build_unit_command(self, piece: int) -> Array:
         """The command that is 1 on one piece alone, ``(m, L)``."""
         command = np.zeros((self.errors.shares.size, self.functionals.response.grid.pieces))
         command[:, piece] = 1.0
@@ -297,21 +297,23 @@ class VaryingPieces(MeasurablePieces):
         Results are kept, since a bound over cells asks for their ends more than once.
         """
         key = b"".join(array.tobytes() for array in (times, H, pieces))
-        if key in self._enclosed:
-            return self._enclosed[key]
-        oriented = H if self.errors.bound is not None else H * _turned(H)[:, None]
+        if key in self._enclosures:
+            return self._enclosures[key]
+        oriented = H if self.errors.bound is not None else H * _compute_leading_signs(H)[:, None]
         rows, row_inverse = np.unique(oriented + 0.0, axis=0, return_inverse=True)  # of a box opposite rows are one
         enclosures, r = np.zeros((times.size, len(rows), 2)), len(rows)
         for piece in np.unique(pieces):
             indices = np.flatnonzero(pieces == piece)
             distinct, time_inverse = np.unique(times[indices], return_inverse=True)
-            bounds = self.errors.enclosed(self._alone(piece), np.repeat(distinct, r), np.tile(rows, (distinct.size, 1)))
+            bounds = self.errors.enclosed(
+                self._build_unit_command(piece), np.repeat(distinct, r), np.tile(rows, (distinct.size, 1))
+            )
             enclosures[indices] = bounds.reshape(distinct.size, r, 2)[time_inverse.reshape(-1)]
-        remember(self._enclosed, key, enclosures[:, row_inverse.reshape(-1)], ENCLOSED_KEPT)
-        return self._enclosed[key]
+        remember(self._enclosures, key, enclosures[:, row_inverse.reshape(-1)], ENCLOSED_KEPT)
+        return self._enclosures[key]
 
     @cached_property
-    def _enclosed(self) -> dict[bytes, Array]:
+    def _enclosures(self) -> dict[bytes, Array]:
         return {}
 
     def within(self, times: Array, H: Array, pieces: np.ndarray | None = None) -> Array:
@@ -322,7 +324,7 @@ class VaryingPieces(MeasurablePieces):
         deviations = np.zeros((lower.size, H.shape[0]))
         for piece in np.unique(pieces):
             indices = np.flatnonzero(pieces == piece)
-            cell_support = VaryingExecutionCellSupport(self.errors, self._alone(piece), H, self.motion)
+            cell_support = VaryingExecutionCellSupport(self.errors, self._build_unit_command(piece), H, self.motion)
             deviations[indices] = cell_support.deviation(lower[indices], upper[indices] - lower[indices])
         widths = np.max([np.ptp(self.enclosed(end, H, pieces), axis=2) for end in (lower, upper)], axis=0)
         return np.asarray((deviations + widths / 2.0) * OUTWARD)
@@ -359,7 +361,7 @@ class VaryingPieces(MeasurablePieces):
         return Pushes.joined(kernels[::-1], (until - ends)[::-1], counts[::-1].tolist())
 
 
-def _turned(H: Array) -> Array:
+def _compute_leading_signs(H: Array) -> Array:
     """The signs ``(r,)`` with which the first numbers of ``H (r, d)`` other than 0 are positive."""
     first = H[np.arange(len(H)), (H != 0.0).argmax(axis=1)]
     return np.where(first < 0.0, -1.0, 1.0)

@@ -112,12 +112,12 @@ class Tree:
     work: float = 0.0
     signals: list[Array] = field(default_factory=list)
     _columns: list[np.ndarray] = field(default_factory=list)
-    _groups: dict[tuple[int, bytes], np.ndarray] = field(default_factory=dict)
-    _imposed: set[tuple[int, int, bytes]] = field(default_factory=set)
-    _order: list[tuple[int, int, int]] = field(default_factory=list)
-    _numbers: list[int] = field(default_factory=list)
-    _own: dict[tuple[int, bytes], np.ndarray] = field(default_factory=dict)
-    _efforts: list[int] = field(default_factory=list)
+    _group_columns: dict[tuple[int, bytes], np.ndarray] = field(default_factory=dict)
+    _imposed_keys: set[tuple[int, int, bytes]] = field(default_factory=set)
+    _imposed_rows: list[tuple[int, int, int]] = field(default_factory=list)
+    _row_numbers: list[int] = field(default_factory=list)
+    _group_size_columns: dict[tuple[int, bytes], np.ndarray] = field(default_factory=dict)
+    _effort_rows: list[int] = field(default_factory=list)
 
     def __post_init__(self) -> None:
         m, K = self.prices.shape
@@ -125,23 +125,23 @@ class Tree:
         low, high = -self.control.support(-axes), self.control.support(axes)
         radii = np.maximum(np.abs(low), np.abs(high))
         # columns are controls in this unit, and costs in that of the largest
-        self._far = np.where(radii > 0.0, radii, 1.0)
-        self._low, self._high = low / self._far, high / self._far
-        largest = float((self.prices * self._far[:, None]).sum())
-        self._unit = largest if largest > 0.0 else 1.0
-        self._linear = Growing()
+        self._control_units = np.where(radii > 0.0, radii, 1.0)
+        self._lower_bounds, self._upper_bounds = low / self._control_units, high / self._control_units
+        largest = float((self.prices * self._control_units[:, None]).sum())
+        self._cost_unit = largest if largest > 0.0 else 1.0
+        self._program = Growing()
         upper, price = (0.0, 0.0) if self.highest is None else (self.highest, -1.0)
-        self._linear.variables(np.zeros(1), np.array([upper]), np.array([price]))
-        self._sizes = np.zeros((m, 0), dtype=int)
+        self._program.variables(np.zeros(1), np.array([upper]), np.array([price]))
+        self._size_columns = np.zeros((m, 0), dtype=int)
         if self.priced:
-            self._charges, reach = self._rates.ravel(), np.ones(m * K)
+            self._charges, reach = self._column_prices.ravel(), np.ones(m * K)
             if self.cost == "worst":
                 self._charges, reach = np.ones(1), np.array([2.0])
-            self._charged = self._linear.variables(np.zeros(reach.size), reach, self._charges)
+            self._charged_columns = self._program.variables(np.zeros(reach.size), reach, self._charges)
             if self.cost != "worst":
-                self._sizes = self._charged.reshape(m, K)
-            entries = [(np.zeros(reach.size, dtype=int), self._charged, self._charges)]
-            self._budget = int(self._linear.rows(entries, np.array([-np.inf]), np.array([np.inf]))[0])
+                self._size_columns = self._charged_columns.reshape(m, K)
+            entries = [(np.zeros(reach.size, dtype=int), self._charged_columns, self._charges)]
+            self._budget_row = int(self._program.rows(entries, np.array([-np.inf]), np.array([np.inf]))[0])
 
     @property
     def priced(self) -> bool:
@@ -149,30 +149,30 @@ class Tree:
         return self.highest is None
 
     @cached_property
-    def _rates(self) -> Array:
+    def _column_prices(self) -> Array:
         """The prices of the columns, ``(m, K)``."""
-        return np.asarray(self.prices * self._far[:, None] / self._unit)
+        return np.asarray(self.prices * self._control_units[:, None] / self._cost_unit)
 
     @cached_property
-    def _flat(self) -> tuple[Array, Array] | None:
+    def _halfspaces(self) -> tuple[Array, Array] | None:
         """Half-spaces of the columns of a piece, each in the unit of what it can be; the bounds of a box are none."""
         flat = None if self.control.is_box else self.control.halfspaces()
         if flat is None:
             return None
-        H = flat[0] * self._far
+        H = flat[0] * self._control_units
         size = np.maximum(np.abs(H).sum(axis=1), np.finfo(float).tiny)
         return H / size[:, None], flat[1] / size
 
     @cached_property
-    def _moves(self) -> Array:
+    def _control_coefficients(self) -> Array:
         """Coefficients of the columns in the rows, ``(R, m, K)``."""
-        return np.asarray(self.sampled.T * self._far[:, None])
+        return np.asarray(self.sampled.T * self._control_units[:, None])
 
     @cached_property
     def units(self) -> Array:
         """Largest possible size of every row, ``(R,)``, by which the row is divided."""
         s = self.sampled
-        size = np.abs(self._moves).sum(axis=(1, 2)) + self.knowledge.most + np.abs(s.b)
+        size = np.abs(self._control_coefficients).sum(axis=(1, 2)) + self.knowledge.most + np.abs(s.b)
         return np.where(size > 0.0, size, 1.0)
 
     def add(self, z: Array) -> bool:
@@ -181,39 +181,41 @@ class Tree:
         if any(np.array_equal(z, signal) for signal in self.signals):
             return False
         m, K = self.prices.shape
-        columns, nominal, flat = np.zeros((m, K), dtype=int), not self.signals, self._flat
+        columns, nominal, flat = np.zeros((m, K), dtype=int), not self.signals, self._halfspaces
         for k in range(K):
-            key = self._known(z, k)
-            is_new = key not in self._groups
+            key = self._compute_information_key(z, k)
+            is_new = key not in self._group_columns
             if is_new:
-                self._groups[key] = self._linear.variables(self._low, self._high, np.zeros(m))
-            columns[:, k] = self._groups[key]
+                self._group_columns[key] = self._program.variables(self._lower_bounds, self._upper_bounds, np.zeros(m))
+            columns[:, k] = self._group_columns[key]
             if is_new and flat is not None:
                 row, channel = np.nonzero(flat[0])
-                self._rows([(row, columns[channel, k], flat[0][row, channel])], flat[1])
+                self._add_rows([(row, columns[channel, k], flat[0][row, channel])], flat[1])
             if is_new and self.priced and (nominal or self.cost != "nominal"):
                 channels = np.arange(m)
                 if self.cost == "worst":
-                    self._own[key] = self._linear.variables(np.zeros(m), np.ones(m), np.zeros(m))
-                sizes = self._own[key] if self.cost == "worst" else self._sizes[:, k]
+                    self._group_size_columns[key] = self._program.variables(np.zeros(m), np.ones(m), np.zeros(m))
+                sizes = self._group_size_columns[key] if self.cost == "worst" else self._size_columns[:, k]
                 for sign in (1.0, -1.0):
-                    self._rows(
+                    self._add_rows(
                         [(channels, columns[:, k], np.full(m, sign)), (channels, sizes, -np.ones(m))], np.zeros(m)
                     )
         if self.priced and self.cost == "worst":
-            size_variables = [self._own[self._known(z, k)] for k in range(K)]
-            column = np.concatenate([*size_variables, self._charged])
-            self._efforts.append(
-                self._rows([(np.zeros(column.size, dtype=int), column, np.append(self._rates.T, -1.0))], np.zeros(1))
+            size_variables = [self._group_size_columns[self._compute_information_key(z, k)] for k in range(K)]
+            column = np.concatenate([*size_variables, self._charged_columns])
+            self._effort_rows.append(
+                self._add_rows(
+                    [(np.zeros(column.size, dtype=int), column, np.append(self._column_prices.T, -1.0))], np.zeros(1)
+                )
             )
         self.signals.append(z)
         self._columns.append(columns)
         return True
 
-    def _rows(self, entries: list[tuple[np.ndarray, np.ndarray, Array]], upper: Array) -> int:
-        return int(self._linear.rows(entries, np.full(upper.size, -np.inf), upper)[0])
+    def _add_rows(self, entries: list[tuple[np.ndarray, np.ndarray, Array]], upper: Array) -> int:
+        return int(self._program.rows(entries, np.full(upper.size, -np.inf), upper)[0])
 
-    def _known(self, z: Array, k: int) -> tuple[int, bytes]:
+    def _compute_information_key(self, z: Array, k: int) -> tuple[int, bytes]:
         """Return a key that is equal for all signals that the control on piece ``k`` cannot distinguish."""
         return k, self.knowledge.history(z, int(self.knowledge.seen[k]))
 
@@ -222,75 +224,80 @@ class Tree:
         tree."""
         return self.knowledge.changed(self.signals[signal], row, report)[1]
 
-    def _impose(self, signal: int, row: int, report: int) -> bool:
+    def _impose_row(self, signal: int, row: int, report: int) -> bool:
         """Impose one row under a `changed` signal, and return whether it is new."""
         s, z = self.sampled, self.signals[signal]
         key = (row, report, self.knowledge.history(z, report))
-        if key in self._imposed:
+        if key in self._imposed_keys:
             return False
-        self._imposed.add(key)
+        self._imposed_keys.add(key)
         is_informed, unit = self.knowledge.seen > report, self.units[row]
-        channel, piece = np.nonzero(self._moves[row] * ~is_informed)
+        channel, piece = np.nonzero(self._control_coefficients[row] * ~is_informed)
         noise, _ = self.knowledge.changed(z, row, report)
-        columns, values = [self._columns[signal][channel, piece]], [self._moves[row][channel, piece]]
+        columns, values = [self._columns[signal][channel, piece]], [self._control_coefficients[row][channel, piece]]
         columns.append(np.zeros(1, dtype=int))
         values.append(np.array([-unit if self.priced else noise]))
         limit = s.b[row] - (noise if self.priced else 0.0)
-        if self._limited:
-            columns.append(self._sizes[:, is_informed].ravel())
-            values.append(-self._by_size[row][:, is_informed].ravel())
-            limit -= float(self._fixed[row][:, is_informed].sum())
+        if self._has_peak_variables:
+            columns.append(self._size_columns[:, is_informed].ravel())
+            values.append(-self._decrease_rates[row][:, is_informed].ravel())
+            limit -= float(self._forced_contributions[row][:, is_informed].sum())
         else:
-            limit -= float(self._least[row, is_informed].sum())
+            limit -= float(self._least_contributions[row, is_informed].sum())
         column, value = np.concatenate(columns), np.concatenate(values) / unit
-        self._numbers.append(self._rows([(np.zeros(column.size, dtype=int), column, value)], np.array([limit / unit])))
-        self._order.append((signal, row, report))
+        self._row_numbers.append(
+            self._add_rows([(np.zeros(column.size, dtype=int), column, value)], np.array([limit / unit]))
+        )
+        self._imposed_rows.append((signal, row, report))
         return True
 
     @property
-    def _limited(self) -> bool:
+    def _has_peak_variables(self) -> bool:
         """True where variables bound the sizes of the controls, as with the cost ``peak``."""
         return self.cost == "peak" and self.priced
 
     @cached_property
-    def _by_size(self) -> Array:
+    def _decrease_rates(self) -> Array:
         """Largest decrease of every row by a control, per unit of the peak that bounds the control, ``(R, m, K)``."""
-        T = self._moves
-        moves = np.where(T > 0.0, (self._low < 0.0)[:, None], (self._high > 0.0)[:, None])
+        T = self._control_coefficients
+        moves = np.where(T > 0.0, (self._lower_bounds < 0.0)[:, None], (self._upper_bounds > 0.0)[:, None])
         return np.asarray(np.abs(T) * moves)
 
     @cached_property
-    def _fixed(self) -> Array:
+    def _forced_contributions(self) -> Array:
         """Least contribution of the control to every row where its bounds exclude 0, ``(R, m, K)``; 0 elsewhere."""
-        T = self._moves
+        T = self._control_coefficients
         return np.asarray(
-            T * np.where(T > 0.0, np.maximum(self._low, 0.0)[:, None], np.minimum(self._high, 0.0)[:, None])
+            T
+            * np.where(
+                T > 0.0, np.maximum(self._lower_bounds, 0.0)[:, None], np.minimum(self._upper_bounds, 0.0)[:, None]
+            )
         )
 
     @cached_property
-    def _least(self) -> Array:
+    def _least_contributions(self) -> Array:
         """The least that the control on every piece can give to every row, ``(R, K)``."""
         return np.asarray(-self.control.support(-self.sampled.T.swapaxes(1, 2)))
 
     def least(self) -> Grown | None:
         """Return the tree of least cost, or of the largest factor; ``None`` where nothing is feasible or nothing was
         solved."""
-        return self._solved()
+        return self._solve_tree()
 
     def relaxed(self, budget: float = np.inf, central: bool = False) -> Grown | None:
         """The least relaxation, in the rows' units, that a cost within a ``budget`` needs (below 0: how far within all
         rows it can stay); the ``value`` is that. ``central``: in the middle of all controls that need no more."""
-        highs = self._linear.highs
+        highs = self._program.highs
         highs.changeColBounds(0, -ROOM, np.inf)
         highs.changeColCost(0, 1.0)
-        for column in self._charged.tolist():
+        for column in self._charged_columns.tolist():
             highs.changeColCost(column, 0.0)
-        highs.changeRowBounds(self._budget, -np.inf, budget / self._unit)
+        highs.changeRowBounds(self._budget_row, -np.inf, budget / self._cost_unit)
         if central:
             highs.setOptionValue("solver", "ipm")
             highs.setOptionValue("run_crossover", "off")
         try:
-            return self._solved(relaxed=True)
+            return self._solve_tree(relaxed=True)
         finally:
             if central:
                 highs.setOptionValue("solver", "simplex")
@@ -298,30 +305,35 @@ class Tree:
                 highs.clearSolver()
             highs.changeColBounds(0, 0.0, 0.0)
             highs.changeColCost(0, 0.0)
-            for column, price in zip(self._charged.tolist(), self._charges.tolist(), strict=True):
+            for column, price in zip(self._charged_columns.tolist(), self._charges.tolist(), strict=True):
                 highs.changeColCost(column, price)
-            highs.changeRowBounds(self._budget, -np.inf, np.inf)
+            highs.changeRowBounds(self._budget_row, -np.inf, np.inf)
 
-    def _solved(self, relaxed: bool = False) -> Grown | None:
+    def _solve_tree(self, relaxed: bool = False) -> Grown | None:
         """The program with every sampled row, which are imposed as they are violated."""
         solution = None
         for _ in range(PASSES):
-            is_solved, _, x, y = self._linear.solve(self.seconds())
-            self.work += self._linear.work + len(self.signals) * (self.sampled.T.size + self.sampled.N.size)
+            is_solved, _, x, y = self._program.solve(self.seconds())
+            self.work += self._program.work + len(self.signals) * (self.sampled.T.size + self.sampled.N.size)
             if not is_solved:
                 return None
-            u, multipliers = x[np.array(self._columns)] * self._far[:, None], np.array([y[at] for at in self._numbers])
+            u, multipliers = (
+                x[np.array(self._columns)] * self._control_units[:, None],
+                np.array([y[at] for at in self._row_numbers]),
+            )
             kept = np.flatnonzero(multipliers > 0.0)
-            signals, rows, reports = np.array(self._order, dtype=int).reshape(-1, 3)[kept].T
-            unit = 1.0 if relaxed or not self.priced else self._unit
-            value = float(x[0]) if relaxed or not self.priced else unit * float(self._charges @ x[self._charged])
-            shares = np.maximum([y[at] for at in self._efforts], 0.0)
+            signals, rows, reports = np.array(self._imposed_rows, dtype=int).reshape(-1, 3)[kept].T
+            unit = 1.0 if relaxed or not self.priced else self._cost_unit
+            value = (
+                float(x[0]) if relaxed or not self.priced else unit * float(self._charges @ x[self._charged_columns])
+            )
+            shares = np.maximum([y[at] for at in self._effort_rows], 0.0)
             solution = Grown(value, x, u, signals, rows, reports, unit * multipliers[kept] / self.units[rows], shares)
-            if not self._separate(solution):
+            if not self._impose_violated_rows(solution):
                 break
         return solution
 
-    def _separate(self, found: Grown) -> bool:
+    def _impose_violated_rows(self, found: Grown) -> bool:
         s, excess, grew = self.sampled, self.excess(found), False
         kinds = s.constraint * (1 + s.side.max(initial=0)) + s.side
         for kind in np.unique(kinds):
@@ -330,7 +342,7 @@ class Tree:
             for signal, flat_indices in enumerate(np.argsort(-violations, axis=1)[:, :AT_ONCE]):
                 for flat_index in flat_indices[violations[signal, flat_indices] > EXCEEDED].tolist():
                     row, report = divmod(flat_index, excess.shape[2])
-                    grew |= self._impose(signal, int(rows[row]), report)
+                    grew |= self._impose_row(signal, int(rows[row]), report)
         return grew
 
     def excess(self, found: Grown) -> Array:
@@ -341,9 +353,9 @@ class Tree:
         """
         s, knowledge = self.sampled, self.knowledge
         control_values = np.einsum("rmk,smk->srk", s.T, found.u)
-        best = self._least
-        if self._limited:
-            best = (self._fixed - self._by_size * found.x[self._sizes]).sum(axis=1)
+        best = self._least_contributions
+        if self._has_peak_variables:
+            best = (self._forced_contributions - self._decrease_rates * found.x[self._size_columns]).sum(axis=1)
         later_best = sums(best[:, ::-1])[:, ::-1]  # of every piece and all later ones
         reports, scale = np.arange(knowledge.reports + 1), 1.0 if self.priced else max(found.x[0], np.finfo(float).tiny)
         offsets = sums(control_values)[:, :, knowledge.first] + later_best[:, knowledge.first] - s.b[:, None]

@@ -82,11 +82,11 @@ class Pushes:
     @staticmethod
     def of(A: Array, E: Array, length: float) -> Pushes:
         """Return the kernel ``e^{A r} E`` for ``r`` from 0 to ``length``, on equal parts."""
-        count = _parts(A, length)
+        count = _choose_part_count(A, length)
         half, term = length / count / 2.0, E
         flows = exponential(A * ((np.arange(count) + 0.5) * (2.0 * half))[:, None, None])
         terms = []
-        for order in range(_degree(float(np.linalg.norm(A, 2)) * half) + 1):
+        for order in range(_choose_degree(float(np.linalg.norm(A, 2)) * half) + 1):
             terms.append(flows @ term)
             term = A @ term * (half / (order + 1))
         return Pushes(np.stack(terms, axis=1), np.linspace(0.0, length, count + 1))
@@ -106,7 +106,9 @@ class Pushes:
         """
         terms, cuts = [], [ends[:1]]
         for kernel, low, high, count in zip(kernels, ends[:-1], ends[1:], counts, strict=True):
-            part_terms = np.einsum("skj,jdw->skdw", _across(len(kernel), count), kernel) / (high - low)
+            part_terms = np.einsum("skj,jdw->skdw", _build_expansion_matrices(len(kernel), count), kernel) / (
+                high - low
+            )
             terms.append(part_terms)
             cuts.append(low + (high - low) * np.arange(1, count + 1) / count)
         size = max(len(kernel) for kernel in kernels)
@@ -181,7 +183,7 @@ class Zonoid(ConvexSet):
         axes = np.eye(self.dimension)
         if not self.is_symmetric:
             return super().chord(np.zeros_like(axes), axes)
-        high = 1.0 / self._boundary(np.zeros_like(axes), axes)[0]
+        high = 1.0 / self._compute_gauge(np.zeros_like(axes), axes)[0]
         return -high, high
 
     @property
@@ -237,32 +239,32 @@ class Zonoid(ConvexSet):
         flat = np.asarray(directions, dtype=float).reshape(-1, self.dimension)
         values = np.zeros(flat.shape[0])
         for corner_set in self.parts:
-            for chunk in self._chunks(flat.shape[0], corner_set):
-                values[chunk] += self._swept(corner_set, flat[chunk]).values()
+            for chunk in self._split_into_chunks(flat.shape[0], corner_set):
+                values[chunk] += self._sweep_corners(corner_set, flat[chunk]).values()
         return values.reshape(np.shape(directions)[:-1])
 
     def support_point(self, directions: Array) -> Array:
         flat = np.asarray(directions, dtype=float).reshape(-1, self.dimension)
         points = np.zeros(flat.shape)
         for corner_set in self.parts:
-            for chunk in self._chunks(flat.shape[0], corner_set):
-                points[chunk] += self._swept(corner_set, flat[chunk]).points()
+            for chunk in self._split_into_chunks(flat.shape[0], corner_set):
+                points[chunk] += self._sweep_corners(corner_set, flat[chunk]).points()
         points[~flat.any(axis=1)] = 0.0
         return points.reshape(np.shape(directions))
 
     def signals(self, points: Array) -> list[Arc]:
         """A signal that leads to each of the points ``(k, r)`` of the set: a mean of at most ``r`` that attain support
         functions and of the middle (Caratheodory)."""
-        all_directions, shares = self._made_of(points)
+        all_directions, shares = self._decompose_points(points)
         return [
-            _mean([self.best(a) for a in directions[share > 0.0]], share[share > 0.0], self.channels)
+            _combine_arcs([self.best(a) for a in directions[share > 0.0]], share[share > 0.0], self.channels)
             for directions, share in zip(all_directions, shares, strict=True)
         ]
 
     def best(self, direction: Array) -> Arc:
         """The signal that attains the support function of a direction ``(r,)``."""
-        arcs = [self._swept(corner_set, direction[None]).arc() for corner_set in self.parts]
-        return _mean(arcs, np.ones(len(arcs)), self.channels)
+        arcs = [self._sweep_corners(corner_set, direction[None]).arc() for corner_set in self.parts]
+        return _combine_arcs(arcs, np.ones(len(arcs)), self.channels)
 
     def reached(self, signal: Arc) -> Array:
         """The point ``(r,)`` that a signal leads to."""
@@ -276,14 +278,14 @@ class Zonoid(ConvexSet):
         integrals = cumulative[part_numbers] + np.einsum("np,nprw->nrw", powers, self.integrals[part_numbers])
         return np.asarray(np.einsum("nrw,nw->r", integrals[:-1] - integrals[1:], signal.values))
 
-    def _chunks(self, size: int, part: Array) -> Iterator[slice]:
+    def _split_into_chunks(self, size: int, part: Array) -> Iterator[slice]:
         step = max(1, HELD // ((self.count + 1) * max(self.channels, part.shape[0])))
         return (slice(first, first + step) for first in range(0, size, step))
 
-    def _swept(self, part: Array, directions: Array) -> _Sweep:
+    def _sweep_corners(self, part: Array, directions: Array) -> _Sweep:
         return _Sweep(self, part, directions)
 
-    def _made_of(self, points: Array) -> tuple[Array, Array]:
+    def _decompose_points(self, points: Array) -> tuple[Array, Array]:
         """Directions ``(k, r, r)`` and shares ``(k, r)``, at most 1 together, such that the support points of the
         directions in these shares are ``points (k, r)`` of the set, nearly: the gauge of a point as a linear program
         whose columns are generated, as in `ConvexSet`. By how much they miss it, `reached` says."""
@@ -309,7 +311,7 @@ class Zonoid(ConvexSet):
             is_replaced[open_, leaving] = True
         shares = np.linalg.solve(np.swapaxes(columns, 1, 2), points[..., None])[..., 0]
         for point in np.flatnonzero(((shares < 0.0) | ~is_replaced).any(axis=1)):
-            shares[point] = _shares(np.where(is_replaced[point][:, None], columns[point], 0.0), points[point])
+            shares[point] = _solve_shares(np.where(is_replaced[point][:, None], columns[point], 0.0), points[point])
         return chosen, shares / np.maximum(1.0, shares.sum(axis=1, keepdims=True))
 
 
@@ -332,10 +334,10 @@ class _Sweep:
         )[:, :, 0]
         highest = self.best[..., None]
         first, last = (np.take_along_axis(end, highest, axis=2) - end for end in (heights[:, :-1], heights[:, 1:]))
-        self.clean: np.ndarray = np.all(_apart(first, last, 2.0 * curvature, 0.0), axis=2)
-        self._split()
+        self.clean: np.ndarray = np.all(_is_nonnegative(first, last, 2.0 * curvature, 0.0), axis=2)
+        self._cut_into_cells()
 
-    def _split(self) -> None:
+    def _cut_into_cells(self) -> None:
         zonoid, part = self.zonoid, self.part
         n, s = np.nonzero(~self.clean)
         P = np.einsum("nr,nprw,vw->npv", self.directions[n], zonoid.coefficients[s], part, optimize=True)
@@ -345,13 +347,13 @@ class _Sweep:
         owner = np.arange(n.size)  # the polynomial of every open cell
         cells: list[tuple[np.ndarray, Array, Array, np.ndarray]] = []
         for halving in range(HALVINGS + 1):
-            first, last = _at(P[owner], low), _at(P[owner], high)
+            first, last = _evaluate_polynomials(P[owner], low), _evaluate_polynomials(P[owner], high)
             best = (first + last).argmax(axis=1)
             gaps = P[owner] - np.take_along_axis(P[owner], best[:, None, None], axis=2)
             curvature = (np.abs(gaps) * (orders * (orders - 1))[:, None]).sum(axis=1)
             g, h = (np.take_along_axis(end, best[:, None], axis=1) - end for end in (first, last))
             half_square = ((high - low) ** 2 / 2.0)[:, None]
-            ready = np.all(_apart(g, h, half_square * curvature, FLAT * scale[owner][:, None]), axis=1) | (
+            ready = np.all(_is_nonnegative(g, h, half_square * curvature, FLAT * scale[owner][:, None]), axis=1) | (
                 halving == HALVINGS
             )
             cells.append((owner[ready], low[ready], high[ready], best[ready]))
@@ -360,7 +362,7 @@ class _Sweep:
                 break
             a, b = first.argmax(axis=1), last.argmax(axis=1)
             rows = np.arange(owner.size)
-            cut = _root(P[owner][rows, :, a] - P[owner][rows, :, b], low, high)
+            cut = _find_roots(P[owner][rows, :, a] - P[owner][rows, :, b], low, high)
             owner, low, high = np.tile(owner, 2), np.concatenate([low, cut]), np.concatenate([cut, high])
         owners, low, high, best = (np.concatenate(arrays) for arrays in zip(*cells, strict=True))
         self.cells = (n[owners], s[owners], low, high, best)
@@ -392,12 +394,12 @@ class _Sweep:
         return Arc(1.0 - start[order] / ends[-1], self.part[corner_numbers[order]])
 
 
-def _parts(A: Array, length: float) -> int:
+def _choose_part_count(A: Array, length: float) -> int:
     speed = min(float(np.linalg.norm(A, 2)), MOST_PARTS / max(length, 1e-300))
     return int(np.clip(np.ceil(speed * length / FAST), PARTS, MOST_PARTS))
 
 
-def _degree(reach: float) -> int:
+def _choose_degree(reach: float) -> int:
     """Return the degree of polynomials that approximate an exponential whose exponent goes from ``-reach`` to
     ``reach``, at most `DEGREE`."""
     term = 1.0
@@ -408,7 +410,7 @@ def _degree(reach: float) -> int:
     return DEGREE
 
 
-def _across(size: int, count: int) -> Array:
+def _build_expansion_matrices(size: int, count: int) -> Array:
     """Return the matrices ``(count, size, size)`` that expand a polynomial again on each of ``count`` equal parts.
 
     They map the coefficients of powers of the share, from 0 to 1, of an interval to those of powers of ``u`` from -1 to
@@ -422,7 +424,7 @@ def _across(size: int, count: int) -> Array:
     return matrices
 
 
-def _apart(left: Array, right: Array, bent: Array, spare: Array | float) -> np.ndarray:
+def _is_nonnegative(left: Array, right: Array, bent: Array, spare: Array | float) -> np.ndarray:
     """Return whether a function is certainly not negative on a cell, given its values at the ends.
 
     The second derivative times half the square of the cell's length is at most ``bent``. The function is then at least
@@ -432,7 +434,7 @@ def _apart(left: Array, right: Array, bent: Array, spare: Array | float) -> np.n
     return (left >= -spare) & (right >= -spare) & (near**2 >= bent - spare)
 
 
-def _at(P: Array, u: Array) -> Array:
+def _evaluate_polynomials(P: Array, u: Array) -> Array:
     """Polynomials ``(M, p + 1, ...)`` at ``u (M,)``."""
     u = u.reshape(-1, *([1] * (P.ndim - 2)))
     value = P[:, -1]
@@ -441,28 +443,28 @@ def _at(P: Array, u: Array) -> Array:
     return value
 
 
-def _root(P: Array, low: Array, high: Array) -> Array:
+def _find_roots(P: Array, low: Array, high: Array) -> Array:
     """A root of polynomials ``(M, p + 1)`` between ``low`` and ``high (M,)`` where the signs there differ, their middle
     elsewhere."""
-    first, last = _at(P, low), _at(P, high)
+    first, last = _evaluate_polynomials(P, low), _evaluate_polynomials(P, high)
     middle = (low + high) / 2.0
     is_crossing = first * last < 0.0
     slope = P[:, 1:] * np.arange(1, P.shape[1])
     a, b = low.copy(), high.copy()
     u = np.where(is_crossing, low - first * (high - low) / np.where(is_crossing, last - first, 1.0), middle)
     for _ in range(NEWTON):
-        value = _at(P, u)
+        value = _evaluate_polynomials(P, u)
         same = value * first > 0.0
         a, b = np.where(same, u, a), np.where(same, b, u)
         with np.errstate(divide="ignore", invalid="ignore"):
-            step = u - value / _at(slope, u)
+            step = u - value / _evaluate_polynomials(slope, u)
         u = np.where((step >= a) & (step <= b), step, (a + b) / 2.0)  # at an end, a root that was found
     least = EDGE * (high - low)
     is_inside = is_crossing & (u > low + least) & (u < high - least)
     return np.asarray(np.where(is_inside, u, middle))
 
 
-def _shares(columns: Array, point: Array) -> Array:
+def _solve_shares(columns: Array, point: Array) -> Array:
     """Return shares ``(r,) >= 0`` with which ``columns (r, r)``, one in each row, add up to a ``point``, as nearly as
     least squares can.
 
@@ -480,7 +482,7 @@ def _shares(columns: Array, point: Array) -> Array:
     return all_shares
 
 
-def _mean(signals: Sequence[Arc], shares: Array, channels: int) -> Arc:
+def _combine_arcs(signals: Sequence[Arc], shares: Array, channels: int) -> Arc:
     """The sum of signals in these shares, constants that are equal joined."""
     ends = np.unique(np.concatenate([[1.0], *(signal.ends for signal in signals)]))
     total = np.zeros((ends.size, channels))

@@ -69,30 +69,30 @@ class Controller:
     """
 
     def __init__(self, plan: Plan, resolving: Resolving | None = None) -> None:
-        self._planned, self._resolving = plan, resolving
+        self._first_plan, self._resolver = plan, resolving
         began = clock.perf_counter()
         if resolving is not None:
             resolving.prepare(plan)
-        self._prepared = clock.perf_counter() - began if resolving is not None else 0.0
+        self._preparation_seconds = clock.perf_counter() - began if resolving is not None else 0.0
         self.reset()
 
     def __repr__(self) -> str:
-        pieces = len(self._planned.model.control.breakpoints) - 1
-        state = "covered" if self._covered else "not covered by the proof"
-        kind = "applies its plan" if self._resolving is None else "solves anew at every step"
+        pieces = len(self._first_plan.model.control.breakpoints) - 1
+        state = "covered" if self._is_covered else "not covered by the proof"
+        kind = "applies its plan" if self._resolver is None else "solves anew at every step"
         return f"Controller of {pieces} pieces, {len(self._steps)} steps made: {kind}; {state}"
 
     @property
     def breakpoints(self) -> Array:
         """Times at which the pieces of the control begin, and the horizon as the last one, ``(K + 1,)``, in the time of
         the problem."""
-        return np.array(self._planned.model.control.breakpoints)
+        return np.array(self._first_plan.model.control.breakpoints)
 
     @property
     def prepared(self) -> float:
         """Seconds spent before the first step on work that no step with a time limit waits for; 0 without a re-solve.
         The time limit applies to every step, also to the first one: make the controller before the system runs."""
-        return self._prepared
+        return self._preparation_seconds
 
     @property
     def covered(self) -> bool:
@@ -104,13 +104,13 @@ class Controller:
         answer may stay true too long. Parameters cannot be told apart from a disturbance: with uncertain parameters the
         answer is true as long as no measurement was missing.
         """
-        return self._covered
+        return self._is_covered
 
     @property
     def ever_uncovered(self) -> bool:
         """True where any state since the last `reset` was missing or not covered by the proof, even if a later plan
         covers the states again. Then more acts on the system than the problem says."""
-        return self._ever
+        return self._is_ever_uncovered
 
     @property
     def steps(self) -> tuple[Step, ...]:
@@ -124,14 +124,16 @@ class Controller:
 
     def reset(self) -> None:
         """Begin anew: the next step is that of time 0."""
-        self._take(self._planned)
-        self._next, self._covered, self._steps = 0, True, list[Step]()
-        self._period, self._ever = 0, False
-        self._before: Array | None = None
-        self._last: Array | None = None
-        self._reach: tuple[Array, Array] | None = None
+        self._apply_plan(self._first_plan)
+        self._next_piece, self._is_covered, self._steps = 0, True, list[Step]()
+        self._period, self._is_ever_uncovered = 0, False
+        self._last_control: Array | None = None
+        self._last_state: Array | None = None
+        self._reach_bounds: tuple[Array, Array] | None = None
         # of the integrals, which nobody measures, what the applied controls have added up to
-        self._added_up = np.zeros(self._planned.model.problem.system.states - self._states - self._beside)
+        self._integral_values = np.zeros(
+            self._first_plan.model.problem.system.states - self._state_count - self._added_state_count
+        )
 
     def step(self, time: float, state: npt.ArrayLike | None) -> Array:
         """Return the control ``(m,)`` for the piece that begins at ``time``, a breakpoint. Breakpoints come one after
@@ -156,68 +158,77 @@ class Controller:
             For a time or a state that is none. The controller is then as it was before.
         """
         start_time = clock.perf_counter()
-        period, piece = self._timed(time)
-        measured = None if state is None else self._measured(state)
+        period, piece = self._check_time(time)
+        measured = None if state is None else self._read_measurement(state)
         if period > self._period:
-            self._begin(period)
-            measured = None if state is None else self._measured(state)  # integrals begin anew
+            self._begin_period(period)
+            measured = None if state is None else self._read_measurement(state)  # integrals begin anew
         # from any of the initial states the proof holds for another period
         anew = period > 0 and piece == 0 and self._observer is None
-        covered = measured is not None and (self._covered or anew) and self._within(measured)
-        self._ever = self._ever or not covered
+        covered = measured is not None and (self._is_covered or anew) and self._is_expected_state(measured)
+        self._is_ever_uncovered = self._is_ever_uncovered or not covered
         answer = None
-        if self._resolving is not None and measured is not None:
-            answer = self._resolving.answer(self._plan, piece, measured, self._before, self._innovations(measured))
+        if self._resolver is not None and measured is not None:
+            answer = self._resolver.answer(
+                self._plan, piece, measured, self._last_control, self._compute_innovations(measured)
+            )
             if answer.plan is not None and (answer.cheaper or not covered):
-                self._go_on(answer.plan)
+                self._replace_plan(answer.plan)
                 covered = True
             else:
                 answer = None
-        u = self._control(piece - self._plan.first, measured)
+        u = self._compute_control(piece - self._plan.first, measured)
         measured_state = None if self._observer is not None else measured
-        self._reach = None if measured_state is None else self._plan.reach(piece - self._plan.first, measured_state, u)
-        self._added_up = self._added_up + self._plan.added(piece - self._plan.first, u)[self._states + self._beside :]
-        self._next, self._covered, self._before, self._last = piece + 1, covered, u, measured
-        at = self._begins_at(period, piece)
+        self._reach_bounds = (
+            None if measured_state is None else self._plan.reach(piece - self._plan.first, measured_state, u)
+        )
+        self._integral_values = (
+            self._integral_values
+            + self._plan.added(piece - self._plan.first, u)[self._state_count + self._added_state_count :]
+        )
+        self._next_piece, self._is_covered, self._last_control, self._last_state = piece + 1, covered, u, measured
+        at = self._compute_piece_time(period, piece)
         outcome = (False, np.nan, np.nan) if answer is None else (answer.plan is not None, answer.cost, answer.lower)
         self._steps.append(Step(at, clock.perf_counter() - start_time, outcome[0], covered, *outcome[1:]))
         return u.copy()
 
-    def _begin(self, period: int) -> None:
+    def _begin_period(self, period: int) -> None:
         """Apply the plan anew, in the next period."""
-        self._take(self._planned)
-        self._next, self._period = 0, period
-        self._added_up = np.zeros_like(self._added_up)
+        self._apply_plan(self._first_plan)
+        self._next_piece, self._period = 0, period
+        self._integral_values = np.zeros_like(self._integral_values)
 
-    def _begins_at(self, period: int, piece: int) -> float:
-        points = self._planned.model.control.breakpoints
+    def _compute_piece_time(self, period: int, piece: int) -> float:
+        points = self._first_plan.model.control.breakpoints
         return float(period * points[-1] + points[piece])
 
-    def _take(self, plan: Plan) -> None:
+    def _apply_plan(self, plan: Plan) -> None:
         self._plan = plan
-        self._acting: tuple[int, Array] | None = None  # the last piece of the disturbance that was seen, and its value
+        self._last_disturbance: tuple[int, Array] | None = (
+            None  # the last piece of the disturbance that was seen, and its value
+        )
         feedback = plan.known.feedback
         self._measuring = None if feedback is None else Measuring.of(plan.known, plan.decision)
-        self._nominal = plan.known.pieces(plan.decision)
+        self._nominal_control = plan.known.pieces(plan.decision)
 
-    def _go_on(self, plan: Plan) -> None:
+    def _replace_plan(self, plan: Plan) -> None:
         """Apply a new plan from now on; one with the same gains goes on answering what was seen so far."""
         if self._measuring is None or plan.known is not self._plan.known:
-            self._take(plan)
+            self._apply_plan(plan)
             return
-        self._plan, self._nominal = plan, plan.known.pieces(plan.decision)
-        self._measuring = replace(self._measuring, nominal=self._nominal)
+        self._plan, self._nominal_control = plan, plan.known.pieces(plan.decision)
+        self._measuring = replace(self._measuring, nominal=self._nominal_control)
 
-    def _timed(self, time: object) -> tuple[int, int]:
+    def _check_time(self, time: object) -> tuple[int, int]:
         """Return the period, and the piece of it, that begin at a time, which must be the next breakpoint."""
-        points = self._planned.model.control.breakpoints
-        period, piece = self._period, self._next
-        if piece >= points.size - 1 and self._planned.model.problem.repeat:
+        points = self._first_plan.model.control.breakpoints
+        period, piece = self._period, self._next_piece
+        if piece >= points.size - 1 and self._first_plan.model.problem.repeat:
             period, piece = period + 1, 0
         if piece >= points.size - 1:
             got = f"a step at {time!r}"
             raise InputError(path="time", expected=f"reset() first, since the horizon {points[-1]:g} is over", got=got)
-        expected = self._begins_at(period, piece)
+        expected = self._compute_piece_time(period, piece)
         number = isinstance(time, int | float | np.number) and not isinstance(time, bool)
         if not number or not abs(float(time) - expected) <= SAME_BREAKPOINT * points[-1]:  # type: ignore[arg-type]
             expectation = "0, since it begins there" if not period + piece else f"{expected!r}, the next breakpoint"
@@ -225,16 +236,16 @@ class Controller:
         return period, piece
 
     @property
-    def _states(self) -> int:
+    def _state_count(self) -> int:
         """Number of states of the problem as the user stated it, all of which are measured where the whole state is
         measured."""
-        return self._planned.model.stated.system.states
+        return self._first_plan.model.stated.system.states
 
     @property
-    def _beside(self) -> int:
+    def _added_state_count(self) -> int:
         """Number of further states that hold the effect of the parameters of a system that also depends on time. They
-        follow the `_states` states of the user, and are 0 where a state is measured."""
-        first, end = self._planned.model.problem.names.corners.added
+        follow the `_state_count` states of the user, and are 0 where a state is measured."""
+        first, end = self._first_plan.model.problem.names.corners.added
         return end - first
 
     @property
@@ -242,9 +253,9 @@ class Controller:
         """Observer that makes innovations of measured outputs; ``None`` where the state is measured."""
         return self._plan.known.observer
 
-    def _measured(self, state: object) -> Array:
+    def _read_measurement(self, state: object) -> Array:
         """Return the measured outputs; or the measured state, followed by the states that nobody measures."""
-        observer, count, kind = self._observer, self._states, "state"
+        observer, count, kind = self._observer, self._state_count, "state"
         if observer is not None:
             count, kind = observer.C.shape[0], "output"
         try:
@@ -254,63 +265,65 @@ class Controller:
         if measured.shape != (count,) or not np.isfinite(measured).all():
             expected = f"{count} finite numbers, one per {kind}, or None where the measurement is missing"
             raise InputError(path="state", expected=expected, got=f"{state!r}")
-        unmeasured = np.append(np.zeros(self._beside), self._added_up)
+        unmeasured = np.append(np.zeros(self._added_state_count), self._integral_values)
         return measured if observer is not None else np.append(measured, unmeasured)
 
-    def _within(self, state: Array) -> bool:
+    def _is_expected_state(self, state: Array) -> bool:
         """Return whether the last state may lead to this state, or, at the first step, whether it is an admissible
         initial state. Later states are compared coordinate by coordinate; the result is true where the last state tells
         no bounds. Of outputs, return whether each entry of the innovation is within the bounds that admissible
         deviations give."""
         if self._observer is not None:
-            return self._expected(state)
-        if self._next == 0:
-            problem = self._planned.model.problem
+            return self._is_expected_output(state)
+        if self._next_piece == 0:
+            problem = self._first_plan.model.problem
             centre, axes = np.asarray(problem.initial_state, dtype=float), np.eye(state.size)
             deviation, size = state - centre, np.abs(state) + np.abs(centre)
             if problem.initial_set is None:
                 return bool((np.abs(deviation) <= SEEN * np.maximum(size, size.max())).all())
             tolerance = SEEN * float(problem.initial_set.reach(axes).max() + size.max())
             return float(problem.initial_set.violation(deviation)) <= tolerance
-        if self._reach is None or self._last is None:
+        if self._reach_bounds is None or self._last_state is None:
             return True
-        lower, upper = (bound[: self._states] for bound in self._reach)
+        lower, upper = (bound[: self._state_count] for bound in self._reach_bounds)
         tolerance = SEEN * max(float(np.abs(lower).max()), float(np.abs(upper).max()), np.finfo(float).tiny)
-        user_state = state[: self._states]
+        user_state = state[: self._state_count]
         return bool(
             (user_state >= lower - tolerance).all() and (user_state <= upper + tolerance).all()
-        ) and self._caused(state, tolerance)
+        ) and self._has_admissible_cause(state, tolerance)
 
-    def _expected(self, outputs: Array) -> bool:
+    def _is_expected_output(self, outputs: Array) -> bool:
         assert self._measuring is not None
         innovation = self._measuring.seen(outputs)[-1]
-        lower, upper = (bound[self._next - self._plan.first] for bound in self._plan.known.answering.loop.expected)
+        lower, upper = (
+            bound[self._next_piece - self._plan.first] for bound in self._plan.known.answering.loop.expected
+        )
         tolerance = SEEN * float(np.max([np.abs(outputs), np.abs(innovation), np.abs(lower), np.abs(upper)]))
         return bool((innovation >= lower - tolerance).all() and (innovation <= upper + tolerance).all())
 
-    def _caused(self, state: Array, room: float) -> bool:
+    def _has_admissible_cause(self, state: Array, room: float) -> bool:
         """Return whether an admissible disturbance led from the last state to this one; true where the states do not
         determine the disturbance."""
-        assert self._last is not None and self._before is not None
-        cause = self._plan.caused(self._next - 1 - self._plan.first, self._last, self._before, state)
-        bound = self._planned.model.problem.disturbance
+        assert self._last_state is not None and self._last_control is not None
+        cause = self._plan.caused(self._next_piece - 1 - self._plan.first, self._last_state, self._last_control, state)
+        bound = self._first_plan.model.problem.disturbance
         if cause is None or bound is None:
             return True
         block, value, residual, growth = cause
-        residual = residual[: self._states]
+        residual = residual[: self._state_count]
         margin = growth * room + SEEN * float(np.abs(value).max())
-        is_new_block = self._acting is None or self._acting[0] != block
-        is_same = is_new_block or bool((np.abs(value - self._acting[1]) <= 2.0 * margin).all())  # type: ignore[index]
-        self._acting = (block, value)
+        is_new_block = self._last_disturbance is None or self._last_disturbance[0] != block
+        is_same = is_new_block or bool((np.abs(value - self._last_disturbance[1]) <= 2.0 * margin).all())  # type: ignore[index]
+        self._last_disturbance = (block, value)
         return is_same and bool((np.abs(residual) <= room).all()) and float(bound.violation(value)) <= margin
 
-    def _innovations(self, state: Array) -> list[Array]:
+    def _compute_innovations(self, state: Array) -> list[Array]:
         """Return the innovations that the applied plan answers when this state is measured, one vector for each
         breakpoint since the plan began; a single zero vector where the plan has no feedback."""
         return [np.zeros(state.size)] if self._measuring is None else self._measuring.seen(state)
 
-    def _control(self, piece: int, state: Array | None) -> Array:
-        nominal = self._nominal[:, piece]
+    def _compute_control(self, piece: int, state: Array | None) -> Array:
+        nominal = self._nominal_control[:, piece]
         if self._measuring is None:
             return nominal.copy()
         observed = self._measuring.predicted() if state is None else state[:, None]

@@ -70,8 +70,8 @@ def remaining(
         ``control_step`` to it.
     """
     problem, begin = model.problem, float(model.control.breakpoints[piece])
-    control = _rest(model.control, begin, problem.horizon)
-    disturbance = control if alone else _rest(model.disturbance.merged(), begin, problem.horizon)
+    control = _restrict_dictionary(model.control, begin, problem.horizon)
+    disturbance = control if alone else _restrict_dictionary(model.disturbance.merged(), begin, problem.horizon)
     horizon = control.horizon
     windows = [
         entry.remaining(begin, horizon, name=name)
@@ -83,7 +83,7 @@ def remaining(
         initial_state=state,
         initial_set=None,
         initial_control=before if problem.control_step is not None else None,
-        path=[*filter(None, windows), *_seam(problem, control, again)],
+        path=[*filter(None, windows), *_build_seam(problem, control, again)],
         repeat=False,  # the return is among the windows
         **({"disturbance": None} if alone else {}),
     )
@@ -91,7 +91,7 @@ def remaining(
     return prepare(remainder, control, disturbance, policy=None if alone else model.policy)
 
 
-def _rest(dictionary: Dictionary, begin: float, horizon: float) -> Dictionary:
+def _restrict_dictionary(dictionary: Dictionary, begin: float, horizon: float) -> Dictionary:
     """Return the dictionary of the remaining pieces after ``begin``, with one indicator function for each piece."""
     slack = SAME_TIME * horizon
     later = dictionary.breakpoints[dictionary.breakpoints > begin + slack] - begin
@@ -99,7 +99,7 @@ def _rest(dictionary: Dictionary, begin: float, horizon: float) -> Dictionary:
     return Dictionary(np.concatenate([[0.0], later]), np.eye(later.size))
 
 
-def _seam(problem: OptimalControlProblem, control: Dictionary, again: Array | None) -> list[MixedConstraint]:
+def _build_seam(problem: OptimalControlProblem, control: Dictionary, again: Array | None) -> list[MixedConstraint]:
     """Return the constraint on the last control, from which the first control of the next period is a step. The list is
     empty for a plan that does not repeat, and for a ``control_step`` without flat sides."""
     flat = None if problem.control_step is None else problem.control_step.halfspaces()

@@ -207,37 +207,40 @@ class Resolving:
         refuse_remaining(model)
         self._model, self._tools, self._seconds = model, tools, seconds
         self._method = Exchange(tolerance=tolerance)
-        self._kept: dict[int, tuple[Transcription, Transcription, Units]] = {}
-        self._tracking: dict[int, Tracking | None] = {}
-        self._retuning: list[Retuning] = []
-        self._took, self._pieces = 0.0, model.control.pieces  # a whole program, and the pieces that it had
-        self._again: Array | None = None  # with what the next period begins, of a plan that repeats
-        self._written = 0.0  # what it takes to write a whole program down, however few pieces are left
+        self._prepared_problems: dict[int, tuple[Transcription, Transcription, Units]] = {}
+        self._trackers: dict[int, Tracking | None] = {}
+        self._retunings: list[Retuning] = []
+        self._solve_seconds, self._solved_pieces = (
+            0.0,
+            model.control.pieces,
+        )  # a whole program, and the pieces that it had
+        self._next_control: Array | None = None  # with what the next period begins, of a plan that repeats
+        self._transcription_seconds = 0.0  # what it takes to write a whole program down, however few pieces are left
 
     def prepare(self, plan: Plan) -> None:
         """Compute everything that steps with a time limit should not wait for, for the plan that loops begin with;
         nothing without a limit."""
-        self._again = plan.known.pieces(plan.decision)[:, 0]
+        self._next_control = plan.known.pieces(plan.decision)[:, 0]
         if self._seconds is None:
             return
         state, start_time = np.asarray(self._model.problem.initial_state, dtype=float), clock.perf_counter()
         remaining(self._model, 0, state, None)
-        self._written = clock.perf_counter() - start_time
-        self._took = WHOLE * self._written
+        self._transcription_seconds = clock.perf_counter() - start_time
+        self._solve_seconds = WHOLE * self._transcription_seconds
         if self._model.feedback is not None:
             retuning = Retuning(plan.known, plan.decision)
             retuning.prepare(state)
-            self._retuning = [retuning]
+            self._retunings = [retuning]
             return
         if self._model.problem.control_step is None:
             for piece in range(self._model.control.pieces):
-                if self._tracker(piece, state) is None and self._written > self._seconds:
+                if self._get_tracker(piece, state) is None and self._transcription_seconds > self._seconds:
                     return  # those that are left are never begun
 
-    def _in_time(self, piece: int) -> bool:
+    def _is_in_time(self, piece: int) -> bool:
         """Return whether a whole program from a piece on is expected to end within the time limit."""
         pieces = self._model.control.pieces - piece
-        needed = max(self._written, self._took * (pieces / self._pieces) ** 2)
+        needed = max(self._transcription_seconds, self._solve_seconds * (pieces / self._solved_pieces) ** 2)
         return self._seconds is None or needed <= self._seconds
 
     def answer(
@@ -249,7 +252,7 @@ class Resolving:
         deadline = Deadline(self._seconds)
         tools = replace(self._tools, deadline=deadline, notify=ignore)
         try:
-            solved = (self._fixed if self._model.feedback is None else self._feedback)(
+            solved = (self._solve_open_loop if self._model.feedback is None else self._solve_feedback)(
                 plan, piece, state, before, innovations, tools
             )
         except (
@@ -261,7 +264,7 @@ class Resolving:
             raise KeyboardInterrupt
         return solved
 
-    def _feedback(
+    def _solve_feedback(
         self,
         plan: Plan,
         piece: int,
@@ -271,36 +274,38 @@ class Resolving:
         tools: Tools,
     ) -> Solved:
         tools.deadline.check()
-        tuned, pieces = self._tuned(plan, piece, state, innovations), self._model.control.pieces - piece
-        if not self._in_time(piece):
+        tuned, pieces = self._retune(plan, piece, state, innovations), self._model.control.pieces - piece
+        if not self._is_in_time(piece):
             return tuned
         start_time, full = clock.perf_counter(), Solved(None)
         with suppress(SparseRobError, OutOfTime):
             model = remaining(self._model, piece, state, before)
             gap = float(self._model.control.breakpoints[piece] - self._model.control.breakpoints[plan.first])
-            result = answered_in_own_units(partial(self._begun, plan.cuts, gap), model.program, tools)
+            result = answered_in_own_units(partial(self._solve_from_cuts, plan.cuts, gap), model.program, tools)
             known_cost = plan.cost_left(piece - plan.first, innovations)
-            full = self._judged(model, result, piece, result.decision, result.cost, result.lower_bound, known_cost)
-        self._took, self._pieces = clock.perf_counter() - start_time, pieces
+            full = self._judge_result(
+                model, result, piece, result.decision, result.cost, result.lower_bound, known_cost
+            )
+        self._solve_seconds, self._solved_pieces = clock.perf_counter() - start_time, pieces
         if full.plan is None:
-            self._took *= 2.0  # it needs more than it had
+            self._solve_seconds *= 2.0  # it needs more than it had
         if tuned.plan is None or (full.plan is not None and full.cost <= tuned.cost):
             return full
         return replace(tuned, lower=full.lower)
 
-    def _begun(self, cuts: Sequence[Cut], gap: float, program: SemiInfiniteProgram, tools: Tools) -> Result:
+    def _solve_from_cuts(self, cuts: Sequence[Cut], gap: float, program: SemiInfiniteProgram, tools: Tools) -> Result:
         """Solve a program in its own units by the exchange method, starting from the ``cuts`` of an earlier solve. The
         program begins ``gap`` later than the program in which these cuts were active."""
         return self._method.close(program, tools, prover_of(program, tools), shifted(cuts, gap, program))
 
-    def _tuned(self, plan: Plan, piece: int, state: Array, innovations: Sequence[Array]) -> Solved:
+    def _retune(self, plan: Plan, piece: int, state: Array, innovations: Sequence[Array]) -> Solved:
         """Solve for the best nominal control with the same gains, where `Retuning` accepts the problem."""
-        retuning = next((entry for entry in self._retuning if entry.model is plan.known), None)
+        retuning = next((entry for entry in self._retunings if entry.model is plan.known), None)
         if retuning is None:
-            if self._seconds is not None and self._written > self._seconds:
+            if self._seconds is not None and self._transcription_seconds > self._seconds:
                 return Solved(None)
             retuning = Retuning(plan.known, plan.decision)
-            self._retuning = [*self._retuning[:1], retuning]  # that of the plan that loops begin with, and the last
+            self._retunings = [*self._retunings[:1], retuning]  # that of the plan that loops begin with, and the last
         plan_piece = piece - plan.first
         tracked = retuning.solve(plan_piece, state)
         if tracked is None:
@@ -310,7 +315,7 @@ class Resolving:
         cost, known_cost = (candidate.cost_left(plan_piece, innovations) for candidate in (tuned, plan))
         return Solved(tuned, cost, cheaper=is_cheaper(cost, known_cost))
 
-    def _fixed(
+    def _solve_open_loop(
         self,
         plan: Plan,
         piece: int,
@@ -319,19 +324,22 @@ class Resolving:
         innovations: Sequence[Array],
         tools: Tools,
     ) -> Solved:
-        tracked = self._tracked(plan, piece, state, innovations)
+        tracked = self._solve_by_tracking(plan, piece, state, innovations)
         if tracked is not None:
             return tracked
         tools.deadline.check()
-        if not self._in_time(piece):
+        if not self._is_in_time(piece):
             return Solved(None)
         start_time = clock.perf_counter()
         try:
-            return self._closed(plan, piece, state, before, innovations, tools)
+            return self._solve_by_exchange(plan, piece, state, before, innovations, tools)
         finally:
-            self._took, self._pieces = clock.perf_counter() - start_time, self._model.control.pieces - piece
+            self._solve_seconds, self._solved_pieces = (
+                clock.perf_counter() - start_time,
+                self._model.control.pieces - piece,
+            )
 
-    def _closed(
+    def _solve_by_exchange(
         self,
         plan: Plan,
         piece: int,
@@ -341,7 +349,7 @@ class Resolving:
         tools: Tools,
     ) -> Solved:
         """Solve the remaining program by the exchange method until its gap is closed."""
-        model, own, units = self._own(piece, state, before)
+        model, own, units = self._pose_from_state(piece, state, before)
         program = own.program
         gap = float(self._model.control.breakpoints[piece] - self._model.control.breakpoints[plan.first])
         result = self._method.close(
@@ -356,19 +364,21 @@ class Resolving:
         known_cost = units.cost * float(program.cost(tail))
         cuts = tuple(replace(cut, index=cut.index * index_units(program, cut)) for cut in result.indices)
         result = replace(result, indices=cuts)
-        return self._judged(
+        return self._judge_result(
             model, result, piece, decision, units.cost * result.cost, units.cost * result.lower_bound, known_cost
         )
 
-    def _tracked(self, plan: Plan, piece: int, state: Array, innovations: Sequence[Array]) -> Solved | None:
+    def _solve_by_tracking(self, plan: Plan, piece: int, state: Array, innovations: Sequence[Array]) -> Solved | None:
         """Return the answer of `Tracking` where it accepts the problem and closes the gap; otherwise ``None``."""
         if self._model.problem.control_step is not None:
             return None
-        is_too_late = self._seconds is not None and self._written > self._seconds and piece not in self._tracking
-        tracking = None if is_too_late else self._tracker(piece, state)
+        is_too_late = (
+            self._seconds is not None and self._transcription_seconds > self._seconds and piece not in self._trackers
+        )
+        tracking = None if is_too_late else self._get_tracker(piece, state)
         if tracking is None:
             return None
-        model, own, units = self._prepared(piece, state)
+        model, own, units = self._prepare_problem(piece, state)
         tracked = tracking.solve(state / units.states)
         if tracked is None:
             return None
@@ -384,32 +394,34 @@ class Resolving:
             is_cheaper(tracked.cost, known_cost),
         )
 
-    def _tracker(self, piece: int, state: Array) -> Tracking | None:
+    def _get_tracker(self, piece: int, state: Array) -> Tracking | None:
         """Return the solver `Tracking` of the remaining problem from a piece on; ``None`` where it does not accept the
         problem."""
-        if piece not in self._tracking:
-            own = self._prepared(piece, state)[1]
-            self._tracking[piece] = Tracking(own) if trackable(own) else None
-        return self._tracking[piece]
+        if piece not in self._trackers:
+            own = self._prepare_problem(piece, state)[1]
+            self._trackers[piece] = Tracking(own) if trackable(own) else None
+        return self._trackers[piece]
 
-    def _prepared(self, piece: int, state: Array) -> tuple[Transcription, Transcription, Units]:
+    def _prepare_problem(self, piece: int, state: Array) -> tuple[Transcription, Transcription, Units]:
         """Return the remaining problem in the user's units, the same problem in its own units, and these units. The
         initial state is the first one that was asked for at this piece."""
-        if piece not in self._kept:
+        if piece not in self._prepared_problems:
             model = remaining(self._model, piece, state, None)
-            self._kept[piece] = (model, *in_own_units(model))
-        return self._kept[piece]
+            self._prepared_problems[piece] = (model, *in_own_units(model))
+        return self._prepared_problems[piece]
 
-    def _own(self, piece: int, state: Array, before: Array | None) -> tuple[Transcription, Transcription, Units]:
+    def _pose_from_state(
+        self, piece: int, state: Array, before: Array | None
+    ) -> tuple[Transcription, Transcription, Units]:
         """Return the remaining problem from this state in the user's units, the same problem in its own units, and
         these units."""
         if self._model.problem.control_step is not None:
-            model = remaining(self._model, piece, state, before, again=self._again)
+            model = remaining(self._model, piece, state, before, again=self._next_control)
             return (model, *in_own_units(model))
-        model, own, units = self._prepared(piece, state)
+        model, own, units = self._prepare_problem(piece, state)
         return from_state(model, state), from_state(own, state / units.states), units
 
-    def _judged(
+    def _judge_result(
         self,
         model: Transcription,
         result: Result,
@@ -448,14 +460,16 @@ def shifted(cuts: Sequence[Cut], gap: float, program: SemiInfiniteProgram) -> Vi
         index[0] -= gap
         index = index if units is None else index / units
         is_start = (
-            family.uncertain is not None and family.start is not None and _holds(family.start, index, box.upper[0])
+            family.uncertain is not None
+            and family.start is not None
+            and _is_start_index(family.start, index, box.upper[0])
         )
         if box.lower[0] <= index[0] <= box.upper[0] and not is_start:
             rows.append((index[None], np.array([cut.row]), cut.family))
     return rows
 
 
-def _holds(start: Array, index: Array, last: float) -> bool:
+def _is_start_index(start: Array, index: Array, last: float) -> bool:
     """Return whether an index is among the indices that a method begins with, up to the rounding of times up to
     ``last``."""
     return bool((np.abs(start - index).max(axis=1) <= SAME_TIME * abs(last)).any())

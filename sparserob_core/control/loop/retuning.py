@@ -59,32 +59,32 @@ class Retuning:
 
     def __init__(self, model: Transcription, decision: Array) -> None:
         self.model, self.decision = model, decision
-        self._tracking: dict[int, Tracking | None] = {}
+        self._trackers: dict[int, Tracking | None] = {}
 
     def prepare(self, state: Array) -> None:
         """Compute the solver of every piece, as long as `Tracking` accepts the problem; the value of ``state (d,)``
         does not matter."""
         for piece in range(self.model.control.pieces):
-            if self._tracking.setdefault(piece, self._prepared(piece, state)) is None:
+            if self._trackers.setdefault(piece, self._prepare_tracker(piece, state)) is None:
                 return
 
     def solve(self, piece: int, state: Array) -> Tracked | None:
         """Return the nominal control ``(m K',)`` that remains from ``piece`` on, with the response of the gains to the
         past, from a measured ``state (d,)``. ``None`` where no answer is proven, or where `Tracking` does not accept
         the problem."""
-        if piece not in self._tracking:
-            self._tracking[piece] = self._prepared(piece, state)
-        tracking = self._tracking[piece]
+        if piece not in self._trackers:
+            self._trackers[piece] = self._prepare_tracker(piece, state)
+        tracking = self._trackers[piece]
         return None if tracking is None else tracking.solve(state)
 
-    def _prepared(self, piece: int, state: Array) -> Tracking | None:
+    def _prepare_tracker(self, piece: int, state: Array) -> Tracking | None:
         model, grid = self.model, self.model.response.grid
         loop, signal = model.answering.loop, model.functionals.disturbance
         if model.answering.charge.cost not in ("nominal", "peak") or not loop.spread.is_box or loop.middles.any():
             return None
         if model.problem.disturbance_class != "piecewise_constant":
             return None
-        if signal is None or signal.starts is None or signal.starts.size != grid.pieces or not _plain(model):
+        if signal is None or signal.starts is None or signal.starts.size != grid.pieces or not _is_plain_problem(model):
             return None
         try:
             remainder = remaining(model, piece, state, None, alone=True)
@@ -103,7 +103,7 @@ class Retuning:
         return tracking if tracking.limited else None
 
 
-def _plain(model: Transcription) -> bool:
+def _is_plain_problem(model: Transcription) -> bool:
     """Return whether the nominal control alone determines the problem without feedback: no parameters, no steps of the
     control, no equalities, on equal pieces."""
     problem, grid = model.problem, model.response.grid

@@ -143,87 +143,101 @@ class Tracking:
         self.factors = np.array(factors)
         self.last = np.linalg.norm(self.rates[-1] @ self.A, axis=1)
         self.growth = float(np.linalg.norm(self.A, 2))
-        self._summed = np.tile(np.eye(self.h.size), (TERMS, 1))
+        self._summation = np.tile(np.eye(self.h.size), (TERMS, 1))
         self._series: dict[float, tuple[Array, Array]] = {}
         self._blocks: dict[tuple[int, int], _Instants] = {}
         self._offsets: dict[int, tuple[Array, Array]] = {}
-        self._given = self.kernel @ self.E
-        self._added: dict[tuple[int, int, int], Array] = {}
-        self._first, zeros = self._pushed(np.eye(d)[None], np.zeros((1, d, d)))[0], np.zeros((1, d, d))
-        self._bent, magnitudes = self._bending(), np.zeros_like(self._first)
+        self._disturbance_kernel = self.kernel @ self.E
+        self._support_cache: dict[tuple[int, int, int], Array] = {}
+        self._support_values, zeros = (
+            self._compute_support(np.eye(d)[None], np.zeros((1, d, d)))[0],
+            np.zeros((1, d, d)),
+        )
+        self._curvature_bounds, magnitudes = self._bound_disturbance_curvature(), np.zeros_like(self._support_values)
         if self._answering is not None:
             ends = [self._answering.added(np.eye(d)[None], zeros, k) for k in range(self.K + 1)]
-            self._first = np.concatenate(ends)
-            self._bent, magnitudes = self._answering.bending(lambda rates: self._curvature(rates, self.length))
-        self._flat = self.nodes.reshape(-1, self.nodes.shape[2])
-        self._sizes = np.abs(self.powers)
-        self._absolute = ROUND_OFF * np.abs(self.H).T
+            self._support_values = np.concatenate(ends)
+            self._curvature_bounds, magnitudes = self._answering.bending(
+                lambda rates: self._bound_curvature(rates, self.length)
+            )
+        self._flat_nodes = self.nodes.reshape(-1, self.nodes.shape[2])
+        self._power_magnitudes = np.abs(self.powers)
+        self._row_roundings = ROUND_OFF * np.abs(self.H).T
         number = np.arange(self.K + 1)[:, None]
-        self._seen = (number >= self.start) & (number <= self.stop)
-        self._inside = (number[:-1] >= self.start) & (number[:-1] < self.stop)
-        effects = np.abs(self._first)
-        self._noise = self.sizes @ self._absolute + ROUND_OFF * (np.abs(self.h) + effects.max(axis=0, initial=0.0))
-        self._noise = self._noise + ROUND_OFF * magnitudes
-        self._recent: list[tuple[int, int, int, int]] = []  # rows that had a multiplier, those of the last states last
-        self._begin()
+        self._is_active_node = (number >= self.start) & (number <= self.stop)
+        self._is_active_piece = (number[:-1] >= self.start) & (number[:-1] < self.stop)
+        effects = np.abs(self._support_values)
+        self._rounding_errors = self.sizes @ self._row_roundings + ROUND_OFF * (
+            np.abs(self.h) + effects.max(axis=0, initial=0.0)
+        )
+        self._rounding_errors = self._rounding_errors + ROUND_OFF * magnitudes
+        self._recent_instants: list[
+            tuple[int, int, int, int]
+        ] = []  # rows that had a multiplier, those of the last states last
+        self._start_program()
 
-    def _begin(self) -> None:
+    def _start_program(self) -> None:
         self._program = WarmProgram(*self.limits)
-        self._places: list[tuple[int, int, int, int]] = []  # row, piece, level and number of an instant
-        self._free, self._right = np.zeros((0, self.H.shape[1])), np.zeros(0)
+        self._row_instants: list[tuple[int, int, int, int]] = []  # row, piece, level and number of an instant
+        self._state_rows, self._right_hand_sides = np.zeros((0, self.H.shape[1])), np.zeros(0)
 
     def solve(self, state: Array) -> Tracked | None:
         """Return the answer from an initial state; ``None`` where none was proven."""
-        if len(self._places) > KEPT:
-            self._forget()
-        nominal = self._undriven(state)
+        if len(self._row_instants) > KEPT:
+            self._drop_idle_rows()
+        nominal = self._propagate_uncontrolled(state)
         for round_ in range(ROUNDS):
-            h = self._right - self._free @ state
+            h = self._right_hand_sides - self._state_rows @ state
             solution = self._program.solve(h - MARGIN)
             if solution is None:
                 return None
             x, y = solution
-            open_instants = self._open(x, *nominal)
+            open_instants = self._find_unproven_instants(x, *nominal)
             if open_instants is None:
                 return None
             if not open_instants:
-                self._recent = [*self._recent, *(self._places[i] for i in np.flatnonzero(y > 0.0))][-RECENT:]
+                self._recent_instants = [
+                    *self._recent_instants,
+                    *(self._row_instants[i] for i in np.flatnonzero(y > 0.0)),
+                ][-RECENT:]
                 weights = self.limits[0]
                 return Tracked(x, float(weights @ np.abs(x)), self._program.bound(h, y))
-            new_instants = [instant for instant in open_instants if instant not in self._places]
+            new_instants = [instant for instant in open_instants if instant not in self._row_instants]
             if not new_instants:
                 return None
-            self._impose(new_instants + self._between(new_instants) if round_ else new_instants)
+            self._impose_rows(new_instants + self._bisect_instants(new_instants) if round_ else new_instants)
         return None
 
-    def _forget(self) -> None:
+    def _drop_idle_rows(self) -> None:
         """Remove the rows without a multiplier in the last solutions."""
-        needed = set(list(dict.fromkeys(self._recent))[-KEPT // 2 :])
-        kept = self._program.keep(np.array([instant in needed for instant in self._places], dtype=bool))
-        self._places = [self._places[i] for i in np.flatnonzero(kept)]
-        self._free, self._right = self._free[kept], self._right[kept]
+        needed = set(list(dict.fromkeys(self._recent_instants))[-KEPT // 2 :])
+        kept = self._program.keep(np.array([instant in needed for instant in self._row_instants], dtype=bool))
+        self._row_instants = [self._row_instants[i] for i in np.flatnonzero(kept)]
+        self._state_rows, self._right_hand_sides = self._state_rows[kept], self._right_hand_sides[kept]
 
-    def _between(self, fresh: list[tuple[int, int, int, int]]) -> list[tuple[int, int, int, int]]:
+    def _bisect_instants(self, fresh: list[tuple[int, int, int, int]]) -> list[tuple[int, int, int, int]]:
         """Return instants halfway from new rows to the next rows on both sides. Without them, a peak between two rows
         would be halved round by round."""
         instants = list[tuple[int, int, int, int]]()
         for row, piece, level, number in fresh:
-            numbers = sorted(n for *same, n in self._places if same == [row, piece, level])
+            numbers = sorted(n for *same, n in self._row_instants if same == [row, piece, level])
             after = bisect_left(numbers, number)
             instants += [(row, piece, level, (number + n) // 2) for n in numbers[max(after - 1, 0) : after + 1]]
-        return [instant for instant in dict.fromkeys(instants) if instant not in fresh and instant not in self._places]
+        return [
+            instant for instant in dict.fromkeys(instants) if instant not in fresh and instant not in self._row_instants
+        ]
 
-    def _impose(self, places: list[tuple[int, int, int, int]]) -> None:
+    def _impose_rows(self, places: list[tuple[int, int, int, int]]) -> None:
         G, F, right = [], [], []
         for row, piece, level, number in places:
-            c, input_row, support_value = self.H[row], np.zeros(self.H.shape[1]), self._first[piece, row]
+            c, input_row, support_value = self.H[row], np.zeros(self.H.shape[1]), self._support_values[piece, row]
             if level:
                 parent = min(number // PARTS, PARTS ** (level - 1) - 1)
-                block, at = self._block(level, parent), number - parent * PARTS
+                block, at = self._get_block(level, parent), number - parent * PARTS
                 c, input_row, support_value = (
                     c @ block.flow[at],
                     c @ block.driven[at],
-                    self._at(level, parent, piece)[at, row],
+                    self._get_support(level, parent, piece)[at, row],
                 )
             g = (c @ self.nodes[piece]).reshape(self.m, self.K)
             if level:
@@ -232,30 +246,34 @@ class Tracking:
             F.append(c @ self.powers[piece])
             right.append(self.h[row] - c @ self.fixed[piece] - input_row @ self.drift - support_value)
         self._program.add(np.array(G))
-        self._free = np.vstack([self._free, F])
-        self._right = np.concatenate([self._right, right])
-        self._places += places
+        self._state_rows = np.vstack([self._state_rows, F])
+        self._right_hand_sides = np.concatenate([self._right_hand_sides, right])
+        self._row_instants += places
 
-    def _undriven(self, state: Array) -> tuple[Array, Array]:
+    def _propagate_uncontrolled(self, state: Array) -> tuple[Array, Array]:
         """Return the states ``(K + 1, d)`` at the breakpoints without control, and the rounding error of the rows
         there, ``(K + 1, R)``."""
-        return self.powers @ state + self.fixed, self._noise + self._sizes @ np.abs(state) @ self._absolute
+        return self.powers @ state + self.fixed, self._rounding_errors + self._power_magnitudes @ np.abs(
+            state
+        ) @ self._row_roundings
 
-    def _open(self, x: Array, undriven: Array, noise: Array) -> list[tuple[int, int, int, int]] | None:
+    def _find_unproven_instants(
+        self, x: Array, undriven: Array, noise: Array
+    ) -> list[tuple[int, int, int, int]] | None:
         """Return the worst instant of every row in every run of cells in which the row is not proven to hold. The list
         is empty where all rows are proven; ``None`` where this remains undecided."""
-        nodes = (self._flat @ x).reshape(self.fixed.shape) + undriven
+        nodes = (self._flat_nodes @ x).reshape(self.fixed.shape) + undriven
         drives = x.reshape(self.m, self.K).T @ self.B.T + self.drift
-        heights = nodes @ self.H.T + self._first - self.h
-        is_violated = (heights + noise > TOLERANCE) & self._seen
+        heights = nodes @ self.H.T + self._support_values - self.h
+        is_violated = (heights + noise > TOLERANCE) & self._is_active_node
         if is_violated.any():
             worst = np.where(is_violated, heights, -np.inf)
-            peaks = self._peaks(worst, 0, np.zeros(self.K + 1, int), np.arange(self.K + 1))
-            return self._sharpened(peaks, nodes, drives)
+            peaks = self._find_peaks(worst, 0, np.zeros(self.K + 1, int), np.arange(self.K + 1))
+            return self._refine_peaks(peaks, nodes, drives)
         rates = nodes[:-1] @ self.A.T + drives
-        curvature = (self._curvature(rates, self.length) + self._bent) * (self.length**2 / 8.0)
+        curvature = (self._bound_curvature(rates, self.length) + self._curvature_bounds) * (self.length**2 / 8.0)
         noise = np.maximum(noise[:-1], noise[1:])
-        is_open = (np.maximum(heights[:-1], heights[1:]) + curvature + noise > TOLERANCE) & self._inside
+        is_open = (np.maximum(heights[:-1], heights[1:]) + curvature + noise > TOLERANCE) & self._is_active_piece
         cells = [(int(k), 0) for k in np.flatnonzero(is_open.any(axis=1))]
         for level in range(1, LEVELS + 1):
             if not cells or len(cells) > FEW:
@@ -263,32 +281,36 @@ class Tracking:
             instants, open_cells = list[tuple[int, int, int, int]](), list[tuple[int, int]]()
             width = self.length / PARTS**level
             for k, parent in cells:
-                at = self._block(level, parent)
+                at = self._get_block(level, parent)
                 states = at.flow @ nodes[k] + at.driven @ drives[k]  # (PARTS + 1, d)
-                heights = states @ self.H.T + self._at(level, parent, k) - self.h
-                is_violated = (heights + noise[k] > TOLERANCE) & self._inside[k]
+                heights = states @ self.H.T + self._get_support(level, parent, k) - self.h
+                is_violated = (heights + noise[k] > TOLERANCE) & self._is_active_piece[k]
                 first = parent * PARTS
                 if is_violated.any():
                     numbers = np.arange(first, first + PARTS + 1)
                     worst = np.where(is_violated, heights, -np.inf)
-                    instants += self._peaks(worst, level, numbers, np.full(numbers.size, k))
+                    instants += self._find_peaks(worst, level, numbers, np.full(numbers.size, k))
                 elif not instants:
-                    cell_curvature = self._curvature(states[:-1] @ self.A.T + drives[k], width) + self._bent[k]
+                    cell_curvature = (
+                        self._bound_curvature(states[:-1] @ self.A.T + drives[k], width) + self._curvature_bounds[k]
+                    )
                     upper_bounds = np.maximum(heights[:-1], heights[1:]) + cell_curvature * (width**2 / 8.0) + noise[k]
-                    is_open_cell = ((upper_bounds > TOLERANCE) & self._inside[k]).any(axis=1)
+                    is_open_cell = ((upper_bounds > TOLERANCE) & self._is_active_piece[k]).any(axis=1)
                     open_cells += [(k, first + int(cell)) for cell in np.flatnonzero(is_open_cell)]
             if instants:
-                return self._sharpened(instants, nodes, drives)
+                return self._refine_peaks(instants, nodes, drives)
             cells = open_cells
         return None if cells else []
 
-    def _peaks(self, worst: Array, level: int, at: np.ndarray, pieces: np.ndarray) -> list[tuple[int, int, int, int]]:
+    def _find_peaks(
+        self, worst: Array, level: int, at: np.ndarray, pieces: np.ndarray
+    ) -> list[tuple[int, int, int, int]]:
         """Return the local maxima of violations ``(k, R)`` at consecutive instants."""
         padded = np.vstack([np.full(worst.shape[1], -np.inf), worst, np.full(worst.shape[1], -np.inf)])
         is_peak = (worst > padded[:-2]) & (worst >= padded[2:]) & np.isfinite(worst)
         return [(int(row), int(pieces[k]), level, int(at[k])) for k, row in np.argwhere(is_peak)]
 
-    def _sharpened(
+    def _refine_peaks(
         self, places: list[tuple[int, int, int, int]], nodes: Array, drives: Array
     ) -> list[tuple[int, int, int, int]]:
         """Return the instants near these places at which the rows are worst. A row at the very peak of a trajectory
@@ -300,10 +322,10 @@ class Tracking:
                 for before in (1, 0):  # the cells that end and begin in the instant
                     k, cell = (piece - 1, size - 1) if number < before else (piece, number - before)
                     k, cell = (k + 1, 0) if cell == size else (k, cell)
-                    if 0 <= k < self.K and self._inside[k, row]:
-                        block = self._block(level + 1, cell)
+                    if 0 <= k < self.K and self._is_active_piece[k, row]:
+                        block = self._get_block(level + 1, cell)
                         states = block.flow @ nodes[k] + block.driven @ drives[k]
-                        heights = states @ self.H[row] + self._at(level + 1, cell, k)[:, row]
+                        heights = states @ self.H[row] + self._get_support(level + 1, cell, k)[:, row]
                         worst = int(heights.argmax())
                         candidates.append((float(heights[worst]), k, cell * PARTS + worst))
                 if not candidates:
@@ -313,11 +335,13 @@ class Tracking:
             instants.append((row, piece, level, number))
         return list(dict.fromkeys(instants))
 
-    def _curvature(self, rates: Array, width: float) -> Array:
+    def _bound_curvature(self, rates: Array, width: float) -> Array:
         """Return bounds ``(..., R)`` of the second derivative of the rows over a cell of this ``width``, at whose
         beginning the states have the ``rates (..., d)``."""
         if rates.ndim > 2:
-            return np.array([self._curvature(table, width) for table in rates]).reshape(*rates.shape[:-1], self.h.size)
+            return np.array([self._bound_curvature(table, width) for table in rates]).reshape(
+                *rates.shape[:-1], self.h.size
+            )
         if width not in self._series:
             powers = np.cumprod([1.0] + [width] * TERMS)
             tail = self.factors[-1] / TERMS * powers[-1] * np.exp(self.growth * width)
@@ -325,9 +349,9 @@ class Tracking:
             self._series[width] = terms.reshape(-1, rates.shape[-1]).T.copy(), tail * self.last
         terms, tail = self._series[width]
         sizes = np.sqrt(np.einsum("ki,ki->k", rates, rates))
-        return np.asarray(np.abs(rates @ terms) @ self._summed + sizes[:, None] * tail)
+        return np.asarray(np.abs(rates @ terms) @ self._summation + sizes[:, None] * tail)
 
-    def _block(self, level: int, parent: int) -> _Instants:
+    def _get_block(self, level: int, parent: int) -> _Instants:
         """Return the quantities at the ``PARTS + 1`` ends of the parts of one cell of the level before."""
         key = (level, parent)
         if key not in self._blocks:
@@ -335,41 +359,41 @@ class Tracking:
                 self._offsets[level] = self.own.response.flows(np.arange(PARTS + 1) * self.length / PARTS**level)
             flow, integral = self._offsets[level]
             if level > 1:
-                before, at = self._block(level - 1, parent // PARTS), parent % PARTS
+                before, at = self._get_block(level - 1, parent // PARTS), parent % PARTS
                 flow, integral = flow @ before.flow[at], flow @ before.driven[at] + integral
-            self._blocks[key] = _Instants(flow, integral, self._pushed(flow, integral))
+            self._blocks[key] = _Instants(flow, integral, self._compute_support(flow, integral))
         return self._blocks[key]
 
-    def _at(self, level: int, parent: int, piece: int) -> Array:
+    def _get_support(self, level: int, parent: int, piece: int) -> Array:
         """Return the support value of the disturbance in every row at the instants of a block on one piece, ``(q, R)``.
         Under gains, the effect of the control that answers is included."""
-        block = self._block(level, parent)
+        block = self._get_block(level, parent)
         if self._answering is None:
             return np.asarray(block.pushed[:, piece])
         key = (level, parent, piece)
-        if key not in self._added:
-            self._added[key] = self._answering.added(block.flow, block.driven, piece)
-        return self._added[key]
+        if key not in self._support_cache:
+            self._support_cache[key] = self._answering.added(block.flow, block.driven, piece)
+        return self._support_cache[key]
 
-    def _pushed(self, flow: Array, driven: Array) -> Array:
+    def _compute_support(self, flow: Array, driven: Array) -> Array:
         """Return the support value of the disturbance in every row on every piece, ``(q, K + 1, R)``, at instants with
         these flows from the beginning of a piece."""
         support_values = np.zeros((flow.shape[0], self.K + 1, self.h.size))
         if self.bound is not None:
-            q, (K, d, w) = flow.shape[0], self._given.shape
-            responses = (self.H @ flow).reshape(-1, d) @ self._given.transpose(1, 0, 2).reshape(d, -1)
+            q, (K, d, w) = flow.shape[0], self._disturbance_kernel.shape
+            responses = (self.H @ flow).reshape(-1, d) @ self._disturbance_kernel.transpose(1, 0, 2).reshape(d, -1)
             responses = responses.reshape(q, self.h.size, K, w).swapaxes(1, 2)
             support_values[:, 1:] = np.cumsum(self.bound.support(responses), axis=1)
             support_values[:, : self.K] += self.bound.support(self.H @ driven @ self.E)[:, None]
         return support_values
 
-    def _bending(self) -> Array:
+    def _bound_disturbance_curvature(self) -> Array:
         """Return bounds ``(K, R)`` of the second derivative of the effect of any disturbance over every piece: the sum
         of the bounds of its entries, each as large as it may be."""
         if self.bound is None:
             return np.zeros((self.K, self.h.size))
         reach = self.bound.reach(np.eye(self.E.shape[1]))
-        rates = (self.A @ self._given).swapaxes(1, 2)  # (K, mw, d)
-        bounds = np.einsum("kir,i->kr", self._curvature(rates, self.length), reach)
+        rates = (self.A @ self._disturbance_kernel).swapaxes(1, 2)  # (K, mw, d)
+        bounds = np.einsum("kir,i->kr", self._bound_curvature(rates, self.length), reach)
         past = np.vstack([np.zeros((1, self.h.size)), np.cumsum(bounds, axis=0)[:-1]])
-        return np.asarray(past + reach @ self._curvature(self.E.T, self.length))
+        return np.asarray(past + reach @ self._bound_curvature(self.E.T, self.length))

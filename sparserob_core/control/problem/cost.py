@@ -119,11 +119,13 @@ class Cost(Term):
             l1 = np.nan
         if not 0.0 <= l1 < np.inf or isinstance(self.l1, bool):
             raise InputError(path="l1", expected="a number, at least 0", got=f"{self.l1!r}")
-        group = _groups(self.group, controls, weights)
+        group = _check_groups(self.group, controls, weights)
         if group and l1 == 0.0:
             raise InputError("nothing is left to group where l1 is 0", path="group")
-        state, final = (_term(key, term, "Q", states) for key, term in (("state", self.state), ("final", self.final)))
-        control = _term("control", self.control, "R", controls)
+        state, final = (
+            _check_term(key, term, "Q", states) for key, term in (("state", self.state), ("final", self.final))
+        )
+        control = _check_term("control", self.control, "R", controls)
         if l1 == 0.0 and not any(term is not None and term.Q.any() for term in (state, control, final)):
             raise InputError(path="l1", expected="a number above 0, or one of state, control and final", got="0")
         return replace(self, l1=l1, group=group, state=state, control=control, final=final)
@@ -178,7 +180,7 @@ def nominal_point(convex: ConvexSet) -> Array:
     return convex.interior_point() if vertices is None else np.asarray(vertices, dtype=float).mean(axis=0)
 
 
-def _groups(given: object, controls: int, weights: Array) -> tuple[tuple[int, ...], ...] | None:
+def _check_groups(given: object, controls: int, weights: Array) -> tuple[tuple[int, ...], ...] | None:
     """Return the groups of channels, counted from 1, as tuples; raise `InputError` where they are unsuitable."""
     if given is None:
         return None
@@ -215,7 +217,7 @@ def _groups(given: object, controls: int, weights: Array) -> tuple[tuple[int, ..
     return integer_groups
 
 
-def _term(key: str, given: object, letter: str, size: int) -> Quadratic | None:
+def _check_term(key: str, given: object, letter: str, size: int) -> Quadratic | None:
     """Return one quadratic term from a mapping ``{letter: matrix, reference: vector}``, or ``None`` where it is absent.
 
     Parameters
@@ -247,16 +249,16 @@ def _term(key: str, given: object, letter: str, size: int) -> Quadratic | None:
     else:
         raise InputError(path=key, expected=f"a mapping with {letter}", got=f"{type(given).__name__}")
     quantity = "control" if key == "control" else "state"
-    Q = _numbers(
+    Q = _check_numbers(
         f"{key}.{letter}", matrix, (size, size), f"a {size} by {size} matrix of finite numbers, a row per {quantity}"
     )
     r = np.zeros(size)
     if reference is not None:
-        r = _numbers(f"{key}.reference", reference, (size,), f"{size} finite numbers, one per {quantity}")
-    return Quadratic(_semidefinite(f"{key}.{letter}", Q), r)
+        r = _check_numbers(f"{key}.reference", reference, (size,), f"{size} finite numbers, one per {quantity}")
+    return Quadratic(_require_semidefinite(f"{key}.{letter}", Q), r)
 
 
-def _numbers(path: str, given: object, shape: tuple[int, ...], expected: str) -> Array:
+def _check_numbers(path: str, given: object, shape: tuple[int, ...], expected: str) -> Array:
     """Return an array of finite numbers of the given shape; raise `InputError`."""
     try:
         array = np.asarray(dense(given), dtype=float)
@@ -267,7 +269,7 @@ def _numbers(path: str, given: object, shape: tuple[int, ...], expected: str) ->
     return array + 0.0
 
 
-def _semidefinite(path: str, Q: Array) -> Array:
+def _require_semidefinite(path: str, Q: Array) -> Array:
     """Return a symmetric positive semidefinite matrix; raise `InputError` for other matrices.
 
     A matrix that is semidefinite up to rounding is made so by a small addition to its diagonal, because the checker
@@ -276,14 +278,14 @@ def _semidefinite(path: str, Q: Array) -> Array:
     form = require_convex(path, Q, Q.shape[0])
     Q, diagonal = form.toarray(), form.diagonal()
     small, kept = ROUNDED * Q.shape[0], np.flatnonzero(diagonal > 0.0)
-    if form.nnz == np.count_nonzero(diagonal) or (Q.shape[0] <= EXACT and _exactly_semidefinite(Q)):
+    if form.nnz == np.count_nonzero(diagonal) or (Q.shape[0] <= EXACT and _is_exactly_semidefinite(Q)):
         return Q
     if is_definite(form[kept][:, kept], 1.0 - 2.0 * small):
         return Q
     return Q + np.diag(4.0 * small * diagonal)
 
 
-def _exactly_semidefinite(Q: Array) -> bool:
+def _is_exactly_semidefinite(Q: Array) -> bool:
     """Return True where symmetric elimination in fractions shows that a matrix is positive semidefinite.
 
     No pivot may be negative, and the rest of the row of a pivot that is 0 must be 0 too.
@@ -332,7 +334,7 @@ def checked_weights(given: npt.ArrayLike | None, controls: int, horizon: float) 
                 path="weights", expected=f"{controls} positive numbers, one per control", got=f"{weights.tolist()}"
             )
         return weights
-    rows = _rows(given, controls, horizon)
+    rows = _check_rows(given, controls, horizon)
     return rows[0, 1:] if len(rows) == 1 and (rows[0, 1:] > 0.0).all() else rows
 
 
@@ -343,7 +345,7 @@ def _is_nested(given: npt.ArrayLike) -> bool:
     return isinstance(given, list | tuple) and any(isinstance(row, list | tuple | np.ndarray) for row in given)
 
 
-def _rows(given: npt.ArrayLike, controls: int, horizon: float) -> Array:
+def _check_rows(given: npt.ArrayLike, controls: int, horizon: float) -> Array:
     """Return rows ``(r, 1 + m)`` of a time and the weights from then on; raise `InputError`."""
     expected = f"rows of {1 + controls} numbers, a time and a weight for every control"
     try:

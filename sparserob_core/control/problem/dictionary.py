@@ -57,26 +57,26 @@ class Dictionary:
     __repr__ = noun
 
     def __init__(self, breakpoints: npt.ArrayLike, values: npt.ArrayLike | csr_array) -> None:
-        times = _times(breakpoints)
-        entries = _sparse(values) if hasattr(values, "tocsr") else None
-        matrix = _real("values", values) if entries is None else entries
+        times = _check_times(breakpoints)
+        entries = _check_sparse(values) if hasattr(values, "tocsr") else None
+        matrix = _check_numbers("values", values) if entries is None else entries
         shape: tuple[int, ...] = matrix.shape
         if len(shape) != 2 or shape[0] == 0 or shape[1] != times.size - 1:
             raise InputError(
                 f"values must have shape (functions, {times.size - 1}), got {matrix.shape}", path="dictionary"
             )
-        _at_most(shape[0], shape[1])
+        _check_function_count(shape[0], shape[1])
         owner = _owner(matrix) if entries is None else None
         if owner is not None:
-            self._keep(breakpoints=times, _owner=owner)
+            self._set_fields(breakpoints=times, _owner=owner)
         elif entries is not None:
-            self._keep(breakpoints=times, _entries=entries)
-            if not _orthogonal(entries) and not _independent(self.values):
-                raise _dependent(self.values)
-        elif not _independent(matrix):
-            raise _dependent(matrix)
+            self._set_fields(breakpoints=times, _entries=entries)
+            if not _has_orthogonal_rows(entries) and not _has_full_row_rank(self.values):
+                raise _build_dependence_error(self.values)
+        elif not _has_full_row_rank(matrix):
+            raise _build_dependence_error(matrix)
         else:
-            self._keep(breakpoints=times, values=matrix)
+            self._set_fields(breakpoints=times, values=matrix)
 
     @classmethod
     def indicators(cls, breakpoints: npt.ArrayLike, owner: npt.ArrayLike | None = None) -> Dictionary:
@@ -100,9 +100,9 @@ class Dictionary:
         InputError
             If the times do not increase from 0, or ``owner`` is not of this form.
         """
-        times = _times(breakpoints)
+        times = _check_times(breakpoints)
         if owner is None:
-            return cls._made(times, _owner=np.arange(times.size - 1))
+            return cls._build_from_fields(times, _owner=np.arange(times.size - 1))
         owner = np.array(owner)
         if (
             owner.shape != (times.size - 1,)
@@ -111,19 +111,19 @@ class Dictionary:
             or not np.bincount(owner).all()
         ):
             raise InputError(
-                f"owner must be {times.size - 1} whole numbers, all from 0 to the largest, got {_short(owner)}",
+                f"owner must be {times.size - 1} whole numbers, all from 0 to the largest, got {_abbreviate(owner)}",
                 path="dictionary",
             )
-        return cls._made(times, _owner=owner)
+        return cls._build_from_fields(times, _owner=owner)
 
     @classmethod
-    def _made(cls, breakpoints: Array, **kept: object) -> Dictionary:
+    def _build_from_fields(cls, breakpoints: Array, **kept: object) -> Dictionary:
         """Return a dictionary with checked fields."""
         dictionary = cls.__new__(cls)
-        dictionary._keep(breakpoints=breakpoints, **kept)
+        dictionary._set_fields(breakpoints=breakpoints, **kept)
         return dictionary
 
-    def _keep(self, **kept: object) -> None:
+    def _set_fields(self, **kept: object) -> None:
         """Keep fields of the frozen dictionary."""
         self.__dict__.update(kept)
 
@@ -133,17 +133,17 @@ class Dictionary:
         The controls remain the same; their coefficients become their values on the intervals.
         """
         full = self.functions == self.pieces and not self.is_indicators
-        return Dictionary._made(self.breakpoints, _owner=np.arange(self.pieces)) if full else self
+        return Dictionary._build_from_fields(self.breakpoints, _owner=np.arange(self.pieces)) if full else self
 
     def on(self, breakpoints: npt.ArrayLike) -> Dictionary:
         """Return the same functions on as many intervals between other ``breakpoints (K + 1,)``; raise `InputError`."""
-        times = _times(breakpoints)
+        times = _check_times(breakpoints)
         if times.size != self.breakpoints.size:
             raise InputError(f"expected {self.breakpoints.size} breakpoints, got {times.size}", path="dictionary")
-        return Dictionary._made(times, **self._kept)
+        return Dictionary._build_from_fields(times, **self._value_field)
 
     @property
-    def _kept(self) -> dict[str, object]:
+    def _value_field(self) -> dict[str, object]:
         """The field that holds the values."""
         if self._owner is not None:
             return {"_owner": self._owner}
@@ -275,10 +275,10 @@ class Dictionary:
         keep = np.concatenate([[True], self.changes])
         breakpoints = self.breakpoints[np.concatenate([keep, [True]])]
         if self._owner is not None:
-            return Dictionary._made(breakpoints, _owner=self._owner[keep])
+            return Dictionary._build_from_fields(breakpoints, _owner=self._owner[keep])
         if self._entries is not None:
-            return Dictionary._made(breakpoints, _entries=self._entries[:, np.flatnonzero(keep)])
-        return Dictionary._made(breakpoints, values=self.values[:, keep])
+            return Dictionary._build_from_fields(breakpoints, _entries=self._entries[:, np.flatnonzero(keep)])
+        return Dictionary._build_from_fields(breakpoints, values=self.values[:, keep])
 
     @property
     def is_complete(self) -> bool:
@@ -313,17 +313,18 @@ class DictionaryFactory(ABC):
         """Return the dictionary on ``[0, horizon]``; raise `InputError` where the options do not fit the horizon."""
 
 
-def _times(value: object) -> Array:
+def _check_times(value: object) -> Array:
     """Return breakpoints as an array; raise `InputError` where they do not increase from 0."""
-    breakpoints = _real("breakpoints", value)
+    breakpoints = _check_numbers("breakpoints", value)
     if breakpoints.ndim != 1 or breakpoints.size < 2 or breakpoints[0] != 0.0 or (np.diff(breakpoints) <= 0).any():
         raise InputError(
-            f"breakpoints must increase from 0, at least two of them, got {_short(breakpoints)}", path="dictionary"
+            f"breakpoints must increase from 0, at least two of them, got {_abbreviate(breakpoints)}",
+            path="dictionary",
         )
     return breakpoints
 
 
-def _real(name: str, value: object) -> Array:
+def _check_numbers(name: str, value: object) -> Array:
     """Return an array of finite numbers; raise `InputError`."""
     try:
         array = np.array(value, dtype=float)
@@ -334,7 +335,7 @@ def _real(name: str, value: object) -> Array:
     return array
 
 
-def _sparse(values: object) -> csr_array:
+def _check_sparse(values: object) -> csr_array:
     """Return a sparse array of finite numbers without stored zeros; raise `InputError`."""
     from scipy.sparse import csr_array
 
@@ -349,7 +350,7 @@ def _sparse(values: object) -> csr_array:
     return entries
 
 
-def _at_most(functions: int, pieces: int) -> None:
+def _check_function_count(functions: int, pieces: int) -> None:
     """Raise `InputError` where there are more functions than intervals."""
     if functions > pieces:
         raise InputError(
@@ -359,7 +360,7 @@ def _at_most(functions: int, pieces: int) -> None:
         )
 
 
-def _dependent(values: Array) -> InputError:
+def _build_dependence_error(values: Array) -> InputError:
     """Return the error for functions that are linearly dependent."""
     return InputError(
         f"the {values.shape[0]} functions must be linearly independent, their rank is {np.linalg.matrix_rank(values)}",
@@ -376,13 +377,13 @@ def _owner(values: Array) -> np.ndarray | None:
     return owner
 
 
-def _orthogonal(entries: csr_array) -> bool:
+def _has_orthogonal_rows(entries: csr_array) -> bool:
     """Return True where the rows are orthogonal to one another, and none of them is 0."""
     gram = (entries @ entries.T).tocoo()
     return bool((np.diff(entries.indptr) > 0).all() and (gram.data[gram.row != gram.col] == 0.0).all())
 
 
-def _independent(values: Array) -> bool:
+def _has_full_row_rank(values: Array) -> bool:
     """Return True where a table has full row rank.
 
     Disjoint supports and orthogonal rows are recognised without a singular value decomposition.
@@ -398,5 +399,5 @@ def _independent(values: Array) -> bool:
     return bool(np.linalg.matrix_rank(values) == values.shape[0])
 
 
-def _short(array: np.ndarray) -> str:
+def _abbreviate(array: np.ndarray) -> str:
     return np.array2string(array, threshold=8, precision=6)

@@ -151,18 +151,20 @@ def joined(
                 expected=f"{kind}, the class of the first: l1_ball is of all of a list, or of none",
                 got=disturbance.kind,
             )
-    windows = [_window(f"disturbance.{i}", disturbance, horizon) for i, disturbance in enumerate(every)]
-    breakpoints = tuple(_own(f"disturbance.{i}", disturbance, every, horizon) for i, disturbance in enumerate(every))
+    windows = [_check_window(f"disturbance.{i}", disturbance, horizon) for i, disturbance in enumerate(every)]
+    breakpoints = tuple(
+        _check_breakpoints(f"disturbance.{i}", disturbance, every, horizon) for i, disturbance in enumerate(every)
+    )
     grids = breakpoints if any(times is not None for times in breakpoints) else None
     sets = [
-        _checked(f"disturbance.{i}.set", disturbance.set, disturbance.entering(f"disturbance.{i}", first_phase))
+        _check_set(f"disturbance.{i}.set", disturbance.set, disturbance.entering(f"disturbance.{i}", first_phase))
         for i, disturbance in enumerate(every)
     ]
     phases: list[Phase] = []
     for phase in legs(system, {time for window in windows for time in window}, horizon):
         columns = []
         for i, (disturbance, (start, stop)) in enumerate(zip(every, windows, strict=True)):
-            E = _columns(disturbance.entering(f"disturbance.{i}", phase))
+            E = _get_disturbance_matrix(disturbance.entering(f"disturbance.{i}", phase))
             acts = start < phase.until - SAME_TIME * horizon and phase.begin + SAME_TIME * horizon < stop
             columns.append(E if acts else np.zeros((phase.states, sets[i].dimension)))
         phases.append(replace(phase, E=reduce(beside, columns)))
@@ -194,7 +196,9 @@ def apart(bound: ConvexSet | None, classes: Classes, kind: DisturbanceClass) -> 
     if bound is None or isinstance(classes, str):
         return bound if classes == kind else None
     pairs = zip(bound.factors, classes, strict=True)
-    return product([factor if factor_class == kind else _nothing(factor.dimension) for factor, factor_class in pairs])
+    return product(
+        [factor if factor_class == kind else _build_zero_set(factor.dimension) for factor, factor_class in pairs]
+    )
 
 
 def columns_of(bound: ConvexSet, classes: Classes, kind: DisturbanceClass) -> np.ndarray:
@@ -219,7 +223,7 @@ def columns_of(bound: ConvexSet, classes: Classes, kind: DisturbanceClass) -> np
     return np.repeat([factor_class == kind for factor_class in classes], [factor.dimension for factor in bound.factors])
 
 
-def _own(where: str, one: Disturbance, every: Sequence[Disturbance], horizon: float) -> Array | None:
+def _check_breakpoints(where: str, one: Disturbance, every: Sequence[Disturbance], horizon: float) -> Array | None:
     """Return the own breakpoints of one of several disturbances, or ``None`` where it has none; raise `InputError`."""
     if one.breakpoints is None:
         return None
@@ -240,12 +244,12 @@ def _own(where: str, one: Disturbance, every: Sequence[Disturbance], horizon: fl
     return np.append(times[:-1], horizon)
 
 
-def _nothing(dimension: int) -> ConvexSet:
+def _build_zero_set(dimension: int) -> ConvexSet:
     """Return the set of so many coordinates that holds 0 alone."""
     return Box(np.zeros(dimension), np.zeros(dimension))
 
 
-def _window(where: str, one: Disturbance, horizon: float) -> tuple[float, float]:
+def _check_window(where: str, one: Disturbance, horizon: float) -> tuple[float, float]:
     """Return the times between which a disturbance acts; raise `InputError` for a window outside of the horizon."""
     start, stop = float(one.start), horizon if one.stop is None else float(one.stop)
     if not (0.0 <= start <= stop - SAME_TIME * horizon and stop <= horizon):
@@ -284,13 +288,13 @@ def legs(system: System, cuts: Collection[float], horizon: float) -> Iterator[Ph
         yield phase.between(begin, until)
 
 
-def _columns(phase: Phase) -> Entries:
+def _get_disturbance_matrix(phase: Phase) -> Entries:
     """Return ``E`` of a phase as an array, as expressions or as a function."""
     entry: Entries = phase.E  # type: ignore[assignment]  # a phase has made it one of these
     return entry
 
 
-def _checked(where: str, bound: object, phase: Phase) -> ConvexSet:
+def _check_set(where: str, bound: object, phase: Phase) -> ConvexSet:
     """Return the set of a disturbance; raise `InputError` where it is unbounded or does not fit ``E``."""
     if not isinstance(bound, ConvexSet):
         raise InputError(path=where, expected="a convex set, such as Box", got=f"{type(bound).__name__}")

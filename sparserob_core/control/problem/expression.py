@@ -301,10 +301,10 @@ class ExpressionMatrix:
 
         It is an array of floats, or an object array where ``p`` holds other things than numbers.
         """
-        values = self._with_defined(dict(zip(self.names, p, strict=True)))
+        values = self._add_definitions(dict(zip(self.names, p, strict=True)))
         return np.array([[entry(values) for entry in row] for row in self.entries])
 
-    def _with_defined(self, values: dict[str, Value]) -> dict[str, Value]:
+    def _add_definitions(self, values: dict[str, Value]) -> dict[str, Value]:
         """Return the values with those of the definitions, where an entry uses any; each one is evaluated once."""
         if any(name in self._defined_names for row in self.entries for entry in row for name in entry.names):
             for name, expression in self.defined:
@@ -318,7 +318,7 @@ class ExpressionMatrix:
 
     def evaluate(self, parameters: Array) -> Array:
         """Return the matrices ``(k, rows, columns)`` at parameters ``(k, nu)``."""
-        values = self._with_defined({name: parameters[:, i] for i, name in enumerate(self.names)})
+        values = self._add_definitions({name: parameters[:, i] for i, name in enumerate(self.names)})
         matrices = np.empty((len(parameters), *self.shape))
         for i, row in enumerate(self.entries):
             for j, entry in enumerate(row):
@@ -356,7 +356,7 @@ def beside(left: Entries, right: Entries) -> Entries:
     array, expressions or function of the parameters
         The matrix; a function where one of the two is a function.
     """
-    return _joined(left, right, 1)
+    return _join_matrices(left, right, 1)
 
 
 def above(upper: Entries, lower: Entries) -> Entries:
@@ -372,32 +372,32 @@ def above(upper: Entries, lower: Entries) -> Entries:
     array, expressions or function of the parameters
         The matrix; a function where one of the two is a function.
     """
-    return _joined(upper, lower, 0)
+    return _join_matrices(upper, lower, 0)
 
 
-def _joined(one: Entries, other: Entries, axis: int) -> Entries:
+def _join_matrices(one: Entries, other: Entries, axis: int) -> Entries:
     """Return two matrices as one along an axis: as an array, as expressions, or as a function."""
     if isinstance(one, np.ndarray) and isinstance(other, np.ndarray):
         return np.concatenate([one, other], axis)
     expressions = next((matrix for matrix in (one, other) if isinstance(matrix, ExpressionMatrix)), None)
     names, defined = ((), ()) if expressions is None else (expressions.names, expressions.defined)
-    first, second = _written(one), _written(other)
+    first, second = _list_expressions(one), _list_expressions(other)
     if first is None or second is None:
         return Joined((one, other), axis)
     rows = first + second if axis == 0 else tuple(a + b for a, b in zip(first, second, strict=True))
     return ExpressionMatrix(rows, names, defined)
 
 
-def _written(part: Entries) -> tuple[tuple[Expression, ...], ...] | None:
+def _list_expressions(part: Entries) -> tuple[tuple[Expression, ...], ...] | None:
     """Return the entries of a matrix as expressions, or ``None`` for a function."""
     if isinstance(part, ExpressionMatrix):
         return part.entries
     if not isinstance(part, np.ndarray):
         return None
-    return tuple(tuple(_number(value) for value in row) for row in part)
+    return tuple(tuple(_convert_number(value) for value in row) for row in part)
 
 
-def _number(value: np.float64) -> Expression:
+def _convert_number(value: np.float64) -> Expression:
     """Return a number as an expression."""
     return Expression(repr(float(value)), frozenset(), lambda values: value)
 
@@ -438,7 +438,7 @@ def parse_matrix(
         entries.append([])
         for j, entry in enumerate(row):
             try:
-                entries[i].append(_finite(parse_expression(entry, allowed_names)))
+                entries[i].append(_require_finite(parse_expression(entry, allowed_names)))
             except InputError as error:
                 raise error.under(name, i, j) from None
     return ExpressionMatrix(tuple(map(tuple, entries)), tuple(names), defined)
@@ -472,7 +472,7 @@ def parse_column(
         raise
 
 
-def _finite(expression: Expression) -> Expression:
+def _require_finite(expression: Expression) -> Expression:
     """Return the expression itself; raise `InputError` where it is a constant that is not a finite number."""
     if not expression.names and not np.isfinite(expression({})):
         raise InputError(f"expression {expression.text!r}: its value is not a finite number")

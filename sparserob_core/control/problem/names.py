@@ -183,7 +183,7 @@ class Names:
     def __post_init__(self) -> None:
         kind_of: dict[str, str] = {}
         for kind in KINDS:
-            names = self._texts(kind)
+            names = self._check_texts(kind)
             for name in names:
                 if not name.strip():
                     raise InputError(path=f"names.{kind}", expected="names that are not empty", got=f"{list(names)}")
@@ -191,12 +191,12 @@ class Names:
                     also = f" and in {kind_of[name]}" if kind_of[name] != kind else ""
                     raise InputError(f"the name {name!r} occurs twice, in {kind}{also}", path="names")
                 kind_of[name] = kind
-            self._texts(f"{kind[:-1]}_units")
+            self._check_texts(f"{kind[:-1]}_units")
         if not isinstance(self.time, str):
             raise InputError(path="names.units.time", expected="a text such as s", got=f"{self.time!r}")
-        if plane := self._texts("plane"):
+        if plane := self._check_texts("plane"):
             expected = "two of the states" + (f", {', '.join(self.states)}" if self.states else ", such as x1 and x2")
-            indices = [self._place(name) for name in plane]
+            indices = [self._find_state(name) for name in plane]
             if len(plane) != 2 or plane[0] == plane[1] or None in indices:
                 raise InputError(path="names.plane", expected=expected, got=f"{list(plane)}")
             units = [
@@ -208,10 +208,10 @@ class Names:
     @property
     def in_plane(self) -> tuple[int, int] | None:
         """The indices of the two states that are a position in the plane; ``None`` where none are given."""
-        horizontal, vertical = [self._place(name) for name in self.plane] or [None, None]
+        horizontal, vertical = [self._find_state(name) for name in self.plane] or [None, None]
         return None if horizontal is None or vertical is None else (horizontal, vertical)
 
-    def _place(self, name: str) -> int | None:
+    def _find_state(self, name: str) -> int | None:
         """Return the index of the state with a name, or ``None`` where no state has it."""
         if self.states:
             return self.states.index(name) if name in self.states else None
@@ -268,7 +268,7 @@ class Names:
                 return unit.removesuffix(rate) + suffix
         return f"{unit} {self.time}"
 
-    def _texts(self, field: str) -> tuple[str, ...]:
+    def _check_texts(self, field: str) -> tuple[str, ...]:
         """Return a field as a tuple of texts, which is kept; raise `InputError` for anything else."""
         texts = getattr(self, field)
         if isinstance(texts, str) or not all(isinstance(text, str) for text in texts):

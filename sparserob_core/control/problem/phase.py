@@ -80,11 +80,11 @@ class Phase:
     def __post_init__(self) -> None:
         self._check_domain()
         for name in ("A", "B"):
-            object.__setattr__(self, name, self._matrix(name, getattr(self, name)))
+            object.__setattr__(self, name, self._check_matrix(name, getattr(self, name)))
         d, columns = self._shape("A")
         if d != columns:
             raise InputError(f"A must be square, got shape {(d, columns)}", path="system")
-        object.__setattr__(self, "E", np.eye(d) if self.E is None else self._matrix("E", self.E))
+        object.__setattr__(self, "E", np.eye(d) if self.E is None else self._check_matrix("E", self.E))
         for name in ("B", "E"):
             if self._shape(name)[0] != d:
                 raise InputError(f"{name} must have {d} rows, as A has, got shape {self._shape(name)}", path="system")
@@ -125,7 +125,7 @@ class Phase:
         """
         if self.c is None:
             return self
-        return replace(self, B=beside(self._entry("B"), self._entry("c")), c=None)
+        return replace(self, B=beside(self._get_entry("B"), self._get_entry("c")), c=None)
 
     def between(self, begin: float, until: float) -> Phase:
         """Return the phase from another time and until another time.
@@ -186,16 +186,18 @@ class Phase:
         assert isinstance(self.domain, Box)
         ends = zip((begin, self.until - later), (self.domain.lower, self.domain.upper), strict=True)
         domain = Box(*(np.append(time, side[1:]) for time, side in ends))
-        return self._through(partial(_moved, later), domain, self.names, begin, until)
+        return self._substitute_arguments(partial(_shift_time, later), domain, self.names, begin, until)
 
     def at(self, parameter: Array) -> Phase:
         """Return the known phase at one value ``(nu,)`` of the uncertain parameter."""
         if not self.timed:
             A, B, E = (matrix[0] for matrix in self.matrices(parameter[None]))
-            drift = None if self.c is None else self._values("c", parameter[None])[0]
+            drift = None if self.c is None else self._evaluate_matrix("c", parameter[None])[0]
             return Phase(A, B, E, c=drift, begin=self.begin, until=self.until)
         domain = and_time(self.begin, self.until, None)
-        return self._through(partial(_with_parameter, parameter), domain, (TIME,), self.begin, self.until)
+        return self._substitute_arguments(
+            partial(_append_parameter, parameter), domain, (TIME,), self.begin, self.until
+        )
 
     def during(self, time: float, parameters: ConvexSet | None) -> Phase:
         """Return a timed phase at one time, as a phase with constant entries in time.
@@ -212,7 +214,7 @@ class Phase:
         Phase
             The phase, which is not timed and has no end.
         """
-        return self._through(partial(_at_time, time), parameters, self.names[1:], timed=False)
+        return self._substitute_arguments(partial(_prepend_time, time), parameters, self.names[1:], timed=False)
 
     def in_time(self, until: float) -> Phase:
         """Return the phase as a timed phase that ends at ``until``.
@@ -220,9 +222,9 @@ class Phase:
         Raises `InputError` where the domain is no bounded box.
         """
         domain = and_time(self.begin, until, None if self.domain is None else boxed(self.domain))
-        return self._through(_without_time, domain, (TIME, *self.names), self.begin, until)
+        return self._substitute_arguments(_drop_time, domain, (TIME, *self.names), self.begin, until)
 
-    def _through(
+    def _substitute_arguments(
         self,
         arguments: Callable[[_Arguments], _Arguments],
         domain: ConvexSet | None,
@@ -269,9 +271,11 @@ class Phase:
         k, d = rows.shape
         blocks = {"B": inputs, "E": np.zeros((k, self.disturbances)), "c": np.zeros((k, 1))}
         extended = {
-            name: above(self._entry(name), block) for name, block in blocks.items() if name != "c" or self.c is not None
+            name: above(self._get_entry(name), block)
+            for name, block in blocks.items()
+            if name != "c" or self.c is not None
         }
-        A = above(beside(self._entry("A"), np.zeros((d, k))), np.hstack([rows, np.zeros((k, k))]))
+        A = above(beside(self._get_entry("A"), np.zeros((d, k))), np.hstack([rows, np.zeros((k, k))]))
         return replace(self, A=A, B=extended["B"], E=extended["E"], c=extended.get("c"))
 
     @shaped
@@ -298,7 +302,7 @@ class Phase:
         points = np.asarray(arguments, dtype=float)
         if points.ndim != 2 or points.shape[1] != self.count:
             raise InputError(f"parameters must have shape (k, {self.count}), got {points.shape}", path="system")
-        A, B, E = (self._values(name, points) for name in ("A", "B", "E"))
+        A, B, E = (self._evaluate_matrix(name, points) for name in ("A", "B", "E"))
         return A, B, E
 
     @shaped
@@ -339,7 +343,7 @@ class Phase:
         """
         p = np.empty(self.count, dtype=object)
         p[:] = space.variables(centre, radius)
-        A, B, E = (self._enclosed(name, space, p) for name in ("A", "B", "E"))
+        A, B, E = (self._enclose_matrix(name, space, p) for name in ("A", "B", "E"))
         return *A, *B, *E
 
     @shaped
@@ -373,7 +377,7 @@ class Phase:
         begin, until = self.begin / time, self.until / time
         if self.domain is None:
             ours = [matrix[0] for matrix in self.matrices(np.zeros((1, 0)))]
-            drift = None if self.c is None else self._values("c", np.zeros((1, 0)))[0] * c
+            drift = None if self.c is None else self._evaluate_matrix("c", np.zeros((1, 0)))[0] * c
             return Phase(ours[0] * A, ours[1] * B, ours[2] * E, c=drift, begin=begin, until=until)
         return PhaseInUnits(
             self.A,
@@ -405,9 +409,9 @@ class Phase:
 
         The value is ``None`` for the drift of a phase without a drift.
         """
-        return None if name == "c" and self.c is None else self._entry(name)
+        return None if name == "c" and self.c is None else self._get_entry(name)
 
-    def _entry(self, name: str) -> _Entry:
+    def _get_entry(self, name: str) -> _Entry:
         """Return a matrix of the phase, which is known to exist, as an array, expressions or a function."""
         entry: _Entry = getattr(self, name)
         return entry
@@ -434,26 +438,28 @@ class Phase:
     def _check_drift(self, d: int) -> None:
         """Keep the drift as a matrix of one column; raise `InputError` where it does not fit ``d`` states."""
         drift = self.c
-        if callable(drift) and not isinstance(drift, ExpressionMatrix | _AsColumn):
-            drift = _AsColumn(drift)
+        if callable(drift) and not isinstance(drift, ExpressionMatrix | _ColumnFunction):
+            drift = _ColumnFunction(drift)
         elif not callable(drift):
             drift = dense(drift)
             array = np.asarray(drift, dtype=object)
             if array.ndim == 0:
                 raise InputError(path="system.c", expected=f"{d} numbers, one per state", got=f"{drift!r}")
             drift = array[:, None].tolist() if array.ndim == 1 else drift
-        object.__setattr__(self, "c", self._matrix("c", drift))
+        object.__setattr__(self, "c", self._check_matrix("c", drift))
         if self._shape("c") != (d, 1):
             rows, columns = self._shape("c")
             got = f"{rows}" if columns == 1 else f"shape {(rows, columns)}"
             raise InputError(path="system.c", expected=f"{d} numbers, one per state", got=got)
-        self._values("c", self.probes)
+        self._evaluate_matrix("c", self.probes)
 
-    def _matrix(self, name: str, value: object) -> _Entry:
+    def _check_matrix(self, name: str, value: object) -> _Entry:
         """Return a matrix of the user as a checked array, as expressions or as a function; raise `InputError`."""
         if isinstance(value, ExpressionMatrix):
             return (
-                value(np.zeros(len(value.names))).astype(float) if value.is_constant else self._known_names(name, value)
+                value(np.zeros(len(value.names))).astype(float)
+                if value.is_constant
+                else self._check_expression_names(name, value)
             )
         if callable(value):
             if self.domain is None:
@@ -469,11 +475,12 @@ class Phase:
             ) from error
         if array.ndim != 2 or array.size == 0 or not np.isfinite(array).all():
             raise InputError(
-                f"{name} must be a matrix of finite numbers, rows by columns, got {_seen(array)}", path="system"
+                f"{name} must be a matrix of finite numbers, rows by columns, got {_describe_array(array)}",
+                path="system",
             )
         return array
 
-    def _known_names(self, name: str, matrix: ExpressionMatrix) -> ExpressionMatrix:
+    def _check_expression_names(self, name: str, matrix: ExpressionMatrix) -> ExpressionMatrix:
         """Return the expressions; raise `InputError` where they are not in the names of this phase."""
         if matrix.names != tuple(self.names):
             raise InputError(
@@ -485,20 +492,21 @@ class Phase:
 
     def _shape(self, name: str) -> tuple[int, int]:
         """Return the numbers of rows and of columns of a matrix."""
-        entry = self._entry(name)
+        entry = self._get_entry(name)
         if isinstance(entry, np.ndarray | ExpressionMatrix):
             rows, columns = entry.shape
             return rows, columns
-        return self._probed_shape(name)
+        return self._probe_shape(name)
 
-    def _probed_shape(self, name: str) -> tuple[int, int]:
+    def _probe_shape(self, name: str) -> tuple[int, int]:
         """Return the shape of the matrix that a function returns, which is called once for it."""
         cache: dict[str, tuple[int, int]] = self.__dict__.setdefault("_shapes", {})
         if name not in cache:
-            value = np.asarray(self._called(name, self.probes[0]))
+            value = np.asarray(self._call_function(name, self.probes[0]))
             if value.ndim != 2 or value.size == 0:
                 raise InputError(
-                    f"the function {name} must return a matrix, rows by columns, got {_seen(value)}", path="system"
+                    f"the function {name} must return a matrix, rows by columns, got {_describe_array(value)}",
+                    path="system",
                 )
             cache[name] = (value.shape[0], value.shape[1])
         return cache[name]
@@ -512,9 +520,9 @@ class Phase:
         points = self.domain.support_point(np.vstack([axes, -axes]))
         return np.vstack([self.domain.interior_point(), points])
 
-    def _called(self, name: str, parameter: Array) -> Array:
+    def _call_function(self, name: str, parameter: Array) -> Array:
         """Return the value of a function at one argument ``(n,)``; raise `InputError` where the function fails."""
-        function = self._entry(name)
+        function = self._get_entry(name)
         assert callable(function)
         try:
             with np.errstate(all="ignore"):  # entries that are not finite are reported with their arguments
@@ -525,16 +533,20 @@ class Phase:
             ) from error
 
     @shaped
-    def _values(self, name: str, points: Float[Array, "k n"]) -> Float[Array, "k rows columns"]:
+    def _evaluate_matrix(self, name: str, points: Float[Array, "k n"]) -> Float[Array, "k rows columns"]:
         """Return a matrix at points ``(k, n)``; raise `InputError` where its shape changes or it is not finite."""
-        entry = self._entry(name)
+        entry = self._get_entry(name)
         if isinstance(entry, np.ndarray):
-            return np.broadcast_to(entry, (len(points), *entry.shape)) if len(points) != 1 else _still(entry[None])
+            return (
+                np.broadcast_to(entry, (len(points), *entry.shape))
+                if len(points) != 1
+                else _make_read_only(entry[None])
+            )
         shape = self._shape(name)
         if isinstance(entry, ExpressionMatrix):
             values = entry.evaluate(points)
         else:
-            rows = [self._called(name, point) for point in points]
+            rows = [self._call_function(name, point) for point in points]
             other_shape = next((row.shape for row in rows if row.shape != shape), None)
             if other_shape is not None:
                 raise InputError(
@@ -548,9 +560,9 @@ class Phase:
             )
         return values
 
-    def _enclosed(self, name: str, space: TaylorSpace, p: npt.NDArray[np.object_]) -> tuple[Array, Array]:
+    def _enclose_matrix(self, name: str, space: TaylorSpace, p: npt.NDArray[np.object_]) -> tuple[Array, Array]:
         """Return the coefficients and the bounds of the remainders of one matrix, as Taylor models; see `taylor`."""
-        entry, shape = self._entry(name), self._shape(name)
+        entry, shape = self._get_entry(name), self._shape(name)
         coefficients, remainder = np.zeros((space.size, *shape)), np.zeros(shape)
         if isinstance(entry, np.ndarray):
             coefficients[0] = entry
@@ -599,7 +611,7 @@ class Phase:
         value, remainder : arrays of the shape of the matrix
             The constant coefficients of the Taylor models, and the bounds of their remainders.
         """
-        numeric = self._called(name, centre)
+        numeric = self._call_function(name, centre)
         excess = np.abs(numeric - value) - remainder
         if not (excess <= SAME * np.abs(numeric).max()).all():
             i, j = (int(i) for i in np.unravel_index(int(excess.argmax()), excess.shape))
@@ -613,18 +625,18 @@ class Phase:
 
 @final
 @dataclass(frozen=True, eq=False)
-class _AsColumn:
+class _ColumnFunction:
     """A function of the parameters that returns ``(d,)``, as a function that returns ``(d, 1)``."""
 
     function: Callable[..., object]
 
     def __call__(self, parameter: object) -> object:
         value = self.function(parameter)
-        array = np.array(value, dtype=object if _holds_models(value) else float)
+        array = np.array(value, dtype=object if _has_models(value) else float)
         return array[:, None] if array.ndim == 1 else array
 
 
-def _holds_models(value: object) -> bool:
+def _has_models(value: object) -> bool:
     """Return True where a value has entries that are no numbers, such as Taylor models."""
     return not all(
         isinstance(entry, int | float | np.integer | np.floating) for entry in np.asarray(value, dtype=object).flat
@@ -662,14 +674,14 @@ def through(entry: _Entry | None, arguments: Callable[[_Arguments], _Arguments])
     return Through(entry, arguments) if callable(entry) else entry
 
 
-def _moved(later: float, p: _Arguments) -> _Arguments:
+def _shift_time(later: float, p: _Arguments) -> _Arguments:
     """Return the arguments ``p``, with ``later`` added to the time, which is the first of them."""
     shifted = p.copy()
     shifted[0] = p[0] + later
     return shifted
 
 
-def _with_parameter(parameter: Array, p: _Arguments) -> _Arguments:
+def _append_parameter(parameter: Array, p: _Arguments) -> _Arguments:
     """Return the time, followed by one parameter ``(nu,)``."""
     arguments = np.empty(1 + parameter.size, dtype=object)
     arguments[0], zero = p[0], 0.0 * p[0]
@@ -678,19 +690,19 @@ def _with_parameter(parameter: Array, p: _Arguments) -> _Arguments:
     return arguments
 
 
-def _at_time(time: float, p: _Arguments) -> _Arguments:
+def _prepend_time(time: float, p: _Arguments) -> _Arguments:
     """Return the parameters ``p``, after one time."""
     arguments = np.empty(1 + len(p), dtype=object)
     arguments[0], arguments[1:] = time, p
     return arguments
 
 
-def _without_time(p: _Arguments) -> _Arguments:
+def _drop_time(p: _Arguments) -> _Arguments:
     """Return the parameters, which follow the time."""
     return p[1:]
 
 
-def _times(units: Array, p: _Arguments) -> _Arguments:
+def _multiply_by_units(units: Array, p: _Arguments) -> _Arguments:
     """Return arguments ``p (n,)`` times ``units (n,)``."""
     return np.asarray(np.asarray(p, dtype=object) * units)
 
@@ -808,14 +820,14 @@ class PhaseInUnits(Phase):
         if entry is None:
             return None
         factor = self.factors[name]
-        return Through(entry, partial(_times, self.units), factor) if callable(entry) else entry * factor
+        return Through(entry, partial(_multiply_by_units, self.units), factor) if callable(entry) else entry * factor
 
     def _shape(self, name: str) -> tuple[int, int]:
         return self.base._shape(name)
 
     @shaped
-    def _values(self, name: str, points: Float[Array, "k n"]) -> Float[Array, "k rows columns"]:
-        return self.base._values(name, points * self.units) * self.factors[name]
+    def _evaluate_matrix(self, name: str, points: Float[Array, "k n"]) -> Float[Array, "k rows columns"]:
+        return self.base._evaluate_matrix(name, points * self.units) * self.factors[name]
 
     @shaped
     def taylor(
@@ -833,12 +845,12 @@ class PhaseInUnits(Phase):
         return scaled[0], scaled[1], scaled[2], scaled[3], scaled[4], scaled[5]
 
 
-def _still(view: Array) -> Array:
+def _make_read_only(view: Array) -> Array:
     """Return the view after it was made read-only."""
     view.flags.writeable = False
     return view
 
 
-def _seen(array: npt.NDArray[np.float64]) -> str:
+def _describe_array(array: npt.NDArray[np.float64]) -> str:
     """Return an array in words: its entries where it is small, its shape elsewhere."""
     return str(array.tolist()) if array.size <= 8 else f"an array of shape {array.shape}"

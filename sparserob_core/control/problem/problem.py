@@ -62,7 +62,7 @@ SYSTEM = {
 }
 
 
-def _pieces(times: Array, begin: float, horizon: float) -> Array:
+def _shift_breakpoints(times: Array, begin: float, horizon: float) -> Array:
     """Return breakpoints from the time ``begin`` on, counted from there.
 
     The first interval is the rest of the interval that contains ``begin``.
@@ -207,7 +207,9 @@ class OptimalControlProblem(Term):
     repeat: bool | Repeating = field(default=False, metadata=UNITLESS)
     execution: npt.ArrayLike | None = field(default=None, metadata=UNITLESS)
     commanded: tuple[int, ...] = field(default=(), metadata=UNITLESS)
-    disturbance_breakpoints: Breakpoints | None = field(default=None, metadata=measured(lambda of: of.time, _pieces))
+    disturbance_breakpoints: Breakpoints | None = field(
+        default=None, metadata=measured(lambda of: of.time, _shift_breakpoints)
+    )
 
     __repr__ = noun
 
@@ -215,18 +217,18 @@ class OptimalControlProblem(Term):
         horizon = as_bound("horizon", self.horizon)
         if horizon.shape != (1,) or not 0.0 < horizon[0] < np.inf:
             raise InputError(path="horizon", expected="a positive, finite time", got=f"{self.horizon!r}")
-        self._set("horizon", float(horizon[0]))
+        self._set_field("horizon", float(horizon[0]))
         self._check_system()
         self._join_disturbances()
-        self._set("initial_state", self._state())
-        self._set("initial_set", self._deviations())
-        self._set("weights", checked_weights(self.weights, self.system.controls, self.horizon))
-        self._set("initial_control", self._control_before())
-        self._set("cost", self._costs())
+        self._set_field("initial_state", self._check_initial_state())
+        self._set_field("initial_set", self._check_initial_set())
+        self._set_field("weights", checked_weights(self.weights, self.system.controls, self.horizon))
+        self._set_field("initial_control", self._check_initial_control())
+        self._set_field("cost", self._check_cost())
         checked_set("control", self.control, self.system.controls, "controls", bounded=True)
         if self.control_step is not None:
             step = checked_set("control_step", self.control_step, self.system.controls, "controls")
-            self._set("control_step", None if restricts_nothing(step) else step)
+            self._set_field("control_step", None if restricts_nothing(step) else step)
         self._check_disturbance()
         bound = self.measurable
         if self.system.varies and bound is not None and not enclosed(bound):
@@ -236,16 +238,18 @@ class OptimalControlProblem(Term):
                 " disturbances are measurable",
                 got=bound.kind,
             )
-        self._set("measurements", self._measured())
+        self._set_field("measurements", self._check_measurements())
         self._check_names()
         for attribute in fields(self):
             if KIND in attribute.metadata:
-                self._set(attribute.name, tuple(self._constraints(attribute.name, attribute.metadata[KIND])))
-        self._set("terminal", tuple(self._terminal()))
+                self._set_field(
+                    attribute.name, tuple(self._check_constraints(attribute.name, attribute.metadata[KIND]))
+                )
+        self._set_field("terminal", tuple(self._check_terminal()))
         if self.repeat is not Repeating.IMPOSED:
-            self._return()
+            self._require_return()
         self._check_uncertain()
-        self._set("execution", self._executed())
+        self._set_field("execution", self._check_execution())
         sealed(self)
 
     @property
@@ -307,7 +311,7 @@ class OptimalControlProblem(Term):
         """The equalities that fix values of the final state."""
         return [end for end in self.terminal if isinstance(end, Equality)]
 
-    def _set(self, name: str, value: object) -> None:
+    def _set_field(self, name: str, value: object) -> None:
         object.__setattr__(self, name, value)
 
     def _check_system(self) -> None:
@@ -351,7 +355,7 @@ class OptimalControlProblem(Term):
                 got="others",
             )
 
-    def _executed(self) -> Array | None:
+    def _check_execution(self) -> Array | None:
         """Return the errors of execution ``(m,)``, or ``None`` where there are none.
 
         Raises `InputError` for combinations with other fields of which nothing can be proven yet.
@@ -367,7 +371,7 @@ class OptimalControlProblem(Term):
         if not shares.any():
             return None
         sets = [entry if isinstance(entry, ConvexSet) else entry.set for entry in (*self.path, *self.terminal_sets)]
-        timed = self._in_time()
+        timed = self._find_timed_system()
         refused = {
             "fixed final values, which an error of execution misses: a terminal set such as box": bool(
                 self.terminal_equalities
@@ -386,14 +390,14 @@ class OptimalControlProblem(Term):
                 raise InputError(path="execution", expected=f"none beside {combination}", got=f"{shares.tolist()}")
         return shares
 
-    def _in_time(self) -> System | None:
+    def _find_timed_system(self) -> System | None:
         """Return the system as one whose entries depend on the time; ``None`` where its parameters are in no box."""
         try:
             return self.system.in_time(self.horizon)
         except InputError:
             return None
 
-    def _state(self) -> Array:
+    def _check_initial_state(self) -> Array:
         """Return the centre ``(d,)`` of the initial states; raise `InputError`."""
         d = self.system.states
         state = np.atleast_1d(as_bound("initial_state", self.initial_state))
@@ -403,7 +407,7 @@ class OptimalControlProblem(Term):
             )
         return state
 
-    def _deviations(self) -> ConvexSet | None:
+    def _check_initial_set(self) -> ConvexSet | None:
         """Return the set of initial deviations, or ``None`` for 0 alone; raise `InputError` where 0 is not in it."""
         if self.initial_set is None:
             return None
@@ -444,7 +448,7 @@ class OptimalControlProblem(Term):
         is_weighted = weights.ndim == 2 or bool((weights != 1.0).any())
         return "" if is_weighted or self.cost.is_quadratic else self.names.effort
 
-    def _measured(self) -> Measurements | None:
+    def _check_measurements(self) -> Measurements | None:
         """Return the checked measurements, or ``None`` where there are none; raise `InputError`."""
         if self.measurements is None:
             return None
@@ -457,7 +461,7 @@ class OptimalControlProblem(Term):
             raise error.under("measurements") from None
         return measurements
 
-    def _costs(self) -> Cost:
+    def _check_cost(self) -> Cost:
         """Return the checked cost; raise `InputError`."""
         if not isinstance(self.cost, Cost):
             raise InputError(path="cost", expected="a Cost", got=f"{type(self.cost).__name__}")
@@ -466,7 +470,7 @@ class OptimalControlProblem(Term):
         except InputError as error:
             raise error.under("cost") from None
 
-    def _control_before(self) -> Array | None:
+    def _check_initial_control(self) -> Array | None:
         """Return the control ``(m,)`` before time 0, or ``None`` where it is not given; raise `InputError`."""
         if self.initial_control is None:
             return None
@@ -524,11 +528,11 @@ class OptimalControlProblem(Term):
                 got=f"{self.disturbance_class}" if self.disturbance is None else self.disturbance.kind,
             )
         system, bound, kind, breakpoints = joined(self.system, disturbances, self.horizon)
-        self._set("system", system)
-        self._set("disturbance", bound)
-        self._set("disturbance_class", kind)
-        self._set("disturbance_breakpoints", breakpoints)
-        self._set("disturbances", ())
+        self._set_field("system", system)
+        self._set_field("disturbance", bound)
+        self._set_field("disturbance_class", kind)
+        self._set_field("disturbance_breakpoints", breakpoints)
+        self._set_field("disturbances", ())
 
     def _check_names(self) -> None:
         """Raise `InputError` where the names do not fit the numbers of states, controls and disturbances."""
@@ -536,16 +540,16 @@ class OptimalControlProblem(Term):
             raise InputError(path="names", expected="Names(states=[...], ...)", got=f"{type(self.names).__name__}")
         self.names.fitting(self.system.states, self.system.controls, self.system.disturbances)
 
-    def _constraints(self, name: str, kind: type[Window]) -> Iterator[Window]:
+    def _check_constraints(self, name: str, kind: type[Window]) -> Iterator[Window]:
         """Yield the checked constraints of the field ``name`` that exclude anything, as terms of one ``kind``."""
         noun = "sets" if kind is PathConstraint else kind.__name__
         setting = Setting(self.system.states, self.system.controls, self.system.delay, self.horizon)
-        for i, entry in enumerate(_listed(name, getattr(self, name), noun)):
+        for i, entry in enumerate(_list_entries(name, getattr(self, name), noun)):
             constraint = kind.of(f"{name}.{i}", entry).checked(f"{name}.{i}", setting)
             if constraint.restricts:
                 yield constraint
 
-    def _return(self) -> None:
+    def _require_return(self) -> None:
         """Require that every final state is one of the initial states, where the plan repeats."""
         if not isinstance(self.repeat, bool | np.bool_):
             raise InputError(path="repeat", expected="true or false", got=f"{self.repeat!r}")
@@ -560,15 +564,15 @@ class OptimalControlProblem(Term):
             )
         if any(entry.name == RETURN for entry in self.windows):
             raise InputError(path="repeat", expected=f"no path constraint named {RETURN}, which is that of repeat")
-        self._set("repeat", Repeating.IMPOSED)
+        self._set_field("repeat", Repeating.IMPOSED)
         path, ends = ending(self.initial_set, np.asarray(self.initial_state, dtype=float), self.horizon)
-        self._set("path", (*self.path, *path))
-        self._set("terminal", (*self.terminal, *ends))
+        self._set_field("path", (*self.path, *path))
+        self._set_field("terminal", (*self.terminal, *ends))
 
-    def _terminal(self) -> list[ConvexSet | Equality]:
+    def _check_terminal(self) -> list[ConvexSet | Equality]:
         """Return the checked sets and equalities of the final state that restrict anything; raise `InputError`."""
         kept: list[ConvexSet | Equality] = []
-        for i, item in enumerate(_listed("terminal", self.terminal)):
+        for i, item in enumerate(_list_entries("terminal", self.terminal)):
             if not isinstance(item, Equality):
                 end = checked_set(f"terminal.{i}", item, self.system.states, "states")
                 kept += [] if restricts_nothing(end) else [end]
@@ -591,7 +595,7 @@ class ProblemFactory(ABC):
         """Return the problem; raise `InputError` where the options do not describe one."""
 
 
-def _listed(name: str, value: object, of: str = "sets") -> list[object]:
+def _list_entries(name: str, value: object, of: str = "sets") -> list[object]:
     """Return the entries of a list, or the single entry that stands instead of a list; raise `InputError`."""
     if isinstance(value, ConvexSet | Window | Equality):
         return [value]

@@ -37,7 +37,7 @@ def require_representable(problem: OptimalControlProblem) -> None:
     InputError
         The error begins with the key of a config.
     """
-    for path, value in _keyed(problem):
+    for path, value in _list_keyed_numbers(problem):
         _require_small(path, value)
     if problem.system.varies:
         for mode in problem.system.modes:
@@ -61,10 +61,10 @@ def require_representable(problem: OptimalControlProblem) -> None:
         last = until
 
 
-def _keyed(problem: OptimalControlProblem) -> Iterator[tuple[Path, np.ndarray]]:
+def _list_keyed_numbers(problem: OptimalControlProblem) -> Iterator[tuple[Path, np.ndarray]]:
     """Yield every array and number of a problem, with the keys of a config that lead to it."""
     is_switched = len(problem.system.phases) > 1
-    for path, value in _numbers(problem, ()):
+    for path, value in _list_numbers(problem, ()):
         if path[:2] != ("system", "phases"):
             yield path, value
         elif path[3] == "domain":  # parameters and times, which are fields of the system and of the phase too
@@ -82,7 +82,7 @@ def _require_small(path: Path, value: np.ndarray) -> None:
         raise InputError(path=path, expected=f"numbers of at most {LARGEST:g} in size", got=f"{float(size.max()):g}")
 
 
-def _numbers(record: object, path: Path) -> Iterator[tuple[Path, np.ndarray]]:
+def _list_numbers(record: object, path: Path) -> Iterator[tuple[Path, np.ndarray]]:
     """Yield every array and number of a record, with the keys that lead to it."""
     if isinstance(record, np.ndarray) and record.dtype.kind == "f":
         yield path, record
@@ -90,7 +90,7 @@ def _numbers(record: object, path: Path) -> Iterator[tuple[Path, np.ndarray]]:
         yield path, np.array([record])
     elif isinstance(record, tuple | list):
         for i, entry in enumerate(record):
-            yield from _numbers(entry, (*path, i))
+            yield from _list_numbers(entry, (*path, i))
     elif is_dataclass(record):
         for field in fields(record):
-            yield from _numbers(getattr(record, field.name, None), (*path, KEYS.get(field.name, field.name)))
+            yield from _list_numbers(getattr(record, field.name, None), (*path, KEYS.get(field.name, field.name)))

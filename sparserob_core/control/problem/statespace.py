@@ -36,7 +36,7 @@ def matrices_of(plant: object) -> tuple[Any, Any]:
             " to_ss)",
             got=f"a {type(plant).__name__} without {' and '.join(missing)}",
         )
-    step = _step(plant)
+    step = _describe_step(plant)
     if step is not None:
         raise InputError(
             path="plant",
@@ -47,7 +47,7 @@ def matrices_of(plant: object) -> tuple[Any, Any]:
     return matrices["A"], matrices["B"]
 
 
-def _step(plant: object) -> str | None:
+def _describe_step(plant: object) -> str | None:
     """Return the sampling step of a model in words, or ``None`` where it is in continuous time.
 
     The package python-control writes continuous time as 0, and scipy.signal as ``None``.

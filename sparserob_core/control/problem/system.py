@@ -71,7 +71,7 @@ class System:
     delay: float = 0.0
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "delay", _duration(self.delay))
+        object.__setattr__(self, "delay", _check_delay(self.delay))
         if not self.phases:
             raise InputError(path="system.pieces", expected="at least one", got="none")
         first, *later = self.phases
@@ -85,7 +85,7 @@ class System:
                     )
         if len({phase.c is None for phase in self.phases}) > 1:
             object.__setattr__(self, "phases", tuple(phase.drifting() for phase in self.phases))
-        _ = self._depends
+        _ = self._parameter_dependence
 
     __repr__ = noun
 
@@ -192,13 +192,13 @@ class System:
             if self.powers is not None:
                 modes += [phase.during(time, self.parameters) for time in times[:, 0].tolist()]
                 continue
-            arguments = self._arguments(times)
+            arguments = self._build_arguments(times)
             A, B, E = phase.matrices(arguments)
             drifts = list(phase.forced.matrices(arguments)[1][:, :, -1:]) if self.drifts else [None] * LOOKS
             modes += [Phase(a, b, e, c=drift) for a, b, e, drift in zip(A, B, E, drifts, strict=True)]
         return tuple(modes)
 
-    def _arguments(self, times: Array) -> Array:
+    def _build_arguments(self, times: Array) -> Array:
         """Return times ``(k, 1)`` as arguments of a phase, with the parameters in the middle of their box."""
         middle = np.zeros(0) if self.parameters is None else self.parameters.interior_point()
         return np.hstack([times, np.tile(middle, (len(times), 1))])
@@ -280,7 +280,7 @@ class System:
             return
         matrices = [[matrix[0] for matrix in mode.forced.matrices(mode.probes[:1])] for mode in self.modes]
         sizes = [np.abs(values).max(axis=0) for values in zip(*matrices, strict=True)]
-        ends = self.phases[0].forced.matrices(self._arguments(np.array([[0.0], [self.horizon]])))
+        ends = self.phases[0].forced.matrices(self._build_arguments(np.array([[0.0], [self.horizon]])))
         for name, size, (first, last) in zip("ABE", sizes, ends, strict=True):
             for i, j in np.argwhere(np.abs(last - first) > PERIODIC * size):
                 entry = f"c[{i + 1}]" if name == "B" and j >= self.controls else f"{name}[{i + 1}][{j + 1}]"
@@ -297,7 +297,7 @@ class System:
         The value is ``None`` for a system that does not depend on the time or has no parameters, or whose state is not
         affine in them.
         """
-        return None if isinstance(self._depends, int) else self._depends
+        return None if isinstance(self._parameter_dependence, int) else self._parameter_dependence
 
     @property
     def powers(self) -> int | None:
@@ -305,10 +305,10 @@ class System:
 
         The value is ``None`` where the system does not depend on the time, has no parameters, or is affine in them.
         """
-        return self._depends if isinstance(self._depends, int) else None
+        return self._parameter_dependence if isinstance(self._parameter_dependence, int) else None
 
     @cached_property
-    def _depends(self) -> Dependence | int | None:
+    def _parameter_dependence(self) -> Dependence | int | None:
         """The `dependence` or the `powers`; ``None`` for a system without time or without parameters in its entries."""
         if not self.varies or self.parameters is None:
             return None
@@ -321,7 +321,7 @@ class System:
             return np.zeros(0), np.zeros(0)
         centre, box = self.box.interior_point(), self.box
         sides = ((centre, box.upper), (box.lower, centre))
-        return centre, np.max([[_difference(a, b) for a, b in zip(*ends, strict=True)] for ends in sides], axis=0)
+        return centre, np.max([[_subtract_upwards(a, b) for a, b in zip(*ends, strict=True)] for ends in sides], axis=0)
 
     def superposed(self, depends: Dependence | Spread) -> System:
         """Return the known system of the coefficients of the state, where the state is expanded in the parameters.
@@ -650,8 +650,8 @@ class VaryingSystem(System):
         >>> sr.VaryingSystem.of([["-(1 + 0.4 * cos(2 * t))"]], [[1]], 5.0).varies
         True
         """
-        uncertain = _Uncertain.of(parameters, names)
-        return System((_phase("system", (A, B, E, c), (0.0, horizon), define, uncertain),), uncertain.box, delay)
+        uncertain = _ParameterBox.of(parameters, names)
+        return System((_build_phase("system", (A, B, E, c), (0.0, horizon), define, uncertain),), uncertain.box, delay)
 
     @staticmethod
     def taking_turns(
@@ -683,15 +683,15 @@ class VaryingSystem(System):
         InputError
             If an entry cannot be read, the times do not increase, or the shapes disagree.
         """
-        ends, uncertain = [0.0, *(float(until) for until, _ in pieces)], _Uncertain.of(parameters, names)
+        ends, uncertain = [0.0, *(float(until) for until, _ in pieces)], _ParameterBox.of(parameters, names)
         phases = tuple(
-            _phase(f"system.pieces.{i}", matrices, during, define, uncertain)
+            _build_phase(f"system.pieces.{i}", matrices, during, define, uncertain)
             for i, (during, (_, matrices)) in enumerate(zip(pairwise(ends), pieces, strict=True))
         )
         return System(phases, uncertain.box, delay)
 
 
-def _duration(value: object) -> float:
+def _check_delay(value: object) -> float:
     """Return the delay as a float; raise `InputError` where it is no finite number of at least 0."""
     usable = isinstance(value, int | float | np.integer | np.floating) and not isinstance(value, bool)
     if not usable or not 0.0 <= float(value) < np.inf:  # type: ignore[arg-type]
@@ -699,7 +699,7 @@ def _duration(value: object) -> float:
     return float(value)  # type: ignore[arg-type]
 
 
-def _difference(low: float, high: float) -> float:
+def _subtract_upwards(low: float, high: float) -> float:
     """Return ``high - low`` as a double, rounded upwards."""
     exact, difference = Fraction(float(high)) - Fraction(float(low)), float(high) - float(low)
     return difference if Fraction(difference) >= exact else float(np.nextafter(difference, np.inf))
@@ -749,14 +749,14 @@ def _check_piece(i: int, pair: object, before: float) -> None:
 
 @final
 @dataclass(frozen=True, eq=False)
-class _Uncertain:
+class _ParameterBox:
     """The box of the uncertain parameters, and the names of the time and of these parameters."""
 
     box: Box | None
     names: tuple[str, ...]
 
     @staticmethod
-    def of(parameters: ConvexSet | None, names: Sequence[str]) -> _Uncertain:
+    def of(parameters: ConvexSet | None, names: Sequence[str]) -> _ParameterBox:
         """Return the box and the names; raise `InputError` for another set or for unsuitable names."""
         box = None if parameters is None else boxed(parameters)
         count = 0 if box is None else box.dimension
@@ -764,15 +764,15 @@ class _Uncertain:
         if len(parameter_names) != count or TIME in parameter_names:
             expected = f"{count} names, none of them {TIME}, which is the time"
             raise InputError(path="system.parameters", expected=expected, got=", ".join(parameter_names))
-        return _Uncertain(box, (TIME, *parameter_names))
+        return _ParameterBox(box, (TIME, *parameter_names))
 
 
-def _phase(
+def _build_phase(
     where: str,
     given: InTime,
     during: tuple[float, float],
     define: Mapping[str, str | float] | None,
-    uncertain: _Uncertain,
+    uncertain: _ParameterBox,
 ) -> Phase:
     """Return the phase with the given matrices, whose entries are expressions in the time and the parameters.
 
@@ -786,7 +786,7 @@ def _phase(
         The times from which and until which the phase holds.
     define : mapping or None
         Names for expressions, which entries may use.
-    uncertain : _Uncertain
+    uncertain : _ParameterBox
         The box of the parameters, and the names of the time and of the parameters.
 
     Returns

@@ -36,34 +36,34 @@ class Symbol:
         return self.text
 
     def __add__(self, other: object) -> Symbol:
-        return _joined(self, "+", other)
+        return _join_operands(self, "+", other)
 
     def __radd__(self, other: object) -> Symbol:
-        return _joined(other, "+", self)
+        return _join_operands(other, "+", self)
 
     def __sub__(self, other: object) -> Symbol:
-        return _joined(self, "-", other)
+        return _join_operands(self, "-", other)
 
     def __rsub__(self, other: object) -> Symbol:
-        return _joined(other, "-", self)
+        return _join_operands(other, "-", self)
 
     def __mul__(self, other: object) -> Symbol:
-        return _joined(self, "*", other)
+        return _join_operands(self, "*", other)
 
     def __rmul__(self, other: object) -> Symbol:
-        return _joined(other, "*", self)
+        return _join_operands(other, "*", self)
 
     def __truediv__(self, other: object) -> Symbol:
-        return _joined(self, "/", other)
+        return _join_operands(self, "/", other)
 
     def __rtruediv__(self, other: object) -> Symbol:
-        return _joined(other, "/", self)
+        return _join_operands(other, "/", self)
 
     def __pow__(self, other: object) -> Symbol:
-        return _joined(self, "**", other)
+        return _join_operands(self, "**", other)
 
     def __rpow__(self, other: object) -> Symbol:
-        return _joined(other, "**", self)
+        return _join_operands(other, "**", self)
 
     def __neg__(self) -> Symbol:
         return Symbol(f"(-{self.text})")
@@ -112,25 +112,27 @@ def traced(name: str, function: Callable[..., object], names: Sequence[str], pro
     p[:] = [Symbol(parameter) for parameter in names]
     try:
         matrix = np.atleast_2d(np.asarray(function(p), dtype=object))
-        rows = [[_entry(value) for value in row] for row in matrix]
+        rows = [[_write_entry(value) for value in row] for row in matrix]
         written = parse_matrix(name, rows, names)
     except InputError as error:
-        raise InputError(_refused(name, error.sentence), path=f"system.{name}") from error
+        raise InputError(_write_refusal(name, error.sentence), path=f"system.{name}") from error
     except (TypeError, ValueError, ArithmeticError, AttributeError, IndexError) as error:
-        raise InputError(_refused(name, str(error)), path=f"system.{name}") from error
+        raise InputError(_write_refusal(name, str(error)), path=f"system.{name}") from error
     for point in probes:
-        if not _agree(written, function, point):
-            raise InputError(_refused(name, "its arithmetic depends on more than its argument"), path=f"system.{name}")
+        if not _has_equal_values(written, function, point):
+            raise InputError(
+                _write_refusal(name, "its arithmetic depends on more than its argument"), path=f"system.{name}"
+            )
     return rows
 
 
-def _agree(written: ExpressionMatrix, function: Callable[..., object], point: Array) -> bool:
+def _has_equal_values(written: ExpressionMatrix, function: Callable[..., object], point: Array) -> bool:
     """Return True where a matrix of expressions agrees with the function at one point ``(nu,)``, up to `SAME`."""
     expected, actual = np.asarray(function(point), dtype=float), np.asarray(written(point), dtype=float)
     return expected.shape == actual.shape and bool(np.allclose(expected, actual, rtol=SAME, atol=0.0))
 
 
-def _refused(name: str, why: str) -> str:
+def _write_refusal(name: str, why: str) -> str:
     """Return the message for a function that cannot be written as expressions."""
     return (
         f"the function {name} cannot be written into a config: {why}; expected arithmetic and numpy's"
@@ -138,7 +140,7 @@ def _refused(name: str, why: str) -> str:
     )
 
 
-def _entry(value: object) -> str | float:
+def _write_entry(value: object) -> str | float:
     """Return an entry as text or number."""
     if isinstance(value, Symbol):
         return value.text
@@ -147,7 +149,7 @@ def _entry(value: object) -> str | float:
     raise TypeError(f"it returns {type(value).__name__} for an entry")
 
 
-def _joined(left: object, operator: str, right: object) -> Symbol:
+def _join_operands(left: object, operator: str, right: object) -> Symbol:
     """Return both operands with an operator between them.
 
     Returns ``NotImplemented`` for an operand that is neither a symbol nor a number, such as an array, which then
@@ -155,10 +157,10 @@ def _joined(left: object, operator: str, right: object) -> Symbol:
     """
     if not all(isinstance(value, Symbol | NUMBER) and not isinstance(value, bool) for value in (left, right)):
         return NotImplemented  # type: ignore[no-any-return]
-    return Symbol(f"({_text(left)} {operator} {_text(right)})")
+    return Symbol(f"({_write_operand(left)} {operator} {_write_operand(right)})")
 
 
-def _text(value: Any) -> str:
+def _write_operand(value: Any) -> str:
     """Return an operand as text, a negative number in parentheses."""
     if isinstance(value, Symbol):
         return value.text

@@ -39,10 +39,12 @@ class DisturbanceSupport:
     def steepness(self, times: Array) -> Array:
         """Return bounds ``(k, r, nu)`` of the slope of the functionals in each parameter over the cell, under *any* one
         disturbance."""
-        if self._repeats:
-            return np.asarray(self._gathered(times, self._reaches) @ self._space.exponents[self._monomials])
-        self._asked["blocks"] = times, (blocks := self._side_by_side(self.blocks(times)))
-        return np.asarray(self._reaches(blocks).sum(axis=2) @ self._space.exponents[self._monomials])
+        if self._has_uniform_blocks:
+            return np.asarray(
+                self._sum_over_blocks(times, self._bound_coefficients) @ self._space.exponents[self._monomials]
+            )
+        self._last_blocks["blocks"] = times, (blocks := self._stack_functionals(self.blocks(times)))
+        return np.asarray(self._bound_coefficients(blocks).sum(axis=2) @ self._space.exponents[self._monomials])
 
     def at(self, times: Array, ends: Array) -> tuple[Array, Array]:
         """Taylor coefficients ``(k, r, M)`` of the support function under the worst disturbance of a centre, and its
@@ -51,20 +53,24 @@ class DisturbanceSupport:
         ``ends (k, r, nu)``: parameters that are known to be at an end of the cell (-1 or 1); the centre is that of the
         face they leave.
         """
-        if not self._repeats:  # and `steepness` has just been asked for these times, where there are parameters
-            last_times, blocks = self._asked.pop("blocks", (None, None))
+        if (
+            not self._has_uniform_blocks
+        ):  # and `steepness` has just been asked for these times, where there are parameters
+            last_times, blocks = self._last_blocks.pop("blocks", (None, None))
             if blocks is None or last_times is not times:
-                blocks = self._side_by_side(self.blocks(times))
-            return over_faces(self._space, ends, lambda index, face: self._summed(blocks[index], face).sum(axis=2))
+                blocks = self._stack_functionals(self.blocks(times))
+            return over_faces(
+                self._space, ends, lambda index, face: self._majorise_blocks(blocks[index], face).sum(axis=2)
+            )
         return over_faces(
             self._space,
             ends,
-            lambda index, face: self._gathered(
-                times[index], partial(self._summed, face=face), kept="worst" if face is None else ""
+            lambda index, face: self._sum_over_blocks(
+                times[index], partial(self._majorise_blocks, face=face), kept="worst" if face is None else ""
             ),
         )
 
-    def _summed(self, blocks: Array, face: Face | None) -> Array:
+    def _majorise_blocks(self, blocks: Array, face: Face | None) -> Array:
         return summed(self.disturbance.set, blocks, face, self._monomials, self._space.size)
 
     def deviation(self, start: Array, widths: Array) -> Array:
@@ -77,13 +83,15 @@ class DisturbanceSupport:
         away long before a cell is as short as they are.
         """
         grid, comparison = self.lifted.grid, self.lifted.comparison
-        curvature_rows, slope_norms, curvature_norms, norms, squared = self._bending
-        sizes = self._gathered(start, self._reaches, curvature_rows, plain=True, kept="bent").sum(axis=2)
+        curvature_rows, slope_norms, curvature_norms, norms, squared = self._curvature_terms
+        sizes = self._sum_over_blocks(start, self._bound_coefficients, curvature_rows, plain=True, kept="bent").sum(
+            axis=2
+        )
         pieces = np.minimum(np.maximum(grid.breakpoints.searchsorted(start, side="right") - 1, 0), grid.pieces - 1)
         flow = comparison.over(start - grid.breakpoints[pieces], cells=True).flow
         reach = comparison.over(widths, cells=True)
         lasting_sizes = flow.on(np.broadcast_to(self._drive, (start.size, self._drive.size)))
-        ended_sizes = flow.on(self._gains[pieces])
+        ended_sizes = flow.on(self._effect_bounds[pieces])
         square = (widths**2 / 8)[:, None]
         exact = square * (
             sizes
@@ -102,7 +110,7 @@ class DisturbanceSupport:
         return np.asarray(np.minimum(exact, by_mode))
 
     @cached_property
-    def _bending(self) -> tuple[Array, Array, Array, Array, Array]:
+    def _curvature_terms(self) -> tuple[Array, Array, Array, Array, Array]:
         """Quantities of `deviation` that do not depend on time: the lifted functionals times the square of the matrix;
         the block norms ``(r, q)`` of their first derivative, of their second derivative, and of the functionals
         themselves; and the square of the block sizes."""
@@ -124,11 +132,11 @@ class DisturbanceSupport:
         degree.
         """
         lifted, radius = self.lifted, self.disturbance.radius
-        sizes, remainder = lifted.row_bounds(self.rows, self._repeats)
-        truncation = lifted.spilt(_row_norms(lifted.W, lifted.starts)) + np.linalg.norm(lifted.slack_W, axis=1)
+        sizes, remainder = lifted.row_bounds(self.rows, self._has_uniform_blocks)
+        truncation = lifted.spilt(_compute_row_norms(lifted.W, lifted.starts)) + np.linalg.norm(lifted.slack_W, axis=1)
         rates = remainder @ self._drive + radius * np.einsum("rlaj,aj->rl", sizes, truncation)
         within = np.cumsum(rates[:, lifted.span] * lifted.fine.lengths, axis=1)[:, lifted.ends[1:] - 1]
-        earlier_effect = self._carried
+        earlier_effect = self._earlier_effect
         if earlier_effect is None:
             return np.asarray(within)
         earlier_errors = (
@@ -141,20 +149,20 @@ class DisturbanceSupport:
     def reached(self) -> Array:
         """Norm bounds ``(L, q)`` of the effect of any disturbance on every block of the coordinates until the end of
         every piece."""
-        return self._gains[1:]
+        return self._effect_bounds[1:]
 
     @property
     def _space(self) -> TaylorSpace:
         return (self.combination or self.lifted).space
 
     @property
-    def _repeats(self) -> bool:
+    def _has_uniform_blocks(self) -> bool:
         """True where the blocks are the pieces of a uniform grid, so that what a block receives depends only on its age
         ``t - s``."""
         alone = self.lifted.grid.pieces == self.disturbance.grid.pieces  # not one leg of several
         return alone and self.lifted.backward.uniform and self.disturbance.by_piece
 
-    def _gathered(
+    def _sum_over_blocks(
         self,
         times: Array,
         of_blocks: Callable[[Array], Array],
@@ -169,26 +177,26 @@ class DisturbanceSupport:
         uncombined; ``kept``: a name by which sums over the ages of whole pieces are remembered.
         """
         start = self._lifted_rows if rows is None else rows
-        combined = (lambda blocks: blocks) if plain else self._side_by_side
-        if not self._repeats:
-            return np.asarray(of_blocks(combined(self._blocks(times, start))).sum(axis=2))
+        combined = (lambda blocks: blocks) if plain else self._stack_functionals
+        if not self._has_uniform_blocks:
+            return np.asarray(of_blocks(combined(self._weigh_blocks(times, start))).sum(axis=2))
         grid = self.lifted.grid
         pieces = grid.locate(times)
         within, duration_indices = grid.distinct(times - grid.breakpoints[pieces])
-        if within.size == 1 and kept and self._whole(float(within[0])):
+        if within.size == 1 and kept and self._is_at_breakpoint(float(within[0])):
             key = (kept, float(within[0]))
-            if key not in self._sums:
-                sums = self._by_age(within, grid.pieces - 1, start, lambda blocks: of_blocks(combined(blocks)))
+            if key not in self._cached_sums:
+                sums = self._sum_by_age(within, grid.pieces - 1, start, lambda blocks: of_blocks(combined(blocks)))
                 if sums.size > KEPT:
                     return np.asarray(sums[duration_indices, :, pieces])
-                self._sums[key] = sums
-            return np.asarray(self._sums[key][duration_indices, :, pieces])
+                self._cached_sums[key] = sums
+            return np.asarray(self._cached_sums[key][duration_indices, :, pieces])
         count = int(pieces.max(initial=0))
         chunk_size = max(1, AT_ONCE // max(1, start.shape[0] * count * self._impulses.columns.shape[1]))
         answer = None
         for begin in range(0, within.size, chunk_size):
             chunk = slice(begin, begin + chunk_size)
-            chunk_sums = self._by_age(within[chunk], count, start, lambda blocks: of_blocks(combined(blocks)))
+            chunk_sums = self._sum_by_age(within[chunk], count, start, lambda blocks: of_blocks(combined(blocks)))
             if chunk_size >= within.size:
                 return np.asarray(chunk_sums[duration_indices, :, pieces])
             members = np.flatnonzero((duration_indices >= chunk.start) & (duration_indices < chunk.stop))
@@ -198,25 +206,25 @@ class DisturbanceSupport:
         assert answer is not None
         return answer
 
-    def _whole(self, within: float) -> bool:
+    def _is_at_breakpoint(self, within: float) -> bool:
         """Return whether a time within a piece is its beginning or, up to rounding, its end."""
         length = float(self.lifted.backward.propagator.lengths[0])
         return within == 0.0 or abs(within - length) <= SAME * length
 
     @cached_property
-    def _asked(self) -> dict[str, tuple[Array, Array]]:
+    def _last_blocks(self) -> dict[str, tuple[Array, Array]]:
         """The times that `steepness` was last asked for, and the blocks there, until `at` has used them."""
         return {}
 
     @cached_property
-    def _sums(self) -> dict[tuple[str, float], Array]:
+    def _cached_sums(self) -> dict[tuple[str, float], Array]:
         return {}
 
-    def _by_age(self, within: Array, count: int, start: Array, of_blocks: Callable[[Array], Array]) -> Array:
-        """The sums of `_gathered` at such times ``within (q,)`` of the pieces ``0, ..., count``, ``(q, r, count + 1,
-        j)``, since what a block receives depends on its age."""
+    def _sum_by_age(self, within: Array, count: int, start: Array, of_blocks: Callable[[Array], Array]) -> Array:
+        """The sums of `_sum_over_blocks` at such times ``within (q,)`` of the pieces ``0, ..., count``,
+        ``(q, r, count + 1, j)``, since what a block receives depends on its age."""
         propagated_rows, gains = self.lifted.flown(np.broadcast_to(start, (within.size, *start.shape)), within)
-        lasting_weights = self._weights(gains)[..., None, :]
+        lasting_weights = self._weigh_disturbance(gains)[..., None, :]
         ended_weights = self._impulses.of(propagated_rows, count)
         ended_weights = ended_weights.reshape(
             *ended_weights.shape[:-1], lasting_weights.shape[2], lasting_weights.shape[4]
@@ -227,10 +235,10 @@ class DisturbanceSupport:
     def _impulses(self) -> Impulses:
         """Contributions of the disturbance on a piece to the Taylor coefficients of a functional, by the age of the
         piece."""
-        weights = self._weights(np.eye(self.lifted.row_matrix.shape[0]))
+        weights = self._weigh_disturbance(np.eye(self.lifted.row_matrix.shape[0]))
         return Impulses(self.lifted.backward.propagator, weights.reshape(weights.shape[0], -1))
 
-    def _side_by_side(self, blocks: Array) -> Array:
+    def _stack_functionals(self, blocks: Array) -> Array:
         """Coefficients ``(k, r, M, nb, q)`` as those of the polynomials whose sums are taken: of the one of a direction
         that varies, ``(k, 1, r M, nb, q)``, whose other coefficients are 0."""
         k, r, size, *block_shape = blocks.shape
@@ -238,19 +246,20 @@ class DisturbanceSupport:
 
     @cached_property
     def _monomials(self) -> np.ndarray:
-        """Indices, in the space, of the monomials of the coefficients of `_side_by_side`, the constant one first."""
+        """Indices, in the space, of the monomials of the coefficients of `_stack_functionals`, the constant one
+        first."""
         return np.arange(self._space.size) if self.combination is None else self.combination.targets.reshape(-1)
 
-    def _reaches(self, blocks: Array) -> Array:
+    def _bound_coefficients(self, blocks: Array) -> Array:
         """Return bounds ``(k, r, nb, M)`` of the absolute value of every Taylor coefficient of every block under any
         one disturbance."""
         return self.disturbance.set.reach(blocks).swapaxes(2, 3)
 
     def blocks(self, times: Array) -> Array:
         """Taylor coefficients ``(k, r, M, nb, q)`` of what the functionals give to every block."""
-        return self._blocks(times, self._lifted_rows)
+        return self._weigh_blocks(times, self._lifted_rows)
 
-    def _blocks(self, times: Array, rows: Array) -> Array:
+    def _weigh_blocks(self, times: Array, rows: Array) -> Array:
         """Taylor coefficients ``(k, r, M, nb, q)`` of what functionals that start as lifted ``rows (r, M d)`` give to
         every block."""
         return self.disturbance.blocks(np.moveaxis(self.on_pieces(times, rows), 3, 2))
@@ -262,14 +271,14 @@ class DisturbanceSupport:
         free, gains, _, _ = self.lifted.backward.adjoint(
             np.repeat(times, r), np.tile(rows, (k, 1)), np.zeros((k * r, 0))
         )
-        weights = self._weights(gains.reshape(k, r, gains.shape[1], -1))
+        weights = self._weigh_disturbance(gains.reshape(k, r, gains.shape[1], -1))
         first, piece_count = self.lifted.first, self.disturbance.grid.pieces
         if piece_count == weights.shape[2]:
             return weights
         all_weights = np.zeros((k, r, piece_count, *weights.shape[3:]))
         all_weights[:, :, first : first + weights.shape[2]] = weights
-        if self._carried is not None:
-            space, effect = self.lifted.space, self._carried.effect
+        if self._earlier_effect is not None:
+            space, effect = self.lifted.space, self._earlier_effect.effect
             row_coefficients = free.reshape(k, r, space.size, -1)
             for left, right, target in zip(*space.products, strict=True):
                 all_weights[:, :, :first, target] += np.einsum(
@@ -278,16 +287,16 @@ class DisturbanceSupport:
         return all_weights
 
     @property
-    def _carried(self) -> Carried | None:
+    def _earlier_effect(self) -> Carried | None:
         past = self.lifted.past
         if past is None:
             return None
         earlier_effect = past.carried.get(id(self.disturbance))
         if not isinstance(earlier_effect, Carried):
-            earlier_effect = past.carried[id(self.disturbance)] = _carry(past, self.disturbance)
+            earlier_effect = past.carried[id(self.disturbance)] = _propagate_effect(past, self.disturbance)
         return earlier_effect
 
-    def _weights(self, gains: Array) -> Array:
+    def _weigh_disturbance(self, gains: Array) -> Array:
         """Gains ``(..., M d)`` on the state's drive, as Taylor coefficients ``(..., M, mw)`` of the weights on the
         disturbance."""
         space = self.lifted.space
@@ -304,7 +313,7 @@ class DisturbanceSupport:
     @cached_property
     def before(self) -> Array:
         """Norm bounds ``(q,)`` of the effect of any disturbance before time 0 on every block of the coordinates."""
-        return np.zeros(self.lifted.starts.size) if self._carried is None else self._carried.reached
+        return np.zeros(self.lifted.starts.size) if self._earlier_effect is None else self._earlier_effect.reached
 
     @cached_property
     def _lifted_rows(self) -> Array:
@@ -316,11 +325,11 @@ class DisturbanceSupport:
     def _drive(self) -> Array:
         """Norm bounds ``(q,)`` of the rate at which any admissible disturbance drives every block of the
         coordinates."""
-        norms = _row_norms(self.lifted.W, self.lifted.starts).sum(axis=0)
+        norms = _compute_row_norms(self.lifted.W, self.lifted.starts).sum(axis=0)
         return np.asarray(self.disturbance.radius * (norms + np.linalg.norm(self.lifted.slack_W, axis=1)))
 
     @cached_property
-    def _gains(self) -> Array:
+    def _effect_bounds(self) -> Array:
         """``int_0^t e^{M s} |W| ds`` for the comparison system at the breakpoints, ``(L+1, q)``: norm bounds of the
         effect of any disturbance until then on every block."""
         grid = self.lifted.grid
@@ -378,7 +387,7 @@ def carried(past: Past, of: object, old: Array, entries: Array, reached: Array, 
     return Carried(of, effect, sizes, bounds, error_bounds + past.rounded(entries.sum(axis=1)) + terms * bounds)
 
 
-def _carry(past: Past, disturbance: DisturbanceModel) -> Carried:
+def _propagate_effect(past: Past, disturbance: DisturbanceModel) -> Carried:
     lifted, d = past.lifted, past.turn.shape[0]
     earlier_support, rows = DisturbanceSupport(lifted, disturbance, np.eye(d)), np.eye(d, lifted.row_matrix.shape[0])
     first = lifted.first + lifted.grid.pieces
@@ -467,6 +476,6 @@ def summed(
     return polynomials
 
 
-def _row_norms(coefficients: Array, starts: np.ndarray) -> Array:
+def _compute_row_norms(coefficients: Array, starts: np.ndarray) -> Array:
     """Norms ``(M, q)`` of the rows of every block of ``(M, d, mw)``."""
     return np.asarray(np.sqrt(np.add.reduceat((coefficients**2).sum(axis=2), starts, axis=1)))

@@ -156,15 +156,15 @@ class CellEnclosure:
             ``(k, nu')`` that halving each parameter, or direction, would reduce.
         """
         with np.errstate(over="ignore", invalid="ignore"):  # a bound that overflows is no bound, and is told as such
-            return self._bounds(start, stop)
+            return self._compute_bounds(start, stop)
 
-    def _bounds(self, start: Array, stop: Array) -> tuple[Array, Array, Array]:
+    def _compute_bounds(self, start: Array, stop: Array) -> tuple[Array, Array, Array]:
         pieces = self.lifted.grid.locate(stop)
-        ends, end_indices = _ends(start, stop, pieces, self.lifted.grid.breakpoints)
-        bounds, spreads = self._at(*ends)
+        ends, end_indices = _merge_ends(start, stop, pieces, self.lifted.grid.breakpoints)
+        bounds, spreads = self._bound_at(*ends)
         start_bounds, stop_bounds = bounds[end_indices[: start.size]], bounds[end_indices[start.size :]]
-        bend = self._deviation(start, stop, pieces)
-        neglected = self._neglected[:, pieces].T
+        bend = self._bound_chord_error(start, stop, pieces)
+        neglected = self._remainder_bounds[:, pieces].T
         if self.combination is not None:  # the parts of one constraint, each with a factor of at most 1
             bend, neglected = bend.sum(axis=1, keepdims=True), neglected.sum(axis=1, keepdims=True)
         if self.direct is not None:
@@ -176,7 +176,7 @@ class CellEnclosure:
         pick = (np.arange(worst.size), worst)
         spread = (
             np.maximum(spreads[end_indices[: start.size]][pick], spreads[end_indices[start.size :]][pick])
-            + self._shares * neglected[pick][:, None]
+            + self._remainder_shares * neglected[pick][:, None]
         )
         # A short cell that bends beyond all measure has models that are good for narrower parameters only.
         short = self.lifted.norm * (stop - start) < 1.0
@@ -184,9 +184,9 @@ class CellEnclosure:
         gain = np.where(wild, 0.0, bend[pick]) if spread.shape[1] else bend[pick]
         return total[pick], gain, spread
 
-    def _at(self, times: Array, pieces: np.ndarray) -> tuple[Array, Array]:
+    def _bound_at(self, times: Array, pieces: np.ndarray) -> tuple[Array, Array]:
         """Bounds ``(k, r)`` at single times, and how much of them each parameter accounts for, ``(k, r, nu)``."""
-        states = self._states(times, pieces)
+        states = self._compute_states(times, pieces)
         coefficients = np.einsum("ri,kai->kra", self._rows, states)
         if self.moving is not None:
             coefficients[:, :, 0] += self.moving.at(times + self.lifted.grid.elapsed)
@@ -199,9 +199,9 @@ class CellEnclosure:
             if self.sigma is None or not space.nu
             else self.sigma.steepness(times)
         )
-        coefficients, gain = self._cut_off(space, coefficients, times)
-        ends = self._better_ends(space, coefficients, steepness)
-        coefficients, excess = _on_faces(space, coefficients, ends), np.zeros(coefficients.shape[:2])
+        coefficients, gain = self._apply_cuts(space, coefficients, times)
+        ends = self._find_better_ends(space, coefficients, steepness)
+        coefficients, excess = _restrict_to_faces(space, coefficients, ends), np.zeros(coefficients.shape[:2])
         if self.sigma is not None:
             support, excess = self.sigma.at(times, ends)
             coefficients = coefficients + support
@@ -209,10 +209,10 @@ class CellEnclosure:
         blame = np.where(ends == 0, steepness, 0.0) + np.finfo(float).tiny
         spread = spread if gain is None else gain
         if self.combination is not None:
-            spread = self._of_directions(space, coefficients, ends, spread, np.maximum(bound + excess, 0.0))
+            spread = self._add_direction_gains(space, coefficients, ends, spread, np.maximum(bound + excess, 0.0))
         return bound + excess, spread + excess[..., None] * blame / blame.sum(axis=2, keepdims=True)
 
-    def _of_directions(
+    def _add_direction_gains(
         self, space: TaylorSpace, coefficients: Array, ends: Array, spread: Array, violated: Array
     ) -> Array:
         """Return the ``spread (k, r, nu')`` with the gain from halving each direction.
@@ -232,7 +232,7 @@ class CellEnclosure:
         gain = np.abs(hessian).sum(axis=3) - np.abs(own) + loss * highest**2
         return np.concatenate([spread[..., :nu], gain[..., nu:]], axis=2)
 
-    def _cut_off(self, space: TaylorSpace, coefficients: Array, times: Array) -> tuple[Array, Array | None]:
+    def _apply_cuts(self, space: TaylorSpace, coefficients: Array, times: Array) -> tuple[Array, Array | None]:
         """Polynomials above ``coefficients (k, r, M)`` where the parameters are, and what halving the cell would gain
         with them."""
         if self.cuts is None:
@@ -241,7 +241,7 @@ class CellEnclosure:
         return self.cuts.lowered(space, coefficients, support)
 
     @staticmethod
-    def _better_ends(space: TaylorSpace, coefficients: Array, steepness: Array) -> Array:
+    def _find_better_ends(space: TaylorSpace, coefficients: Array, steepness: Array) -> Array:
         """Parameters in which the violation is monotone over the cell, whatever the disturbance: their better ends,
         ``(k, r, nu)``."""
         if not space.nu:
@@ -250,7 +250,7 @@ class CellEnclosure:
             steepness.shape
         )
 
-    def _states(self, times: Array, pieces: np.ndarray) -> Array:
+    def _compute_states(self, times: Array, pieces: np.ndarray) -> Array:
         """Taylor coefficients ``(k, M, d)`` of the state under the control alone, from the last breakpoint."""
         start: Array = self._nodes[pieces]
         within = times - self.lifted.grid.breakpoints[pieces]
@@ -259,10 +259,10 @@ class CellEnclosure:
         pieces = np.minimum(pieces, self.lifted.grid.pieces - 1)  # beyond the last there is no time to be driven in
         return self.lifted.moved(within, pieces, start, self._inputs[pieces])
 
-    def _deviation(self, start: Array, stop: Array, pieces: np.ndarray) -> Array:
+    def _bound_chord_error(self, start: Array, stop: Array, pieces: np.ndarray) -> Array:
         """Return bounds ``(k, r)`` of the distance of the state and of the support function from their chords on the
         cells, summed over the Taylor coefficients."""
-        width, states = stop - start, self._states(start, pieces)
+        width, states = stop - start, self._compute_states(start, pieces)
         total = self.lifted.deviation(self._rows, start, width, pieces, states, self._inputs[pieces])
         return np.asarray(total if self.sigma is None else total + self.sigma.deviation(start, width))
 
@@ -283,14 +283,14 @@ class CellEnclosure:
         return self.lifted.grid.inputs(self.control).T
 
     @cached_property
-    def _shares(self) -> Array:
+    def _remainder_shares(self) -> Array:
         """Shares ``(nu',)`` of the parameters (and directions) in the remainder of the models, of sum 1."""
         directions = (self.combination.space.nu - self.lifted.space.nu) if self.combination is not None else 0
         total = np.append(self.lifted.influence, np.zeros(directions)) + SMALL_SHARE
         return np.asarray(total / total.sum())
 
     @cached_property
-    def _neglected(self) -> Array:
+    def _remainder_bounds(self) -> Array:
         """Bounds ``(r, L)`` of the remainder of the Taylor models and of the rounding of the last products and sums."""
         lifted = self.lifted
         widest = block_norms(np.abs(self.H) @ np.abs(lifted.transform), lifted.starts)  # with what cancels in H T
@@ -341,7 +341,7 @@ def over_legs(legs: Sequence[AnyMotion], cell: Callable[[AnyMotion], CellEnclosu
     return LegsEnclosure([cell(leg) for leg in legs], np.array([leg.grid.elapsed for leg in legs]))
 
 
-def _on_faces(space: TaylorSpace, coefficients: Array, ends: Array) -> Array:
+def _restrict_to_faces(space: TaylorSpace, coefficients: Array, ends: Array) -> Array:
     """Polynomials ``(k, r, M)`` with the variables that have an end in ``ends (k, r, nu)`` set to it."""
     if not ends.any():
         return coefficients
@@ -354,7 +354,7 @@ def _on_faces(space: TaylorSpace, coefficients: Array, ends: Array) -> Array:
     return on_faces
 
 
-def _ends(
+def _merge_ends(
     start: Array, stop: Array, pieces: np.ndarray, breakpoints: Array
 ) -> tuple[tuple[Array, np.ndarray], np.ndarray]:
     """The ends of the cells with the piece that each is looked at from, the same ones once where cells share a piece or
@@ -385,7 +385,7 @@ def enclose(
     if lower.shape[1] == 1:
         bounds, bend, _ = cell_over(lower[0, 1:], upper[0, 1:]).bounds(lower[:, 0], upper[:, 0])
         return Enclosure(bounds, split, bend)
-    for members in _groups(np.hstack([lower[:, 1:], upper[:, 1:]]), touched):
+    for members in _group_by_key(np.hstack([lower[:, 1:], upper[:, 1:]]), touched):
         low, high = lower[members[0], 1:], upper[members[0], 1:]
         try:
             cell = cell_over(low, high)
@@ -402,7 +402,7 @@ def enclose(
     return Enclosure(bounds, split)
 
 
-def _groups(keys: Array, touched: np.ndarray) -> list[np.ndarray]:
+def _group_by_key(keys: Array, touched: np.ndarray) -> list[np.ndarray]:
     """Positions of the touched rows of ``keys``, those with the same row together."""
     touched_rows = np.flatnonzero(touched)
     if not touched_rows.size or not keys.shape[1]:

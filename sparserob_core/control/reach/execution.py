@@ -17,7 +17,7 @@ from sparserob_core.control.enclosures.comparison import block_norms
 from sparserob_core.control.enclosures.matrix_exponential import rounding
 from sparserob_core.control.enclosures.taylor import Combination
 from sparserob_core.control.problem.system import LinearSystem
-from sparserob_core.control.reach.measurable import MeasurableSupport, _moved
+from sparserob_core.control.reach.measurable import MeasurableSupport, _propagate_rows
 from sparserob_core.control.reach.support import KnownCellSupport, Support, over_directions
 from sparserob_core.control.reach.varying_motion import (
     SpreadMotion,
@@ -124,7 +124,7 @@ class Execution:
         """
         ages = np.clip(times[:, None] - self.breakpoints, 0.0, None)
         contributions = np.zeros((times.size, self.shares.size, self.breakpoints.size - 1))
-        for j, integral in enumerate(self._integrals(ages, directions)):
+        for j, integral in enumerate(self._integrate_responses(ages, directions)):
             contributions[:, j] = self.shares[j] * np.maximum(integral[:, :-1] - integral[:, 1:], 0.0)
         return contributions.reshape(times.size, self.shares.size * (self.breakpoints.size - 1))
 
@@ -138,7 +138,7 @@ class Execution:
         if not pieces.size:
             return np.zeros(times.size)
         ages = np.clip(times[:, None] - self.breakpoints[pieces], 0.0, None)
-        pairs = zip(self._integrals(ages, directions), jumps, strict=True)
+        pairs = zip(self._integrate_responses(ages, directions), jumps, strict=True)
         return np.asarray(sum(integral @ change for integral, change in pairs))
 
     @shaped
@@ -148,7 +148,7 @@ class Execution:
         """The derivative ``(k,)`` of `added` in the time, from the left where that jumps."""
         (A, B), (pieces, jumps) = self.matrices, self.jumps(control)
         ages = times[:, None] - self.breakpoints[pieces]
-        impulse_responses = _moved(A, directions, ages) @ B
+        impulse_responses = _propagate_rows(A, directions, ages) @ B
         return np.asarray(np.einsum("kqm,mq,kq->k", np.abs(impulse_responses), jumps, ages > 0.0))
 
     @shaped
@@ -159,7 +159,7 @@ class Execution:
         pieces = np.flatnonzero(jumps.any(axis=0))
         return pieces, jumps[:, pieces]
 
-    def _integrals(self, ages: Array, directions: Array) -> list[Array]:
+    def _integrate_responses(self, ages: Array, directions: Array) -> list[Array]:
         """``int_0^age |c'e^{A s} B_j| ds`` for ages ``(k, q)`` of directions ``(k, d)``, of every channel; of ages that
         are alike once."""
         tolerance = ALIKE * float(self.breakpoints[-1])

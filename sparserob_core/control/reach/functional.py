@@ -138,21 +138,21 @@ class WorstCase:
             response = response.from_state(response.initial_state + nominal_point(self.initial))
         disturbance = None if model is None else model.held(nominal_point(model.bound))
         return replace(
-            self, response=response, disturbance=disturbance, shared=None, initial=None, execution=self._exactly
+            self, response=response, disturbance=disturbance, shared=None, initial=None, execution=self._exact_execution
         )
 
     def nominal(self) -> WorstCase:
         """The functionals of the system at an interior point of its parameters, from the centre of the initial states,
         under one admissible disturbance: none, where it may be."""
-        return self._nominal
+        return self._nominal_case
 
     @cached_property
-    def _nominal(self) -> WorstCase:
+    def _nominal_case(self) -> WorstCase:
         system, model = self.response.system, self.disturbance
         if model is not None:
             zero = np.zeros(model.channels)
             model = model.held(zero if model.bound.contains(zero) else model.bound.interior_point())
-        response, exact = self.response, self._exactly
+        response, exact = self.response, self._exact_execution
         if system.parameters is not None:
             response = response.at(system.parameters.interior_point())
         if system.varies:
@@ -160,7 +160,7 @@ class WorstCase:
         return WorstCase(response, self.dictionary, model, names=self.names, execution=exact)
 
     @property
-    def _exactly(self) -> Execution | None:
+    def _exact_execution(self) -> Execution | None:
         """The execution of the same decisions without errors, where the control is delivered as it is commanded;
         ``None`` where there is no execution."""
         return None if self.execution is None else self.execution.none()
@@ -188,11 +188,11 @@ class WorstCase:
         self, times: Float[Array, " k"], directions: Float[Array, "k d"], parameters: Float[Array, "k nu"]
     ) -> tuple[Float[Array, "k n"], Float[Array, " k"]]:
         """``G (k, n)`` and ``offset (k,)`` with ``max_w c'x(t) = G theta + offset``."""
-        return self._rows(
+        return self._build_rows(
             times,
             directions,
             parameters,
-            lambda chunk, weights: self._support(weights, times[chunk], directions[chunk], parameters[chunk]),
+            lambda chunk, weights: self._evaluate_support(weights, times[chunk], directions[chunk], parameters[chunk]),
         )
 
     @shaped
@@ -210,17 +210,19 @@ class WorstCase:
 
         def pushed(part: slice, known: Weights) -> Array:
             free = known.free
-            initial_effect = self._begun(free) if deviations is None else (free * deviations[part]).sum(axis=1)
+            initial_effect = (
+                self._evaluate_initial_support(free) if deviations is None else (free * deviations[part]).sum(axis=1)
+            )
             return (
                 initial_effect
                 if disturbances is None
                 else initial_effect + np.einsum("kli,kil->k", known.disturbance, disturbances[part])
             )
 
-        return self._rows(times, directions, parameters, pushed)
+        return self._build_rows(times, directions, parameters, pushed)
 
     @shaped
-    def _rows(
+    def _build_rows(
         self,
         times: Float[Array, " k"],
         directions: Float[Array, "k d"],
@@ -230,7 +232,7 @@ class WorstCase:
         """Rows and offsets; ``pushed(part, weights)`` is what the uncertainty adds to the offsets of a part of the
         indices."""
         G, offset = np.empty((times.size, self.variables)), np.empty(times.size)
-        for chunk in self._chunks(parameters):
+        for chunk in self._divide_into_chunks(parameters):
             weights = self.response.weights(times[chunk], directions[chunk], parameters[chunk])
             G[chunk, : self.coefficients] = self.on_decision(weights.control)
             if self.execution is not None:
@@ -265,14 +267,14 @@ class WorstCase:
         and each is asked for once: with measurable disturbances and errors as in `turning`."""
         control = self.on_grid(theta)
         result = np.empty(times.size)
-        for chunk in self._chunks(parameters):
+        for chunk in self._divide_into_chunks(parameters):
             weights = self.response.weights(times[chunk], directions[chunk], parameters[chunk])
             control_effect = np.einsum("klm,ml->k", weights.control, control)
-            support = self._support(weights, times[chunk], directions[chunk], parameters[chunk], roughly)
+            support = self._evaluate_support(weights, times[chunk], directions[chunk], parameters[chunk], roughly)
             result[chunk] = weights.free @ self.response.initial_state + control_effect + support
             if roughly:
                 result[chunk] += np.einsum(
-                    "klm,ml->k", np.abs(weights.control[..., : self.channels]), self._missed(control)
+                    "klm,ml->k", np.abs(weights.control[..., : self.channels]), self._bound_execution_errors(control)
                 )
             elif self.execution is not None:
                 error_directions = self.execution.seen(directions[chunk], parameters[chunk])
@@ -284,11 +286,11 @@ class WorstCase:
         nu)``: of directions ``(j, d)`` and the places ``(j,)`` that they are at, as many at each, ``(j,)``. Weights are
         linear in the direction, so that those of the axes are computed once. What measurable disturbances and errors of
         execution add is not, and is only about right: of errors it is what those do that are constant on pieces."""
-        weights, model, control = self._axes(times, parameters), self.disturbance, self.on_grid(theta)
+        weights, model, control = self._weigh_axes(times, parameters), self.disturbance, self.on_grid(theta)
         states = weights.free @ self.response.initial_state + np.einsum("kdlm,ml->kd", weights.control, control)
         by_block, measurable = None if model is None else model.on_blocks, self.measurable
         blocks = np.zeros((*states.shape, 0, 0)) if by_block is None else by_block.blocks(weights.disturbance)
-        error_sizes = self._missed(control)
+        error_sizes = self._bound_execution_errors(control)
         error_pieces = np.flatnonzero(error_sizes.any(axis=0))
         error_weights = (weights.control[:, :, error_pieces, : self.channels] * error_sizes[:, error_pieces].T).reshape(
             *states.shape, -1
@@ -298,10 +300,10 @@ class WorstCase:
             places = which[np.flatnonzero(np.diff(which, prepend=-1))]
             c = directions.reshape(places.size, -1, directions.shape[1])
             values: Array = (c * states[places, None]).sum(axis=2)
-            for chunk in _parts(places.size, max(1, NEAR // max(1, c[:1, :, 0].size * blocks[:1, 0].size))):
+            for chunk in _divide_range(places.size, max(1, NEAR // max(1, c[:1, :, 0].size * blocks[:1, 0].size))):
                 indices, chunk_directions = places[chunk], c[chunk]
                 free = chunk_directions @ weights.free[indices]
-                values[chunk] += self._begun(free.reshape(-1, free.shape[2])).reshape(free.shape[:2])
+                values[chunk] += self._evaluate_initial_support(free.reshape(-1, free.shape[2])).reshape(free.shape[:2])
                 if by_block is not None:
                     on_blocks = chunk_directions @ blocks[indices].reshape(*blocks[indices].shape[:2], -1)
                     values[chunk] += by_block.pushed(on_blocks.reshape(*free.shape[:2], *blocks.shape[2:]))
@@ -313,7 +315,7 @@ class WorstCase:
 
         return along
 
-    def _missed(self, control: Array) -> Array:
+    def _bound_execution_errors(self, control: Array) -> Array:
         """Return the largest error of execution of every channel of a control on the pieces of the merged grid,
         ``(m, L)``."""
         commanded = np.abs(control[: self.channels])
@@ -336,19 +338,19 @@ class WorstCase:
             return self.offsets(np.repeat(times, r), np.tile(directions, (k, 1)), repeated).reshape(k, r)
         sigma, chunk_size = np.zeros((k, r)), max(1, CHUNK // (r * directions.shape[1]))
         if by_block is not None:
-            lifted = self._frozen.get(parameter.tobytes())
+            lifted = self._frozen_systems.get(parameter.tobytes())
             if lifted is None:
                 arguments = (self.response.system.modes[0], self.response.grid, self.response.initial_state, parameter)
-                lifted = remember(self._frozen, parameter.tobytes(), frozen(*arguments), LEGS_KEPT)
+                lifted = remember(self._frozen_systems, parameter.tobytes(), frozen(*arguments), LEGS_KEPT)
             sigma = DisturbanceSupport(lifted, by_block, directions).at(times, np.zeros((k, r, 0)))[0][:, :, 0]
         if measurable is not None:
-            for chunk in _parts(k, chunk_size):
+            for chunk in _divide_range(k, chunk_size):
                 pairs = np.repeat(times[chunk], r), np.tile(directions, (times[chunk].size, 1))
                 sigma[chunk] += measurable(*pairs, np.broadcast_to(parameter, (pairs[0].size, parameter.size))).reshape(
                     -1, r
                 )
         if self.initial is not None:
-            for chunk in _parts(k, chunk_size):
+            for chunk in _divide_range(k, chunk_size):
                 rows = self.response.propagator.backwards(times[chunk], directions, parameter)
                 sigma[chunk] += self.initial.support(rows)
         return sigma
@@ -358,14 +360,14 @@ class WorstCase:
         for all directions, in which it is linear."""
         (r, d), sigma, model = directions.shape, np.zeros((times.size, directions.shape[0])), self.disturbance
         chunk_size = max(1, CHUNK // (d * self.response.numbers(parameter.size)))
-        for chunk in _parts(times.size if self.disturbed else 0, chunk_size):
-            weights = self._axes(times[chunk], np.broadcast_to(parameter, (times[chunk].size, parameter.size)))
+        for chunk in _divide_range(times.size if self.disturbed else 0, chunk_size):
+            weights = self._weigh_axes(times[chunk], np.broadcast_to(parameter, (times[chunk].size, parameter.size)))
             k = weights.free.shape[0]
-            sigma[chunk] = self._begun((directions @ weights.free).reshape(k * r, d)).reshape(k, r)
+            sigma[chunk] = self._evaluate_initial_support((directions @ weights.free).reshape(k * r, d)).reshape(k, r)
             if model is None:
                 continue
             blocks = model.blocks(weights.disturbance)
-            for inner_chunk in _parts(k, max(1, NEAR // (r * blocks[0, 0].size))):
+            for inner_chunk in _divide_range(k, max(1, NEAR // (r * blocks[0, 0].size))):
                 active_blocks = blocks[inner_chunk][:, :, blocks[inner_chunk].any(axis=(0, 1, 3))]
                 projected = directions @ active_blocks.reshape(active_blocks.shape[0], d, active_blocks[0, 0].size)
                 sigma[chunk][inner_chunk] += model.pushed(
@@ -373,14 +375,14 @@ class WorstCase:
                 )
         return sigma
 
-    def _axes(self, times: Array, parameters: Array) -> Weights:
+    def _weigh_axes(self, times: Array, parameters: Array) -> Weights:
         """The weights of the functionals along the axes at times ``(k,)``, with one dimension ``(k, d, ...)`` more."""
         d = self.response.initial_state.size
         axes = np.tile(np.eye(d), (times.size, 1))
         repeated = [np.repeat(values, d, axis=0) for values in (times, parameters)]
         chunks = [
             self.response.weights(repeated[0][chunk], axes[chunk], repeated[1][chunk])
-            for chunk in self._chunks(repeated[1])
+            for chunk in self._divide_into_chunks(repeated[1])
         ]
         arrays = [
             np.concatenate([getattr(weights, name) for weights in chunks])
@@ -465,9 +467,9 @@ class WorstCase:
         if not self.disturbed:
             return np.zeros(times.size)
         result = np.empty(times.size)
-        for chunk in self._chunks(parameters):
+        for chunk in self._divide_into_chunks(parameters):
             weights = self.response.weights(times[chunk], directions[chunk], parameters[chunk])
-            result[chunk] = self._support(weights, times[chunk], directions[chunk], parameters[chunk])
+            result[chunk] = self._evaluate_support(weights, times[chunk], directions[chunk], parameters[chunk])
         return result
 
     @shaped
@@ -484,8 +486,8 @@ class WorstCase:
         weights = self.response.weights(*index)
         return Parts(
             float(weights.free[0] @ self.response.initial_state + self.given(weights.control)[0]),
-            float(self._support(weights, *index)[0]),
-            float(self._begun(weights.free)[0]),
+            float(self._evaluate_support(weights, *index)[0]),
+            float(self._evaluate_initial_support(weights.free)[0]),
             None if self.disturbance is None else self.disturbance.worst(weights.disturbance)[0],
             None if self.initial is None else self.initial.support_point(weights.free)[0],
         )
@@ -516,7 +518,7 @@ class WorstCase:
     def given(self, weights: Float[Array, "k L mc"]) -> Float[Array, " k"]:
         """Return the contribution ``(k,)`` of all inputs that are not decided, from weights ``(k, L, m + constants)``
         on the columns of ``B``."""
-        return np.einsum("klm,ml->k", weights, self.known) if self._gives else np.zeros(weights.shape[0])
+        return np.einsum("klm,ml->k", weights, self.known) if self._has_known_inputs else np.zeros(weights.shape[0])
 
     @shaped
     def decided(self, weights: Float[Array, "k L mc"]) -> Float[Array, "k J m"]:
@@ -526,13 +528,15 @@ class WorstCase:
         The ``J`` grid pieces are those on which a piece of the control acts.
         """
         grid = self.response.grid
-        return weights[:, grid.decided, : self.channels] if self._gives or grid.before is not None else weights
+        return (
+            weights[:, grid.decided, : self.channels] if self._has_known_inputs or grid.before is not None else weights
+        )
 
     @shaped
     def on_decision(self, weights: Float[Array, "k L mc"]) -> Float[Array, "k n"]:
         """Weights ``(k, L, m + constants)`` on the columns of ``B`` on every grid piece, as rows ``(k, n)`` of the
         decision."""
-        acting, starts = self._acting
+        acting, starts = self._active_pieces
         on_pieces = self.decided(weights)
         if starts.size < on_pieces.shape[1]:
             on_pieces = np.add.reduceat(on_pieces, starts, axis=1)
@@ -543,7 +547,7 @@ class WorstCase:
         return self.dictionary.gathered(on_pieces).swapaxes(1, 2).reshape(-1, self.coefficients)
 
     @cached_property
-    def _acting(self) -> tuple[np.ndarray, np.ndarray]:
+    def _active_pieces(self) -> tuple[np.ndarray, np.ndarray]:
         """The pieces of the control that act, and where each begins among the grid pieces on which one acts."""
         acting = self.response.grid.control_piece[self.response.grid.decided]
         starts = np.flatnonzero(np.diff(acting, prepend=-1))
@@ -557,49 +561,51 @@ class WorstCase:
         The result is remembered, for all constraints.
         """
         key, response = low.tobytes() + high.tobytes(), self.response
-        if key not in self._legs:
+        if key not in self._cached_phases:
             cell = (low + high) / 2, (high - low) / 2
             legs: tuple[Leg, ...]
             if response.propagator.laws is not None:
-                legs = (self._on_cell(low, high),)
+                legs = (self._expand_over_cell(low, high),)
             elif response.grid.varying:
                 legs = (VaryingMotion(response.propagator, response.initial_state),)
             else:
                 legs = lift_legs(response.system, response.grid, response.initial_state, *cell)
-            remember(self._legs, key, legs, LEGS_KEPT)
-        return self._legs[key]
+            remember(self._cached_phases, key, legs, LEGS_KEPT)
+        return self._cached_phases[key]
 
-    def _on_cell(self, low: Array, high: Array) -> SpreadMotion:
+    def _expand_over_cell(self, low: Array, high: Array) -> SpreadMotion:
         """Return the motion over a cell of parameters; its growth bound is the least known one of the cells around it,
         if there is any."""
         propagator, initial_state = self.response.propagator, self.response.initial_state
         assert propagator.laws is not None
         part_index = propagator.laws.holding(low, high)  # of which units are
         around = [
-            growth for own, a, b, growth in self._grown if own == part_index and (a <= low).all() and (high <= b).all()
+            growth
+            for own, a, b, growth in self._growth_bounds
+            if own == part_index and (a <= low).all() and (high <= b).all()
         ]
         least_growth = min(around, default=None)
         leg = SpreadMotion.of(propagator.on_cell(low, high), initial_state, least_growth)
         if least_growth is None:
-            self._grown.append((part_index, low, high, leg.truncation.growth))
+            self._growth_bounds.append((part_index, low, high, leg.truncation.growth))
         return leg
 
     @cached_property
-    def _grown(self) -> list[tuple[int | None, Array, Array, float]]:
+    def _growth_bounds(self) -> list[tuple[int | None, Array, Array, float]]:
         return []
 
-    def _growth(self, low: Array, high: Array, halvings: int) -> float:
+    def _bound_growth(self, low: Array, high: Array, halvings: int) -> float:
         """Return a bound of the norm of the transitions at any parameter of a cell; ``inf`` where smaller cells have
         none."""
         try:
-            return self._on_cell(low, high).truncation.growth
+            return self._expand_over_cell(low, high).truncation.growth
         except NotEnclosable as error:
             if error.along is None or not halvings:
                 return np.inf
             ends = low.copy(), high.copy()
             for end in ends:
                 end[error.along] = (low[error.along] + high[error.along]) / 2
-            return max(self._growth(low, ends[1], halvings - 1), self._growth(ends[0], high, halvings - 1))
+            return max(self._bound_growth(low, ends[1], halvings - 1), self._bound_growth(ends[0], high, halvings - 1))
 
     def beyond(self, far: Array) -> Array:
         """Return bounds ``(d,)`` of the truncation error of any state, from the series of the law in the parameters.
@@ -610,15 +616,15 @@ class WorstCase:
         laws, bounds = self.response.propagator.laws, np.zeros(self.response.initial_state.size)
         if laws is None or all(spread.left is None for spread, _ in laws.every):
             return bounds
-        initial_sizes, inputs = self._largest(far)
+        initial_sizes, inputs = self._bound_initial_and_inputs(far)
         for part_index, (spread, _) in enumerate(laws.every):
             if spread.left is not None:
-                growth = self._growth(*laws.ends(part_index), HALVINGS)
+                growth = self._bound_growth(*laws.ends(part_index), HALVINGS)
                 error_bounds = laws.left_out(part_index, initial_sizes, inputs, growth)
                 bounds = np.maximum(bounds, error_bounds)
         return bounds
 
-    def _largest(self, far: Array) -> tuple[Array, Array]:
+    def _bound_initial_and_inputs(self, far: Array) -> tuple[Array, Array]:
         """Return bounds of the initial state, ``(d,)``, and of all inputs, ``(m + constants + mw,)``, for a control of
         at most ``far (m,)``."""
         initial_sizes, model = np.abs(self.response.initial_state), self.disturbance
@@ -634,11 +640,11 @@ class WorstCase:
         return initial_sizes, np.concatenate([delivered, input_sizes[far.size :], disturbance_sizes])
 
     @cached_property
-    def _frozen(self) -> dict[bytes, LiftedSystem]:
+    def _frozen_systems(self) -> dict[bytes, LiftedSystem]:
         return {}
 
     @cached_property
-    def _legs(self) -> dict[bytes, tuple[Leg, ...]]:
+    def _cached_phases(self) -> dict[bytes, tuple[Leg, ...]]:
         return {}
 
     @shaped
@@ -648,7 +654,7 @@ class WorstCase:
         return self.response.grid.inputs(self.control(theta))
 
     @shaped
-    def _support(
+    def _evaluate_support(
         self,
         known: Weights,
         times: Float[Array, " k"],
@@ -656,7 +662,10 @@ class WorstCase:
         parameters: Float[Array, "k nu"],
         roughly: bool = False,
     ) -> Float[Array, " k"]:
-        total, by_block = self._begun(known.free), None if self.disturbance is None else self.disturbance.on_blocks
+        total, by_block = (
+            self._evaluate_initial_support(known.free),
+            None if self.disturbance is None else self.disturbance.on_blocks,
+        )
         if by_block is not None:
             total = total + by_block.support(known.disturbance)
         if self.measurable is None:
@@ -665,16 +674,16 @@ class WorstCase:
         return total + np.asarray(evaluate(times, directions, parameters))
 
     @shaped
-    def _begun(self, free: Float[Array, "k d"]) -> Float[Array, " k"]:
+    def _evaluate_initial_support(self, free: Float[Array, "k d"]) -> Float[Array, " k"]:
         """Return the support value ``(k,)`` of the deviations of the initial state, for weights ``free (k, d)`` on
         it."""
         return np.zeros(free.shape[0]) if self.initial is None else self.initial.support(free)
 
     @cached_property
-    def _gives(self) -> bool:
+    def _has_known_inputs(self) -> bool:
         return bool(self.known.any())
 
-    def _chunks(self, parameters: Array) -> list[slice]:
+    def _divide_into_chunks(self, parameters: Array) -> list[slice]:
         count, numbers = parameters.shape[0], self.response.numbers(parameters.shape[1])
         size = max(1, CHUNK // numbers)
         if 0 < count <= size:
@@ -682,6 +691,6 @@ class WorstCase:
         return [slice(start, start + size) for start in range(0, count, size)]
 
 
-def _parts(count: int, several: int) -> list[slice]:
+def _divide_range(count: int, several: int) -> list[slice]:
     """Return slices that divide ``count`` numbers into parts of at most ``several``."""
     return [slice(first, first + several) for first in range(0, count, several)]

@@ -52,7 +52,7 @@ GUESSED = 8
 
 
 @dataclass(frozen=True, eq=False)
-class _Table:
+class _IntegralTable:
     """Integrals along one direction, between the times ``starts (n + 1,)``.
 
     ``sums (n + 1, c)`` are the integrals up to each time, or their lower and upper bounds. For the interval after each
@@ -71,7 +71,7 @@ class _Table:
 
 
 @dataclass(frozen=True, eq=False)
-class _Balanced:
+class _BalancedMatrix:
     """A matrix ``A (d, d)`` in ``units (d,)`` of the states in which it is small, powers of two.
 
     The remainder of an expansion is bounded by the norm of ``A`` in these units, the ``speed``.
@@ -83,11 +83,11 @@ class _Balanced:
     leaps: Leaps
 
     @staticmethod
-    def of(A: Array) -> _Balanced:
+    def of(A: Array) -> _BalancedMatrix:
         from scipy.linalg import matrix_balance
 
         balanced, (units, _) = matrix_balance(A, permute=False, separate=True)
-        return _Balanced(balanced, units, float(np.linalg.norm(balanced, 2)), Leaps(balanced))
+        return _BalancedMatrix(balanced, units, float(np.linalg.norm(balanced, 2)), Leaps(balanced))
 
     @cached_property
     def fastest(self) -> float:
@@ -111,8 +111,8 @@ class MeasurableSupport:
 
     response: Response
     bound: ConvexSet
-    _tables: dict[bytes, _Table] = field(default_factory=dict, repr=False)
-    _balanced: dict[bytes, _Balanced] = field(default_factory=dict, repr=False)
+    _tables: dict[bytes, _IntegralTable] = field(default_factory=dict, repr=False)
+    _balanced_matrices: dict[bytes, _BalancedMatrix] = field(default_factory=dict, repr=False)
 
     @shaped
     def __call__(
@@ -123,7 +123,9 @@ class MeasurableSupport:
         result = np.empty(times.size)
         for position, parameter in enumerate(unique):
             members = np.flatnonzero(parameter_indices.reshape(-1) == position)
-            result[members] = self._at(times[members], directions[members], parameter, self.is_enclosed).mean(axis=1)
+            result[members] = self._integrate_phases(
+                times[members], directions[members], parameter, self.is_enclosed
+            ).mean(axis=1)
         return result
 
     @shaped
@@ -137,7 +139,7 @@ class MeasurableSupport:
         """
         if parameters.shape[1] or self.response.grid.mode is not None:
             return self(times, directions, parameters)
-        starts, lengths, columns = self._nodes
+        starts, lengths, columns = self._midpoint_nodes
         values, chunk_size = np.empty(times.size), max(1, AT_ONCE // (starts.size * columns.shape[2]))
         for first in range(0, times.size, chunk_size):
             chunk = slice(first, first + chunk_size)
@@ -146,7 +148,7 @@ class MeasurableSupport:
         return values
 
     @cached_property
-    def _nodes(self) -> tuple[Array, Array, Array]:
+    def _midpoint_nodes(self) -> tuple[Array, Array, Array]:
         """Beginnings ``(q,)`` and lengths ``(q,)`` of short intervals of ages, and ``e^{As} E`` in the middle of each,
         ``(d, q, mw)``."""
         A, E = (matrix[0] for matrix in self.response.system.modes[0].matrices(np.zeros((1, 0)))[::2])
@@ -154,7 +156,7 @@ class MeasurableSupport:
         lengths = np.repeat(np.diff(ages) / GUESSED, GUESSED)
         starts = np.repeat(ages[:-1], GUESSED) + lengths * np.tile(np.arange(GUESSED), ages.size - 1)
         middles = np.broadcast_to(starts + lengths / 2, (A.shape[0], starts.size))
-        return starts, lengths, _moved(A, np.eye(A.shape[0]), middles) @ E
+        return starts, lengths, _propagate_rows(A, np.eye(A.shape[0]), middles) @ E
 
     def over(
         self, rows: Array, leg: LiftedSystem | VaryingMotion | SpreadMotion, joined: Combination | None = None
@@ -198,18 +200,18 @@ class MeasurableSupport:
 
         With a phase ``leg`` of a switched system, ``times`` are counted from the beginning of that phase.
         """
-        bounds = self._at(times, directions, np.zeros(0), enclosed=True, leg=leg)
+        bounds = self._integrate_phases(times, directions, np.zeros(0), enclosed=True, leg=leg)
         rounding_errors = rounding(self.response.grid.pieces) * np.abs(bounds).max(axis=1, initial=0.0)
         return np.asarray(bounds + rounding_errors[:, None] * [-1.0, 1.0])
 
     @cached_property
-    def _legs(self) -> list[TimeGrid]:
+    def _phase_grids(self) -> list[TimeGrid]:
         """The pieces of every phase of a switched system, in times from the beginning of the phase."""
         grid = self.response.grid
         return [grid] if grid.mode is None else [grid.leg(number) for number in range(len(grid.turns))]
 
     @cached_property
-    def _differing(self) -> np.ndarray | None:
+    def _differing_states(self) -> np.ndarray | None:
         """The states ``(k,)`` by whose equations alone the modes of a known switched system differ, if no other states
         depend on them, as with integrals in windows.
 
@@ -223,7 +225,7 @@ class MeasurableSupport:
         return None if A[~is_different][:, is_different].any() else np.flatnonzero(is_different)
 
     @shaped
-    def _at(
+    def _integrate_phases(
         self,
         times: Float[Array, " k"],
         directions: Float[Array, "k d"],
@@ -236,12 +238,12 @@ class MeasurableSupport:
         The mode that acts last contributes from the beginning of its phase. Each phase before it contributes for the
         rows to which the transitions from its end take the directions.
         """
-        begins = np.array([grid.elapsed for grid in self._legs])
+        begins = np.array([grid.elapsed for grid in self._phase_grids])
         total = np.zeros((times.size, 2 if enclosed else 1))
-        if self._differing is not None and not directions[:, self._differing].any():
+        if self._differing_states is not None and not directions[:, self._differing_states].any():
             A, E = (matrix[0] for matrix in self.response.system.modes[0].matrices(parameter[None])[::2])
             since, key = (0.0 if leg is None else begins[leg]), parameter.tobytes() + b"all" + bytes([enclosed])
-            return total + self._until(A, E, self.response.grid.breakpoints, times + since, directions, key)
+            return total + self._integrate_until(A, E, self.response.grid.breakpoints, times + since, directions, key)
         if leg is None:
             legs = np.maximum(np.searchsorted(begins, times) - 1, 0)
             times = times - begins[legs]
@@ -250,20 +252,20 @@ class MeasurableSupport:
         rows = directions
         for number in range(int(legs.max(initial=0)), -1, -1):
             A, E = (matrix[0] for matrix in self.response.system.modes[number].matrices(parameter[None])[::2])
-            ages, length = self._legs[number].breakpoints, float(self._legs[number].breakpoints[-1])
+            ages, length = self._phase_grids[number].breakpoints, float(self._phase_grids[number].breakpoints[-1])
             last, through = np.flatnonzero(legs == number), np.flatnonzero(legs > number)
             key = parameter.tobytes() + number.to_bytes(4) + bytes([enclosed])
-            total[last] += self._until(A, E, ages, times[last], rows[last], key)
+            total[last] += self._integrate_until(A, E, ages, times[last], rows[last], key)
             if through.size:
-                total[through] += self._through(A, E, length, rows[through], enclosed)
+                total[through] += self._integrate_whole_phase(A, E, length, rows[through], enclosed)
             if number:
                 members = np.flatnonzero(legs >= number)
                 durations = np.where(legs[members] == number, times[members], length)
                 rows = rows.copy()
-                rows[members] = _moved(A, rows[members], durations[:, None])[:, 0]
+                rows[members] = _propagate_rows(A, rows[members], durations[:, None])[:, 0]
         return total
 
-    def _until(self, A: Array, E: Array, ages: Array, times: Array, directions: Array, key: bytes) -> Array:
+    def _integrate_until(self, A: Array, E: Array, ages: Array, times: Array, directions: Array, key: bytes) -> Array:
         """Return the contribution of one mode until ``times (k,)`` from the beginning of its phase, ``(k, 1)``, or its
         lower and upper bounds, ``(k, 2)``.
 
@@ -273,7 +275,7 @@ class MeasurableSupport:
         if not times.size:
             return np.zeros((0, 1))
         unique, table_indices = unique_rows(directions)
-        tables = self._known(A, E, ages, unique, key)
+        tables = self._look_up_tables(A, E, ages, unique, key)
         starts = tables[0].starts
         intervals = np.clip(np.searchsorted(starts, times, side="right") - 1, 0, starts.size - 2)
         within = np.clip(times - starts[intervals], 0.0, None)
@@ -288,10 +290,10 @@ class MeasurableSupport:
             partial = integrated(self.bound, terms, within, accuracy) + (shares * errors + late)[:, None] * [-1.0, 1.0]
         else:
             rows = np.stack([tables[i].rows[j] for i, j in zip(table_indices, intervals, strict=True)])
-            partial = self._integrals(A, E, rows, within, table_indices)[:, None]
+            partial = self._integrate_rows(A, E, rows, within, table_indices)[:, None]
         return np.asarray(before + partial)
 
-    def _through(self, A: Array, E: Array, length: float, directions: Array, enclosed: bool) -> Array:
+    def _integrate_whole_phase(self, A: Array, E: Array, length: float, directions: Array, enclosed: bool) -> Array:
         """Return the contribution of one mode over a whole phase of this ``length``, for rows ``directions (k, d)`` at
         its end.
 
@@ -299,13 +301,13 @@ class MeasurableSupport:
         """
         if not enclosed:
             lengths, owners = np.full(len(directions), length), np.arange(len(directions))
-            return self._integrals(A, E, directions, lengths, owners)[:, None]
-        starts = self._short(A, np.array([0.0, length]))
+            return self._integrate_rows(A, E, directions, lengths, owners)[:, None]
+        starts = self._divide_intervals(A, np.array([0.0, length]))
         lengths, values = np.diff(starts), np.empty((len(directions), 2))
         chunk_size = max(1, AT_ONCE // (lengths.size * (ORDER + 1) * max(E.shape)))
         for first in range(0, len(directions), chunk_size):
             chunk = slice(first, first + chunk_size)
-            terms, errors, tallest = self._expanded(A, E, directions[chunk], starts)
+            terms, errors, tallest = self._expand_rows(A, E, directions[chunk], starts)
             accuracy = ACCURACY * np.maximum(tallest * length, TINY)
             intervals = np.tile(lengths, len(terms)), np.repeat(accuracy, lengths.size)
             bounds = integrated(self.bound, terms.reshape(-1, *terms.shape[2:]), *intervals)
@@ -315,26 +317,26 @@ class MeasurableSupport:
             values[chunk] = bounds.reshape(*errors.shape, -1, 2).sum(axis=1) + (errors + late)[:, None] * [-1.0, 1.0]
         return values
 
-    def _known(self, A: Array, E: Array, ages: Array, directions: Array, key: bytes) -> list[_Table]:
+    def _look_up_tables(self, A: Array, E: Array, ages: Array, directions: Array, key: bytes) -> list[_IntegralTable]:
         """Return the table of each of ``directions (k, d)``, made where none is remembered."""
         keys = [direction.tobytes() + key for direction in directions]
         tables = {table_key: self._tables[table_key] for table_key in keys if table_key in self._tables}
         missing = np.array([number for number, table_key in enumerate(keys) if table_key not in tables], dtype=int)
-        make = self._enclosing if key[-1] else self._measuring
+        make = self._enclose_tables if key[-1] else self._estimate_tables
         for number, table in zip(missing.tolist(), make(A, E, ages, directions[missing]), strict=True):
             tables[keys[number]] = remember(self._tables, keys[number], table, TABLES_KEPT)
         return [tables[table_key] for table_key in keys]
 
-    def _measuring(self, A: Array, E: Array, ages: Array, directions: Array) -> Iterator[_Table]:
+    def _estimate_tables(self, A: Array, E: Array, ages: Array, directions: Array) -> Iterator[_IntegralTable]:
         """Yield the table of each of ``directions (k, d)``, with integrals by quadrature from one of ``ages (L + 1,)``
         to the next."""
         for direction in directions:
-            rows = _moved(A, direction[None], ages[None])[0]
+            rows = _propagate_rows(A, direction[None], ages[None])[0]
             lengths, owners = np.diff(ages), np.zeros(ages.size - 1, dtype=int)
-            sums = np.append(0.0, np.cumsum(self._integrals(A, E, rows[:-1], lengths, owners)))
-            yield _Table(ages, sums[:, None], rows=rows)
+            sums = np.append(0.0, np.cumsum(self._integrate_rows(A, E, rows[:-1], lengths, owners)))
+            yield _IntegralTable(ages, sums[:, None], rows=rows)
 
-    def _enclosing(self, A: Array, E: Array, ages: Array, directions: Array) -> Iterator[_Table]:
+    def _enclose_tables(self, A: Array, E: Array, ages: Array, directions: Array) -> Iterator[_IntegralTable]:
         """Yield the table of each of ``directions (k, d)``, with lower and upper bounds at the ends of short intervals.
 
         On short intervals a row is a polynomial ``f`` with a remainder. In Bernstein's form ``f`` is a convex
@@ -342,11 +344,11 @@ class MeasurableSupport:
         at most the length times the mean of ``h(b_k)``, and at least that of ``w'b_k`` for any point ``w`` of the set.
         Both are equal where one corner of the set is best for all; an interval where another takes over is halved.
         """
-        starts = self._short(A, ages)
+        starts = self._divide_intervals(A, ages)
         lengths, horizon = np.diff(starts), float(self.response.grid.breakpoints[-1])
         chunk_size = max(1, AT_ONCE // (lengths.size * (ORDER + 1) * max(E.shape)))
         for first in range(0, len(directions), chunk_size):
-            terms, errors, tallest = self._expanded(A, E, directions[first : first + chunk_size], starts)
+            terms, errors, tallest = self._expand_rows(A, E, directions[first : first + chunk_size], starts)
             accuracy = ACCURACY * np.maximum(tallest * horizon, TINY)
             intervals = np.tile(lengths, len(terms)), np.repeat(accuracy, lengths.size)
             bounds = integrated(self.bound, terms.reshape(-1, *terms.shape[2:]), *intervals).reshape(*errors.shape, 2)
@@ -355,20 +357,22 @@ class MeasurableSupport:
             for number, interval_bounds in enumerate(bounds):
                 sums = np.vstack([np.zeros(2), np.cumsum(interval_bounds, axis=0)])
                 own = float(accuracy[number]), float(late[number])
-                yield _Table(starts, sums, terms=terms[number], lost=errors[number], accuracy=own[0], late=own[1])
+                yield _IntegralTable(
+                    starts, sums, terms=terms[number], lost=errors[number], accuracy=own[0], late=own[1]
+                )
 
-    def _short(self, A: Array, ages: Array) -> Array:
+    def _divide_intervals(self, A: Array, ages: Array) -> Array:
         """The ends ``(n + 1,)`` of short intervals, as many between all neighbours of ``ages (L + 1,)``."""
         pieces = np.diff(ages)
-        count = int(np.clip(np.ceil(self._in_balance(A).fastest * pieces.max() / SHORT), 1, MOST_SHORT))
+        count = int(np.clip(np.ceil(self._balance_matrix(A).fastest * pieces.max() / SHORT), 1, MOST_SHORT))
         return np.append((ages[:-1, None] + np.outer(pieces, np.arange(count) / count)).ravel(), ages[-1])
 
-    def _in_balance(self, A: Array) -> _Balanced:
+    def _balance_matrix(self, A: Array) -> _BalancedMatrix:
         """Return the balanced form of the matrix ``A (d, d)`` of a system; the last ones are remembered."""
         key = A.tobytes()
-        return self._balanced.get(key) or remember(self._balanced, key, _Balanced.of(A), KEPT)
+        return self._balanced_matrices.get(key) or remember(self._balanced_matrices, key, _BalancedMatrix.of(A), KEPT)
 
-    def _expanded(self, A: Array, E: Array, directions: Array, starts: Array) -> tuple[Array, Array, Array]:
+    def _expand_rows(self, A: Array, E: Array, directions: Array, starts: Array) -> tuple[Array, Array, Array]:
         """Return polynomials of every row on every interval, with error bounds.
 
         Parameters
@@ -386,7 +390,7 @@ class MeasurableSupport:
             Polynomials ``(k, n, ORDER + 1, mw)`` in the share of the interval that has passed; bounds ``(k, n)`` of the
             error of the integral over the interval with them; and bounds ``(k,)`` of the integrand.
         """
-        balanced = self._in_balance(A)
+        balanced = self._balance_matrix(A)
         A, units, speed, E = balanced.A, balanced.units, balanced.speed, E / balanced.units[:, None]
         lengths, radius, count = np.tile(np.diff(starts), len(directions)), self.bound.radius_bound, len(directions)
         matrix, absolute_matrix = balanced.products
@@ -408,7 +412,7 @@ class MeasurableSupport:
         return np.stack(terms, axis=1).reshape(count, -1, ORDER + 1, E.shape[1]), errors.reshape(count, -1), tallest
 
     @shaped
-    def _integrals(
+    def _integrate_rows(
         self,
         A: Float[Array, "d d"],
         E: Float[Array, "d mw"],
@@ -424,17 +428,17 @@ class MeasurableSupport:
         count = int(np.clip(np.ceil(fastest * lengths.max(initial=0.0)), 1, MOST_SHORT))
         owner = np.repeat(np.arange(lengths.size), count)  # short intervals, on which the quadrature is at home
         offsets = np.outer(lengths, np.arange(count) / count)
-        starts = _moved(A, starts, offsets).reshape(-1, A.shape[0])
+        starts = _propagate_rows(A, starts, offsets).reshape(-1, A.shape[0])
         lengths = lengths[owner] / count
-        estimate, size = self._quadrature(A, E, starts, lengths)
+        estimate, size = self._apply_quadrature(A, E, starts, lengths)
         largest = np.zeros(int(member.max(initial=0)) + 1)
         np.maximum.at(largest, member[owner], size)
         accuracy = ACCURACY * np.maximum(largest[member] * float(self.response.grid.breakpoints[-1]), TINY)
         for _ in range(HALVINGS):
-            middles = _moved(A, starts, lengths[:, None] / 2)[:, 0]
+            middles = _propagate_rows(A, starts, lengths[:, None] / 2)[:, 0]
             first_half, second_half = (
-                self._quadrature(A, E, starts, lengths / 2)[0],
-                self._quadrature(A, E, middles, lengths / 2)[0],
+                self._apply_quadrature(A, E, starts, lengths / 2)[0],
+                self._apply_quadrature(A, E, middles, lengths / 2)[0],
             )
             open_ = np.abs(first_half + second_half - estimate) > accuracy[owner]
             np.add.at(total, owner[~open_], (first_half + second_half)[~open_])
@@ -446,14 +450,14 @@ class MeasurableSupport:
         return total
 
     @shaped
-    def _quadrature(
+    def _apply_quadrature(
         self, A: Float[Array, "d d"], W: Float[Array, "d mw"], starts: Float[Array, "l d"], lengths: Float[Array, " l"]
     ) -> tuple[Float[Array, " l"], Float[Array, " l"]]:
-        values = self.bound.support(_moved(A, starts, lengths[:, None] * (NODES + 1) / 2) @ W)
+        values = self.bound.support(_propagate_rows(A, starts, lengths[:, None] * (NODES + 1) / 2) @ W)
         return (values * WEIGHTS).sum(axis=1) * lengths / 2, np.abs(values).max(axis=1, initial=0.0)
 
 
-def _moved(A: Array, rows: Array, durations: Array) -> Array:
+def _propagate_rows(A: Array, rows: Array, durations: Array) -> Array:
     """``c'e^{A r} (k, q, d)`` of ``rows (k, d)`` over ``durations (k, q)`` of their own."""
     repeated = np.repeat(rows, durations.shape[1], axis=0)
     return Leaps(A).rows(repeated, durations.ravel())[0].reshape(*durations.shape, -1)
@@ -503,15 +507,17 @@ class MeasurableCellSupport(KnownCellSupport):
             2.0 * reach.integral.on(current_drive),
         )
         bounds = np.minimum(exact, product(block_norms(rows, lifted.starts), by_mode.T).T)
-        return np.asarray(bounds if self._earlier is None else bounds + self._earlier.deviation(start, widths))
+        return np.asarray(
+            bounds if self._earlier_support is None else bounds + self._earlier_support.deviation(start, widths)
+        )
 
     @cached_property
     def neglected(self) -> Array:
         """Bounds ``(r, L)`` of the rounding error of ``e^{A' s} c``, times the disturbance."""
-        error_bounds = self._rounded(self.rows @ self.lifted.transform)
-        return error_bounds if self._earlier is None else error_bounds + self._earlier.neglected
+        error_bounds = self._bound_rounding(self.rows @ self.lifted.transform)
+        return error_bounds if self._earlier_support is None else error_bounds + self._earlier_support.neglected
 
-    def _rounded(self, rows: Array) -> Array:
+    def _bound_rounding(self, rows: Array) -> Array:
         """Return `neglected` for ``rows (r, d)`` in the coordinates of the lifted system, without the effect of earlier
         phases."""
         lifted = self.lifted
@@ -525,10 +531,10 @@ class MeasurableCellSupport(KnownCellSupport):
         every piece."""
         reach = self.lifted.comparison.over(self.lifted.grid.breakpoints[1:])
         bounds = reach.integral.on(np.broadcast_to(self._drive, (self.lifted.grid.pieces, self._drive.size)))
-        return bounds if self._earlier is None else bounds + self._earlier.reached
+        return bounds if self._earlier_support is None else bounds + self._earlier_support.reached
 
     @cached_property
-    def _earlier(self) -> InitialSupport | None:
+    def _earlier_support(self) -> InitialSupport | None:
         """The effect of disturbances before this phase on the state, as the support of a box of states at its
         beginning; ``None`` in the first phase."""
         past = self.lifted.past
@@ -538,9 +544,9 @@ class MeasurableCellSupport(KnownCellSupport):
         if not isinstance(earlier_effect, Carried):
             axes = np.eye(past.lifted.states)
             earlier_support = MeasurableCellSupport(self.support, self.rows, past.lifted)
-            left_out = earlier_support._rounded(axes)[:, -1]
-            if earlier_support._earlier is not None:
-                left_out = left_out + replace(earlier_support._earlier, rows=axes).neglected[:, -1]
+            left_out = earlier_support._bound_rounding(axes)[:, -1]
+            if earlier_support._earlier_support is not None:
+                left_out = left_out + replace(earlier_support._earlier_support, rows=axes).neglected[:, -1]
             radii = np.repeat(earlier_support.reached[-1], np.diff(past.lifted.starts, append=past.lifted.states))
             box = Box(-radii, radii)
             earlier_effect = carried(

@@ -94,7 +94,7 @@ class InitialSupport:
     def steepness(self, times: Array) -> Array:
         """Return bounds ``(k, r, nu)`` of the slope of the functional in each parameter over the cell, under *any* one
         deviation."""
-        return np.asarray(self._reaches(self._combined(self.blocks(times))) @ self._space.exponents)
+        return np.asarray(self._bound_coefficients(self._apply_combination(self.blocks(times))) @ self._space.exponents)
 
     def at(self, times: Array, ends: Array) -> tuple[Array, Array]:
         """Taylor coefficients ``(k, r, M)`` under the worst deviation of a centre, and the excess ``(k, r)``, as in
@@ -102,9 +102,9 @@ class InitialSupport:
         return over_faces(
             self._space,
             ends,
-            lambda index, face: summed(self.set, self._combined(self.blocks(times[index]))[:, :, :, None], face)[
-                :, :, 0
-            ],
+            lambda index, face: summed(
+                self.set, self._apply_combination(self.blocks(times[index]))[:, :, :, None], face
+            )[:, :, 0],
         )
 
     def deviation(self, start: Array, widths: Array) -> Array:
@@ -118,9 +118,9 @@ class InitialSupport:
         comparison, starts = lifted.comparison, lifted.starts
         pieces = np.clip(np.searchsorted(grid.breakpoints, start, side="right") - 1, 0, grid.pieces - 1)
         flow = comparison.over(start - grid.breakpoints[pieces], cells=True).flow
-        ended_sizes, reach = flow.on(self._gains[pieces]), comparison.over(widths, cells=True)
-        curvature_rows = self._lifted_rows(start) @ lifted.row_matrix @ lifted.row_matrix
-        sizes = self._reaches(self._parts(curvature_rows)).sum(axis=2)
+        ended_sizes, reach = flow.on(self._effect_bounds[pieces]), comparison.over(widths, cells=True)
+        curvature_rows = self._propagate_rows(start) @ lifted.row_matrix @ lifted.row_matrix
+        sizes = self._bound_coefficients(self._weigh_deviation(curvature_rows)).sum(axis=2)
         square = (widths**2 / 8)[:, None]
         lifted_rows = np.zeros((self.rows.shape[0], lifted.row_matrix.shape[0]))
         lifted_rows[:, : lifted.states] = self.rows
@@ -140,46 +140,46 @@ class InitialSupport:
         """Bounds ``(r, L)`` of the remainder of the Taylor models on every piece."""
         lifted = self.lifted
         sizes, remainder = lifted.row_bounds(self.rows)
-        remainders = remainder @ self._sizes + sizes.sum(axis=2) @ self._slack
-        if self._carried is not None:
-            remainders = remainders + np.einsum("rlaj,aj->rl", sizes, lifted.spilt(self._carried.sizes))
+        remainders = remainder @ self._norm_bounds + sizes.sum(axis=2) @ self._error_bounds
+        if self._earlier_effect is not None:
+            remainders = remainders + np.einsum("rlaj,aj->rl", sizes, lifted.spilt(self._earlier_effect.sizes))
         return np.asarray(np.maximum.reduceat(remainders[:, lifted.span], lifted.ends[:-1], axis=1))
 
     @cached_property
     def reached(self) -> Array:
         """Norm bounds ``(L, q)`` of the effect of any deviation on every block of the coordinates on every piece."""
         peak = self.lifted.comparison.over(self.lifted.grid.lengths).peak
-        return peak.on(self._gains[:-1])
+        return peak.on(self._effect_bounds[:-1])
 
     @property
     def _space(self) -> TaylorSpace:
         return (self.combination or self.lifted).space
 
-    def _combined(self, blocks: Array) -> Array:
+    def _apply_combination(self, blocks: Array) -> Array:
         return blocks if self.combination is None else self.combination.apply(blocks)
 
-    def _reaches(self, blocks: Array) -> Array:
+    def _bound_coefficients(self, blocks: Array) -> Array:
         """Return bounds ``(k, r, M)`` of the absolute value of every Taylor coefficient under any one deviation, from
         weights ``(k, r, M, d)``."""
         return np.asarray(self.set.reach(blocks))
 
     def blocks(self, times: Array) -> Array:
         """Taylor coefficients ``(k, r, M, d)`` of the weights on the deviation, in the coordinates of its set."""
-        return self._parts(self._lifted_rows(times))
+        return self._weigh_deviation(self._propagate_rows(times))
 
-    def _parts(self, rows: Array) -> Array:
+    def _weigh_deviation(self, rows: Array) -> Array:
         """Lifted rows ``(k, r, M d)`` as Taylor coefficients of weights on the deviation ``(k, r, M, d)``."""
         space = self.lifted.space
         coefficients = rows.reshape(*rows.shape[:2], space.size, self.lifted.states)
-        if self._carried is None:
+        if self._earlier_effect is None:
             return np.asarray(coefficients @ self.lifted.decoupling.inverse.astype(float))
-        weights, effect = np.zeros((*coefficients.shape[:-1], self.set.dimension)), self._carried.effect
+        weights, effect = np.zeros((*coefficients.shape[:-1], self.set.dimension)), self._earlier_effect.effect
         for left, right, target in zip(*space.products, strict=True):
             weights[..., target, :] += coefficients[..., right, :] @ effect[left]
         return weights
 
     @property
-    def _carried(self) -> Carried | None:
+    def _earlier_effect(self) -> Carried | None:
         """The effect of a deviation on the state before a later phase begins, ``effect (M, d, d)``; ``None`` in the
         first phase."""
         past = self.lifted.past
@@ -196,19 +196,19 @@ class InitialSupport:
                 self.set,
                 effect,
                 np.abs(effect) @ radii,
-                earlier_support._gains[-1],
+                earlier_support._effect_bounds[-1],
                 earlier_support.neglected[:, -1],
             )
         return earlier_effect
 
-    def _lifted_rows(self, times: Array) -> Array:
+    def _propagate_rows(self, times: Array) -> Array:
         """The lifted functionals that ``c'x(t)`` are of the state at time 0, ``(k, r, M d)``."""
         grid = self.lifted.grid
         pieces = np.clip(np.searchsorted(grid.breakpoints, times, side="right") - 1, 0, grid.pieces - 1)
-        return self.lifted.flown(self._nodes[pieces], times - grid.breakpoints[pieces])[0]
+        return self.lifted.flown(self._node_rows[pieces], times - grid.breakpoints[pieces])[0]
 
     @cached_property
-    def _nodes(self) -> Array:
+    def _node_rows(self) -> Array:
         """The lifted functionals at the breakpoints of the grid, ``(L + 1, r, M d)``."""
         backward = self.lifted.backward
         steps, pieces = backward.steps(KNOWN), self.lifted.grid.pieces
@@ -219,21 +219,22 @@ class InitialSupport:
         return rows
 
     @cached_property
-    def _sizes(self) -> Array:
+    def _norm_bounds(self) -> Array:
         """Norms of every block of the coordinates of any deviation, at most, ``(q,)``."""
-        if self._carried is not None:
-            return self._carried.reached
+        if self._earlier_effect is not None:
+            return self._earlier_effect.reached
         radii = self.set.reach(np.eye(self.set.dimension))
         return (
-            block_norms(np.abs(self.lifted.decoupling.inverse).astype(float) @ radii, self.lifted.starts) + self._slack
+            block_norms(np.abs(self.lifted.decoupling.inverse).astype(float) @ radii, self.lifted.starts)
+            + self._error_bounds
         )
 
     @cached_property
-    def _slack(self) -> Array:
+    def _error_bounds(self) -> Array:
         """Norm bounds ``(q,)`` of the rounding error of every block of a deviation, from the coordinates; in a later
         phase, of the remainder of the Taylor models at its beginning."""
-        if self._carried is not None:
-            return self._carried.left_out
+        if self._earlier_effect is not None:
+            return self._earlier_effect.left_out
         decoupling = self.lifted.decoupling
         radii = self.set.reach(np.eye(self.set.dimension))
         if decoupling.is_identity:
@@ -244,11 +245,11 @@ class InitialSupport:
         return block_norms(1.001 * errors, self.lifted.starts)
 
     @cached_property
-    def _gains(self) -> Array:
+    def _effect_bounds(self) -> Array:
         """Norm bounds ``(L + 1, q)`` of the effect of any deviation on every block at the breakpoints."""
         grid = self.lifted.grid
         flow = self.lifted.comparison.over(grid.lengths).flow
-        return flow.summed(self._sizes, np.zeros((grid.pieces, self._sizes.size)))
+        return flow.summed(self._norm_bounds, np.zeros((grid.pieces, self._norm_bounds.size)))
 
 
 class KnownCellSupport:
@@ -300,7 +301,7 @@ class DirectionsCellSupport:
         # powers of two of one row are asked for again in every smaller cell
         sizes = np.exp2(np.frexp(np.abs(axes).max(axis=1, initial=0.0))[1])
         axes = axes / sizes[:, None]
-        values, error_bounds = self._at(times, np.vstack([axes, -axes]))
+        values, error_bounds = self._evaluate_rows(times, np.vstack([axes, -axes]))
         largest = np.maximum(values + error_bounds, 0.0).reshape(times.size, 2, len(axes)).max(axis=1)
         return np.asarray((largest * sizes * OUTWARD)[:, None])
 
@@ -316,8 +317,8 @@ class DirectionsCellSupport:
         patterns, pattern_indices = distinct_patterns(ends)
         for position, pattern in enumerate(patterns):
             members = np.flatnonzero(pattern_indices[:, 0] == position)
-            corners = _corners(pattern)
-            values, error_bounds = self._at(
+            corners = _list_corners(pattern)
+            values, error_bounds = self._evaluate_rows(
                 times[members], self.rows[0] + np.vstack([pattern, corners]) @ self.rows[1:]
             )
             interpolation, truncation = between_corners(self.joined.space, pattern, values[:, 1:])
@@ -333,24 +334,24 @@ class DirectionsCellSupport:
     @shaped
     def deviation(self, start: Float[Array, " k"], widths: Float[Array, " k"]) -> Float[Array, "k r"]:
         """`Support.deviation` of every row."""
-        return self._each.deviation(start, widths)
+        return self._row_support.deviation(start, widths)
 
     @cached_property
     def neglected(self) -> Array:
         """`Support.neglected` of every row, with what rounding makes of the corners, ``(r, L)``."""
         sizes = block_norms(np.abs(self.rows) @ np.abs(self.leg.transform), self.leg.starts)
-        return np.asarray(self._each.neglected + rounding(len(self.rows)) * product(sizes, self.reached.T))
+        return np.asarray(self._row_support.neglected + rounding(len(self.rows)) * product(sizes, self.reached.T))
 
     @cached_property
     def reached(self) -> Array:
         """`Support.reached`."""
-        return self._each.reached
+        return self._row_support.reached
 
     @cached_property
-    def _each(self) -> Support:
+    def _row_support(self) -> Support:
         return self.made(self.rows)
 
-    def _at(self, times: Array, rows: Array) -> tuple[Array, Array]:
+    def _evaluate_rows(self, times: Array, rows: Array) -> tuple[Array, Array]:
         """Return the support values along ``rows (r, d)``, and their error bounds, ``(k, r)`` each."""
         coefficients, error_bounds = self.made(rows).at(times, np.zeros((times.size, len(rows), 0)))
         return coefficients[..., 0], error_bounds
@@ -380,7 +381,7 @@ def over_directions(
     return made(rows) if joined is None else DirectionsCellSupport(made, rows, leg, joined)
 
 
-def _corners(pattern: Array) -> Array:
+def _list_corners(pattern: Array) -> Array:
     """The corners ``(n, nu)`` of the face of ``[-1, 1]^nu`` on which the coordinates with an end in ``pattern (nu,)``
     are at it."""
     free = np.flatnonzero(pattern == 0.0)
@@ -400,7 +401,7 @@ def between_corners(space: TaylorSpace, pattern: Array, values: Array) -> tuple[
     pattern : Array
         The face ``(nu,)``: -1 or 1 for a coordinate at an end, else 0.
     values : Array
-        Values ``(q, n)`` at the `_corners` of the face.
+        Values ``(q, n)`` at the `_list_corners` of the face.
 
     Returns
     -------
@@ -408,7 +409,7 @@ def between_corners(space: TaylorSpace, pattern: Array, values: Array) -> tuple[
         Coefficients ``(q, M)``; and bounds ``(q,)`` of how far the interpolation is above them, by products that are
         not in the space and by rounding.
     """
-    corners, free = _corners(pattern), np.flatnonzero(pattern == 0.0)
+    corners, free = _list_corners(pattern), np.flatnonzero(pattern == 0.0)
     coefficients = np.zeros((len(values), space.size))
     truncation = len(corners) * rounding(2 * len(corners) + 8) * np.abs(values).max(axis=1)
     for chosen in every_choice((0, 1), repeat=free.size):

@@ -24,7 +24,7 @@ from sparserob_core.control.reach.measurable import ACCURACY, AT_ONCE, KEPT, TIN
 from sparserob_core.control.reach.support import (
     KnownCellSupport,
     Support,
-    _corners,
+    _list_corners,
     between_corners,
     over_directions,
 )
@@ -60,18 +60,18 @@ class VaryingExecution(Execution):
     bound: ConvexSet | None = None
     through: np.ndarray | None = None
     _lengths: dict[bytes, Array] = field(default_factory=dict, repr=False)
-    _ways: dict[bytes, tuple[Array, Kernel]] = field(default_factory=dict, repr=False)
-    _reaching: dict[bytes, VaryingExecutionCellSupport] = field(default_factory=dict, repr=False)
+    _transitions: dict[bytes, tuple[Array, Kernel]] = field(default_factory=dict, repr=False)
+    _cell_supports: dict[bytes, VaryingExecutionCellSupport] = field(default_factory=dict, repr=False)
 
     def none(self) -> VaryingExecution:
         """Return the execution without errors; remembered results that depend on the shares are dropped."""
-        return replace(self, shares=np.zeros(self.shares.size), _lengths={}, _reaching={})
+        return replace(self, shares=np.zeros(self.shares.size), _lengths={}, _cell_supports={})
 
     def following(self, propagator: Propagator, initial_state: Array) -> VaryingExecution:
         """Return the errors along states ``(d,)`` or their coefficients ``(M d,)``, that a propagator moves."""
         response = Response(propagator.system, propagator.grid, initial_state, shared=propagator)
         felt = np.tile(self.felt, initial_state.size // self.felt.size)
-        return replace(self, response=response, felt=felt, _lengths={}, _ways={}, _reaching={})
+        return replace(self, response=response, felt=felt, _lengths={}, _transitions={}, _cell_supports={})
 
     def over(
         self,
@@ -92,10 +92,10 @@ class VaryingExecution(Execution):
         The bounds hold for all coefficients of the state, whatever the functional. The result is remembered.
         """
         key = control.tobytes()
-        if key not in self._reaching:
+        if key not in self._cell_supports:
             support = VaryingExecutionCellSupport(self, control, np.zeros((0, self.motion.states)), self.motion)
-            remember(self._reaching, key, support, KEPT)
-        return self._reaching[key]
+            remember(self._cell_supports, key, support, KEPT)
+        return self._cell_supports[key]
 
     @cached_property
     def motion(self) -> VaryingMotion:
@@ -121,7 +121,7 @@ class VaryingExecution(Execution):
         """The errors of the box around the set, where there is one."""
         if self.bound is None:
             return self
-        return replace(self, shares=self.far, bound=None, _lengths={}, _reaching={})
+        return replace(self, shares=self.far, bound=None, _lengths={}, _cell_supports={})
 
     @cached_property
     def acting(self) -> np.ndarray:
@@ -154,7 +154,7 @@ class VaryingExecution(Execution):
     @shaped
     def lengths(self, times: Float[Array, " k"], directions: Float[Array, "k d"]) -> Float[Array, "k n"]:
         """`Execution.lengths`."""
-        lengths = self._of_each(times, directions)[:, :, self.late :]
+        lengths = self._integrate_unit_errors(times, directions)[:, :, self.late :]
         return lengths.reshape(times.size, self.shares.size * (self.breakpoints.size - 1))
 
     @shaped
@@ -164,17 +164,17 @@ class VaryingExecution(Execution):
             return np.zeros(times.size)
         return self.added(np.zeros((self.shares.size, self.breakpoints.size - 1)), times, directions)
 
-    def _of_each(self, times: Array, directions: Array) -> Array:
+    def _integrate_unit_errors(self, times: Array, directions: Array) -> Array:
         """Return the contribution of errors for size 1 of each entry of `acts`, ``(k, m, late + K)``."""
         wanted = np.ones((self.shares.size, self.late + self.breakpoints.size - 1), dtype=bool)
-        return np.asarray(self._over_pieces(times, directions, wanted).mean(axis=3))
+        return np.asarray(self._bound_integrals(times, directions, wanted).mean(axis=3))
 
     @shaped
     def added(
         self, control: Float[Array, "m K"], times: Float[Array, " k"], directions: Float[Array, "k d"]
     ) -> Float[Array, " k"]:
         """`Execution.added`."""
-        return np.asarray(self._summed(control, times, directions).mean(axis=1))
+        return np.asarray(self._bound_contribution(control, times, directions).mean(axis=1))
 
     def sampled(self, control: Array, times: Array, directions: Array) -> Array:
         """`Execution.sampled`: where that is not too much, from the lengths, which are the same for every control."""
@@ -182,7 +182,7 @@ class VaryingExecution(Execution):
             return self.added(control, times, directions)
         key = times.tobytes() + directions.tobytes()
         if key not in self._lengths:
-            lengths = self._of_each(times, directions)
+            lengths = self._integrate_unit_errors(times, directions)
             remember(self._lengths, key, lengths.reshape(times.size, lengths.shape[1] * lengths.shape[2]), KEPT)
         return np.asarray(self._lengths[key] @ self.acts(control).ravel())
 
@@ -200,17 +200,17 @@ class VaryingExecution(Execution):
         self, control: Float[Array, "m K"], times: Float[Array, " k"], directions: Float[Array, "k d"]
     ) -> Float[Array, "k 2"]:
         """Return `Execution.enclosed`, without the error of the transitions."""
-        bounds = self._summed(control, times, directions)
+        bounds = self._bound_contribution(control, times, directions)
         rounding_errors = rounding(self.size + 8) * np.abs(bounds).max(axis=1)
         return np.asarray(bounds + rounding_errors[:, None] * [-1.0, 1.0])
 
-    def _summed(self, control: Array, times: Array, directions: Array) -> Array:
+    def _bound_contribution(self, control: Array, times: Array, directions: Array) -> Array:
         """Return lower and upper bounds of the contribution of errors of a control, ``(k, 2)``."""
         size = self.acts(control)
-        bounds: Array = self._over_pieces(times, directions, np.asarray(size > 0.0))
+        bounds: Array = self._bound_integrals(times, directions, np.asarray(size > 0.0))
         return np.asarray(np.einsum("kjpe,jp->ke", bounds, size))
 
-    def _over_pieces(self, times: Array, directions: Array, wanted: np.ndarray) -> Array:
+    def _bound_integrals(self, times: Array, directions: Array, wanted: np.ndarray) -> Array:
         """Return bounds of ``share_j int |c'Phi(t, s) B_j(s)| ds`` for each entry of `acts`, ``(k, m, late + K, 2)``.
 
         Entries that are not ``wanted (m, late + K)`` have 0.
@@ -225,11 +225,11 @@ class VaryingExecution(Execution):
         chunk_size = max(1, AT_ONCE // (pieces.size * self.kernel.terms[0].size + acting.size * directions.shape[1]))
         for begin in range(0, times.size, chunk_size):
             chunk = slice(begin, begin + chunk_size)
-            for time_indices, piece, bounds in self._bounds(times[chunk], directions[chunk], pieces, is_active):
+            for time_indices, piece, bounds in self._bound_pieces(times[chunk], directions[chunk], pieces, is_active):
                 np.add.at(contributions.swapaxes(1, 2), (begin + time_indices, acting[piece]), bounds)
         return contributions
 
-    def _bounds(
+    def _bound_pieces(
         self, times: Array, directions: Array, pieces: np.ndarray, asked: np.ndarray
     ) -> Iterator[tuple[np.ndarray, np.ndarray, Array]]:
         """Yield bounds of the errors on ``pieces`` between marks, for every one of ``times (k,)`` after their
@@ -245,7 +245,7 @@ class VaryingExecution(Execution):
             np.stack([times, grid.breakpoints[last_pieces]]), axis=1, return_inverse=True
         )
         distinct_indices = distinct_indices.reshape(-1)
-        transitions, kernel = self._begun(distinct)
+        transitions, kernel = self._compute_transitions(distinct)
         row, rows = np.zeros(directions.shape), np.empty((times.size, *directions.shape[1:], grid.pieces))
         first = np.einsum("ki,kij->kj", directions, transitions[distinct_indices])
         for k in range(int(last_pieces.max()) - 1, int(pieces[0]) - 1, -1):  # rows on the end of every piece
@@ -254,16 +254,20 @@ class VaryingExecution(Execution):
             row = row @ steps[k]
         indices, piece_positions = np.nonzero(pieces < last_pieces[:, None])
         piece = pieces[piece_positions]
-        yield indices, piece, self._along(self.kernel, piece, rows[indices, :, piece], asked[:, self.acting[piece]])
+        yield (
+            indices,
+            piece,
+            self._bound_intervals(self.kernel, piece, rows[indices, :, piece], asked[:, self.acting[piece]]),
+        )
         inside = np.flatnonzero(np.isin(last_pieces, pieces) & np.greater(times, grid.breakpoints[last_pieces]))
         piece = last_pieces[inside]
         yield (
             inside,
             piece,
-            self._along(kernel, distinct_indices[inside], directions[inside], asked[:, self.acting[piece]]),
+            self._bound_intervals(kernel, distinct_indices[inside], directions[inside], asked[:, self.acting[piece]]),
         )
 
-    def _begun(self, distinct: Array) -> tuple[Array, Kernel]:
+    def _compute_transitions(self, distinct: Array) -> tuple[Array, Kernel]:
         """Return the transitions ``(k, d, d)`` from the breakpoint before each time to the time, and the kernel between
         them.
 
@@ -271,20 +275,20 @@ class VaryingExecution(Execution):
         times are asked for in many directions.
         """
         key = distinct.tobytes()
-        if key not in self._ways:
+        if key not in self._transitions:
             until, expansion = np.maximum(*distinct), self.motion.expansion
             entry = expansion.flow(distinct[1], until).state, expansion.kernel(distinct[1], until)
-            remember(self._ways, key, entry, max(1, AT_ONCE // (entry[0].size + entry[1].terms.size)))
-        return self._ways[key]
+            remember(self._transitions, key, entry, max(1, AT_ONCE // (entry[0].size + entry[1].terms.size)))
+        return self._transitions[key]
 
-    def _along(self, kernel: Kernel, which: np.ndarray, rows: Array, asked: np.ndarray) -> Array:
+    def _bound_intervals(self, kernel: Kernel, which: np.ndarray, rows: Array, asked: np.ndarray) -> Array:
         """Return lower and upper bounds ``(q, m, 2)`` of the errors on intervals ``which (q,)`` of a kernel.
 
         ``rows (q, d)`` are the functionals at the ends of the intervals. Channels that are not ``asked (m, q)`` have 0.
         """
         m, units, columns = self.shares.size, self.motion.expansion.units, self.columns
         if self.bound is not None:
-            return self._together(self.bound, kernel, which, rows)
+            return self._bound_joint_inputs(self.bound, kernel, which, rows)
         sizes = np.einsum("qd,qdm->qm", np.abs(rows), np.abs(kernel.terms[..., columns]).sum(axis=1)[which])
         errors = np.einsum("qd,qdm->qm", np.abs(rows) * units, kernel.sizes[which][..., columns])
         errors = errors * kernel.error[which, None]
@@ -300,8 +304,8 @@ class VaryingExecution(Execution):
             bounds[members, j] = share * np.maximum(integrals, 0.0) * [1.0 / OUTWARD, OUTWARD]
         return bounds
 
-    def _together(self, bound: ConvexSet, kernel: Kernel, which: np.ndarray, rows: Array) -> Array:
-        """Return `_along` for a set of inputs through all columns together, ``(q, 1, 2)``."""
+    def _bound_joint_inputs(self, bound: ConvexSet, kernel: Kernel, which: np.ndarray, rows: Array) -> Array:
+        """Return `_bound_intervals` for a set of inputs through all columns together, ``(q, 1, 2)``."""
         columns, radii = self.columns, self.far
         sizes = np.einsum("qd,qdm->qm", np.abs(rows), np.abs(kernel.terms[..., columns]).sum(axis=1)[which]) @ radii
         units = np.abs(rows) * self.motion.expansion.units
@@ -323,18 +327,24 @@ class UncertainExecution(Execution):
     """
 
     known: VaryingExecution
-    _at: dict[bytes, VaryingExecution] = field(default_factory=dict, repr=False)
-    _on: dict[bytes, tuple[SpreadMotion, VaryingExecution]] = field(default_factory=dict, repr=False)
+    _point_executions: dict[bytes, VaryingExecution] = field(default_factory=dict, repr=False)
+    _cell_executions: dict[bytes, tuple[SpreadMotion, VaryingExecution]] = field(default_factory=dict, repr=False)
 
     def none(self) -> UncertainExecution:
         """`Execution.none`."""
-        return replace(self, shares=np.zeros(self.shares.size), known=self.known.none(), _at={}, _on={})
+        return replace(
+            self, shares=np.zeros(self.shares.size), known=self.known.none(), _point_executions={}, _cell_executions={}
+        )
 
     @property
     def around(self) -> UncertainExecution:
         """`VaryingExecution.around`."""
         around = self.known.around
-        return self if around is self.known else replace(self, shares=around.shares, known=around, _at={}, _on={})
+        return (
+            self
+            if around is self.known
+            else replace(self, shares=around.shares, known=around, _point_executions={}, _cell_executions={})
+        )
 
     def seen(self, directions: Array, parameters: Array) -> Array:
         """Return directions with the parameters as further columns, ``(k, d + nu)``."""
@@ -345,10 +355,10 @@ class UncertainExecution(Execution):
         if not self.shares.any():  # there may be no parameters
             return self.known
         key = parameter.tobytes()
-        if key not in self._at:
+        if key not in self._point_executions:
             execution = self.known.following(self.response.propagator.at_point(parameter), self.response.initial_state)
-            remember(self._at, key, execution, POINTS_KEPT)
-        return self._at[key]
+            remember(self._point_executions, key, execution, POINTS_KEPT)
+        return self._point_executions[key]
 
     def over(
         self,
@@ -361,10 +371,10 @@ class UncertainExecution(Execution):
         assert isinstance(leg, SpreadMotion)
         assert joined is None  # refused beside curved sets
         key = id(leg).to_bytes(8)  # of a leg that is kept beside
-        if key not in self._on:
+        if key not in self._cell_executions:
             execution = self.known.following(leg.motion.propagator, leg.motion.initial_state)
-            remember(self._on, key, (leg, execution), CELLS_KEPT)
-        return SpreadExecutionSupport(self._on[key][1].reaching(control), rows, leg)
+            remember(self._cell_executions, key, (leg, execution), CELLS_KEPT)
+        return SpreadExecutionSupport(self._cell_executions[key][1].reaching(control), rows, leg)
 
     def _each(
         self, directions: Array, found: Array, of: Callable[[VaryingExecution, np.ndarray, Array], Array]
@@ -461,7 +471,7 @@ class VaryingExecutionCellSupport(KnownCellSupport):
         law_bounds, second, third = (
             bounds[pieces][:, :, used_columns] for bounds in (motion.most, motion.second, motion.third)
         )
-        start_sizes, input_sizes = self._sizes(start), self.sizing[pieces]
+        start_sizes, input_sizes = self._bound_effects(start), self.sizing[pieces]
         state_curvature = np.abs(self.rows @ (slope[:, :, :d] + law[:, :, :d] @ law[:, :, :d]))
         input_curvature = np.abs(self.rows @ slope[:, :, d:]) + np.abs(self.rows @ law[:, :, :d] @ law[:, :, d:])
         input_effects = width * np.einsum("kim,km->ki", law_bounds[:, :, d:], input_sizes)
@@ -507,9 +517,9 @@ class VaryingExecutionCellSupport(KnownCellSupport):
     @cached_property
     def at_marks(self) -> Array:
         """Bounds ``(K + 1, d)`` of the effect of the errors of execution on every state at the marks."""
-        return self._sizes(self.motion.grid.breakpoints)
+        return self._bound_effects(self.motion.grid.breakpoints)
 
-    def _sizes(self, times: Array) -> Array:
+    def _bound_effects(self, times: Array) -> Array:
         """Return bounds ``(k, d)`` of the effect of the errors of execution on every state.
 
         For a set of inputs through several columns together the bounds are those of the box around it, whose integrals
@@ -545,19 +555,19 @@ class SpreadExecutionSupport:
     @shaped
     def steepness(self, times: Float[Array, " k"]) -> Float[Array, "k r nu"]:
         """`Support.steepness`."""
-        return np.asarray(self._sizes(times) @ self.motion.space.exponents)
+        return np.asarray(self._bound_effects(times) @ self.motion.space.exponents)
 
     @shaped
     def at(
         self, times: Float[Array, " k"], ends: Float[Array, "k r nu"]
     ) -> tuple[Float[Array, "k r M"], Float[Array, "k r"]]:
         """`Support.at`."""
-        space, sizes, support = self.motion.space, self._sizes(times), self.every
+        space, sizes, support = self.motion.space, self._bound_effects(times), self.every
         coefficients, excess = np.zeros((*ends.shape[:2], space.size)), np.zeros(ends.shape[:2])
         patterns, pattern_indices = distinct_patterns(ends)
         for position, pattern in enumerate(patterns):
             time_indices, row_indices = np.nonzero(pattern_indices == position)
-            free, corners = np.flatnonzero(pattern == 0.0), _corners(pattern)
+            free, corners = np.flatnonzero(pattern == 0.0), _list_corners(pattern)
             powers = space.monomials(corners)
             directions = (powers[:, :, None] * self.rows[row_indices][:, None, None, :]).reshape(
                 len(row_indices) * len(corners), -1
@@ -577,7 +587,7 @@ class SpreadExecutionSupport:
     @shaped
     def deviation(self, start: Float[Array, " k"], widths: Float[Array, " k"]) -> Float[Array, "k r"]:
         """`VaryingExecutionCellSupport.deviation`, by the largest numbers on every piece."""
-        row_curvature = self._bent[self._pieces(start)] @ self.motion.sizes(np.abs(self.rows)).T
+        row_curvature = self._curvature_bounds[self._locate_pieces(start)] @ self.motion.sizes(np.abs(self.rows)).T
         return np.asarray((widths**2 / 8)[:, None] * row_curvature * OUTWARD)
 
     @cached_property
@@ -596,7 +606,7 @@ class SpreadExecutionSupport:
         return np.asarray((1.0 + self.motion.space.size) * self.motion.folded(self.every.reached))
 
     @cached_property
-    def _bent(self) -> Array:
+    def _curvature_bounds(self) -> Array:
         """The second derivative in time of every coefficient, at most, on every piece, ``(K, states)``."""
         support, d = self.every, self.every.motion.states
         second = support.motion.second
@@ -606,11 +616,11 @@ class SpreadExecutionSupport:
         )
         return np.asarray(curvatures * OUTWARD)
 
-    def _sizes(self, times: Array) -> Array:
+    def _bound_effects(self, times: Array) -> Array:
         """Return bounds ``(k, r, M)`` of the effect of the errors of execution along every coefficient on the cell."""
-        bounds = self.every.reached[self._pieces(times)].reshape(times.size, self.motion.space.size, -1)
+        bounds = self.every.reached[self._locate_pieces(times)].reshape(times.size, self.motion.space.size, -1)
         sizes = np.einsum("rd,kad->kra", np.abs(self.rows), bounds)
         return np.asarray(sizes * OUTWARD)
 
-    def _pieces(self, times: Array) -> np.ndarray:
+    def _locate_pieces(self, times: Array) -> np.ndarray:
         return np.asarray(np.minimum(self.every.motion.place(times), self.every.motion.origin.size - 1))

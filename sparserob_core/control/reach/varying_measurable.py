@@ -81,7 +81,7 @@ class VaryingMeasurable:
                 self.middle == 0.0, half_widths, np.where(box.upper > box.lower, np.nextafter(half_widths, np.inf), 0.0)
             )
         else:
-            bound, through = _moving(self.bound)
+            bound, through = _drop_zero_coordinates(self.bound)
         ends, felt = self.response.grid.breakpoints[[0, -1]], np.ones(self.response.system.states)
         execution = VaryingExecution(self.response, ends, shares, felt, disturbing=True, bound=bound, through=through)
         return followed(execution)
@@ -118,7 +118,7 @@ class VaryingMeasurable:
         return np.asarray(self.errors.around.lengths(times, error_directions).sum(axis=1))
 
 
-def _moving(bound: ConvexSet) -> tuple[ConvexSet, np.ndarray]:
+def _drop_zero_coordinates(bound: ConvexSet) -> tuple[ConvexSet, np.ndarray]:
     """Return a flat set without the coordinates that are 0 in all of it, and the indices of the others.
 
     Coordinates are 0 where the disturbances in them are of another class.

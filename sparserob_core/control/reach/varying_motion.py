@@ -159,13 +159,13 @@ class VaryingMotion:
         """
         pieces = np.minimum(pieces, self.origin.size - 1)  # beyond the last there is no time
         key = within.tobytes() + pieces.tobytes()
-        if key not in self._ways:
+        if key not in self._flows:
             start = self.grid.breakpoints[pieces]
-            remember(self._ways, key, self.expansion.flow(start, start + within), WAYS_KEPT)
-        return self._ways[key]
+            remember(self._flows, key, self.expansion.flow(start, start + within), WAYS_KEPT)
+        return self._flows[key]
 
     @cached_property
-    def _ways(self) -> dict[bytes, Flow]:
+    def _flows(self) -> dict[bytes, Flow]:
         return {}
 
     def deviation(
@@ -231,18 +231,18 @@ class VaryingMotion:
         The result is remembered, since it is the same for all rows.
         """
         key = control.tobytes()
-        if key not in self._under:
+        if key not in self._control_bounds:
             input_sizes, start_sizes = np.abs(self.grid.inputs(control)), np.abs(self.nodes(control)[:-1, 0])
             m = input_sizes.shape[0]
             error_bounds = self.left_out(start_sizes, self.flow.sizes[:, :, :m] * input_sizes.T[:, None])
-            forcing = np.einsum("kim,mk->ki", self.most[:, :, self._columns(m)], input_sizes)
+            forcing = np.einsum("kim,mk->ki", self.most[:, :, self._slice_inputs(m)], input_sizes)
             driven_sizes = start_sizes + self.grid.lengths[:, None] * forcing
             bounds = error_bounds, self.grown(self.every, self.grid.lengths, driven_sizes)
-            remember(self._under, key, bounds, PATHS_KEPT)
-        return self._under[key]
+            remember(self._control_bounds, key, bounds, PATHS_KEPT)
+        return self._control_bounds[key]
 
     @cached_property
-    def _under(self) -> dict[bytes, tuple[Array, Array]]:
+    def _control_bounds(self) -> dict[bytes, tuple[Array, Array]]:
         return {}
 
     def left_out(self, sizes: Array, pushed: Array) -> Array:
@@ -264,19 +264,23 @@ class VaryingMotion:
         Array
             Bounds ``(K, d)``.
         """
-        step_errors, lengths, d = self._lost(sizes, pushed.sum(axis=2)), self.grid.lengths[:, None], self.states
+        step_errors, lengths, d = (
+            self._propagate_step_errors(sizes, pushed.sum(axis=2)),
+            self.grid.lengths[:, None],
+            self.states,
+        )
         second = np.einsum("kij,kj->ki", self.second[:, :, :d], step_errors)
         third = np.einsum("kij,kj->ki", self.third[:, :, :d], self.grown(self.every, lengths[:, 0], step_errors))
         return np.asarray((2.0 * step_errors + lengths**2 / 8 * (second + lengths * third)) * OUTWARD)
 
-    def _lost(self, sizes: Array, pushed: Array) -> Array:
+    def _propagate_step_errors(self, sizes: Array, pushed: Array) -> Array:
         """Return bounds ``(K, d)`` of the propagated error of all steps, on every piece.
 
         Every step has an error in proportion to the states at its beginning, and to their inputs, of all states that
         are coupled with one another, in the units of its segment. The transitions from there, and within the piece,
         propagate it.
         """
-        units, step_errors = self._steps_off
+        units, step_errors = self._step_errors
         start_norms = self.expansion.over_parts((sizes / units)[:, :, None])[:, :, 0]
         # not 0, which times no bound is no number
         local_errors = np.maximum(step_errors[:, None] * (start_norms + pushed), TINY)
@@ -290,7 +294,7 @@ class VaryingMotion:
         return np.asarray((self.grown(self.every, self.grid.lengths, propagated) + units * local_errors) * OUTWARD)
 
     @cached_property
-    def _steps_off(self) -> tuple[Array, Array]:
+    def _step_errors(self) -> tuple[Array, Array]:
         """Units and errors of the steps over all pieces.
 
         The units ``(K, d)`` are those of the segment that a piece is in, or of all where it is in several. The error
@@ -321,7 +325,7 @@ class VaryingMotion:
         these transitions, each in the units of the pieces that end at both marks, and ``e`` the sum of the errors of
         all steps in these units.
         """
-        (units, step_errors), first = self._steps_off, self._stretches[1]
+        (units, step_errors), first = self._step_errors, self._stretches[1]
         bounds = np.zeros((len(units) + 1, first.size, self.states))
         for mark, sums in enumerate(self.sums()):
             earlier = first[first < mark]
@@ -341,7 +345,7 @@ class VaryingMotion:
         States are in the units of the piece before their mark. For coefficients of polynomials, the states are those of
         the constant coefficient.
         """
-        units, own = self._steps_off[0], self.expansion.own
+        units, own = self._step_errors[0], self.expansion.own
         effects = np.empty((len(units) + 1, self.states, own))
         for mark in range(len(effects)):
             if mark:
@@ -396,7 +400,7 @@ class VaryingMotion:
         """The numbers of all pieces."""
         return np.arange(self.origin.size)
 
-    def _columns(self, m: int) -> slice:
+    def _slice_inputs(self, m: int) -> slice:
         return slice(self.states, self.states + m)
 
     @cached_property
@@ -406,7 +410,7 @@ class VaryingMotion:
         return self.expansion.segment_of((marks[:-1] + marks[1:]) / 2)
 
     @cached_property
-    def _bounds(self) -> tuple[Array, Array, Array, Array]:
+    def _segment_bounds(self) -> tuple[Array, Array, Array, Array]:
         """Bounds on every segment of the expansion, entry by entry.
 
         Of ``[A F]``, and of the matrices that give the second and the third derivative of a solution from the state and
@@ -427,24 +431,24 @@ class VaryingMotion:
     @cached_property
     def most(self) -> Array:
         """The largest absolute values of ``[A F]`` on every piece, ``(K, d, d + m + mw)``."""
-        return np.asarray(self._bounds[0][self._segments])
+        return np.asarray(self._segment_bounds[0][self._segments])
 
     @cached_property
     def second(self) -> Array:
         """Bounds of the matrix that gives the second derivative of a solution from the state and its inputs, on every
         piece, ``(K, d, d + m + mw)``."""
-        return np.asarray(self._bounds[1][self._segments])
+        return np.asarray(self._segment_bounds[1][self._segments])
 
     @cached_property
     def third(self) -> Array:
         """Bounds of the matrix that gives the third derivative of a solution from the state and its inputs, on every
         piece, ``(K, d, d + m + mw)``."""
-        return np.asarray(self._bounds[2][self._segments])
+        return np.asarray(self._segment_bounds[2][self._segments])
 
     @cached_property
     def paces(self) -> Array:
         """The norm of ``A`` in own units on every piece, ``(K,)``."""
-        return np.asarray(self._bounds[3][self._segments])
+        return np.asarray(self._segment_bounds[3][self._segments])
 
     @cached_property
     def of_initial(self) -> Array:
@@ -510,13 +514,13 @@ class VaryingSupport:
 
     def steepness(self, times: Array) -> Array:
         """`Support.steepness`."""
-        sizes = self.set.reach(self._seen(times)).sum(axis=3)
+        sizes = self.set.reach(self._weigh_blocks(times)).sum(axis=3)
         return np.asarray(sizes @ self._space.exponents)
 
     def at(self, times: Array, ends: Array) -> tuple[Array, Array]:
         """`Support.at`."""
         return over_faces(
-            self._space, ends, lambda index, face: summed(self.set, self._seen(times[index]), face).sum(axis=2)
+            self._space, ends, lambda index, face: summed(self.set, self._weigh_blocks(times[index]), face).sum(axis=2)
         )
 
     def deviation(self, start: Array, widths: Array) -> Array:
@@ -568,7 +572,7 @@ class VaryingSupport:
     def _space(self) -> TaylorSpace:
         return KNOWN if self.combination is None else self.combination.space
 
-    def _seen(self, times: Array) -> Array:
+    def _weigh_blocks(self, times: Array) -> Array:
         """Taylor coefficients ``(k, r, M, nb, q)`` of what the functionals give to every block."""
         rows = np.broadcast_to(self.rows, (times.size, *self.rows.shape))
         coefficients = self.blocks(self.weights(times, rows))[:, :, None]
@@ -627,7 +631,7 @@ class Truncation:
         return self.norms(rates)
 
     @cached_property
-    def _norms(self) -> Array:
+    def _coefficient_norms(self) -> Array:
         """The norms of the coefficients of ``A`` on every piece, ``(K, M)``."""
         d, space = self.spread.d, self.spread.space
         first = self.motion.most[:, :, :d].reshape(-1, space.size, d, d) / self.units[:, None] * self.units
@@ -639,22 +643,22 @@ class Truncation:
         d, space, lengths = self.motion.states, self.spread.space, self.motion.grid.lengths
         inputs = self.motion.most[:, :, d:].reshape(lengths.size, space.size, self.spread.d, -1)
         input_norms = (inputs / self.units[:, None]).max(axis=(2, 3), initial=0.0)
-        return np.asarray(lengths @ (self._norms + input_norms) @ space.exponents)
+        return np.asarray(lengths @ (self._coefficient_norms + input_norms) @ space.exponents)
 
     @property
     def growing(self) -> int:
         """The parameter that moves ``A`` most, which alone decides how far states grow."""
-        changes = self.motion.grid.lengths @ self._norms @ self.spread.space.exponents
+        changes = self.motion.grid.lengths @ self._coefficient_norms @ self.spread.space.exponents
         return int(changes.argmax())
 
     @cached_property
-    def _sizes(self) -> Array:
+    def _degree_norms(self) -> Array:
         """The norms of the coefficients of ``A`` of every degree on every piece, ``(K, D + 1)``."""
-        space, norms = self.spread.space, self._norms
+        space, norms = self.spread.space, self._coefficient_norms
         return np.stack([norms[:, space.degrees == j].sum(axis=1) for j in range(space.degree + 1)], axis=1)
 
     @cached_property
-    def _off(self) -> tuple[Array, Array]:
+    def _law_remainders(self) -> tuple[Array, Array]:
         """Bounds of the remainder of the entries of the law on every piece: the norm of that of ``A``, ``(K,)``, and
         the rate at which that of ``[B E]`` drives states per unit of each input, ``(K, m + mw)``."""
         d, K = self.spread.d, self.motion.grid.pieces
@@ -664,14 +668,14 @@ class Truncation:
         return (sizes[:, :, :d] * self.units).sum(axis=2).max(axis=1) * OUTWARD, sizes[:, :, d:].max(axis=1) * OUTWARD
 
     @cached_property
-    def _within(self) -> Array:
+    def _growth_bounds(self) -> Array:
         """Bounds ``(K, D + 1, D + 1)`` of the growth of the norms of the coefficients of every degree, anywhere on a
         piece."""
-        size, count = self.spread.space.degree + 1, self._sizes.shape[0]
+        size, count = self.spread.space.degree + 1, self._degree_norms.shape[0]
         rate = np.zeros((count, size, size))
         for j in range(size):
             for i in range(j + 1):
-                rate[:, j, i] = self._sizes[:, j - i]
+                rate[:, j, i] = self._degree_norms[:, j - i]
         rate = rate * self.motion.grid.lengths[:, None, None]
         total, term = np.tile(np.eye(size), (count, 1, 1)), np.tile(np.eye(size), (count, 1, 1))
         for n in range(1, TERMS):
@@ -680,25 +684,25 @@ class Truncation:
         return (total + REST) * OUTWARD
 
     @cached_property
-    def _beyond(self) -> Array:
+    def _truncation_factors(self) -> Array:
         """Factors ``(K, D + 1)`` of the coefficients of every degree in the products beyond the degree ``D``, with the
         remainder of ``A``."""
-        sums = np.cumsum(self._sizes[:, ::-1], axis=1)  # of the degrees D, D and D - 1, ...: for j = 0, 1, ...
+        sums = np.cumsum(self._degree_norms[:, ::-1], axis=1)  # of the degrees D, D and D - 1, ...: for j = 0, 1, ...
         above = np.concatenate([np.zeros((sums.shape[0], 1)), sums[:, :-1]], axis=1)
-        return np.asarray((above + self._off[0][:, None]) * OUTWARD)
+        return np.asarray((above + self._law_remainders[0][:, None]) * OUTWARD)
 
-    def _added(self, begun: Array, driven: Array, off: Array) -> Array:
+    def _integrate_truncation(self, begun: Array, driven: Array, off: Array) -> Array:
         """Return the integral of the terms beyond the degree over every piece, ``(K,)``.
 
         ``begun (K, D + 1)`` are the norms of the states at the beginning of the piece, ``driven (K, D + 1)`` the rates
         of their inputs, and ``off (K,)`` the rate from the remainder of the entries.
         """
         lengths = self.motion.grid.lengths[:, None]
-        state_norms = np.einsum("kij,kj->ki", self._within, begun + lengths * driven)
-        return np.asarray(((state_norms * self._beyond).sum(axis=1) + off) * lengths[:, 0] * OUTWARD)
+        state_norms = np.einsum("kij,kj->ki", self._growth_bounds, begun + lengths * driven)
+        return np.asarray(((state_norms * self._truncation_factors).sum(axis=1) + off) * lengths[:, 0] * OUTWARD)
 
     @cached_property
-    def _carried(self) -> Array:
+    def _transition_norms(self) -> Array:
         """Norms ``(K + 1, D + 1)`` of the coefficients of every degree of the transitions from any mark to each one.
 
         The norms are those of the computed effect of the constant coefficient on all coefficients, plus the error of
@@ -723,13 +727,13 @@ class Truncation:
         """An upper bound of the norm of the transitions from any time to any later one, at any parameter."""
         if self.known is not None:
             return self.known
-        sizes = self._sizes.sum(axis=1) + self._off[0]
+        sizes = self._degree_norms.sum(axis=1) + self._law_remainders[0]
         piece_growth = float(np.exp((sizes * self.motion.grid.lengths).max()) * OUTWARD)
-        mark_norms = self._carried[:-1]
+        mark_norms = self._transition_norms[:-1]
         share = piece_growth * float(
-            self._added(mark_norms, np.zeros(mark_norms.shape), np.zeros(len(mark_norms))).sum()
+            self._integrate_truncation(mark_norms, np.zeros(mark_norms.shape), np.zeros(len(mark_norms))).sum()
         )
-        largest = float(self._carried.sum(axis=1).max())
+        largest = float(self._transition_norms.sum(axis=1).max())
         return piece_growth * piece_growth * largest / (1.0 - share) * OUTWARD if share < 0.5 else np.inf
 
     def lost(self, sizes: Array, inputs: Array) -> Array:
@@ -747,23 +751,23 @@ class Truncation:
         Array
             Bounds ``(K, d)``.
         """
-        remainder_rates = (self._off[1] * inputs).sum(axis=1)
-        accumulated = np.cumsum(self._added(self.norms(sizes), self.driven(inputs), remainder_rates))
+        remainder_rates = (self._law_remainders[1] * inputs).sum(axis=1)
+        accumulated = np.cumsum(self._integrate_truncation(self.norms(sizes), self.driven(inputs), remainder_rates))
         return np.asarray(self.growth * accumulated[:, None] * self.units * OUTWARD)
 
     def under(self, control: Array) -> Array:
         """Return bounds ``(K, d)`` of the truncation error of the states under a control; remembered."""
         key = control.tobytes()
-        if key not in self._under:
+        if key not in self._control_bounds:
             motion, inputs = self.motion, np.abs(self.motion.grid.inputs(control)).T
             all_inputs = np.zeros((len(inputs), motion.most.shape[2] - motion.states))
             all_inputs[:, : inputs.shape[1]] = inputs
             start_sizes = np.abs(motion.nodes(control)[:-1, 0]) + motion.under(control)[0]
-            remember(self._under, key, self.lost(start_sizes, all_inputs), PATHS_KEPT)
-        return self._under[key]
+            remember(self._control_bounds, key, self.lost(start_sizes, all_inputs), PATHS_KEPT)
+        return self._control_bounds[key]
 
     @cached_property
-    def _under(self) -> dict[bytes, Array]:
+    def _control_bounds(self) -> dict[bytes, Array]:
         return {}
 
 
@@ -840,11 +844,13 @@ class SpreadMotion:
 
     def nodes(self, control: Array) -> Array:
         """`Motion.nodes`."""
-        return self._apart(self.motion.nodes(control)[:, 0])
+        return self._separate_coefficients(self.motion.nodes(control)[:, 0])
 
     def moved(self, within: Array, pieces: np.ndarray, begun: Array, inputs: Array) -> Array:
         """`Motion.moved`."""
-        return self._apart(self.motion.moved(within, pieces, begun.reshape(len(begun), 1, -1), inputs)[:, 0])
+        return self._separate_coefficients(
+            self.motion.moved(within, pieces, begun.reshape(len(begun), 1, -1), inputs)[:, 0]
+        )
 
     def deviation(
         self, rows: Array, start: Array, width: Array, pieces: np.ndarray, states: Array, inputs: Array
@@ -873,7 +879,7 @@ class SpreadMotion:
         """Return the bounds ``(K, d)`` of states with bounds ``sizes (K, states)`` of all coefficients."""
         return np.asarray(sizes.reshape(len(sizes), self.space.size, -1).sum(axis=1) * OUTWARD)
 
-    def _apart(self, states: Array) -> Array:
+    def _separate_coefficients(self, states: Array) -> Array:
         return states.reshape(len(states), self.space.size, self.states)
 
 
@@ -910,7 +916,7 @@ class SpreadSupport:
 
     def steepness(self, times: Array) -> Array:
         """`Support.steepness`."""
-        sizes = self.every.set.reach(self._seen(times)).sum(axis=3)
+        sizes = self.every.set.reach(self._weigh_blocks(times)).sum(axis=3)
         return np.asarray(sizes @ self._space.exponents)
 
     def at(self, times: Array, ends: Array) -> tuple[Array, Array]:
@@ -918,7 +924,7 @@ class SpreadSupport:
         return over_faces(
             self._space,
             ends,
-            lambda index, face: summed(self.every.set, self._seen(times)[index], face).sum(axis=2),
+            lambda index, face: summed(self.every.set, self._weigh_blocks(times)[index], face).sum(axis=2),
         )
 
     def deviation(self, start: Array, widths: Array) -> Array:
@@ -950,19 +956,19 @@ class SpreadSupport:
     def _space(self) -> TaylorSpace:
         return self.motion.space if self.combination is None else self.combination.space
 
-    def _seen(self, times: Array) -> Array:
+    def _weigh_blocks(self, times: Array) -> Array:
         """Taylor coefficients ``(k, r, M, nb, q)`` of what the functionals give to every block; those of the last times
         are remembered."""
-        if self._asked.get("times") is not times:
+        if self._last_weights.get("times") is not times:
             rows = np.broadcast_to(self.every.rows, (times.size, *self.every.rows.shape))
             coefficients = self.every.blocks(self.every.weights(times, rows))
             coefficients = coefficients.reshape(
                 times.size, len(self.rows), self.motion.space.size, *coefficients.shape[2:]
             )
             coefficients = coefficients if self.combination is None else self.combination.apply(coefficients)
-            self._asked.update(times=times, found=coefficients)
-        return self._asked["found"]
+            self._last_weights.update(times=times, found=coefficients)
+        return self._last_weights["found"]
 
     @cached_property
-    def _asked(self) -> dict[str, Array]:
+    def _last_weights(self) -> dict[str, Array]:
         return {}

@@ -97,14 +97,14 @@ class DisturbanceModel:
         if self.by_piece:
             return weights
         if self.starts is not None:
-            return self._gathered(np.add.reduceat(weights, self.starts, axis=-2))
+            return self._gather_weights(np.add.reduceat(weights, self.starts, axis=-2))
         assert self.functions is not None
         coefficients = np.einsum("...li,jl->...ij", weights, self.functions)
         if self.scale is None:
             return np.asarray(coefficients.reshape(*coefficients.shape[:-2], 1, -1))
         return np.asarray(coefficients * self.scale[:, None])
 
-    def _gathered(self, blocks: Array) -> Array:
+    def _gather_weights(self, blocks: Array) -> Array:
         """Return the weights on every block, ``(..., nb, mw)``. Weights on components that are held over several blocks
         are added to the first of these."""
         if not self.lasting:
@@ -199,13 +199,15 @@ def disturbance_model(
     merged = dictionary.merged()
     if dictionary.is_complete:
         piece_indices = np.clip(
-            np.searchsorted(merged.breakpoints, _middles(grid), side="right") - 1, 0, merged.breakpoints.size - 2
+            np.searchsorted(merged.breakpoints, _compute_middles(grid), side="right") - 1,
+            0,
+            merged.breakpoints.size - 2,
         )
         starts = np.flatnonzero(np.diff(piece_indices, prepend=-1))
         plain = DisturbanceModel("piecewise_constant", bound, bound, grid, starts=starts)
         if breakpoints is None:
             return plain
-        lasting = _lasting(bound, breakpoints, _middles(grid)[starts])
+        lasting = _find_held_components(bound, breakpoints, _compute_middles(grid)[starts])
         return replace(plain, set=product(bound.factors), lasting=lasting)
     flat = bound.halfspaces()
     if flat is None:
@@ -220,7 +222,9 @@ def disturbance_model(
     return DisturbanceModel("piecewise_constant", coupled, bound, grid, functions=dictionary.at(grid.disturbance_piece))
 
 
-def _lasting(bound: ConvexSet, breakpoints: Breakpoints, middles: Array) -> tuple[tuple[slice, np.ndarray], ...]:
+def _find_held_components(
+    bound: ConvexSet, breakpoints: Breakpoints, middles: Array
+) -> tuple[tuple[slice, np.ndarray], ...]:
     """Return the field ``lasting`` of a `DisturbanceModel` for blocks that contain these ``middles``, one time each."""
     held_components, column = list[tuple[slice, np.ndarray]](), 0
     for factor, times in zip(bound.factors, breakpoints, strict=True):
@@ -233,5 +237,5 @@ def _lasting(bound: ConvexSet, breakpoints: Breakpoints, middles: Array) -> tupl
     return tuple(held_components)
 
 
-def _middles(grid: TimeGrid) -> Array:
+def _compute_middles(grid: TimeGrid) -> Array:
     return (grid.breakpoints[:-1] + grid.breakpoints[1:]) / 2

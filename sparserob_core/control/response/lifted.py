@@ -200,10 +200,10 @@ class LiftedSystem:
             return np.arange(pieces)
         growth = float(np.abs(np.linalg.eigvals(self.comparison.rising)).max()) * float(self.fine.lengths.max())
         count = int(max(1.0, min(pieces // SPANS, SHORT / max(growth, TINY))))
-        return np.arange(0, pieces, max(1, count // self._block) * self._block)
+        return np.arange(0, pieces, max(1, count // self._block_size) * self._block_size)
 
     @cached_property
-    def _block(self) -> int:
+    def _block_size(self) -> int:
         """Number of pieces in which the states are computed at once; every span begins where such a block does."""
         forward = self.forward
         return forward.propagator.block(forward.steps(KNOWN)) if forward.uniform else 1
@@ -211,14 +211,14 @@ class LiftedSystem:
     @cached_property
     def span(self) -> np.ndarray:
         """Span to which every piece of the fine grid belongs, ``(L',)``."""
-        return np.repeat(np.arange(self.spans.size), self._counts)
+        return np.repeat(np.arange(self.spans.size), self._piece_counts)
 
     @cached_property
-    def _counts(self) -> np.ndarray:
+    def _piece_counts(self) -> np.ndarray:
         return np.diff(np.append(self.spans, self.fine.pieces))
 
     @cached_property
-    def _durations(self) -> Array:
+    def _span_durations(self) -> Array:
         """Durations of the spans, ``(S,)``."""
         return np.diff(self.fine.breakpoints[np.append(self.spans, self.fine.pieces)])
 
@@ -234,34 +234,34 @@ class LiftedSystem:
         start = np.zeros(self.matrix.shape[0])
         start[: self.states] = self.initial_state
         drive = self.B.reshape(-1, self.B.shape[2])
-        return Response(LinearSystem(self.matrix, drive), self.fine, start, self._propagate(rows=False))
+        return Response(LinearSystem(self.matrix, drive), self.fine, start, self._build_exponentials(rows=False))
 
     @cached_property
     def backward(self) -> Response:
         """Adjoint of the lifted system; its functionals are Taylor coefficients of ``c'e^{A(p) t}``."""
-        return self._adjoint_on(self.grid)
+        return self._build_adjoint(self.grid)
 
     @cached_property
     def _backward_fine(self) -> Response:
-        return self.backward if self.fine is self.grid else self._adjoint_on(self.fine)
+        return self.backward if self.fine is self.grid else self._build_adjoint(self.fine)
 
-    def _adjoint_on(self, grid: TimeGrid) -> Response:
+    def _build_adjoint(self, grid: TimeGrid) -> Response:
         size = self.row_matrix.shape[0]
         drive = LinearSystem(self.row_matrix, np.zeros((size, 1)))
-        return Response(drive, grid, np.zeros(size), self._propagate(rows=True))
+        return Response(drive, grid, np.zeros(size), self._build_exponentials(rows=True))
 
-    def _propagate(self, rows: bool) -> LiftedExponentials:
+    def _build_exponentials(self, rows: bool) -> LiftedExponentials:
         return LiftedExponentials(self, rows)
 
     def nodes(self, control: Array) -> Array:
         """Return the Taylor coefficients ``(L+1, M, d)`` of the state at the breakpoints, under ``control (m, K)``."""
-        path = self._path(control)
+        path = self._compute_path(control)
         return path if self.fine is self.grid else path[self.ends]
 
     def state_remainder(self, control: Array) -> tuple[Array, Array]:
         """Return norm bounds ``(L, q)``, per piece and block, of the remainder of the Taylor models of the state,
         rounding included; and norm bounds of the Taylor models themselves, summed over their coefficients."""
-        left_out, sizes, _ = self._left_out(control)
+        left_out, sizes, _ = self._get_remainder_bounds(control)
         return left_out[self.shared], sizes[self.shared]
 
     def moved(self, within: Array, pieces: np.ndarray, begun: Array, inputs: Array) -> Array:
@@ -271,12 +271,14 @@ class LiftedSystem:
         start = begun.reshape(within.size, -1)
         size = self.norm * float(within.max(initial=0.0))
         if size < LONG_STEP:
-            coefficients = self._by_series(start, start @ self.matrix.T + self._drive(inputs), within[:, None], size)
+            coefficients = self._propagate_by_series(
+                start, start @ self.matrix.T + self._compute_forcing(inputs), within[:, None], size
+            )
         else:
-            coefficients = self._columns(start, self._drive(inputs), within)
+            coefficients = self._propagate_columns(start, self._compute_forcing(inputs), within)
         return np.asarray(coefficients.reshape(within.size, self.space.size, -1))
 
-    def _columns(self, start: Array, drives: Array, within: Array) -> Array:
+    def _propagate_columns(self, start: Array, drives: Array, within: Array) -> Array:
         """Return the coefficients ``(k, M d)`` after durations ``(k,)`` under the forcing ``drives (k, M d)``, by
         matrix exponentials."""
         if not self.space.nu:
@@ -298,19 +300,19 @@ class LiftedSystem:
             return self.flows.rows(rows, durations)
         distinct, indices = self.grid.distinct(durations)
         key, size = distinct.tobytes(), distinct.size * self.row_matrix.size
-        flows = self._flown.get(key)
+        flows = self._flow_cache.get(key)
         if flows is None:
             flows = self.backward.flows(distinct)
             if size <= FLOWN_SIZE:
-                remember(self._flown, key, flows, max(1, FLOWN_SIZE // size))
+                remember(self._flow_cache, key, flows, max(1, FLOWN_SIZE // size))
         flow, integral = flows
         return rows @ flow[indices], rows @ integral[indices]
 
     @cached_property
-    def _flown(self) -> dict[bytes, tuple[Array, Array]]:
+    def _flow_cache(self) -> dict[bytes, tuple[Array, Array]]:
         return {}
 
-    def _by_series(self, start: Array, slopes: Array, within: Array, size: float) -> Array:
+    def _propagate_by_series(self, start: Array, slopes: Array, within: Array, size: float) -> Array:
         """Return the coefficients after short steps by the exponential series; no matrix is built."""
         total, term, order, bound = start + within * slopes, slopes, 1, size
         while bound > TAYLOR_TERMS:
@@ -320,7 +322,7 @@ class LiftedSystem:
             bound *= size / order
         return total
 
-    def _drive(self, inputs: Array) -> Array:
+    def _compute_forcing(self, inputs: Array) -> Array:
         """Return the forcing of the Taylor coefficients, ``(k, M d)``, under inputs ``(k, m)``."""
         return np.asarray(inputs @ self.B.reshape(-1, self.B.shape[2]).T)
 
@@ -333,7 +335,7 @@ class LiftedSystem:
         The smaller of two bounds is taken, mode by mode: by the second derivative in time, or twice the distance that
         the state can move (as in `DisturbanceSupport.deviation`).
         """
-        slopes = states.reshape(start.size, -1) @ self.matrix.T + self._drive(inputs)
+        slopes = states.reshape(start.size, -1) @ self.matrix.T + self._compute_forcing(inputs)
         curvature = (slopes @ self.matrix.T).reshape(states.shape)
         along = np.abs(np.einsum("ri,kai->kra", rows, curvature)).sum(axis=2)
         slope_norms, curvature_norms = (
@@ -363,24 +365,24 @@ class LiftedSystem:
     def along(self, control: Array, rows: Array, others: Array) -> Array:
         """Return the two bounds of `state_remainder`, multiplied by ``rows`` and ``others (r, q)`` and added up: ``(r,
         L)``."""
-        left_out, sizes, _ = self._left_out(control)
+        left_out, sizes, _ = self._get_remainder_bounds(control)
         answer: Array = (product(rows, left_out.T) + product(others, sizes.T))[:, self.shared]
         return answer
 
-    def _left_out(self, control: Array) -> tuple[Array, Array, Array]:
+    def _get_remainder_bounds(self, control: Array) -> tuple[Array, Array, Array]:
         """Return the two bounds of `state_remainder`, on the spans where these are many pieces, and the bound of the
         remainder at the end, ``(q,)``; remembered."""
         key = control.tobytes()
-        if key not in self._remainders:
-            remember(self._remainders, key, self._remainder(control), PATHS_KEPT)
-        return self._remainders[key]
+        if key not in self._remainder_cache:
+            remember(self._remainder_cache, key, self._compute_remainder_bounds(control), PATHS_KEPT)
+        return self._remainder_cache[key]
 
     @cached_property
-    def _remainders(self) -> dict[bytes, tuple[Array, Array, Array]]:
+    def _remainder_cache(self) -> dict[bytes, tuple[Array, Array, Array]]:
         return {}
 
-    def _remainder(self, control: Array) -> tuple[Array, Array, Array]:
-        inputs, slack = np.abs(self.fine.inputs(control)), self._slack(control)[None]
+    def _compute_remainder_bounds(self, control: Array) -> tuple[Array, Array, Array]:
+        inputs, slack = np.abs(self.fine.inputs(control)), self._bound_initial_remainder(control)[None]
         size = np.abs(self.B).sum(axis=0)
         if self.spans.size < self.fine.pieces:
             largest_inputs = np.maximum.reduceat(inputs, self.spans, axis=1)
@@ -388,56 +390,57 @@ class LiftedSystem:
                 block_norms((size @ largest_inputs).T, self.starts),
                 (self.slack_B @ largest_inputs).T[None],
             )
-            begin = block_norms(self._path(control)[self.spans, 0], self.starts)[None]
-            neglected, bounds, size_bounds = self._neglected(
-                begin, forcing_norms, drive, slack, rows=False, jumps=self._jumps(control, size)
+            begin = block_norms(self._compute_path(control)[self.spans, 0], self.starts)[None]
+            neglected, bounds, size_bounds = self._bound_error(
+                begin, forcing_norms, drive, slack, rows=False, jumps=self._sum_jumps(control, size)
             )
             return neglected[0], size_bounds[0], bounds[0, -1]
         forcing = self.fine.inputs(control).T @ self.forward.steps(KNOWN).B[0].T
-        nodes = self._path(control)[None]
-        sizes = self._sizes(nodes, forcing, rows=False)
+        nodes = self._compute_path(control)[None]
+        sizes = self._bound_sizes(nodes, forcing, rows=False)
         forcing_norms, drive = block_norms((size @ inputs).T, self.starts), (self.slack_B @ inputs).T[None]
         begin = block_norms(nodes[:, :-1], self.starts).sum(axis=2)
-        residual = self._spilt(sizes, rows=False) + drive
-        neglected, bounds, _ = self._neglected(begin, forcing_norms, residual, slack, rows=False)
+        residual = self._bound_residual(sizes, rows=False) + drive
+        neglected, bounds, _ = self._bound_error(begin, forcing_norms, residual, slack, rows=False)
         first = self.ends[:-1]
         left_out: Array = np.maximum.reduceat(neglected[0], first, axis=0)
         return left_out, np.maximum.reduceat(sizes[0].sum(axis=1), first, axis=0), bounds[0, -1]
 
-    def _jumps(self, control: Array, size: Array) -> Array:
+    def _sum_jumps(self, control: Array, size: Array) -> Array:
         """Return the sum of the jumps of the forcing of each block within each span, ``(S, q)``."""
         inputs = self.fine.inputs(control)
         jumps = np.abs(np.diff(inputs, axis=1, prepend=inputs[:, :1]))
         jumps[:, self.spans] = 0.0
         return block_norms((size @ np.add.reduceat(jumps, self.spans, axis=1)).T, self.starts)
 
-    def _slack(self, control: Array) -> Array:
+    def _bound_initial_remainder(self, control: Array) -> Array:
         """Return bounds of the remainder of the Taylor models at time 0, ``(q,)``."""
         if self.past is None:
             return self.slack_x
         before, final_sizes = self.past.lifted, np.abs(self.past.lifted.nodes(control)[-1]).sum(axis=0)
         return np.asarray(
-            product(self.past.blocks, before._left_out(control)[2][:, None])[:, 0] + self.past.rounded(final_sizes)
+            product(self.past.blocks, before._get_remainder_bounds(control)[2][:, None])[:, 0]
+            + self.past.rounded(final_sizes)
         )
 
-    def _path(self, control: Array) -> Array:
+    def _compute_path(self, control: Array) -> Array:
         """Return the Taylor coefficients of the state at the breakpoints of the fine grid, remembered: all directions
         of a cell share them."""
         key = control.tobytes()
-        if key not in self._paths:
+        if key not in self._path_cache:
             capacity = max(1, min(PATHS_KEPT, PATHS_SIZE // ((self.fine.pieces + 1) * self.matrix.shape[0])))
-            while len(self._paths) >= capacity:  # before the new one is made: either may be large
-                self._paths.pop(next(iter(self._paths)))
+            while len(self._path_cache) >= capacity:  # before the new one is made: either may be large
+                self._path_cache.pop(next(iter(self._path_cache)))
             forward = self.forward
             if self.past is not None:
                 final_coefficients = self.past.lifted.nodes(control)[-1]
                 forward = forward.from_state((final_coefficients @ self.past.turn.T).ravel())
             states = forward.states(control, KNOWN)[0]
-            self._paths[key] = states.reshape(-1, self.space.size, self.states)
-        return self._paths[key]
+            self._path_cache[key] = states.reshape(-1, self.space.size, self.states)
+        return self._path_cache[key]
 
     @cached_property
-    def _paths(self) -> dict[bytes, Array]:
+    def _path_cache(self) -> dict[bytes, Array]:
         return {}
 
     def row_bounds(self, directions: Array, by_age: bool = False) -> tuple[Array, Array]:
@@ -450,13 +453,13 @@ class LiftedSystem:
         nodes, zeros = self.row_nodes(directions), np.zeros((self.spans.size, self.starts.size))
         begin, start = block_norms(nodes[:, :-1], self.starts).sum(axis=2), zeros[:1]
         if self.spans.size < self.fine.pieces:
-            neglected, _, size_bounds = self._neglected(begin, zeros, zeros[None], start, rows=True, by_age=by_age)
+            neglected, _, size_bounds = self._bound_error(begin, zeros, zeros[None], start, rows=True, by_age=by_age)
             if by_age:
                 propagator = self.backward.propagator
                 neglected = neglected + propagator.lateness[0] / float(propagator.lengths[0]) * size_bounds
             return size_bounds[:, :, None], neglected
-        sizes = self._sizes(nodes, np.zeros(1), rows=True)
-        return sizes, self._neglected(begin, zeros, self._spilt(sizes, rows=True), start, rows=True)[0]
+        sizes = self._bound_sizes(nodes, np.zeros(1), rows=True)
+        return sizes, self._bound_error(begin, zeros, self._bound_residual(sizes, rows=True), start, rows=True)[0]
 
     def row_nodes(self, directions: Array) -> Array:
         """Return the Taylor coefficients ``(r, S+1, M, d)`` of ``c'e^{A(p) s}`` at the ends ``s`` of the spans."""
@@ -473,9 +476,9 @@ class LiftedSystem:
         if self.spans.size == self.fine.pieces:
             return self._backward_fine
         ends, none = np.append(self.spans, self.fine.pieces), np.zeros(self.spans.size, dtype=int)
-        return self._adjoint_on(TimeGrid(self.fine.breakpoints[ends], none, none, elapsed=self.fine.elapsed))
+        return self._build_adjoint(TimeGrid(self.fine.breakpoints[ends], none, none, elapsed=self.fine.elapsed))
 
-    def _sizes(self, nodes: Array, driven: Array, rows: bool) -> Array:
+    def _bound_sizes(self, nodes: Array, driven: Array, rows: bool) -> Array:
         """Return block norms ``(r, L', M, q)`` of Taylor coefficients ``(r, L'+1, M, d)``, the largest on every fine
         piece.
 
@@ -490,22 +493,22 @@ class LiftedSystem:
         slopes = flat @ matrix.T + driven
         curvature = block_norms((slopes @ matrix.T).reshape(shape), self.starts)
         ends = block_norms(nodes, self.starts)
-        integral, peak = self._majorants(lengths, rows)
+        integral, peak = self._compute_majorants(lengths, rows)
         forcing_norms = block_norms(np.broadcast_to(driven, flat.shape).reshape(shape), self.starts)
-        displacement = _applied(integral, block_norms(slopes.reshape(shape), self.starts))
-        chord = np.maximum(ends[:, :-1], ends[:, 1:]) + (lengths**2 / 8)[:, None, None] * _applied(peak, curvature)
+        displacement = _apply_bounds(integral, block_norms(slopes.reshape(shape), self.starts))
+        chord = np.maximum(ends[:, :-1], ends[:, 1:]) + (lengths**2 / 8)[:, None, None] * _apply_bounds(peak, curvature)
         return np.minimum(
             np.minimum(chord, ends[:, :-1] + displacement),
-            _applied(peak, ends[:, :-1]) + _applied(integral, forcing_norms),
+            _apply_bounds(peak, ends[:, :-1]) + _apply_bounds(integral, forcing_norms),
         )
 
-    def _majorants(self, lengths: Array, rows: bool) -> tuple[NormBounds, NormBounds]:
+    def _compute_majorants(self, lengths: Array, rows: bool) -> tuple[NormBounds, NormBounds]:
         """Return bounds of ``int |e^{lifted s}| ds`` and ``|e^{lifted r}|`` on every fine piece, coefficient by
         coefficient, matrices ``(M q, M q)``; as in `ComparisonSystem.over`."""
         if not self.space.nu:
             reach = self.comparison.over(lengths)
             return (reach.integral.transposed, reach.peak.transposed) if rows else (reach.integral, reach.peak)
-        if rows not in self._majorised:
+        if rows not in self._majorant_cache:
             _, longest, indices = alike(lengths, (self.space.size * self.starts.size) ** 2)
             majorant = block_sizes(self.A, self.starts)
             majorant[0] = comparison_matrix(self.A[0], self.starts)
@@ -521,20 +524,20 @@ class LiftedSystem:
                 NormBounds(lifted_matrix(self.space, coefficients, rows=False), indices)
                 for coefficients in (integral, peak)
             )
-            self._majorised[rows] = (next(both), next(both))
-        return self._majorised[rows]
+            self._majorant_cache[rows] = (next(both), next(both))
+        return self._majorant_cache[rows]
 
     @cached_property
-    def _majorised(self) -> dict[bool, tuple[NormBounds, NormBounds]]:
+    def _majorant_cache(self) -> dict[bool, tuple[NormBounds, NormBounds]]:
         return {}
 
-    def _spilt(self, sizes: Array, rows: bool) -> Array:
+    def _bound_residual(self, sizes: Array, rows: bool) -> Array:
         """Return the residual of the truncation on every fine piece, ``(r, L', q)``, from the ``sizes (r, L', M, q)``
         of the coefficients."""
         residual_norms = self.spilt(block_sizes(self.A, self.starts))
         return np.asarray(np.einsum("rlaj,aij->rli" if not rows else "rlai,aij->rlj", sizes, residual_norms))
 
-    def _neglected(
+    def _bound_error(
         self,
         begin: Array,
         driven: Array,
@@ -554,22 +557,22 @@ class LiftedSystem:
         ``begin (r, S, q)``, and on the forcing. The forcing is at most ``driven (S, q)``, and jumps by ``jumps (S, q)``
         on spans of many pieces.
         """
-        reach = self.comparison.over(self._durations)
+        reach = self.comparison.over(self._span_durations)
         flow, integral, peak = (
             norms.transposed if rows else norms for norms in (reach.flow, reach.integral, reach.peak)
         )
         drives = np.broadcast_to(driven, begin.shape)
         size_bounds, growth = peak.on(begin) + integral.on(drives), flow
         if self.spans.size < self.fine.pieces:
-            error_gain, delay = self._lost(peak, rows, by_age)
+            error_gain, delay = self._bound_span_error(peak, rows, by_age)
             end_rounding = inner_rounding = error_gain.on(size_bounds) + delay * peak.on(drives + jumps)
             size_bounds = size_bounds + end_rounding
             if rows:  # what is computed piece by piece begins a span elsewhere, and its rounding is that of where it is
                 growth = NormBounds(flow.matrices + product(error_gain.matrices, peak.matrices), flow.which)
         else:
             relative, speed = (
-                self._relative(self.fine.lengths)[:, None] * size_bounds,
-                self._speed(size_bounds, driven, rows),
+                self._bound_transition_rounding(self.fine.lengths)[:, None] * size_bounds,
+                self._bound_speed(size_bounds, driven, rows),
             )
             end_rounding, inner_rounding = (
                 relative + delay * speed for delay in (self._backward_fine if rows else self.forward).lateness
@@ -579,7 +582,7 @@ class LiftedSystem:
 
         slack = self.slack_A.T if rows else self.slack_A
         end_slips, largest_slips = (
-            flow_slip.on(begin) + integral_slip.on(drives) for flow_slip, integral_slip in self._slips(rows)
+            flow_slip.on(begin) + integral_slip.on(drives) for flow_slip, integral_slip in self._bound_slips(rows)
         )
         largest_slips = np.minimum(finite(largest_slips), integral.on(product(size_bounds, slack.T)))
 
@@ -592,7 +595,7 @@ class LiftedSystem:
             size_bounds = size_bounds + propagated
         return np.asarray(propagated + residual_effect + inner_rounding + largest_slips), bounds, size_bounds
 
-    def _lost(self, peak: NormBounds, rows: bool, by_age: bool) -> tuple[NormBounds, float]:
+    def _bound_span_error(self, peak: NormBounds, rows: bool, by_age: bool) -> tuple[NormBounds, float]:
         """Return bounds of the error of a piece-by-piece computation on spans of many pieces, relative to the exact
         sizes; and a time, by which the forcing is multiplied for the error that it adds.
 
@@ -602,41 +605,43 @@ class LiftedSystem:
         its piece counts. This distance moves the value by its speed, and has an effect where an input jumps there
         (summation by parts of the errors of the durations).
         """
-        longest, count = np.maximum.reduceat(self.fine.lengths, self.spans), int(self._counts.max())
+        longest, count = np.maximum.reduceat(self.fine.lengths, self.spans), int(self._piece_counts.max())
         propagator = (self._backward_fine if rows else self.forward).propagator
         piece_delay, inner_delay = propagator.lateness
         if by_age:  # a row and a column go through one transition for every bit of the age
-            share = (self.fine.pieces.bit_length() + 4) * self._relative(self.fine.breakpoints[-1:])
+            share = (self.fine.pieces.bit_length() + 4) * self._bound_transition_rounding(self.fine.breakpoints[-1:])
             delay = 2.0 * propagator.drift + inner_delay
-        elif rows or self._block == 1:
-            share, delay = (count + 1) * self._relative(longest), count * piece_delay + inner_delay
+        elif rows or self._block_size == 1:
+            share, delay = (count + 1) * self._bound_transition_rounding(longest), count * piece_delay + inner_delay
         else:
-            share = propagator.products(count, self._block) * self._relative(self._block * longest)
+            share = propagator.products(count, self._block_size) * self._bound_transition_rounding(
+                self._block_size * longest
+            )
             delay = 2.0 * propagator.drift + inner_delay
         if rows:  # the ends of the spans are computed by transitions of their own
-            share = share + 2.0 * self._relative(self._durations)
+            share = share + 2.0 * self._bound_transition_rounding(self._span_durations)
             delay = delay + 2.0 * self._backward_spans.lateness[0]
         sizes = self.comparison.sizes.T if rows else self.comparison.sizes
         first_order = product(peak.matrices, share.max() * np.eye(sizes.shape[0]) + delay * sizes)
         is_small = (product(first_order, peak.matrices) <= 0.5 * peak.matrices).all()
         return NormBounds(np.where(is_small, 2.0 * first_order, np.inf), peak.which), 2.0 * delay
 
-    def _slips(self, rows: bool) -> tuple[tuple[NormBounds, NormBounds], tuple[NormBounds, NormBounds]]:
+    def _bound_slips(self, rows: bool) -> tuple[tuple[NormBounds, NormBounds], tuple[NormBounds, NormBounds]]:
         """Return the bounds `ComparisonSystem.slips` at the end of every span, and the largest on it; remembered."""
         if not rows:
-            return self._slipping
+            return self._slip_bounds
         # e^{(A + S) r} - e^{A r} is what it is from either side
-        at_end, largest = (tuple(norms.transposed for norms in pair) for pair in self._slipping)
+        at_end, largest = (tuple(norms.transposed for norms in pair) for pair in self._slip_bounds)
         return (at_end[0], at_end[1]), (largest[0], largest[1])
 
     @cached_property
-    def _slipping(self) -> tuple[tuple[NormBounds, NormBounds], tuple[NormBounds, NormBounds]]:
+    def _slip_bounds(self) -> tuple[tuple[NormBounds, NormBounds], tuple[NormBounds, NormBounds]]:
         # where nothing decays, slips grow with the time, so that the last is the largest
         majorant = ComparisonSystem(self.comparison.rising, self.comparison.sizes)
-        slack, lengths = self.slack_A, self._durations
+        slack, lengths = self.slack_A, self._span_durations
         return self.comparison.slips(slack, lengths), majorant.slips(slack, lengths)
 
-    def _relative(self, lengths: Array) -> Array:
+    def _bound_transition_rounding(self, lengths: Array) -> Array:
         """Return the relative error of transitions over such ``lengths (S,)``, and of a product with them."""
         if self.space.nu:
             relative, terms = flows_rounding(self.space, self.A, lengths), self.A.shape[1]
@@ -646,7 +651,7 @@ class LiftedSystem:
         terms = terms * int(np.bincount(self.space.products[2]).max()) + max(self.B.shape[2], self.W.shape[2])
         return np.asarray(relative + rounding(terms))
 
-    def _speed(self, reached: Array, driven: Array, rows: bool) -> Array:
+    def _bound_speed(self, reached: Array, driven: Array, rows: bool) -> Array:
         """Return an upper bound of the speed of a quantity of the sizes ``reached (r, S, q)`` under the forcing
         ``driven``."""
         return np.asarray(product(reached, self.comparison.sizes if rows else self.comparison.sizes.T) + driven)
@@ -680,7 +685,7 @@ class LiftedExponentials:
         return decoupled_transitions(lifted.decoupling, lifted.A[0], durations)
 
 
-def _applied(bounds: NormBounds, norms: Array) -> Array:
+def _apply_bounds(bounds: NormBounds, norms: Array) -> Array:
     """Return bounds by matrices ``(M q, M q)`` on block norms ``(r, L', M, q)``."""
     return bounds.on(norms.reshape(*norms.shape[:2], -1)).reshape(norms.shape)
 
@@ -688,7 +693,7 @@ def _applied(bounds: NormBounds, norms: Array) -> Array:
 def lift(phase: Phase, grid: TimeGrid, initial_state: Array, centre: Array, radius: Array) -> LiftedSystem:
     """Return the lifted system over a cell, in the coordinates of `decoupled`; raise `NotEnclosable` where there is
     none."""
-    space = _space(centre.size)
+    space = _choose_space(centre.size)
     A, slack_A, B, slack_B, W, slack_W = phase.taylor(space, centre, radius)
     basis = decoupled(A[0])
     size, transformed = np.abs(basis.inverse).astype(float), basis.matrix(A)
@@ -706,8 +711,8 @@ def lift(phase: Phase, grid: TimeGrid, initial_state: Array, centre: Array, radi
         inputs[1][0],
         basis,
         block_sizes(rounded + slack @ slack_A @ np.abs(basis.transform), basis.starts),
-        _row_sizes(inputs[0][1].sum(axis=0) + slack @ slack_B, basis.starts),
-        _row_sizes(inputs[1][1].sum(axis=0) + slack @ slack_W, basis.starts),
+        _compute_column_norms(inputs[0][1].sum(axis=0) + slack @ slack_B, basis.starts),
+        _compute_column_norms(inputs[1][1].sum(axis=0) + slack @ slack_W, basis.starts),
         block_norms(state[1][:, 0], basis.starts),
     )
 
@@ -729,7 +734,7 @@ def lift_legs(
     return tuple(lifted_phases)
 
 
-def _row_sizes(entries: Array, starts: np.ndarray) -> Array:
+def _compute_column_norms(entries: Array, starts: np.ndarray) -> Array:
     """Return the norms ``(q, m)`` of the blocks of columns ``(d, m)``."""
     return block_norms(entries.T, starts).T
 
@@ -740,9 +745,9 @@ def frozen(phase: Phase, grid: TimeGrid, initial_state: Array, parameter: Array)
     basis = identity(A.shape[1])
     none_A, none_B, none_W = (np.zeros((A.shape[1], matrix.shape[2])) for matrix in (A, B, W))
     return LiftedSystem(
-        _space(0), grid, initial_state, A, B, W, basis, none_A, none_B, none_W, slack_x=np.zeros(A.shape[1])
+        _choose_space(0), grid, initial_state, A, B, W, basis, none_A, none_B, none_W, slack_x=np.zeros(A.shape[1])
     )
 
 
-def _space(nu: int) -> TaylorSpace:
+def _choose_space(nu: int) -> TaylorSpace:
     return taylor_space(nu, DEGREES.get(nu, 2))

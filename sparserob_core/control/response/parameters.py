@@ -68,7 +68,7 @@ class ParameterIndex:
         not."""
         if self.set is None or self.set.is_box:
             return np.ones(lower.shape[0], dtype=bool)
-        H, h = self._halfspaces(self.set, (lower + upper) / 2)
+        H, h = self._enclose_by_halfspaces(self.set, (lower + upper) / 2)
         smallest = np.minimum(H * lower[:, None], H * upper[:, None]).sum(axis=2)
         return np.asarray((smallest <= h + TOUCHING * np.maximum(1.0, np.abs(h))).all(axis=1))
 
@@ -82,7 +82,7 @@ class ParameterIndex:
         towards = (
             centre[None] if flat or ball is not None else np.vstack([centre, *product(*zip(low, high, strict=True))])
         )
-        H, h = (side.reshape(-1, *side.shape[2:]) for side in self._halfspaces(self.set, towards))
+        H, h = (side.reshape(-1, *side.shape[2:]) for side in self._enclose_by_halfspaces(self.set, towards))
         slopes, slack = H * radius, h - H @ centre
         crossing = np.abs(slopes).sum(axis=1) > slack
         if not crossing.any() and (
@@ -98,7 +98,7 @@ class ParameterIndex:
         return Cuts(slopes[crossing], slack[crossing], ball, curvature)
 
     @staticmethod
-    def _halfspaces(convex_set: ConvexSet, points: Array) -> tuple[Array, Array]:
+    def _enclose_by_halfspaces(convex_set: ConvexSet, points: Array) -> tuple[Array, Array]:
         """Return half-spaces ``H p <= h`` that contain the set, ``(k, q, nu), (k, q)``: its own sides, or a tangent one
         on the ray to each of ``points``."""
         flat = convex_set.halfspaces()

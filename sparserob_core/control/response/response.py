@@ -195,10 +195,10 @@ def merge_grids(
     if delay > 0.0:
         begin, horizon = control + delay, float(control[-1])
         later = np.concatenate([[0.0], begin[begin < horizon - SAME_TIME * horizon], [horizon]])
-        control = _joined(control, later)
-    points = _joined(control, disturbance)
+        control = _merge_breakpoints(control, later)
+    points = _merge_breakpoints(control, disturbance)
     if switches:
-        points = _joined(points, np.array(switches))
+        points = _merge_breakpoints(points, np.array(switches))
     middles = (points[:-1] + points[1:]) / 2
     control_piece, disturbance_piece = np.searchsorted(begin, middles) - 1, np.searchsorted(disturbance, middles) - 1
     mode = np.searchsorted(switches, middles) if switches else np.arange(middles.size) if varying else None
@@ -207,7 +207,7 @@ def merge_grids(
     )
 
 
-def _joined(points: Array, others: Array) -> Array:
+def _merge_breakpoints(points: Array, others: Array) -> Array:
     """Return the union of two sets of breakpoints. Breakpoints of the second set that differ from one of the first by
     rounding only are left out."""
     after = np.clip(np.searchsorted(points, others), 1, points.size - 1)
@@ -448,20 +448,20 @@ class Propagator:
         # no parameters: any number of rows has the same bytes
         key = bytes(str(parameters.shape), "ascii") + parameters.tobytes()
         if key not in self._steps and self.system.varies:
-            remember(self._steps, key, self._varying_steps(parameters), STEPS_KEPT)
+            remember(self._steps, key, self._compute_varying_steps(parameters), STEPS_KEPT)
         if key not in self._steps:
             by_mode = [mode.matrices(parameters) for mode in self.system.modes]
             A, B, E = (
                 np.stack([matrices[0] for matrices in by_mode], axis=1),
                 *(np.concatenate([matrices[index] for matrices in by_mode], axis=2) for index in (1, 2)),
             )
-            Phi, Gamma = self._transitions(A, self._modes, self.lengths)
+            Phi, Gamma = self._compute_transitions(A, self._modes, self.lengths)
             remember(self._steps, key, Steps(A, B, E, Phi, Gamma, self._modes), STEPS_KEPT)
         return self._steps[key]
 
-    def _transitions(self, A: Array, modes: np.ndarray, durations: Array) -> tuple[Array, Array]:
+    def _compute_transitions(self, A: Array, modes: np.ndarray, durations: Array) -> tuple[Array, Array]:
         """Return ``e^{A r}`` and its integral, ``(v, q, d, d)`` each, of ``modes (q,)`` over ``durations (q,)``."""
-        if self._depends:
+        if self._has_dependence:
             return transitions(A[:, modes], durations[None])
         flows = np.empty((2, 1, durations.size, *A.shape[2:]))
         for mode in np.unique(modes):
@@ -470,7 +470,7 @@ class Propagator:
         return flows[0], flows[1]
 
     @cached_property
-    def _depends(self) -> bool:
+    def _has_dependence(self) -> bool:
         """True where the system depends on parameters, or changes with time."""
         return self.system.varies or self.system.parameters is not None
 
@@ -484,7 +484,7 @@ class Propagator:
             self._exponentials[mode] = Leaps(self.system.modes[mode].matrices(np.zeros((1, 0)))[0][0])
         return self._exponentials[mode]
 
-    def _varying_weights(self, times: Array, directions: Array, parameters: Array) -> Weights:
+    def _compute_varying_weights(self, times: Array, directions: Array, parameters: Array) -> Weights:
         """Return the weights of functionals (`weights`) for a system that changes with time, without an input matrix
         for every index."""
         unique, indices = unique_rows(parameters)
@@ -505,7 +505,7 @@ class Propagator:
         weights = np.zeros((times.size, self.grid.pieces, input_response.shape[2]))
         weights[np.arange(times.size), at] = (rows[:, None] @ input_response)[:, 0]
         rows = (rows[:, None] @ state)[:, 0]
-        self._by_recursion(steps.pushed, indices[order], at, rows, weights)
+        self._propagate_by_recursion(steps.pushed, indices[order], at, rows, weights)
         inverse_order = np.empty_like(order)
         inverse_order[order] = np.arange(order.size)
         channels = self.system.controls
@@ -520,7 +520,7 @@ class Propagator:
         """
         breaks = self.grid.breakpoints
         for expansion in self.law.expansions if self.system.varies else ():
-            breaks = np.union1d(_joined(breaks, expansion.ends[1:-1]), expansion.ends[list(expansion.turns)])
+            breaks = np.union1d(_merge_breakpoints(breaks, expansion.ends[1:-1]), expansion.ends[list(expansion.turns)])
         return breaks
 
     @cached_property
@@ -536,7 +536,7 @@ class Propagator:
         0 for another system."""
         return max((expansion.slack for expansion in self.law.expansions), default=0.0) if self.system.varies else 0.0
 
-    def _varying_steps(self, parameters: Array) -> Steps:
+    def _compute_varying_steps(self, parameters: Array) -> Steps:
         """Return the `Steps` of a system that changes with time, whose pieces are modes. ``Gamma`` is the length of a
         piece. ``B`` and ``E`` of a mode are the response of the state to an input on the piece, divided by its
         length."""
@@ -550,7 +550,9 @@ class Propagator:
         B, E = (np.ascontiguousarray(columns).reshape(count, d, -1) for columns in (rates[..., :m], rates[..., m:]))
         return Steps(A, B, E, state, Gamma, self._modes)
 
-    def _varying_adjoint(self, times: Array, directions: Array, parameters: Array) -> tuple[Array, Array, Array, Array]:
+    def _compute_varying_adjoint(
+        self, times: Array, directions: Array, parameters: Array
+    ) -> tuple[Array, Array, Array, Array]:
         """Return the functionals (`adjoint`) for a system that changes with time. The part of a piece before a time has
         its own ``B`` and ``E``."""
         unique, indices = unique_rows(parameters)
@@ -587,12 +589,12 @@ class Propagator:
         parameters; matrices of several modes are side by side (`TimeGrid.through`).
         """
         if self.system.varies:
-            return self._varying_adjoint(times, directions, parameters)
+            return self._compute_varying_adjoint(times, directions, parameters)
         if self.aged(parameters.shape[1]):
-            free, (gains,) = self._by_age(times, directions, self._every_state)
+            free, (gains,) = self._compute_weights_by_age(times, directions, self._state_impulses)
             indices, steps = np.zeros(times.size, dtype=int), self.steps(np.zeros((1, 0)))
         else:
-            free, gains, steps, indices = self._piece_by_piece(times, directions, parameters, drives=True)
+            free, gains, steps, indices = self._compute_weights_by_piece(times, directions, parameters, drives=True)
         return free, gains, steps.B[indices], steps.E[indices]
 
     @shaped
@@ -602,16 +604,16 @@ class Propagator:
         """Return the functional ``c'x(t)`` of each index as weights on the initial state and on inputs: `adjoint` and
         `TimeGrid.through`, without ``(k, L, d)`` numbers."""
         if self.system.varies:
-            return self._varying_weights(times, directions, parameters)
+            return self._compute_varying_weights(times, directions, parameters)
         if self.aged(parameters.shape[1]):
             channels = self.steps(np.zeros((1, 0))).B.shape[2]
-            free, (control, disturbance) = self._by_age(times, directions, self.inputs, channels)
+            free, (control, disturbance) = self._compute_weights_by_age(times, directions, self.inputs, channels)
             return Weights(free, control, disturbance)
-        free, input_weights, steps, _ = self._piece_by_piece(times, directions, parameters, drives=False)
+        free, input_weights, steps, _ = self._compute_weights_by_piece(times, directions, parameters, drives=False)
         channels = steps.B.shape[2] // steps.A.shape[1]
         return Weights(free, input_weights[..., :channels], input_weights[..., channels:])
 
-    def _piece_by_piece(
+    def _compute_weights_by_piece(
         self, times: Array, directions: Array, parameters: Array, drives: bool
     ) -> tuple[Array, Array, Steps, np.ndarray]:
         """Return the weights of functionals on the initial state, ``(k, d)``, and on every input on every piece, ``(k,
@@ -621,20 +623,20 @@ class Propagator:
         steps, pieces = self.steps(unique), self.grid.locate(times)
         order = np.argsort(-pieces, kind="stable")
         at, within = pieces[order], np.clip(times - self.grid.breakpoints[pieces], 0.0, None)[order]
-        rows, last_weights = self._inside(steps, indices[order], at, directions[order], within)
+        rows, last_weights = self._propagate_within_pieces(steps, indices[order], at, directions[order], within)
         if not drives:
             last_weights = (last_weights[:, None] @ steps.inputs[indices[order], self.grid.modes[at]])[:, 0]
         weights = np.zeros((times.size, self.grid.pieces, last_weights.shape[1]))
         weights[np.arange(times.size), at] = last_weights
-        if drives or self._depends:
-            self._by_recursion(steps.driven if drives else steps.pushed, indices[order], at, rows, weights)
+        if drives or self._has_dependence:
+            self._propagate_by_recursion(steps.driven if drives else steps.pushed, indices[order], at, rows, weights)
         else:
             self._stretches.on(at, rows, weights)
         inverse_order = np.empty_like(order)
         inverse_order[order] = np.arange(order.size)
         return rows[inverse_order], weights[inverse_order], steps, indices
 
-    def _by_recursion(self, over: Array, mine: np.ndarray, at: np.ndarray, rows: Array, found: Array) -> None:
+    def _propagate_by_recursion(self, over: Array, mine: np.ndarray, at: np.ndarray, rows: Array, found: Array) -> None:
         """Propagate ``rows (k, d)`` from the beginnings of the pieces ``at (k,)``, in decreasing order, back to time 0,
         piece by piece. ``over (v, q, d, w + d)`` are the matrices, ``mine (k,)`` the index of each row's parameters.
         The weights on the pieces between are written to ``found (k, L, w)``, the rows at time 0 to ``rows``."""
@@ -656,13 +658,13 @@ class Propagator:
         steps = self.steps(np.zeros((1, 0)))
         return Stretches.of(self.which, steps.Gamma[0] @ steps.inputs[0, self._modes], steps.Phi[0])
 
-    def _inside(
+    def _propagate_within_pieces(
         self, steps: Steps, which: np.ndarray, pieces: np.ndarray, rows: Array, within: Array
     ) -> tuple[Array, Array]:
         """Return ``c'e^{A r}`` and ``c'Gamma(r)``, ``(k, d)`` each, of ``rows (k, d)`` over parts ``within (k,)`` of
         their pieces. No matrix is made for a time where no parameter is uncertain."""
         modes = self.grid.modes[pieces]
-        if not self._depends:
+        if not self._has_dependence:
             products = np.empty((2, *rows.shape))
             for mode in np.unique(modes):
                 is_mode = modes == mode
@@ -682,18 +684,20 @@ class Propagator:
         """Return whether the weights on a piece depend only on its age, with so many ``parameters``."""
         return not parameters and self.uniform
 
-    def _by_age(self, times: Array, directions: Array, impulses: Impulses, *ends: int) -> tuple[Array, list[Array]]:
+    def _compute_weights_by_age(
+        self, times: Array, directions: Array, impulses: Impulses, *ends: int
+    ) -> tuple[Array, list[Array]]:
         """Return the weights of functionals on the initial state, ``(k, d)``, and on the columns of ``impulses`` on
         every piece. The columns are divided at ``ends`` into parts, ``(k, L, c)`` each."""
         pieces, steps = self.grid.locate(times), self.steps(np.zeros((1, 0)))
-        rows, integrated = self._over_parts(steps, directions, times - self.grid.breakpoints[pieces])
+        rows, integrated = self._propagate_within_equal_pieces(steps, directions, times - self.grid.breakpoints[pieces])
         count = int(pieces.max(initial=0))
         all_rows, signs = np.arange(times.size), np.ones(times.size)
         distinct, indices = rows, all_rows
         if times.size > 1 and rows.shape[1] > FEW_STATES:
             # later times are shifts of one impulse response, and an opposite row has the opposite one
             signs = np.where(rows[all_rows, np.abs(rows).argmax(axis=1)] < 0.0, -1.0, 1.0)
-            distinct, indices = _apart(rows * signs[:, None])
+            distinct, indices = _find_distinct_rows(rows * signs[:, None])
         by_age, last_weights = impulses.of(distinct, count), integrated @ impulses.columns
         limits = [0, *ends, last_weights.shape[1]]
         slices = [slice(*pair) for pair in pairwise(limits)]
@@ -707,7 +711,7 @@ class Propagator:
                     np.multiply(backwards[:, columns], sign, out=gains[number, :piece])
         for gains, columns in zip(weights, slices, strict=True):
             gains[all_rows, pieces] = last_weights[:, columns]
-        return self._leapt(rows, pieces), weights
+        return self._propagate_whole_pieces(rows, pieces), weights
 
     @cached_property
     def inputs(self) -> Impulses:
@@ -715,7 +719,7 @@ class Propagator:
         steps = self.steps(np.zeros((1, 0)))
         return Impulses(self, np.concatenate([steps.B[0], steps.E[0]], axis=1))
 
-    def _over_parts(self, steps: Steps, rows: Array, within: Array) -> tuple[Array, Array]:
+    def _propagate_within_equal_pieces(self, steps: Steps, rows: Array, within: Array) -> tuple[Array, Array]:
         """Return ``c'e^{A r}`` and ``c'Gamma(r)`` of ``rows (k, d)`` over parts ``within (k,)`` of equal pieces of a
         known system, ``(k, d)`` each."""
         length, tolerance = float(self.lengths[0]), STEP * float(self.grid.breakpoints[-1])
@@ -734,14 +738,14 @@ class Propagator:
         of equal pieces are computed together first, whole pieces after."""
         (k, r), d = (times.size, directions.shape[0]), directions.shape[1]
         if not self.aged(parameter.size):
-            exponentials = Leaps(self.steps(parameter[None]).A[0, 0]) if self._depends else self.own()
+            exponentials = Leaps(self.steps(parameter[None]).A[0, 0]) if self._has_dependence else self.own()
             return exponentials.orbits(directions, times)[0]
         pieces = self.grid.locate(times)
         within, indices = self.grid.distinct(np.maximum(times - self.grid.breakpoints[pieces], 0.0))
         rows = self.own().orbits(directions, within)[0][indices].reshape(-1, d)
-        return self._leapt(rows, np.repeat(pieces, r)).reshape(k, r, d)
+        return self._propagate_whole_pieces(rows, np.repeat(pieces, r)).reshape(k, r, d)
 
-    def _leapt(self, rows: Array, pieces: np.ndarray) -> Array:
+    def _propagate_whole_pieces(self, rows: Array, pieces: np.ndarray) -> Array:
         """Return ``rows (k, d)`` propagated over ``pieces (k,)`` whole pieces, ``(k, d)``."""
         free, common_pieces = rows.copy(), int(pieces[0]) if pieces.size and (pieces == pieces[0]).all() else None
         for level, leap in enumerate(self.leaps[: int(pieces.max(initial=0)).bit_length()]):
@@ -808,18 +812,18 @@ class Propagator:
         if self.system.parameters is None and steps.A.shape[:2] == (1, 1):
             return [leap.T[None] for leap in self.leaps[:count]]
         durations = 2.0 ** np.arange(count) * self.lengths[0]
-        flows = self._transitions(steps.A, np.zeros(count, dtype=int), durations)[0]
+        flows = self._compute_transitions(steps.A, np.zeros(count, dtype=int), durations)[0]
         return [np.swapaxes(flows[:, level], 1, 2) for level in range(count)]
 
     @cached_property
-    def _every_state(self) -> Impulses:
+    def _state_impulses(self) -> Impulses:
         return Impulses(self, np.eye(self.system.states))
 
     @cached_property
     def kernel(self) -> Array:
         """Table ``e^{A i h} Gamma(h)`` for ``i = 0, ..., L - 1``, ``(d, L, d)``, of the impulse response in every
         direction of the state; for a known system and equal pieces."""
-        return self._every_state.of(np.eye(self.system.states), self.grid.pieces)
+        return self._state_impulses.of(np.eye(self.system.states), self.grid.pieces)
 
     @cached_property
     def lateness(self) -> tuple[float, float]:
@@ -858,7 +862,7 @@ class Outputs:
         return pieces, np.bincount(indices, elapsed) / np.bincount(indices), indices
 
     @cached_property
-    def _kinds(self) -> tuple[np.ndarray, Array, np.ndarray]:
+    def _modes_and_durations(self) -> tuple[np.ndarray, Array, np.ndarray]:
         """Distinct modes and durations, ``(q,)`` each, and the index of every time among them, ``(T,)``. For a single
         mode the durations are those of `within`."""
         pieces, durations, duration_indices = self.within
@@ -869,7 +873,7 @@ class Outputs:
     @cached_property
     def _steps(self) -> tuple[Array, Array]:
         """Products ``H e^{A r}`` and ``H Gamma(r)`` for the distinct modes and durations: ``(v, q, r, d)`` each."""
-        steps, (modes, durations, _) = self.propagator.steps(self.points), self._kinds
+        steps, (modes, durations, _) = self.propagator.steps(self.points), self._modes_and_durations
         if steps.A.shape[0] > 1:
             flow, integral = transitions(steps.A[:, modes], durations[None])
             return self.H @ flow, self.H @ integral
@@ -881,7 +885,7 @@ class Outputs:
         return products[0], products[1]
 
     @cached_property
-    def _over_pieces(self) -> tuple[Array, Array] | None:
+    def _varying_responses(self) -> tuple[Array, Array] | None:
         """Response of the rows at every time to the state at the beginning of its piece, ``(v, T, r, d)``, and to the
         inputs on the piece, ``(v, T, r, m)``; for a system that changes with time, otherwise ``None``."""
         if not self.propagator.system.varies:
@@ -897,33 +901,33 @@ class Outputs:
         pieces."""
         steps, grid = self.propagator.steps(self.points), self.propagator.grid
         if self.propagator.aged(self.points.shape[1]) and self.propagator.block(steps) > 1:
-            return self._in_blocks(response.initial_state, grid.inputs(control))[None]
-        if self._over_pieces is not None:
-            flow, forced = self._over_pieces
+            return self._propagate_in_blocks(response.initial_state, grid.inputs(control))[None]
+        if self._varying_responses is not None:
+            flow, forced = self._varying_responses
             nodes, inputs = response.nodes(control, self.points), grid.inputs(control).T
             pieces = self.within[0]
             forced_outputs = np.einsum("vtrm,tm->vrt", forced, inputs[pieces])
             return np.asarray(np.einsum("vtri,vti->vrt", flow, nodes[:, pieces]) + forced_outputs)
         nodes, drive = response.nodes(control, self.points), grid.driven(steps.B, grid.inputs(control))
-        pieces, indices = self.within[0], self._kinds[2]
+        pieces, indices = self.within[0], self._modes_and_durations[2]
         flow, forced = (table[:, indices] for table in self._steps)
         outputs = np.einsum("vtri,vti->vrt", flow, nodes[:, pieces]) + np.einsum(
             "vtri,vti->vrt", forced, drive[:, pieces]
         )
         return np.asarray(outputs)
 
-    def _in_blocks(self, initial_state: Array, inputs: Array) -> Array:
+    def _propagate_in_blocks(self, initial_state: Array, inputs: Array) -> Array:
         """Return the outputs ``(r, T)`` from an initial state and inputs ``(m, L)``, block by block."""
-        block, first, count = self._blocks
-        state_response, input_response = self._tables
+        block, first, count = self._block_layout
+        state_response, input_response = self._output_responses
         pieces, durations, indices = self.within
         m, d = inputs.shape[0], initial_state.size
         padded = np.zeros(((first + count) * block, m))
         kept = min(padded.shape[0], inputs.shape[1])
         padded[:kept] = inputs[:, :kept].T
         by_block = padded.reshape(first + count, block * m)
-        block_states, forced_states = np.empty((first + count, d)), by_block @ self._pushed
-        block_states[0], transition = initial_state, self._over_block
+        block_states, forced_states = np.empty((first + count, d)), by_block @ self._block_input_response
+        block_states[0], transition = initial_state, self._block_transition
         for number in range(1, first + count):
             block_states[number] = transition @ block_states[number - 1] + forced_states[number - 1]
         outputs = block_states[first:] @ state_response + by_block[first:] @ input_response
@@ -931,7 +935,7 @@ class Outputs:
         return np.asarray(by_piece[pieces - first * block, indices].T)
 
     @cached_property
-    def _blocks(self) -> tuple[int, int, int]:
+    def _block_layout(self) -> tuple[int, int, int]:
         """Number of pieces of a block, the first block that contains a time, and the number of blocks from it to the
         last one that does."""
         steps, pieces = self.propagator.steps(self.points), self.within[0]
@@ -940,23 +944,23 @@ class Outputs:
         return block, first, int(pieces.max()) // block + 1 - first
 
     @cached_property
-    def _over_block(self) -> Array:
+    def _block_transition(self) -> Array:
         """Transition over a block, ``(d, d)``."""
-        steps, block = self.propagator.steps(self.points), self._blocks[0]
+        steps, block = self.propagator.steps(self.points), self._block_layout[0]
         return np.asarray(transitions(steps.A[0, 0], block * self.propagator.lengths[:1])[0][0])
 
     @cached_property
-    def _pushed(self) -> Array:
+    def _block_input_response(self) -> Array:
         """Response of the state at the end of a block to the inputs of the block, ``(block m, d)``."""
-        block, m = self._blocks[0], self.propagator.steps(self.points).B.shape[2]
+        block, m = self._block_layout[0], self.propagator.steps(self.points).B.shape[2]
         responses = self.propagator.inputs.of(np.eye(self.H.shape[1]), block)  # (d, block, m + mw)
         return np.ascontiguousarray(responses[:, ::-1, :m].reshape(responses.shape[0], -1).T)
 
     @cached_property
-    def _tables(self) -> tuple[Array, Array]:
+    def _output_responses(self) -> tuple[Array, Array]:
         """Response of ``H x`` on the pieces of a block, for all distinct durations, to the state at its beginning,
         ``(d, block q r)``, and to the inputs in it, ``(block m, block q r)``."""
-        steps, block = self.propagator.steps(self.points), self._blocks[0]
+        steps, block = self.propagator.steps(self.points), self._block_layout[0]
         flow, integral = (table[0].reshape(-1, self.H.shape[1]) for table in self._steps)  # (q r, d)
         m, rows = steps.B.shape[2], flow.shape[0]
         state_response = np.empty((block, rows, self.H.shape[1]))
@@ -1090,7 +1094,7 @@ class Response:
             path[:, 1:] = drive @ steps.Gamma[:, 0].swapaxes(1, 2)
             block = self.propagator.block(steps)
             if block > 1:
-                return self._in_blocks(path, steps, block)
+                return self._propagate_in_blocks(path, steps, block)
         else:
             for piece, length in enumerate(lengths):
                 path[:, piece + 1] = moved(steps.Gamma[:, length], drive[:, piece])
@@ -1107,15 +1111,15 @@ class Response:
         """Return the `states` without a disturbance, remembered for the last control, since all constraints ask for
         them."""
         key = control.tobytes() + parameters.tobytes()
-        if key not in self._nodes:
-            remember(self._nodes, key, self.states(control, parameters), 1)
-        return self._nodes[key]
+        if key not in self._node_cache:
+            remember(self._node_cache, key, self.states(control, parameters), 1)
+        return self._node_cache[key]
 
     @cached_property
-    def _nodes(self) -> dict[bytes, Array]:
+    def _node_cache(self) -> dict[bytes, Array]:
         return {}
 
-    def _in_blocks(self, path: Array, steps: Steps, block: int) -> Array:
+    def _propagate_in_blocks(self, path: Array, steps: Steps, block: int) -> Array:
         """Solve ``x_{k+1} = Phi x_k + f_k`` in blocks, from a ``path (v, L+1, d)`` that holds ``x_0, f_0, f_1, ...``;
         return the path of the states.
 
@@ -1134,7 +1138,9 @@ class Response:
             inside = path[:, processed + 1 : processed + count * size + 1].reshape(v, count, size, d)
             for level in range(levels):
                 step = 2**level
-                inside[:, :, 2 * step - 1 :: 2 * step] += _moved(inside[:, :, step - 1 :: 2 * step], leaps[level])
+                inside[:, :, 2 * step - 1 :: 2 * step] += _apply_transition(
+                    inside[:, :, step - 1 :: 2 * step], leaps[level]
+                )
             starts = np.empty((v, count, 1, d))
             starts[:, 0, 0] = path[:, processed]
             for number in range(count):
@@ -1144,12 +1150,12 @@ class Response:
             for level in range(levels - 1, -1, -1):
                 step = 2**level
                 before = np.concatenate([starts, inside[:, :, 2 * step - 1 :: 2 * step][:, :, :-1]], axis=2)
-                inside[:, :, step - 1 :: 2 * step] += _moved(before, leaps[level])
+                inside[:, :, step - 1 :: 2 * step] += _apply_transition(before, leaps[level])
             processed += count * size
         return path
 
 
-def _moved(states: Array, leap: Array) -> Array:
+def _apply_transition(states: Array, leap: Array) -> Array:
     """Return ``(v, count, k, d)`` states, as rows, times the transposed transitions ``(v, d, d)``."""
     return np.asarray(states.reshape(states.shape[0], -1, states.shape[3]) @ leap).reshape(states.shape)
 
@@ -1162,12 +1168,12 @@ def unique_rows(rows: Float[Array, "k n"]) -> tuple[Float[Array, "u n"], Int[np.
     """
     if rows.shape[1] == 0 or rows.shape[0] == 1:
         return rows[:1], np.zeros(rows.shape[0], dtype=int)
-    distinct, row_index = _apart(rows)
+    distinct, row_index = _find_distinct_rows(rows)
     unique, indices = np.unique(distinct, axis=0, return_inverse=True)
     return unique, indices.reshape(-1)[row_index]
 
 
-def _apart(rows: Array) -> tuple[Array, np.ndarray]:
+def _find_distinct_rows(rows: Array) -> tuple[Array, np.ndarray]:
     """Return the distinct rows in the order of their first occurrence, and the index of every row among them."""
     index_of: dict[bytes, int] = {}
     # of zeros one

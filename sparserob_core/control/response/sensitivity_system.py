@@ -37,16 +37,16 @@ def tangent(response: Response) -> Response:
     system, blocks = response.system, 1 + response.system.parameter_count
     if blocks == 1 or system.varies:
         return response
-    larger = System(tuple(_larger(phase) for phase in system.phases), system.parameters)
+    larger = System(tuple(_augment_phase(phase) for phase in system.phases), system.parameters)
     return Response(
         larger, response.grid, np.concatenate([response.initial_state, np.zeros((blocks - 1) * system.states)])
     )
 
 
-def _larger(phase: Phase) -> Phase:
+def _augment_phase(phase: Phase) -> Phase:
     at = Derivatives(phase)
     return Phase(
-        lambda p: _acting_on_rows(at(p)[0]),
+        lambda p: _build_row_matrix(at(p)[0]),
         lambda p: np.concatenate(at(p)[1]),
         lambda p: np.concatenate(at(p)[2]),
         phase.domain,
@@ -66,30 +66,32 @@ class Derivatives:
     """
 
     phase: Phase
-    _known: dict[bytes, tuple[Array, Array, Array]] = field(default_factory=dict, repr=False)
+    _derivative_cache: dict[bytes, tuple[Array, Array, Array]] = field(default_factory=dict, repr=False)
 
     def __call__(self, parameter: Array) -> tuple[Array, Array, Array]:
         """Return ``A (1 + nu, d, d)``, ``B (1 + nu, d, m)``, ``E (1 + nu, d, mw)`` at ``parameter (nu,)``: values, then
         derivatives."""
         key = np.asarray(parameter, dtype=float).tobytes()
-        if key not in self._known:
-            remember(self._known, key, self._at(np.asarray(parameter, dtype=float)), POINTS_KEPT)
-        return self._known[key]
+        if key not in self._derivative_cache:
+            remember(
+                self._derivative_cache, key, self._compute_derivatives(np.asarray(parameter, dtype=float)), POINTS_KEPT
+            )
+        return self._derivative_cache[key]
 
     @cached_property
     def _box(self) -> Box:
         return ParameterIndex(self.phase.domain).box
 
-    def _at(self, parameter: Array) -> tuple[Array, Array, Array]:
+    def _compute_derivatives(self, parameter: Array) -> tuple[Array, Array, Array]:
         values = self.phase.matrices(parameter[None])
         try:
-            slopes = self._enclosed(parameter)
+            slopes = self._differentiate_by_taylor(parameter)
         except NotEnclosable:
-            slopes = self._differenced(parameter)
+            slopes = self._differentiate_by_differences(parameter)
         A, B, E = (np.concatenate([value, slope]) for value, slope in zip(values, slopes, strict=True))
         return A, B, E
 
-    def _enclosed(self, parameter: Array) -> tuple[Array, Array, Array]:
+    def _differentiate_by_taylor(self, parameter: Array) -> tuple[Array, Array, Array]:
         box = self._box
         width = box.upper - box.lower
         radius = CELL * np.where(width > 0, width, 1.0 + np.abs(parameter))
@@ -99,7 +101,7 @@ class Derivatives:
         A, B, E = (coefficients[index][linear] / radius[:, None, None] for index in (0, 2, 4))
         return A, B, E
 
-    def _differenced(self, parameter: Array) -> tuple[Array, Array, Array]:
+    def _differentiate_by_differences(self, parameter: Array) -> tuple[Array, Array, Array]:
         box = self._box
         shapes = [matrix.shape[1:] for matrix in self.phase.matrices(parameter[None])]
 
@@ -112,7 +114,7 @@ class Derivatives:
         return A, B, E
 
 
-def _acting_on_rows(A: Array) -> Array:
+def _build_row_matrix(A: Array) -> Array:
     """Return the matrix ``((1 + nu) d, (1 + nu) d)`` by which rows ``(r, r_1, ..., r_nu)`` are multiplied, from ``A``
     and its derivatives, ``(1 + nu, d, d)``."""
     blocks, d = A.shape[:2]

@@ -79,7 +79,7 @@ class Ellipsoid(ConvexSet):
             raise InputError(
                 f"shape must be a square matrix of finite numbers, got shape {shape.shape}", path="ellipsoid"
             )
-        if (fault := _indefinite(shape)) is not None:
+        if (fault := _describe_indefiniteness(shape)) is not None:
             raise InputError(f"shape must be symmetric positive definite, got {fault}", path="ellipsoid")
         object.__setattr__(self, "centre", finite("ellipsoid.centre", self.centre, shape.shape[0]))
         object.__setattr__(self, "shape", (shape + shape.T) / 2)
@@ -114,7 +114,7 @@ class Ellipsoid(ConvexSet):
 
     @shaped
     def continued(self, centre: Float[Array, "k d"], spread: Float[Array, "k d"]) -> Float[Array, " k"] | None:
-        root = _continued_root(centre @ self.factor, spread @ np.abs(self.factor), 2.0)
+        root = _bound_complex_root(centre @ self.factor, spread @ np.abs(self.factor), 2.0)
         return np.asarray((np.abs(centre) + spread) @ np.abs(self.centre) + root)
 
     @shaped
@@ -126,7 +126,7 @@ class Ellipsoid(ConvexSet):
 
     @shaped
     def linearisation_excess(self, centre: Float[Array, "*k d"], spread: Float[Array, "*k J d"]) -> Float[Array, " *k"]:
-        return _round_excess(
+        return _bound_length_excess(
             np.asarray(centre, dtype=float) @ self.factor, np.asarray(spread, dtype=float) @ self.factor
         )
 
@@ -178,14 +178,14 @@ class Ellipsoid(ConvexSet):
 
     @shaped
     def gauge(self, points: Float[Array, "*k d"]) -> Float[Array, " *k"]:
-        return np.asarray(np.linalg.norm(self._solved(self.factor, points), axis=-1))
+        return np.asarray(np.linalg.norm(self._solve_from_centre(self.factor, points), axis=-1))
 
     @shaped
     def normal(self, points: Float[Array, "*k d"]) -> Float[Array, "*k d"]:
-        return self._solved(self.shape, points)
+        return self._solve_from_centre(self.shape, points)
 
     @shaped
-    def _solved(self, matrix: Float[Array, "d d"], points: Float[Array, "*k d"]) -> Float[Array, "*k d"]:
+    def _solve_from_centre(self, matrix: Float[Array, "d d"], points: Float[Array, "*k d"]) -> Float[Array, "*k d"]:
         """Return the solutions ``(..., d)`` of ``matrix y = point - centre``."""
         rays = np.asarray(points, dtype=float) - self.centre
         return np.asarray(np.linalg.solve(matrix, rays.reshape(-1, self.dimension).T).T.reshape(rays.shape))
@@ -221,7 +221,7 @@ class Ellipsoid(ConvexSet):
         array (count, d)
             The points.
         """
-        return np.asarray(self.centre + _in_ball(2.0, self.dimension, count, rng) @ self.factor.T)
+        return np.asarray(self.centre + _sample_ball(2.0, self.dimension, count, rng) @ self.factor.T)
 
     @shaped
     def interior_point(self) -> Float[Array, " d"]:
@@ -298,7 +298,7 @@ class NormBall(ConvexSet):
     @shaped
     def support(self, directions: Float[Array, "*k d"]) -> Float[Array, " *k"]:
         directions = np.asarray(directions, dtype=float)
-        height: Array = directions @ self.centre + self.radius * _norm(directions, self.dual)
+        height: Array = directions @ self.centre + self.radius * _compute_norms(directions, self.dual)
         return height
 
     @shaped
@@ -308,7 +308,7 @@ class NormBall(ConvexSet):
         if self.p == 1.0:
             axes = self.radius * np.eye(self.dimension)
             return continued_by_corners(self.centre + np.vstack([axes, -axes]), centre, spread)
-        root = self.radius * _continued_root(centre, spread, self.dual) if self.radius > 0.0 else 0.0  # a point
+        root = self.radius * _bound_complex_root(centre, spread, self.dual) if self.radius > 0.0 else 0.0  # a point
         return np.asarray((np.abs(centre) + spread) @ np.abs(self.centre) + root)
 
     @shaped
@@ -339,11 +339,11 @@ class NormBall(ConvexSet):
                 np.asarray(centre), np.asarray(spread)
             )
         if self.p != 2.0:
-            smooth = self.radius * _power_excess(
+            smooth = self.radius * _bound_power_excess(
                 np.asarray(centre, dtype=float), np.abs(spread).sum(axis=-2), self.dual
             )
             return np.minimum(super().linearisation_excess(centre, spread), smooth)
-        return self.radius * _round_excess(np.asarray(centre, dtype=float), np.asarray(spread, dtype=float))
+        return self.radius * _bound_length_excess(np.asarray(centre, dtype=float), np.asarray(spread, dtype=float))
 
     @shaped
     def support_majorant(
@@ -385,7 +385,7 @@ class NormBall(ConvexSet):
         if self.halfspaces() is not None:
             return super().violation(points)
         z = np.abs(np.asarray(points, dtype=float) - self.centre)
-        excess = np.asarray(_norm(z, self.p) - self.radius)
+        excess = np.asarray(_compute_norms(z, self.p) - self.radius)
         if self.p == 2.0:
             return excess
         if self.radius == 0.0:
@@ -393,7 +393,7 @@ class NormBall(ConvexSet):
         signed, outside = np.array(excess / self.dimension ** max(0.0, 1.0 / self.p - 0.5)), excess > 0.0
         if outside.any():
             z = z[outside] / self.radius
-            signed[outside] = self.radius * np.linalg.norm(z - self._projected(z), axis=-1)
+            signed[outside] = self.radius * np.linalg.norm(z - self._project_onto_unit_ball(z), axis=-1)
         return signed
 
     @shaped
@@ -421,14 +421,14 @@ class NormBall(ConvexSet):
         if self.halfspaces() is not None:
             return super().contains(points, tolerance)
         rays = np.asarray(points, dtype=float) - self.centre
-        excess = np.atleast_1d(_norm(rays, self.p) - self.radius)
+        excess = np.atleast_1d(_compute_norms(rays, self.p) - self.radius)
         to_p_norm, to_euclidean = (self.dimension ** max(0.0, sign * (1.0 / self.p - 0.5)) for sign in (1.0, -1.0))
         inside = excess <= to_p_norm * tolerance
         undecided = inside & (excess > 0.0) & (to_euclidean * excess > tolerance)
         inside[undecided] = self.violation(self.centre + rays.reshape(*excess.shape, -1)[undecided]) <= tolerance
         return np.asarray(inside.reshape(rays.shape[:-1]))
 
-    def _projected(self, z: Array) -> Array:
+    def _project_onto_unit_ball(self, z: Array) -> Array:
         """Return the Euclidean projections of ``z >= 0`` onto the unit ball.
 
         A projection ``y`` satisfies ``y_i + multiplier y_i^(p-1) = z_i`` with the multiplier for which its norm is 1.
@@ -436,16 +436,17 @@ class NormBall(ConvexSet):
         power = self.p - 1.0
         _, high = bisect(
             lambda logarithm: (
-                np.linalg.norm(_shrunk(z, np.exp(logarithm)[..., None], power), ord=self.p, axis=-1) <= 1.0
+                np.linalg.norm(_solve_power_equation(z, np.exp(logarithm)[..., None], power), ord=self.p, axis=-1)
+                <= 1.0
             ),
             np.full(z.shape[:-1], -50.0),
             np.full(z.shape[:-1], 50.0),
         )
-        return _shrunk(z, np.exp(high)[..., None], power)
+        return _solve_power_equation(z, np.exp(high)[..., None], power)
 
     @shaped
     def gauge(self, points: Float[Array, "*k d"]) -> Float[Array, " *k"]:
-        return ratios(_norm(np.asarray(points, dtype=float) - self.centre, self.p), self.radius)
+        return ratios(_compute_norms(np.asarray(points, dtype=float) - self.centre, self.p), self.radius)
 
     @shaped
     def normal(self, points: Float[Array, "*k d"]) -> Float[Array, "*k d"]:
@@ -484,7 +485,7 @@ class NormBall(ConvexSet):
         unit = (
             rng.uniform(-1.0, 1.0, size=(count, self.dimension))
             if self.p == np.inf
-            else _in_ball(self.p, self.dimension, count, rng)
+            else _sample_ball(self.p, self.dimension, count, rng)
         )
         return np.asarray(self.centre + self.radius * unit)
 
@@ -507,7 +508,7 @@ class NormBall(ConvexSet):
         return super().in_units(units)
 
 
-def _indefinite(shape: Array) -> str | None:
+def _describe_indefiniteness(shape: Array) -> str | None:
     """Return in words why a square matrix is not symmetric and positive definite; ``None`` where it is both.
 
     The matrix is judged with its diagonal scaled to 1, so that units change no answer.
@@ -530,7 +531,7 @@ def _indefinite(shape: Array) -> str | None:
 
 
 @shaped
-def _round_excess(centre: Float[Array, "*k d"], spread: Float[Array, "*k J d"]) -> Float[Array, " *k"]:
+def _bound_length_excess(centre: Float[Array, "*k d"], spread: Float[Array, "*k J d"]) -> Float[Array, " *k"]:
     """Return an upper bound ``(...,)`` of ``|y| - g'y`` over ``y = centre + sum_j s_j spread_j`` with ``|s_j| <= 1``.
 
     Here ``g`` is the unit vector of the centre. The bound is ``sqrt(a^2 + b^2) - a``, which decreases in ``a <= g'y``
@@ -552,7 +553,7 @@ def _round_excess(centre: Float[Array, "*k d"], spread: Float[Array, "*k J d"]) 
     return excess
 
 
-def _shrunk(z: Array, multiplier: Array, power: float) -> Array:
+def _solve_power_equation(z: Array, multiplier: Array, power: float) -> Array:
     """Return the root ``0 <= y <= z`` of ``y + multiplier y^power = z``, entry by entry.
 
     One of the two summands, ``a``, is chosen such that the other is a convex function ``(a / unit)^q`` of it,
@@ -571,7 +572,7 @@ def _shrunk(z: Array, multiplier: Array, power: float) -> Array:
     return np.minimum(z, (a / unit) ** q if power < 1.0 else a)
 
 
-def _in_ball(p: float, dimension: int, count: int, rng: np.random.Generator) -> Array:
+def _sample_ball(p: float, dimension: int, count: int, rng: np.random.Generator) -> Array:
     """Return ``count`` uniform points in the unit ball of the ``p``-norm.
 
     The method is that of Barthe, Guedon, Mendelson and Naor 2005, Theorem 1.
@@ -617,7 +618,7 @@ def norm_curvature(centre: Float[Array, " b"], spread: Float[Array, "J b"]) -> F
         return np.zeros((spread.shape[0], spread.shape[0]))
     along = spread @ centre / size
     across = spread - np.outer(along, centre / size)
-    columns = _pivoted(across @ across.T)
+    columns = _factorise_semidefinite(across @ across.T)
     widths = np.abs(columns).sum(axis=1) ** 2
     # Terms whose widths agree up to a factor of 2 share the mean of their slopes, which is as good as any order.
     _, group = np.unique(np.frexp(widths)[1], return_inverse=True)
@@ -626,7 +627,7 @@ def norm_curvature(centre: Float[Array, " b"], spread: Float[Array, "J b"]) -> F
     return np.asarray((2.0 * slopes[group] * columns.T) @ columns)
 
 
-def _pivoted(matrix: Array) -> Array:
+def _factorise_semidefinite(matrix: Array) -> Array:
     """Return rows ``c_k (b, J)``, the widest first, for which ``sum_k c_k c_k'`` is a matrix up to rounding.
 
     The ``matrix (J, J)`` is positive semidefinite.
@@ -645,7 +646,7 @@ def _pivoted(matrix: Array) -> Array:
     return np.array(columns).reshape(len(columns), matrix.shape[0])
 
 
-def _continued_root(a: Array, b: Array, q: float) -> Array:
+def _bound_complex_root(a: Array, b: Array, q: float) -> Array:
     """Return an upper bound of ``|(sum_i z_i^q)^(1/q)|`` for complex ``z_i`` within ``b_i`` of ``|a_i|``.
 
     Parameters
@@ -664,7 +665,7 @@ def _continued_root(a: Array, b: Array, q: float) -> Array:
     Notes
     -----
     The deviation of ``z^q`` is at most ``q b (|a| + b)^(q - 1)``, the integral of its derivative. Where one entry is
-    larger than the others, `_beside_largest` may give a smaller bound.
+    larger than the others, `_bound_by_largest` may give a smaller bound.
     """
     largest = (np.abs(a) + b).max(axis=1, keepdims=True)
     unit = np.where(largest > 0.0, largest, 1.0)
@@ -675,11 +676,11 @@ def _continued_root(a: Array, b: Array, q: float) -> Array:
         return np.where(analytic, unit[:, 0] * np.sqrt(total + deviation), np.inf)
     away = ((a > b) | (b == 0.0)).all(axis=1)
     power_bound = np.where(analytic & away & (q < STEEP), (total + deviation) ** (1.0 / q), np.inf)
-    return np.asarray(unit[:, 0] * np.minimum(power_bound, np.where(away, _beside_largest(a, b, q), np.inf)))
+    return np.asarray(unit[:, 0] * np.minimum(power_bound, np.where(away, _bound_by_largest(a, b, q), np.inf)))
 
 
-def _beside_largest(a: Array, b: Array, q: float) -> Array:
-    """Return the bound of `_continued_root` for entries ``a >= 0`` whose discs of radius ``b`` do not contain 0.
+def _bound_by_largest(a: Array, b: Array, q: float) -> Array:
+    """Return the bound of `_bound_complex_root` for entries ``a >= 0`` whose discs of radius ``b`` do not contain 0.
 
     The root is written as ``z (1 + sum (z_i / z)^q)^(1/q)`` with the largest entry ``z``. Where the other entries are
     smaller by more than the share ``1 / q`` of it, this form gives a bound for discs of any size. The sum of powers
@@ -704,7 +705,7 @@ def _beside_largest(a: Array, b: Array, q: float) -> Array:
     return np.where((lower > 0.0) & (ratio_sum < ROOM), upper * (1.0 + ratio_sum) ** (1.0 / q), np.inf)
 
 
-def _norm(vectors: Array, q: float) -> Array:
+def _compute_norms(vectors: Array, q: float) -> Array:
     """Return the ``q``-norms ``(...,)`` of vectors ``(..., d)``.
 
     Vectors are divided by their largest entries first. A large power of an entry that is not near 1 is 0 or infinite.
@@ -716,7 +717,7 @@ def _norm(vectors: Array, q: float) -> Array:
 
 
 @shaped
-def _power_excess(a: Float[Array, "*k d"], b: Float[Array, "*k d"], q: float) -> Float[Array, " *k"]:
+def _bound_power_excess(a: Float[Array, "*k d"], b: Float[Array, "*k d"], q: float) -> Float[Array, " *k"]:
     """Return an upper bound of ``|a + s|_q - |a|_q - gradient's`` for all ``|s_i| <= b_i``.
 
     The root is concave in ``sum |a_i + s_i|^q``, and each term of this sum is convex.

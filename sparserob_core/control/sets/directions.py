@@ -33,7 +33,7 @@ def shares(convex_set: ConvexSet, z: Float[Array, "k b"]) -> Float[Array, "k b"]
         divided by the length of ``c``; 0 remains 0.
     """
     directions = convex_set.along(z)
-    return np.asarray(z / _rooms(convex_set, directions)[:, None])
+    return np.asarray(z / _measure_extents(convex_set, directions)[:, None])
 
 
 @shaped
@@ -77,7 +77,7 @@ def across(convex_set: ConvexSet, z: Float[Array, "k b"], slopes: Float[Array, "
         The derivatives in the points; 0 at the point 0.
     """
     directions = convex_set.along(z)
-    rooms, sizes = _rooms(convex_set, directions), np.linalg.norm(directions, axis=1, keepdims=True)
+    rooms, sizes = _measure_extents(convex_set, directions), np.linalg.norm(directions, axis=1, keepdims=True)
     outwards = convex_set.support_point(directions) - convex_set.interior_point()
     flat = (outwards * directions).sum(axis=1, keepdims=True) <= 0.0
     outwards = np.where(flat, directions / np.where(sizes > 0, sizes, 1.0), outwards) @ convex_set.frame.T
@@ -86,7 +86,7 @@ def across(convex_set: ConvexSet, z: Float[Array, "k b"], slopes: Float[Array, "
 
 
 @shaped
-def _rooms(convex_set: ConvexSet, directions: Float[Array, "k d"]) -> Float[Array, " k"]:
+def _measure_extents(convex_set: ConvexSet, directions: Float[Array, "k d"]) -> Float[Array, " k"]:
     """Return the extent ``(k,)`` of a set from its interior point along directions ``(k, d)``.
 
     Where the extent is 0, the length of the direction is returned.

@@ -57,12 +57,15 @@ def curved_integral(bound: ConvexSet, terms: Array, lengths: Array, accuracy: Ar
     total, owner = np.zeros((lengths.size, 2)), np.arange(lengths.size)
     orders = np.arange(terms.shape[1])
     # from here on in powers of a variable that runs from -1 to 1 over the interval
-    terms = _moved(terms.shape[1], 0.5, 0.5) @ terms
+    terms = _build_substitution_matrix(terms.shape[1], 0.5, 0.5) @ terms
     reach = bound.reach(np.eye(bound.dimension))
     step_rounding, first_sizes = 2.0 * orders.size * EPSILON, np.abs(terms).sum(axis=1) @ reach
     rounding = step_rounding + (8.0 * reach.size + 64.0) * EPSILON
-    to_series = _series(orders.size)
-    powers, halves = NODES[:, None] ** orders, [_moved(orders.size, 0.5, side) for side in (-0.5, 0.5)]
+    to_series = _build_chebyshev_matrix(orders.size)
+    powers, halves = (
+        NODES[:, None] ** orders,
+        [_build_substitution_matrix(orders.size, 0.5, side) for side in (-0.5, 0.5)],
+    )
     for halving in range(HALVINGS + 1):
         series = to_series @ terms
         radii = np.einsum("k,lkw->lw", RADIUS ** orders[1:], np.abs(series[:, 1:])) * (1.0 + rounding)
@@ -88,7 +91,7 @@ def curved_integral(bound: ConvexSet, terms: Array, lengths: Array, accuracy: Ar
 
 
 @cache
-def _series(count: int) -> Array:
+def _build_chebyshev_matrix(count: int) -> Array:
     """Return the matrix ``(count, count)`` from coefficients of powers to those of Chebyshev polynomials."""
     matrix = np.zeros((count, count))
     for k, power in enumerate(np.eye(count)):
@@ -97,7 +100,7 @@ def _series(count: int) -> Array:
 
 
 @cache
-def _moved(count: int, share: float, begin: float) -> Array:
+def _build_substitution_matrix(count: int, share: float, begin: float) -> Array:
     """Return the matrix from coefficients of powers of ``x`` to those of ``y``, ``x = begin + share y``.
 
     Its shape is ``(count, count)``.
@@ -140,7 +143,7 @@ def integrated(bound: ConvexSet, terms: Array, lengths: Array, accuracy: Array) 
         high = bound.support(points).mean(axis=1) * lengths
         is_open = (high - low > accuracy[owner]) & (halving < HALVINGS)
         np.add.at(total, owner[~is_open], np.stack([low, high], axis=1)[~is_open])
-        points, owner = _halved(points[is_open]), np.tile(owner[is_open], 2)
+        points, owner = _halve_polynomials(points[is_open]), np.tile(owner[is_open], 2)
         lengths = np.tile(lengths[is_open] / 2, 2)
         if not owner.size:
             break
@@ -175,12 +178,12 @@ def absolute(terms: Array, accuracy: Array) -> Array:
         points, owner, lengths = points[is_open], np.tile(owner[is_open], 2), lengths[is_open]
         if not owner.size:
             break
-        at = _sign_changes(points) if division < CUTS else np.full(len(points), 0.5)
-        points, lengths = _cut(points, at), np.concatenate([lengths * at, lengths * (1.0 - at)])
+        at = _find_sign_changes(points) if division < CUTS else np.full(len(points), 0.5)
+        points, lengths = _split_polynomials(points, at), np.concatenate([lengths * at, lengths * (1.0 - at)])
     return total
 
 
-def _sign_changes(points: Array) -> Array:
+def _find_sign_changes(points: Array) -> Array:
     """Return approximate points ``(l,)`` at which polynomials change their signs.
 
     They are computed by the Illinois variant of the secant method.
@@ -207,7 +210,7 @@ def _sign_changes(points: Array) -> Array:
     return at
 
 
-def _cut(points: Array, at: Array) -> Array:
+def _split_polynomials(points: Array, at: Array) -> Array:
     """Return Bernstein coefficients on both sides of the points ``at (l,)``, all left parts first (de Casteljau).
 
     Parameters
@@ -236,7 +239,7 @@ def bezier(order: int) -> Array:
     return np.array([[comb(k, j) / comb(order, j) for j in range(order + 1)] for k in range(order + 1)])
 
 
-def _halved(points: Array) -> Array:
+def _halve_polynomials(points: Array) -> Array:
     """Return Bernstein coefficients on both halves of an interval, all left halves first (de Casteljau).
 
     Parameters

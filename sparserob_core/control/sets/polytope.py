@@ -86,7 +86,7 @@ class Polytope(ConvexSet):
         object.__setattr__(self, "H", H[keep])
         object.__setattr__(self, "h", h[keep])
         sealed(self)
-        if self.chebyshev[1] < -1e-9 * max(1.0, float(np.abs(self._balanced[1]).max(initial=0.0))):
+        if self.chebyshev[1] < -1e-9 * max(1.0, float(np.abs(self._balanced_halfspaces[1]).max(initial=0.0))):
             raise InputError("empty, no point satisfies every row of H x <= h", path="polytope")
 
     @property
@@ -112,7 +112,7 @@ class Polytope(ConvexSet):
         return polytope
 
     @cached_property
-    def _balanced(self) -> tuple[Array, Array, Array]:
+    def _balanced_halfspaces(self) -> tuple[Array, Array, Array]:
         """The arrays ``H'``, ``h'`` and ``units`` with ``{x : H x <= h} = {units * y : H' y <= h'}``.
 
         Rows and columns of very different sizes are divided by powers of two, the means of the logarithms of their
@@ -144,7 +144,7 @@ class Polytope(ConvexSet):
         """
         from scipy.optimize import linprog
 
-        (rows, d), (H, h, units) = self.H.shape, self._balanced
+        (rows, d), (H, h, units) = self.H.shape, self._balanced_halfspaces
         if rows == 0:
             return np.zeros(d), np.inf
         cap = 1.0 + float(np.abs(h).max())
@@ -174,7 +174,7 @@ class Polytope(ConvexSet):
     @cached_property
     def is_bounded(self) -> bool:
         axes = np.eye(self.dimension)
-        return bool(np.isfinite(self._reach)) or all(
+        return bool(np.isfinite(self._coordinate_bound)) or all(
             np.isfinite(self._maximise(axis)[0]) for axis in np.vstack([axes, -axes])
         )
 
@@ -187,19 +187,19 @@ class Polytope(ConvexSet):
         if d == 1:
             slopes, ends = self.H[:, 0], self.h / self.H[:, 0]
             return np.array([[ends[slopes < 0].max()], [ends[slopes > 0].min()]])
-        (centre, radius), (H, h, units) = self.chebyshev, self._balanced
+        (centre, radius), (H, h, units) = self.chebyshev, self._balanced_halfspaces
         centre = centre / units
         if radius <= 1e-9 * (1.0 + float(np.abs(centre).max())):
-            return self._corners()
+            return self._find_exact_vertices()
         from scipy.spatial import HalfspaceIntersection, QhullError
 
         try:
             intersection = HalfspaceIntersection(np.column_stack([H, -h]), centre)
         except QhullError:
             return None
-        return self._polished(intersection.intersections, intersection.dual_facets) * units
+        return self._polish_vertices(intersection.intersections, intersection.dual_facets) * units
 
-    def _corners(self) -> Array | None:
+    def _find_exact_vertices(self) -> Array | None:
         """Return the vertices ``(v, d)`` of a set without an interior, computed in fractions.
 
         A vertex is a point at which ``d`` rows meet and which no row excludes. The value is ``None`` where there are
@@ -215,7 +215,7 @@ class Polytope(ConvexSet):
         is_outside = points @ self.H.T - self.h > _BESIDE * (np.abs(points) @ np.abs(self.H).T + np.abs(self.h))
         candidates = np.concatenate([choices[is_regular][~is_outside.any(axis=1)], choices[~is_regular]])
         H, h = ([[Fraction(float(x)) for x in row] for row in array] for array in (self.H, self.h[:, None]))
-        meetings = {_meeting([H[i] for i in choice], [h[i][0] for i in choice]) for choice in candidates}
+        meetings = {_intersect_hyperplanes([H[i] for i in choice], [h[i][0] for i in choice]) for choice in candidates}
         corners = [
             x
             for x in meetings
@@ -225,12 +225,12 @@ class Polytope(ConvexSet):
         return np.array([[float(a) for a in x] for x in sorted(corners)]) if corners else None
 
     @shaped
-    def _polished(self, points: Float[Array, "v d"], facets: list[list[int]]) -> Float[Array, "u d"]:
+    def _polish_vertices(self, points: Float[Array, "v d"], facets: list[list[int]]) -> Float[Array, "u d"]:
         """Return vertices ``(u, d)`` without repetitions, solved for from their active rows ``facets``.
 
         The points ``(v, d)`` of qhull are less accurate, because qhull computes in a dual space.
         """
-        H, h, _ = self._balanced
+        H, h, _ = self._balanced_halfspaces
         vertices = [np.linalg.lstsq(H[rows], h[rows], rcond=None)[0] for rows in facets]
         exact = np.where(np.isfinite(vertices), vertices, points)
         _, first = np.unique(np.round(exact, 12), axis=0, return_index=True)
@@ -296,9 +296,9 @@ class Polytope(ConvexSet):
         Several linear programs are solved together as one, because a call of the solver costs far more than a small
         program. Where this fails, they are solved one by one.
         """
-        _, h, units = self._balanced
+        _, h, units = self._balanced_halfspaces
         values, points = np.zeros(len(directions)), np.tile(self.interior_point(), (len(directions), 1))
-        is_unbounded = self._endless(directions * units)
+        is_unbounded = self._is_along_lines(directions * units)
         values[is_unbounded] = np.inf
         pending = np.flatnonzero((np.abs(directions).max(axis=1, initial=0.0) > 0) & ~is_unbounded)
         for start in range(0, pending.size, _TOGETHER):
@@ -307,10 +307,10 @@ class Polytope(ConvexSet):
             sizes = np.abs(scaled).max(axis=1)
             balanced = scaled / sizes[:, None]
             if batch.size > 1 and h.size and np.isfinite(balanced).all():
-                solution = self._side_by_side(balanced)
+                solution = self._maximise_together(balanced)
                 if solution is not None:
                     maximisers, multipliers = solution
-                    proven = sizes * self._dual_bound(balanced, multipliers)
+                    proven = sizes * self._bound_by_duality(balanced, multipliers)
                     values[batch] = np.maximum((scaled * maximisers).sum(axis=1), proven)
                     points[batch] = maximisers * units
                     continue
@@ -318,7 +318,7 @@ class Polytope(ConvexSet):
                 values[position], points[position] = self._maximise(directions[position])
         return values, points
 
-    def _side_by_side(self, directions: Array) -> tuple[Array, Array] | None:
+    def _maximise_together(self, directions: Array) -> tuple[Array, Array] | None:
         """Return maximisers ``(k, d)`` and multipliers ``(k, r)`` of directions ``(k, d)``, by one linear program.
 
         All are in balanced coordinates. The value is ``None`` where the program has no solution, as for an unbounded
@@ -327,7 +327,7 @@ class Polytope(ConvexSet):
         from scipy.optimize import linprog
         from scipy.sparse import block_diag, csc_array
 
-        (H, h, _), count = self._balanced, len(directions)
+        (H, h, _), count = self._balanced_halfspaces, len(directions)
         rows = block_diag([csc_array(H)] * count, format="csc")
         answer = linprog(-directions.reshape(-1), rows, np.tile(h, count), bounds=(None, None))
         if answer.status != 0:
@@ -335,7 +335,7 @@ class Polytope(ConvexSet):
         multipliers = -np.asarray(answer.ineqlin.marginals).reshape(count, h.size)
         return np.asarray(answer.x).reshape(directions.shape), multipliers
 
-    def _endless(self, directions: Array) -> npt.NDArray[np.bool_]:
+    def _is_along_lines(self, directions: Array) -> npt.NDArray[np.bool_]:
         """Return a mask ``(k,)`` of the directions ``(k, d)`` with a clear part along a line that is in the set.
 
         Directions are in balanced coordinates.
@@ -349,7 +349,7 @@ class Polytope(ConvexSet):
 
         There are no rows where rounding leaves a doubt.
         """
-        _, sizes, vectors = np.linalg.svd(self._balanced[0])
+        _, sizes, vectors = np.linalg.svd(self._balanced_halfspaces[0])
         sizes = np.concatenate([sizes, np.zeros(self.dimension - sizes.size)]) / max(
             float(sizes.max(initial=0.0)), 1e-300
         )
@@ -365,7 +365,7 @@ class Polytope(ConvexSet):
         """
         from scipy.optimize import linprog
 
-        H, h, units = self._balanced
+        H, h, units = self._balanced_halfspaces
         scaled = direction * units
         size = float(np.abs(scaled).max())
         if size == 0.0:
@@ -375,10 +375,10 @@ class Polytope(ConvexSet):
         answer = linprog(-scaled / size, H, h, bounds=(None, None))
         if answer.status != 0:
             return np.inf, self.interior_point()
-        proven = size * self._dual_bound(scaled[None] / size, -np.asarray(answer.ineqlin.marginals)[None])[0]
+        proven = size * self._bound_by_duality(scaled[None] / size, -np.asarray(answer.ineqlin.marginals)[None])[0]
         return max(float(scaled @ answer.x), float(proven)), np.asarray(answer.x) * units
 
-    def _dual_bound(self, directions: Array, multipliers: Array) -> Array:
+    def _bound_by_duality(self, directions: Array, multipliers: Array) -> Array:
         """Return proven upper bounds ``(k,)`` of the support function of directions ``(k, d)``.
 
         All are in balanced coordinates.
@@ -387,28 +387,28 @@ class Polytope(ConvexSet):
         does not rest on the accuracy of the linear program, except for the rounding of these sums. It is ``-inf`` where
         no ``R`` is known.
         """
-        H, h, _ = self._balanced
+        H, h, _ = self._balanced_halfspaces
         y = np.maximum(multipliers, 0.0)
         residual = np.abs(directions - y @ H).sum(axis=1)
         with np.errstate(invalid="ignore"):
-            bound: Array = y @ h + np.where(residual > 0.0, residual * self._reach, 0.0)
+            bound: Array = y @ h + np.where(residual > 0.0, residual * self._coordinate_bound, 0.0)
         return np.where(np.isfinite(bound), bound, -np.inf)
 
     @cached_property
-    def _reach(self) -> float:
+    def _coordinate_bound(self) -> float:
         """A proven bound of every coordinate of every point, in balanced coordinates; ``inf`` where none is found.
 
         With multipliers ``y`` of each axis, ``M = max |x_i|`` is at most ``y'h + |e_i - H'y|_1 M``. This bounds ``M``
         where the factor of ``M`` is below 1.
         """
-        H, h, _ = self._balanced
+        H, h, _ = self._balanced_halfspaces
         axes = np.vstack([np.eye(self.dimension), -np.eye(self.dimension)])
         highest, residual = 0.0, 0.0
         if not h.size:
             return np.inf
         for start in range(0, len(axes), _TOGETHER):
             batch = axes[start : start + _TOGETHER]
-            solution = self._side_by_side(batch)
+            solution = self._maximise_together(batch)
             if solution is None:
                 return np.inf
             y = np.maximum(solution[1], 0.0)
@@ -419,7 +419,7 @@ class Polytope(ConvexSet):
         return 2.0 * abs(highest) / (1.0 - residual) if residual < 0.5 else np.inf
 
 
-def _meeting(rows: Sequence[Sequence[Fraction]], ends: Sequence[Fraction]) -> tuple[Fraction, ...] | None:
+def _intersect_hyperplanes(rows: Sequence[Sequence[Fraction]], ends: Sequence[Fraction]) -> tuple[Fraction, ...] | None:
     """Return the point at which ``d`` hyperplanes meet, by Gauss-Jordan elimination; ``None`` where it is not unique.
 
     Parameters

@@ -253,15 +253,15 @@ class Cylinder(ConvexSet):
 
     @property
     def normals(self) -> Array:
-        return self._lifted(np.eye(self.base.dimension))
+        return self._lift_directions(np.eye(self.base.dimension))
 
     @property
     def frame(self) -> Array:
-        return self._lifted(self.base.frame)
+        return self._lift_directions(self.base.frame)
 
     @shaped
     def along(self, z: Float[Array, "*k b"]) -> Float[Array, "*k d"]:
-        return self._lifted(self.base.along(z))
+        return self._lift_directions(self.base.along(z))
 
     @shaped
     def in_units(self, units: Float[Array, " d"]) -> Cylinder:
@@ -287,11 +287,11 @@ class Cylinder(ConvexSet):
 
     @shaped
     def violation(self, points: Float[Array, "*k d"]) -> Float[Array, " *k"]:
-        return self.base.violation(self._seen(points))
+        return self.base.violation(self._project_points(points))
 
     @shaped
     def gauge(self, points: Float[Array, "*k d"]) -> Float[Array, " *k"]:
-        return self.base.gauge(self._seen(points))
+        return self.base.gauge(self._project_points(points))
 
     def scaled(self, factor: float) -> Cylinder:
         return Cylinder(self.base.scaled(factor), self.size, self.slopes)
@@ -300,13 +300,13 @@ class Cylinder(ConvexSet):
     def interior_point(self) -> Float[Array, " d"]:
         return np.concatenate([self.base.interior_point(), np.zeros(self.size - self.base.dimension)])
 
-    def _lifted(self, directions: Array) -> Array:
+    def _lift_directions(self, directions: Array) -> Array:
         """Return directions ``(k, b)`` of the base as directions ``(k, size)`` of the cylinder."""
         zeros = np.zeros((*directions.shape[:-1], self.size - self.base.dimension))
         free = zeros if self.slopes is None else directions @ self.slopes
         return np.concatenate([directions, free], axis=-1)
 
-    def _seen(self, points: Array) -> Array:
+    def _project_points(self, points: Array) -> Array:
         """Return points ``(..., size)`` projected into the space of the base: ``x[:b] + slopes x[b:]``."""
         coordinates = np.asarray(points, dtype=float)
         base, free = coordinates[..., : self.base.dimension], coordinates[..., self.base.dimension :]

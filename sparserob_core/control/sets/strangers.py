@@ -54,7 +54,7 @@ def require_consistent(path: str, convex: ConvexSet | None) -> None:
         The error names the contradiction and a direction.
     """
     for stranger in strangers(convex):
-        contradiction = _contradiction(stranger)
+        contradiction = _find_contradiction(stranger)
         if contradiction:
             raise InputError(
                 path=path,
@@ -63,7 +63,7 @@ def require_consistent(path: str, convex: ConvexSet | None) -> None:
             )
 
 
-def _contradiction(convex: ConvexSet) -> str:
+def _find_contradiction(convex: ConvexSet) -> str:
     """Return the first contradiction of a set in words; empty where none is found."""
     axes = np.eye(convex.dimension)
     random_directions = np.random.default_rng(5).normal(size=(DIRECTIONS, convex.dimension))
@@ -90,15 +90,15 @@ def _contradiction(convex: ConvexSet) -> str:
     lengths = np.linalg.norm(c, axis=1)
     tolerances = CLOSE * lengths * max(float(np.abs(heights).max()), float(np.abs(points).max()))
     values = points @ c.T  # c'x for every support point x and every direction c
-    return _first(
+    return _describe_first_failure(
         (np.abs(np.diag(values) - heights) > tolerances, c, "it is not attained at its support point"),
         (values.max(axis=0) > heights + tolerances, c, "it does not bound its own support points: it is not sublinear"),
         (np.abs(convex.support(2.5 * c) - 2.5 * heights) > 2.5 * tolerances, c, "h(2.5 c) is not 2.5 h(c)"),
-        *_sides(convex, points, tolerances),
+        *_check_halfspaces(convex, points, tolerances),
     )
 
 
-def _sides(convex: ConvexSet, points: Array, close: Array) -> Iterator[tuple[Array, Array, str]]:
+def _check_halfspaces(convex: ConvexSet, points: Array, close: Array) -> Iterator[tuple[Array, Array, str]]:
     """Yield the checks of the half-spaces of a set, each as a mask of failures, the normals, and words."""
     flat = convex.halfspaces()
     if flat is not None and flat[1].size:
@@ -108,7 +108,7 @@ def _sides(convex: ConvexSet, points: Array, close: Array) -> Iterator[tuple[Arr
         yield convex.support(H) > h + room, H, "it is above the right-hand side of a half-space"
 
 
-def _first(*looks: tuple[Array, Array, str]) -> str:
+def _describe_first_failure(*looks: tuple[Array, Array, str]) -> str:
     """Return the words of the first check that fails, with the direction; empty where none fails."""
     for fails, directions, words in looks:
         if fails.any():

@@ -138,10 +138,10 @@ class Zonotope(ConvexSet):
         return self.centre + share @ self.generators, excess.sum(axis=-1)
 
     def halfspaces(self) -> tuple[Array, Array] | None:
-        return self._sides
+        return self._halfspaces
 
     @cached_property
-    def _sides(self) -> tuple[Array, Array] | None:
+    def _halfspaces(self) -> tuple[Array, Array] | None:
         """The half-spaces ``H (r, d)`` and ``h (r,)`` of the set; ``None`` where there are too many of them.
 
         As many generators as the dimension of their span, less one, span a facet. For a set without an interior the
@@ -154,7 +154,11 @@ class Zonotope(ConvexSet):
         if comb(len(generators), max(rank - 1, 0)) > MOST_SIDES:
             return None
         basis = np.where(np.abs(basis) > ROUNDED, basis, 0.0) if rank < d else np.eye(d)
-        within = [normal @ basis[:rank] for normal in self._across(generators @ basis[:rank].T, rank)] if rank else []
+        within = (
+            [normal @ basis[:rank] for normal in self._find_facet_normals(generators @ basis[:rank].T, rank)]
+            if rank
+            else []
+        )
         H = np.vstack([*within, basis[rank:]])
         H, widths, size = (
             np.vstack([H, -H]),
@@ -165,7 +169,7 @@ class Zonotope(ConvexSet):
         return H, self.support(H) + room * (np.abs(H) @ (np.abs(self.centre) + size))
 
     @staticmethod
-    def _across(generators: Array, d: int) -> list[Array]:
+    def _find_facet_normals(generators: Array, d: int) -> list[Array]:
         """Return a normal for every pair of opposite facets, from generators that span all ``d`` dimensions.
 
         The generators have length 1.

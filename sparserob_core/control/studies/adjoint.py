@@ -235,7 +235,7 @@ class WorstRow:
     def at(self, times: Array, inside: Array | None = None) -> tuple[Array, Array]:
         """Bounds ``(k,)`` of the largest value at ``times (k,)``: one that is reached, and one that is not exceeded but
         for rounding, which `lost` bounds; with the control of the pieces that hold the times ``inside``."""
-        rows, middle = self.adjoint.rows(times), self._driven(times)
+        rows, middle = self.adjoint.rows(times), self._compute_drive_effect(times)
         low = middle + rows @ self.centre
         if self.begun is not None:
             low = low + self.begun.support(rows)
@@ -247,44 +247,44 @@ class WorstRow:
             low = low + values[np.clip(pieces, 0, values.size - 1)]
         if self.pushes is None:
             return low, low
-        support_values = self._pushed(times)
+        support_values = self._bound_disturbances(times)
         return low + support_values[:, 0], low + support_values[:, 1]
 
-    def _driven(self, times: Array) -> Array:
+    def _compute_drive_effect(self, times: Array) -> Array:
         if not self.drives.any():
             return np.zeros(times.size)
         used = self.drives.shape[0]
         return np.asarray(
             sum(
-                np.einsum("kq,q->k", self._between(times, a, b)[:, :used], u)
+                np.einsum("kq,q->k", self._integrate_between(times, a, b)[:, :used], u)
                 for a, b, u in zip(self.grid[:-1], self.grid[1:], self.drives.T, strict=True)
                 if u.any()
             )
         )
 
-    def _between(self, times: Array, start: float, stop: float) -> Array:
+    def _integrate_between(self, times: Array, start: float, stop: float) -> Array:
         """Return the contribution of an input of 1 from ``start`` to ``stop`` to the row at every time, ``(k, q)``."""
         return self.adjoint.integrals(times - start) - self.adjoint.integrals(times - stop)
 
-    def _pushed(self, times: Array) -> Array:
+    def _bound_disturbances(self, times: Array) -> Array:
         assert self.pushes is not None
         bound, columns = self.pushes.bound, self.pushes.inputs
         if self.pushes.changes is not None:
             total = np.zeros(times.size)
             for a, b in pairwise(self.pushes.changes):
-                total += bound.support(self._between(times, a, b)[:, columns])
+                total += bound.support(self._integrate_between(times, a, b)[:, columns])
             return np.stack([total, total], axis=1)
         steps, shares = self.adjoint.placed(times)
-        inside = self._integrated(steps, shares)
-        return np.asarray(self._sums[steps] + inside)
+        inside = self._bound_integrals(steps, shares)
+        return np.asarray(self._cumulative_bounds[steps] + inside)
 
     @cached_property
-    def _sums(self) -> Array:
+    def _cumulative_bounds(self) -> Array:
         """Bounds of the integral of the support function of ``E'l``, up to the end of every step, ``(N + 1, 2)``."""
         steps = np.arange(self.adjoint.nodes.shape[0] - 1)
-        return np.vstack([np.zeros(2), np.cumsum(self._integrated(steps, np.ones(steps.size)), axis=0)])
+        return np.vstack([np.zeros(2), np.cumsum(self._bound_integrals(steps, np.ones(steps.size)), axis=0)])
 
-    def _integrated(self, steps: np.ndarray, shares: Array) -> Array:
+    def _bound_integrals(self, steps: np.ndarray, shares: Array) -> Array:
         """Bounds of the integrals over the first shares ``(k,)`` of some steps, ``(k, 2)``."""
         assert self.pushes is not None
         powers = shares[:, None] ** np.arange(ORDER + 1)
@@ -309,24 +309,26 @@ class WorstRow:
         """
         steps = self.adjoint.nodes.shape[0]
         terms = 2 * self.adjoint.A.shape[0] * (ceil(log2(steps)) + 2) + ORDER + 8 + ROUNDED * steps
-        size = float((np.abs(self.adjoint.nodes / self.adjoint.units) @ self._far).max())
-        size += float((np.abs(self.adjoint.coefficients[:, 0]) @ self._inputs_far).sum() * self.adjoint.step)
+        size = float((np.abs(self.adjoint.nodes / self.adjoint.units) @ self._state_magnitudes).max())
+        size += float((np.abs(self.adjoint.coefficients[:, 0]) @ self._input_magnitudes).sum() * self.adjoint.step)
         size += 0.0 if self.beside is None else float(np.abs(self.beside[1]).max())
         size += 0.0 if self.moving is None else float(np.abs(self.moving[1]).max())
         norms = np.linalg.norm(self.adjoint.nodes, axis=1)
-        inputs = float(np.linalg.norm(self.adjoint.B, axis=0) @ self._inputs_far) * self.adjoint.step
+        inputs = float(np.linalg.norm(self.adjoint.B, axis=0) @ self._input_magnitudes) * self.adjoint.step
         truncation = (SHORT ** (ORDER + 1)) * np.exp(SHORT) / FACTORIALS[ORDER + 1]
-        truncation *= float(norms.max() * np.linalg.norm(self._far / self.adjoint.units) + norms.sum() * inputs)
+        truncation *= float(
+            norms.max() * np.linalg.norm(self._state_magnitudes / self.adjoint.units) + norms.sum() * inputs
+        )
         return float(rounding(terms) * size + truncation)
 
     @cached_property
-    def _far(self) -> Array:
+    def _state_magnitudes(self) -> Array:
         """Largest absolute values of the initial states, ``(d,)``."""
         magnitudes = np.abs(self.centre)
         return magnitudes if self.begun is None else magnitudes + self.begun.reach(np.eye(magnitudes.size))
 
     @cached_property
-    def _inputs_far(self) -> Array:
+    def _input_magnitudes(self) -> Array:
         """Largest absolute values of the inputs, ``(q,)``."""
         magnitudes = np.zeros(self.adjoint.B.shape[1])
         magnitudes[: self.drives.shape[0]] = np.abs(self.drives).max(axis=1, initial=0.0)
@@ -335,12 +337,12 @@ class WorstRow:
         return magnitudes
 
     @cached_property
-    def _bent(self) -> Array:
+    def _curvature_bounds(self) -> Array:
         """Bounds ``(N,)`` of the curvature of the row on every step: times an eighth of the square of a cell's width
         they bound its excess over the chord."""
         state_bounds, first_bounds, second_bounds = self.adjoint.bends
-        magnitudes = self._inputs_far.copy()
-        curvature = state_bounds @ self._far
+        magnitudes = self._input_magnitudes.copy()
+        curvature = state_bounds @ self._state_magnitudes
         if self.pushes is not None and self.pushes.changes is None:  # the slope of an integral that is a support
             curvature = curvature + first_bounds[:, self.pushes.inputs] @ magnitudes[self.pushes.inputs]
             magnitudes[self.pushes.inputs] = 0.0
@@ -356,10 +358,15 @@ class WorstRow:
             high = self.at(ends)[1][indices]
         else:
             high = self.at(np.concatenate([lower, upper]), np.tile(middles, 2))[1]
-        first, last = (np.clip((at / self.adjoint.step).astype(int), 0, self._bent.size - 1) for at in (lower, upper))
-        curvature = np.maximum(self._bent[first], self._bent[last])
+        first, last = (
+            np.clip((at / self.adjoint.step).astype(int), 0, self._curvature_bounds.size - 1) for at in (lower, upper)
+        )
+        curvature = np.maximum(self._curvature_bounds[first], self._curvature_bounds[last])
         curvature = np.maximum(
-            curvature, self._bent[np.clip((middles / self.adjoint.step).astype(int), 0, self._bent.size - 1)]
+            curvature,
+            self._curvature_bounds[
+                np.clip((middles / self.adjoint.step).astype(int), 0, self._curvature_bounds.size - 1)
+            ],
         )
         return np.asarray(np.maximum(high[:count], high[count:]) + (upper - lower) ** 2 / 8 * curvature + self.lost)
 
@@ -371,8 +378,8 @@ class WorstRow:
         if self.pushes is None:
             return state, self.grid[[0, -1]], None
         bound, columns = self.pushes.bound, self.pushes.inputs
-        changes = self._switches(time) if self.pushes.changes is None else self.pushes.changes
-        gains = np.stack([self._between(np.array([time]), a, b)[0, columns] for a, b in pairwise(changes)])
+        changes = self._find_switches(time) if self.pushes.changes is None else self.pushes.changes
+        gains = np.stack([self._integrate_between(np.array([time]), a, b)[0, columns] for a, b in pairwise(changes)])
         values = np.where(
             np.abs(gains).max(axis=1)[:, None] > 0.0, within(bound, bound.support_point(gains)), bound.interior_point()
         )
@@ -393,7 +400,7 @@ class WorstRow:
             value += float((gains * disturbance.T).sum())
         return value
 
-    def _switches(self, time: float) -> Array:
+    def _find_switches(self, time: float) -> Array:
         """Times between which one value of a measurable disturbance is best for the row at ``time``: the ends of the
         steps before it, and where the best value changes within one."""
         assert self.pushes is not None

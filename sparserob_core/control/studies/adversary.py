@@ -73,8 +73,8 @@ def find_adversary(
     none. Under ``feedback`` that of the closed loop. Where the program is known in its ``own`` units, in which a method
     has looked at every sample before, it is sought there."""
     if feedback is not None:
-        return _of_loop(constraint, decision, feedback.loop)
-    separation = constraint.worst(decision) if own is None else _sought(constraint, decision, own)
+        return _find_in_closed_loop(constraint, decision, feedback.loop)
+    separation = constraint.worst(decision) if own is None else _separate_in_own_units(constraint, decision, own)
     if not separation.violations.size:
         return None
     row = int(separation.rows[0])
@@ -99,7 +99,7 @@ def find_adversary(
     )
 
 
-def _sought(constraint: StateConstraint, decision: Array, own: OwnUnits) -> Separation:
+def _separate_in_own_units(constraint: StateConstraint, decision: Array, own: OwnUnits) -> Separation:
     """The largest violation of all rows in the user's units, its place found in the program's ``own``."""
     family = own.program.family(constraint.name)
     family = family.reduced or family
@@ -111,7 +111,7 @@ def _sought(constraint: StateConstraint, decision: Array, own: OwnUnits) -> Sepa
     return Separation(indices, row, constraint.violations(decision, indices, row))
 
 
-def _of_loop(constraint: StateConstraint, decision: Array, loop: ClosedLoop) -> Adversary:
+def _find_in_closed_loop(constraint: StateConstraint, decision: Array, loop: ClosedLoop) -> Adversary:
     from sparserob_core.control.constraints.feedback_curved import of_state
 
     robust_constraint = of_state(constraint, loop)
@@ -151,7 +151,7 @@ def worst_signal(functionals: WorstCase, time: float, direction: Array, paramete
     if model is None or support is None:
         return grid.breakpoints, functionals.worst_disturbance(time, direction, parameter)
     bound = support.bound
-    flow = _way(functionals.response, parameter, time, direction)
+    flow = _build_adjoint(functionals.response, parameter, time, direction)
     starts = np.concatenate(
         [
             begin + (end - begin) * np.arange(PARTS) / PARTS
@@ -160,11 +160,13 @@ def worst_signal(functionals: WorstCase, time: float, direction: Array, paramete
     )
     ends = np.append(starts[1:], grid.breakpoints[-1])
     is_past = starts < time
-    starts, ends = _halved(bound, flow, (starts[is_past], np.minimum(ends[is_past], time)), float(grid.breakpoints[-1]))
+    starts, ends = _refine_parts(
+        bound, flow, (starts[is_past], np.minimum(ends[is_past], time)), float(grid.breakpoints[-1])
+    )
     values = bound.support_point(flow.gains(starts, ends))
     if time < grid.breakpoints[-1]:  # afterwards nothing matters
         starts, values = np.append(starts, time), np.vstack([values, bound.interior_point()])
-    points, signal = _merged(starts, values, grid.breakpoints)
+    points, signal = _merge_equal_parts(starts, values, grid.breakpoints)
     if model.on_blocks is not None:  # of other columns
         weights = functionals.response.weights(np.array([time]), direction[None], parameter[None]).disturbance
         block_signal = model.on_blocks.worst(weights)[0]
@@ -182,12 +184,12 @@ def pushed_by(
     """
     ends, values = signal
     is_past = ends[:-1] < time
-    flow = _way(functionals.response, parameter, time, direction)
+    flow = _build_adjoint(functionals.response, parameter, time, direction)
     return float((flow.gains(ends[:-1][is_past], np.minimum(ends[1:][is_past], time)) * values.T[is_past]).sum())
 
 
 @dataclass(frozen=True, eq=False)
-class _Way:
+class _SwitchedAdjoint:
     """Adjoint of a functional ``direction'x(time)``, propagated backwards through the phases of a switched system.
 
     Parameters
@@ -208,7 +210,7 @@ class _Way:
     E: list[Array]
 
     @staticmethod
-    def of(response: Response, parameter: Array, time: float, direction: Array) -> _Way:
+    def of(response: Response, parameter: Array, time: float, direction: Array) -> _SwitchedAdjoint:
         """Compute the adjoint of a functional at a ``time`` with a ``direction (d,)``."""
         matrices = [[matrix[0] for matrix in mode.matrices(parameter[None])] for mode in response.system.modes]
         leaps, begins = [Leaps(A) for A, _, _ in matrices], np.array([0.0, *response.system.switches])
@@ -216,12 +218,12 @@ class _Way:
         rows = np.tile(direction, (ends.size, 1))
         for mode in range(ends.size - 1, 0, -1):
             rows[mode - 1] = leaps[mode].rows(rows[[mode]], ends[[mode]] - ends[[mode - 1]])[0][0]
-        return _Way(ends, rows, leaps, [E for _, _, E in matrices])
+        return _SwitchedAdjoint(ends, rows, leaps, [E for _, _, E in matrices])
 
     def at(self, times: Array, inside: Array) -> Array:
         """Return ``E' Phi(time, s)' direction`` at ``times (k,)``, in the phases that hold the times ``inside (k,)``:
         ``(k, mw)``."""
-        return self._over(times, inside, lambda leaps, rows, indices: rows)
+        return self._evaluate_by_phase(times, inside, lambda leaps, rows, indices: rows)
 
     def gains(self, starts: Array, ends: Array) -> Array:
         """Return the integrals of ``E' Phi(time, s)' direction`` from ``starts (k,)`` to ``ends (k,)``, each within one
@@ -230,9 +232,11 @@ class _Way:
         def integrated(leaps: Leaps, rows: Array, which: np.ndarray) -> Array:
             return leaps.rows(rows, (ends - starts)[which])[1]
 
-        return self._over(ends, (starts + ends) / 2, integrated)
+        return self._evaluate_by_phase(ends, (starts + ends) / 2, integrated)
 
-    def _over(self, times: Array, inside: Array, made: Callable[[Leaps, Array, np.ndarray], Array]) -> Array:
+    def _evaluate_by_phase(
+        self, times: Array, inside: Array, made: Callable[[Leaps, Array, np.ndarray], Array]
+    ) -> Array:
         values, modes = np.zeros((times.size, self.E[0].shape[1])), np.searchsorted(self.ends[:-1], inside)
         for mode in np.unique(modes):
             indices = np.flatnonzero(modes == mode)
@@ -242,7 +246,7 @@ class _Way:
 
 
 @dataclass(frozen=True, eq=False)
-class _VaryingWay:
+class _VaryingAdjoint:
     """Adjoint of a functional with the ``row (d,)`` at its ``time``, propagated backwards through a system that changes
     with time."""
 
@@ -255,22 +259,22 @@ class _VaryingWay:
         ``(k, mw)``."""
         pieces = np.minimum(self.motion.place(inside), self.motion.origin.size - 1)
         inputs = self.motion.law(times, pieces)[0][:, :, self.motion.states :]
-        return np.asarray((self._rows(times)[:, None] @ inputs)[:, 0, self.motion.expansion.channels[0] :])
+        return np.asarray((self._propagate_back(times)[:, None] @ inputs)[:, 0, self.motion.expansion.channels[0] :])
 
     def gains(self, starts: Array, ends: Array) -> Array:
         """Return the integrals of ``E' Phi(time, s)' row`` from ``starts (k,)`` to ``ends (k,)``: ``(k, mw)``."""
         input_response = self.motion.expansion.flow(starts, ends).disturbance
-        return np.asarray((self._rows(ends)[:, None] @ input_response)[:, 0])
+        return np.asarray((self._propagate_back(ends)[:, None] @ input_response)[:, 0])
 
-    def _rows(self, times: Array) -> Array:
+    def _propagate_back(self, times: Array) -> Array:
         """Return the functional propagated backwards to earlier ``times (k,)``: ``(k, d)``."""
-        ends, rows = self._ahead
+        ends, rows = self._rows_at_ends
         pieces = np.minimum(self.motion.place(times), ends.size - 1)
         state = self.motion.expansion.flow(times, ends[pieces]).state
         return np.asarray((rows[pieces][:, None] @ state)[:, 0])
 
     @cached_property
-    def _ahead(self) -> tuple[Array, Array]:
+    def _rows_at_ends(self) -> tuple[Array, Array]:
         """Ends of the pieces between marks, up to the piece that holds the time of the functional, ``(K,)``, and the
         functional there, ``(K, d)``. The last end is the time itself."""
         motion, marks = self.motion, self.motion.grid.breakpoints
@@ -283,23 +287,23 @@ class _VaryingWay:
         return ends, rows
 
 
-Way: TypeAlias = _Way | _VaryingWay
+Way: TypeAlias = _SwitchedAdjoint | _VaryingAdjoint
 
 
-def _way(response: Response, parameter: Array, time: float, direction: Array) -> Way:
+def _build_adjoint(response: Response, parameter: Array, time: float, direction: Array) -> Way:
     if response.grid.varying:
         response = response.at(parameter)
-        return _VaryingWay(VaryingMotion(response.propagator, response.initial_state), direction, time)
-    return _Way.of(response, parameter, time, direction)
+        return _VaryingAdjoint(VaryingMotion(response.propagator, response.initial_state), direction, time)
+    return _SwitchedAdjoint.of(response, parameter, time, direction)
 
 
-def _halved(bound: ConvexSet, flow: Way, parts: tuple[Array, Array], horizon: float) -> tuple[Array, Array]:
+def _refine_parts(bound: ConvexSet, flow: Way, parts: tuple[Array, Array], horizon: float) -> tuple[Array, Array]:
     """The parts, halved wherever the best constant on one is not the best at both of its ends; the most lossy of them
     when they are too many."""
     starts, ends = parts
     active = np.arange(starts.size)
     for _ in range(HALVINGS):
-        loss, size = _lost(bound, flow, starts[active], ends[active])
+        loss, size = _measure_loss(bound, flow, starts[active], ends[active])
         allowed = LOST * size * horizon
         middles = (starts[active] + ends[active]) / 2
         open_ = np.flatnonzero((loss > allowed) & (middles > starts[active]) & (middles < ends[active]))
@@ -314,7 +318,7 @@ def _halved(bound: ConvexSet, flow: Way, parts: tuple[Array, Array], horizon: fl
     return starts[order], ends[order]
 
 
-def _lost(bound: ConvexSet, flow: Way, starts: Array, ends: Array) -> tuple[Array, float]:
+def _measure_loss(bound: ConvexSet, flow: Way, starts: Array, ends: Array) -> tuple[Array, float]:
     """Return the loss of the best constant on each part against the best values at its two ends, times the part's
     length, ``(k,)``, and the largest absolute support value there."""
     best = bound.support_point(flow.gains(starts, ends))
@@ -327,7 +331,7 @@ def _lost(bound: ConvexSet, flow: Way, starts: Array, ends: Array) -> tuple[Arra
     return loss, largest
 
 
-def _merged(starts: Array, values: Array, breakpoints: Array) -> tuple[Array, Array]:
+def _merge_equal_parts(starts: Array, values: Array, breakpoints: Array) -> tuple[Array, Array]:
     """Parts with the same value as one, but for the breakpoints of the grid, which all stay."""
     changes = np.concatenate([[True], (np.diff(values, axis=0) != 0).any(axis=1)])
     points = np.unique(np.concatenate([breakpoints, starts[changes]]))

@@ -40,7 +40,7 @@ class Signal:
     values: Array
 
     def __call__(self, time: npt.ArrayLike) -> Array:
-        times = _times(time, float(self.breakpoints[-1]))
+        times = _parse_times(time, float(self.breakpoints[-1]))
         pieces = np.clip(np.searchsorted(self.breakpoints, times, side="right") - 1, 0, self.values.shape[1] - 1)
         return np.asarray(self.values[:, pieces])
 
@@ -109,12 +109,12 @@ class ControlResult(Result):
     @property
     def control(self) -> Signal:
         """The control as a function of time, and as breakpoints with values ``(m, K)``."""
-        return Signal(self.model.control.breakpoints, self.model.pieces(self._decided()))
+        return Signal(self.model.control.breakpoints, self.model.pieces(self._require_decision()))
 
     def tube(self, times: npt.ArrayLike) -> Tube:
         """The states at times ``(T,)``, and how far the disturbance may bring them: exact for known systems, at
         sampled parameters for uncertain ones."""
-        return tube(self.model, self._decided(), np.atleast_1d(_times(times, self.problem.horizon)))
+        return tube(self.model, self._require_decision(), np.atleast_1d(_parse_times(times, self.problem.horizon)))
 
     def adversary(self, constraint: str) -> Adversary:
         """The worst case of the constraint of that name: time, parameter and disturbance, as arrays. Raises
@@ -124,13 +124,13 @@ class ControlResult(Result):
             names = ", ".join(named) or "none on the state"
             raise InputError(path="constraint", expected=f"one of {names}", got=f"{constraint!r}")
         worst_case = find_adversary(
-            named[constraint], self._decided(), self.model.feedback, self.model.program.own_units
+            named[constraint], self._require_decision(), self.model.feedback, self.model.program.own_units
         )
         if worst_case is None:
             raise InputError(f"the constraint {constraint} has no worst case at this decision")
         return worst_case
 
-    def _decided(self) -> Array:
+    def _require_decision(self) -> Array:
         if self.decision is None:
             raise InputError(f"there is no control: the result is {self.status}: {self.message}")
         return np.asarray(self.decision, dtype=float).ravel()
@@ -190,7 +190,7 @@ def supports(model: Transcription, theta: Array, times: Array, directions: Array
     return largest
 
 
-def _times(time: npt.ArrayLike, horizon: float) -> Array:
+def _parse_times(time: npt.ArrayLike, horizon: float) -> Array:
     try:
         times = np.array(time, dtype=float)
     except (TypeError, ValueError):

@@ -101,9 +101,9 @@ class Limits:
     """
 
     def __init__(self, signals: int, work: float, seconds: float, passed: Callable[[], bool]) -> None:
-        self.work, self._most, self._passed = work, signals, passed
-        self._beside = 0
-        self._until = time.perf_counter() + seconds
+        self.work, self._signal_limit, self._is_run_over = work, signals, passed
+        self._initial_count = 0
+        self._deadline = time.perf_counter() + seconds
         self.ended: Ended = "settled"
 
     @staticmethod
@@ -116,11 +116,11 @@ class Limits:
     @property
     def seconds(self) -> float:
         """Number of seconds that are left."""
-        return max(0.0, self._until - time.perf_counter())
+        return max(0.0, self._deadline - time.perf_counter())
 
     def passed(self) -> bool:
         """Return whether the time of the search, or that of the run, is over."""
-        return not self.seconds or self._passed()
+        return not self.seconds or self._is_run_over()
 
     def over(self, tree: Tree, idle: int = 0) -> bool:
         """Return whether the search for a tree ends after so many ``idle`` rounds, and record the reason in
@@ -140,18 +140,18 @@ class Limits:
 
     def begin(self, tree: Tree) -> None:
         """Exclude the signals that the tree already holds from the count."""
-        self._beside = len(tree.signals)
+        self._initial_count = len(tree.signals)
 
     def again(self) -> None:
         """Start the limits anew for another tree: signals and work count from 0, but the time goes on."""
-        self._beside = 0
+        self._initial_count = 0
         if self.ended != "seconds":
             self.ended = "settled"
 
     def room(self, tree: Tree) -> int:
         """Return the number of signals that may still be added to the tree; before the search begins always 1, so that
         there is no limit."""
-        return self._most + self._beside - len(tree.signals) if self._beside else 1
+        return self._signal_limit + self._initial_count - len(tree.signals) if self._initial_count else 1
 
 
 @final
@@ -172,11 +172,13 @@ class CausalSearch:
         places = np.zeros(0, dtype=int) if disturbance is None or disturbance.starts is None else disturbance.starts
         self.starts = grid.breakpoints[places]
         self.spread = Spread(() if disturbance is None else self.loop.spread.sets[:1])
-        requests = [(constraint.H, constraint.h, self._times(constraint, active)) for constraint in self.constraints]
+        requests = [
+            (constraint.H, constraint.h, self._sample_times(constraint, active)) for constraint in self.constraints
+        ]
         self.sampled = Sampled.of(self.loop, requests)
         self._active = active
 
-    def _times(self, one: FlatConstraint, active: Sequence[tuple[str, float, Array | None]]) -> Array:
+    def _sample_times(self, one: FlatConstraint, active: Sequence[tuple[str, float, Array | None]]) -> Array:
         points = self.model.response.grid.breakpoints
         shares = np.arange(1, INSIDE + 1) / (INSIDE + 1)
         inner = (points[:-1, None] + np.diff(points)[:, None] * shares).ravel()
@@ -192,7 +194,7 @@ class CausalSearch:
         N = s.N[:, : self.spread.size]
         width, block_counts = self.spread.size // max(1, self.starts.size), np.searchsorted(self.starts, s.time)
         signals = [extreme(self.spread, z) for _, _, z in self._active if z is not None and z.any()]
-        return self._planted(
+        return self._build_tree(
             OfDisturbances(N, self.spread, width, known_counts, block_counts), signals, limits, highest
         )
 
@@ -208,9 +210,9 @@ class CausalSearch:
             return None
         knowledge.limit, knowledge.passed = limits.work, limits.passed
         signals = [beside[0].signals[index] for index in np.unique(beside[1].signals)] if beside is not None else []
-        return self._planted(knowledge, signals, limits, highest)
+        return self._build_tree(knowledge, signals, limits, highest)
 
-    def _planted(self, knowledge: Knowledge, known: list[Array], limits: Limits, highest: float | None) -> Tree:
+    def _build_tree(self, knowledge: Knowledge, known: list[Array], limits: Limits, highest: float | None) -> Tree:
         problem, feedback = self.model.problem, self.model.answering
         limits.again()
         prices = problem.prices(self.model.control.breakpoints)
@@ -227,16 +229,16 @@ class CausalSearch:
         """The tree that was found, its multipliers, and whether they prove that no causal policy exists; ``cost``: of
         the policy, an upper bound of what the tree can prove, infinite where none is known. First as if no noise hid
         anything, and then, where it ``hides``, with what that took to prove."""
-        best = self._least_cost(self.tree(limits), cost, limits)
+        best = self._search_least_cost(self.tree(limits), cost, limits)
         if not hides or (best is not None and best[2]):
             return best
         tree = self.hiding(limits, None if best is None else best[:2])
-        better = None if tree is None else self._least_cost(tree, cost, limits)
+        better = None if tree is None else self._search_least_cost(tree, cost, limits)
         if best is None or (better is not None and (better[2] or better[1].value > best[1].value)):
             return better
         return best
 
-    def _least_cost(self, tree: Tree, cost: float, limits: Limits) -> tuple[Tree, Grown, bool] | None:
+    def _search_least_cost(self, tree: Tree, cost: float, limits: Limits) -> tuple[Tree, Grown, bool] | None:
         best, idle = tree.least(), 0
         while best is not None and idle < len(ANSWERED) and not limits.over(tree, idle):
             aim = cost if np.isfinite(cost) else np.inf
@@ -245,28 +247,28 @@ class CausalSearch:
                 break
             better = tree.least()
             if better is None:  # nothing is feasible, or the solver did not finish
-                refused = self._refused(tree)
+                refused = self._prove_infeasibility(tree)
                 return (tree, best, False) if refused is None else (tree, refused, True)
             idle = 0 if better.value > best.value + NONE * abs(better.value) else idle + 1
             best = better
         if best is not None:
             return tree, best, False
-        refused = self._refused(tree)
+        refused = self._prove_infeasibility(tree)
         return None if refused is None else (tree, refused, True)
 
     @staticmethod
-    def _refused(tree: Tree) -> Grown | None:
+    def _prove_infeasibility(tree: Tree) -> Grown | None:
         multipliers = tree.relaxed()
         return multipliers if multipliers is not None and multipliers.value > NONE else None
 
     def largest_factor(self, highest: float, limits: Limits) -> tuple[Tree, Grown] | None:
         """The largest factor of all deviations for which the tree is feasible, with its multipliers. Of outputs with a
         noise first as if it hid nothing, and then below the factor that was found, for which it hides its share."""
-        best = self._largest_factor(self.tree(limits, highest), limits)
+        best = self._search_largest_factor(self.tree(limits, highest), limits)
         for _ in range(AGAIN if best is not None else 0):
             assert best is not None
             tree = self.hiding(limits, best, best[1].value * (1.0 + NARROWER))
-            better = None if tree is None else self._largest_factor(tree, limits)
+            better = None if tree is None else self._search_largest_factor(tree, limits)
             if better is None or better[1].value >= best[1].value:
                 break
             narrower, best = better[1].value < best[1].value * (1.0 - NARROWER), better
@@ -274,7 +276,7 @@ class CausalSearch:
                 break
         return best
 
-    def _largest_factor(self, tree: Tree, limits: Limits) -> tuple[Tree, Grown] | None:
+    def _search_largest_factor(self, tree: Tree, limits: Limits) -> tuple[Tree, Grown] | None:
         best, idle = tree.least(), 0
         while best is not None and idle < len(ANSWERED) and not limits.over(tree, idle):
             if not self._grow(tree, best, limits.room(tree), idle):
@@ -294,9 +296,11 @@ class CausalSearch:
         """
         shares = ANSWERED if self.decision is not None else (0.0,)
         at = min(idle, len(shares) - 1)
-        return any(self._sought(tree, centre, most, share) for share in dict.fromkeys((*shares[at:], *shares[:at])))
+        return any(
+            self._add_departures(tree, centre, most, share) for share in dict.fromkeys((*shares[at:], *shares[:at]))
+        )
 
-    def _sought(self, tree: Tree, centre: Grown, most: int, share: float) -> bool:
+    def _add_departures(self, tree: Tree, centre: Grown, most: int, share: float) -> bool:
         """Add signals that depart from a signal of the tree at a report and are the worst for a row from there on, and
         return whether there are new ones.
 
@@ -344,20 +348,22 @@ class CausalSearch:
             weights[index] = weights.get(index, 0.0) + float(found.shares[signal])
         total = max(1.0, sum(weights.values())) / SHARED
         shares = tuple(weights.get(index, 0.0) / total for index in range(len(deviations)) if weights)
-        signals = tuple(_values(z[: self.spread.size], disturbance, self.starts.size) for z in deviations)
+        signals = tuple(_place_in_set(z[: self.spread.size], disturbance, self.starts.size) for z in deviations)
         if not isinstance(tree.knowledge, OfOutputs):
             return CausalBound(lower, signals, tuple(rows), ended, shares)
         outputs = tuple(tree.knowledge.outputs(z) for z in deviations)
-        initial_states = tuple(self._begun(z[self.spread.size : self.sampled.N.shape[1]]) for z in deviations)
+        initial_states = tuple(
+            self._compute_initial_state(z[self.spread.size : self.sampled.N.shape[1]]) for z in deviations
+        )
         return CausalBound(lower, signals, tuple(rows), ended, shares, outputs, initial_states)
 
-    def _begun(self, z: Array) -> Array:
+    def _compute_initial_state(self, z: Array) -> Array:
         """The initial state of deviations, certainly in its set."""
         bound = self.model.problem.initial_set
-        return self.loop.start if bound is None else _values(z, bound, 1)[:, 0]
+        return self.loop.start if bound is None else _place_in_set(z, bound, 1)[:, 0]
 
 
-def _values(z: Array, disturbance: ConvexSet | None, blocks: int) -> Array:
+def _place_in_set(z: Array, disturbance: ConvexSet | None, blocks: int) -> Array:
     """The disturbance ``(mw, blocks)`` of deviations, certainly in its set; 0 is exactly the middle."""
     if disturbance is None:
         return np.zeros((0, 0))

@@ -156,60 +156,62 @@ class Horizons:
             key = multiplier.parameter.tobytes()
             try:
                 if key not in lifted:
-                    lifted[key] = self._lifted(multiplier.parameter, low / self._units.time, high / self._units.time)
+                    lifted[key] = self._lift_system(
+                        multiplier.parameter, low / self._units.time, high / self._units.time
+                    )
                 share = multiplier.share_from(low)
                 with np.errstate(over="ignore", invalid="ignore"):
-                    summand = self._part(multiplier, lifted[key], share, multiplier.highest(share, low, high))
+                    summand = self._expand_row(multiplier, lifted[key], share, multiplier.highest(share, low, high))
             except NotEnclosable:
                 return -np.inf
             scaled = summand.times(multiplier.weight / size)
             total = scaled if total is None else total.plus(scaled)
         assert total is not None
-        answer = total.least(self._own.control)
+        answer = total.least(self._own_problem.control)
         return answer * size if np.isfinite(answer) else -np.inf
 
-    def _lifted(self, parameter: Array, low: float, high: float) -> LiftedSystem:
+    def _lift_system(self, parameter: Array, low: float, high: float) -> LiftedSystem:
         """The system at one parameter in the time ``s``, over the horizons of an interval."""
         at = (parameter / self._units.parameters)[None]
-        A, B, E = (matrix[0] for matrix in self._own.system.forced.modes[0].matrices(at))
+        A, B, E = (matrix[0] for matrix in self._own_problem.system.forced.modes[0].matrices(at))
         horizons = Box(np.array([low]), np.array([high]))
         scaled = Phase(lambda T: A * T[0], lambda T: B * T[0], lambda T: E * T[0], horizons)
         middle, radius = np.array([(low + high) / 2]), np.array([(high - low) / 2])
-        return lift(scaled, self._grid, self._start, middle, radius * (1.0 + 4.0 * np.finfo(float).eps))
+        return lift(scaled, self._grid, self._initial_state, middle, radius * (1.0 + 4.0 * np.finfo(float).eps))
 
-    def _part(self, one: Multiplier, lifted: LiftedSystem, share: float, limit: float) -> _Sum:
+    def _expand_row(self, one: Multiplier, lifted: LiftedSystem, share: float, limit: float) -> _TaylorRow:
         """``c'x(s) - limit`` with the worst uncertainty of the interval's middle, as a Taylor model in the horizon."""
-        own, m = self._own, self._own.system.controls
+        own, m = self._own_problem, self._own_problem.system.controls
         at, rows = np.array([share]), (one.direction * self._units.states)[None] @ lifted.transform
         piece = int(self._grid.locate(at)[0])
         coefficients = np.zeros(lifted.space.size)
         coefficients[0] = -limit
         initial_set = own.initial_set
         radius = np.zeros(own.system.states) if initial_set is None else extent(initial_set)
-        initial = InitialSupport(lifted, Box(self._start - radius, self._start + radius), rows)
+        initial = InitialSupport(lifted, Box(self._initial_state - radius, self._initial_state + radius), rows)
         weights = initial.blocks(at)[0, 0]
-        start = self._start
+        start = self._initial_state
         if initial_set is not None and one.uncertain:
             start = start + initial_set.support_point(weights[:1])[0]
         coefficients += weights @ start
-        sizes = abs(limit) + abs(one.limit) + float((np.abs(weights) @ (np.abs(self._start) + radius)).sum())
+        sizes = abs(limit) + abs(one.limit) + float((np.abs(weights) @ (np.abs(self._initial_state) + radius)).sum())
         error = float(initial.neglected[0, piece])
-        if self._noise is not None and one.uncertain:
-            support = DisturbanceSupport(lifted, self._noise, rows)
+        if self._disturbance_model is not None and one.uncertain:
+            support = DisturbanceSupport(lifted, self._disturbance_model, rows)
             blocks = support.blocks(at)[0, 0]
-            worst = self._noise.set.support_point(blocks[0])
+            worst = self._disturbance_model.set.support_point(blocks[0])
             coefficients += np.einsum("bq,abq->a", worst, blocks)
             sizes += float(np.einsum("bq,abq->", np.abs(worst), np.abs(blocks)))
             error += float(support.neglected[0, piece])
         if lifted.B.shape[2] > m:  # a drift, whose input is always 1
             ones = Box(np.ones(lifted.B.shape[2] - m), np.ones(lifted.B.shape[2] - m))
             drift_model = DisturbanceModel("piecewise_constant", ones, ones, self._grid, starts=np.zeros(1, dtype=int))
-            support = DisturbanceSupport(_driven(lifted, slice(m, None)), drift_model, rows)
+            support = DisturbanceSupport(_replace_disturbance(lifted, slice(m, None)), drift_model, rows)
             blocks = support.blocks(at)[0, 0].sum(axis=(1, 2))
             coefficients += blocks
             sizes += float(np.abs(blocks).sum())
             error += float(support.neglected[0, piece])
-        acting = DisturbanceSupport(_driven(lifted, slice(0, m)), self._acting, rows)
+        acting = DisturbanceSupport(_replace_disturbance(lifted, slice(0, m)), self._control_model, rows)
         blocks = acting.blocks(at)[0, 0]
         if one.gain is not None:
             ends = stretched(self.control, 1.0).breakpoints
@@ -217,36 +219,38 @@ class Horizons:
         sizes += float(own.control.reach(blocks).sum())
         error += float(acting.neglected[0, piece])
         terms = rounding(2 * own.system.states + lifted.space.size + self._grid.pieces)
-        return _Sum(lifted, coefficients, blocks, error + terms * sizes)
+        return _TaylorRow(lifted, coefficients, blocks, error + terms * sizes)
 
     @cached_property
     def _units(self) -> Units:
-        return rough_units(self._unchanged)
+        return rough_units(self._problem_before_change)
 
     @cached_property
-    def _own(self) -> OptimalControlProblem:
-        return self._units.of_problem(self._unchanged)
+    def _own_problem(self) -> OptimalControlProblem:
+        return self._units.of_problem(self._problem_before_change)
 
     @property
-    def _unchanged(self) -> OptimalControlProblem:
+    def _problem_before_change(self) -> OptimalControlProblem:
         """The problem as it is up to the first change of the system."""
         system = self.problem.system
         return replace(self.problem, system=System((system.phases[0].between(0.0, np.inf),), system.parameters))
 
     @cached_property
-    def _start(self) -> Array:
-        return np.asarray(self._own.initial_state, dtype=float)
+    def _initial_state(self) -> Array:
+        return np.asarray(self._own_problem.initial_state, dtype=float)
 
     @cached_property
     def _grid(self) -> TimeGrid:
         """The merged grid in the time ``s``, from 0 to 1."""
         breakpoints = [stretched(dictionary, 1.0).breakpoints for dictionary in (self.control, self.disturbance)]
-        forced = self._own.system.forced
-        return merge_grids(breakpoints[0], breakpoints[1], 0.0, None, forced.controls - self._own.system.controls)
+        forced = self._own_problem.system.forced
+        return merge_grids(
+            breakpoints[0], breakpoints[1], 0.0, None, forced.controls - self._own_problem.system.controls
+        )
 
     @cached_property
-    def _noise(self) -> DisturbanceModel | None:
-        own = self._own
+    def _disturbance_model(self) -> DisturbanceModel | None:
+        own = self._own_problem
         if own.disturbance is None:
             return None
         if own.measurable is not None:  # what is constant on pieces is measurable
@@ -255,15 +259,17 @@ class Horizons:
         return disturbance_model(own.disturbance_class, own.disturbance, stretched(self.disturbance, 1.0), self._grid)
 
     @cached_property
-    def _acting(self) -> DisturbanceModel:
+    def _control_model(self) -> DisturbanceModel:
         """The control on its pieces, in the form of a disturbance."""
         starts = np.flatnonzero(np.diff(self._grid.control_piece, prepend=-1))
-        return DisturbanceModel("piecewise_constant", self._own.control, self._own.control, self._grid, starts=starts)
+        return DisturbanceModel(
+            "piecewise_constant", self._own_problem.control, self._own_problem.control, self._grid, starts=starts
+        )
 
 
 @final
 @dataclass(frozen=True, eq=False)
-class _Sum:
+class _TaylorRow:
     """Taylor coefficients ``(M,)`` in the horizon of what no control changes, and ``(M, K, m)`` of the weights on the
     control's pieces; the truth is off by at most ``lost``."""
 
@@ -272,13 +278,13 @@ class _Sum:
     weights: Array
     lost: float
 
-    def times(self, factor: float) -> _Sum:
+    def times(self, factor: float) -> _TaylorRow:
         """Return the sum multiplied by ``factor``."""
-        return _Sum(self.lifted, factor * self.coefficients, factor * self.weights, abs(factor) * self.lost)
+        return _TaylorRow(self.lifted, factor * self.coefficients, factor * self.weights, abs(factor) * self.lost)
 
-    def plus(self, other: _Sum) -> _Sum:
+    def plus(self, other: _TaylorRow) -> _TaylorRow:
         """Return the sum of two."""
-        return _Sum(
+        return _TaylorRow(
             self.lifted,
             self.coefficients + other.coefficients,
             self.weights + other.weights,
@@ -292,6 +298,6 @@ class _Sum:
         return -float(above[0] + support_values[-1] + self.lost * (1.0 + 1e-12))
 
 
-def _driven(lifted: LiftedSystem, columns: slice) -> LiftedSystem:
+def _replace_disturbance(lifted: LiftedSystem, columns: slice) -> LiftedSystem:
     """The lifted system with some columns of ``B`` in the place of the disturbance's."""
     return replace(lifted, W=lifted.B[:, :, columns], slack_W=lifted.slack_B[:, columns])

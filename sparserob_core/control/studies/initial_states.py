@@ -78,8 +78,8 @@ class InitialPlane:
         them."""
         key = z.tobytes()
         if key not in self._programs:
-            program = from_state(self.centred, self._state(z)).program
-            A, b = self._equalities(z)
+            program = from_state(self.centred, self._build_initial_state(z)).program
+            A, b = self._build_equalities(z)
             remember(self._programs, key, replace(program, A=A, b=b), PROGRAMS_KEPT)
         return self._programs[key]
 
@@ -88,10 +88,10 @@ class InitialPlane:
         raise."""
         if self.model.response.propagator.expansion is None:
             return result
-        mu = np.zeros(self._end_units.size)
-        mu[np.flatnonzero(self._needed(z))[: result.dual.mu.size]] = result.dual.mu
-        ends = replace(result, dual=replace(result.dual, mu=mu / self._end_units))  # of the states that are fixed
-        bound = rounded_down(from_state(self.centred, self._state(z)), ends, None).lower_bound
+        mu = np.zeros(self._equality_units.size)
+        mu[np.flatnonzero(self._find_needed_equalities(z))[: result.dual.mu.size]] = result.dual.mu
+        ends = replace(result, dual=replace(result.dual, mu=mu / self._equality_units))  # of the states that are fixed
+        bound = rounded_down(from_state(self.centred, self._build_initial_state(z)), ends, None).lower_bound
         return replace(result, lower_bound=bound)
 
     def weakened(self, result: Result) -> Result:
@@ -105,11 +105,11 @@ class InitialPlane:
         """
         if self.model.response.propagator.expansion is None:
             return result
-        error = sum(cut.multiplier * self._off_at(cut) for cut in result.dual.cuts)
+        error = sum(cut.multiplier * self._bound_row_error(cut) for cut in result.dual.cuts)
         if result.status != "infeasible":
-            error += float(np.abs(result.dual.mu) @ self._off_at_ends[: result.dual.mu.size])
+            error += float(np.abs(result.dual.mu) @ self._equality_error_bounds[: result.dual.mu.size])
             return replace(result, lower_bound=result.lower_bound - error)
-        if result.dual.bound > max(error, self._off_at_most):
+        if result.dual.bound > max(error, self._largest_error_share):
             return result
         message = "nothing seems feasible, by no more than what steps of the system may be off by"
         return replace(result, status="undecided", message=message, lower_bound=-np.inf)
@@ -127,32 +127,32 @@ class InitialPlane:
         sizes = added_up(self.centred, times, directions, parameters) + np.abs(columns).sum(axis=1)
         return np.asarray((SHARE + response.propagator.slack) * sizes + np.abs(directions) @ self.beyond)
 
-    def _off_at(self, cut: Cut) -> float:
+    def _bound_row_error(self, cut: Cut) -> float:
         """Return the error bound of a row that holds with equality, under feedback; 0 for other rows, which are wider
         by their bound."""
-        constraint = self.centred.constraint(self._base.family(cut.family))
+        constraint = self.centred.constraint(self._centre_program.family(cut.family))
         if constraint is None or any(constraint is entry for entry in self.centred.constraints):
             return 0.0
         times, directions, parameters, _ = constraint.functionals_at(cut.index[None, :1])
         return float(self.off(times, directions, parameters)[cut.row])
 
     @cached_property
-    def _off_at_ends(self) -> Array:
+    def _equality_error_bounds(self) -> Array:
         """Error bounds of the equalities, in their units, ``(e,)``."""
         axes, middle = fixed(self.model.held)[0], self.model.parameters.middle
         times = np.full(axes.shape[0], self.model.problem.horizon)
-        return self.off(times, axes, np.tile(middle, (times.size, 1))) / self._end_units
+        return self.off(times, axes, np.tile(middle, (times.size, 1))) / self._equality_units
 
     @cached_property
-    def _off_at_most(self) -> float:
+    def _largest_error_share(self) -> float:
         """Largest error bound of an equality as a share of the norm of its row.
 
         An equality without entries counts 0 where its residual exceeds the bound, and ``inf`` elsewhere.
         """
-        base, errors = self._base.finite, self._off_at_ends
+        base, errors = self._centre_program.finite, self._equality_error_bounds
         if not base.b.size:
             return 0.0
-        norms = np.linalg.norm(np.hstack([base.A, self._columns]), axis=1)
+        norms = np.linalg.norm(np.hstack([base.A, self._equality_columns]), axis=1)
         empty_row_share = np.where(np.abs(base.b) > errors, 0.0, np.inf)
         return float(np.where(norms > 0.0, errors / np.where(norms > 0.0, norms, 1.0), empty_row_share).max())
 
@@ -160,28 +160,28 @@ class InitialPlane:
     def strip(self) -> float:
         """The area, in coordinates ``z``, of what is left of the plane by an equality that no control enters, up to
         what it may be off by; 0 where there is none."""
-        lengths = np.linalg.norm(self._columns, axis=1)
-        is_pinned = ~self._base.finite.A.any(axis=1) & (lengths > 0.0)
-        widths = 2.0 * self._off_at_ends[is_pinned] / lengths[is_pinned]
+        lengths = np.linalg.norm(self._equality_columns, axis=1)
+        is_pinned = ~self._centre_program.finite.A.any(axis=1) & (lengths > 0.0)
+        widths = 2.0 * self._equality_error_bounds[is_pinned] / lengths[is_pinned]
         return float(2.0 * np.sqrt(2.0) * widths.max(initial=0.0))
 
     @cached_property
-    def _end_units(self) -> Array:
+    def _equality_units(self) -> Array:
         """Divisors of the equalities, ``(e,)``."""
         count = fixed(self.model.held)[1].size
         return np.ones(count) if self.model.rows is None else self.model.rows.fixed[:count]
 
-    def _needed(self, z: Array) -> np.ndarray:
+    def _find_needed_equalities(self, z: Array) -> np.ndarray:
         """Return which equalities ``(e,)`` the program at ``z`` has: all but those that no control enters and that hold
         there but for rounding."""
-        base = self._base.finite
-        return np.asarray(base.A.any(axis=1) | (np.abs(base.b - self._columns @ z) > TOLERANCE))
+        base = self._centre_program.finite
+        return np.asarray(base.A.any(axis=1) | (np.abs(base.b - self._equality_columns @ z) > TOLERANCE))
 
-    def _equalities(self, z: Array) -> tuple[Array | None, Array | None]:
+    def _build_equalities(self, z: Array) -> tuple[Array | None, Array | None]:
         """Return the matrix and the right-hand sides of the equalities of the program at ``z``, ``None`` each where
         there are none."""
-        base, needed = self._base.finite, self._needed(z)
-        return (base.A[needed], (base.b - self._columns @ z)[needed]) if needed.any() else (None, None)
+        base, needed = self._centre_program.finite, self._find_needed_equalities(z)
+        return (base.A[needed], (base.b - self._equality_columns @ z)[needed]) if needed.any() else (None, None)
 
     def support(self, direction: Array, known: Sequence[Cut] = ()) -> SemiInfiniteProgram:
         """Minimise ``-direction'z`` over all ``(theta, z)``: its value is minus the support function of the feasible
@@ -193,14 +193,14 @@ class InitialPlane:
         if self.free is not self:
             return self.free.support(direction, known)
         if self.model.feedback is not None:
-            return self._support_under_feedback(direction, known)
-        base, finite, n = self._base, self._base.finite, self._base.n
-        G, h = self._rows(known)
-        A = None if base.A is None else np.hstack([base.A, self._columns])
+            return self._build_feedback_support(direction, known)
+        base, finite, n = self._centre_program, self._centre_program.finite, self._centre_program.n
+        G, h = self._build_rows(known)
+        A = None if base.A is None else np.hstack([base.A, self._equality_columns])
         return SemiInfiniteProgram(
             n=n + 2,
             q=np.concatenate([np.zeros(n), -direction]),
-            S=_with_identity(finite.S),
+            S=_append_identity(finite.S),
             lower=np.append(finite.lower, [-1.0, -1.0]),
             upper=np.append(finite.upper, [1.0, 1.0]),
             G=G,
@@ -211,8 +211,8 @@ class InitialPlane:
             channels=base.channels,
         )
 
-    def _support_under_feedback(self, direction: Array, known: Sequence[Cut]) -> SemiInfiniteProgram:
-        base, finite, n = self._base, self._base.finite, self._base.n
+    def _build_feedback_support(self, direction: Array, known: Sequence[Cut]) -> SemiInfiniteProgram:
+        base, finite, n = self._centre_program, self._centre_program.finite, self._centre_program.n
 
         def settle(x: Array) -> Array:
             settled = self.at(x[-2:]).settle
@@ -223,7 +223,7 @@ class InitialPlane:
             q=np.concatenate([np.zeros(n), -direction]),
             lower=np.append(finite.lower, [-1.0, -1.0]),
             upper=np.append(finite.upper, [1.0, 1.0]),
-            families=[_JoinedUncertain(self, family).family(known) for family in base.families],
+            families=[_UncertainJointFamily(self, family).family(known) for family in base.families],
             channels=base.channels,
             spread=base.spread,
             settle=None if base.settle is None else settle,
@@ -232,9 +232,9 @@ class InitialPlane:
     @cached_property
     def ends(self) -> list[SemiInfiniteProgram]:
         """The ordinary programs where one of ``z`` is 1 and the other 0."""
-        return [from_state(self.centred, self._state(z)).program for z in np.eye(2)]
+        return [from_state(self.centred, self._build_initial_state(z)).program for z in np.eye(2)]
 
-    def _rows(self, cuts: Sequence[Cut]) -> tuple[Array | None, Array | None]:
+    def _build_rows(self, cuts: Sequence[Cut]) -> tuple[Array | None, Array | None]:
         if not cuts:
             return None, None
         rows = [next(f for f in self._families if f.name == cut.family).rows(cut.index[None]) for cut in cuts]
@@ -245,38 +245,38 @@ class InitialPlane:
 
     @cached_property
     def _families(self) -> list[ConstraintFamily]:
-        return [_Joined(self, family).family() for family in self._base.families]
+        return [_JointFamily(self, family).family() for family in self._centre_program.families]
 
     @cached_property
-    def _base(self) -> SemiInfiniteProgram:
+    def _centre_program(self) -> SemiInfiniteProgram:
         """The ordinary program at the centre."""
         return self.centred.program
 
     @cached_property
-    def _columns(self) -> Array:
+    def _equality_columns(self) -> Array:
         """The columns ``(e, 2)`` of ``z`` in the equalities."""
-        at_centre = self._base.b
+        at_centre = self._centre_program.b
         if at_centre is None:
             return np.zeros((0, 2))
-        right_hand_sides = [from_state(self.model, self._state(z)).program.b for z in np.eye(2)]
+        right_hand_sides = [from_state(self.model, self._build_initial_state(z)).program.b for z in np.eye(2)]
         return np.stack([at_centre - np.asarray(b) for b in right_hand_sides], axis=1)
 
     @cached_property
     def centred(self) -> Transcription:
         """The problem from the centre of the plane."""
-        return from_state(self.model, self._state(np.zeros(2)))
+        return from_state(self.model, self._build_initial_state(np.zeros(2)))
 
     @cached_property
     def beyond(self) -> Array:
         """Bounds ``(d,)`` of the remainder of a law's series in the parameters, for every state, from any initial state
         of the plane."""
-        magnitudes = np.abs(self._state(np.zeros(2)))
+        magnitudes = np.abs(self._build_initial_state(np.zeros(2)))
         magnitudes[list(self.states)] += np.abs(self.radius)
         control = self.model.problem.control
         reach = control.reach(np.eye(control.dimension))
         return self.centred.functionals.from_state(magnitudes).beyond(reach)
 
-    def _state(self, z: Array) -> Array:
+    def _build_initial_state(self, z: Array) -> Array:
         state = np.array(self.model.problem.initial_state, dtype=float)
         state[list(self.states)] = self.point(z)
         return state
@@ -296,7 +296,7 @@ def check_states(states: object, count: int) -> tuple[int, int]:
 
 
 @dataclass(frozen=True, eq=False)
-class _OfPlane:
+class _PlaneFamily:
     """Family of the ordinary program with the initial state at the coordinates ``z (2,)``, which end the decision."""
 
     plane: InitialPlane
@@ -304,19 +304,19 @@ class _OfPlane:
 
     def worst(self, x: Array) -> Separation:
         """The exact separation of the family at that initial state."""
-        worst = self._at(x).worst
+        worst = self._select_family(x).worst
         assert worst is not None  # every family of a control problem has its own separation
         return worst(x[:-2])
 
     def enclosure(self, x: Array, lower: Array, upper: Array) -> Enclosure:
         """The enclosure of the family at that initial state."""
-        enclosure = self._at(x).enclosure
+        enclosure = self._select_family(x).enclosure
         assert enclosure is not None
         return enclosure(x[:-2], lower, upper)
 
     def scale(self, x: Array) -> float:
         """The scale of the family at that initial state."""
-        return self._at(x).allowed(x[:-2]) / TOLERANCE
+        return self._select_family(x).allowed(x[:-2]) / TOLERANCE
 
     def explain(self, index: Array, row: int) -> Explanation:
         """Return the description of the constraint for a reader, without the value from the initial state, which is
@@ -326,13 +326,13 @@ class _OfPlane:
         )
         return explanation.from_any_state() if isinstance(explanation, TimedExplanation) else explanation
 
-    def _at(self, x: Array) -> ConstraintFamily:
+    def _select_family(self, x: Array) -> ConstraintFamily:
         return self.plane.at(x[-2:]).family(self.base.name)
 
 
 @final
 @dataclass(frozen=True, eq=False)
-class _Joined(_OfPlane):
+class _JointFamily(_PlaneFamily):
     """Family of the ordinary program, as a family in ``(theta, z)``."""
 
     def family(self) -> ConstraintFamily:
@@ -372,7 +372,7 @@ class _Joined(_OfPlane):
 
 @final
 @dataclass(frozen=True, eq=False)
-class _JoinedUncertain(_OfPlane):
+class _UncertainJointFamily(_PlaneFamily):
     """Family of the ordinary program under feedback, as a family in ``(v, M, z)``.
 
     At every deviation its rows are affine in the initial state, which enters only their right-hand sides.
@@ -424,10 +424,10 @@ class _JoinedUncertain(_OfPlane):
 
     def excess(self, x: Array, indices: Array) -> Array:
         """The violations from that initial state."""
-        return self._at(x).violations(x[:-2], indices)
+        return self._select_family(x).violations(x[:-2], indices)
 
 
-def _with_identity(S: csc_array | None) -> csc_array | None:
+def _append_identity(S: csc_array | None) -> csc_array | None:
     if S is None:
         return None
     from scipy.sparse import block_diag, csc_array

@@ -68,13 +68,13 @@ class Uncertainty:
         neighbours, drawn where none are given."""
         near = self.bases(law, count, rng) if bases is None else bases
         if near is not None:
-            return self._neighbours(near, rng)
-        disturbances, parameters = self._drawn(law, count, rng)
+            return self._draw_neighbours(near, rng)
+        disturbances, parameters = self._draw_signals(law, count, rng)
         bound = self.functionals.initial
         if bound is None:
             return disturbances, parameters, None
         # slow is a law of signals; a state that is there at once is drawn as those of `iid`
-        points = _extreme if law == "vertices" else _uniform
+        points = _sample_extreme if law == "vertices" else _sample_uniform
         return disturbances, parameters, self.functionals.response.initial_state + points(bound, count, rng)
 
     def errors(self, law: LawName, count: int, command: Array, rng: np.random.Generator) -> Array | None:
@@ -91,7 +91,7 @@ class Uncertainty:
             return np.asarray(worst * np.where(rng.uniform(size=worst.shape) < FLIPPED / pieces, -1.0, 1.0))
         if law == "slow":
             breaks = self.functionals.response.grid.breakpoints
-            hats = _hats((breaks[:-1] + breaks[1:]) / (2 * breaks[-1]), KNOTS)
+            hats = _evaluate_hats((breaks[:-1] + breaks[1:]) / (2 * breaks[-1]), KNOTS)
             shares = np.einsum("lk,kmn->lmn", hats, rng.choice([-1.0, 1.0], size=(KNOTS, m, count)))
         elif law == "vertices":
             shares = rng.choice([-1.0, 1.0], size=(pieces, m, count))
@@ -99,17 +99,17 @@ class Uncertainty:
             shares = rng.uniform(-1.0, 1.0, size=(pieces, m, count))
         return np.asarray(execution.shares[:, None] * shares)
 
-    def _drawn(self, law: LawName, count: int, rng: np.random.Generator) -> tuple[Array | None, Array]:
+    def _draw_signals(self, law: LawName, count: int, rng: np.random.Generator) -> tuple[Array | None, Array]:
         """Disturbances and parameters of `draw`."""
-        points = _extreme if law == "vertices" else _uniform
+        points = _sample_extreme if law == "vertices" else _sample_uniform
         parameters = np.zeros((count, 0)) if self.parameters.set is None else points(self.parameters.set, count, rng)
         model = self.functionals.disturbance
         if model is None:
             return None, parameters
-        blocks = self._slow(model, count, rng) if law == "slow" else _every_block(model, count, rng, points)
+        blocks = self._draw_slow_blocks(model, count, rng) if law == "slow" else _draw_blocks(model, count, rng, points)
         return model.signals(blocks), parameters
 
-    def _slow(self, model: DisturbanceModel, count: int, rng: np.random.Generator) -> Array:
+    def _draw_slow_blocks(self, model: DisturbanceModel, count: int, rng: np.random.Generator) -> Array:
         """Linear between extreme points of the set at equally spaced times, one to `KNOTS` of them: convex
         combinations, so admissible.
 
@@ -125,19 +125,19 @@ class Uncertainty:
             if not indices.size:
                 continue
             points = model.bound.sample_extreme(indices.size * number, rng).reshape(indices.size, number, -1)
-            signal[indices] = np.einsum("lk,nki->nli", _hats(middles, number), points)
+            signal[indices] = np.einsum("lk,nki->nli", _evaluate_hats(middles, number), points)
         if model.starts is not None:
             return signal[:, model.starts]
         coefficients = np.einsum("nli,lj->nij", signal, np.linalg.pinv(np.asarray(model.functions)))
         if model.scale is None:
-            return _drawn_in(model.set, coefficients.reshape(count, 1, -1))
-        return _drawn_in(model.set, coefficients / np.where(model.scale > 0, model.scale, 1.0)[:, None])
+            return _pull_into_set(model.set, coefficients.reshape(count, 1, -1))
+        return _pull_into_set(model.set, coefficients / np.where(model.scale > 0, model.scale, 1.0)[:, None])
 
-    def _neighbours(self, base: np.ndarray, rng: np.random.Generator) -> tuple[Array | None, Array, Array | None]:
+    def _draw_neighbours(self, base: np.ndarray, rng: np.random.Generator) -> tuple[Array | None, Array, Array | None]:
         """The worst disturbance of random times and constraints with a few blocks replaced by extreme points, a
         parameter near its own, and the worst initial state, for some drawn towards an extreme one."""
         count = base.size
-        disturbances, parameters = self._near(base, rng)
+        disturbances, parameters = self._draw_neighbour_signals(base, rng)
         bound = self.functionals.initial
         if bound is None:
             return disturbances, parameters, None
@@ -146,8 +146,8 @@ class Uncertainty:
         deviations = worst + share * (bound.sample_extreme(count, rng) - worst)
         return disturbances, parameters, self.functionals.response.initial_state + deviations
 
-    def _near(self, base: np.ndarray, rng: np.random.Generator) -> tuple[Array | None, Array]:
-        """Disturbances and parameters of `_neighbours`."""
+    def _draw_neighbour_signals(self, base: np.ndarray, rng: np.random.Generator) -> tuple[Array | None, Array]:
+        """Disturbances and parameters of `_draw_neighbours`."""
         bases, count = self._bases, base.size
         parameters = bases[2][base]
         if self.parameters.set is not None:
@@ -221,7 +221,10 @@ class ParametersInTime:
 
         Neighbours are near the corners that belong to the ``directions (count, size or more)``, one row each.
         """
-        drawn, units = (_extreme if law == "vertices" else _uniform)(self.box, count, rng), self.depends.units
+        drawn, units = (
+            (_sample_extreme if law == "vertices" else _sample_uniform)(self.box, count, rng),
+            self.depends.units,
+        )
         shares = (drawn - self.depends.centre) / np.where(units > 0.0, units, 1.0)
         rows = np.stack([self.depends.rows(share) for share in shares])
         if directions is None:
@@ -264,7 +267,7 @@ def admissibility(model: DisturbanceModel, signals: Array) -> Array:
     return np.asarray(np.maximum(model.set.violation(coefficients.reshape(signals.shape[0], -1)), outside))
 
 
-def _every_block(
+def _draw_blocks(
     model: DisturbanceModel,
     count: int,
     rng: np.random.Generator,
@@ -273,21 +276,21 @@ def _every_block(
     return points(model.set, count * model.block_count, rng).reshape(count, model.block_count, -1)
 
 
-def _uniform(convex: ConvexSet, count: int, rng: np.random.Generator) -> Array:
+def _sample_uniform(convex: ConvexSet, count: int, rng: np.random.Generator) -> Array:
     return convex.sample(count, rng)
 
 
-def _extreme(convex: ConvexSet, count: int, rng: np.random.Generator) -> Array:
+def _sample_extreme(convex: ConvexSet, count: int, rng: np.random.Generator) -> Array:
     return convex.sample_extreme(count, rng)
 
 
-def _hats(places: Array, knots: int) -> Array:
+def _evaluate_hats(places: Array, knots: int) -> Array:
     """Weights ``(l, knots)`` of linear interpolation at places in ``[0, 1]`` between equally spaced knots."""
     at = places * (knots - 1)
     return np.clip(1.0 - np.abs(at[:, None] - np.arange(knots)), 0.0, None)
 
 
-def _drawn_in(convex: ConvexSet, points: Array) -> Array:
+def _pull_into_set(convex: ConvexSet, points: Array) -> Array:
     flat = points.reshape(-1, points.shape[-1])
     middle = convex.interior_point()
     return (middle + (flat - middle) / np.maximum(convex.gauge(flat), 1.0)[:, None]).reshape(points.shape)
@@ -298,5 +301,5 @@ def noises(bound: ConvexSet | None, law: LawName, count: int, measured: int, rng
     points of the set where the law is of such, else uniform ones; ``None`` where there is no noise."""
     if bound is None:
         return None
-    points = (_extreme if law == "vertices" else _uniform)(bound, count * measured, rng)
+    points = (_sample_extreme if law == "vertices" else _sample_uniform)(bound, count * measured, rng)
     return np.ascontiguousarray(points.reshape(count, measured, -1).transpose(1, 2, 0))

@@ -40,7 +40,7 @@ class Measuring:
     nominal: Array
     gains: Array
     noises: Array | None = None
-    _predicted: Array | None = None
+    _prediction: Array | None = None
     _commands: dict[int, Array] = field(default_factory=dict)  # of the pieces of the control so far, ``(m, n)`` each
     _innovations: list[Array] = field(default_factory=list)
 
@@ -54,40 +54,40 @@ class Measuring:
         without changing the state of this object."""
         return [
             *(innovation[:, 0] for innovation in self._innovations),
-            self._new(measured[:, None], self._observed())[:, 0],
+            self._compute_innovations(measured[:, None], self._predict_states())[:, 0],
         ]
 
-    def _loop(self) -> ClosedLoop:
+    def _get_loop(self) -> ClosedLoop:
         return self.model.answering.loop
 
     def outputs(self, k: int, state: Array) -> Array:
         """Return the measurements ``(p, n)`` of states ``(d, n)`` as piece ``k`` of the control begins."""
-        observer = self._loop().observer
+        observer = self._get_loop().observer
         return state if observer is None else observer.outputs(state, None if self.noises is None else self.noises[k])
 
-    def _new(self, measured: Array, predicted: Array) -> Array:
+    def _compute_innovations(self, measured: Array, predicted: Array) -> Array:
         """Return the innovations ``(p, n)`` of the measurements ``(p, n)`` as the next piece begins, where the states
         ``(d, n)`` are ``predicted``."""
-        loop = self._loop()
+        loop = self._get_loop()
         if loop.observer is not None:
             return measured - loop.observer.outputs(predicted)
-        if self._predicted is None and not loop.begins.any():  # from one initial state nothing is new in it
+        if self._prediction is None and not loop.begins.any():  # from one initial state nothing is new in it
             return np.zeros_like(measured)
         return measured - predicted
 
-    def _observed(self) -> Array:
+    def _predict_states(self) -> Array:
         """Return the prediction of the states ``(d, n)`` as the next piece begins."""
-        observer = self._loop().observer
-        if self._predicted is None:
-            return self._loop().start[:, None]
+        observer = self._get_loop().observer
+        if self._prediction is None:
+            return self._get_loop().start[:, None]
         if observer is None or not self._innovations:
-            return self._predicted
-        return np.asarray(self._predicted + observer.L[len(self._innovations) - 1] @ self._innovations[-1])
+            return self._prediction
+        return np.asarray(self._prediction + observer.L[len(self._innovations) - 1] @ self._innovations[-1])
 
     def predicted(self) -> Array:
         """Return the prediction of the measurements ``(p, n)`` as the next piece begins, at which the innovation is
         0."""
-        observer, state = self._loop().observer, self._observed()
+        observer, state = self._get_loop().observer, self._predict_states()
         return state if observer is None else observer.outputs(state)
 
     def command(self, k: int) -> Array:
@@ -102,31 +102,31 @@ class Measuring:
     def after(self, piece: int, measured: Callable[[int], Array]) -> Array:
         """Return the inputs ``(mc, n)`` on a piece of the grid, from the measurements ``(p, n)`` that ``measured``
         gives as a piece of the control begins."""
-        response, loop = self.model.response, self._loop()
+        response, loop = self.model.response, self._get_loop()
         grid, steps = response.grid, response.steps(KNOWN)
         commanded, acting = self.commanded, int(grid.control_piece[piece])
         k = int(commanded[piece])
         if piece == 0 or k != commanded[piece - 1]:
             if piece == 0:
-                self._predicted, self._innovations = None, []
-            now, predicted = measured(k), self._observed()
-            self._innovations.append(self._new(now, predicted))
+                self._prediction, self._innovations = None, []
+            now, predicted = measured(k), self._predict_states()
+            self._innovations.append(self._compute_innovations(now, predicted))
             u = np.repeat(self.nominal[:, k, None], now.shape[1], axis=1)
             for j, innovation in enumerate(self._innovations):
                 if self.gains[k, j].any():
                     u = u + self.gains[k, j] @ innovation
             self._commands = {**(self._commands if piece else {}), k: u}
-            self._predicted = (
+            self._prediction = (
                 now if loop.observer is None else np.broadcast_to(predicted, (len(predicted), now.shape[1]))
             )
-        assert self._predicted is not None
+        assert self._prediction is not None
         length, mode = int(response.which[piece]), int(grid.modes[piece])
-        before, count = np.zeros(0) if grid.before is None else grid.before, self._predicted.shape[1]
+        before, count = np.zeros(0) if grid.before is None else grid.before, self._prediction.shape[1]
         u = self._commands[acting] if acting >= 0 else np.repeat(before[:, None], count, axis=1)
         inputs = np.vstack([u, np.ones((grid.constants, count))])
         B, E = (grid.of_modes(matrices)[mode] for matrices in (steps.B[0], steps.E[0]))
         drive = B @ inputs + (E @ loop.middles[piece])[:, None]
-        self._predicted = steps.Phi[0, length] @ self._predicted + steps.Gamma[0, length] @ drive
+        self._prediction = steps.Phi[0, length] @ self._prediction + steps.Gamma[0, length] @ drive
         return np.asarray(inputs)
 
     @cached_property

@@ -48,17 +48,17 @@ def sandwich(ask: Callable[[Array], Support], known: Sequence[Support], count: i
     cut by the direction normal to ``w - v``. Source: G. Rote (1992), The convergence rate of the sandwich algorithm for
     approximating convex functions.
     """
-    supports = sorted(known, key=_angle)
+    supports = sorted(known, key=_compute_angle)
     while len(supports) < count:
         wedges = [
-            _wedge(support, neighbour)
+            _measure_wedge(support, neighbour)
             for support, neighbour in zip(supports, [*supports[1:], supports[0]], strict=True)
         ]
         area, direction = max(wedges, key=lambda wedge: wedge[0])
         total = polygon_area(outer_polygon(supports))
         if area <= 0.0 or direction is None or sum(wedge[0] for wedge in wedges) <= gap * total:
             break
-        supports = sorted([*supports, ask(direction)], key=_angle)
+        supports = sorted([*supports, ask(direction)], key=_compute_angle)
     return supports
 
 
@@ -75,7 +75,7 @@ def outer_polygon(supports: Sequence[Support]) -> Array:
     axes = [min(s.bound for s in supports if float(s.direction @ axis) > 1.0 - PARALLEL) for axis in AXES]
     polygon = np.array([[axes[0], -axes[3]], [axes[0], axes[1]], [-axes[2], axes[1]], [-axes[2], -axes[3]]])
     for support in supports:
-        polygon = _clipped(polygon, support.direction, support.bound)
+        polygon = _clip_polygon(polygon, support.direction, support.bound)
     return polygon
 
 
@@ -84,7 +84,7 @@ def convex_hull(points: Array) -> Array:
     ordered = np.unique(points, axis=0)
     if ordered.shape[0] < 3:
         return ordered
-    lower, upper = _chain(ordered), _chain(ordered[::-1])
+    lower, upper = _build_chain(ordered), _build_chain(ordered[::-1])
     return np.array(lower[:-1] + upper[:-1])
 
 
@@ -103,11 +103,11 @@ def inside(polygon: Array, points: Array) -> np.ndarray:
     return np.asarray((edges[:, 0] * offsets[..., 1] - edges[:, 1] * offsets[..., 0] >= 0.0).all(axis=1))
 
 
-def _angle(support: Support) -> float:
+def _compute_angle(support: Support) -> float:
     return float(np.arctan2(support.direction[1], support.direction[0]))
 
 
-def _wedge(one: Support, other: Support) -> tuple[float, Array | None]:
+def _measure_wedge(one: Support, other: Support) -> tuple[float, Array | None]:
     """The area in which the boundary between two neighbouring directions is still to be found, and the direction that
     would cut it."""
     if one.point is None or other.point is None:
@@ -126,18 +126,18 @@ def _wedge(one: Support, other: Support) -> tuple[float, Array | None]:
     )
     chord = other.point - one.point
     length = float(np.linalg.norm(chord))
-    normal = np.array([chord[1], -chord[0]]) / length if length > THIN else _bisector(one, other)
+    normal = np.array([chord[1], -chord[0]]) / length if length > THIN else _compute_bisector(one, other)
     within = _cross(one.direction, normal) > PARALLEL and _cross(normal, other.direction) > PARALLEL
     area = abs(_cross(corner - one.point, chord)) / 2
     return (area, normal) if within else (0.0, None)
 
 
-def _bisector(one: Support, other: Support) -> Array:
+def _compute_bisector(one: Support, other: Support) -> Array:
     middle = one.direction + other.direction
     return np.asarray(middle / np.linalg.norm(middle))
 
 
-def _clipped(polygon: Array, direction: Array, bound: float) -> Array:
+def _clip_polygon(polygon: Array, direction: Array, bound: float) -> Array:
     """The part of a convex polygon in ``direction'z <= bound`` (Sutherland and Hodgman 1974)."""
     if not polygon.shape[0]:
         return polygon
@@ -152,7 +152,7 @@ def _clipped(polygon: Array, direction: Array, bound: float) -> Array:
     return np.array(kept).reshape(-1, 2)
 
 
-def _chain(points: Array) -> list[Array]:
+def _build_chain(points: Array) -> list[Array]:
     chain: list[Array] = []
     for point in points:
         while len(chain) > 1 and _cross(chain[-1] - chain[-2], point - chain[-2]) <= 0.0:

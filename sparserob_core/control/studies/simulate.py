@@ -78,7 +78,7 @@ def walk(
     ``None``) on the pieces that the grid refers to,
     ``parameters (n, nu)``: the variation of constants over each piece, in which both inputs are constant.
     """
-    grid, motion = response.grid, _motion(response, parameters)
+    grid, motion = response.grid, _choose_motion(response, parameters)
     if initial_states is None:
         initial_states = np.repeat(response.initial_state[None], parameters.shape[0], axis=0)
     zero_signal = np.broadcast_to(0.0, (1, response.system.disturbances, grid.disturbance_piece.max() + 1))
@@ -100,18 +100,18 @@ def walk(
         yield states
 
 
-def _motion(response: Response, parameters: Array) -> Motion:
+def _choose_motion(response: Response, parameters: Array) -> Motion:
     """Return the motion that takes the least work; ``parameters (n, nu)`` are those of the trajectories."""
     grid, system = response.grid, response.system
     if grid.varying:
-        return _InTime(response, parameters)
+        return _TimeVaryingMotion(response, parameters)
     is_large = grid.distinct(grid.lengths)[0].size * 4 * system.states**2 > HELD
     if is_large and not parameters.shape[1] and grid.mode is None:
-        return _Apart(response)
-    return _ByMatrices(response, parameters)
+        return _DecoupledMotion(response)
+    return _MatrixMotion(response, parameters)
 
 
-class _ByMatrices:
+class _MatrixMotion:
     """A system that is the same on each of its pieces: one transition for every length."""
 
     def __init__(self, response: Response, parameters: Array) -> None:
@@ -135,15 +135,15 @@ class _ByMatrices:
         mode = int(grid.modes[piece])
         A, B, W = self.modes[mode]
         if mode != self.mode:
-            self.mode, (self.flows, self.integrals) = mode, _transitions(A, self.lengths)
+            self.mode, (self.flows, self.integrals) = mode, _compute_transitions(A, self.lengths)
         inputs = (int(self.which[piece]), int(grid.control_piece[piece]), int(grid.disturbance_piece[piece]), mode)
         if inputs != self.inputs:  # the pieces that times inside cut one into are driven alike
-            drive = _times(B, control) + _times(W, disturbance)
-            self.inputs, self.driven = inputs, _times(self.integrals[inputs[0]], drive)
-        return _times(self.flows[inputs[0]], state) + self.driven
+            drive = _multiply(B, control) + _multiply(W, disturbance)
+            self.inputs, self.driven = inputs, _multiply(self.integrals[inputs[0]], drive)
+        return _multiply(self.flows[inputs[0]], state) + self.driven
 
 
-class _Apart:
+class _DecoupledMotion:
     """A known system with many states on pieces of many lengths, in coordinates in which its modes are apart: no matrix
     is held for a length."""
 
@@ -166,7 +166,7 @@ class _Apart:
         return np.asarray(self.flows.columns(state, np.broadcast_to(drive.T, state.shape), lengths))
 
 
-class _InTime:
+class _TimeVaryingMotion:
     """A system that changes with time: the transitions of the pieces, of each trajectory at its parameters."""
 
     def __init__(self, response: Response, parameters: Array) -> None:
@@ -185,8 +185,8 @@ class _InTime:
         return state
 
     def step(self, piece: int, state: Array, control: Array, disturbance: Array) -> Array:
-        drive = _times(self.B[piece], control) + _times(self.E[piece], disturbance)
-        return np.asarray(_times(self.Phi[piece], state) + self.lengths[piece] * drive)
+        drive = _multiply(self.B[piece], control) + _multiply(self.E[piece], disturbance)
+        return np.asarray(_multiply(self.Phi[piece], state) + self.lengths[piece] * drive)
 
 
 def delivered(command: Array, errors: Array) -> Callable[[int, Array], Array]:
@@ -217,7 +217,7 @@ def trajectories_at_once(response: Response, uncertain: bool) -> int:
     return int(np.clip(min(signals, flows), 16, 4096))
 
 
-def _transitions(A: Array, lengths: Array) -> tuple[Array, Array]:
+def _compute_transitions(A: Array, lengths: Array) -> tuple[Array, Array]:
     """``e^{A r}`` and its integral for every distinct length, ``(q, d, d)``, or ``(q, d, d, n)`` for ``n`` matrices
     ``(d, d, n)``. A known system is taken in units in which it is small, powers of two: in metres and seconds an orbit
     is known a hundred times better so."""
@@ -232,7 +232,7 @@ def _transitions(A: Array, lengths: Array) -> tuple[Array, Array]:
     return np.ascontiguousarray(np.moveaxis(flows, 1, -1)), np.ascontiguousarray(np.moveaxis(integrals, 1, -1))
 
 
-def _times(matrix: Array, vectors: Array) -> Array:
+def _multiply(matrix: Array, vectors: Array) -> Array:
     """Matrix times vectors ``(b, n)``, for one matrix ``(a, b)`` or one for each vector ``(a, b, n)``."""
     if matrix.ndim == 2:
         return matrix @ vectors

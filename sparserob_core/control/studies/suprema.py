@@ -172,8 +172,8 @@ def bound_row(
     Dictionaries are those of control and disturbance."""
     worst = followed(problem, dictionaries, theta, row)
     if worst is not None:
-        return _of_known(worst, row, tolerance, notify, deadline)
-    return _of_program(problem, dictionaries, theta, row, tolerance, notify, deadline)
+        return _bound_known_row(worst, row, tolerance, notify, deadline)
+    return _bound_by_program(problem, dictionaries, theta, row, tolerance, notify, deadline)
 
 
 def followed(
@@ -217,7 +217,9 @@ def followed(
     )
 
 
-def _of_known(worst: WorstRow, row: Row, tolerance: float, notify: Notify, deadline: Deadline | None) -> BoundedRow:
+def _bound_known_row(
+    worst: WorstRow, row: Row, tolerance: float, notify: Notify, deadline: Deadline | None
+) -> BoundedRow:
     cuts, window = worst.cuts(), np.array([row.start, row.stop])
     cuts = np.unique(np.concatenate([window, cuts[(cuts > row.start) & (cuts < row.stop)]]))
     cells = (cuts[:-1], cuts[1:]) if cuts.size > 1 else (cuts, cuts)
@@ -238,7 +240,7 @@ def _of_known(worst: WorstRow, row: Row, tolerance: float, notify: Notify, deadl
     tidied = float(tidy(np.array([best]), float(worst.grid[-1]))[0])
     time = tidied if row.start <= tidied <= row.stop else best
     state, changes, disturbance = worst.witness(time)
-    edges, middles = _bins(row)
+    edges, middles = _divide_window(row)
     rounding_error = LOST * max(float(np.abs(samples).max()), abs(bounds.lower)) + worst.lost
     return BoundedRow(
         row,
@@ -251,13 +253,13 @@ def _of_known(worst: WorstRow, row: Row, tolerance: float, notify: Notify, deadl
         disturbance,
         edges,
         worst.at(middles)[0] - worst.lost,
-        _over(edges, bounds),
+        _bound_bins(edges, bounds),
         bounds.cells,
         bounds.reason,
     )
 
 
-def _bins(row: Row) -> tuple[Array, Array]:
+def _divide_window(row: Row) -> tuple[Array, Array]:
     """The ends of equal parts of a window, and their middles; nothing of a window of one time."""
     if row.stop <= row.start:
         return np.zeros(0), np.zeros(0)
@@ -265,13 +267,13 @@ def _bins(row: Row) -> tuple[Array, Array]:
     return edges, (edges[:-1] + edges[1:]) / 2
 
 
-def _over(edges: Array, found: Supremum) -> Array:
+def _bound_bins(edges: Array, found: Supremum) -> Array:
     """The largest bound of the cells that meet each part."""
     lower, upper, bounds = found.leaves[0][:, 0], found.leaves[1][:, 0], found.leaves[2]
     return np.array([bounds[(lower < b) & (upper > a)].max(initial=-np.inf) for a, b in pairwise(edges.tolist())])
 
 
-def _of_program(
+def _bound_by_program(
     problem: OptimalControlProblem,
     dictionaries: tuple[Dictionary, Dictionary],
     theta: Array,
@@ -301,7 +303,7 @@ def _of_program(
     times = np.linspace(family.index_set.lower[0], family.index_set.upper[0], LOOKS)
     samples = family.violations(decision, np.hstack([times[:, None], np.tile(middle[1:], (LOOKS, 1))]))
     parameter = model.parameters.clamp((middle * units)[None, 1:])
-    magnitude = _added(model.functionals, theta, row.direction[:d], times * units[0], parameter)
+    magnitude = _sum_magnitudes(model.functionals, theta, row.direction[:d], times * units[0], parameter)
     largest = float(np.abs(samples).max())
     size = largest if max(largest, magnitude / unit) > NOTHING else 1.0
     try:
@@ -323,7 +325,7 @@ def _of_program(
         if functionals.measurable is not None:  # whose worst signal is found to rounding, or less
             support = float(functionals.offsets(*at)[0]) - functionals.parts(*of_state).begun
             shortfall = max(0.0, support - pushed_by(functionals, *of_state, (changes, disturbance)))
-    edges, middles = _bins(row)
+    edges, middles = _divide_window(row)
     low = np.full(middles.size, -np.inf)
     for p in (bounds.index[1:], middle[1:]):
         indices = np.hstack([(middles / units[0])[:, None], np.tile(p, (middles.size, 1))])
@@ -341,13 +343,13 @@ def _of_program(
         disturbance,
         edges,
         unit * (low - rounding_error),
-        unit * (_over(own_edges, bounds) + rounding_error),
+        unit * (_bound_bins(own_edges, bounds) + rounding_error),
         bounds.cells,
         bounds.reason,
     )
 
 
-def _added(functionals: WorstCase, theta: Array, state: Array, times: Array, parameter: Array) -> float:
+def _sum_magnitudes(functionals: WorstCase, theta: Array, state: Array, times: Array, parameter: Array) -> float:
     """The largest sum of the sizes of what makes a row ``state (d,)`` beside the disturbance, at ``times (k,)`` and
     ``parameter (1, nu)``: so much is rounded where the row itself is near 0."""
     at = times, np.tile(state, (times.size, 1)), np.repeat(parameter, times.size, axis=0)

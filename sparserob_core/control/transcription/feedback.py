@@ -93,7 +93,7 @@ class Answering(Acting):
 
     def in_own(self, theirs: Posed, own: Posed, units: Units) -> Answering:
         """Return this control with its measurements in the problem's ``own`` units."""
-        measurements = self.first[1] if own is self.first[0] else _seen(self.mask, theirs, own, units)[0]
+        measurements = self.first[1] if own is self.first[0] else _build_measurements(self.mask, theirs, own, units)[0]
         return replace(self, seen=measurements)
 
     def from_state(self, model: Transcription, begun: Posed) -> Transcription:
@@ -148,11 +148,11 @@ class Answering(Acting):
         loop = ClosedLoop(
             functionals,
             gains,
-            _spread(posed, measurements.pieces, measurements.still),
+            _collect_deviations(posed, measurements.pieces, measurements.still),
             size,
             measurements.pieces,
             measurements.observer,
-            anew=_begins_anew(posed),
+            anew=_has_next_initial_state(posed),
         )
         system, horizon = functionals.response.system, problem.horizon
         families = [of_state(constraint, loop).family() for constraint in posed.constraints]
@@ -216,20 +216,20 @@ class Answering(Acting):
 def answering(policy: Policy, mask: np.ndarray, posed: Posed, own: Posed, units: Units) -> Answering:
     """Return the control that acts by a policy in the user's units, from its measurements in the problem's ``own``
     units."""
-    scaled, outputs = _seen(mask, posed, own, units)
+    scaled, outputs = _build_measurements(mask, posed, own, units)
     assert scaled.deviations is not None
     pieces, observer = scaled.pieces, scaled.observer
     measurements = Seen(
-        answers=_in_users(scaled.answers, outputs, scaled.deviations),
+        answers=_scale_to_user_units(scaled.answers, outputs, scaled.deviations),
         pieces=None if pieces is None else pieces.in_units_of(posed.functionals, units.states, units.disturbances),
         observer=None if observer is None else observer.in_units(units.states, outputs),
-        fixed=_equal(*fixed(posed.problem)),
+        fixed=_split_equalities(*fixed(posed.problem)),
         still=scaled.still,
     )
     return Answering(policy, mask, policy.charge, measurements, (own, scaled))
 
 
-def _seen(mask: np.ndarray, theirs: Posed, own: Posed, units: Units) -> tuple[Seen, Array]:
+def _build_measurements(mask: np.ndarray, theirs: Posed, own: Posed, units: Units) -> tuple[Seen, Array]:
     """Return the measurements that a control answers, in ``own`` units, and one unit of each measured output in the
     user's units. ``theirs`` is the problem in the user's units."""
     problem, disturbance, has_initial_set = (
@@ -238,8 +238,8 @@ def _seen(mask: np.ndarray, theirs: Posed, own: Posed, units: Units) -> tuple[Se
         own.problem.initial_set is not None,
     )
     pieces = measurable_pieces(own.functionals)
-    spread = _spread(own, pieces, None)
-    still: np.ndarray = read_only(_still(own, spread))
+    spread = _collect_deviations(own, pieces, None)
+    still: np.ndarray = read_only(_find_ineffective_entries(own, spread))
     spread = replace(spread, still=still)
     blocks = 0 if disturbance is None else disturbance.block_count
     deviations = np.tile(units.disturbances[: problem.system.disturbances], blocks)
@@ -251,7 +251,7 @@ def _seen(mask: np.ndarray, theirs: Posed, own: Posed, units: Units) -> tuple[Se
         radii = np.delete(spread.radii, np.arange(deviations.size, spread.size - initial_units.size))
         observer = Observer.of(problem.measurements, innovations, between(own.response, own.control), radii)
         deviations = np.append(deviations, np.tile(output_units, own.control.pieces if observer.noisy else 0))
-    begins_anew = _begins_anew(own)
+    begins_anew = _has_next_initial_state(own)
     deviations = np.concatenate([deviations, initial_units, *[initial_units] * begins_anew])
     innovations = innovations_of(innovations, initial_units.size, observer, begins_anew) * (spread.radii > 0.0)
     coordinates, (H, h) = (
@@ -261,11 +261,11 @@ def _seen(mask: np.ndarray, theirs: Posed, own: Posed, units: Units) -> tuple[Se
     is_small = (spread.radii > 0.0) & (spread.radii < SMALL)
     coordinates = coordinates.on(power_of_two(np.where(is_small, spread.radii, 1.0)))
     equality_units = FINER * power_of_two(np.maximum(added_up(problem, own.functionals), np.abs(h)))
-    ends = _equal(H / equality_units[:, None], h / equality_units)
+    ends = _split_equalities(H / equality_units[:, None], h / equality_units)
     return Seen(coordinates, pieces, observer, ends, still, deviations, _step_units(problem)), output_units
 
 
-def _equal(H: Array, h: Array) -> tuple[Array, Array]:
+def _split_equalities(H: Array, h: Array) -> tuple[Array, Array]:
     """Return equalities ``H x = h`` as twice as many inequalities."""
     return np.vstack([H, -H]), np.append(h, -h)
 
@@ -282,7 +282,7 @@ def refuse(
     named = [entry.name for entry in paths if entry.name in (of_control(problem), PEAK, EFFORT, EQUALS, STEP)]
     bound, measurable = problem.disturbance, classes == {"measurable"}
     uncertainty = [convex for convex in (None if measurable else bound, problem.initial_set) if convex is not None]
-    slanted = [convex.kind for convex in uncertainty if _is_slanted(convex)]
+    slanted = [convex.kind for convex in uncertainty if _has_zero_chord(convex)]
     leaning = [convex.kind for convex in uncertainty if fixed(problem)[1].size and Spread(((1, convex),)).leans]
     reasons = {
         "control that can have any value on every piece: an answer to a measurement does not reach back before it": (
@@ -328,14 +328,14 @@ def refuse(
             raise InputError(f"feedback needs a {wanted}", path="policy.name")
 
 
-def _is_slanted(convex: ConvexSet) -> bool:
+def _has_zero_chord(convex: ConvexSet) -> bool:
     """Return whether a set has no length along an axis through its middle although its entry on this axis deviates.
     Then no gain on that entry of a deviation is bounded."""
     spread = Spread(((1, convex),))
     return bool(((spread.chords <= 0.0) & (spread.radii > 0.0)).any())
 
 
-def _in_users(own: Answers, measured: Array, deviations: Array) -> Answers:
+def _scale_to_user_units(own: Answers, measured: Array, deviations: Array) -> Answers:
     """Return the same coordinates of gains in the user's units. ``measured (d,)`` and ``deviations (Q,)`` are one unit
     of each measured quantity and of each deviation there. The factors are powers of two and change only the exponents
     of numbers."""
@@ -347,10 +347,10 @@ def _in_users(own: Answers, measured: Array, deviations: Array) -> Answers:
     return replace(own, effect=effect, gain=gain)
 
 
-def _spread(posed: Posed, acting: MeasurablePieces | None, still: np.ndarray | None) -> Spread:
+def _collect_deviations(posed: Posed, acting: MeasurablePieces | None, still: np.ndarray | None) -> Spread:
     """Return the deviations of the disturbance, of the noise of measurements, and of the initial state of a problem.
     Some entries of these are ``still (Q,)``."""
-    problem, disturbance, periods = posed.problem, posed.functionals.disturbance, 1 + _begins_anew(posed)
+    problem, disturbance, periods = posed.problem, posed.functionals.disturbance, 1 + _has_next_initial_state(posed)
     if acting is not None:
         sets = (*acting.sets, *deviations_of(None, 0, problem.initial_set, periods=periods).sets)
         return Spread(sets, MISSED, still)
@@ -360,7 +360,7 @@ def _spread(posed: Posed, acting: MeasurablePieces | None, still: np.ndarray | N
     return replace(spread, still=still)
 
 
-def _still(own: Posed, spread: Spread) -> np.ndarray:
+def _find_ineffective_entries(own: Posed, spread: Spread) -> np.ndarray:
     """Return which entries ``(Q,)`` of the disturbance and of the initial state have no effect on any row that double
     precision resolves, relative to the size of the row (decision 0088). Gains on such entries would be unbounded.
 
@@ -376,26 +376,26 @@ def _still(own: Posed, spread: Spread) -> np.ndarray:
     disturbance_widths, initial_widths = (
         np.zeros(0) if convex is None else convex.width(np.eye(convex.dimension)) for convex in sets
     )
-    rows = _rows_in_sizes(own.constraints, own.problem.system.states)
+    rows = _normalise_rows(own.constraints, own.problem.system.states)
     is_unfelt = unfelt(own.response, None if bound is None else model, disturbance_widths, initial_widths, rows, STILL)
     if bound is not None and model is not None:
-        entries = _at_all_times(bound, is_unfelt[: is_unfelt.size - initial_widths.size])
+        entries = _combine_over_times(bound, is_unfelt[: is_unfelt.size - initial_widths.size])
         is_still[: is_unfelt.size - initial_widths.size] = np.tile(entries, model.block_count)
     if own.problem.initial_set is not None:
-        periods = 1 + _begins_anew(own)
-        entries = _at_all_times(own.problem.initial_set, is_unfelt[is_unfelt.size - initial_widths.size :])
+        periods = 1 + _has_next_initial_state(own)
+        entries = _combine_over_times(own.problem.initial_set, is_unfelt[is_unfelt.size - initial_widths.size :])
         is_still[spread.size - initial_widths.size * periods :] = np.tile(entries, periods)
     return is_still
 
 
-def _at_all_times(convex: ConvexSet, still: np.ndarray) -> np.ndarray:
+def _combine_over_times(convex: ConvexSet, still: np.ndarray) -> np.ndarray:
     """Return which coordinates ``(q,)`` of the points of a set are ``still`` in every point, where the points follow
     one another. For a set that is no box the answer is the same for all coordinates."""
     entries = np.asarray(still.reshape(-1, convex.dimension).all(axis=0))
     return entries if convex.is_box else np.full(convex.dimension, entries.all())
 
 
-def _rows_in_sizes(constraints: Sequence[StateConstraint], d: int) -> Array:
+def _normalise_rows(constraints: Sequence[StateConstraint], d: int) -> Array:
     """Return rows ``(k, d)`` on the state in multiples of the size that a user reads from them: the larger of bound and
     width. A curved set has one row for each axis. A row with size 0 stays in its own unit."""
     rows = [np.zeros((0, d))]
@@ -412,7 +412,7 @@ def _rows_in_sizes(constraints: Sequence[StateConstraint], d: int) -> Array:
     return np.vstack(rows)
 
 
-def _begins_anew(posed: Posed) -> bool:
+def _has_next_initial_state(posed: Posed) -> bool:
     """Return whether this period's program contains the initial state of the next period: for the step between the
     periods."""
     problem = posed.problem

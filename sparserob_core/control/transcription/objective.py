@@ -40,12 +40,12 @@ def objective(problem: OptimalControlProblem, dictionary: Dictionary, images: in
     weights = np.append(weights, np.zeros(images - weights.size))
     return {
         "weights": weights,
-        "blocks": _blocks(problem, dictionary, images),
+        "blocks": _number_groups(problem, dictionary, images),
         **quadratics(problem, dictionary, variables),
     }
 
 
-def _blocks(problem: OptimalControlProblem, dictionary: Dictionary, images: int) -> Array | None:
+def _number_groups(problem: OptimalControlProblem, dictionary: Dictionary, images: int) -> Array | None:
     """Return the number of the group and piece of every image; ``None`` where every channel counts alone."""
     if not problem.cost.blocks:
         return None

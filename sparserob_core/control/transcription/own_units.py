@@ -41,13 +41,13 @@ def rough_units(problem: OptimalControlProblem) -> Units:
     """
     system, bound = problem.system, problem.disturbance
     time = float(power_of_two(np.array(problem.horizon)))
-    controls, disturbances = _control_units(problem), np.ones(system.disturbances)
+    controls, disturbances = _choose_control_units(problem), np.ones(system.disturbances)
     if bound is not None:
         disturbances = power_of_two(extent(bound))
     index = ParameterIndex(system.parameters)
-    parameters = np.ones(0) if system.parameters is None else power_of_two(_widths(system.parameters))
+    parameters = np.ones(0) if system.parameters is None else power_of_two(_measure_widths(system.parameters))
     matrices = [mode.matrices(looked_at(index)) for mode in system.forced.modes]
-    A, B, E = _largest(matrices)
+    A, B, E = _find_largest_entries(matrices)
     # a fast system is coupled through for a time of about 1/norm only; the eigenvalues do not depend on the units
     # (LAPACK balances)
     fastest = max(float(np.abs(np.linalg.eigvals(mode_matrices[0])).max()) for mode_matrices in matrices)
@@ -78,11 +78,11 @@ def own_units(problem: OptimalControlProblem, rough: Units, functionals: WorstCa
     usable = np.isfinite(reach) & (reach > 0.0)
     states = rough.states * power_of_two(np.where(usable, reach, 1.0))
     states = np.where(usable, states, power_of_two(walls(problem)))
-    cost = COST * float(power_of_two(np.array(_cost_per_time(problem, states, rough.time)))) * rough.time
+    cost = COST * float(power_of_two(np.array(_estimate_cost_per_time(problem, states, rough.time)))) * rough.time
     return Units(rough.time, states, rough.controls, rough.disturbances, rough.parameters, cost)
 
 
-def _control_units(problem: OptimalControlProblem) -> Array:
+def _choose_control_units(problem: OptimalControlProblem) -> Array:
     """Return a unit for every control, ``(m,)``. Controls of one group share a unit, since their norm is the norm of
     one vector."""
     size = extent(problem.control)
@@ -91,7 +91,7 @@ def _control_units(problem: OptimalControlProblem) -> Array:
     return power_of_two(size)
 
 
-def _cost_per_time(problem: OptimalControlProblem, states: Array, time: float) -> float:
+def _estimate_cost_per_time(problem: OptimalControlProblem, states: Array, time: float) -> float:
     """Return the largest cost per time, where states are as large as their units or their references."""
     size = extent(problem.control)
     total = float((problem.prices(np.array([0.0, problem.horizon]))[:, 0] * size).sum()) / problem.horizon
@@ -121,7 +121,7 @@ def row_units(constraint: StateConstraint, control: ConvexSet) -> Array:
         size = np.abs(H).sum(axis=1)
         is_used = (size > 0.0) & np.isfinite(h)
         position = float((np.abs(h[is_used]) / size[is_used]).max(initial=0.0))
-        near = size * max(position, _driven(functionals, constraint.parameters))
+        near = size * max(position, _estimate_uncontrolled_reach(functionals, constraint.parameters))
         return units_of_sides(H, h, *reach_and_sums, near)
     box = constraint.index_set
     z = sampled(box.dimension - 1 - constraint.parameters.count)
@@ -134,7 +134,8 @@ def row_units(constraint: StateConstraint, control: ConvexSet) -> Array:
     reach, sums = reaches(functionals, constraint.parameters, control, directions, times)
     sums = sums + reference.reach(directions)
     near = max(
-        np.abs(heights).max(), np.abs(directions).sum(axis=1).max() * _driven(functionals, constraint.parameters)
+        np.abs(heights).max(),
+        np.abs(directions).sum(axis=1).max() * _estimate_uncontrolled_reach(functionals, constraint.parameters),
     )
     if (THIN * np.minimum(sums, near) > 1.0).all():
         reach = reach + reference.reach(directions)
@@ -266,13 +267,13 @@ def reaches(
     return reach, sums.max(axis=(0, 1))
 
 
-def _driven(functionals: WorstCase, parameters: ParameterIndex) -> float:
+def _estimate_uncontrolled_reach(functionals: WorstCase, parameters: ParameterIndex) -> float:
     """Return the largest distance of any state from 0 over the whole horizon, in own units, due to the initial state,
     drift, disturbance and one coupling. Amplification by an instability is left out, and so is the control, which need
     not act."""
     response, time = functionals.response, float(functionals.response.grid.breakpoints[-1])
     system = response.system
-    A, B, E = _largest([mode.matrices(looked_at(parameters)) for mode in system.forced.modes])
+    A, B, E = _find_largest_entries([mode.matrices(looked_at(parameters)) for mode in system.forced.modes])
     distances = np.abs(response.initial_state) + time * B[:, system.controls :].sum(axis=1)
     if functionals.initial is not None:
         distances = distances + extent(functionals.initial)
@@ -281,7 +282,7 @@ def _driven(functionals: WorstCase, parameters: ParameterIndex) -> float:
     return float((distances + time * A @ distances).max())
 
 
-def _largest(every: Sequence[tuple[Array, Array, Array]]) -> list[Array]:
+def _find_largest_entries(every: Sequence[tuple[Array, Array, Array]]) -> list[Array]:
     """Return the largest absolute entries of ``A``, ``B`` and ``E`` over some parameters and all phases; the drift is a
     further column of ``B``."""
     return [np.abs(np.concatenate([matrices[index] for matrices in every])).max(axis=0) for index in range(3)]
@@ -330,7 +331,7 @@ def window_times(functionals: WorstCase, start: float, stop: float) -> Array:
     return np.unique(np.concatenate([[start], inside[chosen] if inside.size else inside, [stop]]))
 
 
-def _widths(convex: ConvexSet) -> Array:
+def _measure_widths(convex: ConvexSet) -> Array:
     """Return the width of each component of a bounded set, or its distance from 0 where the width is 0."""
     axes = np.eye(convex.dimension)
     width = convex.width(axes)

@@ -77,10 +77,12 @@ class OpenLoop(Acting):
         """Return the program of the same problem from another initial state. Everything that does not depend on this
         state is shared, and the families are in their reduced form only."""
         reduced_families = {
-            constraint.name: replace(_reduced(constraint), row_units=family.row_units, index_units=family.index_units)
+            constraint.name: replace(
+                _build_reduced_family(constraint), row_units=family.row_units, index_units=family.index_units
+            )
             for constraint, family in zip(begun.constraints, model.program.families, strict=False)
         }
-        A, b = _equalities(begun)
+        A, b = _build_scaled_equalities(begun)
         program = replace(
             model.program,
             **quadratics(begun.problem, model.control, begun.functionals.variables),
@@ -110,12 +112,12 @@ def transcribed(posed: Posed, acting: Acting) -> Transcription:
     """Return the program of a posed problem, without a twin. It has the nominal entries with their cost, bounds and
     equalities, and the part that depends on how the control is ``acting``."""
     problem, control, functionals, acting_part = posed.problem, posed.control, posed.functionals, acting.part(posed)
-    A, b = _equalities(posed)
+    A, b = _build_scaled_equalities(posed)
     if posed.rows is not None:
         b = np.where(A.any(axis=1) | (np.abs(b) > TOLERANCE), b, 0.0)  # no control enters, and rounding is missing
-    S, lower, upper = _image(posed.held, control, posed.rows)
+    S, lower, upper = _build_image(posed.held, control, posed.rows)
     if functionals.execution is not None:
-        S, lower, upper = _with_sizes(S, lower, upper, functionals)
+        S, lower, upper = _append_sizes(S, lower, upper, functionals)
     lower, upper = np.concatenate([lower, acting_part.lower]), np.concatenate([upper, acting_part.upper])
     n = functionals.variables + acting_part.lower.size
     priced = objective(problem, control, lower.size, n)
@@ -204,7 +206,8 @@ def held_units(posed: Posed, ranged: ConvexSet) -> RowUnits:
     precision."""
     sums = added_up(replace(posed.held, control=ranged), posed.functionals)
     is_controlled = (
-        np.abs(_ends(posed.held, posed.functionals, posed.parameters)[0]).max(axis=1, initial=0.0) > IDLE * sums
+        np.abs(_build_equalities(posed.held, posed.functionals, posed.parameters)[0]).max(axis=1, initial=0.0)
+        > IDLE * sums
     )
     H, h = slanted(ranged)
     sides = units_of_sides(H, h, ranged.reach(H), np.abs(H) @ extent(ranged)) if h.size else h
@@ -228,7 +231,7 @@ def _block_units(model: DisturbanceModel, units: Units) -> Array:
     return np.tile(np.repeat(units.disturbances, model.set.dimension // model.channels), model.block_count)
 
 
-def _image(
+def _build_image(
     problem: OptimalControlProblem, dictionary: Dictionary, rows: RowUnits | None
 ) -> tuple[csc_array | None, Array, Array]:
     """Return the matrix of the image, and its bounds. The image is the control on every piece, then one entry per piece
@@ -261,12 +264,12 @@ def _image(
     )
 
 
-def _with_sizes(
+def _append_sizes(
     S: csc_array | None, lower: Array, upper: Array, functionals: WorstCase
 ) -> tuple[csc_array, Array, Array]:
-    """Return the images of `_image` for a decision that continues with a bound ``a`` of the size of every value ``s``
-    of the control. Further images hold ``0 <= a - s`` and ``0 <= a + s``. Both are at most twice the largest ``|s|``,
-    which ``a = |s|`` never exceeds."""
+    """Return the images of `_build_image` for a decision that continues with a bound ``a`` of the size of every value
+    ``s`` of the control. Further images hold ``0 <= a - s`` and ``0 <= a + s``. Both are at most twice the largest
+    ``|s|``, which ``a = |s|`` never exceeds."""
     from scipy.sparse import block_array, csc_array, eye_array
 
     assert functionals.execution is not None
@@ -297,13 +300,15 @@ def slanted(bound: ConvexSet) -> tuple[Array, Array]:
     return flat[0][is_slanted], flat[1][is_slanted]
 
 
-def _equalities(posed: Posed) -> tuple[Array, Array]:
+def _build_scaled_equalities(posed: Posed) -> tuple[Array, Array]:
     """Return the terminal equalities as rows of the decision, in their units."""
-    A, b = _ends(posed.held, posed.functionals, posed.parameters)
+    A, b = _build_equalities(posed.held, posed.functionals, posed.parameters)
     return (A, b) if posed.rows is None else posed.rows.equalities(A, b)
 
 
-def _ends(problem: OptimalControlProblem, functionals: WorstCase, parameters: ParameterIndex) -> tuple[Array, Array]:
+def _build_equalities(
+    problem: OptimalControlProblem, functionals: WorstCase, parameters: ParameterIndex
+) -> tuple[Array, Array]:
     """Return the terminal equalities as rows of the decision. Raise `InputError` where the uncertainty reaches a fixed
     state, since no control could then satisfy the equality."""
     A, b = [np.zeros((0, functionals.variables))], [np.zeros(0)]
@@ -314,7 +319,7 @@ def _ends(problem: OptimalControlProblem, functionals: WorstCase, parameters: Pa
         G, offset = functionals.rows(time, up[None], middle)
         sigma = functionals.offsets(time, up[None], middle) + functionals.offsets(time, -up[None], middle)
         state = int(np.flatnonzero(up)[0])
-        if sigma[0] > SAME * size or _reached(problem, parameters, state):
+        if sigma[0] > SAME * size or _is_uncertain_state(problem, parameters, state):
             raise InputError(
                 f"terminal: equals: state {state + 1} depends on the uncertainty, so no control can fix its final"
                 f" value to {value:g}; expected a set with interior"
@@ -324,7 +329,7 @@ def _ends(problem: OptimalControlProblem, functionals: WorstCase, parameters: Pa
     return np.vstack(A), np.concatenate(b)
 
 
-def _reached(problem: OptimalControlProblem, parameters: ParameterIndex, state: int) -> bool:
+def _is_uncertain_state(problem: OptimalControlProblem, parameters: ParameterIndex, state: int) -> bool:
     """Return whether an uncertain entry of the system may reach a state, over all parameters. The function follows the
     entries of ``A`` that are not exactly 0."""
     if parameters.set is None:
@@ -369,13 +374,13 @@ def family_of(constraint: StateConstraint) -> ConstraintFamily:
         initial_states = None if bound is None else bound.sample(count, rng)
         return ScenarioConstraint(constraint, *sides, disturbances, parameters, initial_states).family()
 
-    model, reduced = constraint.functionals.disturbance, _reduced(constraint)
+    model, reduced = constraint.functionals.disturbance, _build_reduced_family(constraint)
     literal = reduced if model is None else LiteralConstraint(constraint, model).family(reduced)
-    nominal = replace(_reduced(constraint.nominal()), formulation="nominal", source=constraint)
+    nominal = replace(_build_reduced_family(constraint.nominal()), formulation="nominal", source=constraint)
     return replace(reduced, nominal=nominal, sample=sample, literal=literal)
 
 
-def _reduced(constraint: StateConstraint) -> ConstraintFamily:
+def _build_reduced_family(constraint: StateConstraint) -> ConstraintFamily:
     response = constraint.functionals.response
     return ConstraintFamily(
         name=constraint.name,

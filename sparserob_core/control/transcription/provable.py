@@ -76,10 +76,10 @@ def remark(problem: OptimalControlProblem, feedback: bool = False) -> str:
     unless these are enclosed."""
     kinds = sorted({convex.kind for convex in strangers(problem)})
     assumption = f"what sets of the kind {', '.join(kinds)} say of themselves is believed" if kinds else ""
-    return "; ".join(filter(None, [assumption, _of_integrals(problem, feedback)]))
+    return "; ".join(filter(None, [assumption, _describe_integral_assumption(problem, feedback)]))
 
 
-def _of_integrals(problem: OptimalControlProblem, feedback: bool) -> str:
+def _describe_integral_assumption(problem: OptimalControlProblem, feedback: bool) -> str:
     """Return the assumption about the integrals over measurable disturbances. Under ``feedback`` the checker proves
     it."""
     if problem.measurable is None:

@@ -94,10 +94,10 @@ def nominal_pieces(problem: OptimalControlProblem, breakpoints: Array) -> Nomina
         propagator = Propagator(system.at(parameter).forced, grid)
         kind_of_piece, (flows, weights) = (
             np.arange(grid.pieces),
-            _in_time(propagator, reference, noise, first_control, M),
+            _integrate_varying(propagator, reference, noise, first_control, M),
         )
     else:
-        kind_of_piece, flows, weights = _by_kind(grid, modes, reference, noise, first_control, M)
+        kind_of_piece, flows, weights = _integrate_by_kind(grid, modes, reference, noise, first_control, M)
     end = np.zeros((d + 1, d + 1))
     if final is not None:
         final_deviation = np.hstack([np.eye(d), (reference - final.reference)[:, None]])
@@ -109,7 +109,7 @@ def nominal_pieces(problem: OptimalControlProblem, breakpoints: Array) -> Nomina
     return NominalPieces(kind_of_piece, grid.control_piece, flows, weights, start, end)
 
 
-def _by_kind(
+def _integrate_by_kind(
     grid: TimeGrid, modes: Sequence[Sequence[Array]], reference: Array, noise: Array, given: Array, M: Array
 ) -> tuple[np.ndarray, Array, Array]:
     """Return the kind of every piece ``(L,)``, and the flows and weights of each kind (`NominalPieces`). Pieces of one
@@ -130,13 +130,15 @@ def _by_kind(
         drift = A @ reference + B[:, m:].sum(axis=1) + E @ noise
         F[:d, :d], F[:d, d] = A, drift if acting else drift + B[:, :m] @ given
         F[:d, d + 1 :] = B[:, :m] if acting else 0.0
-        flow, weight = _integrated(F, M, float(length))
+        flow, weight = _integrate_weight(F, M, float(length))
         flows.append(flow)
         weights.append(weight)
     return kind_of_piece, np.stack(flows), np.stack(weights)
 
 
-def _in_time(propagator: Propagator, reference: Array, noise: Array, given: Array, M: Array) -> tuple[Array, Array]:
+def _integrate_varying(
+    propagator: Propagator, reference: Array, noise: Array, given: Array, M: Array
+) -> tuple[Array, Array]:
     """Return the flows and weights of every piece of a system that changes with time, ``(L, ...)`` each. The integrals
     use Gauss' rule between the times at which the system becomes another polynomial."""
     grid, expansion, d = propagator.grid, propagator.expansion, reference.size
@@ -182,12 +184,12 @@ def quadratic_cost(problem: OptimalControlProblem, breakpoints: Array) -> Quadra
                 " expected fewer pieces",
                 path="cost",
             )
-        coupled, q, constant = _of_the_state(nominal_pieces(problem, breakpoints), m, size)
+        coupled, q, constant = _condense_state_cost(nominal_pieces(problem, breakpoints), m, size)
         P = csc_array(P + csc_array(coupled))
     return QuadraticCost(P, q, constant)
 
 
-def _of_the_state(pieces: NominalPieces, m: int, size: int) -> tuple[Array, Array, float]:
+def _condense_state_cost(pieces: NominalPieces, m: int, size: int) -> tuple[Array, Array, float]:
     """Return ``P (m K, m K)``, ``q (m K,)`` and the constant of the cost of the state.
 
     ``V`` is the cost of the free motion from the start of a piece ``l`` of time. By telescoping, the whole cost is
@@ -225,7 +227,7 @@ def _of_the_state(pieces: NominalPieces, m: int, size: int) -> tuple[Array, Arra
     return P.transpose(1, 0, 3, 2).reshape(size, size), q.T.ravel(), constant
 
 
-def _integrated(F: Array, M: Array, length: float) -> tuple[Array, Array]:
+def _integrate_weight(F: Array, M: Array, length: float) -> tuple[Array, Array]:
     """Return ``e^{F h}`` and ``int_0^h e^{F't} M e^{Ft} dt``."""
     from scipy.linalg import expm
 

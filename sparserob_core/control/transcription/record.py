@@ -162,7 +162,7 @@ class Transcription(Posed):
     program: SemiInfiniteProgram
     feedback: Feedback | None = None
     given: OptimalControlProblem | None = None
-    _explained: dict[tuple[str, Formulation, int, bytes], TimedExplanation | None] = field(
+    _explanation_cache: dict[tuple[str, Formulation, int, bytes], TimedExplanation | None] = field(
         default_factory=dict, init=False, repr=False
     )
 
@@ -177,14 +177,14 @@ class Transcription(Posed):
         one may take long.
         """
         keys = [(cut.family, cut.formulation, cut.row, cut.index.tobytes()) for cut in cuts]
-        fresh = {key: cut for key, cut in zip(keys, cuts, strict=True) if key not in self._explained}
+        fresh = {key: cut for key, cut in zip(keys, cuts, strict=True) if key not in self._explanation_cache}
         loop = None if self.feedback is None else self.feedback.loop
         if loop is not None and loop.measurable is not None and fresh:
             size = loop.spread.size  # of the deviations, which end an index: those of the initial state come last
             loop.measurable.compose([cut.index[-size:] for cut in fresh.values() if cut.index.size > size > 0])
         for key, cut in fresh.items():
-            self._explained[key] = in_numbers(self.program, cut.family, cut.formulation, cut.index, cut.row)
-        return [self._explained[key] for key in keys]
+            self._explanation_cache[key] = in_numbers(self.program, cut.family, cut.formulation, cut.index, cut.row)
+        return [self._explanation_cache[key] for key in keys]
 
     @property
     def stated(self) -> OptimalControlProblem:

@@ -35,22 +35,30 @@ def rounded_down(model: Transcription, result: Result, tolerance: float | None, 
     of the disturbance to ``c'x(t)``. The absolute values of these contributions, at their largest, times the
     multipliers of the rows and `SHARE`, bound the effect of all their rounding on the bound (Higham 2002, section 3.1).
     A piece of the control whose switching function is below its price by more than that contributes 0 to the bound,
-    whatever is rounded (`_pushed`).
+    whatever is rounded (`_sum_control_magnitudes`).
 
-    Further errors are subtracted as well. A multiplier of the wrong sign has an error (`_neglected`). Transitions have
-    a relative error (`_moving`), and the truncation error of a law as a series in the parameters (`_beyond`). With
-    fewer functions than pieces, multipliers of the pieces have rounding errors too (`_slipped`). Signals of measurable
-    disturbances under feedback prove only the deviations that they attain, not those that they were composed for
-    (`_missed`); where these do not prove that nothing is feasible, the result does not claim it. ``prices (n,)`` are
-    the prices of the decision, where the bound is the least cost of the sizes of its entries at these prices.
+    Further errors are subtracted as well. A multiplier of the wrong sign has an error (`_bound_sign_error`).
+    Transitions have a relative error (`_bound_transition_error`), and the truncation error of a law as a series in the
+    parameters (`_bound_law_truncation`). With fewer functions than pieces, multipliers of the pieces have rounding
+    errors too (`_bound_image_error`). Signals of measurable disturbances under feedback prove only the deviations that
+    they attain, not those that they were composed for (`_bound_signal_loss`); where these do not prove that nothing is
+    feasible, the result does not claim it. ``prices (n,)`` are the prices of the decision, where the bound is the least
+    cost of the sizes of its entries at these prices.
     """
-    if result.status == "infeasible" and np.subtract(*_missed(model, result)) >= 0.0:
+    if result.status == "infeasible" and np.subtract(*_bound_signal_loss(model, result)) >= 0.0:
         return replace(result, status="failed", message=UNPROVEN, infeasible=None, lower_bound=-np.inf)
     if not np.isfinite(result.lower_bound) or result.lower_bound <= 0.0:  # without multipliers 0 is exact
         return result
-    share = SHARE + _moving(model)
-    error = share * (_added(model, result, share, prices) + _quadratic(model, result) + result.lower_bound)
-    error += _neglected(model, result) + _beyond(model, result) + _missed(model, result)[0] + _slipped(model, result)
+    share = SHARE + _bound_transition_error(model)
+    error = share * (
+        _sum_row_magnitudes(model, result, share, prices) + _sum_tangent_magnitudes(model, result) + result.lower_bound
+    )
+    error += (
+        _bound_sign_error(model, result)
+        + _bound_law_truncation(model, result)
+        + _bound_signal_loss(model, result)[0]
+        + _bound_image_error(model, result)
+    )
     lowered = max(0.0, result.lower_bound - error)
     dual = replace(result.dual, bound=min(result.dual.bound, lowered))
     answer = replace(result, lower_bound=lowered, dual=dual)
@@ -60,7 +68,7 @@ def rounded_down(model: Transcription, result: Result, tolerance: float | None, 
     return replace(answer, status="verified", message=message)
 
 
-def _moving(model: Transcription) -> float:
+def _bound_transition_error(model: Transcription) -> float:
     """Return the relative error of transitions. For a system that changes with time it is the truncation error of their
     expansion.
 
@@ -75,7 +83,7 @@ def _moving(model: Transcription) -> float:
     return EPSILON * fastest * model.problem.horizon
 
 
-def _added(model: Transcription, result: Result, share: float, prices: Array | None) -> float:
+def _sum_row_magnitudes(model: Transcription, result: Result, share: float, prices: Array | None) -> float:
     """Return the sum over all rows with a multiplier of the multiplier times the absolute numbers that are added up to
     the row. A ``share`` of this sum may be lost by rounding; ``prices`` as in `rounded_down`."""
     middle = model.parameters.middle
@@ -85,7 +93,7 @@ def _added(model: Transcription, result: Result, share: float, prices: Array | N
         if explanation is not None and constraint is not None and cut.multiplier > 0.0:
             rows.append((cut.multiplier, explanation.time, explanation.direction, explanation.parameter_or(middle)))
             if explanation.gain is not None:
-                extra += cut.multiplier * float(np.abs(explanation.gain) @ _far(model.problem.control))
+                extra += cut.multiplier * float(np.abs(explanation.gain) @ _bound_components(model.problem.control))
             extra += cut.multiplier * float(constraint.reference.reach(explanation.direction))
             uses_prices = uses_prices and explanation.gain is None
         elif cut.multiplier > 0.0:
@@ -97,19 +105,21 @@ def _added(model: Transcription, result: Result, share: float, prices: Array | N
     multipliers, *indices = (np.array(column, dtype=float) for column in zip(*rows, strict=True))
     times, directions, parameters = indices[0], indices[1], indices[2].reshape(len(rows), -1)
     weights = model.response.weights(times, directions, parameters)
-    sizes = np.abs(multipliers) @ _beside_control(model, weights, times, directions, parameters)
-    prices = prices if uses_prices and _plain(model, result) else None
-    return float(sizes) + extra + _pushed(model, prices, weights.control, multipliers, share)
+    sizes = np.abs(multipliers) @ _sum_other_contributions(model, weights, times, directions, parameters)
+    prices = prices if uses_prices and _is_priced_box(model, result) else None
+    return float(sizes) + extra + _sum_control_magnitudes(model, prices, weights.control, multipliers, share)
 
 
-def _plain(model: Transcription, result: Result) -> bool:
+def _is_priced_box(model: Transcription, result: Result) -> bool:
     """Return whether the bound depends only on rows, and on the box and the price of every entry of the decision."""
     finite, m = model.program.finite, model.problem.system.controls
     is_plain = finite.S is None and finite.P is None and finite.blocks is None and not finite.q.any()
     return is_plain and result.dual.z is None and finite.n == m * model.control.pieces
 
 
-def _pushed(model: Transcription, prices: Array | None, weights: Array, multipliers: Array, share: float) -> float:
+def _sum_control_magnitudes(
+    model: Transcription, prices: Array | None, weights: Array, multipliers: Array, share: float
+) -> float:
     """Return the largest sum of absolute contributions of the control to rows with ``multipliers (k,)`` and ``weights
     (k, L, m)``.
 
@@ -118,7 +128,7 @@ def _pushed(model: Transcription, prices: Array | None, weights: Array, multipli
     So the sum has only entries whose ``|r_j|`` is not below ``w_j`` by more than a ``share`` of the largest numbers in
     their channel. All entries count where the bound is of another form, and there are no prices.
     """
-    sizes = np.tensordot(np.abs(multipliers), _controlled(model, weights), 1)
+    sizes = np.tensordot(np.abs(multipliers), _bound_control_contributions(model, weights), 1)
     if prices is not None:
         grid, finite = model.response.grid, model.program.finite
         functionals, m = model.functionals, model.problem.system.controls
@@ -130,10 +140,10 @@ def _pushed(model: Transcription, prices: Array | None, weights: Array, multipli
     return float(sizes.sum())
 
 
-def _beyond(model: Transcription, result: Result) -> float:
+def _bound_law_truncation(model: Transcription, result: Result) -> float:
     """Return an upper bound of the truncation error of a law as a series in the parameters, over all rows with a
     multiplier."""
-    truncation, error = model.functionals.beyond(_far(model.problem.control)), 0.0
+    truncation, error = model.functionals.beyond(_bound_components(model.problem.control)), 0.0
     if truncation.any():
         for cut, explanation in zip(result.dual.cuts, model.explained(result.dual.cuts), strict=True):
             error += (
@@ -144,7 +154,7 @@ def _beyond(model: Transcription, result: Result) -> float:
     return error
 
 
-def _missed(model: Transcription, result: Result) -> tuple[float, float]:
+def _bound_signal_loss(model: Transcription, result: Result) -> tuple[float, float]:
     """Return how much the bound falls, at most, at the signals of measurable disturbances instead of the deviations
     that these signals represent; and the bound that the rows prove at these deviations, without the cost.
 
@@ -183,17 +193,17 @@ def added_up(model: Transcription, times: Array, directions: Array, parameters: 
     """Return the largest sums ``(k,)`` of absolute numbers that are added up to rows ``c'x(t)``, ``directions (k,
     d)``."""
     weights = model.response.weights(times, directions, parameters)
-    sums = _beside_control(model, weights, times, directions, parameters)
-    return np.asarray(sums + _controlled(model, weights.control).sum(axis=(1, 2)))
+    sums = _sum_other_contributions(model, weights, times, directions, parameters)
+    return np.asarray(sums + _bound_control_contributions(model, weights.control).sum(axis=(1, 2)))
 
 
-def _controlled(model: Transcription, weights: Array) -> Array:
+def _bound_control_contributions(model: Transcription, weights: Array) -> Array:
     """Return the largest absolute contributions ``(k, J, m)`` of every piece of the control to rows with ``weights (k,
     L, m)``."""
-    return np.asarray(np.abs(model.functionals.decided(weights)) * _far(model.problem.control))
+    return np.asarray(np.abs(model.functionals.decided(weights)) * _bound_components(model.problem.control))
 
 
-def _beside_control(
+def _sum_other_contributions(
     model: Transcription, weights: Weights, times: Array, directions: Array, parameters: Array
 ) -> Array:
     """Return the largest sums ``(k,)`` of absolute contributions to rows ``c'x(t)``, without the contribution of the
@@ -201,39 +211,41 @@ def _beside_control(
     functionals, free = model.functionals, np.abs(weights.free)
     sizes = free @ np.abs(model.response.initial_state)
     if model.problem.initial_set is not None:
-        sizes += free @ _far(model.problem.initial_set)
+        sizes += free @ _bound_components(model.problem.initial_set)
     sizes += np.einsum("klm,ml->k", np.abs(weights.control), np.abs(functionals.known))
     if functionals.execution is not None:
         lengths = functionals.execution.lengths(times, functionals.execution.seen(directions, parameters))
-        sizes += INTEGRATED * (lengths @ np.repeat(_far(model.problem.control), model.control.pieces))
-    return np.asarray(sizes + _disturbing(model, weights.disturbance, times, directions, parameters))
+        sizes += INTEGRATED * (lengths @ np.repeat(_bound_components(model.problem.control), model.control.pieces))
+    return np.asarray(sizes + _sum_disturbance_contributions(model, weights.disturbance, times, directions, parameters))
 
 
-def _disturbing(model: Transcription, on_noise: Array, times: Array, directions: Array, parameters: Array) -> Array:
+def _sum_disturbance_contributions(
+    model: Transcription, on_noise: Array, times: Array, directions: Array, parameters: Array
+) -> Array:
     """Return the largest sums ``(k,)`` of absolute contributions of disturbances, from the weights ``on_noise (k, L,
     mw)``."""
     if model.problem.disturbance is None:
         return np.zeros(times.size)
-    sizes: Array = (np.abs(on_noise) @ _far(model.problem.disturbance)).sum(axis=1)
+    sizes: Array = (np.abs(on_noise) @ _bound_components(model.problem.disturbance)).sum(axis=1)
     measurable = model.functionals.measurable
     if measurable is None:
         return sizes
     return sizes + INTEGRATED * measurable.integrated_sizes(times, directions, parameters)
 
 
-def _quadratic(model: Transcription, result: Result) -> float:
+def _sum_tangent_magnitudes(model: Transcription, result: Result) -> float:
     """Return the largest sum of absolute numbers that are added up to the tangent of the quadratic terms. The slope ``P
     at`` may be small because these numbers cancel, as along a flat direction of ``P``; their rounding does not become
     small."""
     finite, at = model.program.finite, result.dual.at
     if finite.P is None or at is None:
         return 0.0
-    magnitudes = _coefficients(model)
+    magnitudes = _bound_coefficients(model)
     slopes, at, q = (np.abs(model.nominal(values)) for values in (np.asarray(abs(finite.P) @ np.abs(at)), at, finite.q))
     return float(abs(finite.constant) + 0.5 * at @ slopes + (q + slopes) @ magnitudes)
 
 
-def _coefficients(model: Transcription) -> Array:
+def _bound_coefficients(model: Transcription) -> Array:
     """Return the largest absolute value of each coefficient of the control, ``(m N,)``."""
     reach = model.problem.control.reach(np.eye(model.problem.system.controls))
     if model.program.finite.S is None:
@@ -241,7 +253,7 @@ def _coefficients(model: Transcription) -> Array:
     return np.asarray(np.kron(reach, np.abs(np.linalg.pinv(model.control.values.T)).sum(axis=1)))
 
 
-def _slipped(model: Transcription, result: Result) -> float:
+def _bound_image_error(model: Transcription, result: Result) -> float:
     """Return an upper bound of the effect of errors in the multipliers of the image: their difference from the slopes
     that they represent, times the largest coefficients. The difference is the rounding of the sums that convert one
     into the other (Higham 2002, section 3.1)."""
@@ -250,10 +262,10 @@ def _slipped(model: Transcription, result: Result) -> float:
         return 0.0
     terms = int(np.diff(S.tocsc().indptr).max(initial=0))
     sizes = model.nominal(np.asarray(abs(S).T @ np.abs(z)))
-    return float((terms + 8) * EPSILON * np.abs(sizes) @ _coefficients(model))
+    return float((terms + 8) * EPSILON * np.abs(sizes) @ _bound_coefficients(model))
 
 
-def _neglected(model: Transcription, result: Result) -> float:
+def _bound_sign_error(model: Transcription, result: Result) -> float:
     """Return an upper bound of the effect of multipliers of the wrong sign on slanted sides ``H u <= h`` of the
     controls' set and of the set of their steps, with the rounding of the sums with these multipliers.
 
@@ -267,13 +279,13 @@ def _neglected(model: Transcription, result: Result) -> float:
     sides, remaining = np.split(result.dual.z[controls * pieces :], [h.size * pieces])
     error = float(np.maximum(-sides, 0.0).reshape(h.size, pieces).sum(axis=1) @ np.maximum(bound.support(-H), 0.0))
     # of opposite sides of a set without interior multipliers may be as large as they like
-    error += SHARE * float(np.abs(sides).reshape(h.size, pieces).sum(axis=1) @ (np.abs(H) @ _far(bound)))
+    error += SHARE * float(np.abs(sides).reshape(h.size, pieces).sum(axis=1) @ (np.abs(H) @ _bound_components(bound)))
     steps = Steps.of(model.problem, model.control)
     if steps.count:
         own = remaining[: steps.upper.size * steps.times.size]  # what follows bounds sizes from both sides
         step_multipliers, magnitudes = (
             own.reshape(steps.upper.size, steps.times.size),
-            2.0 * np.abs(steps.H) @ _far(bound),
+            2.0 * np.abs(steps.H) @ _bound_components(bound),
         )
         wrong_signs = np.where(np.isfinite(steps.upper), 0.0, np.maximum(step_multipliers, 0.0).sum(axis=1))
         wrong_signs += np.where(np.isfinite(steps.lower), 0.0, np.maximum(-step_multipliers, 0.0).sum(axis=1))
@@ -281,7 +293,7 @@ def _neglected(model: Transcription, result: Result) -> float:
     return error
 
 
-def _far(convex: ConvexSet) -> Array:
+def _bound_components(convex: ConvexSet) -> Array:
     """Return the largest absolute value of each component of a bounded set, ``(d,)``."""
     axes = np.eye(convex.dimension)
     return np.maximum(np.abs(convex.support(axes)), np.abs(convex.support(-axes)))

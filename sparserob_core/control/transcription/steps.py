@@ -127,12 +127,12 @@ def refuse_without_steps(problem: OptimalControlProblem, dictionary: Dictionary)
     steps = differences(K, start is not None).toarray().T
     first = np.zeros((len(steps), m)) if start is None else np.vstack([-start / units, np.zeros((K - 1, m))])
     constraints = [(problem.control.in_units(units), np.eye(K), np.zeros((K, m))), (step.in_units(units), steps, first)]
-    if _cut_off(constraints, K, m):
+    if _is_provably_infeasible(constraints, K, m):
         condition = "" if start is None else f" and begins at the initial_control {start.tolist()}"
         raise InputError(f"no control that stays in its set{condition} changes by such steps only", path="control_step")
 
 
-def _cut_off(held: list[tuple[ConvexSet, Array, Array]], K: int, m: int) -> bool:
+def _is_provably_infeasible(held: list[tuple[ConvexSet, Array, Array]], K: int, m: int) -> bool:
     """Return whether tangents prove that no ``u (K, m)`` has every row of ``M u + offset`` in its set, for all ``(set,
     M, offset)``."""
     from scipy.optimize import linprog

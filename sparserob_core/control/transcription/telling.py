@@ -35,7 +35,7 @@ class Telling:
         rows, begins = ratios(normals, own_normals, coordinates), source.index_units(self.units)
 
         def told(one: ConstraintFamily, as_theirs: ConstraintFamily) -> ConstraintFamily:
-            return self._explained(one, as_theirs, rows, begins)
+            return self._attach_units(one, as_theirs, rows, begins)
 
         def sample(count: int, rng: np.random.Generator) -> ConstraintFamily:
             assert draw is not None
@@ -64,12 +64,12 @@ class Telling:
             sample=None if draw is None else sample,
         )
 
-    def _explained(
+    def _attach_units(
         self, own: ConstraintFamily, theirs: ConstraintFamily, rows: Array, begins: Array
     ) -> ConstraintFamily:
         """Return one form of a family, with units of its rows, ``rows (r,)``, and units of the first coordinates of its
         reduced indices, ``begins``."""
-        scale, explain, hindered = self._index(own, begins), theirs.explain, theirs.hindrance
+        scale, explain, hindered = self._collect_index_units(own, begins), theirs.explain, theirs.hindrance
         return replace(
             own,
             explain=None if explain is None else (lambda index, row: explain(index * scale, row)),
@@ -80,7 +80,7 @@ class Telling:
             along=theirs.along,
         )
 
-    def _index(self, own: ConstraintFamily, begins: Array) -> Array:
+    def _collect_index_units(self, own: ConstraintFamily, begins: Array) -> Array:
         """Return one unit of each coordinate of an index, in the user's units. Directions, signs and the numbers of
         samples have no unit: their factor is 1."""
         leading, trailing = {

@@ -107,7 +107,7 @@ def prepare(
                 f"which is rounding for a horizon of {problem.horizon:g}"
             )
     require_representable(problem)
-    stated, disturbance = _on_one_grid(problem, disturbance)
+    stated, disturbance = _merge_disturbance_grids(problem, disturbance)
     problem = accumulated(stated)
     refuse_without_steps(problem, control)
     mask = answers_of(policy, control.breakpoints, problem.measurements)
@@ -125,16 +125,18 @@ def prepare(
                 f"formulation: expected reduced with a policy that answers what is measured, got {formulation!r}"
             )
         nominal_problem = held_nominally(problem)
-    posed = _posed(problem, nominal_problem, control, disturbance)
-    own = cache(lambda: _in_units(posed))
+    posed = _pose_problem(problem, nominal_problem, control, disturbance)
+    own = cache(lambda: _scale_to_own_units(posed))
     acting: Acting = OpenLoop(formulation)
     if policy is not None and mask.any():
         acting = feedback.answering(policy, mask, posed, *own())
     model = transcribed(posed, acting)
-    return replace(model, program=model.program.mirrored(lambda _: _twin(model, *own())), given=stated)
+    return replace(model, program=model.program.mirrored(lambda _: _build_own_units(model, *own())), given=stated)
 
 
-def _on_one_grid(problem: OptimalControlProblem, disturbance: Dictionary) -> tuple[OptimalControlProblem, Dictionary]:
+def _merge_disturbance_grids(
+    problem: OptimalControlProblem, disturbance: Dictionary
+) -> tuple[OptimalControlProblem, Dictionary]:
     """Return the problem with the breakpoints of every disturbance of a list, where one has its own, and indicators of
     the pieces on which all of them are constant. Raise `InputError` for a dictionary with fewer functions than pieces
     together with such disturbances."""
@@ -151,7 +153,7 @@ def _on_one_grid(problem: OptimalControlProblem, disturbance: Dictionary) -> tup
     return replace(problem, disturbance_breakpoints=own), Dictionary.indicators(joint)
 
 
-def _functionals(
+def _build_functionals(
     problem: OptimalControlProblem, control: Dictionary, disturbance: Dictionary
 ) -> tuple[WorstCase, ParameterIndex]:
     system, grid = problem.system.forced, grid_of(problem, control.breakpoints, disturbance.breakpoints)
@@ -173,12 +175,12 @@ def _functionals(
     return functionals, ParameterIndex(problem.system.parameters)
 
 
-def _posed(
+def _pose_problem(
     problem: OptimalControlProblem, held: OptimalControlProblem, control: Dictionary, disturbance: Dictionary
 ) -> Posed:
     """Return a problem on its dictionaries, in its units; ``held`` is the part that becomes rows of the nominal
     decision."""
-    functionals, parameters = _functionals(problem, control, disturbance)
+    functionals, parameters = _build_functionals(problem, control, disturbance)
     return Posed(
         problem=problem,
         held=held,
@@ -186,11 +188,11 @@ def _posed(
         disturbance=disturbance,
         functionals=functionals,
         parameters=parameters,
-        constraints=_state_constraints(problem, functionals, parameters),
+        constraints=_build_state_constraints(problem, functionals, parameters),
     )
 
 
-def _in_units(posed: Posed, wide: bool = False) -> tuple[Posed, Units]:
+def _scale_to_own_units(posed: Posed, wide: bool = False) -> tuple[Posed, Units]:
     """Return the same problem in its own units (decision 0016), with every row divided by its own unit, and these
     units.
 
@@ -199,22 +201,22 @@ def _in_units(posed: Posed, wide: bool = False) -> tuple[Posed, Units]:
     nonetheless.
     """
     controls = np.ones(posed.problem.system.controls)
-    own, units = _scaled(posed, controls)
+    own, units = _scale_to_shares(posed, controls)
     least_share = shortfall(own.constraints)
     if wide or least_share >= 1.0:
         return own, units
     share = float(np.exp2(np.floor(np.log2(least_share)))) / 2.0
-    ranged = _scaled(posed, share * controls)
+    ranged = _scale_to_shares(posed, share * controls)
     if shortfall(ranged[0].constraints) < 1.0:  # what is too fine is so without a control
         return own, units
     for channel in range(controls.size if controls.size > 1 else 0):
         chosen = np.where(np.arange(controls.size) == channel, 1.0, ranged[1].controls / units.controls)
-        candidate = _scaled(posed, chosen)
+        candidate = _scale_to_shares(posed, chosen)
         ranged = candidate if shortfall(candidate[0].constraints) >= 1.0 else ranged
     return ranged
 
 
-def _scaled(posed: Posed, shares: Array) -> tuple[Posed, Units]:
+def _scale_to_shares(posed: Posed, shares: Array) -> tuple[Posed, Units]:
     """Return the problem in the units that it would have if every channel used only the share ``(m,)`` of its range,
     and these units; the range itself does not change."""
     problem = posed.problem
@@ -222,24 +224,24 @@ def _scaled(posed: Posed, shares: Array) -> tuple[Posed, Units]:
     ranged = problem if (shares == 1.0).all() else ranged
     rough, dictionaries = rough_units(ranged), (posed.control, posed.disturbance)
     rough_problem = rough.of_problem(ranged)
-    reaching, _ = _functionals(rough_problem, *(rough.of_dictionary(dictionary) for dictionary in dictionaries))
+    reaching, _ = _build_functionals(rough_problem, *(rough.of_dictionary(dictionary) for dictionary in dictionaries))
     units = own_units(ranged, rough, reaching, rough_problem.control)
     control, disturbance = (units.of_dictionary(dictionary) for dictionary in dictionaries)
     scaled = units.of_problem(problem)
     nominal_problem = scaled if posed.held is problem else held_nominally(scaled)
-    own = _posed(scaled, nominal_problem, control, disturbance)
+    own = _pose_problem(scaled, nominal_problem, control, disturbance)
     control_range, held_range = (variant.control.in_units(1.0 / shares) for variant in (scaled, nominal_problem))
     constraints = tuple(constraint.divided(row_units(constraint, control_range)) for constraint in own.constraints)
     return replace(own, constraints=constraints, rows=held_units(own, held_range)), units
 
 
 def in_own_units(model: Transcription, wide: bool = False) -> tuple[Transcription, Units]:
-    """Return the transcription of the same problem in its own units, and these units (`_in_units`). Its families are
-    explained in the user's units."""
-    return _told(model, *_in_units(model, wide))
+    """Return the transcription of the same problem in its own units, and these units (`_scale_to_own_units`). Its
+    families are explained in the user's units."""
+    return _transcribe_in_own_units(model, *_scale_to_own_units(model, wide))
 
 
-def _told(model: Transcription, posed: Posed, units: Units) -> tuple[Transcription, Units]:
+def _transcribe_in_own_units(model: Transcription, posed: Posed, units: Units) -> tuple[Transcription, Units]:
     """Return the transcription of a problem that is ``posed`` in its own units, with families that are explained in the
     user's units, and these own units."""
     own = transcribed(posed, model.acting.in_own(model, posed, units))
@@ -254,9 +256,11 @@ def _told(model: Transcription, posed: Posed, units: Units) -> tuple[Transcripti
 def like(own: Transcription, problem: OptimalControlProblem) -> SemiInfiniteProgram:
     """Return the program of another problem on the dictionaries of ``own``, with the row units and the explanations of
     ``own``. The two problems may differ only in numbers on the right-hand sides."""
-    posed = _posed(problem, problem, own.control, own.disturbance)
+    posed = _pose_problem(problem, problem, own.control, own.disturbance)
     pairs = zip(posed.constraints, own.constraints, strict=True)
-    constraints = tuple(constraint.divided(_shares(constraint, own_constraint)) for constraint, own_constraint in pairs)
+    constraints = tuple(
+        constraint.divided(_compute_row_ratios(constraint, own_constraint)) for constraint, own_constraint in pairs
+    )
     program = transcribed(replace(posed, constraints=constraints, rows=own.rows), own.acting).program
     families = [
         replace(family, explain=own_family.explain, row_units=own_family.row_units, index_units=own_family.index_units)
@@ -265,13 +269,13 @@ def like(own: Transcription, problem: OptimalControlProblem) -> SemiInfiniteProg
     return replace(program, families=families)
 
 
-def _twin(model: Transcription, posed: Posed, units: Units) -> OwnUnits:
+def _build_own_units(model: Transcription, posed: Posed, units: Units) -> OwnUnits:
     """Return the program of a problem that is ``posed`` in its own units, and the factors back to the user's units."""
-    own, _ = _told(model, posed, units)
+    own, _ = _transcribe_in_own_units(model, posed, units)
     decision, image, equalities = way_back(model, own, units)
 
     def wider() -> OwnUnits:
-        return _twin(model, *_in_units(model, wide=True))
+        return _build_own_units(model, *_scale_to_own_units(model, wide=True))
 
     narrow = bool((units.controls < rough_units(model.problem).controls).any())  # it goes less far than it may
     return OwnUnits(
@@ -284,7 +288,7 @@ def _twin(model: Transcription, posed: Posed, units: Units) -> OwnUnits:
     )
 
 
-def _shares(one: StateConstraint, other: StateConstraint) -> Array:
+def _compute_row_ratios(one: StateConstraint, other: StateConstraint) -> Array:
     """Return the ratios ``(r,)`` of the rows of a constraint to those of another constraint with the same
     directions."""
     theirs, ours = (constraint.normals_at(constraint.index_set.lower) for constraint in (one, other))
@@ -304,7 +308,7 @@ def from_state(model: Transcription, initial_state: Array) -> Transcription:
     return replace(model.acting.from_state(model, posed), given=model.given)
 
 
-def _state_constraints(
+def _build_state_constraints(
     problem: OptimalControlProblem, functionals: WorstCase, parameters: ParameterIndex
 ) -> tuple[StateConstraint, ...]:
     """Return the path and terminal constraints in the form that the program uses; equalities are not among them."""
@@ -325,9 +329,11 @@ def windows_of(problem: OptimalControlProblem) -> list[tuple[str, PathConstraint
     """Return the path and terminal constraints with the names of their families. The window of a terminal constraint is
     the horizon alone."""
     end, ends = problem.horizon, problem.terminal_sets
-    finals = [(_name("terminal", i, len(ends)), PathConstraint(convex, end, end)) for i, convex in enumerate(ends)]
+    finals = [
+        (_name_family("terminal", i, len(ends)), PathConstraint(convex, end, end)) for i, convex in enumerate(ends)
+    ]
     return [*zip(problem.called("path"), problem.windows, strict=True), *finals]
 
 
-def _name(kind: str, position: int, count: int) -> str:
+def _name_family(kind: str, position: int, count: int) -> str:
     return f"{kind}[{position}]" if count > 1 else kind

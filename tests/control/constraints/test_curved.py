@@ -90,7 +90,7 @@ def test_directions_at_a_held_time_are_the_worst_ones(curved: CurvedConstraint) 
         for t in times
     ]
     start = np.hstack([times[:, None], np.tile(middle, (3, 1)), z[best]])
-    turned, heights = curved._turned(x, start)
+    turned, heights = curved._climb_directions(x, start)
     np.testing.assert_array_equal(turned[:, :-2], start[:, :-2])
     np.testing.assert_allclose(heights, curved.violations(x, turned, np.zeros(3, dtype=int)), rtol=0.0, atol=1e-12)
     angles = np.linspace(0.0, 2 * np.pi, 2001)

@@ -14,7 +14,7 @@ from scipy.linalg import expm
 
 from sparserob_core.control.enclosures import decoupling as module
 from sparserob_core.control.enclosures.comparison import ComparisonSystem, block_norms, block_sizes, comparison_matrix
-from sparserob_core.control.enclosures.decoupling import MANY, _clusters, decoupled, decoupled_transitions
+from sparserob_core.control.enclosures.decoupling import MANY, _cluster_eigenvalues, decoupled, decoupled_transitions
 
 MATRICES = {
     "a number": [[-3.0]],
@@ -157,10 +157,12 @@ def test_a_long_chain_of_masses_comes_apart_in_whatever_units_its_states_are(see
 
 def test_eigenvalues_that_are_near_each_other_are_one_cluster_in_chains():
     values = np.array([1.0, 5.0, 1.3, -2.0 + 0.1j, -2.0 - 0.1j, 1.6, 5.25])
-    found = [np.flatnonzero(one).tolist() for one in _clusters(values, 0.3000001)]
+    found = [np.flatnonzero(one).tolist() for one in _cluster_eigenvalues(values, 0.3000001)]
     assert found == [[0, 2, 5], [1, 6], [3, 4]]
-    assert [one.tolist() for one in _clusters(np.array([1.0, 2.0, 3.0]), 0.5)] == np.eye(3, dtype=bool).tolist()
-    assert len(_clusters(np.array([1.0, 2.0, 3.0]), 1.0)) == 1
+    assert [one.tolist() for one in _cluster_eigenvalues(np.array([1.0, 2.0, 3.0]), 0.5)] == np.eye(
+        3, dtype=bool
+    ).tolist()
+    assert len(_cluster_eigenvalues(np.array([1.0, 2.0, 3.0]), 1.0)) == 1
 
 
 def test_what_is_wrong_with_an_inverse_is_in_its_bound_to_either_side(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -170,7 +172,7 @@ def test_what_is_wrong_with_an_inverse_is_in_its_bound_to_either_side(monkeypatc
         rough = exact + 1e-3 * np.array(signs).reshape(2, 2)
         with monkeypatch.context() as told:
             told.setattr(np.linalg, "inv", lambda _, rough=rough: rough)
-            found = module._checked(T, np.zeros(1, dtype=int), np.zeros(2, dtype=int))
+            found = module._verify_inverse(T, np.zeros(1, dtype=int), np.zeros(2, dtype=int))
         assert found is not None
         off = np.abs(exact - np.asarray(found.inverse, dtype=float))
         assert (off <= found.defect @ np.abs(np.asarray(found.inverse, dtype=float))).all() and off.max() > 1e-7

@@ -76,13 +76,13 @@ def test_long_exponentials_are_rounded_once() -> None:
     """Squares of floats would be off by a rounding for every doubling of the time, twice as much each time: 1e-14."""
     A = np.random.default_rng(3).normal(size=(5, 5))
     leaps, doublings = Leaps(A), 7
-    flow, driven = exponential(scaled(exact(leaps._own), Fraction(leaps.step)))
+    flow, driven = exponential(scaled(exact(leaps._scaled_matrix), Fraction(leaps.step)))
     driven = scaled(driven, Fraction(leaps.step))
     for _ in range(doublings):
         driven, flow = added(driven, times(flow, driven)), times(flow, flow)
         digits = 2**300  # of fractions that would else double their length each time
         flow, driven = ([[Fraction(round(x * digits), digits) for x in row] for row in part] for part in (flow, driven))
-    known = leaps._over(doublings + 1)[-1]
+    known = leaps._compute_transitions(doublings + 1)[-1]
     assert off(flow, known[0]) <= 2e-16
     assert off(driven, known[1]) <= 2e-15
 

@@ -126,7 +126,7 @@ def test_what_an_expansion_leaves_out_of_what_a_piece_does_is_in_the_bounds(monk
         off = np.ptp(pieces.enclosed(times, H, every), axis=2) / 2.0
         assert off.max() > 1e-7 and (pieces.allowance(times, times, H, every) >= off).all()
         assert loop.motion is not None
-        left, under_way = loop._left_out(none, loop.motion), loop.motion.left_out(*pieces.reached)
+        left, under_way = loop._bound_transition_errors(none, loop.motion), loop.motion.left_out(*pieces.reached)
         assert under_way[0].min() > 1e-12 and (left >= under_way * (1.0 - 1e-12)).all()
 
 

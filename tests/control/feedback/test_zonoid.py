@@ -11,7 +11,7 @@ from scipy.linalg import expm
 import sparserob_core as sr
 from sparserob_core.checker.reach.measurable import Side
 from sparserob_core.checker.sets.polynomials import Enclosed
-from sparserob_core.control.feedback.zonoid import Arc, Pushes, Zonoid, _apart, _shares
+from sparserob_core.control.feedback.zonoid import Arc, Pushes, Zonoid, _is_nonnegative, _solve_shares
 from sparserob_core.control.sets.sets import Box, Polytope
 from sparserob_core.sip.convex_set import Array, ConvexSet
 from tests.support.undriven import undriven
@@ -130,10 +130,10 @@ def test_shares_of_columns_that_are_one_point_are_taken_over_by_one_of_them() ->
     a, b = rng.normal(size=(2, 4))
     columns = np.array([a, a + 1e-9 * rng.normal(size=4), b, a + 1e-9 * rng.normal(size=4)])
     for point in (0.7 * a + 0.2 * b, 0.7 * a + 1e-10 * rng.normal(size=4), b, 0.0 * a):
-        shares = _shares(columns, point)
+        shares = _solve_shares(columns, point)
         assert (shares >= 0.0).all()
         assert shares @ columns == pytest.approx(point, abs=1e-9)
-    assert _shares(np.array([a, 0.0 * a, b, 0.0 * a]), 0.7 * a + 0.2 * b) == pytest.approx([0.7, 0.0, 0.2, 0.0])
+    assert _solve_shares(np.array([a, 0.0 * a, b, 0.0 * a]), 0.7 * a + 0.2 * b) == pytest.approx([0.7, 0.0, 0.2, 0.0])
 
 
 def test_a_direction_that_nothing_pushes_is_no_coordinate() -> None:
@@ -150,12 +150,12 @@ def test_a_chord_less_a_parabola_is_the_whole_truth_of_convex_quadratics() -> No
     u, share = rng.uniform(-0.9, 0.9, size=400), rng.choice([-1e-6, 1e-6, 0.3, -0.3], size=400)
     lowest = share * low
     left, right = (c * (end - u) ** 2 + lowest for end in (-1.0, 1.0))
-    said = _apart(left, right, 4.0 * c, 0.0)
+    said = _is_nonnegative(left, right, 4.0 * c, 0.0)
     assert (said == (lowest >= 0.0)).all()
-    assert not _apart(np.array([-1e-9, 1.0]), np.array([1.0, -1e-9]), np.zeros(2), 0.0).any()
-    assert _apart(np.array([-1e-9]), np.array([1.0]), np.zeros(1), 1e-8).all()
+    assert not _is_nonnegative(np.array([-1e-9, 1.0]), np.array([1.0, -1e-9]), np.zeros(2), 0.0).any()
+    assert _is_nonnegative(np.array([-1e-9]), np.array([1.0]), np.zeros(1), 1e-8).all()
     straight = rng.uniform(0.0, 1.0, size=(2, 50))
-    assert _apart(*straight, np.zeros(50), 0.0).all()
+    assert _is_nonnegative(*straight, np.zeros(50), 0.0).all()
 
 
 @pytest.mark.first(3)

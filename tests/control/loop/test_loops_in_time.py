@@ -121,7 +121,8 @@ def test_integrals_of_controls_go_on_where_parameters_beside_the_time_begin_anew
     states = controller.plan.known.problem.system.states
     spent = 0.0
     for begin, end in zip(controller.breakpoints[:-1], controller.breakpoints[1:], strict=True):
-        u = controller.step(begin, controller._measured([-0.5, 0.5])[:2])  # whatever is told, what was spent is known
+        # whatever is told, what was spent is known
+        u = controller.step(begin, controller._read_measurement([-0.5, 0.5])[:2])
         spent += float(u[0] * (end - begin))
-        unseen = controller._measured([-0.5, 0.5])[2:]
+        unseen = controller._read_measurement([-0.5, 0.5])[2:]
         assert unseen.size == states - 2 and unseen[-1] == pytest.approx(spent) and not unseen[:-1].any()

@@ -25,7 +25,7 @@ def outcome(request, tmp_path_factory) -> sr.Outcome:
 def tuning(outcome: sr.Outcome) -> sr.Controller:
     """A controller that has time for the nominal control, and none for a whole program."""
     controller = sr.controller(outcome, True, seconds=1e6)
-    controller._resolving._took = np.inf
+    controller._resolver._solve_seconds = np.inf
     return controller
 
 

@@ -216,7 +216,7 @@ def test_rows_of_no_integral_see_one_system_where_turns_integrate(name):
     assert found(times, wide, none) == pytest.approx(known(times, rows, none), rel=1e-9, abs=1e-12)
     assert found.enclosed(times[3:] - 0.9, wide[3:], 1) == pytest.approx(known.enclosed(times, rows)[3:], rel=1e-7)
     wide[:, 3] = 1.0  # what is integrated goes through both systems
-    with patch.object(measurable.MeasurableSupport, "_differing", None):
+    with patch.object(measurable.MeasurableSupport, "_differing_states", None):
         through = measurable.MeasurableSupport(turning, BOUNDS[name])(times, wide, none)
     assert found(times, wide, none) == pytest.approx(through, rel=1e-9, abs=1e-12)
 

@@ -229,7 +229,7 @@ def test_norms_of_coefficients_hold_what_transitions_are_off_by(off: float, monk
         )
     turned = (np.cos(2 * marks[:, None]) - np.cos(2 * marks)) / 2  # of the integral of p sin(2 t), from one to another
     still = np.exp(-(marks[:, None] - marks) / 2 + centre[0] * turned)
-    found = truncation._carried
+    found = truncation._transition_norms
     for degree in range(7):
         exact = np.abs(still * (units[0] * turned) ** degree / factorial(degree))
         for k in range(marks.size):
@@ -451,9 +451,9 @@ def test_growth_is_the_largest_on_any_half_of_a_part() -> None:
     low, high = np.array([-1.0]), np.array([1.0])
     with pytest.raises(NotEnclosable):
         constraint.functionals.legs(low, high)
-    found = constraint.functionals._growth(low, high, 8)
+    found = constraint.functionals._bound_growth(low, high, 8)
     assert np.exp(4.0 * np.e) * (1.0 - 1e-9) <= found <= 100.0 * np.exp(4.0 * np.e)
-    assert constraint.functionals._growth(low, high, 0) == np.inf
+    assert constraint.functionals._bound_growth(low, high, 0) == np.inf
 
 
 def test_what_steps_are_off_by_is_carried_to_all_coefficients(pushed: Propagator) -> None:

@@ -122,7 +122,7 @@ def test_a_kernel_is_the_closed_form_but_for_its_error(
         for rough in ("SHARPEST", "BLUNTEST"):
             monkeypatch.setattr(expansion, rough, 1.0)
         monkeypatch.setattr(expansion, name, value)
-    made = Expansion._made(FADING)
+    made = Expansion._expand_system(FADING)
     starts, stops = made.ends[:-1], made.ends[1:]
     found, left = made.kernel(starts, stops), np.linspace(0.0, 1.0, 21)
     s = stops[:, None] - left * (stops - starts)[:, None]
@@ -256,5 +256,5 @@ def test_what_is_remembered_of_times_is_what_was_made_of_them() -> None:
     assert isinstance(execution, VaryingExecution)
     for c in ([1.0, 0.0], [0.0, 1.0], [1.0, 0.0]):
         at = TIMES, np.tile(c, (TIMES.size, 1))
-        again = replace(execution, _ways={}, _lengths={})
+        again = replace(execution, _transitions={}, _lengths={})
         assert (execution.lengths(*at) == again.lengths(*at)).all()

@@ -235,7 +235,7 @@ def test_the_worst_that_steps_may_miss_is_held_and_hardly_more(control, stretche
     path = motion.nodes(np.full((1, 12), control))[:, 0]
     units = motion.expansion.units * ratios
     missed = off * ((np.abs(path[:-1]) / units).max(axis=1) + driven.max(axis=1))[:, None] * units
-    lost = motion._lost(np.abs(path[:-1]), driven[:, :, None].sum(axis=2))
+    lost = motion._propagate_step_errors(np.abs(path[:-1]), driven[:, :, None].sum(axis=2))
     for mark in (1, 2, len(path) // 3, len(path) // 2, len(path) - 2):
         deviation = np.empty(2)
         for state in range(2):
@@ -278,7 +278,7 @@ def test_transitions_count_in_the_units_of_what_they_begin_with(monkeypatch):
 def test_what_products_of_steps_round_is_lost_too(monkeypatch):
     motion = orbiting(monkeypatch, 0.0)
     path, exact, off = motion.nodes(np.zeros((1, 12)))[:, 0], [Fraction(1), Fraction(1, 2)], 0.0
-    lost = motion._lost(np.abs(path[:-1]), np.zeros((len(path) - 1, 2)))
+    lost = motion._propagate_step_errors(np.abs(path[:-1]), np.zeros((len(path) - 1, 2)))
     for k, step in enumerate(motion.flow.state[:-1]):
         exact = [sum(Fraction(a) * x for a, x in zip(row, exact, strict=True)) for row in step]
         miss = np.array([abs(float(x - Fraction(one))) for x, one in zip(exact, path[k + 1], strict=True)])
@@ -296,7 +296,7 @@ def test_a_piece_in_two_segments_counts_in_the_units_of_all(monkeypatch):
     motion = replace(
         first, propagator=Response(FAST_AND_SLOW, merge_grids(times, times, varying=True), np.ones(2)).propagator
     )
-    units, off = motion._steps_off
+    units, off = motion._step_errors
     apart = np.flatnonzero(np.isin(motion.propagator.marks[1:], times[1:-1]))
     assert apart.size == 2
     np.testing.assert_array_equal(units[apart], np.tile(motion.expansion.units, (2, 1)))

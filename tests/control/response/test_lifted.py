@@ -391,7 +391,7 @@ def test_states_and_rows_are_as_near_to_the_truth_as_spans_of_many_pieces_say(na
     nodes, remainder = lifted.nodes(control)[:, 0], lifted.state_remainder(control)[0]
     weights = lifted.backward.adjoint(breaks[1:], np.repeat(rows[:1], 60, axis=0), np.zeros((60, 0)))[0]
     missed = lifted.row_bounds(rows, by_age=blocks)[1][0][lifted.span]
-    assert (lifted._block == 8) == blocks
+    assert (lifted._block_size == 8) == blocks
     with balls(400):
         T = flint.arb_mat(lifted.transform.tolist())
         state = T.inv() * flint.arb_mat(functionals.response.initial_state[:, None].tolist())

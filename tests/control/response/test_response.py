@@ -145,7 +145,7 @@ def test_the_push_by_age_equals_the_push_by_adjoints(seed, pieces, nu):
     sigma = DisturbanceSupport(lifted, functionals.disturbance, rows)
     widths = rng.uniform(0, 1, times.size) * HORIZON / pieces
     fast, steep, bent = sigma.at(times, ends), sigma.steepness(times), sigma.deviation(times, widths)
-    with patch.object(DisturbanceSupport, "_repeats", new=False):
+    with patch.object(DisturbanceSupport, "_has_uniform_blocks", new=False):
         sigma = DisturbanceSupport(lifted, functionals.disturbance, rows)
         slow = sigma.at(times, ends)
         assert np.allclose(fast[0], slow[0], rtol=1e-9, atol=1e-11)

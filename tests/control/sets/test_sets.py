@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import linprog
 
-from sparserob_core.control.sets.curved import _power_excess
+from sparserob_core.control.sets.curved import _bound_power_excess
 from sparserob_core.control.sets.sets import (
     Box,
     Cylinder,
@@ -367,5 +367,5 @@ def test_a_ball_is_the_same_in_any_units(p: float) -> None:
                 other.violation(rows * unit), unit * one.violation(rows), rtol=1e-6, atol=unit * 1e-9
             )
             np.testing.assert_array_equal(other.contains(rows * unit, 1e-9 * unit), one.contains(rows))
-            found = [_power_excess(rows * u, spread * u, one.dual) for u in (1.0, unit)]
+            found = [_bound_power_excess(rows * u, spread * u, one.dual) for u in (1.0, unit)]
             np.testing.assert_allclose(found[1], unit * found[0], rtol=1e-9)

@@ -85,7 +85,7 @@ class IntegralConstraint(Window):
         H, G = (arrays.get(name, np.zeros((count, width))) for name, (_, width, _) in matrices.items())
         if (empty := np.flatnonzero(~np.hstack([H, G]).any(axis=1))).size:
             raise InputError(path=where, expected="rows that integrate something", got=f"zeros in row {empty[0] + 1}")
-        lower, upper = _limits(where, self, count)
+        lower, upper = _check_limits(where, self, count)
         horizon, delay = setting.horizon, setting.delay
         start, stop = float(self.start), end_of(self.stop, horizon)
         if not (0.0 <= start < stop - SAME_TIME * horizon and stop <= horizon):
@@ -138,7 +138,7 @@ class Accumulated(PathConstraint):
     stated = False
 
 
-def _limits(where: str, entry: IntegralConstraint, count: int) -> tuple[Array, Array]:
+def _check_limits(where: str, entry: IntegralConstraint, count: int) -> tuple[Array, Array]:
     """Return the lower and upper bounds ``(r,)`` of an integral, infinite where there is none; raise `InputError`."""
     sides = []
     for name, bound, infinity in (("lower", entry.lower, -np.inf), ("upper", entry.upper, np.inf)):

@@ -68,7 +68,7 @@ def ending(bound: ConvexSet | None, centre: Array, horizon: float) -> tuple[list
     if bound is None:
         return [], ends
     reference = np.column_stack([[0.0, horizon], np.vstack([centre, centre])]) if centre.any() else None
-    return [Return(_free_where_flat(bound).scaled(1.0 - WITHIN), horizon, horizon, RETURN, reference)], ends
+    return [Return(_free_flat_coordinates(bound).scaled(1.0 - WITHIN), horizon, horizon, RETURN, reference)], ends
 
 
 def widths(bound: ConvexSet | None, states: int) -> Array:
@@ -92,7 +92,7 @@ def widths(bound: ConvexSet | None, states: int) -> Array:
     return np.asarray(bound.support(axes) + bound.support(-axes))
 
 
-def _free_where_flat(bound: ConvexSet) -> ConvexSet:
+def _free_flat_coordinates(bound: ConvexSet) -> ConvexSet:
     """Return a set of initial deviations with the coordinates free in which it has no width.
 
     Raises `InputError` for a set that has no interior and is no box.

@@ -23,7 +23,7 @@ Flat: TypeAlias = tuple[Array, Array | None, Array]
 W = TypeVar("W", bound="Window")
 
 
-def _moved(rows: npt.ArrayLike, begin: float, horizon: float) -> Array:
+def _shift_rows(rows: npt.ArrayLike, begin: float, horizon: float) -> Array:
     """Return rows ``(q, 1 + d)`` of a time and a point from the time ``begin`` on, with times counted from there."""
     array = np.asarray(rows, dtype=float)
     shifted = array - np.eye(1, array.shape[1])[0] * begin
@@ -201,7 +201,7 @@ class PathConstraint(Window):
     start: float = field(default=0.0, metadata=TIME)
     stop: float | None = field(default=None, metadata=TIME)
     name: str | None = field(default=None, metadata=UNITLESS)
-    relative_to: npt.ArrayLike | None = field(default=None, metadata=timed(lambda of: of.states, _moved))
+    relative_to: npt.ArrayLike | None = field(default=None, metadata=timed(lambda of: of.states, _shift_rows))
 
     among = "path"
 
@@ -412,7 +412,7 @@ def placed(term: W, where: str, setting: Setting) -> W:
         raise InputError(path=where, expected=expected, got=f"from {start:g} to {stop:g}")
     changes: dict[str, Any] = {"start": start, "stop": stop}
     if term.relative_to is not None:
-        changes["relative_to"] = reference = _reference(f"{where}.relative_to", term.relative_to, setting.states)
+        changes["relative_to"] = reference = _check_reference(f"{where}.relative_to", term.relative_to, setting.states)
         slack = SAME_TIME * horizon
         if reference[0, 0] > start + slack or reference[-1, 0] < stop - slack:
             expected = f"rows whose times cover the window, {start:g} to {stop:g}"
@@ -574,12 +574,12 @@ def coefficients(where: str, **given: tuple[object, int, str]) -> list[Array]:
         If a matrix is not of this form.
     """
     return [
-        _matrix(f"{where}.{name}", rows, f"rows of {width} finite numbers, one per {of}", width)
+        _check_matrix(f"{where}.{name}", rows, f"rows of {width} finite numbers, one per {of}", width)
         for name, (rows, width, of) in given.items()
     ]
 
 
-def _matrix(where: str, rows: object, expected: str, columns: int) -> Array:
+def _check_matrix(where: str, rows: object, expected: str, columns: int) -> Array:
     """Return a matrix of finite numbers with so many columns; raise `InputError`."""
     try:
         matrix = np.array(dense(rows), dtype=float)
@@ -590,9 +590,9 @@ def _matrix(where: str, rows: object, expected: str, columns: int) -> Array:
     return matrix
 
 
-def _reference(where: str, rows: object, states: int) -> Array:
+def _check_reference(where: str, rows: object, states: int) -> Array:
     """Return rows ``(q, 1 + d)`` of a time and a point; raise `InputError` where the times do not increase."""
-    reference = _matrix(where, rows, f"rows of {1 + states} finite numbers, a time and a point each", 1 + states)
+    reference = _check_matrix(where, rows, f"rows of {1 + states} finite numbers, a time and a point each", 1 + states)
     if (np.diff(reference[:, 0]) <= 0.0).any():
         raise InputError(path=where, expected="rows whose times increase", got=f"times {reference[:, 0].tolist()}")
     return reference

@@ -38,7 +38,7 @@ LARGEST_POWER = 64
 SEARCHED = 4000  # parts of horizon and box that are looked through for a pole
 TINIEST = 2.0**-20  # of horizon and box, a part without an enclosure holds a pole
 OUTWARD = 1.0 + 1e-9
-_ROUNDED = 16.0 * EPSILON  # of a value, more than what a function of numpy is off by
+_ROUNDING = 16.0 * EPSILON  # of a value, more than what a function of numpy is off by
 
 
 @final
@@ -50,19 +50,19 @@ class Discs:
 
     def __init__(self, middle: Array, radius: Array) -> None:
         with np.errstate(all="ignore"):
-            radius = (radius + _ROUNDED * np.abs(middle)) * OUTWARD
+            radius = (radius + _ROUNDING * np.abs(middle)) * OUTWARD
         is_finite = np.isfinite(middle) & np.isfinite(radius)
         self.middle: Array = np.where(is_finite, middle, 0.0)
         self.radius: Array = np.where(is_finite, radius, np.inf)
 
     @staticmethod
-    def _like(other: object) -> tuple[Array, Array]:
+    def _convert_operand(other: object) -> tuple[Array, Array]:
         if isinstance(other, Discs):
             return other.middle, other.radius
         return np.asarray(other, dtype=float), np.zeros(())
 
     def __add__(self, other: object) -> Discs:
-        middle, radius = self._like(other)
+        middle, radius = self._convert_operand(other)
         return Discs(self.middle + middle, self.radius + radius)
 
     def __neg__(self) -> Discs:
@@ -72,14 +72,14 @@ class Discs:
         return self
 
     def __sub__(self, other: object) -> Discs:
-        middle, radius = self._like(other)
+        middle, radius = self._convert_operand(other)
         return Discs(self.middle - middle, self.radius + radius)
 
     def __rsub__(self, other: object) -> Discs:
         return -self + other
 
     def __mul__(self, other: object) -> Discs:
-        middle, radius = self._like(other)
+        middle, radius = self._convert_operand(other)
         with np.errstate(all="ignore"):
             distance = np.abs(self.middle) * radius + self.radius * (np.abs(middle) + radius)
         return Discs(self.middle * middle, distance)
@@ -89,7 +89,7 @@ class Discs:
         a, r = self.middle, self.radius
         with np.errstate(all="ignore"):
             under = (np.abs(a) - r) * (np.abs(a) + r)
-            return self._where(np.abs(a) > r, a / under, r / under)
+            return self._mask_unknown(np.abs(a) > r, a / under, r / under)
 
     def __truediv__(self, other: object) -> Discs:
         if isinstance(other, Discs):
@@ -106,7 +106,7 @@ class Discs:
             return (other * self.log()).exp()
         power = float(other)  # type: ignore[arg-type]  # a number then
         if not power.is_integer() or abs(power) > LARGEST_POWER:
-            return self._raised(power)
+            return self._raise_to_power(power)
         product, base = Discs(np.ones(self.middle.shape), np.zeros(self.middle.shape)), self
         for _ in range(abs(int(power))):
             product = product * base
@@ -119,10 +119,10 @@ class Discs:
     __radd__, __rmul__ = __add__, __mul__
 
     @staticmethod
-    def _where(known: np.ndarray, middle: Array, radius: Array) -> Discs:
+    def _mask_unknown(known: np.ndarray, middle: Array, radius: Array) -> Discs:
         return Discs(np.where(known, middle, 0.0), np.where(known, radius, np.inf))
 
-    def _raised(self, power: float) -> Discs:
+    def _raise_to_power(self, power: float) -> Discs:
         """Return a power of discs to the right of 0.
 
         The bound is ``|(1 + w)^a - 1| <= (1 - |w|)^-|a| - 1``, and ``(1 + |w|)^a + 1`` where ``a`` is positive. For a
@@ -133,17 +133,17 @@ class Discs:
             middle, logarithm = a**power, np.log1p(-np.minimum(share, 1.0))
             distance = -np.expm1(power * logarithm) if 0.0 < power <= 1.0 else np.expm1(-abs(power) * logarithm)
             distance = np.minimum(distance, (1.0 + share) ** power + 1.0) if power > 0.0 else distance
-        return self._where((a > 0.0) & (share < 1.0), middle, middle * distance)
+        return self._mask_unknown((a > 0.0) & (share < 1.0), middle, middle * distance)
 
     def sqrt(self) -> Discs:
         """Return the square root."""
-        return self._raised(0.5)
+        return self._raise_to_power(0.5)
 
     def log(self) -> Discs:
         """Return the natural logarithm, of discs to the right of 0."""
         a, share = self.middle, self.radius / np.where(self.middle > 0.0, self.middle, 1.0)
         is_positive = (a > 0.0) & (share < 1.0)
-        return self._where(
+        return self._mask_unknown(
             is_positive, np.log(np.where(is_positive, a, 1.0)), -np.log1p(-np.where(is_positive, share, 0.0))
         )
 
@@ -155,32 +155,32 @@ class Discs:
 
     def sin(self) -> Discs:
         """Return the sine, from its sum ``sin a cos z + cos a sin z``."""
-        return self._turned(np.sin(self.middle), np.cos(self.middle))
+        return self._enclose_sine_or_cosine(np.sin(self.middle), np.cos(self.middle))
 
     def cos(self) -> Discs:
         """Return the cosine."""
-        return self._turned(np.cos(self.middle), np.sin(self.middle))
+        return self._enclose_sine_or_cosine(np.cos(self.middle), np.sin(self.middle))
 
-    def _turned(self, value: Array, other: Array) -> Discs:
+    def _enclose_sine_or_cosine(self, value: Array, other: Array) -> Discs:
         with np.errstate(all="ignore"):
             r = self.radius
-            distance = np.abs(value) * (np.cosh(r) - 1.0) + (np.abs(other) + _ROUNDED) * np.sinh(r)
-        return Discs(value, distance + _ROUNDED * np.where(np.isfinite(r), r, 0.0) + _ROUNDED)
+            distance = np.abs(value) * (np.cosh(r) - 1.0) + (np.abs(other) + _ROUNDING) * np.sinh(r)
+        return Discs(value, distance + _ROUNDING * np.where(np.isfinite(r), r, 0.0) + _ROUNDING)
 
     def tan(self) -> Discs:
         """Return the tangent, from that of a sum; ``|tan z| <= tan |z|``."""
-        return self._tangent(np.tan(self.middle), 1.0)
+        return self._enclose_tangent(np.tan(self.middle), 1.0)
 
     def tanh(self) -> Discs:
         """Return the hyperbolic tangent, in the same way; ``|tanh z| <= tan |z|``."""
-        return self._tangent(np.tanh(self.middle), -1.0)
+        return self._enclose_tangent(np.tanh(self.middle), -1.0)
 
-    def _tangent(self, value: Array, sign: float) -> Discs:
+    def _enclose_tangent(self, value: Array, sign: float) -> Discs:
         with np.errstate(all="ignore"):
             tangent = np.tan(np.minimum(self.radius, 1.57))
             under = 1.0 - np.abs(value) * tangent
-            return self._where(
-                (self.radius < 1.57) & (under > 1e-6), value, ((1.0 + sign * value**2) + _ROUNDED) * tangent / under
+            return self._mask_unknown(
+                (self.radius < 1.57) & (under > 1e-6), value, ((1.0 + sign * value**2) + _ROUNDING) * tangent / under
             )
 
     def kepler(self, eccentricity: float) -> Discs:
@@ -195,7 +195,7 @@ class Discs:
             R = 4.0 * 0.85**step
             curvature = e * (np.abs(np.sin(E)) * (np.cosh(R) - 1.0) + np.abs(np.cos(E)) * (np.sinh(R) - R))
             radius = np.where(R * slope - curvature - 1e-9 * R > self.radius, R, radius)  # what is rounded is far less
-        return Discs(E, radius + _ROUNDED * (np.abs(self.middle) + 1.0) / slope)
+        return Discs(E, radius + _ROUNDING * (np.abs(self.middle) + 1.0) / slope)
 
 
 @final
@@ -214,7 +214,7 @@ class Cauchy:
 
     def left(self, degree: int) -> Left:
         """Return bounds of the terms beyond a degree, of entries that are no polynomials of this degree."""
-        sizes = _least(self.far, degree)
+        sizes = _bound_remainder(self.far, degree)
         sizes[:, ~beyond(self.system, degree)] = 0.0
         return Left(self.ends, sizes)
 
@@ -303,10 +303,10 @@ class _Law:
             is_good = np.ones(starts.size, dtype=bool)
             for degree in DEGREES:
                 cell_bounds, middle_bounds = (
-                    _least(distance, degree)[:, wanted] for distance in (distances, middle_distances)
+                    _bound_remainder(distance, degree)[:, wanted] for distance in (distances, middle_distances)
                 )
                 for k in np.flatnonzero(~np.isfinite(middle_bounds).all(axis=1)):
-                    self._without_pole(float(starts[k]), float(stops[k]), wanted)
+                    self._require_no_pole(float(starts[k]), float(stops[k]), wanted)
                 is_good &= (cell_bounds <= AS_GOOD * middle_bounds + NOTHING * sizes[:, wanted]).all(axis=1)
             is_good |= len(accepted) + 2 * starts.size > MOST_CELLS
             accepted += [(float(starts[k]), float(stops[k]), distances[k], sizes[k]) for k in np.flatnonzero(is_good)]
@@ -314,7 +314,7 @@ class _Law:
             starts, stops = (np.concatenate([pair[side] for pair in halved]) for side in range(2))
         yield from sorted(accepted, key=lambda cell: cell[0])
 
-    def _without_pole(self, start: float, stop: float, wanted: np.ndarray) -> None:
+    def _require_no_pole(self, start: float, stop: float, wanted: np.ndarray) -> None:
         """Raise `InputError` where an entry that is ``wanted`` has a pole, or is no real number, at a time and
         parameters."""
         box = self.system.box
@@ -334,14 +334,14 @@ class _Law:
                 continue
             shares = (high - low) / widths
             if shares.max() <= TINIEST:
-                raise self._has_pole(np.argwhere(is_unbounded)[0], middle)
+                raise self._build_pole_error(np.argwhere(is_unbounded)[0], middle)
             axis = int(shares.argmax())
             for side in range(2):
                 half = low.copy(), high.copy()
                 half[1 - side][axis] = middle[axis]
                 todo.append(half)
 
-    def _has_pole(self, place: np.ndarray, at: Array) -> InputError:
+    def _build_pole_error(self, place: np.ndarray, at: Array) -> InputError:
         row, column = place.tolist()
         name, j = self.places[column]
         entry = self.law.entry(name)
@@ -356,7 +356,7 @@ class _Law:
         )
 
 
-def _least(far: Array, degree: int) -> Array:
+def _bound_remainder(far: Array, degree: int) -> Array:
     """Return the bound of the terms beyond a degree by the best of the `RADII`, ``(s, d, d + n)``, from the largest
     distances ``far (s, r, d, d + n)`` of the entries from a constant."""
     with np.errstate(all="ignore"):

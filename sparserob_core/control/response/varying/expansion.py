@@ -38,7 +38,7 @@ SLOW = 0.25  # norm to which a slow part is brought by units of its own: four ti
 SHARPEST = 1e-13  # remainder on a segment, as a share of the numbers: ten times less is below what is rounded
 BLUNTEST = 1e-10  # from which on a segment is halved even where that did not help: else what a state misses shows
 SHORTEST = 2.0**-30  # of the horizon: a shorter segment without an enclosure holds a pole
-_KNOWN: WeakKeyDictionary[Phase, dict[tuple[object, ...], Expansion]] = WeakKeyDictionary()
+_CACHE: WeakKeyDictionary[Phase, dict[tuple[object, ...], Expansion]] = WeakKeyDictionary()
 FIRST = 8  # segments to begin with
 MOST = 100_000
 """Segments at most. Ten times as many take an hour and gigabytes; of a tenth systems would be refused that are solved
@@ -116,13 +116,15 @@ class Expansion:
         """Return the expansion of a system. Raise `InputError`, which names a time, where there is none, as at a pole
         or at the root of a negative number."""
         first, stated = system.phases[0], system.stated
-        kept = _KNOWN.setdefault(first, {})
+        kept = _CACHE.setdefault(first, {})
         key = system.horizon, *((phase.begin, ref(phase)) for phase in system.phases[1:])
         if key not in kept:
-            kept[key] = Expansion._made(system) if stated is system else Expansion.of(stated)._in_units(system)
+            kept[key] = (
+                Expansion._expand_system(system) if stated is system else Expansion.of(stated)._convert_units(system)
+            )
         return kept[key]
 
-    def _in_units(self, system: System) -> Expansion:
+    def _convert_units(self, system: System) -> Expansion:
         law = system.phases[0]
         assert isinstance(law, PhaseInUnits)
         factors = np.hstack([law.factors[name] * np.ones(shape) for name, shape in self._shapes])
@@ -144,10 +146,10 @@ class Expansion:
         return [("A", (d, d)), ("B", (d, m)), ("E", (d, mw))]
 
     @staticmethod
-    def _made(system: System) -> Expansion:
+    def _expand_system(system: System) -> Expansion:
         space, horizon = TaylorSpace(1, DEGREE), system.horizon
         A = np.max([np.abs(np.asarray(mode.A, dtype=float)) for mode in system.modes], axis=0)
-        spread = _spread_of(system)
+        spread = _find_parametric_expansion(system)
         units = balanced(A, horizon)
         if spread is not None:  # the same for every coefficient, so that norms are those of a ring
             units = np.tile(balanced(A[: spread.d, : spread.d], horizon), spread.space.size)
@@ -156,7 +158,7 @@ class Expansion:
         todo = [
             (start, stop, np.inf, law)
             for law in system.phases
-            for start, stop in pairwise(_cut(law.begin, law.until, horizon))
+            for start, stop in pairwise(_divide_into_segments(law.begin, law.until, horizon))
         ][::-1]
         ends, segments = [0.0], list[Segment]()
         while todo:
@@ -167,7 +169,7 @@ class Expansion:
                 ends.append(stop)
                 segments.append(segment)
                 if len(segments) in (LOOKED, MOST):
-                    _require_few(system, look, ends)
+                    _require_few_segments(system, look, ends)
             elif stop - start <= SHORTEST * horizon:
                 raise InputError(f"near t = {centre:.9g} the system {segment.why}", path="system")
             else:
@@ -190,21 +192,21 @@ class Expansion:
         def follow(here: np.ndarray, step: Array, driven: Array, off: Array, pushed: Array) -> None:
             before = state[here], inputs[here], error[here], sizes[here]
             state[here], inputs[here] = step @ before[0], step @ before[1] + driven
-            error[here], sizes[here] = self._off(before, step, off), before[3] + pushed
+            error[here], sizes[here] = self._bound_product_error(before, step, off), before[3] + pushed
 
         first = self.segment_of(starts)
         last = np.clip(np.searchsorted(self.ends, stops, side="left") - 1, first, self.ends.size - 2)
         nonempty = np.flatnonzero(stops > starts)
         if nonempty.size:
             ends = np.where(last > first, self.ends[first + 1], stops)  # the last one holds what is behind the horizon
-            responses = self._within(first[nonempty], starts[nonempty], ends[nonempty])
+            responses = self._compute_segment_responses(first[nonempty], starts[nonempty], ends[nonempty])
             state[nonempty], inputs[nonempty], error[nonempty], sizes[nonempty] = responses
         for n in range(1, int((last - first).max(initial=0))):
             active = nonempty[(first + n < last)[nonempty]]
-            follow(active, *(array[first[active] + n] for array in self._whole))
+            follow(active, *(array[first[active] + n] for array in self._segment_responses))
         active = nonempty[(last > first)[nonempty]]
         if active.size:
-            follow(active, *self._within(last[active], self.ends[last[active]], stops[active]))
+            follow(active, *self._compute_segment_responses(last[active], self.ends[last[active]], stops[active]))
         return Flow(state, inputs[..., :m], inputs[..., m:], error, sizes)
 
     @shaped
@@ -238,54 +240,60 @@ class Expansion:
             segments = first[active] + n
             begins = np.maximum(starts[active], self.ends[segments])
             ends = np.where(segments < last[active], self.ends[segments + 1], stops[active])
-            step = self._of_values(segments, begins, ends, powers if powers.shape[1] == 1 else powers[:, active])
+            step = self._compute_parameter_responses(
+                segments, begins, ends, powers if powers.shape[1] == 1 else powers[:, active]
+            )
             state[:, active] = step[..., :own] @ state[:, active]
             inputs[:, active] = step[..., :own] @ inputs[:, active] + step[..., own:]
         return state, inputs
 
-    def _of_values(self, segments: np.ndarray, starts: Array, stops: Array, powers: Array) -> Array:
+    def _compute_parameter_responses(self, segments: np.ndarray, starts: Array, stops: Array, powers: Array) -> Array:
         """Return the responses of `at_parameters` over intervals within one segment each, side by side, ``(v, k, d, d +
         n)``."""
-        size, own, nonzero, length = powers.shape[2], self.own, self._there, stops - starts
+        size, own, nonzero, length = powers.shape[2], self.own, self._nonzero_monomials, stops - starts
         distinct, indices = np.unique(segments, return_inverse=True)
-        coefficients = self._first[distinct].reshape(distinct.size, DEGREE + 1, size, own, -1)[:, :, nonzero]
+        coefficients = self._own_coefficients[distinct].reshape(distinct.size, DEGREE + 1, size, own, -1)[:, :, nonzero]
         shape = (len(powers), starts.size, DEGREE + 1, own, coefficients.shape[4])
         if powers.shape[1] == 1:
             values = np.einsum("va,snaij->vsnij", powers[:, 0, nonzero], coefficients)[:, indices.reshape(-1)]
         else:
             values = np.einsum("vka,knaij->vknij", powers[:, :, nonzero], coefficients[indices.reshape(-1)])
-        recentring = self._moved(segments, starts, length) * length[:, None, None]
+        recentring = self._build_recentring(segments, starts, length) * length[:, None, None]
         law = (recentring @ values.reshape(*shape[:3], -1)).reshape(-1, *shape[2:])
         units = self.units[:own, None]
         sizes = (np.abs(law[..., :own]) * units[:, 0] / units).sum(axis=3).max(axis=2)
         forcing = np.abs(law[..., own:]) / units
         totals = forcing.sum(axis=1).max(axis=1)
         shares = (forcing / np.where(totals > 0.0, totals, np.inf)[:, None, None]).max(axis=(2, 3), initial=0.0)
-        terms, _ = _tail(sizes, shares)
-        responses = self._summed(law[..., :own], law[..., own:], terms, DEGREE, 1)
+        terms, _ = _bound_tail(sizes, shares)
+        responses = self._sum_series(law[..., :own], law[..., own:], terms, DEGREE, 1)
         return responses.reshape(*shape[:2], own, -1)
 
     @cached_property
-    def _there(self) -> np.ndarray:
+    def _nonzero_monomials(self) -> np.ndarray:
         """Indices of the coefficients of polynomials in the parameters that the law has."""
-        coefficients = self._first.reshape(*self._first.shape[:2], -1, self.own, self._first.shape[3])
+        coefficients = self._own_coefficients.reshape(
+            *self._own_coefficients.shape[:2], -1, self.own, self._own_coefficients.shape[3]
+        )
         return np.flatnonzero(coefficients.any(axis=(0, 1, 3, 4)))
 
-    def _off(self, before: tuple[Array, ...], step: Array, off: Array) -> Array:
+    def _bound_product_error(self, before: tuple[Array, ...], step: Array, off: Array) -> Array:
         """Return error bounds of products ``P S``: ``P`` is a ``step (k, d, d)`` with the error ``off (k,)``, and ``S``
         the response ``before``. The bound is ``off (|S| + error) + |P| error`` and rounding; for inputs it is relative
         to the forcing."""
         state, inputs, error, sizes = before
         forcing = np.where(sizes > 0.0, sizes, np.inf) * self.units[:, None]
-        norm = np.maximum(self._norm(state[..., : self.own]), (np.abs(inputs) / forcing).max(axis=(1, 2), initial=1.0))
-        growth = self._norm(step[..., : self.own])
+        norm = np.maximum(
+            self._bound_norm(state[..., : self.own]), (np.abs(inputs) / forcing).max(axis=(1, 2), initial=1.0)
+        )
+        growth = self._bound_norm(step[..., : self.own])
         bound = off * (norm + error) + growth * error + rounding(self.units.size + 1) * growth * (norm + error)
         return np.asarray(bound * (1.0 + 1e-9))
 
     @cached_property
-    def _whole(self) -> tuple[Array, ...]:
-        """Responses (`_within`) over every segment as a whole."""
-        return self._within(np.arange(self.ends.size - 1), self.ends[:-1], self.ends[1:])
+    def _segment_responses(self) -> tuple[Array, ...]:
+        """Responses (`_compute_segment_responses`) over every segment as a whole."""
+        return self._compute_segment_responses(np.arange(self.ends.size - 1), self.ends[:-1], self.ends[1:])
 
     def segment_of(self, times: Array) -> np.ndarray:
         """Return the segment that contains each time, or begins at it, ``(k,)``."""
@@ -299,7 +307,7 @@ class Expansion:
         segments, d = self.segment_of(times), self.own
         begin, end = self.ends[segments], self.ends[segments + 1]
         powers = ((2.0 * times - begin - end) / (end - begin))[:, None] ** np.arange(DEGREE + 1)
-        law = np.einsum("kn,knij->kij", powers, self._first[segments])
+        law = np.einsum("kn,knij->kij", powers, self._own_coefficients[segments])
         return law[..., :d], law[..., d:]
 
     @shaped
@@ -313,15 +321,15 @@ class Expansion:
         ``Psi' = h Psi A``: a series that is majorised by that of ``y' = a y``, times that of ``F``."""
         d, own, segments = self.units.size, self.own, self.segment_of((starts + stops) / 2)
         length = stops - starts
-        law, bulk = self._recentred(segments, stops, -length, length)
+        law, bulk = self._recentre_coefficients(segments, stops, -length, length)
         remainder = self.remainder[segments] * length[:, None, None]
         A, F, scale = law[..., :own], law[..., own:], self.units / self.units[:, None]
-        inputs = _totals(self._driven(law[..., own:]), self._driven(remainder[..., d:]))[0]
-        law, bulk, remainder = (self._steady(segments, table) for table in (law, bulk, remainder))
-        sizes, bulk_sizes = (self._norm(table[..., :own]) for table in (law, bulk))
-        forcing, bulk_forcing = (self._driven(table[..., own:]) for table in (law, bulk))
-        input_errors = self._driven(remainder[..., d:])
-        divisors = _totals(forcing, input_errors)[1]
+        inputs = _sum_forcing(self._bound_forcing(law[..., own:]), self._bound_forcing(remainder[..., d:]))[0]
+        law, bulk, remainder = (self._scale_by_ratios(segments, table) for table in (law, bulk, remainder))
+        sizes, bulk_sizes = (self._bound_norm(table[..., :own]) for table in (law, bulk))
+        forcing, bulk_forcing = (self._bound_forcing(table[..., own:]) for table in (law, bulk))
+        input_errors = self._bound_forcing(remainder[..., d:])
+        divisors = _sum_forcing(forcing, input_errors)[1]
         shares = (forcing / divisors[:, None]).max(axis=(2, 3), initial=0.0)
         r = (remainder[..., :d] * scale).sum(axis=2).max(axis=1)
         input_errors = (input_errors / divisors).max(axis=(1, 2), initial=0.0)
@@ -334,17 +342,17 @@ class Expansion:
                     tail = np.fmin(tail, y * (shares * R**orders).sum(axis=1) * R ** -float(terms) / (R - 1.0))
             if (tail <= IDLE).all():
                 break
-        kernel_terms = self._backwards(A, F, terms)
+        kernel_terms = self._compute_kernel_terms(A, F, terms)
         a, a_full = sizes.sum(axis=1), bulk_sizes.sum(axis=1)
         forced = (bulk_forcing.sum(axis=1) / divisors).max(axis=(1, 2), initial=0.0)
         rounded = rounding((DEGREE + 1) * (d + 4)) * (2.0 + a_full) * np.exp(a_full) * forced
         error = (tail + (r + input_errors * (1.0 + r)) * np.exp(a + r) + rounded) * self.ratios[segments].max(axis=1)
         return Kernel(kernel_terms, error * (1.0 + 1e-9), inputs)
 
-    def _backwards(self, A: Array, F: Array, terms: int) -> Array:
+    def _compute_kernel_terms(self, A: Array, F: Array, terms: int) -> Array:
         """Return the terms ``(k, terms + 1, d, m + mw)`` of ``Psi F`` with ``Psi' = Psi A``, ``Psi(0) = I``, from those
         of ``A (k, DEGREE + 1, d, own)`` and ``F``. Where the states are coefficients of polynomials, products are as in
-        `_summed`."""
+        `_sum_series`."""
         count, own = len(A), self.own
         A, F = (table.reshape(count, DEGREE + 1, -1, own, table.shape[3]) for table in (A, F))
         size = A.shape[2]
@@ -371,24 +379,26 @@ class Expansion:
             solution[:, :, :, terms - n] = times(n, of_A, own) / (n + 1)
         return np.stack(products, axis=1)
 
-    def _recentred(self, segments: np.ndarray, times: Array, steps: Array, length: Array) -> tuple[Array, Array]:
+    def _recentre_coefficients(
+        self, segments: np.ndarray, times: Array, steps: Array, length: Array
+    ) -> tuple[Array, Array]:
         """Return the coefficients of ``[A F]`` times a ``length (k,)`` in powers of the share of ``steps (k,)`` from
         ``times (k,)``, ``(k, DEGREE + 1, d, d + m + mw)``; and the sums of absolute numbers from which they are
         computed."""
-        recentring, coefficients = self._moved(segments, times, steps), self._first
+        recentring, coefficients = self._build_recentring(segments, times, steps), self._own_coefficients
         values = coefficients[segments].reshape(times.size, DEGREE + 1, -1)
         shape, factor = (times.size, *coefficients.shape[1:]), length[:, None, None, None]
         return (recentring @ values).reshape(shape) * factor, (np.abs(recentring) @ np.abs(values)).reshape(
             shape
         ) * factor
 
-    def _moved(self, segments: np.ndarray, times: Array, steps: Array) -> Array:
+    def _build_recentring(self, segments: np.ndarray, times: Array, steps: Array) -> Array:
         """Return the matrices ``(k, DEGREE + 1, DEGREE + 1)`` that turn coefficients on segments into those in powers
         of the share of ``steps (k,)`` from ``times (k,)``."""
         centre = (self.ends[segments] + self.ends[segments + 1]) / 2
         radius = (self.ends[segments + 1] - self.ends[segments]) / 2
         at, share = (times - centre) / radius, steps / radius
-        orders, binomials = _binomials(DEGREE)
+        orders, binomials = _compute_binomials(DEGREE)
         exponents = np.maximum(orders - orders[:, None], 0)
         return np.asarray(binomials * (at[:, None] ** orders)[:, exponents] * (share[:, None] ** orders)[:, :, None])
 
@@ -399,13 +409,13 @@ class Expansion:
         return self.units.size if self.spread is None else self.spread.d
 
     @cached_property
-    def _first(self) -> Array:
+    def _own_coefficients(self) -> Array:
         """The ``coefficients`` without the columns that the columns before them determine."""
         if self.spread is None:
             return self.coefficients
         return np.concatenate([self.coefficients[..., : self.own], self.coefficients[..., self.units.size :]], axis=3)
 
-    def _norm(self, columns: Array, ratio: float = 1.0) -> Array:
+    def _bound_norm(self, columns: Array, ratio: float = 1.0) -> Array:
         """Return an upper bound of the norm of largest row sums, in own units, of matrices whose first columns are
         ``columns (..., d, own)``. For coefficients of polynomials, each further degree counts ``ratio`` times as
         much."""
@@ -419,9 +429,9 @@ class Expansion:
         """Return error bounds ``(r, k)`` of transitions over intervals within one segment each, in the norms in which
         each further degree counts one of the ``ratios (r,)`` times as much."""
         segments, length = self.segment_of((starts + stops) / 2), stops - starts
-        table = segments, *self._recentred(segments, starts, length, length), length
-        summed = self._majorant(*table)
-        return np.array([self._majorant(*table, ratio, summed).error for ratio in ratios])
+        table = segments, *self._recentre_coefficients(segments, starts, length, length), length
+        summed = self._compute_majorant(*table)
+        return np.array([self._compute_majorant(*table, ratio, summed).error for ratio in ratios])
 
     def of_all(self, sizes: Array) -> Array:
         """Return bounds ``(..., d)`` for all states from the ``sizes (..., d)`` for the first ones. For coefficients of
@@ -433,7 +443,7 @@ class Expansion:
         below[target, left_factor] = 1.0
         return np.asarray((below @ sizes.reshape(*sizes.shape[:-1], -1, self.own)).reshape(sizes.shape))
 
-    def _summed(self, A: Array, driven: Array, terms: int, degree: int, size: int) -> Array:
+    def _sum_series(self, A: Array, driven: Array, terms: int, degree: int, size: int) -> Array:
         """Return the sum ``(k, size own, own + n)`` of the series of ``x' = A x + driven``.
 
         The arguments are the series of ``A (k, p, size own, own)`` and of the forcing ``driven (k, p, size own, n)``,
@@ -503,7 +513,7 @@ class Expansion:
             The system of all coefficients of the state, as polynomials that are from -1 to 1 on the cell. The terms of
             the law beyond their degree are in the `Spread.left` of its ``spread``.
         """
-        d, recentring, (coefficients, remainders) = law.d, law.recentred(low, high), self._law(law)
+        d, recentring, (coefficients, remainders) = law.d, law.recentred(low, high), self._reshape_law(law)
         sizes = np.abs(coefficients).sum(axis=1)
         cell_remainder = np.einsum(
             "ab,sbij->saij", np.abs(recentring), remainders + rounding(8 * law.space.size) * sizes
@@ -539,7 +549,7 @@ class Expansion:
         """Return the expansion of the known system at a ``parameter (nu,)``, from that of the law, whose parametric
         expansion is ``law``. The truncation error of the series in the parameters is not in its remainder."""
         powers = law.space.monomials(law.shares(parameter[None]))[0]
-        coefficients, remainders = self._law(law)
+        coefficients, remainders = self._reshape_law(law)
         point_coefficients, point_remainder = (
             np.einsum("a,snaij->snij", powers, coefficients),
             np.einsum("a,saij->sij", np.abs(powers), remainders),
@@ -552,29 +562,31 @@ class Expansion:
 
     def largest_inputs(self, law: Spread) -> Array:
         """Return upper bounds ``(s, d, m + mw)`` of ``[B E]`` over all parameters and all times of every segment."""
-        coefficients, remainders = self._law(law)
+        coefficients, remainders = self._reshape_law(law)
         return np.asarray((np.abs(coefficients).sum(axis=(1, 2)) + remainders.sum(axis=1))[..., law.d :])
 
-    def _law(self, law: Spread) -> tuple[Array, Array]:
+    def _reshape_law(self, law: Spread) -> tuple[Array, Array]:
         """Return the coefficients of the law in time and parameters, ``(s, p + 1, M, d, d + m + mw)``, and the
         remainders of those of every monomial in the parameters, ``(s, M, d, d + m + mw)``."""
         remainders = np.concatenate([self.remainder[..., : law.d], self.remainder[..., self.units.size :]], axis=2)
         shape = law.space.size, law.d, remainders.shape[2]
-        return self._first.reshape(*self._first.shape[:2], *shape), remainders.reshape(len(remainders), *shape)
+        return self._own_coefficients.reshape(*self._own_coefficients.shape[:2], *shape), remainders.reshape(
+            len(remainders), *shape
+        )
 
-    def _within(self, segments: np.ndarray, starts: Array, stops: Array) -> tuple[Array, ...]:
+    def _compute_segment_responses(self, segments: np.ndarray, starts: Array, stops: Array) -> tuple[Array, ...]:
         """Return the responses of `flow` over intervals within one segment each, with control and disturbance side by
         side, and their error bounds."""
         length = stops - starts
-        law, bulk = self._recentred(segments, starts, length, length)
-        majorant = self._majorant(segments, law, bulk, length)
+        law, bulk = self._recentre_coefficients(segments, starts, length, length)
+        majorant = self._compute_majorant(segments, law, bulk, length)
         A, forcing = law[..., : self.own], law[..., self.own :]
         size = 1 if self.spread is None else self.spread.space.size
-        total = self._summed(A, forcing, majorant.terms, majorant.degree, size)
+        total = self._sum_series(A, forcing, majorant.terms, majorant.degree, size)
         transition = total[..., : self.own] if self.spread is None else self.spread.filled(total[..., : self.own])
         return transition, total[..., self.own :], majorant.error, majorant.sizes
 
-    def _majorant(
+    def _compute_majorant(
         self,
         segments: np.ndarray,
         law: Array,
@@ -596,27 +608,27 @@ class Expansion:
         """
         d, own = self.units.size, self.own
         remainder = self.remainder[segments] * length[:, None, None]
-        inputs = _totals(self._driven(law[..., own:]), self._driven(remainder[..., d:]))[0]
-        law, bulk, remainder = (self._steady(segments, table) for table in (law, bulk, remainder))
-        sizes = self._norm(law[..., :own], ratio)
-        forcing, input_errors = self._driven(law[..., own:]), self._driven(remainder[..., d:])
-        divisors = _totals(forcing, input_errors)[1]
+        inputs = _sum_forcing(self._bound_forcing(law[..., own:]), self._bound_forcing(remainder[..., d:]))[0]
+        law, bulk, remainder = (self._scale_by_ratios(segments, table) for table in (law, bulk, remainder))
+        sizes = self._bound_norm(law[..., :own], ratio)
+        forcing, input_errors = self._bound_forcing(law[..., own:]), self._bound_forcing(remainder[..., d:])
+        divisors = _sum_forcing(forcing, input_errors)[1]
         shares = (forcing / divisors[:, None]).max(axis=(2, 3), initial=0.0)
         is_relevant = (np.maximum(sizes, shares) > IDLE * np.maximum(sizes.sum(axis=1), 1e-300)[:, None]).any(axis=0)
         degree = int(np.flatnonzero(is_relevant).max(initial=0)) if summed is None else summed.degree
         a = sizes.sum(axis=1)
-        r = self._norm(remainder[..., :own], ratio) + sizes[:, degree + 1 :].sum(axis=1)
+        r = self._bound_norm(remainder[..., :own], ratio) + sizes[:, degree + 1 :].sum(axis=1)
         share = (input_errors / divisors).max(axis=(1, 2), initial=0.0) + shares[:, degree + 1 :].sum(axis=1)
-        terms, tail = _tail(sizes, shares, None if summed is None else summed.terms)
-        bulk_size = self._norm(bulk[..., :own].sum(axis=1), ratio)
-        bulk_size += (self._driven(bulk[..., own:]).sum(axis=1) / divisors).max(axis=(1, 2), initial=0.0)
+        terms, tail = _bound_tail(sizes, shares, None if summed is None else summed.terms)
+        bulk_size = self._bound_norm(bulk[..., :own].sum(axis=1), ratio)
+        bulk_size += (self._bound_forcing(bulk[..., own:]).sum(axis=1) / divisors).max(axis=(1, 2), initial=0.0)
         growth = np.exp(a + r)
-        rounded = rounding((degree + 1) * own * self._there.size + terms) * np.minimum(a, 1.0)
+        rounded = rounding((degree + 1) * own * self._nonzero_monomials.size + terms) * np.minimum(a, 1.0)
         rounded += rounding(DEGREE) * bulk_size
         error = tail + (r + share) * growth + (rounded * (1.0 + a) + EPSILON) * growth
         return Majorant(terms, degree, error * self.ratios[segments].max(axis=1) * (1.0 + 1e-9), inputs)
 
-    def _steady(self, segments: np.ndarray, table: Array) -> Array:
+    def _scale_by_ratios(self, segments: np.ndarray, table: Array) -> Array:
         """Return a ``table (k, ..., d, n)`` of ``[A F]`` on segments for states that are measured in `ratios`."""
         ratios = self.ratios[segments]
         if (ratios == 1.0).all():
@@ -631,7 +643,9 @@ class Expansion:
         """Indices of the states of every part that ``A`` couples with no other state; an error in one part has no
         effect on another."""
         d = self.units.size
-        return _coupled(np.abs(self.coefficients[..., :d]).max(axis=(0, 1)) + self.remainder[..., :d].max(axis=0))
+        return _find_coupled_states(
+            np.abs(self.coefficients[..., :d]).max(axis=(0, 1)) + self.remainder[..., :d].max(axis=0)
+        )
 
     def over_parts(self, entries: Array) -> Array:
         """Return, for each state, the largest of the ``entries (..., d, n)`` over the states of its part."""
@@ -642,7 +656,7 @@ class Expansion:
             largest[..., states, :] = entries[..., states, :].max(axis=-2, keepdims=True)
         return largest
 
-    def _driven(self, entries: Array) -> Array:
+    def _bound_forcing(self, entries: Array) -> Array:
         """Return the largest forcing of every part by ``entries (..., d, m + mw)`` of ``[B E]``, in own units, state by
         state."""
         return self.over_parts(np.abs(entries) / self.units[:, None])
@@ -687,14 +701,16 @@ class Look:
         except NotEnclosable as error:
             return Segment(False, np.inf, f"has a pole, or is no real number ({error})")
         coefficients, remainder = np.concatenate(tables[0::2], axis=2), np.concatenate(tables[1::2], axis=1)
-        relative_remainder, norm = _sharpness(coefficients, remainder, units, self.size)
+        relative_remainder, norm = _measure_remainder(coefficients, remainder, units, self.size)
         norm *= stop - start
         # or halving does not help
         sharp = norm <= LONG and (relative_remainder <= SHARPEST or before / 2 <= relative_remainder <= BLUNTEST)
         if norm > LONG and self.steadies:
             largest = (np.abs(coefficients).sum(axis=0) + remainder)[:, : units.size] / units[:, None] * units
             if (steady := steadied(largest, stop - start)) is not None:
-                scaled_error = _lost(coefficients, remainder, units * steady, stop - start) * float(steady.max())
+                scaled_error = _bound_segment_error(coefficients, remainder, units * steady, stop - start) * float(
+                    steady.max()
+                )
                 ratios, sharp = steady, scaled_error <= SHARPEST
         return Segment(
             sharp, relative_remainder, "has a pole, or is too steep to be enclosed", (coefficients, remainder, ratios)
@@ -713,12 +729,12 @@ class Look:
         return np.inf
 
 
-def _cut(begin: float, until: float, horizon: float) -> list[float]:
+def _divide_into_segments(begin: float, until: float, horizon: float) -> list[float]:
     """Return the ends of the first segments of a law between two times."""
     return list(np.linspace(begin, until, ceil(FIRST * (until - begin) / horizon) + 1).tolist())
 
 
-def _require_few(system: System, look: Look, ends: Sequence[float]) -> None:
+def _require_few_segments(system: System, look: Look, ends: Sequence[float]) -> None:
     """Raise `InputError` where there are more segments than can be followed: those between ``ends``, and those that the
     rest of the horizon takes. The latter are estimated from the lengths of some of them."""
     end, horizon = ends[-1], system.horizon
@@ -738,14 +754,14 @@ def _require_few(system: System, look: Look, ends: Sequence[float]) -> None:
 
 
 @cache
-def _binomials(degree: int) -> tuple[np.ndarray, Array]:
+def _compute_binomials(degree: int) -> tuple[np.ndarray, Array]:
     """Return the orders up to a degree, and the binomial coefficients ``k`` over ``n``, ``(degree + 1, degree +
     1)``."""
     orders = np.arange(degree + 1)
     return orders, np.array([[comb(k, n) for k in orders.tolist()] for n in orders.tolist()], dtype=float)
 
 
-def _tail(sizes: Array, shares: Array, summed: int | None = None) -> tuple[int, Array]:
+def _bound_tail(sizes: Array, shares: Array, summed: int | None = None) -> tuple[int, Array]:
     """Return the number of terms that are summed of a series, and a bound of its truncation error, ``(k,)``: Cauchy's
     tail ``y(R) R^-N / (R - 1)`` for the best ``R``.
 
@@ -763,7 +779,7 @@ def _tail(sizes: Array, shares: Array, summed: int | None = None) -> tuple[int, 
     return terms, tail
 
 
-def _spread_of(system: System) -> Spread | None:
+def _find_parametric_expansion(system: System) -> Spread | None:
     """Return the parametric expansion whose coefficients are the states of a system; ``None`` where the states are no
     such coefficients."""
     entry = system.phases[0].entry("A")
@@ -771,7 +787,7 @@ def _spread_of(system: System) -> Spread | None:
     return depends if isinstance(depends, Spread) else None
 
 
-def _coupled(A: Array) -> list[np.ndarray]:
+def _find_coupled_states(A: Array) -> list[np.ndarray]:
     """Return the indices of the states that ``A (d, d)`` couples with one another, part by part."""
     from scipy.sparse.csgraph import connected_components
 
@@ -779,7 +795,7 @@ def _coupled(A: Array) -> list[np.ndarray]:
     return [np.flatnonzero(labels == k) for k in range(count)]
 
 
-def _totals(pushes: Array, lost: Array) -> tuple[Array, Array]:
+def _sum_forcing(pushes: Array, lost: Array) -> tuple[Array, Array]:
     """Return the sums over orders of ``pushes (k, p, d, n)``, and the numbers to divide by, which are infinite where
     the sum is 0. The sums are at least so large that ``lost (k, d, n)`` is the share `BLUNTEST` of them, also where
     they cancel."""
@@ -806,7 +822,7 @@ def steadied(A: Array, length: float) -> Array | None:
     return units if ((A * length) @ units <= 2.0 * SLOW * units).all() else None
 
 
-def _lost(coefficients: Array, rest: Array, units: Array, length: float) -> float:
+def _bound_segment_error(coefficients: Array, rest: Array, units: Array, length: float) -> float:
     """Return the error of a segment of this length: of states in these ``units``, in the norm of largest row sums, and
     of the forcing relative to its size."""
     d = units.size
@@ -818,7 +834,7 @@ def _lost(coefficients: Array, rest: Array, units: Array, length: float) -> floa
     return max(state_error, float((input_errors / divisors).max(initial=0.0)))
 
 
-def _sharpness(coefficients: Array, rest: Array, units: Array, size: float) -> tuple[float, float]:
+def _measure_remainder(coefficients: Array, rest: Array, units: Array, size: float) -> tuple[float, float]:
     """Return a segment's remainder relative to the numbers themselves, and the norm of ``A`` on it; ``size`` is the
     norm on the whole horizon."""
     d, scale = units.size, units / units[:, None]
@@ -826,7 +842,7 @@ def _sharpness(coefficients: Array, rest: Array, units: Array, size: float) -> t
     norm = float((largest[:, :d] * scale).sum(axis=1).max())
     relative_remainder = float((rest[:, :d] * scale).sum(axis=1).max()) / max(norm, size, np.finfo(float).tiny)
     divisors = np.where(rest[:, d:] > 0.0, largest[:, d:].max(axis=0), np.inf)
-    for states in _coupled(largest[:, :d] + rest[:, :d]):
+    for states in _find_coupled_states(largest[:, :d] + rest[:, :d]):
         largest_inputs = largest[states, d:].max(axis=0)
         divisors[states] = np.where(
             largest_inputs > 0.0, np.minimum(divisors[states], largest_inputs), divisors[states]

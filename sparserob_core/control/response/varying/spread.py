@@ -31,7 +31,7 @@ LOOKS = 17  # times at which coefficients are looked at; nothing is proven with 
 DEGREE = 4  # of the coefficients that are looked at then
 MOST_PARTS = 64  # of the box: each is proven alone
 FAR = 700.0  # exponent by which parameters move the state, whose exponential is still a number
-_KNOWN: WeakKeyDictionary[Phase, dict[tuple[object, ...], Parts]] = WeakKeyDictionary()
+_CACHE: WeakKeyDictionary[Phase, dict[tuple[object, ...], Parts]] = WeakKeyDictionary()
 
 
 @final
@@ -121,39 +121,39 @@ class Parts:
         """
         tables = [
             (indices, expansion.at_parameters(starts, stops, powers[:, None]))
-            for indices, expansion, powers in self._apart(points)
+            for indices, expansion, powers in self._group_by_part(points)
         ]
-        state, inputs = _joined_parts(tables)
+        state, inputs = _join_tables(tables)
         return state, inputs
 
     def along(self, starts: Array, stops: Array, parameters: Array) -> tuple[Array, Array]:
         """Return the responses of `over` with one of the ``parameters (k, nu)`` for each interval, ``(k, d, d)`` and
         ``(k, d, m + mw)``."""
         tables = []
-        for indices, expansion, powers in self._apart(parameters):
+        for indices, expansion, powers in self._group_by_part(parameters):
             responses = expansion.at_parameters(starts[indices], stops[indices], powers[None])
             tables.append((indices, (responses[0][0], responses[1][0])))
-        state, inputs = _joined_parts(tables)
+        state, inputs = _join_tables(tables)
         return state, inputs
 
     def entries(self, times: Array, parameters: Array) -> tuple[Array, Array]:
         """Return ``A (k, d, d)`` and ``[B E] (k, d, m + mw)`` at times ``(k,)`` and ``parameters (k, nu)``; nothing is
         proven by them."""
         tables, d = [], self.every[0][0].d
-        for indices, expansion, powers in self._apart(parameters):
+        for indices, expansion, powers in self._group_by_part(parameters):
             both = (table.reshape(indices.size, -1, d, table.shape[2]) for table in expansion.at(times[indices]))
             A, inputs = (np.einsum("ka,kaij->kij", powers, table) for table in both)
             tables.append((indices, (A, inputs)))
-        A, inputs = _joined_parts(tables)
+        A, inputs = _join_tables(tables)
         return A, inputs
 
     def averages(self, breaks: Array, points: Array) -> Array:
         """Return estimates of ``A`` between ``breaks (L + 1,)`` at parameters ``(v, nu)``, ``(v, L, d, d)``."""
         d, tables = self.every[0][0].d, []
-        for indices, expansion, powers in self._apart(points):
+        for indices, expansion, powers in self._group_by_part(points):
             averages = expansion.average(breaks).reshape(breaks.size - 1, -1, d, d)
             tables.append((indices, (np.einsum("va,kaij->vkij", powers, averages),)))
-        return _joined_parts(tables)[0]
+        return _join_tables(tables)[0]
 
     def left_out(self, part: int, begun: Array, inputs: Array, growth: float) -> Array:
         """Return upper bounds ``(d,)`` of the effect of the law's truncation error on any state at any parameter of a
@@ -178,7 +178,7 @@ class Parts:
         rate = state * A.max(axis=1) + input_error.max(axis=1)
         return np.asarray(growth * float(np.diff(truncation.ends) @ rate) * units * (1.0 + 1e-9))
 
-    def _apart(self, points: Array) -> Iterator[tuple[np.ndarray, Expansion, Array]]:
+    def _group_by_part(self, points: Array) -> Iterator[tuple[np.ndarray, Expansion, Array]]:
         """Yield the indices of the parameters ``(v, nu)`` in every part, the law there, and their monomials."""
         part_of_point = self.of(points)
         for part in np.unique(part_of_point).tolist():
@@ -186,7 +186,7 @@ class Parts:
             yield indices, self.expansions[part], spread.space.monomials(spread.shares(points[indices]))
 
 
-def _joined_parts(found: Sequence[tuple[np.ndarray, Sequence[Array]]]) -> list[Array]:
+def _join_tables(found: Sequence[tuple[np.ndarray, Sequence[Array]]]) -> list[Array]:
     """Return tables of all indices from tables of some of them each, ``(numbers (k,), tables)``."""
     order = np.argsort(np.concatenate([numbers for numbers, _ in found]))
     return [np.concatenate(blocks)[order] for blocks in zip(*(tables for _, tables in found), strict=True)]
@@ -199,7 +199,7 @@ def law_of(system: System) -> Parts:
     parts are as small as these need to be. Raises `InputError` where that takes too many parts.
     """
     first, *later_phases = system.phases
-    kept, box = _KNOWN.setdefault(first, {}), system.box
+    kept, box = _CACHE.setdefault(first, {}), system.box
     key = (
         system.horizon,
         box.lower.tobytes(),
@@ -207,15 +207,15 @@ def law_of(system: System) -> Parts:
         *((phase.begin, ref(phase)) for phase in later_phases),
     )
     if key not in kept:
-        kept[key] = _made(system) if system.stated is system else _in_units(system)
+        kept[key] = _expand_law(system) if system.stated is system else _convert_units(system)
     return kept[key]
 
 
-def _made(system: System) -> Parts:
+def _expand_law(system: System) -> Parts:
     """Return the law (`law_of`) of a system in the units of the user."""
-    edges, series_bounds, degree = _parted(system)
+    edges, series_bounds, degree = _choose_parts(system)
     laws = []
-    for part_system, series_bound in zip(_boxes(system, edges), series_bounds, strict=True):
+    for part_system, series_bound in zip(_restrict_to_parts(system, edges), series_bounds, strict=True):
         centre, units = part_system.deviations
         truncation = None if series_bound is None else series_bound.left(degree)
         spread = Spread(system.states, taylor_space(centre.size, degree), centre, units, truncation)
@@ -223,7 +223,7 @@ def _made(system: System) -> Parts:
     return Parts(edges, tuple(laws))
 
 
-def _in_units(system: System) -> Parts:
+def _convert_units(system: System) -> Parts:
     """Return the law (`law_of`) of a system in its own units, which are powers of two: the same polynomials, in these
     units."""
     law = system.phases[0]
@@ -245,14 +245,14 @@ def _in_units(system: System) -> Parts:
     return Parts(edges, tuple(laws))
 
 
-def _boxes(system: System, edges: tuple[Array, ...]) -> list[System]:
+def _restrict_to_parts(system: System, edges: tuple[Array, ...]) -> list[System]:
     """Return the system with its parameters in every part of their box."""
     ends = [list(pairwise(breaks.tolist())) for breaks in edges]
     corners = [np.array(intervals).T for intervals in product(*ends)]
     return [system] if len(corners) == 1 else [system.with_parameters(Box(low, high)) for low, high in corners]
 
 
-def _parted(system: System) -> tuple[tuple[Array, ...], list[Cauchy | None], int]:
+def _choose_parts(system: System) -> tuple[tuple[Array, ...], list[Cauchy | None], int]:
     """Return the edges of the parts of every parameter, the bounds of the truncation errors of the entries' series, and
     the degree of the series.
 
@@ -261,8 +261,8 @@ def _parted(system: System) -> tuple[tuple[Array, ...], list[Cauchy | None], int
     box, powers, d = system.box, system.powers, system.states
     assert powers is not None
     nu, counts, lowest = box.dimension, np.ones(box.dimension, dtype=int), max(1, powers)
-    scale = _scale(system)
-    exponent = _exponent(system, scale)
+    scale = _choose_state_units(system)
+    exponent = _estimate_exponent(system, scale)
     if exponent > FAR:
         raise InputError(
             path="system.parameters",
@@ -272,15 +272,16 @@ def _parted(system: System) -> tuple[tuple[Array, ...], list[Cauchy | None], int
         )
     degrees = [n for n in range(lowest, MOST_TERMS + 1) if d * comb(nu + n, nu) <= NUMBERS]
     while degrees and counts.prod() <= MOST_PARTS:
-        edges, series_bounds = _looked(system, counts)
+        edges, series_bounds = _bound_parts(system, counts)
         for tolerance, degree in product(LEFT, degrees):
-            if all(_share(series_bound, degree, scale) <= tolerance for series_bound in series_bounds):
+            if all(_estimate_truncation(series_bound, degree, scale) <= tolerance for series_bound in series_bounds):
                 return edges, series_bounds, degree
         candidates = [counts * (1 + direction) for direction in np.eye(nu, dtype=int)]
         counts = min(
             candidates,
             key=lambda numbers: max(
-                _share(series_bound, degrees[-1], scale) for series_bound in _looked(system, numbers)[1]
+                _estimate_truncation(series_bound, degrees[-1], scale)
+                for series_bound in _bound_parts(system, numbers)[1]
             ),
         )
     raise InputError(
@@ -292,25 +293,26 @@ def _parted(system: System) -> tuple[tuple[Array, ...], list[Cauchy | None], int
     )
 
 
-def _looked(system: System, counts: np.ndarray) -> tuple[tuple[Array, ...], list[Cauchy | None]]:
+def _bound_parts(system: System, counts: np.ndarray) -> tuple[tuple[Array, ...], list[Cauchy | None]]:
     """Return the edges of so many parts of every parameter, and the bounds of the truncation errors of the entries'
     series on each part."""
     box, powers = system.box, system.powers
     assert powers is not None
     ends = zip(box.lower.tolist(), box.upper.tolist(), counts.tolist(), strict=True)
-    edges = tuple(_edges(*interval) for interval in ends)
+    edges = tuple(_divide_interval(*interval) for interval in ends)
     return edges, [
-        cauchy(part_system) if beyond(part_system, powers).any() else None for part_system in _boxes(system, edges)
+        cauchy(part_system) if beyond(part_system, powers).any() else None
+        for part_system in _restrict_to_parts(system, edges)
     ]
 
 
-def _scale(system: System) -> Array:
+def _choose_state_units(system: System) -> Array:
     """Return units of the states, ``(d,)``, in which no entry of ``A`` at the middle of the parameters is large."""
     A = np.max([np.abs(np.asarray(mode.A, dtype=float)) for mode in system.at(system.deviations[0]).modes], axis=0)
     return balanced(A, system.horizon)
 
 
-def _exponent(system: System, scale: Array) -> float:
+def _estimate_exponent(system: System, scale: Array) -> float:
     """Return the exponent by which parameters may move the state: the integral of the norms of all coefficients of
     ``A`` except the constant one."""
     (centre, units), exponent = system.deviations, 0.0
@@ -325,13 +327,13 @@ def _exponent(system: System, scale: Array) -> float:
     return exponent
 
 
-def _share(look: Cauchy | None, degree: int, scale: Array) -> float:
+def _estimate_truncation(look: Cauchy | None, degree: int, scale: Array) -> float:
     """Return an estimate of the relative truncation error of series for states in units ``scale (d,)``; 0 for
     polynomials."""
     return 0.0 if look is None else (degree + 1) * look.share(degree, scale)
 
 
-def _edges(low: float, high: float, count: int) -> Array:
+def _divide_interval(low: float, high: float, count: int) -> Array:
     """Return the ends of ``count`` equal parts of an interval."""
     edges = np.linspace(low, high, count + 1)
     edges[0], edges[-1] = low, high

@@ -53,8 +53,8 @@ def accumulated(problem: OptimalControlProblem) -> OptimalControlProblem:
         return in_time(problem)
     running, ends, d = list[Running](), list[Accumulated](), problem.system.states
     for entry, name in zip(problem.integral, problem.called("integral"), strict=True):
-        rows, end = _running(problem, entry, name)
-        bound = _bounded(entry, rows, d + len(running))
+        rows, end = _build_running_states(problem, entry, name)
+        bound = _build_bounding_set(entry, rows, d + len(running))
         ends.append(Accumulated(bound, end, end, name))
         running += [state for row in rows for state in row]
     if not problem.system.switches and all(state.start == 0.0 for state in running):
@@ -63,12 +63,12 @@ def accumulated(problem: OptimalControlProblem) -> OptimalControlProblem:
     larger_problem = larger(
         problem,
         k,
-        system=_system(problem.system, running, problem.horizon),
+        system=_extend_system(problem.system, running, problem.horizon),
         path=[entry.widened(d + k) for entry in (*problem.windows, *ends)],
         terminal=[cylinder(end, d + k) for end in problem.terminal],
         integral=(),
-        names=_names(problem.names, d, running),
-        commanded=_commanded(problem, running),
+        names=_extend_names(problem.names, d, running),
+        commanded=_find_commanded_states(problem, running),
     )
     return in_time(larger_problem)
 
@@ -86,7 +86,9 @@ def in_rows(problem: OptimalControlProblem) -> OptimalControlProblem:
     return replace(problem, **constraints)
 
 
-def _running(problem: OptimalControlProblem, entry: IntegralConstraint, name: str) -> tuple[list[list[Running]], float]:
+def _build_running_states(
+    problem: OptimalControlProblem, entry: IntegralConstraint, name: str
+) -> tuple[list[list[Running]], float]:
     """Return the states whose sums are the rows of an integral, and the time at which all of them are complete.
 
     Where the control acts later than it is commanded, its part is integrated with the same delay. With errors of
@@ -96,8 +98,8 @@ def _running(problem: OptimalControlProblem, entry: IntegralConstraint, name: st
     assert stop is not None
     end = min(stop + delay, problem.horizon) if G.any() else stop
     rows = []
-    for row_name, h, g in zip(_called(name, H, G, problem.names.corners), H, G, strict=True):
-        unit = _unit(measured_in(np.append(h, g), problem.names, h.size).strip(), problem.names.time)
+    for row_name, h, g in zip(_name_rows(name, H, G, problem.names.corners), H, G, strict=True):
+        unit = _derive_unit(measured_in(np.append(h, g), problem.names, h.size).strip(), problem.names.time)
         if (delay == 0.0 and problem.execution is None) or not g.any():
             rows.append([Running(h, g, start, stop, row_name, unit)])
             continue
@@ -107,13 +109,13 @@ def _running(problem: OptimalControlProblem, entry: IntegralConstraint, name: st
     return rows, end
 
 
-def _commanded(problem: OptimalControlProblem, running: list[Running]) -> tuple[int, ...]:
+def _find_commanded_states(problem: OptimalControlProblem, running: list[Running]) -> tuple[int, ...]:
     """Return the indices of the states that integrate the command, where the delivered control may differ from it."""
     d = problem.system.states
     return () if problem.execution is None else tuple(d + i for i, state in enumerate(running) if state.g.any())
 
 
-def _called(name: str, H: Array, G: Array, corners: Corners) -> list[str]:
+def _name_rows(name: str, H: Array, G: Array, corners: Corners) -> list[str]:
     """Return the names of the rows of an integral: with numbers where there are several, and with the parameters at the
     corner to which a row belongs, for a system that depends on time and on parameters. Only the numbers are used where
     names with parameters would not be distinct."""
@@ -130,7 +132,7 @@ def _called(name: str, H: Array, G: Array, corners: Corners) -> list[str]:
     return named if len(set(named)) == len(named) else numbered
 
 
-def _bounded(entry: IntegralConstraint, rows: list[list[Running]], first: int) -> ConvexSet:
+def _build_bounding_set(entry: IntegralConstraint, rows: list[list[Running]], first: int) -> ConvexSet:
     """Return the set that bounds the sums of states; the first of these states has the index ``first``."""
     lower, upper = np.asarray(entry.lower), np.asarray(entry.upper)
     if all(len(row) == 1 for row in rows):
@@ -142,7 +144,7 @@ def _bounded(entry: IntegralConstraint, rows: list[list[Running]], first: int) -
     return Polytope(H[np.isfinite(h)], h[np.isfinite(h)])
 
 
-def _system(system: System, running: list[Running], horizon: float) -> System:
+def _extend_system(system: System, running: list[Running], horizon: float) -> System:
     """Return the system with its running integrals as further states. A new phase begins at each time within the
     horizon at which an integral begins or ends."""
     slack, phases = SAME_TIME * horizon, list[Phase]()
@@ -155,7 +157,7 @@ def _system(system: System, running: list[Running], horizon: float) -> System:
     return system.in_phases(phases)
 
 
-def _names(names: Names, states: int, running: list[Running]) -> Names:
+def _extend_names(names: Names, states: int, running: list[Running]) -> Names:
     units = [*(names.state_units or [""] * states), *(state.unit for state in running)]
     return replace(
         names,
@@ -164,7 +166,7 @@ def _names(names: Names, states: int, running: list[Running]) -> Names:
     )
 
 
-def _unit(unit: str, time: str) -> str:
+def _derive_unit(unit: str, time: str) -> str:
     """Return the unit of an integral over time of a quantity with a ``unit``; empty where one of the two units is not
     known."""
     if not unit or not time:

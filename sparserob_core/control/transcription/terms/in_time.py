@@ -17,7 +17,7 @@ from sparserob_core.errors import InputError, NotEnclosable
 from sparserob_core.sip.convex_set import Array
 
 CORNERS = 64  # of a box of parameters: rows are as many times more, with ten times as many it would take minutes
-_KNOWN: WeakKeyDictionary[OptimalControlProblem, OptimalControlProblem] = WeakKeyDictionary()
+_CACHE: WeakKeyDictionary[OptimalControlProblem, OptimalControlProblem] = WeakKeyDictionary()
 
 
 def in_time(problem: OptimalControlProblem) -> OptimalControlProblem:
@@ -37,10 +37,10 @@ def in_time(problem: OptimalControlProblem) -> OptimalControlProblem:
         return problem if plain else replace(problem, system=system.in_time(problem.horizon))
     if problem.measurable is None or not system.parameter_count:
         return problem
-    if problem not in _KNOWN:
+    if problem not in _CACHE:
         converted = within_reach(problem)
-        _KNOWN[problem] = problem if isinstance(converted, str) else converted
-    return _KNOWN[problem]
+        _CACHE[problem] = problem if isinstance(converted, str) else converted
+    return _CACHE[problem]
 
 
 def within_reach(problem: OptimalControlProblem) -> OptimalControlProblem | str:

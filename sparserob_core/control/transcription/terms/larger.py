@@ -23,11 +23,11 @@ def larger(problem: OptimalControlProblem, more: int, **told: Any) -> OptimalCon
         problem,
         initial_state=np.append(np.asarray(problem.initial_state), zeros),
         initial_set=initial_set if initial_set is None or not more else product([initial_set, Box(zeros, zeros)]),
-        cost=replace(problem.cost, state=_costing(state, more), final=_costing(final, more)),
+        cost=replace(problem.cost, state=_pad_cost(state, more), final=_pad_cost(final, more)),
         measurements=replace(measurements, C=columns(measurements.C, d + more)),
         **told,
     )
 
 
-def _costing(term: Quadratic | None, more: int) -> Quadratic | None:
+def _pad_cost(term: Quadratic | None, more: int) -> Quadratic | None:
     return None if term is None else Quadratic(np.pad(term.Q, (0, more)), np.pad(term.reference, (0, more)))

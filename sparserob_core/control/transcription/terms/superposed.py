@@ -47,7 +47,7 @@ def superposed(problem: OptimalControlProblem) -> OptimalControlProblem:
             for terminal in ([cylinder(end, depends.states)] if isinstance(end, Equality) else everywhere(end, rows))
         ],
         integral=[entry.everywhere(rows) for entry in problem.integral],
-        names=replace(_names(problem.names, system, depends), corners=corners_of(problem)),
+        names=replace(_extend_names(problem.names, system, depends), corners=corners_of(problem)),
     )
 
 
@@ -73,7 +73,7 @@ def corners_of(problem: OptimalControlProblem) -> Corners:
     return Corners(rows, np.array(list(every_choice(*ends))), system.names)
 
 
-def _names(names: Names, system: System, depends: Dependence) -> Names:
+def _extend_names(names: Names, system: System, depends: Dependence) -> Names:
     """Return the names and units of the states, and those of the contribution of each parameter to a state, per unit of
     the parameter."""
     contributions = [

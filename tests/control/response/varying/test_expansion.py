@@ -65,7 +65,7 @@ def test_the_error_holds_what_is_left_out(name: str, value: int, monkeypatch: py
     for rough in ("SHARPEST", "BLUNTEST"):
         monkeypatch.setattr(varying, rough, 1.0)
     monkeypatch.setattr(varying, name, value)
-    expansion = Expansion._made(FADING)
+    expansion = Expansion._expand_system(FADING)
     starts = np.repeat(np.linspace(0.0, 2.9, 30), 30)
     stops = starts + np.tile(np.linspace(0.0, 1.0, 30), 30) * (3.0 - starts)
     found, exact = expansion.flow(starts, stops), fading(starts, stops)
@@ -81,7 +81,7 @@ def test_the_error_holds_what_is_left_out(name: str, value: int, monkeypatch: py
 def test_what_nothing_couples_is_bounded_apart(monkeypatch: pytest.MonkeyPatch) -> None:
     """The error of a state is a share of what drives it, not of what drives one that is a million times larger."""
     monkeypatch.setattr(varying, "TERMS", 6)
-    small, one, both = 2.0**-20, Expansion._made(FADING), Expansion._made(BESIDE)
+    small, one, both = 2.0**-20, Expansion._expand_system(FADING), Expansion._expand_system(BESIDE)
     assert [part.tolist() for part in both.together] == [[0], [1]]
     alone, found, exact = one.flow(STARTS, STOPS), both.flow(STARTS, STOPS), fading(STARTS, STOPS)
     sizes = found.sizes * both.units[:, None]
@@ -94,7 +94,7 @@ def test_what_nothing_couples_is_bounded_apart(monkeypatch: pytest.MonkeyPatch) 
 
 def test_a_remainder_of_what_drives_nothing_is_held_too() -> None:
     """``sin(t) - sin(t)`` beside 1: no coefficient is left of it, only what they may be off by."""
-    expansion = Expansion._made(VaryingSystem.of([[0, 0], [0, 0]], [["sin(t) - sin(t)"], [1]], 2.0))
+    expansion = Expansion._expand_system(VaryingSystem.of([[0, 0], [0, 0]], [["sin(t) - sin(t)"], [1]], 2.0))
     flow = expansion.flow(np.zeros(1), np.array([2.0]))
     lost = float((expansion.remainder[:, 0, 2] * np.diff(expansion.ends)).sum())
     assert 0.0 < lost <= flow.error[0] * flow.sizes[0, 0, 0] * expansion.units[0]
@@ -177,7 +177,7 @@ def eccentric(e: float) -> VaryingSystem:
 @pytest.mark.slow
 def test_a_slow_part_is_looked_at_in_units_of_its_own() -> None:
     system = eccentric(0.9)
-    expansion = Expansion._made(system)
+    expansion = Expansion._expand_system(system)
     assert expansion.ratios.max() >= 8.0 and expansion.ends.size < 140  # 146 in the units of the pericentre
     slow = np.flatnonzero(expansion.ratios.max(axis=1) > 1.0)[::8]
     starts = np.append(expansion.ends[slow], np.linspace(0.0, 4.0, 3))
