@@ -92,7 +92,7 @@ class _Search:
 
     def bound(self, slopes: Array, open_: np.ndarray) -> None:
         """Bound parts, improve what they suggest, and keep those that must be divided."""
-        self.count += len(slopes)
+        first, self.count = self.count, self.count + len(slopes)
         along = slopes @ self.A
         bounds = slopes @ self.a + open_ @ self.heights + self.spread.support(along)
         w = self.spread.worst(along)
@@ -104,7 +104,7 @@ class _Search:
             if height <= self.enough or not open_[i].any():
                 self.closed = max(self.closed, height)
             else:
-                heapq.heappush(self.heap, (-height, self.count + i, slopes[i], open_[i], int(entries[i])))
+                heapq.heappush(self.heap, (-height, first + i, slopes[i], open_[i], int(entries[i])))
 
     def improve(self, values: Array) -> None:
         """Improve signs and deviations in turn, starting from the largest efforts among the controls

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import heapq
 from itertools import product
 
 import numpy as np
@@ -50,6 +51,14 @@ def test_the_largest_effort_over_a_ball_is_that_of_its_points():
         assert found.upper >= top and found.lower <= found.upper
         assert found.lower == pytest.approx(top, rel=1e-7)
         assert found.upper <= top * (1 + 1e-7)
+
+
+def test_every_part_has_a_number_of_its_own(monkeypatch):
+    """Two with the same bound and number would be compared by their arrays, which is an error."""
+    numbers, push, rng = [], heapq.heappush, np.random.default_rng(5)
+    monkeypatch.setattr(heapq, "heappush", lambda heap, item: numbers.append(item[1]) or push(heap, item))
+    largest_effort(0.1 * rng.normal(size=10), rng.normal(size=(10, 4)), Spread(((4, Box([-1.0], [1.0])),)))
+    assert len(numbers) > 20 and len(set(numbers)) == len(numbers)
 
 
 def test_an_effort_that_no_deviation_changes_is_what_it_is():
