@@ -120,6 +120,8 @@ def test_where_a_root_or_an_absolute_value_may_be_0_nothing_is_analytic() -> Non
     assert analytic(corners, [1.0, 0.5], [0.24, 0.24]) and not analytic(corners, [1.0, 0.5], [0.26, 0.26])
     segments = Zonotope(np.zeros(2), np.array([[1.0, 0.0], [1.0, 1.0]]))
     assert analytic(segments, [1.0, 0.5], [0.2, 0.2]) and not analytic(segments, [1.0, -0.5], [0.3, 0.3])
+    with pytest.raises(Unchecked, match="1-norm in up to 10"):  # whose support function has no curvature to speak of
+        _ = CurvedSide(known(NormBall(1.0, 1.0, dimension=12)), [arb(0)] * 12).far
     with pytest.raises(Unchecked, match="boxes, polytopes, ellipsoids"):
         _bound_support(known(Cylinder(ball, 3)), np.zeros(3), np.ones((1, 3)), np.zeros((1, 3)))
 
