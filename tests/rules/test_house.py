@@ -217,6 +217,26 @@ def test_the_spelling_is_british() -> None:
     assert not {relative(path): words for path in suspects if (words := american.findall(prose(path)))}
 
 
+OPENERS = ("What ", "Whether ", "How ", "The same", "Of ", "With ", "One ", "Where ", "Those", "These ", "That ", "As ")
+PRONOUNS = frozenset({
+    *("asked", "begun", "bent", "beside", "beyond", "grown", "held", "here", "known", "made", "off", "one", "other"),
+    *("pushed", "said", "seen", "taken", "these", "thing", "things", "those", "told"),
+})  # fmt: skip
+
+
+def test_docstrings_begin_with_a_verb_or_a_noun_and_local_variables_are_nouns() -> None:
+    """A stranger reads what a value holds, not how it was come by."""
+    documented, wrong = (ast.Module, ast.ClassDef, ast.FunctionDef), []
+    for path in CORE + PLUGINS:
+        nodes = list(ast.walk(ast.parse(path.read_text())))
+        texts = [ast.get_docstring(node) or "" for node in nodes if isinstance(node, documented)]
+        wrong += [f"{relative(path)}: {text.splitlines()[0]}" for text in texts if text.startswith(OPENERS)]
+        within = [part for node in nodes if isinstance(node, ast.FunctionDef) for part in ast.walk(node)]
+        names = {part.id for part in within if isinstance(part, ast.Name) and isinstance(part.ctx, ast.Store)}
+        wrong += [f"{relative(path)}: {name}" for name in sorted(names & PRONOUNS)]
+    assert not wrong
+
+
 def test_a_test_file_says_in_its_first_line_what_it_guards() -> None:
     tests = sorted((ROOT / "tests").rglob("test_*.py"))
     assert not [relative(path) for path in tests if not path.read_text().startswith('"""Guards ')]
