@@ -16,8 +16,10 @@ from sparserob_core.sip.convex_set import Array
 
 
 def lifted_matrix(space: TaylorSpace, coefficients: Array, rows: bool) -> Array:
-    """The lifted matrices ``(..., M d, M d)`` of polynomials ``(..., M, d, d)``: their products with columns, or with
-    ``rows`` from the right."""
+    """Return the lifted matrices ``(..., M d, M d)`` of polynomials ``(..., M, d, d)``.
+
+    They act on columns from the left, or with ``rows`` on rows from the right.
+    """
     size, d = space.size, coefficients.shape[-1]
     lifted = np.zeros((size, size, *coefficients.shape[:-3], d, d))
     left, right, target = space.products
@@ -43,7 +45,7 @@ def flows_of(space: TaylorSpace, A: Array, durations: Array) -> tuple[Array, Arr
 
 
 def flows_rounding(space: TaylorSpace, A: Array, durations: Array) -> Array:
-    """The relative error of `flows_of` in the exponential of the bounds, ``(k,)``."""
+    """Return a bound ``(k,)`` of the rounding error of `flows_of`, relative to the exponential of the bounds."""
     terms = int(np.bincount(space.products[2]).max()) * 2 * A.shape[-1]
     return exponential_rounding(terms, np.abs(A).sum(axis=-2).max(axis=-1).sum() * durations)
 

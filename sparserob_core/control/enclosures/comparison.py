@@ -21,7 +21,8 @@ from sparserob_core.sip.convex_set import Array
 
 SAFE = 1.0 + 1e-6  # on every bound: sums of numbers of one sign, whose rounding is far below this
 KEPT = 64
-EQUAL = 1e-9  # durations that differ by less than this share of them, or by `NOTHING` of the longest, share a bound
+# neighbouring durations share a bound if they differ by at most this share of them and `NOTHING` of the longest
+EQUAL = 1e-9
 NOTHING = 1e-12
 MOST = 10_000_000  # numbers in the matrices of one kind, beyond which durations that differ by `NEAR` share one too
 NEAR = 1e-2
@@ -45,14 +46,15 @@ def block_norms(values: Float[Array, "*k d"], starts: Int[np.ndarray, " q"]) -> 
 
 @shaped
 def block_sizes(matrices: Float[Array, "*k d d"], starts: Int[np.ndarray, " q"]) -> Float[Array, "*k q q"]:
-    """Norms ``(..., q, q)`` of the blocks of matrices ``(..., d, d)``, at most too large (Frobenius)."""
+    """Return upper bounds ``(..., q, q)`` of the 2-norms of the blocks of matrices ``(..., d, d)``: Frobenius norms."""
     rows = np.add.reduceat(matrices * matrices, starts, axis=-2)
     return np.asarray(np.sqrt(np.add.reduceat(rows, starts, axis=-1)))
 
 
 @shaped
 def comparison_matrix(D: Float[Array, "d d"], starts: Int[np.ndarray, " q"]) -> Float[Array, "q q"]:
-    """``M (q, q)`` of a matrix ``D (d, d)``: logarithmic norms of the diagonal blocks, norms of the others."""
+    """Return ``M (q, q)`` of a matrix ``D (d, d)``: logarithmic 2-norms of the diagonal blocks, Frobenius norms of the
+    others."""
     M = block_sizes(D, starts)
     ends = np.append(starts[1:], D.shape[0])
     for i, (start, stop) in enumerate(zip(starts, ends, strict=True)):
@@ -76,7 +78,8 @@ class NormBounds:
 
     @shaped
     def on(self, norms: Float[Array, "*r k q"]) -> Float[Array, "*r k p"]:
-        """Return the bounds ``(..., k, q')`` after each duration, from block norms ``(..., k, q)`` of its own."""
+        """Return the products ``(..., k, q')`` of the matrix of each duration with block norms ``(..., k, q)`` of its
+        own."""
         if self.matrices.shape[0] == 1:
             return product(norms, self.matrices[0].T)
         if self.which.size < FEW * self.matrices.shape[0] and self.matrices[0].size * self.which.size <= MOST:
@@ -100,17 +103,17 @@ class NormBounds:
             else:
                 for step, number in enumerate(self.which.tolist()):
                     sums[..., step + 1, :] += sums[..., step, :] @ self.matrices[number].T
-        if not np.isfinite(sums).all():  # something is infinite, and nothing times that is nothing
+        if not np.isfinite(sums).all():  # something is infinite, and 0 times infinity is to be 0
             sums[..., 0, :], sums[..., 1:, :] = start, added
             for step, number in enumerate(self.which.tolist()):
                 sums[..., step + 1, :] += product(sums[..., step, None, :], self.matrices[number].T)[..., 0, :]
         return sums
 
     def _sum_in_blocks(self, found: Array) -> None:
-        """Fill ``found`` with the result of `summed` for one matrix.
+        """Turn ``found``, which holds ``start`` and ``added``, into the result of `summed` for one matrix.
 
-        The sums are taken first from 0 in every block of as many durations, all blocks at once. The vector at the
-        beginning of each block is added after that.
+        The sums are taken first from 0 in every block of as many durations, all blocks at once. After that the bounds
+        that grow from the vector at the beginning of each block are added.
         """
         flow, size, count = self.matrices[0].T, int(np.sqrt(self.which.size)), self.which.size
         blocks, q = count // size, flow.shape[0]
@@ -146,7 +149,8 @@ class Reach(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class ComparisonSystem:
-    """Bounds for ``z' = A z``: ``metzler (q, q)`` is ``M``, ``sizes (q, q)`` the norms of the blocks of ``A``."""
+    """Bounds for ``z' = A z``: ``metzler (q, q)`` is ``M``, and ``sizes (q, q)`` bounds the norms of the blocks of
+    ``A``."""
 
     metzler: Array
     sizes: Array
@@ -171,7 +175,7 @@ class ComparisonSystem:
 
     @cached_property
     def rising(self) -> Array:
-        """``P``: ``M`` without what decays."""
+        """``P``: ``M`` with the negative entries of its diagonal set to 0."""
         return rising(self.metzler)
 
     @shaped
@@ -179,7 +183,7 @@ class ComparisonSystem:
         """Return bounds of the difference of ``e^{(A + S) r}``, and of its integral, from those of ``A`` at
         ``r = width (k,)``.
 
-        The bounds hold for any ``S`` with blocks of norm ``slack (q, q)``. The difference is
+        The bounds hold for any ``S`` with blocks of norm at most ``slack (q, q)``. The difference is
         ``int_0^r e^{A (r - s)} S e^{(A + S) s} ds``, which is a block of one exponential.
         """
         q = slack.shape[0]
@@ -241,7 +245,8 @@ def alike(
 
 
 def _round_to_side(values: Array, to: np.ufunc) -> Array:
-    """Numbers with ``BITS`` bits, all of them rounded ``to`` one side, so that what differs by rounding is the same."""
+    """Return numbers rounded ``to`` one side, to ``BITS`` bits, so that most numbers that differ by rounding become
+    equal."""
     mantissa, exponent = np.frexp(values)
     return np.asarray(np.ldexp(to(np.ldexp(mantissa, BITS)), exponent - BITS))
 
@@ -266,15 +271,17 @@ def flows_between(metzler: Array, shortest: Array, longest: Array) -> tuple[Arra
 
 
 def flows_apart(rates: Array, coupling: Array, shortest: Array, longest: Array) -> tuple[Array, Array]:
-    """`flows_between` of ``M = D + S``, ``D`` diagonal with ``rates (q,)``, ``S >= 0`` the ``coupling (q, q)``: by
-    numbers, and no matrix is made for a duration but the answer.
+    """Return the bounds of `flows_between` for ``M = D + S``, with scalar exponentials only.
 
-    Duhamel's series ``e^{M r} = e^{D r} + int_0^r e^{D (r - s)} S e^{D s} ds + ...``, all of whose terms grow with
-    ``S``: that of first order is ``S_ij`` times the divided difference of ``e^{x r}`` at the rates ``i`` and ``j``,
-    ``e^{b r} (e^{(a - b) r} - 1) / (a - b)`` with the larger rate ``b``, whose last factor rises with ``r``; its
-    integral, over ``0 <= s <= t <= r``, is at most that over the square, and the triangle times the largest value. The
-    others are at most ``r^k S^k / k!`` times ``e^{r max(0, D)}``, and ``S^k`` is at most ``q^{k - 1} s^k`` with the
-    largest coupling ``s``.
+    ``D`` is diagonal with ``rates (q,)``, ``S >= 0`` is the ``coupling (q, q)``, and ``q`` times its largest entry
+    times the longest duration is at most 1/2.
+
+    The bounds are from Duhamel's series ``e^{M r} = e^{D r} + int_0^r e^{D (r - s)} S e^{D s} ds + ...``, all of whose
+    terms grow with ``S``. The term of first order is ``S_ij`` times the divided difference of ``e^{x r}`` at the rates
+    ``i`` and ``j``. That is ``e^{b r} (e^{(a - b) r} - 1) / (a - b)`` with the larger rate ``b``, whose last factor
+    rises with ``r``. Its integral, over ``0 <= s <= t <= r``, is at most that over the square, and at most the area of
+    the triangle times the largest value. The other terms are at most ``r^k S^k / k!`` times ``e^{r max(0, D)}``, and
+    ``S^k`` is at most ``q^{k - 1} s^k`` with the largest coupling ``s``.
     """
     q, early, late = rates.size, shortest[:, None], longest[:, None]
     diagonal_flow, diagonal_integral = np.exp(rates * np.where(rates < 0, early, late)), _integrate_growth(rates, late)
@@ -295,7 +302,7 @@ def flows_apart(rates: Array, coupling: Array, shortest: Array, longest: Array) 
 
 
 def _scale_couplings(couplings: Array, growth: Array) -> Array:
-    """Couplings times what they grow by, where nothing stays nothing however large the growth is."""
+    """Return couplings times their growth, where a coupling of 0 gives 0 even if the growth is infinite."""
     return np.asarray(np.where(couplings > 0, couplings * growth, 0.0))
 
 
@@ -306,7 +313,7 @@ def _integrate_growth(rates: Array, durations: Array | float) -> Array:
 
 
 def rising(metzler: Array) -> Array:
-    """A comparison matrix ``(q, q)`` without what decays."""
+    """Return a comparison matrix ``(q, q)`` with the negative entries of its diagonal set to 0."""
     return np.where(np.eye(metzler.shape[0]) > 0, np.maximum(metzler, 0.0), metzler)
 
 

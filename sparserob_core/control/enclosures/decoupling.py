@@ -37,8 +37,10 @@ FAR = 6.0  # bits by which two ways to balance may differ before the one that is
 
 @dataclass(frozen=True, eq=False)
 class Decoupling:
-    """``transform`` is ``T (d, d)``, ``inverse`` its inverse ``V`` as computed, in extended precision where the machine
-    has it, ``defect (d, d)`` a bound of ``|T^-1 - V|`` relative to it: ``|T^-1 y - V y| <= defect |V y|``.
+    """Transform ``T (d, d)`` and its ``inverse`` ``V (d, d)`` as computed, in extended precision where the machine has
+    it.
+
+    ``defect (d, d)`` bounds ``|T^-1 - V|`` relative to ``V``: ``|T^-1 y - V y| <= defect |V y|``, entry by entry.
 
     ``starts (q,)``: where the blocks begin; ``groups (g,)``: where the groups begin (each a union of blocks).
     """
@@ -50,9 +52,11 @@ class Decoupling:
     groups: np.ndarray
 
     def normal_form(self, moved: Array) -> Array:
-        """``D (d, d)``: what ``T^-1 A T`` would be without rounding, from ``moved``, which it is with it.
+        """Return ``D (d, d)``, which ``T^-1 A T`` would be without rounding, from the computed product ``moved (d,
+        d)``.
 
         Entries outside the groups and below the diagonal blocks are 0, and 2 by 2 blocks are ``[[a, b], [-b, a]]``.
+        Without a transform ``D`` is ``moved`` itself.
         """
         if self.is_identity:
             return moved.copy()
@@ -67,21 +71,23 @@ class Decoupling:
         return D
 
     def vector(self, columns: Array) -> tuple[Array, Array]:
-        """``V b`` for columns ``b (..., d, e)``, and a bound of ``|T^-1 b - V b|``, entry by entry."""
+        """Return ``V b`` in double precision for columns ``b (..., d, e)``, and a bound of its distance from
+        ``T^-1 b``, entry by entry."""
         if self.is_identity:
             return columns, np.zeros(columns.shape)
         return self._round_to_double(self.inverse @ columns.astype(np.longdouble), np.abs(columns))
 
     def matrix(self, A: Array) -> tuple[Array, Array]:
-        """``V A T`` for matrices ``A (..., d, d)``, and a bound of ``|T^-1 A T - V A T|``, entry by entry."""
+        """Return ``V A T`` in double precision for matrices ``A (..., d, d)``, and a bound of its distance from
+        ``T^-1 A T``, entry by entry."""
         if self.is_identity:
             return A, np.zeros(A.shape)
         transformed = self.inverse @ A.astype(np.longdouble) @ self.transform
         return self._round_to_double(transformed, np.abs(A) @ np.abs(self.transform))
 
     def _round_to_double(self, moved: LongArray, sizes: Array) -> tuple[Array, Array]:
-        """``moved`` in double precision, and how far it may be from the truth; ``sizes`` bound what the inverse was
-        multiplied with."""
+        """Return ``moved`` in double precision, and a bound of its distance from the truth; ``sizes`` bounds the moduli
+        of the factor of the inverse."""
         products = _bound_long_rounding(2 * moved.shape[-2]) * (np.abs(self.inverse) @ sizes)
         result = moved.astype(float)
         bound = products + self.defect @ (np.abs(moved) + products) + np.abs(moved - result)
@@ -103,8 +109,12 @@ class Decoupling:
 
 
 def decoupled(A: Array) -> Decoupling:
-    """Coordinates for ``A (d, d)``: its modes where they are well conditioned, else clusters of them, at worst the
-    Schur form of all (whose transform is orthogonal after balancing)."""
+    """Return coordinates for ``A (d, d)``: its modes where they are well conditioned, else clusters of them, else the
+    Schur form of all.
+
+    The transform of the Schur form has orthogonal columns after balancing. Where no transform can be verified, or for
+    a single state, the coordinates are the states.
+    """
     d = A.shape[0]
     if d == 1 or not np.isfinite(A).all():
         return identity(d)
@@ -123,7 +133,8 @@ def identity(d: int) -> Decoupling:
 
 
 def _verify_inverse(T: Array, starts: np.ndarray, groups: np.ndarray) -> Decoupling | None:
-    """The decoupling with a bound of what is wrong with the inverse; ``None`` where it is no inverse."""
+    """Return the decoupling with a bound of the defect of the inverse of ``T (d, d)``; ``None`` where the residual is
+    too large for a bound."""
     try:
         V = np.asarray(np.linalg.inv(T), dtype=float)
     except np.linalg.LinAlgError:
@@ -146,7 +157,11 @@ def _bound_long_rounding(terms: int) -> float:
 
 
 def _generate_candidates(A: Array) -> Iterator[tuple[Array, np.ndarray, np.ndarray]]:
-    """Transforms of a balanced matrix with the starts of their blocks and groups, the finest first."""
+    """Yield transforms of a balanced matrix with the starts of their blocks and groups, in the order of preference.
+
+    The modes come first where they are well conditioned, then clusters from fine to coarse. The modes of many states
+    follow where they are poorly conditioned, and one group of all is last.
+    """
     values, vectors = np.linalg.eig(A)
     columns: list[Array] = []
     starts: list[int] = []
@@ -201,8 +216,12 @@ def _cluster_eigenvalues(values: np.ndarray, distance: float) -> list[np.ndarray
 def _build_group_bases(
     form: Array, basis: Array, clusters: list[np.ndarray]
 ) -> tuple[Array, np.ndarray, np.ndarray] | None:
-    """Orthonormal bases of the invariant subspaces of the clusters, side by side, each by bringing its eigenvalues to
-    the front of one Schur form (Bai and Demmel 1993)."""
+    """Return orthogonal bases of the invariant subspaces of the clusters, side by side, with the starts of their blocks
+    and groups.
+
+    Each basis comes from moving its eigenvalues to the front of one Schur form (Bai and Demmel 1993). It is orthonormal
+    but for the second column of a rotation, whose scale makes the rotation normal. ``None`` where the order fails.
+    """
     from scipy.linalg.lapack import dtrsen
 
     bases, starts, groups, start = [], [], [], 0
@@ -237,7 +256,8 @@ def pace(A: Array) -> float:
 
 
 def balance(A: Array) -> Array:
-    """Powers of two ``s (d,)`` such that rows and columns of ``A s_j / s_i`` are equally large (Osborne 1960)."""
+    """Return powers of two ``s (d,)`` such that rows and columns of ``A_ij s_j / s_i`` are about equally large, without
+    their diagonal (Osborne 1960)."""
     scale, start = _sweep_scales(A, np.ones(A.shape[0])), _fit_scales(A)
     # where many states are in a row, each next to its like, the sweeps stop early
     return scale if np.ptp(np.log2(scale / start)) <= FAR else _sweep_scales(A, start)
@@ -264,8 +284,8 @@ def _sweep_scales(A: Array, scale: Array) -> Array:
 
 
 def _fit_scales(A: Array) -> Array:
-    """Powers of two ``s (d,)`` for which the logarithms of the entries ``A_ij s_j / s_i`` have the least squares
-    (Curtis and Reid 1972)."""
+    """Return the powers of two ``(d,)`` next to the ``s`` for which the logarithms of ``A_ij s_j / s_i`` have the least
+    squares (Curtis and Reid 1972)."""
     i, j = np.nonzero(A - np.diag(np.diag(A)))
     logs, d = np.log2(np.abs(A[i, j])), A.shape[0]
     graph, sums = np.zeros((d, d)), np.zeros(d)
@@ -288,9 +308,10 @@ def decoupled_transitions(decoupling: Decoupling, D: Array, durations: Array) ->
 
 
 def decoupled_rounding(decoupling: Decoupling, D: Array, durations: Array) -> Array:
-    """The relative error of `decoupled_transitions` in the exponential of the bounds, ``(k,)`` for ``durations (k,)``.
+    """Return bounds ``(k,)`` of the rounding error of `decoupled_transitions` for ``durations (k,)``, relative to the
+    exponential of the bounds.
 
-    A mode's exponent is rounded, by ``eps |a r|`` for a growing and ``eps |b r|`` for a turning one; where a mode
+    The exponent of a mode is rounded, by ``eps |a r|`` for a growing and ``eps |b r|`` for a rotating one. Where a mode
     decays, ``|a r| e^{a r} <= 1``.
     """
     worst = np.zeros(durations.shape)
@@ -306,7 +327,8 @@ def decoupled_rounding(decoupling: Decoupling, D: Array, durations: Array) -> Ar
 
 
 def _exponentiate_mode(D: Array, durations: Array) -> tuple[Array, Array]:
-    """A real eigenvalue ``a``, or a rotation ``[[a, b], [-b, a]]``, which is the complex number ``a + ib``."""
+    """Return `transitions` of a single mode: a real eigenvalue ``a``, or a rotation ``[[a, b], [-b, a]]``, which is the
+    complex number ``a + ib``."""
     rotates = D.shape[0] == 2
     rate = complex(D[0, 0], D[0, 1]) if rotates else D[0, 0]
     flow = np.exp(rate * durations)

@@ -27,11 +27,11 @@ Value: TypeAlias = Any
 Table: TypeAlias = "np.ndarray"
 Exponents: TypeAlias = tuple[int, ...]
 MOST_POWERS = 8
-"""The degree in all parameters together up to which an entry counts as a polynomial in them: of twice as many an
-expansion that holds them is too large, and as an analytic function it needs no more than it shows."""
+"""The degree in all parameters together up to which an entry counts as a polynomial in them. With twice the degree an
+expansion of all terms is too large; beyond it an entry is a power series, of which only the terms that matter count."""
 MOST_ON_CELL, NUMBERS_ON_CELL = 6, 80
-"""The degree on a cell of parameters, and the coefficients times states, at most: of twice as many a cell takes three
-times as long, of half as many there are three times as many cells."""
+"""The degree on a cell of parameters, and the coefficients times states, at most: with twice as many a cell takes three
+times as long, with half as many there are three times as many cells."""
 Part: TypeAlias = "dict[Exponents, Value]"
 """The coefficients of the monomials of one degree, as far as there are any."""
 
@@ -180,8 +180,12 @@ class Dependent:
         )
 
     def _solve_recurrence(self, first: Value, step: Callable[[int, list[Part]], Part]) -> Dependent:
-        """The series that begins with a number and of which every ``step`` makes the coefficients of a degree from
-        those before: along a line through the centre they are those of powers of one number, and obey what these do."""
+        """Return the series with the constant ``first``, in which ``step`` gives the coefficients of every degree from
+        those of the degrees before.
+
+        Along a line through the centre a series is one in a single number, with the parts of a degree as coefficients.
+        So the recurrences of such series hold for the parts.
+        """
         (constant,) = self.parts[0]
         parts: list[Part] = [{constant: first}]
         for n in range(1, self.degree + 1):
@@ -322,7 +326,7 @@ class Split:
     """A matrix that is a polynomial in ``delta (nu,)``.
 
     ``parts`` are its coefficients by their exponents, ``(rows, columns)`` of objects each, the constant one first. The
-    entries ``beyond`` are power series, of which the coefficients go up to a degree.
+    entries at the positions ``beyond`` are power series, of which the coefficients go up to a degree.
     """
 
     parts: Mapping[Exponents, Table]
@@ -352,7 +356,7 @@ class Split:
         Raises
         ------
         InputError
-            Where the entry is not a matrix of arithmetic in single parameters.
+            Where the entry, or the result of the function, is not a matrix.
         """
         nu = centre.size
         p = np.empty(1 + nu, dtype=object)
@@ -361,8 +365,8 @@ class Split:
         with np.errstate(all="ignore"):  # what is not finite is reported where the numbers are used
             zero = 0.0 * time  # a number of the kind of the time, which counts what is rounded
             for j, (middle, unit) in enumerate(zip(centre.tolist(), units.tolist(), strict=True)):
-                slope = {single(nu, j): zero + unit} if unit and degree else {}
-                p[1 + j] = Dependent(zero + middle, slope, degree, bool(unit) and not degree)
+                coefficient = {single(nu, j): zero + unit} if unit and degree else {}
+                p[1 + j] = Dependent(zero + middle, coefficient, degree, bool(unit) and not degree)
             table = np.asarray(entry(p) if callable(entry) else entry, dtype=object)
         if table.ndim != 2:
             raise InputError(
@@ -375,10 +379,10 @@ class Split:
             tables[(0,) * nu][position] = series.value
             if series.beyond:
                 truncated.append((position[0], position[1]))
-            for key, slope in series.others.items():
+            for key, coefficient in series.others.items():
                 if key not in tables:
                     tables[key] = np.zeros(table.shape, dtype=object)
-                tables[key][position] = slope
+                tables[key][position] = coefficient
         return Split(tables, truncated, nu)
 
     @property
@@ -416,10 +420,10 @@ def _mark_nonzeros(table: Table) -> np.ndarray:
 @final
 @dataclass(frozen=True, eq=False)
 class Dependence:
-    """Affine dependence of the state on parameters: the states ``y_j`` that parameter ``j`` reaches,
-    ``reached (nu, d)``.
+    """Affine dependence of the state on parameters: ``reached (nu, d)`` is the mask of the states ``y_j`` that
+    parameter ``j`` reaches.
 
-    The parameters are counted from their ``centre (nu,)`` in ``units (nu,)``.
+    The parameters are measured from their ``centre (nu,)`` in ``units (nu,)``.
     """
 
     reached: np.ndarray
@@ -432,8 +436,8 @@ class Dependence:
         return int(self.reached.shape[1] + self.reached.sum())
 
     def rows(self, shares: Array) -> Array:
-        """``x`` as rows on all states, ``(d, states)``, where the parameters deviate from their centre by these shares
-        of their units."""
+        """Return ``x`` as rows on all states, ``(d, states)``, where the parameters deviate from their centre by these
+        ``shares (nu,)`` of their units."""
         nu, d = self.reached.shape
         axes = np.eye(d)
         return np.hstack([axes, *(shares[j] * axes[:, self.reached[j]] for j in range(nu))])
@@ -527,8 +531,8 @@ class Spread:
         Returns
         -------
         Spread, np.ndarray
-            The polynomials on the cell; and the numbers of the monomials of this space that are of their degree. What
-            is beyond is `left`.
+            The polynomials on the cell; and the indices of the monomials of this space that are at most of their
+            degree. The terms beyond this degree are bounded by their `left`.
         """
         nu = self.space.nu
         degrees = [degree for degree in range(1, MOST_ON_CELL + 1) if self.d * comb(nu + degree, nu) <= NUMBERS_ON_CELL]
@@ -545,8 +549,8 @@ class Spread:
         return np.asarray((parameters - self.centre) / np.where(self.units > 0.0, self.units, 1.0))
 
     def filled(self, first: Array) -> Array:
-        """Return matrices ``(k, states, states)`` on all coefficients from their columns ``(k, states, d)`` for the
-        constant coefficient."""
+        """Return matrices ``(k, states, states)`` on all coefficients, products of polynomials, from their columns
+        ``(k, states, d)`` for the constant coefficient."""
         left, right, target = self.space.products
         columns, size = first.reshape(len(first), self.space.size, self.d, self.d), self.space.size
         blocks = np.zeros((len(first), size, size, self.d, self.d))

@@ -1,8 +1,8 @@
 """Products of matrices in twice the digits, each a sum ``hi + lo`` of two matrices of floats.
 
-The leading digits of two factors are so few that every sum of their products is a float, whatever order it is added up
-in; only what is left, smaller by as many digits, is rounded (Ozaki, Ogita, Oishi and Rump 2012, "Error-free
-transformations of matrix multiplication", Numer. Algorithms 59).
+The leading digits of two factors are so few that every sum of their products is a float, in any order of addition.
+Only the products with the other digits, smaller by as many digits, are rounded (Ozaki, Ogita, Oishi and Rump 2012,
+"Error-free transformations of matrix multiplication", Numer. Algorithms 59).
 """
 
 from __future__ import annotations
@@ -22,8 +22,11 @@ LARGE = 1e150  # the product of two such numbers is a float
 
 
 def product(hi: Array, lo: Array | None, other_hi: Array, other_lo: Array | None) -> tuple[Array, Array]:
-    """``(hi + lo) (other_hi + other_lo)``, ``(d, d)`` each; ``None``: no more digits than a float has. Where numbers
-    become too large, the product of floats."""
+    """Return ``(hi + lo) (other_hi + other_lo)`` as a sum of two matrices ``(d, d)``, without the product of the low
+    parts.
+
+    A low part ``None`` is 0. Where numbers become too large, the result is the product of floats ``hi other_hi``.
+    """
     if not max(np.abs(hi).max(), np.abs(other_hi).max()) < LARGE:
         return hi @ other_hi, np.zeros_like(hi)
     rows, columns = _extract_leading_digits(hi, 1), _extract_leading_digits(other_hi, 0)
@@ -36,8 +39,10 @@ def product(hi: Array, lo: Array | None, other_hi: Array, other_lo: Array | None
 
 
 def flows(A: Array) -> tuple[Array, Array, Array]:
-    """``e^A`` as ``hi + lo``, and ``int_0^1 e^{A s} ds``, ``(d, d)`` each, where the norm of ``A (d, d)`` is at most
-    1: by its series, from the last term."""
+    """Return ``e^A`` as ``hi`` and ``lo``, and ``int_0^1 e^{A s} ds`` as floats, ``(d, d)`` each.
+
+    The norm of ``A (d, d)`` is at most 1. The series is summed from its last term.
+    """
     identity = np.eye(A.shape[0])
     hi = np.asarray(identity / factorial(TERMS))
     for order in range(TERMS - 1, LONG_TERMS, -1):
@@ -47,7 +52,7 @@ def flows(A: Array) -> tuple[Array, Array, Array]:
         hi, lo = product(A, None, hi, lo)
         share = Fraction(1, factorial(order))
         rounded_share = float(share)
-        # what is added to is larger than any entry of what is added, or 0
+        # every entry of the first summand is larger than those of the second, or 0
         hi, error = _add_with_error(identity * rounded_share, hi)
         lo = lo + error + identity * float(share - Fraction(rounded_share))
     flow, flow_lo = product(A, None, hi, lo)
@@ -56,8 +61,10 @@ def flows(A: Array) -> tuple[Array, Array, Array]:
 
 
 def _extract_leading_digits(A: Array, axis: int) -> Array:
-    """The leading digits of the entries of ``A (d, d)``, of their largest along an axis: few enough that a sum of ``d``
-    products of two has no more than a float."""
+    """Return the entries of ``A (d, d)``, rounded to the leading digits of the largest entry along an axis.
+
+    The digits are so few that a sum of ``d`` products of two such numbers is a float.
+    """
     kept = (DIGITS - int(np.ceil(np.log2(A.shape[0])))) // 2
     _, exponent = np.frexp(np.abs(A).max(axis=axis, keepdims=True))
     shift = np.ldexp(1.5, exponent + DIGITS - 1 - kept)
@@ -65,7 +72,7 @@ def _extract_leading_digits(A: Array, axis: int) -> Array:
 
 
 def _add_with_error(large: Array, small: Array) -> tuple[Array, Array]:
-    """The rounded sum, and what was rounded away (Knuth 1997, section 4.2.2)."""
+    """Return the rounded sum, and its rounding error as a float, exactly (Knuth 1997, section 4.2.2)."""
     total = large + small
     included = total - large
     return total, (large - (total - included)) + (small - included)

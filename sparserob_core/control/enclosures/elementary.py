@@ -1,8 +1,8 @@
 """Taylor series of elementary functions on an interval, with a bound of their truncation error.
 
 Every function takes ``degree n``, ``centre`` and the interval ``[low, high]`` around it, and returns the coefficients
-of ``1, y, ..., y^n`` with ``y = x - centre`` and a bound of ``|f^(n+1)| / (n+1)!`` on the interval (Lagrange's form of
-the remainder).
+of ``1, y, ..., y^n`` with ``y = x - centre`` and a bound of the truncation error divided by ``|y|^(n+1)``. The bound is
+one of ``|f^(n+1)| / (n+1)!`` on the interval (Lagrange's form of the remainder) or Cauchy's.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ FUNCTIONS: dict[str, Callable[[Any], Any]] = {
     "log": np.log,
     "tanh": np.tanh,
 }
-KEPLER_STEPS = 60  # each halves at least, and most are Newton's; a tenth of them leaves 1e-2 where e is near 1
+KEPLER_STEPS = 60  # most are Newton's, and the others halve; a tenth of them leaves 1e-2 where e is near 1
 KEPLER_CIRCLES = 50  # down to 4 * 0.85^49 = 1.4e-3; with a tenth of them steps are shorter where e is above 0.9
 
 
@@ -77,10 +77,11 @@ def power_series(power: float, degree: int, centre: float, low: float, high: flo
 def kepler_series(eccentricity: float, degree: int, centre: float, low: float, high: float) -> Series:
     """The eccentric anomaly ``E`` with ``E - e sin E = M``, from ``E' (1 - e cos E) = 1``.
 
-    The bound is Cauchy's: on a circle ``|E - E_0| = R`` the anomaly ``M`` differs from its tangent by at most
-    ``q = e (|sin E_0| cosh R + |cos E_0| sinh R) R^2 / 2``, so that every ``M`` nearer than ``r = R (1 - e cos E_0) -
-    q`` has exactly one ``E`` within it (Rouche), and no coefficient is larger than ``R / r^k``. The radius follows what
-    is near: it is small at the pericentre of a long ellipse only. Raises `NotEnclosable` where the interval is wider.
+    The bound is Cauchy's: on a circle ``|E - E_0| = R`` the anomaly ``M`` differs from its tangent by at most ``q = e
+    (|sin E_0| cosh R + |cos E_0| sinh R) R^2 / 2``, so that every ``M`` nearer than ``r = R (1 - e cos E_0) - q`` has
+    exactly one ``E`` within it (Rouche), and coefficient ``k > 0`` is at most ``R / r^k``. The radius depends on
+    ``E_0``: it is small only near the pericentre of a long ellipse. Raises `NotEnclosable` where the interval is wider
+    than the largest ``r``.
     """
     e, E = eccentricity, float(eccentric_anomaly(centre, eccentricity))
     sine, cosine = math.sin(E), math.cos(E)
@@ -104,8 +105,10 @@ def kepler_series(eccentricity: float, degree: int, centre: float, low: float, h
 
 
 def eccentric_anomaly(anomaly: npt.ArrayLike, eccentricity: float) -> Any:
-    """The ``E`` with ``E - e sin E = M``, for numbers ``M (...)`` and ``0 <= e < 1``: by Newton's method within
-    ``[M - e, M + e]``, halving where a step leaves what is known to hold the root."""
+    """Return the ``E`` with ``E - e sin E = M``, for numbers ``M (...)`` and ``0 <= e < 1``.
+
+    Newton's method starts in ``[M - e, M + e]``, and halves the interval known to hold the root where a step leaves it.
+    """
     M = np.asarray(anomaly, dtype=float)
     low, high = M - eccentricity, M + eccentricity
     E = M + eccentricity * np.sin(M)

@@ -48,13 +48,14 @@ def products(A: Array):  # type: ignore[no-untyped-def]  # an array, or one of s
 @dataclass(frozen=True, eq=False)
 class Leaps:
     """``c'e^{A r}`` and ``c'int_0^r e^{A s} ds``: by transitions over a short time and its doubles, and the exponential
-    series over what is left of ``r``.
+    series over the rest of ``r``.
 
     The short time is a power of two, so that no duration is rounded, and ``|A|`` times it is at most 1: doubled, the
     transitions are those that scaling and squaring makes, and what rows go through beside is few products. So
-    `exponential_rounding` bounds what is rounded here too. Each doubling would double what the ones before have
-    rounded; so they are made in twice the digits, and rounded once. All is done in units of the states, powers of two,
-    in which ``A`` is small: in units of somebody else, the doubles of a time may be too many for any of it to be seen.
+    `exponential_rounding` bounds the rounding errors here too. Each doubling would double the rounding errors of the
+    ones before. So the transitions are doubled in twice the digits, and rounded once; their integrals are floats. All
+    is done in units of the states, powers of two, in which ``A`` is small: in other units there may be so many
+    doublings that nothing of the result is correct.
     """
 
     A: Array
@@ -164,7 +165,8 @@ class Leaps:
     def orbits(
         self, rows: Float[Array, "r d"], durations: Float[Array, " k"]
     ) -> tuple[Float[Array, "k r d"], Float[Array, "k r d"]]:
-        """`rows` where each goes over every duration: what durations begin with, in short times, is gone over once."""
+        """Return `rows` for every row over every duration, ``(k, r, d)`` each; whole short times that durations have in
+        common at their beginning are propagated once."""
         steps, remainders = self._split_durations(durations)
         distinct_steps, inverse = np.unique(steps, return_inverse=True)
         propagated = np.array(rows[None] * self._scale, dtype=float)
@@ -192,7 +194,8 @@ class Leaps:
 
     @shaped
     def transitions(self, durations: Float[Array, " k"]) -> tuple[Float[Array, "k d d"], Float[Array, "k d d"]]:
-        """`Exponentials.transitions`, of the rows of the identity: few of them at once are in the making."""
+        """Return `Exponentials.transitions`, from the rows of the identity; work arrays hold only some of the durations
+        at a time."""
         return self.orbits(np.eye(self.A.shape[0]), durations)
 
 
@@ -202,8 +205,8 @@ def _compute_norm(A: Array) -> float:
 
 @dataclass(frozen=True, eq=False)
 class Flows:
-    """``e^{D r}`` of the normal form ``D (d, d)`` of a decoupling: modes that are blocks of their own by numbers, those
-    of a group by `Leaps`."""
+    """``e^{D r}`` of the normal form ``D (d, d)`` of a decoupling: by scalar exponentials for groups of one block, by
+    `Leaps` for the others."""
 
     decoupling: Decoupling
     D: Array

@@ -11,7 +11,7 @@ EPSILON = float(np.finfo(float).eps)
 
 # 1 / k!; beyond degree 18 nothing is left on the unit ball (1 / 19! < 1e-17)
 COEFFICIENTS = 1.0 / np.cumprod([1.0, *range(1, 19)])
-FEW = 1000  # numbers of which a call costs no more than itself
+FEW = 1000  # numbers in an array up to which a call of numpy costs little more than its overhead
 
 
 @shaped
@@ -49,7 +49,7 @@ def transitions(A: Array, durations: Array) -> tuple[Array, Array]:
     size = A.shape[-1]
     shape = np.broadcast_shapes(A.shape[:-2], durations.shape)
     block = np.zeros((*shape, 2 * size, 2 * size))
-    # I in place of I r, and Gamma = r phi(A r) after: how often is squared then does not depend on the unit of time
+    # I in place of I r, and times r after: so the number of squarings does not depend on the unit of time
     block[..., :size, :size] = A * durations[..., None, None]
     block[..., :size, size:] = np.eye(size)
     both = exponential(block)
@@ -57,18 +57,23 @@ def transitions(A: Array, durations: Array) -> tuple[Array, Array]:
 
 
 def rounding(terms: int) -> float:
-    """``gamma_n = n u / (1 - n u)`` with room for the few operations around a product (Higham 2002, section 3.1), ``u``
-    half of the machine's epsilon: the relative error of a sum of ``n`` products is at most this, in the sum of their
-    absolute values."""
+    """Return ``(n + 4) u``, a bound of the rounding error of a sum of ``n`` products, relative to the sum of their
+    absolute values.
+
+    The unit roundoff ``u`` is half of the machine's epsilon. Up to ``n = 1e8`` the result is above
+    ``gamma_n = n u / (1 - n u)`` (Higham 2002, section 3.1), and for few terms it has room for some operations around
+    the product.
+    """
     return (terms + 4) * EPSILON / 2
 
 
 def exponential_rounding(terms: int, sizes: Array) -> Array:
-    """The relative error of `exponential` and of both parts of `transitions`, for ``||A|| r`` of ``sizes (...)``, in
-    the exponential of any matrix of bounds that compares with ``A`` (`ComparisonSystem`).
+    """Return a bound ``(...)`` of the rounding error of `exponential` and of both parts of `transitions`.
 
-    On the unit ball, each of eight products errs by ``rounding(terms)`` in a polynomial of ``|A|``, which is at most
-    ``e^2`` times the exponential of the bounds; every squaring doubles the relative error and adds one product.
+    It is relative to the exponential of any matrix of bounds that compares with ``A`` (`ComparisonSystem`), for 1-norms
+    ``||A|| r`` of ``sizes (...)``. On the unit ball, each of eight products errs by ``rounding(terms)`` relative to a
+    polynomial of ``|A|``. That is at most ``e^2`` times the exponential of the bounds. Every squaring doubles the
+    relative error and adds one product.
     """
     squared = np.exp2(np.maximum(0.0, np.ceil(np.log2(np.maximum(sizes + 1.0, 1.0)))))
     return np.asarray(60.0 * rounding(terms) * squared)

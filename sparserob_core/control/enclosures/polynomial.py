@@ -9,9 +9,9 @@ from sparserob_core.control.enclosures.taylor import Face, TaylorSpace
 from sparserob_core.shapes import Bool, Float, Int, shaped
 from sparserob_core.sip.convex_set import Array
 
-DEFINITE = 1e-12  # relative to the largest, how negative the eigenvalues of a Hessian are made
-SLOPE = 1e-9  # relative to the Hessian, that at which a side of the box is left again
-ROUNDS = 3  # of the active set method, per variable
+DEFINITE = 1e-12  # share of the largest eigenvalue below 0 to which those of a Hessian are lowered
+SLOPE = 1e-9  # slope inwards, relative to the Hessian, above which a variable leaves a side of the box again
+ROUNDS = 3  # at most, of the active set method, per variable
 FACES_KEPT = 256  # faces that a space remembers
 
 
@@ -19,12 +19,14 @@ FACES_KEPT = 256  # faces that a space remembers
 def polynomial_bound(
     space: TaylorSpace, coefficients: Float[Array, "*k M"]
 ) -> tuple[Float[Array, " *k"], Float[Array, "*k nu"]]:
-    """Upper bounds of polynomials ``(..., M)`` on ``[-1, 1]^nu``, and how much each variable adds to their range,
-    ``(..., nu)``.
+    """Return upper bounds of polynomials ``(..., M)`` on ``[-1, 1]^nu``, and measures ``(..., nu)`` of what halving
+    each variable would gain.
 
-    Variables in which the polynomial is monotone are set to their better end; in the others the quadratic part is
-    maximised, exactly where it is concave, variable by variable or less a multiple of ``|delta|^2`` otherwise.
-    Terms of degree three and more are bounded by their modulus.
+    Variables in which the polynomial is monotone are set to their better end. In the others the quadratic part is
+    bounded variable by variable, or by the tangents of a concave function. Where the part is not concave, a multiple of
+    ``|delta|^2`` is subtracted first and its largest value added. Terms of degree three and more are bounded by their
+    modulus, even monomials by their positive part. The measures are bounds of the partial derivatives, without the
+    gradient in a variable that is set to its end. Rounding is not in the bounds.
     """
     nu = space.nu
     shape = coefficients.shape[:-1]
@@ -49,8 +51,11 @@ def polynomial_bound(
 def monotone_ends(
     space: TaylorSpace, coefficients: Float[Array, "k M"], steepness: Float[Array, "k nu"]
 ) -> Float[Array, "k nu"]:
-    """The end, -1 or 1, of every variable in which polynomials ``(k, M)`` are monotone, whatever is added whose partial
-    derivatives are at most ``steepness (k, nu)``; 0 for the other variables. ``(k, nu)``."""
+    """Return the better end ``(k, nu)``, -1 or 1, of every variable in which polynomials ``(k, M)`` are monotone; 0 for
+    the other variables.
+
+    The polynomials stay monotone with any summand whose partial derivatives are at most ``steepness (k, nu)``.
+    """
     if space.nu == 0 or space.degree == 0:
         return np.zeros((coefficients.shape[0], space.nu))
     gradient, hessian = quadratic_part(space, coefficients)
@@ -98,7 +103,8 @@ def quadratic_part(
 
 @shaped
 def _bound_tail(space: TaylorSpace, flat: Float[Array, "k M"]) -> tuple[Float[Array, " k"], Float[Array, "k nu"]]:
-    """Bounds of the terms of degree three and more, ``(k,)``, and of their partial derivatives, ``(k, nu)``."""
+    """Return upper bounds ``(k,)`` of the terms of degree three and more, and bounds ``(k, nu)`` of the modulus of
+    their partial derivatives."""
     high = space.degrees >= 3
     terms = flat[:, high]
     value = np.where(space.even[high], np.maximum(terms, 0.0), np.abs(terms)).sum(axis=1)
@@ -119,11 +125,12 @@ def _bound_by_variable(gradient: Float[Array, "k d"], hessian: Float[Array, "k d
 def _bound_as_concave(
     gradient: Float[Array, "k d"], hessian: Float[Array, "k d d"], inner: Bool[np.ndarray, "k d"]
 ) -> Float[Array, " k"]:
-    """An upper bound of ``g's + s'H s / 2`` over the box in the inner variables, exact where ``H`` is negative definite
-    in them.
+    """Return an upper bound of ``g's + s'H s / 2`` over the box in the inner variables, close where ``H`` is negative
+    definite in them.
 
-    Elsewhere ``H`` is first lowered by a multiple of the identity, which costs half of that per variable. ``inf`` where
-    fewer than two variables are inner: there, the bound variable by variable is exact.
+    ``H`` is first lowered by a multiple of the identity, at least by the share `DEFINITE`, which costs at most half of
+    that per variable. The bound is ``inf`` where fewer than two variables are inner: there, the bound variable by
+    variable is exact.
     """
     top = np.full(gradient.shape[0], np.inf)
     indices = np.flatnonzero(inner.sum(axis=1) > 1)
@@ -154,9 +161,10 @@ def _bound_concave_maximum(
     inner: Bool[np.ndarray, "k d"],
     size: Float[Array, " k"],
 ) -> Float[Array, " k"]:
-    """The maximum on the box of concave functions ``g's + s'H s / 2`` of the inner variables, from above, ``(k,)``: the
-    least maximum of the tangents at the points of an active set method, in which one variable at a time is held at a
-    side or released from it.
+    """Return upper bounds ``(k,)`` of concave functions ``g's + s'H s / 2`` of the inner variables on the box.
+
+    A bound is the least maximum of the tangents at the points of an active set method. In each round of it one variable
+    is fixed at a side or released from it.
     """
     rows, free, fixed = np.arange(gradient.shape[0]), inner.copy(), np.zeros(gradient.shape)
     filler = -np.where(size > 0, size, 1.0)[:, None, None] * np.eye(gradient.shape[1])

@@ -2,7 +2,8 @@
 enclosed.
 
 After Makino and Berz (2003), "Taylor models and other validated functional inclusion methods". Every operation adds
-what it may have rounded to the remainder; numbers that do not depend on the parameters are what floating point gives.
+a bound of its rounding to the remainder, where a coefficient of a parameter is not 0. Numbers that do not depend on the
+parameters, such as the reciprocal of a divisor, are what floating point gives.
 """
 
 from __future__ import annotations
@@ -36,15 +37,15 @@ if TYPE_CHECKING:
 
 _NUMBERS = (float, int, np.floating, np.integer)
 _LARGEST_POWER = 64
-HALF = EPSILON / 2  # what an operation is off by, as a share of what it gives
+HALF = EPSILON / 2  # unit roundoff: bound of the error of an operation, as a share of its result
 OUTWARD = 1.0 + 1e-10  # for bounds that are sums of at most some hundred thousand numbers that are not negative
 
 
 @final
 @dataclass(frozen=True, eq=False)
 class Face:
-    """A side of the box, on which some variables are at an end: every monomial is ``sign (M,)``, 1 or -1, times
-    another one there, ``target (M,)``."""
+    """A face of the box, on which some variables are at an end: there every monomial is ``sign (M,)``, 1 or -1, times
+    the monomial of index ``target (M,)``, in the other variables only."""
 
     target: np.ndarray
     sign: Array
@@ -80,10 +81,11 @@ class TaylorSpace:
     """Polynomials in ``delta in [-1, 1]^nu`` of total degree at most ``degree``, over one fixed list of ``M``
     monomials.
 
-    ``exponents (M, nu)`` in graded order, the constant first; ``degrees (M,)``; ``index`` from an exponent tuple to its
-    place; ``products``: three arrays ``(left, right, target)``, every pair of monomials whose product is in the space;
-    ``faces``: what `face_of` remembers; ``rounded``: of
-    every such pair, what the coefficient that it is added to is off by, as a share of the modulus of what it adds up.
+    ``exponents (M, nu)`` are in graded order, the constant first; ``degrees (M,)`` are their sums; ``even (M,)`` is the
+    mask of monomials of even exponents only. ``index`` leads from an exponent tuple to its index. ``products`` are
+    three arrays of indices ``(left, right, target)``, every pair of monomials whose product is in the space.
+    ``rounded`` holds for each such pair a bound of the rounding error of the coefficient of its product, as a share of
+    the sum of the moduli of its summands. ``faces`` are those that `face_of` remembers.
     """
 
     def __init__(self, nu: int, degree: int) -> None:
@@ -107,11 +109,11 @@ class TaylorSpace:
         target = self._order[np.searchsorted(self._codes, codes[left] + codes[right])]
         self.products = (left, right, target)
         shares = HALF * np.bincount(target)[target]
-        self.rounded: Array = shares / (1.0 - shares)  # what a coefficient is off by, as a share of all that it adds up
+        self.rounded: Array = shares / (1.0 - shares)  # n u / (1 - n u) for the n summands of a coefficient
         self.faces: dict[bytes, Face] = {}
 
     def places(self, exponents: npt.NDArray[np.int64]) -> npt.NDArray[np.intp]:
-        """The places ``(k,)`` of monomials of the space with these ``exponents (k, nu)``."""
+        """Return the indices ``(k,)`` of monomials of the space with these ``exponents (k, nu)``."""
         return np.asarray(self._order[np.searchsorted(self._codes, exponents @ self._bases)])
 
     @property
@@ -120,8 +122,8 @@ class TaylorSpace:
         return len(self.exponents)
 
     def overflow(self, first: Array, second: Array) -> float:
-        """Bound of what two polynomials ``(M,)`` multiply to above ``degree``: the modulus of all products that leave
-        the space."""
+        """Return a bound of the terms above ``degree`` in the product of two polynomials ``(M,)``: the sum of the
+        moduli of all products that leave the space."""
         size = self.degree + 1
         a = np.bincount(self.degrees, weights=np.abs(first), minlength=size)
         b = np.bincount(self.degrees, weights=np.abs(second), minlength=size)
@@ -181,11 +183,14 @@ class TaylorModel:
         return self.space.monomials(delta) @ self.coefficients
 
     def bounds(self) -> tuple[float, float]:
-        """An interval that holds every value; even monomials are in ``[0, 1]``, the others in ``[-1, 1]``."""
+        """Return an interval that holds every value, but for the rounding of its ends.
+
+        Even monomials are in ``[0, 1]``, the others in ``[-1, 1]``.
+        """
         nonconstant, even = self.coefficients[1:], self.space.even[1:]
-        odd = float(np.abs(nonconstant[~even]).sum()) + self.remainder
-        low = float(self.coefficients[0] + np.minimum(nonconstant[even], 0.0).sum()) - odd
-        high = float(self.coefficients[0] + np.maximum(nonconstant[even], 0.0).sum()) + odd
+        radius = float(np.abs(nonconstant[~even]).sum()) + self.remainder
+        low = float(self.coefficients[0] + np.minimum(nonconstant[even], 0.0).sum()) - radius
+        high = float(self.coefficients[0] + np.maximum(nonconstant[even], 0.0).sum()) + radius
         return low, high
 
     def _sum_magnitudes(self) -> float:
@@ -273,8 +278,10 @@ class TaylorModel:
         )
 
     def _compose(self, series: Series) -> TaylorModel:
-        """``f(centre + y)`` by Horner's rule, ``y`` the model without its constant, and Lagrange's form of the
-        remainder."""
+        """Return ``f(centre + y)`` by Horner's rule, with ``y`` the model without its constant.
+
+        The bound of the series times the largest ``|y|^(n+1)`` is added to the remainder.
+        """
         coefficients, bound = series
         if not math.isfinite(bound):
             raise NotEnclosable("values this large have no enclosure")
@@ -350,7 +357,7 @@ class TaylorModel:
 
 
 def _add_rounding(space: TaylorSpace, coefficients: Array, remainder: float) -> TaylorModel:
-    """A model of which every coefficient has been rounded once."""
+    """Return a model with the rounding of its coefficients in the remainder, where each has been rounded once."""
     if coefficients[1:].any():
         remainder += HALF * float(np.abs(coefficients).sum())
     return TaylorModel(space, coefficients, remainder * OUTWARD)
@@ -358,11 +365,11 @@ def _add_rounding(space: TaylorSpace, coefficients: Array, remainder: float) -> 
 
 @dataclass(frozen=True, eq=False)
 class Combination:
-    """A functional whose direction varies over a cell with the parameters, ``c = c_0 + sum_j eta_j c_j`` with
-    ``|eta_j| <= 1``.
+    """A functional whose direction varies over a cell independently of the parameters, ``c = c_0 + sum_j eta_j c_j``
+    with ``|eta_j| <= 1``.
 
     Polynomials in ``delta`` for each of ``c_0, ..., c_J`` become one polynomial in ``(delta, eta)`` of ``space``.
-    ``targets (J+1, M)``: where monomial ``a`` of functional ``j`` goes.
+    ``targets (J+1, M)``: the index in ``space`` of monomial ``a`` of functional ``j``, times ``eta_j`` for ``j > 0``.
     """
 
     space: TaylorSpace

@@ -30,9 +30,9 @@ class Cuts:
     """Functions of ``delta in [-1, 1]^nu`` that are at least 0 wherever a cell ``centre + radius delta`` holds
     parameters of a set.
 
-    Half-spaces ``slack - slopes delta``, ``(q, nu), (q,)``, all of them crossing the cell;
-    ``(1 - |base + image delta|^2) / 2`` for a ``ball`` ``(base (nu,), image (nu, nu))``. ``bent (nu,)``: about how far
-    the set curves away from its half-spaces over the cell, along every coordinate; it only guides the halving.
+    Half-spaces ``slack - slopes delta`` with ``slopes (q, nu)`` and ``slack (q,)``, all of them crossing the cell;
+    ``(1 - |base + image delta|^2) / 2`` for a ``ball`` ``(base (nu,), image (nu, nu))``. ``bent (nu,)`` estimates how
+    far the set curves away from its half-spaces over the cell, along every coordinate; it only guides the halving.
     """
 
     slopes: Array
@@ -41,9 +41,11 @@ class Cuts:
     bent: Array
 
     def lowered(self, space: TaylorSpace, polynomials: Array, rest: Array | float) -> tuple[Array, Array]:
-        """Polynomials that are above ``polynomials (k, r, M)`` where the parameters are, such that they with the
-        ``rest (k, r, M)`` are low; and how much of their range halving each variable would take away,
-        ``(k, r, nu')``."""
+        """Return polynomials that are above ``polynomials (k, r, M)`` where the parameters are, and measures
+        ``(k, r, nu')`` of what halving each variable would gain.
+
+        Of some additions the one is chosen that gives the lowest bound of the sum with the ``rest (k, r, M)``.
+        """
         total = polynomials + rest
         additions, multipliers = self._build_additions(space, total)
         bounds = [polynomial_bound(space, total + addition) for addition in additions]
@@ -99,8 +101,11 @@ class Cuts:
         )
 
     def _compute_ball_multipliers(self, gradient: Array, hessian: Array) -> list[Array]:
-        """``(k, r)`` each: the best one for the quadratic part on the whole set, and the one that balances it next to
-        the cell."""
+        """Return two multipliers of the ball, ``(k, r)`` each.
+
+        The first is about the best one for the quadratic part on the whole set. The second balances the slope of the
+        quadratic part outwards, at the point of the sphere next to the cell.
+        """
         assert self.ball is not None
         base, _ = self.ball
         inverse = self._inverse_image
@@ -127,8 +132,10 @@ class Cuts:
 
 
 def ball_of(convex: ConvexSet | None, centre: Array, radius: Array) -> tuple[Array, Array] | None:
-    """A set that is the image of the unit ball, ``{p : |L^-1 (p - middle)| <= 1}``, in ``delta``: base and image of
-    `Cuts`; else ``None``."""
+    """Return base and image of `Cuts` for a set that is the image of the unit ball, ``{p : |L^-1 (p - middle)| <= 1}``.
+
+    ``None`` for any other set, and where a radius of the cell is 0.
+    """
     image = None if convex is None else convex.unit_ball_image()
     if image is None or not (radius > 0.0).all():
         return None
@@ -139,12 +146,13 @@ def ball_of(convex: ConvexSet | None, centre: Array, radius: Array) -> tuple[Arr
 
 
 def cheapest_multipliers(slopes: Array, slack: Array, gradient: Array) -> Array:
-    """Multipliers ``(..., q)``, at least 0, for ``gradient (..., nu)``: small ``lambda's + |gradient - lambda'A|_1``, a
-    bound of ``gradient'delta`` for ``|delta_i| <= 1`` with ``A delta <= s`` (weak duality, for any ``lambda >= 0``).
+    """Return multipliers ``lambda (..., q)``, at least 0, for ``gradient (..., nu)``, the best of those that are tried.
 
-    ``slopes`` is ``A (q, nu)``, ``slack`` is ``s (q,)``. Tried are the projections on every few rows of ``A``, which
-    are exact at a corner of the set, and the multipliers of single rows that cancel one coordinate, which are exact
-    beside one.
+    Better is a smaller ``lambda's + |gradient - lambda'A|_1``. It bounds ``gradient'delta`` for ``|delta_i| <= 1`` with
+    ``A delta <= s`` (weak duality, for any ``lambda >= 0``). ``slopes`` is ``A (q, nu)``, ``slack`` is ``s (q,)``.
+    Tried are the projections on all sets of rows of ``A``, or on single rows if these are more than `TOGETHER`. They
+    are exact at a corner of the set. Tried are also the multipliers of single rows that cancel one coordinate, which
+    are exact beside a corner.
     """
     q, nu = slopes.shape
     trials = [np.zeros((*gradient.shape[:-1], q))]

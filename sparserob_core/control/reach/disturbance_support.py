@@ -18,7 +18,7 @@ from sparserob_core.control.response.response import Impulses
 from sparserob_core.sip.convex_set import Array, ConvexSet
 
 AT_ONCE = 4_000_000  # numbers that are summed over all ages at once
-SAME = 1e-9  # of a piece: a time that is no nearer to its end is inside
+SAME = 1e-9  # of a piece: a time that is not as near to its end is inside
 KEPT = 8_000_000  # numbers of sums over all ages, up to which they are remembered
 
 
@@ -60,13 +60,13 @@ class DisturbanceSupport:
             if blocks is None or last_times is not times:
                 blocks = self._stack_functionals(self.blocks(times))
             return over_faces(
-                self._space, ends, lambda index, face: self._majorise_blocks(blocks[index], face).sum(axis=2)
+                self._space, ends, lambda selection, face: self._majorise_blocks(blocks[selection], face).sum(axis=2)
             )
         return over_faces(
             self._space,
             ends,
-            lambda index, face: self._sum_over_blocks(
-                times[index], partial(self._majorise_blocks, face=face), kept="worst" if face is None else ""
+            lambda selection, face: self._sum_over_blocks(
+                times[selection], partial(self._majorise_blocks, face=face), kept="worst" if face is None else ""
             ),
         )
 
@@ -74,13 +74,14 @@ class DisturbanceSupport:
         return summed(self.disturbance.set, blocks, face, self._monomials, self._space.size)
 
     def deviation(self, start: Array, widths: Array) -> Array:
-        """Return bounds ``(k, r)`` of the distance of the weights on the blocks from their chords, for times in
+        """Return bounds ``(k, r)`` of the height of the support function above its chord, for times in
         ``[start, start + width]`` inside one piece.
 
-        The distances are summed over blocks and Taylor coefficients. A block that has ended has ``y(r) = c e^{A r} z``,
-        the one that lasts ``y' = c e^{A r} W``. The distance is at most ``width^2 / 8`` of the largest second
-        derivative, and mode by mode at most twice the total change. The latter bound serves fast modes, which have died
-        away long before a cell is as short as they are.
+        The height is at most the distance of the weights ``y`` on the blocks from their chords, times any disturbance,
+        summed over blocks and Taylor coefficients. A block that has ended has ``y(r) = c e^{A r} z``, the one that
+        lasts ``y' = c e^{A r} W``. The distance is at most ``width^2 / 8`` of the largest second derivative, and mode
+        by mode at most twice the total change. The latter bound serves fast modes, which have died away long before a
+        cell is as short as they are.
         """
         grid, comparison = self.lifted.grid, self.lifted.comparison
         curvature_rows, slope_norms, curvature_norms, norms, squared = self._curvature_terms
@@ -207,7 +208,7 @@ class DisturbanceSupport:
         return answer
 
     def _is_at_breakpoint(self, within: float) -> bool:
-        """Return whether a time within a piece is its beginning or, up to rounding, its end."""
+        """Return whether a time within a piece is its beginning or, up to the share `SAME` of it, its end."""
         length = float(self.lifted.backward.propagator.lengths[0])
         return within == 0.0 or abs(within - length) <= SAME * length
 
@@ -330,8 +331,8 @@ class DisturbanceSupport:
 
     @cached_property
     def _effect_bounds(self) -> Array:
-        """``int_0^t e^{M s} |W| ds`` for the comparison system at the breakpoints, ``(L+1, q)``: norm bounds of the
-        effect of any disturbance until then on every block."""
+        """Norm bounds ``(L+1, q)`` of the effect of any disturbance until each breakpoint on every block: in the
+        comparison system ``int_0^t e^{M s} |W| ds``, plus the growth of `before`."""
         grid = self.lifted.grid
         reach = self.lifted.comparison.over(grid.lengths)
         drive_effects = reach.integral.on(np.broadcast_to(self._drive, (grid.pieces, self._drive.size)))
@@ -410,8 +411,8 @@ def over_faces(
     ends : Array
         Patterns ``(k, r, nu)``: -1 or 1 for a parameter at an end of the cell, else 0.
     parts : Callable
-        ``parts(index, face)`` gives coefficients and excess as ``(k', r, M + 1)`` for the times at ``index`` on one
-        face of the cell.
+        ``parts(selection, face)`` gives coefficients and excess as ``(k', r, M + 1)`` on one face of the cell, for the
+        times at ``selection``, a mask or indices.
 
     Returns
     -------
@@ -426,9 +427,9 @@ def over_faces(
     coefficients, excess = np.empty((k, r, space.size)), np.empty((k, r))
     for position, pattern in enumerate(patterns):
         face = face_of(space, pattern) if pattern.any() else None
-        index = (pattern_indices == position).any(axis=1)
-        values = parts(index, face)
-        is_on_face = pattern_indices[index] == position
+        selection = (pattern_indices == position).any(axis=1)
+        values = parts(selection, face)
+        is_on_face = pattern_indices[selection] == position
         coefficients[pattern_indices == position], excess[pattern_indices == position] = (
             values[is_on_face][:, :-1],
             values[is_on_face][:, -1],
@@ -477,5 +478,5 @@ def summed(
 
 
 def _compute_row_norms(coefficients: Array, starts: np.ndarray) -> Array:
-    """Norms ``(M, q)`` of the rows of every block of ``(M, d, mw)``."""
+    """Return the Frobenius norms ``(M, q)`` of the blocks of rows of matrices ``(M, d, mw)``."""
     return np.asarray(np.sqrt(np.add.reduceat((coefficients**2).sum(axis=2), starts, axis=1)))

@@ -1,10 +1,10 @@
 """Proven upper bounds of the worst-case violation on cells of times and parameters.
 
 On a cell ``[a, b]`` of times inside one piece of the grid, every Taylor coefficient of the state lies within
-``(b - a)^2 / 8 max |second derivative|`` of its chord, and within twice its total change. The support function of a
-chord lies below the chord of the support functions. So the violation is at most the larger of its bounds at ``a`` and
-at ``b``, plus that deviation, plus the remainder of the Taylor models. The propagation to ``a`` is exact: only the
-length of the cell counts, not the length of the piece.
+``(b - a)^2 / 8 max |second derivative|`` of its chord, and within twice a bound of its change. The support function of
+a chord lies below the chord of the support functions. So the violation is at most the larger of its bounds at ``a`` and
+at ``b``, plus that deviation, plus the remainder of the Taylor models. The propagation to ``a`` has no error but
+rounding and truncation: only the length of the cell counts, not the length of the piece.
 """
 
 from __future__ import annotations
@@ -34,8 +34,9 @@ from sparserob_core.errors import NotEnclosable
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.program import Enclosure
 
-WILD = 1e3  # times the numbers of a constraint, a distance from the chord that no halving of a short time explains
-SMALL_SHARE = 1e-6  # so that no coordinate is ever entirely blameless
+# times the numbers of a constraint: a larger distance from the chord on a short cell is not for halving the times
+WILD = 1e3
+SMALL_SHARE = 1e-6  # so that every parameter or direction has a positive share in the remainder
 CELLS_KEPT, CELLS_SIZE = 256, 2_000_000  # enclosures that are kept, and numbers in their decisions
 TIME_FIRST = (
     0.25  # times are halved before anything else unless that gains less than this share: their cells share all work
@@ -152,8 +153,9 @@ class CellEnclosure:
         Returns
         -------
         Array, Array, Array
-            Upper bounds ``(k,)``; the part of them that halving the times would reduce, ``(k,)``; and the parts
-            ``(k, nu')`` that halving each parameter, or direction, would reduce.
+            Upper bounds ``(k,)`` of the largest violation of a row; the part of them that halving the times would
+            reduce, ``(k,)``; and estimates ``(k, nu')`` of the parts that halving each parameter, or direction, would
+            reduce.
         """
         with np.errstate(over="ignore", invalid="ignore"):  # a bound that overflows is no bound, and is told as such
             return self._compute_bounds(start, stop)
@@ -185,7 +187,8 @@ class CellEnclosure:
         return total[pick], gain, spread
 
     def _bound_at(self, times: Array, pieces: np.ndarray) -> tuple[Array, Array]:
-        """Bounds ``(k, r)`` at single times, and how much of them each parameter accounts for, ``(k, r, nu)``."""
+        """Return upper bounds ``(k, r)`` at single times, without the remainder of the models, and estimates
+        ``(k, r, nu')`` of what halving each parameter or direction would gain."""
         states = self._compute_states(times, pieces)
         coefficients = np.einsum("ri,kai->kra", self._rows, states)
         if self.moving is not None:
@@ -233,8 +236,8 @@ class CellEnclosure:
         return np.concatenate([spread[..., :nu], gain[..., nu:]], axis=2)
 
     def _apply_cuts(self, space: TaylorSpace, coefficients: Array, times: Array) -> tuple[Array, Array | None]:
-        """Polynomials above ``coefficients (k, r, M)`` where the parameters are, and what halving the cell would gain
-        with them."""
+        """Return polynomials above ``coefficients (k, r, M)`` where the parameters are, and estimates ``(k, r, nu')``
+        of what halving the cell would gain with them; ``None`` for these without cuts."""
         if self.cuts is None:
             return coefficients, None
         support = 0.0 if self.sigma is None else self.sigma.at(times, np.zeros((*coefficients.shape[:2], space.nu)))[0]
@@ -242,8 +245,8 @@ class CellEnclosure:
 
     @staticmethod
     def _find_better_ends(space: TaylorSpace, coefficients: Array, steepness: Array) -> Array:
-        """Parameters in which the violation is monotone over the cell, whatever the disturbance: their better ends,
-        ``(k, r, nu)``."""
+        """Return the better ends ``(k, r, nu)`` of the parameters in which the violation is monotone over the cell,
+        whatever the disturbance; 0 for the others."""
         if not space.nu:
             return np.zeros(steepness.shape)
         return monotone_ends(space, coefficients.reshape(-1, space.size), steepness.reshape(-1, space.nu)).reshape(
@@ -260,8 +263,8 @@ class CellEnclosure:
         return self.lifted.moved(within, pieces, start, self._inputs[pieces])
 
     def _bound_chord_error(self, start: Array, stop: Array, pieces: np.ndarray) -> Array:
-        """Return bounds ``(k, r)`` of the distance of the state and of the support function from their chords on the
-        cells, summed over the Taylor coefficients."""
+        """Return bounds ``(k, r)`` of the height of the rows above their chords on the cells: of the state, summed over
+        its Taylor coefficients, and of the support function."""
         width, states = stop - start, self._compute_states(start, pieces)
         total = self.lifted.deviation(self._rows, start, width, pieces, states, self._inputs[pieces])
         return np.asarray(total if self.sigma is None else total + self.sigma.deviation(start, width))
@@ -357,9 +360,12 @@ def _restrict_to_faces(space: TaylorSpace, coefficients: Array, ends: Array) -> 
 def _merge_ends(
     start: Array, stop: Array, pieces: np.ndarray, breakpoints: Array
 ) -> tuple[tuple[Array, np.ndarray], np.ndarray]:
-    """The ends of the cells with the piece that each is looked at from, the same ones once where cells share a piece or
-    follow one another, and where each of ``start`` and then ``stop`` is among them. The end of a piece is where the
-    next one begins."""
+    """Return the ends of the cells with the piece from which each is computed, and the index of each of ``start`` and
+    then ``stop`` among them.
+
+    Equal ends are merged where cells follow one another, or everywhere for many cells that share pieces. The end of a
+    piece belongs to the next one.
+    """
     count, ended = start.size, pieces + (stop == breakpoints[pieces + 1])
     if count <= FEW_CELLS or (pieces[1:] > pieces[:-1]).all():
         is_shared = np.append((stop[:-1] == start[1:]) & (ended[:-1] == pieces[1:]), False)
@@ -375,11 +381,11 @@ def _merge_ends(
 def enclose(
     lower: Array, upper: Array, touched: np.ndarray, nu: int, cell_over: Callable[[Array, Array], Bounded]
 ) -> Enclosure:
-    """Bounds on cells ``(k, 1 + nu + b)`` of times, ``nu`` parameters and directions; those of one box ``(low, high)``
-    share its ``cell_over``.
+    """Return upper bounds on cells ``(k, 1 + nu + b)`` of times, ``nu`` parameters and ``b`` coordinates of directions;
+    cells with one box ``(low, high)`` of the latter two share its ``cell_over``.
 
-    Cells that are not ``touched (k,)`` are closed. A cell without an enclosure is halved; raises `NotEnclosable` when a
-    tiny one has none either.
+    Cells that are not ``touched (k,)`` are closed: their bound is ``-inf``. A cell without an enclosure has the bound
+    ``inf`` and is to be halved. Raises `NotEnclosable` where a tiny one in its middle has none either.
     """
     bounds, split = np.full(lower.shape[0], -np.inf), np.zeros(lower.shape[0], dtype=int)
     if lower.shape[1] == 1:

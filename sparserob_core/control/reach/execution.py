@@ -120,7 +120,7 @@ class Execution:
         """Return the largest contribution of errors to ``c'x(t)`` for a command of size 1, on every piece of every
         channel.
 
-        The result ``(k, m K)`` is ordered channel by channel.
+        The result ``(k, m K)`` is ordered channel by channel. It is not enclosed.
         """
         ages = np.clip(times[:, None] - self.breakpoints, 0.0, None)
         contributions = np.zeros((times.size, self.shares.size, self.breakpoints.size - 1))
@@ -133,7 +133,7 @@ class Execution:
         self, control: Float[Array, "m K"], times: Float[Array, " k"], directions: Float[Array, "k d"]
     ) -> Float[Array, " k"]:
         """Return the largest contribution ``(k,)`` of errors of a command to ``c'x(t)``, at ``times (k,)`` in
-        ``directions (k, d)``."""
+        ``directions (k, d)``; `enclosed` has its bounds."""
         pieces, jumps = self.jumps(control)
         if not pieces.size:
             return np.zeros(times.size)
@@ -160,8 +160,11 @@ class Execution:
         return pieces, jumps[:, pieces]
 
     def _integrate_responses(self, ages: Array, directions: Array) -> list[Array]:
-        """``int_0^age |c'e^{A s} B_j| ds`` for ages ``(k, q)`` of directions ``(k, d)``, of every channel; of ages that
-        are alike once."""
+        """Return ``int_0^age |c'e^{A s} B_j| ds`` for ages ``(k, q)`` of directions ``(k, d)``, an array ``(k, q)`` for
+        every channel.
+
+        Ages that differ by less than the share `ALIKE` of the horizon are computed once.
+        """
         tolerance = ALIKE * float(self.breakpoints[-1])
         c, owner = unique_rows(directions)
         keys = np.stack([np.repeat(owner.reshape(-1), ages.shape[1]), np.rint(ages.ravel() / tolerance)])

@@ -55,8 +55,9 @@ class Parts:
 
     ``free`` is the contribution of the centre of the initial states and of inputs that are not decided. ``sigma`` is
     the support value of the worst disturbance and the worst initial state together, and ``begun`` the part of it that
-    comes from the initial state. ``disturbance (mw, L)`` is a worst disturbance on the pieces of the merged grid, and
-    ``deviation (d,)`` a worst deviation from the centre; each is ``None`` where there is none.
+    comes from the initial state. ``disturbance (mw, L)`` is a worst one of the disturbances that are constant on the
+    pieces of the merged grid. ``deviation (d,)`` is a worst deviation from the centre. Each is ``None`` where there is
+    none.
     """
 
     free: float
@@ -142,8 +143,8 @@ class WorstCase:
         )
 
     def nominal(self) -> WorstCase:
-        """The functionals of the system at an interior point of its parameters, from the centre of the initial states,
-        under one admissible disturbance: none, where it may be."""
+        """Return the functionals of the system at an interior point of its parameters, from the centre of the initial
+        states, under one admissible disturbance: 0 where it is admissible."""
         return self._nominal_case
 
     @cached_property
@@ -187,7 +188,10 @@ class WorstCase:
     def rows(
         self, times: Float[Array, " k"], directions: Float[Array, "k d"], parameters: Float[Array, "k nu"]
     ) -> tuple[Float[Array, "k n"], Float[Array, " k"]]:
-        """``G (k, n)`` and ``offset (k,)`` with ``max_w c'x(t) = G theta + offset``."""
+        """Return ``G (k, n)`` and ``offset (k,)`` with ``max_w c'x(t) = G theta + offset`` for a decision ``theta``.
+
+        Where there are errors of execution, the worst of them are included.
+        """
         return self._build_rows(
             times,
             directions,
@@ -204,9 +208,12 @@ class WorstCase:
         disturbances: Float[Array, "k mw L"] | None,
         deviations: Float[Array, "k d"] | None = None,
     ) -> tuple[Float[Array, "k n"], Float[Array, " k"]]:
-        """``G (k, n)`` and ``offset (k,)`` with ``c'x(t) = G theta + offset`` under given disturbances ``(k, mw, L)``
-        on the grid's pieces, from given ``deviations (k, d)`` of the initial state; the worst one of every index where
-        none are given."""
+        """Return ``G (k, n)`` and ``offset (k,)`` with ``c'x(t) = G theta + offset`` under given disturbances.
+
+        ``disturbances (k, mw, L)`` are given on the grid's pieces; ``None`` stands for no disturbance. ``deviations
+        (k, d)`` of the initial state may be given; otherwise those are the worst ones of every index. Errors of
+        execution are the worst ones.
+        """
 
         def pushed(part: slice, known: Weights) -> Array:
             free = known.free
@@ -282,10 +289,14 @@ class WorstCase:
         return result
 
     def turning(self, theta: Array, times: Array, parameters: Array) -> Callable[[Array, np.ndarray], Array]:
-        """``max_w c'x(t)`` at a decision as a function of the direction alone, at ``times (k,)`` and ``parameters (k,
-        nu)``: of directions ``(j, d)`` and the places ``(j,)`` that they are at, as many at each, ``(j,)``. Weights are
-        linear in the direction, so that those of the axes are computed once. What measurable disturbances and errors of
-        execution add is not, and is only about right: of errors it is what those do that are constant on pieces."""
+        """Return ``max_w c'x(t)`` at a decision as a function of the direction alone, at ``times (k,)`` and
+        ``parameters (k, nu)``.
+
+        The function takes directions ``(j, d)`` and the indices ``(j,)`` of their times, in groups of equal size, and
+        returns values ``(j,)``. Weights are linear in the direction, so those of the axes are computed once. The
+        contributions of measurable disturbances and of errors of execution are approximations: of the errors only those
+        that are constant on pieces count.
+        """
         weights, model, control = self._weigh_axes(times, parameters), self.disturbance, self.on_grid(theta)
         states = weights.free @ self.response.initial_state + np.einsum("kdlm,ml->kd", weights.control, control)
         by_block, measurable = None if model is None else model.on_blocks, self.measurable
@@ -325,8 +336,8 @@ class WorstCase:
     def profile(
         self, times: Float[Array, " k"], directions: Float[Array, "r d"], parameter: Float[Array, " nu"]
     ) -> Float[Array, "k r"]:
-        """``sigma (k, r)`` at one parameter, for all ``times (k,)`` and ``directions (r, d)``; by the age of the pieces
-        where the grid allows."""
+        """Return ``sigma (k, r)`` at one parameter, for all ``times (k,)`` and ``directions (r, d)``; by the age of the
+        pieces where the grid allows."""
         model, (k, r) = self.disturbance, (times.size, directions.shape[0])
         changes = self.response.grid.mode is not None
         by_block, measurable = None if model is None else model.on_blocks, self.measurable
@@ -476,7 +487,10 @@ class WorstCase:
     def worst_disturbance(
         self, time: float, direction: Float[Array, " d"], parameter: Float[Array, " nu"]
     ) -> Float[Array, "mw L"] | None:
-        """A disturbance ``(mw, L)`` on the pieces of the merged grid that attains the worst case at one index."""
+        """Return a disturbance ``(mw, L)`` on the pieces of the merged grid that is the worst one at one index.
+
+        Of measurable disturbances it is the worst one of those that are constant on pieces.
+        """
         return self.parts(time, direction, parameter).disturbance
 
     @shaped
@@ -578,7 +592,7 @@ class WorstCase:
         if there is any."""
         propagator, initial_state = self.response.propagator, self.response.initial_state
         assert propagator.laws is not None
-        part_index = propagator.laws.holding(low, high)  # of which units are
+        part_index = propagator.laws.holding(low, high)  # growth is in the units of a part
         around = [
             growth
             for own, a, b, growth in self._growth_bounds
@@ -608,7 +622,8 @@ class WorstCase:
             return max(self._bound_growth(low, ends[1], halvings - 1), self._bound_growth(ends[0], high, halvings - 1))
 
     def beyond(self, far: Array) -> Array:
-        """Return bounds ``(d,)`` of the truncation error of any state, from the series of the law in the parameters.
+        """Return bounds ``(d,)`` of the truncation error of the state at any time and parameter, from the series of the
+        law in the parameters.
 
         ``far (m,)`` bounds the absolute value of the control. The error is 0 where the entries of the law are
         polynomials.
@@ -635,7 +650,7 @@ class WorstCase:
             disturbance_sizes = model.bound.reach(np.eye(model.channels))
         input_sizes = np.abs(self.known).max(axis=1)
         delivered = np.maximum(far, input_sizes[: far.size])
-        if self.execution is not None:  # of what is missed as much is left out as of what is commanded
+        if self.execution is not None:  # the series truncates the effect of errors as that of commands
             delivered = (1.0 + self.execution.shares) * delivered
         return initial_sizes, np.concatenate([delivered, input_sizes[far.size :], disturbance_sizes])
 

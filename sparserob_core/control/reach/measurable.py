@@ -118,7 +118,10 @@ class MeasurableSupport:
     def __call__(
         self, times: Float[Array, " k"], directions: Float[Array, "k d"], parameters: Float[Array, "k nu"]
     ) -> Float[Array, " k"]:
-        """``sigma (k,)`` at ``times (k,)``, ``directions (k, d)``, ``parameters (k, nu)``."""
+        """Return ``sigma (k,)`` at ``times (k,)``, ``directions (k, d)``, ``parameters (k, nu)``, to its quadrature.
+
+        The value is the middle of the bounds where these are close (`is_enclosed`), and a quadrature otherwise.
+        """
         unique, parameter_indices = np.unique(parameters, axis=0, return_inverse=True)
         result = np.empty(times.size)
         for position, parameter in enumerate(unique):
@@ -182,7 +185,7 @@ class MeasurableSupport:
         return [over_directions(lambda functionals: MeasurableCellSupport(self, functionals, leg), rows, leg, joined)]
 
     def integrated_sizes(self, times: Array, directions: Array, parameters: Array) -> Array:
-        """Return the sum ``(k,)`` of the integrals of absolute values that are added up at each index: 0 for this
+        """Return the sum ``(k,)`` of the integrals of absolute values that enter ``sigma`` at each time: 0 for this
         class."""
         return np.zeros(times.size)
 
@@ -196,7 +199,8 @@ class MeasurableSupport:
     def enclosed(
         self, times: Float[Array, " k"], directions: Float[Array, "k d"], leg: int | None = None
     ) -> Float[Array, "k 2"]:
-        """Return lower and upper bounds ``(k, 2)`` of ``sigma`` of a known system.
+        """Return lower and upper bounds ``(k, 2)`` of ``sigma`` of a known system, which are close for the sets of
+        `is_enclosed`.
 
         With a phase ``leg`` of a switched system, ``times`` are counted from the beginning of that phase.
         """
@@ -388,7 +392,7 @@ class MeasurableSupport:
         -------
         Array, Array, Array
             Polynomials ``(k, n, ORDER + 1, mw)`` in the share of the interval that has passed; bounds ``(k, n)`` of the
-            error of the integral over the interval with them; and bounds ``(k,)`` of the integrand.
+            error of the integral over the interval with them; and bounds ``(k,)`` of the integrand of the polynomials.
         """
         balanced = self._balance_matrix(A)
         A, units, speed, E = balanced.A, balanced.units, balanced.speed, E / balanced.units[:, None]
@@ -420,9 +424,11 @@ class MeasurableSupport:
         lengths: Float[Array, " l"],
         member: Int[np.ndarray, " l"],
     ) -> Float[Array, " l"]:
-        """``int_0^length h(E' y(s)) ds`` from rows ``y(0) = starts (l, d)``: Gauss-Lobatto, halving what has not
-        converged (kinks). ``member (l,)``: of which functional each is part, whose largest integrand sets the
-        accuracy."""
+        """Return estimates ``(l,)`` of ``int_0^length h(E' y(s)) ds`` from rows ``y(0) = starts (l, d)``.
+
+        The quadrature is that of Gauss and Lobatto, which halves intervals that have not converged, as at kinks.
+        ``member (l,)`` is the index of the functional of each row, whose largest integrand sets the accuracy.
+        """
         total = np.zeros(lengths.size)
         fastest = min(float(np.linalg.norm(A, 2)), 4.0 * float(np.abs(np.linalg.eigvals(A)).max()))
         count = int(np.clip(np.ceil(fastest * lengths.max(initial=0.0)), 1, MOST_SHORT))
@@ -468,9 +474,9 @@ class MeasurableCellSupport(KnownCellSupport):
     """The support function of measurable disturbances on functionals ``rows (r, d)`` of a *known* system, in the form
     of `DisturbanceSupport`; ``lifted`` is that system, or a phase of a switched system.
 
-    ``sigma`` is an integral with a Lipschitz integrand, so its second derivative is bounded by that of the integrand's
-    argument. The effect of earlier phases is the support function of a set in which this phase begins. Its curvature
-    and its rounding are no more than those of a box around this set.
+    ``sigma`` is an integral with a Lipschitz integrand, so its second derivative is bounded by the slope of the
+    integrand's argument. The effect of earlier phases is the support function of a set in which this phase begins. The
+    bounds of its curvature and its rounding are those for a box around this set.
     """
 
     support: MeasurableSupport
@@ -481,7 +487,11 @@ class MeasurableCellSupport(KnownCellSupport):
     def at(
         self, times: Float[Array, " k"], ends: Float[Array, "k r 0"]
     ) -> tuple[Float[Array, "k r 1"], Float[Array, "k r"]]:
-        """Return support values ``(k, r, 1)`` and their error bounds ``(k, r)``; ``ends (k, r, 0)`` is empty."""
+        """Return support values ``(k, r, 1)`` and their errors ``(k, r)``; ``ends (k, r, 0)`` is empty.
+
+        The errors are bounds where the bounds of `MeasurableSupport.enclosed` are close. For other sets they are an
+        estimate of the error of the quadrature, the share `MISSED` of the value.
+        """
         pairs = self.repeated(times)
         if self.support.is_enclosed:
             return self.between(self.support.enclosed(*pairs, leg=self.lifted.turn))
@@ -491,8 +501,11 @@ class MeasurableCellSupport(KnownCellSupport):
 
     @shaped
     def deviation(self, start: Float[Array, " k"], widths: Float[Array, " k"]) -> Float[Array, "k r"]:
-        """Bounds ``(k, r)`` of how far ``sigma`` is from its chord on ``[start, start + width]``: by the slope of
-        ``h(E' e^{A' s} c)``, or by twice its integral, mode by mode."""
+        """Return bounds ``(k, r)`` of the height of ``sigma`` above its chord on ``[start, start + width]``.
+
+        They are the smaller of two: from the slope of ``h(E' e^{A' s} c)`` in ``s``, and mode by mode from that slope
+        or twice the integral of ``h``.
+        """
         bound, lifted, comparison = self.support.bound, self.lifted, self.lifted.comparison
         rows, W = self.rows @ lifted.transform, lifted.W[0]
         slopes = lifted.flown(np.broadcast_to(rows, (start.size, *rows.shape)), start)[0] @ lifted.A[0]  # (k, r, d)

@@ -35,7 +35,7 @@ class Support(Protocol):
         """Taylor coefficients ``(k, r, M)`` and excess ``(k, r)``."""
 
     def deviation(self, start: Array, widths: Array) -> Array:
-        """Return bounds ``(k, r)`` of the distance of the support function from its chord on cells of time
+        """Return bounds ``(k, r)`` of the height of the support function above its chord on cells of time
         ``[start, start + width]``."""
 
     @property
@@ -79,8 +79,8 @@ class Supports:
 
 @dataclass(frozen=True, eq=False)
 class InitialSupport:
-    """The support function ``h(e^{A't} c)`` of a set of deviations from the initial state, for functionals
-    ``rows (r, d)`` (in the lifted system's coordinates) over one cell.
+    """Support function ``h(e^{A't} c)`` of a set of deviations from the initial state, for functionals ``rows (r, d)``
+    (in the lifted system's coordinates) over one cell.
 
     The deviation is one block that acts at time 0 and never again: the bounds of `DisturbanceSupport` for a block that
     has ended hold for it.
@@ -102,16 +102,16 @@ class InitialSupport:
         return over_faces(
             self._space,
             ends,
-            lambda index, face: summed(
-                self.set, self._apply_combination(self.blocks(times[index]))[:, :, :, None], face
+            lambda selection, face: summed(
+                self.set, self._apply_combination(self.blocks(times[selection]))[:, :, :, None], face
             )[:, :, 0],
         )
 
     def deviation(self, start: Array, widths: Array) -> Array:
-        """Return bounds ``(k, r)`` of the distance of the support function from its chord on
+        """Return bounds ``(k, r)`` of the height of the support function above its chord on
         ``[start, start + width]``.
 
-        Each interval is inside one piece. The distances are summed over the Taylor coefficients, as in
+        Each interval is inside one piece. Distances are summed over the Taylor coefficients, as in
         `DisturbanceSupport.deviation`.
         """
         lifted, grid = self.lifted, self.lifted.grid
@@ -220,7 +220,7 @@ class InitialSupport:
 
     @cached_property
     def _norm_bounds(self) -> Array:
-        """Norms of every block of the coordinates of any deviation, at most, ``(q,)``."""
+        """Norm bounds ``(q,)`` of every block of the coordinates of any deviation, at the beginning of this phase."""
         if self._earlier_effect is not None:
             return self._earlier_effect.reached
         radii = self.set.reach(np.eye(self.set.dimension))
@@ -338,7 +338,7 @@ class DirectionsCellSupport:
 
     @cached_property
     def neglected(self) -> Array:
-        """`Support.neglected` of every row, with what rounding makes of the corners, ``(r, L)``."""
+        """Bounds ``(r, L)`` of `Support.neglected` of every row, with the rounding of the corners."""
         sizes = block_norms(np.abs(self.rows) @ np.abs(self.leg.transform), self.leg.starts)
         return np.asarray(self._row_support.neglected + rounding(len(self.rows)) * product(sizes, self.reached.T))
 

@@ -165,7 +165,8 @@ class VaryingExecution(Execution):
         return self.added(np.zeros((self.shares.size, self.breakpoints.size - 1)), times, directions)
 
     def _integrate_unit_errors(self, times: Array, directions: Array) -> Array:
-        """Return the contribution of errors for size 1 of each entry of `acts`, ``(k, m, late + K)``."""
+        """Return the middle of the bounds of the contribution of errors for size 1 of each entry of `acts`,
+        ``(k, m, late + K)``."""
         wanted = np.ones((self.shares.size, self.late + self.breakpoints.size - 1), dtype=bool)
         return np.asarray(self._bound_integrals(times, directions, wanted).mean(axis=3))
 
@@ -173,7 +174,7 @@ class VaryingExecution(Execution):
     def added(
         self, control: Float[Array, "m K"], times: Float[Array, " k"], directions: Float[Array, "k d"]
     ) -> Float[Array, " k"]:
-        """`Execution.added`."""
+        """Return `Execution.added`: the middle of its bounds, without the error of the transitions."""
         return np.asarray(self._bound_contribution(control, times, directions).mean(axis=1))
 
     def sampled(self, control: Array, times: Array, directions: Array) -> Array:
@@ -205,7 +206,8 @@ class VaryingExecution(Execution):
         return np.asarray(bounds + rounding_errors[:, None] * [-1.0, 1.0])
 
     def _bound_contribution(self, control: Array, times: Array, directions: Array) -> Array:
-        """Return lower and upper bounds of the contribution of errors of a control, ``(k, 2)``."""
+        """Return lower and upper bounds of the contribution of errors of a control, ``(k, 2)``, without the error of
+        the transitions and the rounding of the sum."""
         size = self.acts(control)
         bounds: Array = self._bound_integrals(times, directions, np.asarray(size > 0.0))
         return np.asarray(np.einsum("kjpe,jp->ke", bounds, size))
@@ -213,7 +215,7 @@ class VaryingExecution(Execution):
     def _bound_integrals(self, times: Array, directions: Array, wanted: np.ndarray) -> Array:
         """Return bounds of ``share_j int |c'Phi(t, s) B_j(s)| ds`` for each entry of `acts`, ``(k, m, late + K, 2)``.
 
-        Entries that are not ``wanted (m, late + K)`` have 0.
+        The transitions are those that are computed. Entries that are not ``wanted (m, late + K)`` have 0.
         """
         contributions = np.zeros((times.size, *wanted.shape, 2))
         is_active = np.logical_and(wanted, self.shares[:, None] > 0.0)
@@ -347,7 +349,7 @@ class UncertainExecution(Execution):
         )
 
     def seen(self, directions: Array, parameters: Array) -> Array:
-        """Return directions with the parameters as further columns, ``(k, d + nu)``."""
+        """Return directions ``(k, d)`` with the parameters ``(k, nu)`` as further columns, ``(k, d + nu)``."""
         return np.hstack([directions, parameters])
 
     def at(self, parameter: Array) -> VaryingExecution:
@@ -586,7 +588,8 @@ class SpreadExecutionSupport:
 
     @shaped
     def deviation(self, start: Float[Array, " k"], widths: Float[Array, " k"]) -> Float[Array, "k r"]:
-        """`VaryingExecutionCellSupport.deviation`, by the largest numbers on every piece."""
+        """Return `VaryingExecutionCellSupport.deviation`, from bounds for whole pieces, summed over the coefficients on
+        the cell."""
         row_curvature = self._curvature_bounds[self._locate_pieces(start)] @ self.motion.sizes(np.abs(self.rows)).T
         return np.asarray((widths**2 / 8)[:, None] * row_curvature * OUTWARD)
 
@@ -602,12 +605,13 @@ class SpreadExecutionSupport:
 
     @cached_property
     def reached(self) -> Array:
-        """`Support.reached`, with what rounding there is more of them."""
+        """Bounds ``(K, d)`` of `Support.reached`, times ``1 + M``, as the sums over ``M`` coefficients round more."""
         return np.asarray((1.0 + self.motion.space.size) * self.motion.folded(self.every.reached))
 
     @cached_property
     def _curvature_bounds(self) -> Array:
-        """The second derivative in time of every coefficient, at most, on every piece, ``(K, states)``."""
+        """Bounds ``(K, states)`` of the second derivative in time of the effect of the errors on every coefficient, on
+        every piece."""
         support, d = self.every, self.every.motion.states
         second = support.motion.second
         input_matrix = second[:, :, d + support.execution.columns]

@@ -44,7 +44,8 @@ class VaryingMeasurable:
     def __call__(
         self, times: Float[Array, " k"], directions: Float[Array, "k d"], parameters: Float[Array, "k nu"]
     ) -> Float[Array, " k"]:
-        """``sigma (k,)`` at ``times (k,)``, ``directions (k, d)``, ``parameters (k, nu)``."""
+        """Return ``sigma (k,)`` at ``times (k,)``, ``directions (k, d)``, ``parameters (k, nu)``; it is not
+        enclosed."""
         error_directions = self.errors.seen(directions, parameters)
         values = np.array(self.errors.sampled(self.command, times, error_directions))
         resting = self.resting
@@ -113,7 +114,7 @@ class VaryingMeasurable:
         return supports
 
     def integrated_sizes(self, times: Array, directions: Array, parameters: Array) -> Array:
-        """Return the sum ``(k,)`` of the integrals of absolute values that are added up at each index."""
+        """Return the sum ``(k,)`` of the integrals of absolute values that enter ``sigma`` at each time."""
         error_directions = self.errors.seen(directions, parameters)
         return np.asarray(self.errors.around.lengths(times, error_directions).sum(axis=1))
 

@@ -42,12 +42,13 @@ OUTWARD = 1.0 + 1e-12  # for sums of some thousand numbers that are not negative
 AT_ONCE = 4_000_000  # numbers of weights that are made at once
 TINY = float(np.finfo(float).tiny)
 TERMS = 40  # of the exponential of norms on a piece, which are at most a few: 4^40 / 40! is 1e-24
-REST = 1e-20  # of the norms, more than what is beyond these terms
+REST = 1e-20  # added to each entry, more than the sum of the terms beyond these
 RATIOS = (1.0, 2.0, 4.0, 8.0, 16.0)
-"""What a degree more counts in the norms that transitions are off by: with the first alone each coefficient of a high
-degree is off by what the constant one is, and what is beyond never falls below rounding times the growth."""
+"""Weights of one further degree in the norms in which the errors of transitions are bounded. With the first alone the
+error bound of a coefficient of high degree would be that of the constant one. Then the truncation error could never
+fall below rounding times the growth."""
 PATHS_KEPT = 4  # controls whose states are remembered
-WAYS_KEPT = 4  # times of which the way there is: those of cells, and where they begin, of two constraints
+WAYS_KEPT = 4  # sets of times whose flows are remembered: those of cells, and of their beginnings, of two constraints
 STRETCHES = 256  # of pieces, whose carries count at their largest; a tenth mixes parts of an orbit, ten times are 1 GB
 
 
@@ -103,7 +104,7 @@ class VaryingMotion:
 
     @cached_property
     def norm(self) -> float:
-        """The largest norm of ``A``, in its own units."""
+        """The largest bound of the norm of ``A`` on a piece, in own units."""
         return float(self.paces.max())
 
     @property
@@ -225,8 +226,8 @@ class VaryingMotion:
         return np.asarray(product(rows, error_bounds.T) + product(others, sizes.T))
 
     def under(self, control: Array) -> tuple[Array, Array]:
-        """Return bounds of the error of the states under a control on every piece, and bounds of the states, ``(K, d)``
-        each.
+        """Return bounds of the error of the states under a control on every piece, as `left_out` counts it, and bounds
+        of the states, ``(K, d)`` each.
 
         The result is remembered, since it is the same for all rows.
         """
@@ -264,14 +265,14 @@ class VaryingMotion:
         Array
             Bounds ``(K, d)``.
         """
-        step_errors, lengths, d = (
+        state_errors, lengths, d = (
             self._propagate_step_errors(sizes, pushed.sum(axis=2)),
             self.grid.lengths[:, None],
             self.states,
         )
-        second = np.einsum("kij,kj->ki", self.second[:, :, :d], step_errors)
-        third = np.einsum("kij,kj->ki", self.third[:, :, :d], self.grown(self.every, lengths[:, 0], step_errors))
-        return np.asarray((2.0 * step_errors + lengths**2 / 8 * (second + lengths * third)) * OUTWARD)
+        second = np.einsum("kij,kj->ki", self.second[:, :, :d], state_errors)
+        third = np.einsum("kij,kj->ki", self.third[:, :, :d], self.grown(self.every, lengths[:, 0], state_errors))
+        return np.asarray((2.0 * state_errors + lengths**2 / 8 * (second + lengths * third)) * OUTWARD)
 
     def _propagate_step_errors(self, sizes: Array, pushed: Array) -> Array:
         """Return bounds ``(K, d)`` of the propagated error of all steps, on every piece.
@@ -414,7 +415,7 @@ class VaryingMotion:
         """Bounds on every segment of the expansion, entry by entry.
 
         Of ``[A F]``, and of the matrices that give the second and the third derivative of a solution from the state and
-        its inputs, ``(s, d, d + m + mw)`` each; and the norm of ``A`` in own units, ``(s,)``.
+        its inputs, ``(s, d, d + m + mw)`` each; and a bound ``(s,)`` of the norm of ``A`` in own units.
         """
         expansion, d, sizes = self.expansion, self.states, np.abs(self.expansion.coefficients)
         radius, orders = (np.diff(expansion.ends) / 2)[:, None, None], np.arange(float(sizes.shape[1]))
@@ -430,7 +431,7 @@ class VaryingMotion:
 
     @cached_property
     def most(self) -> Array:
-        """The largest absolute values of ``[A F]`` on every piece, ``(K, d, d + m + mw)``."""
+        """Bounds ``(K, d, d + m + mw)`` of the absolute values of ``[A F]`` on every piece."""
         return np.asarray(self._segment_bounds[0][self._segments])
 
     @cached_property
@@ -447,7 +448,7 @@ class VaryingMotion:
 
     @cached_property
     def paces(self) -> Array:
-        """The norm of ``A`` in own units on every piece, ``(K,)``."""
+        """Bounds ``(K,)`` of the norm of ``A`` in own units on every piece."""
         return np.asarray(self._segment_bounds[3][self._segments])
 
     @cached_property
@@ -520,7 +521,9 @@ class VaryingSupport:
     def at(self, times: Array, ends: Array) -> tuple[Array, Array]:
         """`Support.at`."""
         return over_faces(
-            self._space, ends, lambda index, face: summed(self.set, self._weigh_blocks(times[index]), face).sum(axis=2)
+            self._space,
+            ends,
+            lambda selection, face: summed(self.set, self._weigh_blocks(times[selection]), face).sum(axis=2),
         )
 
     def deviation(self, start: Array, widths: Array) -> Array:
@@ -615,8 +618,8 @@ class Truncation:
         return self.motion.expansion.units[: self.spread.d]
 
     def norms(self, sizes: Array) -> Array:
-        """The summed norms of the coefficients of every degree, ``(..., D + 1)``, of states that are at most ``sizes
-        (..., states)``."""
+        """Return bounds ``(..., D + 1)`` of the summed norms of the coefficients of every degree, from bounds
+        ``sizes (..., states)`` of all coefficients."""
         space = self.spread.space
         coefficient_norms = (sizes.reshape(*sizes.shape[:-1], space.size, self.spread.d) / self.units).max(axis=-1)
         return np.stack(
@@ -624,15 +627,15 @@ class Truncation:
         )
 
     def driven(self, inputs: Array) -> Array:
-        """The rates at which inputs that are at most ``inputs (K, m + mw)`` drive the coefficients of every degree,
-        ``(K, D + 1)``."""
+        """Return bounds ``(K, D + 1)`` of the rates at which inputs of at most ``inputs (K, m + mw)`` drive the
+        coefficients of every degree."""
         d = self.motion.states
         rates = np.einsum("kin,kn->ki", self.motion.most[:, :, d:], inputs)
         return self.norms(rates)
 
     @cached_property
     def _coefficient_norms(self) -> Array:
-        """The norms of the coefficients of ``A`` on every piece, ``(K, M)``."""
+        """Bounds ``(K, M)`` of the norms of the coefficients of ``A`` on every piece."""
         d, space = self.spread.d, self.spread.space
         first = self.motion.most[:, :, :d].reshape(-1, space.size, d, d) / self.units[:, None] * self.units
         return np.asarray(first.sum(axis=3).max(axis=2))
@@ -653,7 +656,7 @@ class Truncation:
 
     @cached_property
     def _degree_norms(self) -> Array:
-        """The norms of the coefficients of ``A`` of every degree on every piece, ``(K, D + 1)``."""
+        """Bounds ``(K, D + 1)`` of the summed norms of the coefficients of ``A`` of every degree on every piece."""
         space, norms = self.spread.space, self._coefficient_norms
         return np.stack([norms[:, space.degrees == j].sum(axis=1) for j in range(space.degree + 1)], axis=1)
 
@@ -687,15 +690,15 @@ class Truncation:
     def _truncation_factors(self) -> Array:
         """Factors ``(K, D + 1)`` of the coefficients of every degree in the products beyond the degree ``D``, with the
         remainder of ``A``."""
-        sums = np.cumsum(self._degree_norms[:, ::-1], axis=1)  # of the degrees D, D and D - 1, ...: for j = 0, 1, ...
+        sums = np.cumsum(self._degree_norms[:, ::-1], axis=1)  # of the degrees D, D and D - 1, ...: for j = 1, 2, ...
         above = np.concatenate([np.zeros((sums.shape[0], 1)), sums[:, :-1]], axis=1)
         return np.asarray((above + self._law_remainders[0][:, None]) * OUTWARD)
 
     def _integrate_truncation(self, begun: Array, driven: Array, off: Array) -> Array:
-        """Return the integral of the terms beyond the degree over every piece, ``(K,)``.
+        """Return bounds ``(K,)`` of the integral of the terms beyond the degree over every piece.
 
-        ``begun (K, D + 1)`` are the norms of the states at the beginning of the piece, ``driven (K, D + 1)`` the rates
-        of their inputs, and ``off (K,)`` the rate from the remainder of the entries.
+        ``begun (K, D + 1)`` bounds the norms of the states at the beginning of the piece, ``driven (K, D + 1)`` the
+        rates of their inputs, and ``off (K,)`` the rate from the remainder of the entries ``[B E]``.
         """
         lengths = self.motion.grid.lengths[:, None]
         state_norms = np.einsum("kij,kj->ki", self._growth_bounds, begun + lengths * driven)
@@ -703,9 +706,10 @@ class Truncation:
 
     @cached_property
     def _transition_norms(self) -> Array:
-        """Norms ``(K + 1, D + 1)`` of the coefficients of every degree of the transitions from any mark to each one.
+        """Bounds ``(K + 1, D + 1)`` of the norms of the coefficients of every degree of the transitions from any mark
+        to each one.
 
-        The norms are those of the computed effect of the constant coefficient on all coefficients, plus the error of
+        The bounds are those of the computed effect of the constant coefficient on all coefficients, plus the error of
         the steps, propagated as in `VaryingMotion.carries`. The error is bounded in each of several norms, in which a
         degree ``j`` counts ``ratio^j``, so that the error of that degree is the bound divided by ``ratio^j``.
         """
@@ -862,7 +866,8 @@ class SpreadMotion:
         return np.asarray(bounds.reshape(start.size, len(rows), -1).sum(axis=2) * OUTWARD)
 
     def along(self, control: Array, rows: Array, others: Array) -> Array:
-        """`Motion.along`; what coefficients are multiplied by and added up is rounded too."""
+        """Return the bounds of `Motion.along`, with the truncation error and the rounding of the sums over
+        coefficients."""
         bounds = self.motion.along(control, self.sizes(rows), (1.0 + self.space.size) * self.sizes(others))
         return np.asarray(bounds + rows @ self.truncation.under(control).T * OUTWARD)
 
@@ -924,7 +929,7 @@ class SpreadSupport:
         return over_faces(
             self._space,
             ends,
-            lambda index, face: summed(self.every.set, self._weigh_blocks(times)[index], face).sum(axis=2),
+            lambda selection, face: summed(self.every.set, self._weigh_blocks(times)[selection], face).sum(axis=2),
         )
 
     def deviation(self, start: Array, widths: Array) -> Array:
@@ -949,7 +954,7 @@ class SpreadSupport:
 
     @cached_property
     def reached(self) -> Array:
-        """`Support.reached`, with what rounding there is more of them."""
+        """Bounds ``(K, d)`` of `Support.reached`, times ``1 + M``, as the sums over ``M`` coefficients round more."""
         return (1.0 + self.motion.space.size) * self.motion.folded(self.every.reached)
 
     @property

@@ -1,9 +1,9 @@
 """Admissible disturbances, and the largest effect of any of them on the state.
 
-Every class is a product of copies of one convex set ``D``, one copy per *block*. The state is linear in the blocks, so
-the worst disturbance at a given index is found block by block: ``sigma = sum_b h_D(y_b)`` with ``h_D`` the support
-function of ``D`` (Rockafellar 1970, Corollary 16.4.1). It does not depend on the control: the disturbance is eliminated
-exactly.
+Every class but the measurable one is a product of copies of one convex set ``D``, one copy per *block*. The state is
+linear in the blocks, so the worst disturbance at a given index is found block by block: ``sigma = sum_b h_D(y_b)`` with
+``h_D`` the support function of ``D`` (Rockafellar 1970, Corollary 16.4.1). It does not depend on the control: the
+disturbance is eliminated exactly.
 """
 
 from __future__ import annotations
@@ -138,7 +138,8 @@ class DisturbanceModel:
 
     @shaped
     def worst(self, weights: Float[Array, "*k L mw"]) -> Float[Array, "*k mw L"]:
-        """Return a disturbance ``(..., mw, L)`` on the grid's pieces that attains `support`."""
+        """Return a disturbance ``(..., mw, L)`` on the grid's pieces that attains `support`, of those that are constant
+        on the blocks."""
         return self.signals(self.set.support_point(self.blocks(weights)))
 
     @property

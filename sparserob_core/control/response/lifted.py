@@ -1,10 +1,10 @@
 """Uncertain system over a cell of parameters, as one larger known system.
 
 With ``p = centre + radius delta`` and ``A(p) = sum_g A_g delta^g + remainder``, the Taylor coefficients of the state in
-``delta`` obey ``x_a' = sum_{g + b = a} A_g x_b + B_a u``: a known linear system of dimension ``d M``, propagated
-exactly. The truncation error at degree ``q``, and the rounding errors of the change to coordinates in which the modes
-are apart, obey the same equation with a small forcing. Both are bounded by Gronwall's inequality, mode by mode. A known
-system is the case ``M = 1`` without truncation.
+``delta`` obey ``x_a' = sum_{g + b = a} A_g x_b + B_a u``: a known linear system of dimension ``d M``, propagated by its
+exponentials. The truncation error, and the rounding errors of the change to coordinates in which the modes are apart,
+obey the same equation with a small forcing. Both are bounded by Gronwall's inequality, mode by mode. A known system is
+the case ``M = 1`` without truncation.
 """
 
 from __future__ import annotations
@@ -329,21 +329,21 @@ class LiftedSystem:
     def deviation(
         self, rows: Array, start: Array, width: Array, pieces: np.ndarray, states: Array, inputs: Array
     ) -> Array:
-        """Return bounds ``(k, r)`` of the distance of rows of the state from their chords, summed over the Taylor
-        coefficients.
+        """Return bounds ``(k, r)`` of the distance of ``rows (r, d)`` of the state from their chords, summed over the
+        Taylor coefficients (`Motion.deviation`).
 
-        The smaller of two bounds is taken, mode by mode: by the second derivative in time, or twice the distance that
-        the state can move (as in `DisturbanceSupport.deviation`).
+        They are the smaller of two: by the second derivative of the rows in time, and mode by mode by the second
+        derivative or by twice the distance that the mode can move (as in `DisturbanceSupport.deviation`).
         """
         slopes = states.reshape(start.size, -1) @ self.matrix.T + self._compute_forcing(inputs)
         curvature = (slopes @ self.matrix.T).reshape(states.shape)
-        along = np.abs(np.einsum("ri,kai->kra", rows, curvature)).sum(axis=2)
+        row_curvature = np.abs(np.einsum("ri,kai->kra", rows, curvature)).sum(axis=2)
         slope_norms, curvature_norms = (
             block_norms(derivative.reshape(states.shape), self.starts).sum(axis=1) for derivative in (slopes, curvature)
         )
         reach = self.comparison.over(width, cells=True)
         square, norms = (width**2 / 8)[:, None], block_norms(rows, self.starts)
-        exact = square * (along + product(norms, reach.departure.on(curvature_norms).T).T)
+        exact = square * (row_curvature + product(norms, reach.departure.on(curvature_norms).T).T)
         by_mode = np.minimum(square * reach.peak.on(curvature_norms), 2.0 * reach.integral.on(slope_norms))
         return np.asarray(np.minimum(exact, product(norms, by_mode.T).T))
 
@@ -407,14 +407,14 @@ class LiftedSystem:
         return left_out, np.maximum.reduceat(sizes[0].sum(axis=1), first, axis=0), bounds[0, -1]
 
     def _sum_jumps(self, control: Array, size: Array) -> Array:
-        """Return the sum of the jumps of the forcing of each block within each span, ``(S, q)``."""
+        """Return norm bounds ``(S, q)`` of the sum of the jumps of the forcing of each block within each span."""
         inputs = self.fine.inputs(control)
         jumps = np.abs(np.diff(inputs, axis=1, prepend=inputs[:, :1]))
         jumps[:, self.spans] = 0.0
         return block_norms((size @ np.add.reduceat(jumps, self.spans, axis=1)).T, self.starts)
 
     def _bound_initial_remainder(self, control: Array) -> Array:
-        """Return bounds of the remainder of the Taylor models at time 0, ``(q,)``."""
+        """Return norm bounds ``(q,)`` of the remainder of the Taylor models at time 0, the beginning of this phase."""
         if self.past is None:
             return self.slack_x
         before, final_sizes = self.past.lifted, np.abs(self.past.lifted.nodes(control)[-1]).sum(axis=0)
@@ -479,8 +479,8 @@ class LiftedSystem:
         return self._build_adjoint(TimeGrid(self.fine.breakpoints[ends], none, none, elapsed=self.fine.elapsed))
 
     def _bound_sizes(self, nodes: Array, driven: Array, rows: bool) -> Array:
-        """Return block norms ``(r, L', M, q)`` of Taylor coefficients ``(r, L'+1, M, d)``, the largest on every fine
-        piece.
+        """Return bounds ``(r, L', M, q)`` of the block norms of Taylor coefficients on every fine piece, from those at
+        its ends, ``nodes (r, L'+1, M, d)``.
 
         They are the least of three bounds: the values at the ends plus the distance from the chord between them; the
         value at the start plus the distance that it can move; the growth of the value at the start plus the effect of
@@ -532,8 +532,8 @@ class LiftedSystem:
         return {}
 
     def _bound_residual(self, sizes: Array, rows: bool) -> Array:
-        """Return the residual of the truncation on every fine piece, ``(r, L', q)``, from the ``sizes (r, L', M, q)``
-        of the coefficients."""
+        """Return bounds ``(r, L', q)`` of the residual of the truncation on every fine piece, from the ``sizes
+        (r, L', M, q)`` of the coefficients."""
         residual_norms = self.spilt(block_sizes(self.A, self.starts))
         return np.asarray(np.einsum("rlaj,aij->rli" if not rows else "rlai,aij->rlj", sizes, residual_norms))
 
@@ -642,7 +642,8 @@ class LiftedSystem:
         return self.comparison.slips(slack, lengths), majorant.slips(slack, lengths)
 
     def _bound_transition_rounding(self, lengths: Array) -> Array:
-        """Return the relative error of transitions over such ``lengths (S,)``, and of a product with them."""
+        """Return bounds ``(S,)`` of the rounding error of transitions over such ``lengths (S,)``, and of a product with
+        them, relative to the sizes."""
         if self.space.nu:
             relative, terms = flows_rounding(self.space, self.A, lengths), self.A.shape[1]
         else:  # beyond the groups there are zeros, whose products and sums are exact

@@ -113,8 +113,11 @@ class ParameterIndex:
         return normals[:, None], convex_set.support(normals)[:, None]
 
     def lattice(self) -> tuple[Array, tuple[int, ...]]:
-        """Return a tensor lattice ``(v, nu)`` over the box (ends and middle included), clamped onto the set, and its
-        shape."""
+        """Return a tensor lattice ``(v, nu)`` over the box, clamped onto the set, and its shape.
+
+        It includes the ends of the box, and its middle for up to 7 parameters. Beyond 12 parameters it is the lower
+        corner alone.
+        """
         if self.set is None:
             return np.zeros((1, 0)), ()
         per_axis = next(n for n in (9, 5, 3, 2, 1) if n**self.count <= (125 if n > 3 else LATTICE) or n == 1)

@@ -149,7 +149,7 @@ class TimeGrid:
     @shaped
     def distinct(self, durations: Float[Array, " k"]) -> tuple[Float[Array, " u"], Int[np.ndarray, " k"]]:
         """Return the distinct durations ``(u,)`` among ``(k,)``, and the index of each duration among them. Durations
-        that differ by rounding are one."""
+        are rounded to the share 1e-15 of the horizon first, so that those that differ by rounding are one."""
         horizon = self.breakpoints[-1]
         shares, indices = np.unique((durations / horizon).round(15), return_inverse=True)
         return shares * horizon, indices.reshape(-1)
@@ -208,8 +208,8 @@ def merge_grids(
 
 
 def _merge_breakpoints(points: Array, others: Array) -> Array:
-    """Return the union of two sets of breakpoints. Breakpoints of the second set that differ from one of the first by
-    rounding only are left out."""
+    """Return the union of two sets of breakpoints. A breakpoint of the second set that differs from one of the first by
+    rounding only is left out; of several next to the same one, only the first is."""
     after = np.clip(np.searchsorted(points, others), 1, points.size - 1)
     nearest = np.where(others - points[after - 1] <= points[after] - others, after - 1, after)
     is_near = np.abs(others - points[nearest]) <= SAME_TIME * float(points[-1])
@@ -334,8 +334,8 @@ class Stretches:
     @staticmethod
     def of(which: np.ndarray, inputs: Array, flows: Array) -> Stretches:
         """Return the stretches of pieces of the kinds ``which (L,)``, with the responses ``inputs (q, d, w)`` to inputs
-        on a piece and the transitions ``flows (q, d, d)`` of each kind. The longest stretches are those for which all
-        stretches together have at most `STRETCHED` numbers more than the pieces."""
+        on a piece and the transitions ``flows (q, d, d)`` of each kind. Stretches are doubled as long as the
+        transitions over several pieces have at most `STRETCHED` numbers more than those over one."""
         stretches, budget = Stretches([which], [inputs], [flows]), flows.size + STRETCHED
         while which.size > 1:
             pairs, which = np.unique(which[: which.size // 2 * 2].reshape(-1, 2), axis=0, return_inverse=True)
@@ -532,8 +532,8 @@ class Propagator:
 
     @property
     def slack(self) -> float:
-        """Relative truncation error `Expansion.slack` of a system that changes with time, the largest one of all parts;
-        0 for another system."""
+        """Measure `Expansion.slack` of the relative error for a system that changes with time, the largest one of all
+        parts; 0 for another system."""
         return max((expansion.slack for expansion in self.law.expansions), default=0.0) if self.system.varies else 0.0
 
     def _compute_varying_steps(self, parameters: Array) -> Steps:
@@ -1176,7 +1176,7 @@ def unique_rows(rows: Float[Array, "k n"]) -> tuple[Float[Array, "u n"], Int[np.
 def _find_distinct_rows(rows: Array) -> tuple[Array, np.ndarray]:
     """Return the distinct rows in the order of their first occurrence, and the index of every row among them."""
     index_of: dict[bytes, int] = {}
-    # of zeros one
+    # adding 0 turns -0 into 0
     indices = np.array([index_of.setdefault(row.tobytes(), len(index_of)) for row in rows + 0.0], dtype=int)
     if len(index_of) == len(rows):
         return rows, indices

@@ -1,8 +1,8 @@
 """A system together with its derivatives in the parameters, as one larger system.
 
 The rows ``r(s) = c'e^{A s}`` and their derivatives ``r_i = dr/dp_i`` obey ``r' = r A`` and
-``r_i' = r_i A + r dA/dp_i``: the rows ``(r, r_1, ..., r_nu)`` are those of one linear system, which is propagated
-exactly, as any other.
+``r_i' = r_i A + r dA/dp_i``: the rows ``(r, r_1, ..., r_nu)`` are those of one linear system, which is propagated by
+matrix exponentials, as any other.
 """
 
 from __future__ import annotations
@@ -61,8 +61,8 @@ def _augment_phase(phase: Phase) -> Phase:
 class Derivatives:
     """The matrices of a phase and their derivatives in the parameters, at one parameter at a time.
 
-    They are the first coefficients of Taylor models on a tiny cell, which is exact; where a function cannot be
-    evaluated on Taylor models, second-order differences within the bounding box of the parameters.
+    They are the first coefficients of Taylor models on a tiny cell, which are exact up to rounding. Where a function
+    cannot be evaluated on Taylor models, they are second-order differences within the bounding box of the parameters.
     """
 
     phase: Phase

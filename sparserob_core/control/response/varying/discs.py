@@ -38,7 +38,7 @@ LARGEST_POWER = 64
 SEARCHED = 4000  # parts of horizon and box that are looked through for a pole
 TINIEST = 2.0**-20  # of horizon and box, a part without an enclosure holds a pole
 OUTWARD = 1.0 + 1e-9
-_ROUNDING = 16.0 * EPSILON  # of a value, more than what a function of numpy is off by
+_ROUNDING = 16.0 * EPSILON  # of a value, above the rounding error of a function of numpy
 
 
 @final
@@ -203,7 +203,7 @@ class Discs:
 class Cauchy:
     """Entries of a system on discs over cells of time, between ``ends (s + 1,)``.
 
-    ``far (s, r, d, d + n)``: the largest distance of the entries of ``[A B c E]`` from a constant, for all `RADII`.
+    ``far (s, r, d, d + n)``: bounds of the distance of the entries of ``[A B c E]`` from a constant, for all `RADII`.
     ``sizes (d, d + n)``: estimates of their absolute values.
     """
 
@@ -276,8 +276,8 @@ class _Law:
         return middle, radius
 
     def over(self, starts: Array, stops: Array) -> tuple[Array, Array]:
-        """Return the absolute values of the entries in the middle, ``(s, d, d + n)``, and their largest distance from
-        there, ``(s, r, d, d + n)``, at all times of cells and on all `RADII`."""
+        """Return the absolute values of the entries in the middle, ``(s, d, d + n)``, and bounds ``(s, r, d, d + n)``
+        of their distance from there, at all times of cells and on all `RADII`."""
         centre, units = self.system.deviations
         middles = (starts + stops) / 2
         halves = np.maximum(stops - middles, middles - starts)
@@ -289,11 +289,11 @@ class _Law:
         return np.abs(middle).max(axis=1), radius
 
     def cells(self, cuts: Array, wanted: np.ndarray) -> Iterator[tuple[float, float, Array, Array]]:
-        """Yield cells of time between the ``cuts``, one after another, with the distance of the entries from a constant
-        there.
+        """Yield cells of time between the ``cuts``, one after another: both ends, bounds ``(r, d, d + n)`` of the
+        distance of the entries from a constant there, and their absolute values in the middle.
 
-        A cell is halved where the truncation errors of entries that are ``wanted (d, d + n)`` are much larger than at
-        its middle.
+        A cell is halved where the bounds of the truncation errors of entries that are ``wanted (d, d + n)`` are much
+        larger than at its middle.
         """
         starts, stops, accepted = cuts[:-1], cuts[1:], list[tuple[float, float, Array, Array]]()
         while starts.size:
@@ -357,8 +357,8 @@ class _Law:
 
 
 def _bound_remainder(far: Array, degree: int) -> Array:
-    """Return the bound of the terms beyond a degree by the best of the `RADII`, ``(s, d, d + n)``, from the largest
-    distances ``far (s, r, d, d + n)`` of the entries from a constant."""
+    """Return bounds ``(s, d, d + n)`` of the terms beyond a degree, by the best of the `RADII`, from bounds
+    ``far (s, r, d, d + n)`` of the distance of the entries from a constant."""
     with np.errstate(all="ignore"):
         bounds = far * (RADII ** -float(degree) / (RADII - 1.0))[:, None, None]
     return np.asarray(bounds.min(axis=1) * OUTWARD)

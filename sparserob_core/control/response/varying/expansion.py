@@ -214,7 +214,7 @@ class Expansion:
         self, starts: Float[Array, " k"], stops: Float[Array, " k"], powers: Float[Array, "v k1 M"]
     ) -> tuple[Float[Array, "v k d d"], Float[Array, "v k d n"]]:
         """Return the response over intervals to the state and to inputs, of a law that is a polynomial in its
-        parameters.
+        parameters, without bounds of its error.
 
         Parameters
         ----------
@@ -278,9 +278,9 @@ class Expansion:
         return np.flatnonzero(coefficients.any(axis=(0, 1, 3, 4)))
 
     def _bound_product_error(self, before: tuple[Array, ...], step: Array, off: Array) -> Array:
-        """Return error bounds of products ``P S``: ``P`` is a ``step (k, d, d)`` with the error ``off (k,)``, and ``S``
-        the response ``before``. The bound is ``off (|S| + error) + |P| error`` and rounding; for inputs it is relative
-        to the forcing."""
+        """Return error bounds ``(k,)`` of products ``P S``: ``P`` is a ``step (k, d, d)`` with the error ``off``, and
+        ``S`` the response ``before``. The bound is ``off (|S| + error) + |P| error`` and rounding; for inputs it is
+        relative to the forcing."""
         state, inputs, error, sizes = before
         forcing = np.where(sizes > 0.0, sizes, np.inf) * self.units[:, None]
         norm = np.maximum(
@@ -301,9 +301,11 @@ class Expansion:
 
     @shaped
     def at(self, times: Float[Array, " k"]) -> tuple[Float[Array, "k d own"], Float[Array, "k d n"]]:
-        """Return ``A`` and ``[B E]`` at times ``(k,)``, as an estimate of the velocity of the state; nothing is proven
-        by them. Where the states are coefficients of polynomials, only the columns of ``A`` that determine the others
-        are returned."""
+        """Return ``A`` and ``[B E]`` at times ``(k,)``, without their remainder; nothing is proven by them.
+
+        Where the states are coefficients of polynomials, only the columns of ``A`` that determine the others are
+        returned, ``own`` of them.
+        """
         segments, d = self.segment_of(times), self.own
         begin, end = self.ends[segments], self.ends[segments + 1]
         powers = ((2.0 * times - begin - end) / (end - begin))[:, None] ** np.arange(DEGREE + 1)
@@ -648,7 +650,8 @@ class Expansion:
         )
 
     def over_parts(self, entries: Array) -> Array:
-        """Return, for each state, the largest of the ``entries (..., d, n)`` over the states of its part."""
+        """Return ``(..., d, n)``: for each state, the largest of the ``entries (..., d, n)`` over the states of its
+        part."""
         if len(self.together) == 1:
             return np.broadcast_to(entries.max(axis=-2, keepdims=True), entries.shape)
         largest = np.empty(entries.shape)
@@ -663,8 +666,8 @@ class Expansion:
 
     @cached_property
     def slack(self) -> float:
-        """Sum of the errors of the flows over all segments, one after another: the relative error of the numbers that
-        are added up to a state at the end of the horizon."""
+        """Sum of the error bounds of the flows over all segments, each over its segment alone: a measure of the
+        relative error of the numbers that are added up to a state at the end of the horizon."""
         return float(self.flow(self.ends[:-1], self.ends[1:]).error.sum())
 
 
@@ -708,10 +711,10 @@ class Look:
         if norm > LONG and self.steadies:
             largest = (np.abs(coefficients).sum(axis=0) + remainder)[:, : units.size] / units[:, None] * units
             if (steady := steadied(largest, stop - start)) is not None:
-                scaled_error = _bound_segment_error(coefficients, remainder, units * steady, stop - start) * float(
-                    steady.max()
-                )
-                ratios, sharp = steady, scaled_error <= SHARPEST
+                scaled_remainder = _measure_scaled_remainder(
+                    coefficients, remainder, units * steady, stop - start
+                ) * float(steady.max())
+                ratios, sharp = steady, scaled_remainder <= SHARPEST
         return Segment(
             sharp, relative_remainder, "has a pole, or is too steep to be enclosed", (coefficients, remainder, ratios)
         )
@@ -797,8 +800,8 @@ def _find_coupled_states(A: Array) -> list[np.ndarray]:
 
 def _sum_forcing(pushes: Array, lost: Array) -> tuple[Array, Array]:
     """Return the sums over orders of ``pushes (k, p, d, n)``, and the numbers to divide by, which are infinite where
-    the sum is 0. The sums are at least so large that ``lost (k, d, n)`` is the share `BLUNTEST` of them, also where
-    they cancel."""
+    the sum is 0. The sums are at least so large that ``lost (k, d, n)`` is at most the share `BLUNTEST` of them, also
+    where ``pushes`` are 0."""
     inputs = np.maximum(pushes.sum(axis=1), lost / BLUNTEST)
     return inputs, np.where(inputs > 0.0, inputs, np.inf)
 
@@ -822,9 +825,9 @@ def steadied(A: Array, length: float) -> Array | None:
     return units if ((A * length) @ units <= 2.0 * SLOW * units).all() else None
 
 
-def _bound_segment_error(coefficients: Array, rest: Array, units: Array, length: float) -> float:
-    """Return the error of a segment of this length: of states in these ``units``, in the norm of largest row sums, and
-    of the forcing relative to its size."""
+def _measure_scaled_remainder(coefficients: Array, rest: Array, units: Array, length: float) -> float:
+    """Return the size of the remainder on a segment of this length: that of ``A`` times the length, in the norm of
+    largest row sums in these ``units``, or that of the inputs relative to the largest, if it is larger."""
     d = units.size
     state_error = float((rest[:, :d] * units / units[:, None]).sum(axis=1).max()) * length
     forcing, input_errors = (
@@ -852,7 +855,11 @@ def _measure_remainder(coefficients: Array, rest: Array, units: Array, size: flo
 
 def balanced(A: Array, horizon: float) -> Array:
     """Return units ``(d,)`` of the states, powers of two, in which ``A`` has rows and columns of similar size (Osborne
-    1960). A state that no other one reaches counts as reached by a little."""
+    1960), apart from its diagonal.
+
+    A state that another one does not reach counts as reached by it a little where the reverse holds: ``A_ij = 0``
+    counts as ``1 / |A_ji|``, with time in units of the horizon.
+    """
     rates = np.abs(A) * horizon
     np.fill_diagonal(rates, 0.0)
     weak = np.where(rates > 0.0, 1.0 / np.where(rates > 0.0, rates, 1.0), 0.0).T

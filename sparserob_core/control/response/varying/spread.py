@@ -24,13 +24,14 @@ from sparserob_core.errors import InputError, NotEnclosable
 from sparserob_core.sip.convex_set import Array
 
 LEFT = (1e-14, 1e-12, 1e-10)
-"""Of the state, what is beyond the degree of the law is about: the first that is reached. A proof needs 1e-8."""
+"""Shares of the state, of which the first is taken that the estimated truncation error of the law reaches. A proof
+needs 1e-8."""
 NUMBERS = 400  # coefficients times states of a law; twice as many are matrices of 5 MB on each of its segments
 MOST_TERMS = 30  # the degree where entries are no polynomials: what 40 of them leave less is below what is rounded
 LOOKS = 17  # times at which coefficients are looked at; nothing is proven with them
 DEGREE = 4  # of the coefficients that are looked at then
 MOST_PARTS = 64  # of the box: each is proven alone
-FAR = 700.0  # exponent by which parameters move the state, whose exponential is still a number
+FAR = 700.0  # largest exponent by which parameters may move the state: its exponential is still a float
 _CACHE: WeakKeyDictionary[Phase, dict[tuple[object, ...], Parts]] = WeakKeyDictionary()
 
 
@@ -313,8 +314,8 @@ def _choose_state_units(system: System) -> Array:
 
 
 def _estimate_exponent(system: System, scale: Array) -> float:
-    """Return the exponent by which parameters may move the state: the integral of the norms of all coefficients of
-    ``A`` except the constant one."""
+    """Return an estimate of the exponent by which parameters may move the state: the integral of the norms of all
+    coefficients of ``A`` except the constant one, from `LOOKS` times and up to `DEGREE`."""
     (centre, units), exponent = system.deviations, 0.0
     for law in system.phases:
         for time in np.linspace(law.begin, law.until, LOOKS).tolist():
