@@ -2,7 +2,7 @@
 
 On ``[0, 1]^v`` a polynomial is a convex combination of its Bernstein coefficients; the corner coefficients are values
 of the polynomial (Farouki 2012). Halving a box averages coefficients. Hence the bound converges quadratically, and is
-exact where the maximum is at a corner.
+attained where the largest coefficient is at a corner.
 
 Rounding: a conversion is a sum of products, whose rounding error is bounded by the same sum of absolute values. A
 halving is a chain of averages of numbers no larger than those, each rounded once. The rounding error of a thousand
@@ -64,10 +64,10 @@ def bernstein(coefficients: Array, symmetric: Sequence[bool], absolute: bool = F
 
 
 def highest(coefficients: Array, symmetric: Sequence[bool], errors: Array, limit: float) -> Array:
-    """Return upper bounds ``(k,)`` of each polynomial plus its ``errors (k,)``.
+    """Return upper bounds ``(k,)`` of each polynomial plus its ``errors (k,)`` and the rounding errors made here.
 
-    A bound is at most ``limit`` where halving boxes can show that; otherwise it is not sharp, and ``inf`` where the
-    coefficients overflow.
+    A bound is at most ``limit`` where halving boxes can show that, and ``inf`` where the coefficients overflow. Halving
+    ends as soon as a bound is at most ``limit``, or certainly cannot become so; hence no bound need be sharp.
     """
     with np.errstate(over="ignore", invalid="ignore"):
         slack = errors + ROUNDING * bernstein(coefficients, symmetric, absolute=True).reshape(

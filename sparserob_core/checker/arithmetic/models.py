@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 LARGEST_POWER = 64  # the largest integer exponent for which a power is multiplied out
 ENOUGH = 2.0**-110  # the relative remainder of a function's series: a smaller one takes terms without a visible effect
-NEWTON = 80  # steps, each at least halves the error; with a tenth of them long ellipses get wide balls
+NEWTON = 80  # steps of Newton's method, or halvings of an interval; with a tenth of them long ellipses get wide balls
 
 Part: TypeAlias = "arb_poly | None"
 
@@ -79,7 +79,7 @@ class Model:
 
     @property
     def size(self) -> arb:
-        """The upper bound of the absolute value."""
+        """The ball whose upper end bounds the absolute value at every time and parameter."""
         return sum((_bound_polynomial(coefficient) for coefficient in self.parts if coefficient is not None), ball(0))
 
     def _convert_to_model(self, value: object) -> Model:
@@ -265,7 +265,8 @@ def kepler_series(anomaly: arb_series, eccentricity: float, length: int) -> arb_
 
 
 def matrix_at(entry: Any, p: np.ndarray) -> np.ndarray:
-    """Return a matrix of a system, an array or a function, at its arguments ``p (n,)``, numbers of any kind."""
+    """Return a matrix of a system, an array or a function, at its arguments ``p (n,)``, numbers of any kind; raise
+    `Unchecked` where these cannot be used in the function."""
     if not callable(entry):
         return np.asarray(entry)
     try:

@@ -43,7 +43,7 @@ class Series:
 
     @property
     def matrix(self) -> arb_mat:
-        """The matrix where there are no parameters."""
+        """The only coefficient, of a series without parameters."""
         (matrix,) = self.parts
         return matrix
 
@@ -71,7 +71,8 @@ class Series:
 
     @cached_property
     def size(self) -> Array:
-        """The upper bounds ``(rows, columns)`` of the absolute values of the entries."""
+        """The upper bounds ``(rows, columns)`` of the absolute values of the entries; 0 also where a bound is too small
+        for a float."""
         entries = np.array([float(x.abs_upper()) for coefficient in self.parts for x in coefficient.entries()])
         bounds = np.where(entries > 0.0, entries + TINY, 0.0)
         return np.asarray(bounds.reshape(len(self.parts), *self.shape).sum(axis=0) * OUTWARD)
@@ -104,8 +105,8 @@ class Series:
         return product.within(remainder * OUTWARD) if remainder.any() else product
 
     def within(self, off: Array) -> Series:
-        """Return the series with radii that contain every matrix within ``off (rows, columns)`` of it at every
-        parameter."""
+        """Return the series with larger radii: it contains every matrix that is within ``off (rows, columns)`` of this
+        one at every parameter."""
         return Series(self.monomials, [self.parts[0] + around(off), *self.parts[1:]])
 
     def scaled(self, factor: arb | arb_mat) -> Series:
@@ -205,7 +206,7 @@ def around(off: Array) -> arb_mat:
 
 
 def middles(matrix: arb_mat) -> Array:
-    """Return the middles of the balls of a matrix as floats."""
+    """Return the middles of the balls of a matrix, rounded to floats."""
     return np.array([[float(x) for x in row] for row in matrix.tolist()])
 
 

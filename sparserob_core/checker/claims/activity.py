@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 ROUNDED = 1e-12  # of the terms that a value of the control is a sum of: so small a value counts as 0
 EQUAL = 1e-12  # counts that differ by no more are equal
-NEARLY = 1e-6  # of one count: a bound so little above a whole number of counts is not rounded up to the next
+NEARLY = 1e-6  # relative to one count: a bound that is above a whole number of counts by less is rounded down to it
 
 Rows = list[tuple[float, ConstraintRow]]
 
@@ -174,7 +174,7 @@ ANY: Part = (-np.inf, np.inf, False)
 
 
 def proven(case: Case, nodes: Sequence[Any], weighted: Callable[[Mapping[str, Any]], Rows]) -> float:
-    """Return the time that every control acts at least, by the leaves of a tree of parts of the controls.
+    """Return a lower bound of the time that every control acts, by the leaves of a tree of parts of the controls.
 
     The bound is infinite where every leaf proves that its part holds no feasible control.
 

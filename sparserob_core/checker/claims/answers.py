@@ -163,7 +163,7 @@ class VerifiedFeedback:
         return [sum(values[1:], values[0]) for values in zip(*support_values, strict=True)]
 
     def sizes(self, rows: Array) -> Array:
-        """Return the largest ``|c'x|`` on the grid under any deviation, for ``rows (k, d)``, never too large."""
+        """Return lower bounds ``(k,)`` of the largest ``|c'x|`` on the grid over deviations, for ``rows (k, d)``."""
         largest = np.zeros(len(rows))
         for node in self.loop.nodes:
             for sign in (1.0, -1.0):
@@ -172,7 +172,7 @@ class VerifiedFeedback:
         return np.asarray(np.where(np.isfinite(largest), largest, 0.0))
 
     def added(self, state: int) -> float:
-        """Return the size of the numbers that are added up to a state at the end.
+        """Return an upper bound of the size of the numbers that are added up to a state at the end.
 
         The numbers are the state without control, the state with it, and what deviations add to both."""
         total = 0.0
@@ -217,9 +217,10 @@ class VerifiedFeedback:
         at_most(a, A, deviations.support, support_values, limit, case.clock)
 
     def least(self, rows: Sequence[tuple[float, ConstraintRow]], priced: bool) -> arb:
-        """Return a lower bound of what gains, and charged peaks or an effort, add to the sum of weighted ``rows``.
+        """Return a ball whose lower end bounds from below what gains, and charged peaks or an effort, add to the sum of
+        weighted ``rows``.
 
-        The bound is 0 where nothing is answered. ``priced`` says whether the cost is part of the sum. Peaks and the
+        It is 0 where nothing is answered. ``priced`` says whether the cost is part of the sum. Peaks and the
         effort are bounded by the set of the control alone. For the gains, the control that they cause is no wider than
         its set: ``h(F_kl) + h(-F_kl) <= width``, summed over the blocks ``l``."""
         case, total, largest_effort = self.case, ball(0), ball(0)
@@ -239,7 +240,7 @@ class VerifiedFeedback:
 
     @cached_property
     def _gains_bound(self) -> GainsBound:
-        """The bound of how far all gains together can lower a weighted sum of constraints."""
+        """The upper bound of how far all gains together can lower a weighted sum of constraints."""
         return GainsBound(self.loop_at_rest, self.case.answers, self.case.problem.control)
 
     @cached_property

@@ -49,10 +49,10 @@ EQUALS, STEP = "equals", "control_step"
 class Case:
     """A certificate, as plain data, and the problem that it is checked against, on the problem's two dictionaries.
 
-    ``given`` is the problem as it was given. In ``problem`` its integrals, and its parameters other than the time, are
-    made states, once for every claim. ``counts`` says that the cost is the time that the control acts. The control may
-    then take the values ``letters`` only, where there are any. With a ``policy`` the control answers what it measures.
-    ``clock`` says when to stop."""
+    ``given`` is the problem as it was given. In ``problem`` its integrals are made states, once for every claim. So are
+    the parameters of a system that changes with time, where the state is an affine function of them. ``counts`` says
+    that the cost is the time that the control acts. The control may then take the values ``letters`` only, where there
+    are any. With a ``policy`` the control answers what it measures. ``clock`` says when to stop."""
 
     problem: OptimalControlProblem
     control: Dictionary

@@ -228,8 +228,8 @@ def _read_outputs(
 ) -> list[Array]:
     """Return the outputs ``(p, K)`` under every signal, relative to the nominal ones.
 
-    The remaining difference of each output must be a noise of the set, at the first ``known_at_all`` breakpoints; later
-    outputs are known to no control."""
+    At the first ``known_at_all`` breakpoints the remaining difference of each output must be a noise of the set; raise
+    `Broken` where that is not shown. Later outputs are known to no control."""
     measurements, entries, times = case.problem.measurements, listed(data, "outputs"), case.control.breakpoints
     assert measurements is not None
     C, K = np.asarray(measurements.C, dtype=float), case.control.pieces
@@ -265,7 +265,7 @@ def _bound_piece(case: Case, k: int, groups: dict[bytes, list[arb]], counts: dic
     """Return a lower bound of what the controls on one piece contribute to the weighted sum and the cost.
 
     The controls of each group of signals are one vector with the slope ``groups[key]``. ``counts`` says which part of
-    the price a group pays; the price of a peak is shared among all groups."""
+    the price a group pays, none where it has no entry; the price of a peak is shared among all groups."""
     m, control = case.problem.system.controls, case.problem.control
     prices = case.price.costs[k] if priced else [ball(0)] * m
     total, zero = ball(0), [ball(0)] * m

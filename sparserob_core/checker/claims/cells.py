@@ -35,7 +35,7 @@ Interval: TypeAlias = tuple[int, float, float]
 @final
 @dataclass(frozen=True, eq=False)
 class Proven:
-    """The result of a proof: no row exceeds its limit by more than ``bound``, or ``share`` in its own unit.
+    """The result of a proof: no row exceeds its limit by more than ``bound``, nor by more than ``share`` of its unit.
 
     The proof took ``cells`` cells of time and ``boxes`` pairs of a box of parameters and a cell of directions."""
 
@@ -138,13 +138,15 @@ class Place:
 @final
 @dataclass(eq=False)
 class _LargestExcess:
-    """The largest excess that could not be excluded so far, as a number and as a share of the unit of its row."""
+    """The largest excess over limits that could not be excluded so far, as a number, and as a share of its row's
+    unit."""
 
     bound: float = -np.inf
     share: float = -np.inf
 
     def add(self, top: float, row: Bounded) -> None:
-        """Record the excess of a row whose bound is ``top``, not positive, relative to what it may reach."""
+        """Record the excess of a row over its limit. Its bound ``top``, not positive, is relative to the limit with the
+        slack."""
         over = top + row.slack
         self.bound = max(self.bound, over)
         self.share = max(self.share, over / row.unit)
@@ -263,7 +265,7 @@ def _bound_rows(
 def _bound_polynomials(tube: Reached, flat: Sequence[tuple[Polynomial, float]]) -> Array:
     """Return upper bounds ``(k,)`` of polynomials with their errors, each less the value that it is allowed to reach.
 
-    A bound is at most 0 where halving boxes shows that; where it is positive it may be far from sharp."""
+    A bound is at most 0 where halving boxes shows that. No bound need be sharp, whatever its sign."""
     tops, monomials = np.empty(len(flat)), tube.flow.monomials
     for orders in {poly.coefficients.shape[0] for poly, _ in flat}:
         indices = [i for i, (poly, _) in enumerate(flat) if poly.coefficients.shape[0] == orders]
@@ -281,7 +283,7 @@ def _bound_polynomials(tube: Reached, flat: Sequence[tuple[Polynomial, float]]) 
 
 
 def _bound_by_halfspaces(place: Place, row: Bounded, poly: Polynomial) -> float:
-    """Return the upper bound that the half-spaces of the set of parameters give.
+    """Return the upper bound that the half-spaces of the set of parameters give; infinite for a box.
 
     Where ``a'p <= s`` on the set, ``v <= v + weight (s - a'p)`` holds there for every ``weight >= 0``."""
     tube, top = place.tube, np.inf

@@ -108,15 +108,15 @@ def derived_causal_bound(case: Case, data: Mapping[str, Any], priced: bool) -> f
 
 
 def precision_of(case: Case) -> int:
-    """Return the bits of a number that the claims of a case need.
+    """Return the bits of a number that the claims of a case need, at most `MOST_PRECISION`.
 
     The exponential of a matrix is enclosed in a norm. Its smallest entries need more bits, as many as the system's
-    numbers differ by in the units that the user chose."""
+    numbers differ by in the units that the user chose. The numbers are those at one parameter in the interior."""
     problem = case.problem
     parameters = problem.system.parameters
-    middle = np.zeros((1, 0)) if parameters is None else parameters.interior_point()[None]
+    point = np.zeros((1, 0)) if parameters is None else parameters.interior_point()[None]
     try:
-        matrices = [matrix for mode in problem.system.modes for matrix in mode.matrices(middle)]
+        matrices = [matrix for mode in problem.system.modes for matrix in mode.matrices(point)]
     except InputError:  # not finite there
         return PRECISION
     with np.errstate(over="ignore"):  # numbers that are not finite do not count
@@ -221,7 +221,7 @@ def _bound_curved_excess(
 ) -> float:
     """Show that what answers deviations is in a curved set on the given pieces, in every direction.
 
-    Return the largest excess that was not excluded, in units of the set."""
+    Return the largest excess that was not excluded, along the gauge of the set."""
     m, times = shape.dimension, case.control.breakpoints.tolist()
     curved = Curved(shape, np.diag(1.0 / np.array(shape.radius)), lambda c, width: 0.0)
     work = list[Work]()
@@ -345,7 +345,9 @@ def _verify_active_time(case: Case) -> str:
 
 
 def _require_agreement(name: str, written: float, derived: arb, scale: float) -> None:
-    """Raise `Broken` unless a written figure is the derived one, to `FIGURES` of the larger of it and ``scale``."""
+    """Raise `Broken` unless a written figure is within `FIGURES` times a size of the derived one.
+
+    The size is ``scale``, or the absolute value of the derived figure where that is larger."""
     difference = abs(ball(written) - derived)
     if not difference <= ball(FIGURES) * ball(scale).max(abs(derived)):
         raise Broken(f"{name}: {written!r} is written, {float(derived)!r} is derived")
@@ -449,7 +451,8 @@ def _verify_causal_bound(case: Case) -> str:
 
 
 def _bound_by_tree(case: Case) -> float:
-    """Return the lower bound of the time of action that the leaves of the certificate's tree prove."""
+    """Return the lower bound of the time of action that the leaves of the certificate's tree prove; infinite where they
+    leave no control."""
     data = case.certificate.get("tree")
     if not isinstance(data, Mapping):
         raise Unchecked("the certificate holds no tree of parts")
@@ -557,10 +560,12 @@ def _verify_witness(case: Case) -> str:
 
 
 def _verify_violation(case: Case, over: arb, slack: float, data: Mapping[str, Any]) -> str:
-    """Show that an excess ``over`` is a violation, and agrees with the figure of the witness up to ``slack``."""
-    none = excused(case, data, slack)
-    if not over > none:
-        raise Broken(f"it leads to a violation of {float(over):.3g}, up to {none:.3g} is none")
+    """Show that an excess ``over`` is a violation, and agrees with the figure of the witness.
+
+    The two may differ by a millionth of the excess, plus ``slack``, enlarged where many steps are rounded."""
+    allowed = excused(case, data, slack)
+    if not over > allowed:
+        raise Broken(f"it leads to a violation of {float(over):.3g}, up to {allowed:.3g} is none")
     # each step of the state's transition rounds a figure in doubles d + 2 times; the slack stands for 17 roundings
     rounded = slack * max(1.0, len(case.timing.grid) * (case.problem.system.states + 2) / 17.0)
     if abs(float(over) - number(data, "violation")) > 1e-6 * abs(float(over)) + rounded:

@@ -288,7 +288,7 @@ def equalities(case: Case) -> str:
 
 
 def missed(case: Case) -> list[tuple[arb, float]]:
-    """Return for every fixed state an upper bound of its residual, and the size of the numbers that are added up to it.
+    """Return for every fixed state its largest absolute residual as a ball, and the size of the numbers added up to it.
 
     The size counts what the initial state and the control contribute. Where the control answers deviations, it also
     counts what these contribute, without the control and with it."""
@@ -308,7 +308,7 @@ def missed(case: Case) -> list[tuple[arb, float]]:
 
 
 def _compute_final_state(case: Case, scene: Scene) -> list[list[arb]]:
-    """Return the nominal final state ``(d, 1)``; raise `Unchecked` where an uncertainty may reach a fixed entry."""
+    """Return the undisturbed final state ``(d, 1)``; raise `Unchecked` where an uncertainty may reach a fixed entry."""
     for state, _ in case.equalities:
         if _is_uncertain(case, state):
             raise Unchecked(f"the uncertainty may reach {case.problem.names.state(state)}, which is to be fixed")
@@ -335,8 +335,8 @@ def of_fixed(case: Case) -> str:
 def _is_uncertain(case: Case, state: int) -> bool:
     """Return whether an uncertain entry, a disturbance or the choice of an initial state may reach a state.
 
-    States are linked by the entries of ``A`` that are other than 0 at some time and parameter. Columns of ``E`` count
-    as entries where the middle of the disturbance is other than 0."""
+    States are linked by the entries of ``A`` that may differ from 0 at some time and parameter. An uncertain entry of
+    ``E`` counts where the middle of that disturbance is not 0."""
     reaching = _find_linked_states(case, state)
     rows = sorted(reaching)
     is_nonzero, is_parametric = case.flows.links
@@ -356,13 +356,13 @@ def _is_uncertain(case: Case, state: int) -> bool:
 
 
 def _is_wide(bound: ConvexSet, axis: Array) -> bool:
-    """Return whether a set is more than one point along an axis."""
+    """Return whether a set may be more than one point along an axis; False only where it provably is one."""
     width = known(bound).support(balls(axis)) + known(bound).support(balls(-axis))
     return not width <= math.ulp(0.0)
 
 
 def _is_at_rest(case: Case, state: int) -> bool:
-    """Return whether a state starts at 0 and nothing ever moves it.
+    """Return whether a state provably starts at 0 and nothing ever moves it, uncertainties aside.
 
     Neither a linked state, nor a control of the decision, nor a drift, nor the middle of a disturbance may move it."""
     reaching, (is_nonzero, _) = _find_linked_states(case, state), case.flows.links
@@ -380,7 +380,8 @@ def _is_at_rest(case: Case, state: int) -> bool:
 
 
 def _find_linked_states(case: Case, state: int) -> set[int]:
-    """Return the states that may reach a state by entries of ``A`` that are other than 0 at some time and parameter."""
+    """Return the states that may reach a state, by entries of ``A`` that may differ from 0 at some time and
+    parameter."""
     d, reaching = case.problem.system.states, {state}
     A = case.flows.links[0][:, :d]
     for _ in range(d):

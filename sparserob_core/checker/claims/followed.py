@@ -20,7 +20,7 @@ from sparserob_core.sip.convex_set import Array
 
 MOST_CELLS = 400_000  # cells of time examined for one row
 PARTS = 8  # of a cell whose bound is too large: the distance to a chord, quadratic in the length, falls to 1/64
-HALVINGS = 16  # rounds of cuts: then cells are 2^-48 of their first length, near rounding
+HALVINGS = 16  # rounds of examination: the last cells are 2^-45 of their first length, near rounding
 
 
 @final
@@ -64,7 +64,7 @@ class FollowedRow:
         raise Unchecked(f"neither shown nor refuted: after {count} cells more than {limit!r} is not excluded")
 
     def beside(self, time: float, inside: float) -> tuple[float, float]:
-        """Return a lower and an upper bound of the terms that are added to the state in the row at a time.
+        """Return a lower and an upper bound of the terms that the reference and the control add to the row at a time.
 
         A mixed constraint takes the control of the piece that holds the time ``inside``. Raise `Broken` where that
         piece does not meet the window at the time."""
@@ -128,7 +128,8 @@ class FollowedRow:
 
 
 def _divide_cells(start: Array, stop: Array) -> tuple[Array, Array]:
-    """Return every cell cut into equal parts; no cells at all where the parts of one are too short for doubles."""
+    """Return every cell cut into `PARTS` equal parts; no cells at all where the parts of one are too short for
+    doubles."""
     ends = start[:, None] + (stop - start)[:, None] * (np.arange(PARTS + 1) / PARTS)
     ends[:, 0], ends[:, -1] = start, stop
     if not (np.diff(ends, axis=1) > 0.0).all():

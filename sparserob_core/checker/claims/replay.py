@@ -137,8 +137,8 @@ def witnessed(case: Case, data: Mapping[str, Any]) -> tuple[arb, float]:
 def excused(case: Case, data: Mapping[str, Any], slack: float) -> float:
     """Return the part of a witness's excess that counts as none.
 
-    For a constraint on the state it is what a claim excuses, which may be less than ``slack``, the accuracy of the
-    figure. For other constraints it is the ``slack``."""
+    For a constraint on the state it is what a claim excuses, but at most ``slack``, the accuracy of the figure. For
+    other constraints it is the ``slack``."""
     name, direction = str(data.get("constraint")), numbers(data.get("direction"), "direction")
     if commanded(case, name) is not None or (name == EQUALS and case.equalities):
         return slack
@@ -173,11 +173,11 @@ def _project_onto_direction(direction: Array, named: NamedDeviations | None, row
 
 
 def exceeded(case: Case, said: Mapping[str, object], begun: Array | None = None) -> tuple[list[float], float]:
-    """Return the excess of the worst disturbance over each row of a constraint at one time, with its accuracy.
+    """Return the excess of the worst disturbance over each row of a constraint at one time, as estimates with a slack.
 
-    A mixed constraint at a jump of the control has its rows on both sides. Raise `Broken` where ``said`` names no
-    constraint of the problem, or no time of it. Raise `Unchecked` for a curved set, whose worst direction is not
-    reported.
+    The slack says how closely a reported figure must agree with them. A mixed constraint at a jump of the control has
+    its rows on both sides. Raise `Broken` where ``said`` names no constraint of the problem, or no time of it. Raise
+    `Unchecked` for a curved set, whose worst direction is not reported.
 
     Parameters
     ----------

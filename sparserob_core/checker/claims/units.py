@@ -51,7 +51,7 @@ class WindowUnits:
     absolute values of rows, on the state and on the control, along the nominal trajectory.
 
     The unit of a row ``c'x <= b`` is the smallest number that is not zero among three. The first is how far ``c'x`` can
-    reach over the window, for any admissible control, the worst disturbance and any parameter. The others are ``|b|``
+    reach over the window, for any admissible control, the worst disturbance and some parameters. The others are ``|b|``
     and the width of the slab where the opposite row exists. A row whose width is `THIN` has the reach alone. The unit
     of a curved set in a direction ``c`` is ``h(c) - c'm``, ``m`` its centre.
 
@@ -124,7 +124,8 @@ class WindowUnits:
 
     @cached_property
     def sums(self) -> Array:
-        """The largest numbers ``(d,)`` that are added up to each state within the window."""
+        """The largest sums ``(d,)`` of the absolute values of the terms that add up to each state within the
+        window."""
         return self._measure_reach(self._interior_parameter, states=True)[1]
 
     def slack(self, direction: Array, limit: arb) -> float:

@@ -58,7 +58,8 @@ class ConstraintWindow:
         return self.shape.dimension > self.states
 
     def split(self, direction: Array) -> tuple[Array, Array]:
-        """Return the parts of a normal on the state ``(d,)`` and on the control ``(m,)``, which may be empty."""
+        """Return the parts of a normal on the state ``(d,)`` and on the control ``(m,)``; without the control the
+        second is empty."""
         return direction[: self.states], direction[self.states :]
 
     def limit(self, direction: Array, time: float) -> arb:

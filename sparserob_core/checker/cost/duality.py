@@ -73,7 +73,7 @@ class Duality:
     lasting: Lasting | None = None
 
     def control_piece(self, time: float) -> int:
-        """Return the piece of the control that is commanded at a time."""
+        """Return the index of the piece of the control that is commanded at a time."""
         piece = int(np.searchsorted(self.control.breakpoints, time, side="right")) - 1
         return min(max(piece, 0), self.control.pieces - 1)
 
@@ -174,7 +174,7 @@ class Duality:
         lengths: bool = True,
         norms: Array | None = None,
     ) -> arb:
-        """Return the lower bound that multipliers of rows prove.
+        """Return a ball whose lower end is the bound that multipliers of rows prove.
 
         Parameters
         ----------
@@ -290,10 +290,11 @@ class Duality:
     def _substitute_slopes(
         self, slopes: list[list[arb]], pieces: Sequence[Sequence[float]]
     ) -> tuple[list[list[arb]], arb]:
-        """Return the slopes of the certificate in place of the derived ones, and a bound of the difference.
+        """Return the slopes of the certificate in place of the derived ones, and an upper bound of the difference that
+        this makes.
 
-        With fewer functions than pieces, different slopes have the same effect on every control of the dictionary. The
-        difference of their effects is bounded by the largest coefficients.
+        With fewer functions than pieces, different slopes may have the same effect on every control of the dictionary.
+        The difference of their effects is bounded by the largest coefficients that a control may have.
         """
         m, K, N = self.problem.system.controls, self.control.pieces, self.control.functions
         certified = [[-ball(pieces[c][k]) for c in range(m)] for k in range(K)]
@@ -323,8 +324,8 @@ class Duality:
 
 
 def steps(problem: OptimalControlProblem, control: Dictionary) -> range:
-    """Return the breakpoints of a control at which it steps: the beginnings of its pieces, and for a plan that repeats
-    the end of the last piece. The beginning counts only where an initial control is given."""
+    """Return the indices of the breakpoints at which a control steps: where its pieces begin, and for a plan that
+    repeats where the last piece ends. Index 0 counts only where an initial control is given."""
     return range(0 if problem.initial_control is not None else 1, control.pieces + bool(problem.repeat))
 
 

@@ -206,7 +206,7 @@ def _split_product(shape: Product, middle: Array) -> list[tuple[ConvexSet, Array
 
 def _compute_chords(shape: ConvexSet, middle: Array) -> list[arb]:
     """Return numbers ``c_b`` such that the width of a set along any ``a`` is at least ``c_b |a_b|``: the lengths of its
-    chords along the axes through its middle."""
+    chords along the axes through its middle, in balls."""
     if isinstance(shape, Product):
         return [chord for factor, point in shape.split(middle) for chord in _compute_chords(factor, point)]
     if isinstance(shape, NormBall):

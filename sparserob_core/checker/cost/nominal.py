@@ -148,7 +148,7 @@ class NominalMotion:
 
     @cached_property
     def running(self) -> arb_mat:
-        """The cost per time as a quadratic form of ``z``."""
+        """The cost of the states per time as a quadratic form of ``z``."""
         corner, d, m = self._build_quadratic_form(0).tolist(), self.problem.system.states, self.problem.system.controls
         return stacked([[*row, *balls(np.zeros(m))] for row in corner] + [balls(np.zeros(d + 1 + m))] * m)
 
@@ -174,7 +174,7 @@ class NominalMotion:
 
     @remembered(key=lambda self, start, stop: self.flow.alike(start, stop))
     def weight(self, start: float, stop: float) -> arb_mat:
-        """Return the cost of an interval as a quadratic form of the ``z`` at its beginning."""
+        """Return the cost of the states on an interval as a quadratic form of the ``z`` at its beginning."""
         size = self.running.nrows()
         total, propagated = zeros(size, size), identity(size)
         for flow_part in self.flow.parts(start, stop) if self.problem.cost.terms[0] is not None else ():

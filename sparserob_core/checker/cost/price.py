@@ -166,10 +166,10 @@ class Price:
 
     @cached_property
     def largest(self) -> float:
-        """The scale of a gap: the largest cost of absolute values, plus the largest value of the quadratic terms at
-        some controls.
+        """The scale that gaps had in earlier versions: a bound of the cost of absolute values, plus the largest value
+        of the quadratic terms at some controls.
 
-        These controls stay 0, or stay at one end of one channel.
+        These controls stay 0, or one channel stays plus or minus its largest absolute value. It is an estimate.
         """
         m = self.problem.system.controls
         axes = np.eye(m)

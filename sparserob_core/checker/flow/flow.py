@@ -27,9 +27,9 @@ from sparserob_core.sip.convex_set import Array
 if TYPE_CHECKING:
     from flint import arb, arb_mat
 
-# From this number of states on, transitions that no claim rests on are computed in floats. With 348 states a transition
-# in balls takes as long as the rest of a check. With few states balls cost nothing, and are right to many digits even
-# where the system grows fast.
+# From this number of states on, transitions that no claim rests on are computed in floats, unless the law may change
+# with time. With 348 states a transition in balls takes as long as the rest of a check. With few states balls cost
+# nothing, and are right to many digits even where the system grows fast.
 COARSE = 16
 MOST_MARKS = 2**17  # the largest number of marks on the horizon
 KEPT = 4096  # parts of the horizon whose flows are remembered
@@ -54,8 +54,10 @@ class StateWeights:
 @final
 @dataclass(frozen=True, eq=False)
 class FlowPart:
-    """A part of an interval of time: a ``share`` of a ``segment``, of this ``length``, and a number of ``doublings``.
-    Each doubling applies the flow twice, for twice the time."""
+    """A part of an interval of time: the first ``share`` of a ``segment``, and a number of ``doublings``.
+
+    ``length`` is the time of the share, before any doubling. Each doubling applies the flow twice, for twice the time.
+    """
 
     segment: VerifiedSegment
     share: arb
@@ -70,7 +72,7 @@ class VerifiedFlow:
 
     A drift is one more column of ``B``, whose input is always 1. ``degree`` is that of the expansion in the parameters,
     of which there may be none. With a ``timing`` the flow has the marks of that law. ``sharp`` is the relative
-    truncation error of the states that a guess may have.
+    truncation error of the states at which a guess ends, and at least `ROUGH` with a ``degree``. No claim rests on it.
     """
 
     plant: Plant
@@ -92,7 +94,7 @@ class VerifiedFlow:
         return VerifiedFlow(self.plant, self.until, ParameterBox(point, (0.0,) * len(point)))
 
     def sharper(self, sharp: float) -> VerifiedFlow:
-        """Return a new flow whose guesses have a truncation error of at most ``sharp`` in the states."""
+        """Return a new flow whose guesses aim at a relative truncation error of at most ``sharp`` in the states."""
         return VerifiedFlow(self.plant, self.until, self.box, self.degree, self.timing, min(self.sharp, sharp))
 
     @cached_property
@@ -120,7 +122,7 @@ class VerifiedFlow:
         return [stretch.start for stretch in self.law.stretches]
 
     def _find_stretch(self, start: float, stop: float) -> int:
-        """Return the number of the stretch that holds an interval; raise `Unchecked` where none does."""
+        """Return the index of the stretch that holds an interval; raise `Unchecked` where none does."""
         if not 0.0 <= start <= stop <= self.until:
             raise Unchecked(f"the system is not known from {start:g} to {stop:g}")
         index = max(0, bisect_right(self._stretch_starts, start) - 1)
@@ -144,7 +146,7 @@ class VerifiedFlow:
 
     def segment(self, start: float, stop: float) -> tuple[VerifiedSegment, arb]:
         """Return the verified segment of the flow from ``start`` on, and the share of its time that has passed at
-        ``stop``."""
+        ``stop``; raise `Unchecked` where no segment is as long."""
         stretch = self.law.stretches[self._find_stretch(start, stop)]
         if stretch.is_still:
             share = (ball(stop) - ball(start)) / stretch.stride
@@ -177,8 +179,8 @@ class VerifiedFlow:
 
     @remembered(lambda: KEPT, lambda self, start, stop: self.alike(start, stop))
     def over(self, start: float, stop: float) -> tuple[Series, Series, Series]:
-        """Return the factors of the state at its end on an interval: of the state at the beginning ``(d, d)``, of
-        constant controls with a drift ``(d, driven)``, and of constant disturbances ``(d, w - driven)``."""
+        """Return the three factors that make up the state at the end of an interval: of the state at its beginning
+        ``(d, d)``, of constant controls with a drift ``(d, driven)``, of constant disturbances ``(d, w - driven)``."""
         total: tuple[Series, Series] | None = None
         for flow_part in self.parts(start, stop):
             flow = flow_part.segment.at(flow_part.share)
@@ -236,8 +238,8 @@ class VerifiedFlow:
         Returns
         -------
         tuple[list[Series], Array]
-            The first ``order`` coefficients ``(d, d + w)`` of ``[Phi Gamma]``, in powers of the share of ``[start,
-            stop]``; and an upper bound ``(d, d + w)`` of their error.
+            At most ``order`` coefficients ``(d, d + w)`` of ``[Phi Gamma]``, in powers of the share of ``[start,
+            stop]``; and an upper bound ``(d, d + w)`` of the error of this polynomial.
         """
         segment, share = self.segment(begin, end)
         if begin == end:
@@ -247,7 +249,7 @@ class VerifiedFlow:
         return segment.within(first, width, order)
 
     def kernel(self, start: float, stop: float) -> tuple[list[Series], Array]:
-        """Return the kernel ``h Phi(stop, s) [B E](s)`` of inputs at any time ``s`` of an interval without marks.
+        """Return the kernel ``h Phi(stop, s) [B c E](s)`` of inputs at any time ``s`` of an interval without marks.
 
         ``h`` is the length of the interval, and the kernel is the effect of the inputs on the state at its end. The
         rows of ``Phi(stop, s)`` are the flow of the transposed system, backwards.
@@ -256,7 +258,7 @@ class VerifiedFlow:
         -------
         tuple[list[Series], Array]
             Coefficients ``(d, w)`` in powers of the share of the interval that is left at ``s``, and an upper bound
-            ``(d, w)`` of their error.
+            ``(d, w)`` of the error of this polynomial.
         """
         stretch = self.law.stretches[self._find_stretch(start, stop)]
         A, F = stretch.between(start, stop, backwards=True)
@@ -304,8 +306,8 @@ class VerifiedFlow:
         Returns
         -------
         tuple[Array, Array, Array]
-            The largest absolute values of ``[A B E]`` and of its derivative in time, ``(d, d + w)`` each. The third
-            value is the units ``(d,)`` of the states, in which the law is small there.
+            Upper bounds of the absolute values of ``[A B c E]`` and of its derivative in time, ``(d, d + w)`` each. The
+            third value is the units ``(d,)`` of the states, in which the law is small there.
         """
         stretch = self.law.stretches[self._find_stretch(start, stop)]
         return *stretch.sizes, stretch.units

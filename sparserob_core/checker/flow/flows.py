@@ -20,7 +20,7 @@ from sparserob_core.control.problem.system import System
 DEGREES = {0: 0, 1: 8, 2: 6, 3: 4, 4: 3}  # the degree of an expansion by the number of parameters; 2 for more
 WIDE = {1: 16, 2: 8, 3: 5, 4: 3}  # the degree of an expansion that serves many boxes
 CLOSE = 1e-11  # the relative remainder that an expansion over a larger box may have in transitions over the horizon
-HALVINGS = 10  # of the box of all parameters, until a box has a flow of its own
+HALVINGS = 10  # the largest number of halvings of the box of all parameters, to find a box whose flow serves others
 KEPT = 64  # flows over boxes that are remembered
 ASIDE = 0.3819  # distance of `aside` from the middle of the parameters, as a share of half their width
 
@@ -56,7 +56,7 @@ class VerifiedFlows:
 
     @remembered(lambda: KEPT)
     def over(self, box: ParameterBox, degree: int) -> VerifiedFlow:
-        """Return the flow over a box, to a degree in the parameters."""
+        """Return the flow over a box, to a degree in the parameters; a degree of 0 is for systems without any."""
         return VerifiedFlow(self.plant, self.until, box, degree, self.timing) if degree else self.at(())
 
     @cached_property
@@ -75,8 +75,11 @@ class VerifiedFlows:
         return self.at(self.aside).marks(times)
 
     def holding(self, box: ParameterBox) -> VerifiedFlow:
-        """Return a flow over a box, or over a larger box that contains it where the remainder of that expansion is
-        small."""
+        """Return a flow over a box, or over a larger box that contains it.
+
+        The larger box is found by halving the box of all parameters until the remainder of its expansion is small. The
+        box after the last of the `HALVINGS` is taken without a test of its remainder, which is a bound all the same.
+        """
         if self._is_still:
             return self.over(box, self.degree)
         candidate, degree = self.box, WIDE.get(len(box.middle), 2)
@@ -119,8 +122,8 @@ class VerifiedFlows:
 
     @cached_property
     def links(self) -> tuple[np.ndarray, np.ndarray]:
-        """The entries of ``[A B E]`` that are not always 0, and the entries that depend on the parameters: two Boolean
-        arrays ``(d, d + w)``."""
+        """The entries of ``[A B c E]`` that may differ from 0 at some time and parameter, and the entries that may
+        depend on the parameters: two Boolean arrays ``(d, d + w)``."""
         law = Law(self.plant, self.until, self.box, min(1, self.degree), self.timing)
         is_dependent = []
         for stretch in law.stretches:
@@ -131,5 +134,5 @@ class VerifiedFlows:
 
 
 def _is_wide(entry: object) -> bool:
-    """Return True where a number is known less closely than rounding makes it."""
+    """Return True where a coefficient of a polynomial has a larger radius than rounding makes it."""
     return any(float(c.rad()) > 2.0**-60 * float(abs(c).upper()) for c in entry.coeffs())  # type: ignore[attr-defined]

@@ -26,24 +26,23 @@ if TYPE_CHECKING:
     from flint import arb_poly
 
 ORDER = 24  # of the law in time on a stretch; with a tenth of it stretches are a million times shorter
-LONG = 2.0  # the largest norm of the system times the length of a stretch; ten times more takes more than `TERMS` terms
+LONG = 2.0  # the largest norm of a law times the length of a stretch or stride; ten times more exceeds `TERMS` terms
 SHORTER = 0.5  # the share of `LONG` that rescaled units aim at: a tenth doubles the digits lost, 1 takes more terms
 FIRST = 8  # stretches on the whole horizon of a law that changes with time, before any is halved
-SHORTEST = 2.0**-30  # of the horizon: a shorter stretch contains a pole
+SHORTEST = 2.0**-30  # of the horizon: where a shorter stretch would be needed, there is a pole as a rule
 
 
 @final
 @dataclass(frozen=True)
 class ParameterBox:
-    """A box of parameters: its ``middle (nu,)`` in exact numbers, and upper bounds ``halves (nu,)`` of half its
-    widths."""
+    """A box of parameters: its ``middle (nu,)``, and half its widths, ``halves (nu,)``, all exact numbers."""
 
     middle: tuple[float, ...] = ()
     halves: tuple[float, ...] = ()
 
     @staticmethod
     def between(low: Sequence[float], high: Sequence[float]) -> ParameterBox:
-        """Return a box that contains all points between two corners."""
+        """Return a box that contains all points between two corners, with halves rounded up."""
         ends = [(a, b, (a + b) / 2) for a, b in zip(map(float, low), map(float, high), strict=True)]
         halves = [0.0 if a == b else float(np.nextafter(max(b - m, m - a), np.inf)) for a, b, m in ends]
         return ParameterBox(tuple(m for _, _, m in ends), tuple(halves))
@@ -66,7 +65,10 @@ class ParameterBox:
         return True
 
     def halved(self, axis: int) -> list[ParameterBox]:
-        """Return the two halves of the box across one parameter, each a little larger than half."""
+        """Return two boxes that cover the box across one parameter up to rounding, each a little larger than half.
+
+        Whether one of them holds a smaller box is for `holds` to test.
+        """
         boxes = []
         for sign in (-0.5, 0.5):
             middle, halves = list(self.middle), list(self.halves)
@@ -82,8 +84,8 @@ class Stretch:
     """The law on an interval of time from ``start`` to ``stop``, on which it is a polynomial.
 
     For every monomial of the parameters the ``table (d, d + w)`` holds polynomials in the time, which runs from -1 to 1
-    across the stretch. The law is small in the ``units (d,)`` of the states. Within a ``stride``, a power of two, it
-    changes the states by little.
+    across the stretch. Its balls contain the law at every time and parameter. The law is small in the ``units (d,)`` of
+    the states. Where it is constant, ``stride`` is a power of two; the norm of ``A`` times it is about `LONG` at most.
     """
 
     start: float
@@ -95,14 +97,15 @@ class Stretch:
 
     @cached_property
     def is_still(self) -> bool:
-        """True where nothing changes with time."""
+        """True where the polynomials are constant; wide balls may still hold a law that changes."""
         return all(entry.length() <= 1 for table in self.table for row in table for entry in row)
 
     def between(self, start: float, stop: float, backwards: bool = False) -> tuple[list[Series], list[Series]]:
         """Return ``A`` and ``[B c E]`` times the length of a part of the stretch, as one series for each power of a
         share.
 
-        The polynomials are in the share of the part that has passed, or ``backwards`` in the share that is left.
+        The polynomials are in the share of the part that has passed, or ``backwards`` in the share that is left. The
+        last powers of ``A`` may be in the balls of the first.
         """
         from flint import arb, arb_poly
 
@@ -123,7 +126,8 @@ class Stretch:
 
     @cached_property
     def sizes(self) -> tuple[Array, Array]:
-        """The largest absolute values of the law and of its derivative in time, ``(d, d + w)`` each."""
+        """The upper bounds of the absolute values of the law and of its derivative in time, ``(d, d + w)`` each; 0 also
+        where a bound is too small for a float."""
         half = (self.stop - self.start) / 2.0
         sizes = np.zeros((2, len(self.table[0]), len(self.table[0][0])))
         for table in self.table:
@@ -136,7 +140,7 @@ class Stretch:
 
 
 def most(table: Sequence[Sequence[arb_poly]]) -> Array:
-    """Return approximate bounds ``(d, d + w)`` of the absolute values of polynomials on [-1, 1]."""
+    """Return bounds ``(d, d + w)`` of the absolute values of polynomials on [-1, 1], up to rounding of floats."""
     return np.array([[sum(float(c.abs_upper()) for c in entry.coeffs()) for entry in row] for row in table])
 
 
@@ -146,7 +150,7 @@ def _round_up_to_power(length: float) -> float:
 
 
 def _truncate_powers(A: list[Series], units: Array) -> list[Series]:
-    """Return the leading powers of ``A``. The first one encloses the later powers, whose sum is at most `SHARP`."""
+    """Return the leading powers of ``A``. The first one encloses the others, whose norms add up to at most `SHARP`."""
     sizes = [term.size for term in A]
     paces = [pace(size, units) for size in sizes]
     count = len(A)
@@ -197,7 +201,7 @@ class Law:
         Raises
         ------
         Unchecked
-            Where the law is not finite.
+            Where the law is not enclosed, since it is not finite or has a pole, or where it is too fast.
         """
         if self.timing is not None:
             return [self._rebuild_stretch(stretch) for stretch in self.timing.stretches]
@@ -211,12 +215,12 @@ class Law:
 
     @property
     def is_still(self) -> bool:
-        """True where no stretch changes with time."""
+        """True where every stretch `Stretch.is_still`."""
         return all(stretch.is_still for stretch in self.stretches)
 
     @cached_property
     def there(self) -> np.ndarray:
-        """The entries of ``[A B c E]`` that differ from 0 at any time or parameter, Booleans ``(d, d + w)``."""
+        """The entries of ``[A B c E]`` that may differ from 0 at some time and parameter, Booleans ``(d, d + w)``."""
         return np.asarray(np.any([stretch.sizes[0] > 0.0 for stretch in self.stretches], axis=0))
 
     @cached_property
@@ -228,7 +232,7 @@ class Law:
         return weights
 
     def _rebuild_stretch(self, other: Stretch) -> Stretch:
-        """Return the law on a stretch of the timing."""
+        """Return the law of this box on a stretch of the timing."""
         phase = next(phase for phase in reversed(self.plant.phases) if phase.begin <= other.start)
         frame, table = self._tabulate_law(other.start, other.stop, phase, self.monomials)
         return replace(
@@ -254,7 +258,7 @@ class Law:
         return stretches
 
     def _enclose_constant_law(self, begin: float, until: float, phase: Phase) -> Stretch | None:
-        """Return a law that does not change with time as one stretch; ``None`` where it changes."""
+        """Return a law that does not change with time as one stretch; ``None`` where that is not shown."""
         try:
             stretch = Stretch(begin, until, *self._tabulate_law(begin, until, phase, self.monomials), self.units)
         except Unchecked:
@@ -279,17 +283,17 @@ class Law:
         )
 
     def _enclose_stretch(self, start: float, stop: float, phase: Phase) -> Stretch | None:
-        """Return the law from ``start`` to ``stop``; ``None`` where that is too long, judged in the middle of the
-        box."""
+        """Return the law from ``start`` to ``stop``; ``None`` where that is too long, by norms and radii in the middle
+        of the box, or where the law is not finite."""
         try:
             _, middle = self._tabulate_law(start, stop, phase, NONE)
             d, u = len(middle[0]), self.units
             size = most(middle[0])
             radii = np.array([[sum(float(c.rad()) for c in e.coeffs()) for e in row] for row in middle[0]])
-            rate, long = pace(size[:, :d], u), float((stop - start) * OUTWARD)
-            ratios = np.ones(d) if rate * long <= LONG else _find_unit_factors(size[:, :d] * u / u[:, None] * long)
-            least = SHARP * max(rate, pace(self._sampled_sizes[0], u))
-            if ratios is None or not pace(radii[:, :d], u) * ratios.max() <= least:
+            rate, length = pace(size[:, :d], u), float((stop - start) * OUTWARD)
+            ratios = np.ones(d) if rate * length <= LONG else _find_unit_factors(size[:, :d] * u / u[:, None] * length)
+            tolerance = SHARP * max(rate, pace(self._sampled_sizes[0], u))
+            if ratios is None or not pace(radii[:, :d], u) * ratios.max() <= tolerance:
                 return None
             if not (radii[:, d:] <= SHARP * self._sampled_sizes[1]).all():
                 return None
@@ -301,7 +305,8 @@ class Law:
     def _tabulate_law(
         self, start: float, stop: float, phase: Phase, monomials: Monomials
     ) -> tuple[Frame, list[list[list[arb_poly]]]]:
-        """Return every entry of the law from ``start`` to ``stop``, one table for each monomial."""
+        """Return every entry of the law from ``start`` to ``stop``, one table ``(d, d + w)`` for each monomial, and the
+        frame of these polynomials."""
         from flint import arb, arb_poly
 
         frame = Frame(monomials, ORDER)
@@ -323,14 +328,14 @@ class Law:
 
 
 def _find_unit_factors(most: Array) -> Array | None:
-    """Return factors ``(d,)`` of the units of the states in which the system is small enough; ``None`` where none
-    exist.
+    """Return factors ``(d,)`` by which to multiply the units of the states, such that the system is small enough in the
+    new units; ``None`` where none are found.
 
-    In the old units the system moves the states by at most ``M = most (d, d)``. With ``g``, a share of `LONG`, the
-    factors ``u = (1 - M / g)^-1 1`` satisfy ``M u <= g u``.
+    In the old units the system moves the states by at most ``M = most (d, d)``. With ``g = SHORTER LONG`` the factors
+    ``u = (1 - M / g)^-1 1`` satisfy ``M u <= g u`` where they are positive.
     """
-    M = most / (SHORTER * LONG)
-    u = np.linalg.lstsq(np.eye(len(M)) - M, np.ones(len(M)), rcond=None)[0]
+    relative = most / (SHORTER * LONG)
+    u = np.linalg.lstsq(np.eye(len(relative)) - relative, np.ones(len(relative)), rcond=None)[0]
     if not (np.isfinite(u).all() and u.min() > 0.0):
         return None
     ratios = np.maximum(u, 1.0)

@@ -26,10 +26,10 @@ from sparserob_core.sip.convex_set import Array
 if TYPE_CHECKING:
     from flint import arb, arb_mat
 
-SHARP = 2.0**-100  # relative truncation error of a guess; 2^-10 would be visible in the residuals of the states
+SHARP = 2.0**-100  # relative truncation error of a guess; with a tenth of these bits it would show in the states
 ROUGH = 2.0**-70  # the same over a box of parameters, which is less sharp anyway, and of kernels, which become floats
 AT_ONCE = 4  # terms between two tests for whether more are needed
-TERMS = 64  # the largest number of terms of a guess
+TERMS = 64  # the largest order of the terms of a guess
 LONGER = 1.0 + 2.0**-30  # the largest share for which a flow is verified: ends of parts of time are rounded
 FAR = 300.0  # the largest exponent in Gronwall's inequality: with a larger one the bound is useless
 
@@ -38,7 +38,7 @@ FAR = 300.0  # the largest exponent in Gronwall's inequality: with a larger one 
 @dataclass(frozen=True, eq=False)
 class Powers:
     """A matrix ``(d, n)`` that is a polynomial in a share of time. The ``stack`` holds its ``count`` coefficients, one
-    above the other. ``off (d, n)`` bounds the error at every share and parameter."""
+    above the other. ``off (d, n)`` bounds the error at every share up to `LONGER` and every parameter."""
 
     stack: Series
     count: int
@@ -51,7 +51,8 @@ class Powers:
         Returns
         -------
         tuple[list[Series], Array]
-            The first ``order`` coefficients ``(d, n)``, and an upper bound ``(d, n)`` of their error.
+            At most ``order`` coefficients ``(d, n)``, and an upper bound ``(d, n)`` of the error of the polynomial that
+            they form.
         """
         from flint import arb, arb_mat
 
@@ -98,13 +99,13 @@ class VerifiedSegment:
         return value.within(remainder)
 
     def within(self, start: arb, width: arb, order: int) -> tuple[list[Series], Array]:
-        """Return the flow on the shares from ``start`` to ``start + width``: ``order`` coefficients, and an error
-        bound."""
+        """Return the flow on the shares from ``start`` to ``start + width``: at most ``order`` coefficients, and the
+        error bound of this polynomial."""
         return self.powers.within(start, width, order)
 
     def first(self, count: int) -> tuple[list[Series], Array]:
-        """Return the first ``count`` terms, and an upper bound ``(d, d + w)`` of the difference between their sum and
-        the flow."""
+        """Return the first ``count`` terms, and an upper bound ``(d, d + w)`` of the difference between their
+        polynomial and the flow, at shares up to 1."""
         return self.terms[:count], (sum((term.size for term in self.terms[count:]), self.off)) * OUTWARD
 
     @property
@@ -146,7 +147,8 @@ def shifted(start: float, width: float, count: int) -> Array:
     Returns
     -------
     Array
-        The matrix ``(power of y, power)``. Each entry is rounded outward for ``4 count`` terms.
+        The matrix ``(power of y, power)``. Each entry is increased by more than its rounding error, some ``8 count``
+        units of rounding.
     """
     n = np.arange(count)
     table = (
@@ -170,7 +172,7 @@ def solve(A: Sequence[Series], F: Sequence[Series], units: Array, sharp: float =
     units
         Units ``(d,)`` of the states, in which the system is small.
     sharp
-        The relative truncation error of the states that the guess may have.
+        The relative truncation error of the states at which the guess ends; at least `ROUGH` over a box of parameters.
     """
     equation = Equation(A, F)
     terms = guess(equation, units, max(sharp, ROUGH) if A[0].monomials.degree else sharp)
@@ -178,7 +180,7 @@ def solve(A: Sequence[Series], F: Sequence[Series], units: Array, sharp: float =
 
 
 def guess(equation: Equation, units: Array, sharp: float = SHARP) -> list[Series]:
-    """Return the first terms of the flow's power series, rounded."""
+    """Return the first terms of the flow's power series, each as the middles of its balls."""
     d, w = len(units), equation.F[0].shape[1]
     terms = [equation.begin]
     scale = np.concatenate([1.0 / units, np.ones(w)]) * units[:, None]
@@ -208,13 +210,13 @@ def verify(equation: Equation, terms: Sequence[Series], units: Array) -> Array:
     defects = [terms[n + 1].scaled(ball(n + 1)) - equation.slope(terms, n) for n in range(last)]
     orders = np.array([1.0, *range(1, last + 1)])[:, None, None]
     residual = (sizes_of([terms[0] - equation.begin, *defects]) / orders).sum(axis=0)
-    sizes, paces, drives = map(sizes_of, (terms, A, F))
+    sizes, A_sizes, F_sizes = map(sizes_of, (terms, A, F))
     for n in range(last, last + max(len(A), len(F))):
         for k in range(max(0, n - last), min(n + 1, len(A))):
-            residual = residual + paces[k] @ sizes[n - k] / (n + 1)
+            residual = residual + A_sizes[k] @ sizes[n - k] / (n + 1)
         if n < len(F):
-            residual[:, d:] += drives[n] / (n + 1)
-    growth = sum(pace(rates, units) / (k + 1) for k, rates in enumerate(paces)) * longer
+            residual[:, d:] += F_sizes[n] / (n + 1)
+    growth = sum(pace(rates, units) / (k + 1) for k, rates in enumerate(A_sizes)) * longer
     if not growth <= FAR:
         raise Unchecked("the system is too fast for a part of its horizon")
     worst = (residual / units[:, None]).max(axis=0, initial=0.0) * (np.exp(growth) * longer)
@@ -224,7 +226,10 @@ def verify(equation: Equation, terms: Sequence[Series], units: Array) -> Array:
 @final
 @dataclass(frozen=True, eq=False)
 class Equation:
-    """The equation ``P' = A P + [0 F]``, ``P(0) = [1 0]``, with polynomials ``A`` and ``F`` of the share of time."""
+    """The equation ``P' = A P + [0 F]``, ``P(0) = [1 0]``, with polynomials ``A`` and ``F`` of the share of time.
+
+    Its solution is ``P = [Phi Gamma]``.
+    """
 
     A: Sequence[Series]
     F: Sequence[Series]

@@ -17,7 +17,7 @@ SWEEPS = 12  # of balancing
 # A source below this share of what a state receives through other states does not count. With 1 a state's own source
 # would be ignored, with 0 a negligible source may determine the unit.
 FAINT = 1e-6
-LEAST = 2.0**-900  # the smallest rate that takes part in the balancing; units end at 2^-500
+LEAST = 2.0**-900  # the smallest rate that takes part in the balancing; units are from 2^-500 to 2^500
 
 
 def balanced(A: Array, horizon: float, speed: Array) -> Array:

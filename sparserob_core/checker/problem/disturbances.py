@@ -55,8 +55,9 @@ class Disturbances:
     def changes(self) -> list[float] | None:
         """The times at which the disturbance may jump; ``None`` without a disturbance.
 
-        For measurable disturbances they are the jumps of those by which rows are measured. Other classes than these and
-        piecewise constant ones raise `Unchecked`.
+        A measurable disturbance may jump at any time; for it these are the times of the grid, since units of rows are
+        measured with disturbances that jump there. Classes other than measurable and piecewise constant raise
+        `Unchecked`.
         """
         if self.problem.disturbance is None:
             return None
@@ -83,10 +84,11 @@ class Disturbances:
 
     @cached_property
     def held(self) -> ConvexSet | None:
-        """The set of the disturbances that stay constant between `changes`.
+        """The set of the disturbances that stay constant between `changes`; ``None`` where there are none.
 
         Without feedback, a measurable disturbance is at the middle of its set here, and a bounded input contains its
-        deviations from the middle.
+        deviations from the middle. Where all disturbances are measurable and that middle is 0, the set is
+        ``None`` too.
         """
         bound, classes = self.problem.disturbance, self.problem.disturbance_class
         if self.timing.answering or self.problem.measurable is None or bound is None:

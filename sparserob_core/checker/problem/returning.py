@@ -23,9 +23,9 @@ def returning(problem: OptimalControlProblem) -> OptimalControlProblem:
     """Return the problem with one more constraint for a plan that repeats: every final state is one of the initial
     states.
 
-    Final states must be inside the set by more than the violation that counts as none. There is no such constraint
-    where there is only one initial state. It is derived from the initial states alone, whatever the problem's records
-    say.
+    Final states must be inside the set by the share `INSIDE` of its size. There is no such constraint where there is
+    only one initial state; coordinates with one initial value are left free. It is derived from the initial states
+    alone, whatever the problem's records say.
     """
     bound, end, fixed = problem.initial_set, problem.horizon, single(problem)
     path = [entry for entry in problem.windows if not isinstance(entry, Return)]

@@ -143,7 +143,7 @@ class ParameterExpansion:
 
     @cached_property
     def is_affine(self) -> bool:
-        """True where the state is an affine function of the parameters."""
+        """True where the state is shown to be an affine function of the parameters."""
         try:
             _ = self.moved
         except Unchecked:
@@ -152,7 +152,8 @@ class ParameterExpansion:
 
     @cached_property
     def moved(self) -> list[list[int]]:
-        """The coordinates of every ``y_j``; raises `Unchecked` where the state is not affine in the parameters."""
+        """The coordinates of every ``y_j`` that may differ from 0; raises `Unchecked` where the state is not shown to
+        be affine in the parameters."""
         d, nu = self.system.states, len(self.middle)
         coupling, dependent_coupling, affected = (
             np.zeros((d, d), dtype=bool),
@@ -197,7 +198,8 @@ class ParameterExpansion:
         return projection
 
     def corners(self) -> Iterator[tuple[float, ...]]:
-        """Return the corners of a box that contains all shares; a parameter without any effect has the share 0 only."""
+        """Return the corners of a box that contains all shares ``s_j``; a parameter without any effect has the share 0
+        only."""
         pairs = zip(self.scales, self.moved, strict=True)
         return product(*((-1.0, 1.0) if scale and states else (0.0,) for scale, states in pairs))
 
@@ -230,7 +232,7 @@ class Larger:
 def parted(problem: OptimalControlProblem) -> OptimalControlProblem:
     """Return the problem with coordinates for the parameters of a system that changes with time.
 
-    It is the problem itself where there are no such parameters, or the state is not an affine function of them.
+    It is the problem itself where there are no such parameters, or the state is not shown to be affine in them.
     """
     system = problem.system
     if not system.varies or system.parameters is None:
@@ -308,7 +310,7 @@ def _deduplicate_rows(blocks: list[Array]) -> Array:
 
 
 def _extend_set(bound: ConvexSet, corners: list[Array]) -> list[ConvexSet]:
-    """Return the sets of the larger state that hold a set at all corners.
+    """Return sets of the larger state: it is in all of them where ``x`` is in a given set at every corner.
 
     A set with flat sides becomes one polytope with the rows of all corners, another set becomes one set for each
     corner.

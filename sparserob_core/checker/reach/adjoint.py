@@ -37,9 +37,9 @@ LONGEST = 16.0  # size of a system over a step, at most: the terms of its series
 BENDING = 7  # degree of the polynomials that bound second derivatives
 MOST_STEPS = 2**17
 BLOCK = 64  # rows in one ball matrix, a power of two: fewer need more calls, more make more rows that are not needed
-# Steps between rows that are products of ball matrices, a power of two, where making all rows so would take long. A row
-# between needs one more product of floats, whose error is like that of the terms of polynomials. With half of it the
-# rows of many states take twice as long, and with twice as much the transitions between take the time of the rows.
+# Steps between rows that are products of ball matrices, a power of two, where it would take long to make all rows of
+# balls. Every row in between takes one more product of floats, with an error like that of the terms of polynomials.
+# With half of it the rows of many states take twice as long; with twice as much the transitions take as long as rows.
 APART = 16
 # Multiplications of balls for all rows, about six seconds; beyond, only every `APART`-th row is made of balls. With a
 # tenth of it bounds for plants whose rows take no time are wider than those that a run reports to the last digit.
@@ -55,9 +55,9 @@ SUMMED = 32
 @final
 @dataclass(frozen=True, eq=False)
 class AdjointFlow:
-    """The flow that the adjoints of all rows of ``x' = A x + F u`` share: that on a ``segment`` of time of the length
-    ``step``, and the number ``count`` of such steps. The length is a power of two, so that places within a step are
-    exact."""
+    """The flow that the adjoints of all rows of ``x' = A x + F u`` share: ``e^{A s}`` on a ``segment`` of time of the
+    length ``step``, and the number ``count`` of such steps, which cover the horizon. The length is a power of two, so
+    that places within a step are exact."""
 
     A: arb_mat
     F: arb_mat
@@ -73,7 +73,7 @@ class AdjointFlow:
         Raises
         ------
         Unchecked
-            If the system is too fast for this horizon.
+            If the system is too fast, or has too many states, for this horizon.
         """
         plain, speed = middles(A), np.abs(middles(F)).sum(axis=1)
         units = balanced(plain, horizon, speed)
@@ -121,7 +121,8 @@ class AdjointFlow:
 
     def _expand_adjoint(self, order: int, columns: arb_mat | None = None) -> Enclosed:
         """Return matrices ``(order + 1, d, n)`` that turn an adjoint at the beginning of a step into the terms of ``l``
-        on this step, or of ``l`` times ``columns (d, n)``. The remainder is in the radius of the first."""
+        on this step, or of ``l'`` times ``columns (d, n)``. The terms are those of powers of the share of the step. The
+        remainder is in the radius of the first matrix."""
         self.clock.check()
         terms, remainder = self.segment.first(order + 1)
         matrices = [term.matrix for term in terms]
@@ -145,7 +146,7 @@ class AdjointFlow:
     @cached_property
     def bending(self) -> Enclosed:
         """The matrices that turn an adjoint into the first terms of ``l'[A^2, A F, A^2 F]`` on a step,
-        ``(J, d, d + 2 q)``."""
+        ``(BENDING + 1, d, d + 2 q)``, with the remainder in the radius of the first."""
         once, twice = (Series.known(self.A * matrix) for matrix in (self.F, self.A))
         return self._expand_adjoint(BENDING, twice.beside(once).beside(Series.known(self.A * once.matrix)).matrix)
 
@@ -221,7 +222,8 @@ class AdjointRow:
 
     @cached_property
     def driven(self) -> Enclosed:
-        """The terms of ``l'F`` on every step, ``(N, p + 1, q)``; the remainder is in the radius of the first."""
+        """The terms of ``l'F`` on every step in powers of its share, ``(N, p + 1, q)``; the remainder is in the radius
+        of the first."""
         return Enclosed(*_multiply_rows(Enclosed(self.nodes.mid[:-1], self.nodes.rad[:-1]), self.motion.inputs))
 
     @cached_property
@@ -230,9 +232,11 @@ class AdjointRow:
 
     @cached_property
     def sums(self) -> Enclosed:
-        """The integrals of ``l'F`` from 0 to the end of every step, ``(N + 1, q)``. The radius grows from step to step
-        by the error bound of this step, so that the error of a difference of two is bounded by the difference of their
-        radii."""
+        """The integrals of ``l'F`` from 0 to the ends of all steps, 0 itself first, ``(N + 1, q)``.
+
+        The radius grows from step to step by the error bound of this step. So the difference of two radii bounds the
+        error of the difference of both integrals, apart from the rounding of each to a float, which is not in it.
+        """
         increments, size = (
             self.step * np.einsum("kjq,j->kq", terms, self._integration_weights)
             for terms in (self.driven.mid, np.abs(self.driven.mid))
@@ -275,8 +279,8 @@ class AdjointRow:
         Returns
         -------
         tuple
-            The integrals ``(..., q)`` with radii as in `sums`, and bounds of the rounding errors made here,
-            ``(..., q)``.
+            The integrals ``(..., q)`` with radii as in `sums`, and bounds of the rounding errors made here and by the
+            floats of `sums`, ``(..., q)``.
         """
         steps, shares = self.placed(np.maximum(times, 0.0))
         powers = self.step * shares[..., None] ** np.arange(1, ORDER + 2) * self._integration_weights
@@ -288,8 +292,8 @@ class AdjointRow:
         return Enclosed(total, (self.sums.rad[steps] + rad) * OUTWARD), rounded * OUTWARD
 
     def between(self, times: Array, start: Array | float, stop: Array | float) -> Enclosed:
-        """Return what an input of 1 from ``start`` to ``stop`` adds to the row at exact times, ``(..., q)``. The radius
-        allows for the rounding of differences of times."""
+        """Return what an input of 1 by every column of ``F``, from ``start`` to ``stop``, adds to the row at exact
+        times, ``(..., q)``. The radius allows for the rounding of differences of times."""
         (since, since_rounding), (until, until_rounding) = subtract_times(times, start), subtract_times(times, stop)
         (late, late_rounding), (early, early_rounding) = self.integrals(since), self.integrals(until)
         mid = late.mid - early.mid
@@ -342,7 +346,8 @@ class SupportIntegrals:
 
     @cached_property
     def _support_bounds(self) -> Array:
-        """The upper bounds of the support functions on every step and its neighbours, ``(N, S)``."""
+        """The upper bounds of the absolute values of the support functions on every step and its neighbours,
+        ``(N, S)``."""
         _, errors, size = self._polynomials
         heights = (size + errors) @ np.array([side.far for side in self.sides]).T * OUTWARD
         padded = np.pad(heights, ((1, 1), (0, 0)), mode="edge")
@@ -364,15 +369,15 @@ class SupportIntegrals:
 
     @cached_property
     def _end_integrals(self) -> tuple[Array, Array, Array]:
-        """The integrals from 0 to the end of every step, and how much more and how much less they may be,
-        ``(N + 1, S)`` each."""
+        """The integrals from 0 to the ends of all steps, 0 itself first, and how much more and how much less they may
+        be, ``(N + 1, S)`` each."""
         value, excess, deficit = self._integrate_steps(np.arange(self.row.count), np.ones(self.row.count))
         outward = OUTWARD * (1.0 + rounding(self.row.count))
         return accumulate_exactly(value), _accumulate_bounds(excess) * outward, _accumulate_bounds(deficit) * outward
 
     def at(self, times: Array, rounded: Array | float = 0.0) -> tuple[Array, Array]:
-        """Return lower and upper bounds ``(k, S)`` of the integrals from 0 to ``times (k,)``, whose rounding errors are
-        at most ``rounded``."""
+        """Return lower and upper bounds, ``(k, S)`` each, of the integrals from 0 to ``times (k,)``. The given times
+        may differ from the true ones by at most ``rounded``."""
         steps, shares = self.row.placed(times)
         (value, excess, deficit), partial = (
             (values[steps] for values in self._end_integrals),
@@ -440,7 +445,8 @@ def _sum_enclosures(parts: Sequence[Enclosed]) -> Enclosed:
 
 
 def accumulate_exactly(values: Array) -> Array:
-    """Return the sums of the first ``0, 1, ..., N`` of ``values (N, q)``, each rounded once."""
+    """Return the sums of the first ``0, 1, ..., N`` of ``values (N, q)``, ``(N + 1, q)``: added in balls, each rounded
+    to a float once."""
     sums = [accumulate(balls(column), initial=ball(0.0)) for column in values.T]
     return np.array([[float(x) for x in column] for column in sums]).reshape(-1, len(values) + 1).T
 
@@ -482,7 +488,7 @@ class Worst:
     adjoint
         The adjoint of the row ``c``.
     centre, begun
-        The centre of the initial states, ``(d,)``, and the set of deviations from it.
+        The centre of the initial states, ``(d,)``, and the set of deviations from it, or ``None``.
     grid, drives
         Times ``(L + 1,)``, and the known inputs between them, ``(q', L)``, which enter by the first inputs of the
         adjoint.
@@ -513,7 +519,7 @@ class Worst:
         return slice(self.drives.mid.shape[0], None)
 
     def along(self, time: float, deviation: Array, changes: Array, signal: Array | None) -> tuple[float, float]:
-        """Return a lower and an upper bound of the row at a time along one trajectory.
+        """Return a lower and an upper bound of ``c'x(t)`` at a time along one trajectory.
 
         Parameters
         ----------
@@ -533,8 +539,8 @@ class Worst:
             rad = rad + row.rad @ np.abs(state) + rounding(state.size) * (np.abs(row.mid) @ np.abs(state))
             rad = rad + 2.0 * HALF_ULP * np.abs(value)
         if signal is not None:
-            late, early = np.append(changes[:-1], time)[:-1], np.minimum(changes[1:], time)
-            effects = self.adjoint.between(np.full(late.size, time), late, early)
+            starts, stops = np.append(changes[:-1], time)[:-1], np.minimum(changes[1:], time)
+            effects = self.adjoint.between(np.full(starts.size, time), starts, stops)
             gains, gain_errors = (
                 effects.mid[:, self._disturbance_columns] * signal.T,
                 effects.rad[:, self._disturbance_columns] * np.abs(signal.T),
@@ -545,7 +551,10 @@ class Worst:
         return float(value[0]) - error, float(value[0]) + error
 
     def _evaluate_inputs(self, times: Array) -> tuple[Array, Array]:
-        """Return what the known inputs add to the row at ``times (k,)``, and the error bounds, ``(k,)`` each."""
+        """Return what the known inputs add to the row at ``times (k,)``, and the error bounds, ``(k,)`` each.
+
+        An interval on which the middles of all inputs are 0 counts as one without inputs.
+        """
         mid, rad, size = np.zeros(times.size), np.zeros(times.size), np.zeros(times.size)
         used = self.drives.mid.shape[0]
         for k, (start, stop) in enumerate(zip(self.grid[:-1], self.grid[1:], strict=True)):
@@ -570,8 +579,8 @@ class Worst:
             supports.append(
                 self._evaluate_held(times) if self.changes is not None else self._evaluate_measurable(times)
             )
-        for high, error in supports:
-            top, rad, size = top + high, rad + error, size + np.abs(high)
+        for support, error in supports:
+            top, rad, size = top + support, rad + error, size + np.abs(support)
         rad = (rad + 8.0 * HALF_ULP * (np.abs(top) + size)) * OUTWARD
         return top + rad, 3.0 * rad
 
@@ -611,16 +620,16 @@ class Worst:
 
     def _evaluate_held(self, times: Array) -> tuple[Array, Array]:
         """Return what the worst disturbance that is constant between ``changes`` adds to the row at ``times (k,)``, and
-        error bounds, ``(k,)`` each."""
+        how much more it may be, ``(k,)`` each."""
         assert self.pushed is not None and self.changes is not None
         top, rad = np.zeros(times.size), np.zeros(times.size)
         for start, stop in zip(self.changes[:-1], self.changes[1:], strict=True):
             effects = self.adjoint.between(times, float(start), float(stop))
-            high, error = _evaluate_support(
+            support, error = _evaluate_support(
                 self.pushed,
                 Enclosed(effects.mid[:, self._disturbance_columns], effects.rad[:, self._disturbance_columns]),
             )
-            top, rad = top + high, rad + error + HALF_ULP * np.abs(top)
+            top, rad = top + support, rad + error + HALF_ULP * np.abs(top)
         return top, rad
 
     @cached_property
@@ -666,8 +675,8 @@ class Worst:
 
     @cached_property
     def _curvature_bounds(self) -> Array:
-        """The bounds ``(N,)`` of the curvature of the largest value on every step. Times an eighth of the square of the
-        width of a cell, they bound how far the largest value lies above its chord."""
+        """The upper bounds ``(N,)`` of the downward curvature of the largest value on every step. Times an eighth of
+        the square of the width of a cell, they bound how far the largest value lies above its chord."""
         states, once, twice = self._single_adjoint.bends
         state_bound = np.abs(self.centre) + (0.0 if self.begun is None else np.array(known(self.begun).radius))
         curvature = states @ state_bound
@@ -706,7 +715,8 @@ class Worst:
         return np.asarray(end_values.max(axis=0) + (width**2 / 8.0 * curvature + rounding_error) * OUTWARD)
 
     def cuts(self, more: Sequence[float]) -> Array:
-        """Return times, among them ``more``, between which no input jumps and which are at most a step apart."""
+        """Return increasing times, among them ``more``, between which no input jumps. They are at most a step apart,
+        except for a `Stopped` adjoint, of which only values at single times are known."""
         times = [np.asarray(more, dtype=float)]
         if isinstance(self.adjoint, AdjointRow):
             times.append(np.arange(self.adjoint.count + 1) * self.adjoint.step)
@@ -716,7 +726,8 @@ class Worst:
 
 
 def _evaluate_support(bound: ConvexSet, rows: Enclosed) -> tuple[Array, Array]:
-    """Return the support values of a set at rows ``(k, d)``, and how much more they may be, ``(k,)`` each."""
+    """Return approximate support values of a set at rows ``(k, d)``, and how much more the true values may be, ``(k,)``
+    each."""
     w, excess = known(bound).bound(rows.mid, rows.rad)
     size = (np.abs(w) * np.abs(rows.mid)).sum(axis=1)
     error = (np.abs(w) * rows.rad).sum(axis=1) + rounding(rows.mid.shape[1]) * size

@@ -121,7 +121,7 @@ class VerifiedLoop:
 
     def pushed(self, vectors: Sequence[Sequence[Fraction]]) -> Pushed:
         """Return which states a block of the disturbance along ``vectors (q, mw)`` reaches. For a system that may
-        change with time, only the positions of entries that are not always 0 are used."""
+        change with time, only the positions of entries that may differ from 0 are used."""
         if not self.flow.plant.is_timed:
             return Pushed.of([(mode["A"], mode["E"]) for mode in modes_at(self.system, ())], vectors)
         d, m = self.flow.states, self.flow.driven

@@ -131,6 +131,7 @@ def of_block(shape: ConvexSet, about: Array, a: list[arb]) -> arb:
 
 
 def rounded_radii(first: list[Array], sets: Sequence[tuple[ConvexSet, Array]]) -> Array:
-    """Return the radii ``first`` of some blocks and those of ``sets`` about their middles, ``(Q,)``, rounded up."""
+    """Return the radii ``first`` of some blocks and bounds of those of ``sets`` about their middles, ``(Q,)``, rounded
+    up."""
     radii = [np.array(known(shape).radius) + np.abs(about) for shape, about in sets]
     return np.asarray(np.nextafter(np.concatenate([np.zeros(0), *first, *radii]) * OUTWARD, np.inf))

@@ -68,8 +68,8 @@ class FollowedExecution(BoundedInputHere):
         return low.reshape(shape), high.reshape(shape)
 
     def least(self, c: Array, time: float) -> Array:
-        """Return lower bounds ``(K, m)`` of what the worst errors add to ``c'x(t)`` for a command of size 1 on every
-        piece."""
+        """Return lower bounds ``(K, m)`` of what the worst errors add to ``c'x(t)``, for a command of size 1 on one
+        piece in one channel."""
         (low,), (high,) = self.integrals(c, np.array([time]), self.breakpoints)
         return np.asarray(np.maximum(self.shares * (low[:-1] - high[1:]) * (1.0 - 1e-15), 0.0))
 

@@ -33,7 +33,7 @@ class Added(NamedTuple):
     off
         The upper bound of how far the true value exceeds them, and the chord between two times.
     over
-        The upper bound of how far they exceed the true value in the middle of the box.
+        The upper bound of how far they exceed the true value in the middle of the box by more than ``off``.
     wide
         The part of ``off`` that is due to the width of each parameter, ``(nu,)``; empty where there is none.
     """
@@ -76,8 +76,8 @@ class BoundedInputHere(BoundedInput):
 
     @abstractmethod
     def least(self, c: Array, time: float) -> Array:
-        """Return lower bounds ``(K, m)`` of what the worst input adds to ``c'x(t)`` for a command of size 1 on every
-        piece."""
+        """Return lower bounds ``(K, m)`` of what the worst input adds to ``c'x(t)``, for a command of size 1 on one
+        piece in one channel."""
 
     @abstractmethod
     def bent(self, c: Array, start: float, stop: float) -> float:
@@ -97,7 +97,7 @@ class BoundedInputHere(BoundedInput):
 
 
 def pushes(law: VerifiedFlow, start: float, stop: float, columns: slice) -> Enclosed:
-    """Return the kernel of an interval without marks: its length times ``Phi(stop, s) [B E](s)``, in some ``columns``.
+    """Return the kernel of an interval without marks: its length times some ``columns`` of ``Phi(stop, s) [B c E](s)``.
 
     The kernel is a polynomial in ``u``, where ``(1 + u) / 2`` is the share of the interval that is left at ``s``.
 
@@ -134,9 +134,9 @@ def above_chord(
     start, stop
         The ends of a cell that lies between two marks.
     begun
-        The upper bound of these sums at ``start`` for every state, ``(d,)``.
+        The upper bound of these sums at ``start`` for every state in the place of ``c'x``, ``(d,)``.
     size
-        The upper bound of the inputs, ``(m,)``, which enter by the columns of ``[B E]`` from the ``first`` one on.
+        The upper bound of the inputs, ``(m,)``, which enter by the columns of ``[B c E]`` from the ``first`` one on.
     """
     lines, width = exactly(rows), (stop - start) * (1.0 + rounding(2))
     enclosure, d = Enclosed.of(lines), lines.ncols()

@@ -33,7 +33,7 @@ from sparserob_core.sip.convex_set import Array, ConvexSet
 if TYPE_CHECKING:
     from flint import arb, arb_mat
 
-SETTLED = 2.0**-49  # of the heights: how much another corner may add on a cell that is cut no further
+SETTLED = 2.0**-49  # relative to the support values: how much another corner may add on a cell that is cut no further
 ROUNDS = 60  # in which cells are cut
 # Rounds that always cut where two corners are equally good. Later every second one halves the cell: where two corners
 # touch at an end, that point lies next to this end, and such cuts gain little.
@@ -102,8 +102,8 @@ class Side:
         Returns
         -------
         tuple
-            Values, how much more and how much less the true integral may be, and bounds of the absolute heights without
-            their errors, ``(n,)`` each.
+            Values, how much more and how much less the true integral may be, and bounds of the absolute support values
+            without their errors, ``(n,)`` each.
         """
         P = np.einsum("npw,vw->npv", plain, self.corners)
         e = (off @ (np.abs(self.corners) + self.rad).T + sizes @ self.rad.T) * OUTWARD
@@ -113,7 +113,7 @@ class Side:
 @final
 @dataclass(frozen=True, eq=False)
 class Together:
-    """The sum of several ``sides``, at least one: its support function is the sum of theirs."""
+    """The Minkowski sum of several ``sides``, at least one: its support function is the sum of theirs."""
 
     sides: Sequence[Side | CurvedSide]
 
@@ -141,8 +141,8 @@ class VerifiedKernel:
     """The kernel ``Phi(end, s) E(s)`` of an interval, by the time ``r`` that is left of the interval at ``s``.
 
     The interval consists of ``S`` parts, from its end backwards. On each the kernel, times the length of the part, is a
-    polynomial in ``u`` from -1 to 1: ``coefficients (S, p + 1, d, mw)`` with the total error bound
-    ``off (S, d, mw)``.
+    polynomial in ``u`` from -1 to 1: ``coefficients (S, p + 1, d, mw)``. ``off (S, d, mw)`` bounds the error of the
+    polynomial.
     """
 
     coefficients: Array
@@ -269,8 +269,8 @@ def _find_crossings(P: Array, start: Array, stop: Array) -> Array:
         has_changed = f * fb < 0.0
         a, fa = np.where(has_changed, b, a), np.where(has_changed, fb, fa / 2.0)
         b, fb = cut, f
-    least = 1e-9 * (stop - start)
-    return np.asarray(np.where(crossing & (cut > start + least) & (cut < stop - least), cut, middle_of))
+    margin = 1e-9 * (stop - start)
+    return np.asarray(np.where(crossing & (cut > start + margin) & (cut < stop - margin), cut, middle_of))
 
 
 @final
@@ -370,7 +370,8 @@ class MeasurableDeviations(Deviations):
 @final
 @dataclass(frozen=True, eq=False)
 class MeasurableLoop(VerifiedLoop):
-    """A `VerifiedLoop` under measurable disturbances."""
+    """A `VerifiedLoop` under measurable disturbances. Its deviations are their effects on the state at the end of every
+    piece of the grid, ``(d,)`` each, and the initial deviation."""
 
     @cached_property
     def deviations(self) -> MeasurableDeviations:
@@ -408,8 +409,8 @@ class MeasurableLoop(VerifiedLoop):
         return stacked(rows)
 
     def state(self, piece: int, time: float) -> arb_mat:
-        """Return the nominal state and the responses at a time in a piece of the grid, without the effect of the
-        disturbance on this piece, ``(d, 1 + Q)``."""
+        """Return the nominal state and the responses at a time in a piece of the grid, ``(d, 1 + Q)``. The disturbance
+        on this piece is at the middle of its set; its deviation is left out."""
         if time == self.grid[piece]:
             return self.nodes[piece]
         Phi, effect = self._compute_part_flow(piece, self.grid[piece], time)
@@ -428,8 +429,8 @@ class MeasurableLoop(VerifiedLoop):
         ]
 
     def under_way(self, piece: int, time: float, rows: Array | arb_mat) -> Enclosed:
-        """Return the most that the disturbances on a piece add to ``rows (r, d)`` up to a time in this piece,
-        ``(r,)``."""
+        """Return the most that deviations of the disturbance on a piece add to ``rows (r, d)`` up to a time in this
+        piece, ``(r,)``."""
         return self.deviations.way(self.grid[piece], time).most(as_enclosed(rows), self.deviations.sides)
 
     def bent(self, piece: int, start: float, stop: float, rows: Array | arb_mat) -> Array:

@@ -52,7 +52,7 @@ class SizedInput:
     breakpoints, pieces
         The breakpoints ``(K + 1,)`` of the command, and its pieces, ``(m, 1)`` each.
     first
-        The first of the columns of ``[B E]`` by which the input enters.
+        The first of the columns of ``[B c E]`` by which the input enters.
     numb
         States that no error reaches: integrals of the command.
     side
@@ -81,23 +81,26 @@ class SizedInput:
 
     @property
     def columns(self) -> slice:
-        """The columns of ``[B E]`` by which the input enters."""
+        """The columns of ``[B c E]`` by which the input enters."""
         return slice(self.first, self.first + (self.shares.size if self.side is None else self.side.dimension))
 
     @cached_property
     def far(self) -> Array:
-        """The upper bound of what enters by each column, ``(m,)``, as a multiple of its size."""
+        """The upper bound of what enters by each of the `columns`, in absolute value, as a multiple of the size of the
+        input: 1, or the extent of the `side`."""
         if self.side is None:
             return np.ones(self.shares.size)
         return self.side.far
 
     def piece_at(self, time: float) -> int:
-        """Return the index of the piece of the command from a time on."""
+        """Return the index of the piece of the command from a time on; before the first and after the last piece, that
+        of these."""
         index = int(np.searchsorted(self.breakpoints, time, side="right")) - 1
         return min(max(0, index), len(self.pieces) - 1)
 
     def largest(self, piece: int) -> Array:
-        """Return upper bounds ``(m,)`` of what enters by each column on a piece."""
+        """Return upper bounds of the absolute values of what enters by each of the `columns` on a piece, up to
+        rounding."""
         return np.asarray((self.sizes.mid[piece] + self.sizes.rad[piece]) * self.far)
 
     def reaching(self, rows: Array) -> Array:
@@ -124,8 +127,8 @@ class BoundedInputAt(BoundedInputHere):
         return np.searchsorted(self.input.breakpoints, np.array(self.marks[:-1]), side="right") - 1
 
     def least(self, c: Array, time: float) -> Array:
-        """Return lower bounds ``(K, m)`` of what the worst input adds to ``c'x(t)`` for a command of size 1 on every
-        piece."""
+        """Return lower bounds ``(K, m)`` of what the worst input adds to ``c'x(t)``, for a command of size 1 on one
+        piece in one channel."""
         bounds = np.zeros((self.input.breakpoints.size - 1, self.input.shares.size))
         low, _, indices = self._bound_integrals(c[None], time, np.arange(len(self.marks) - 1))
         np.add.at(bounds, self.owner[indices], np.maximum(low[:, 0], 0.0))
@@ -219,7 +222,7 @@ class BoundedInputAt(BoundedInputHere):
 
     @remembered(lambda: TIMES_KEPT)
     def _compute_kernel(self, start: float, stop: float) -> Enclosed:
-        """Return the kernel of an interval in powers of ``u`` from -1 to 1, ``(p + 1, d, m)``."""
+        """Return the kernel of an interval in powers of ``u`` from -1 to 1, ``(p + 1, d, m)``, as `pushes` does."""
         kernel = pushes(self.law, start, stop, self.input.columns)
         return Enclosed(kernel.mid[:, 0], kernel.rad[:, 0])
 
@@ -242,9 +245,10 @@ class BoundedInputOver(BoundedInput):
     At one parameter it is the `BoundedInputAt` of the known system there. Over a box, take one parameter after another,
     in shares of half its interval. A function ``f`` differs from its chord by at most half of the largest ``|f''|``,
     and the absolute value of a chord is not above the chord of the absolute values. So the integrals of ``|f|`` are at
-    most the interpolation of their values at the corners, linear in each parameter, plus half of the integrals of
-    ``|f''|``. The second derivatives are bounded by an expansion, whose remainder counts twice. The support function of
-    a ``side`` takes the place of the absolute value, since for a sum it is not above the sum of both values.
+    most the interpolation of their values at the corners, linear in each parameter, plus half of the integrals of the
+    largest ``|f''|``. The second derivatives are bounded by an expansion, whose remainder counts twice. The support
+    function of a ``side`` may take the place of the absolute value: it is convex, and that of a sum of directions is at
+    most the sum of both values.
     """
 
     flows: VerifiedFlows
@@ -290,7 +294,7 @@ class BoundedInputOver(BoundedInput):
         wide
             How far the integrals may lie above the interpolation between corners, due to each parameter, ``(nu,)``.
         remainder
-            The remainder of the expansion.
+            The upper bound of what the remainder of the expansion adds to the integrals.
         chord_error
             How far the integrals may lie above their chord between the ``times``; 0 at a single time.
         """

@@ -50,7 +50,7 @@ class Pushed:
     pattern
         The entries of the effect on the states that may differ from 0, ``(d, q)``.
     states
-        The dimension of the reached subspace, or an upper bound of it.
+        The dimension of the smallest invariant subspace that holds all effects, or an upper bound of it.
     entries
         An upper bound of the number of independent columns of ``E`` along the vectors.
     """
@@ -61,7 +61,8 @@ class Pushed:
 
     @staticmethod
     def of(modes: Sequence[tuple[arb_mat, arb_mat]], vectors: Sequence[Sequence[Fraction]]) -> Pushed:
-        """Return the reached states for a disturbance along ``vectors (q, mw)``, without rounding.
+        """Return the reached states for a disturbance along ``vectors (q, mw)``, without rounding: the entries of the
+        systems must be floats.
 
         The reached subspace is the smallest one that holds the columns of every ``E`` along the vectors and that no
         ``A`` leaves. It is found within ``d`` steps.
@@ -214,8 +215,8 @@ def _insert_zero_columns(matrix: arb_mat, places: list[int], count: int) -> arb_
 
 
 def _has_known_bits(row: Sequence[arb], bits: int) -> bool:
-    """Return whether so many bits of a row are known. With rows of one size, a row of which few bits are known makes a
-    matrix that balls cannot invert, or an inverse of which few bits are known."""
+    """Return True where the largest entry of a row has at least so many known bits. With rows of one size, a row of
+    which few bits are known makes a matrix that balls cannot invert, or an inverse of which few bits are known."""
     return max(float(abs(x.mid())) for x in row) > 2.0**bits * max(float(x.rad()) for x in row)
 
 
@@ -231,7 +232,7 @@ def _scale_by_reach(D: arb_mat, reach: Array) -> tuple[arb_mat, Array, Array]:
 
 def _equilibrate(D: arb_mat) -> tuple[arb_mat, Array, Array]:
     """Return a scaled matrix, and the powers of two that multiply its rows and its columns, so that the largest entry
-    of each is about 1 (Ruiz 2001). The scaled matrix does not depend on units."""
+    of each is about 1 (Ruiz 2001). Units of rows and columns change the scaled matrix by rounded powers of two only."""
     sizes = np.abs(middles(D))
     rows, columns = np.ones(sizes.shape[0]), np.ones(sizes.shape[1])
     for _ in range(EVENED):

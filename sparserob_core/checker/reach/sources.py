@@ -43,7 +43,7 @@ class Sources:
     def strayed(self) -> BoundedInput | None:
         """The measurable disturbances, counted from the middle of their set, where the control does not answer them;
         else ``None``. In a box, they are the errors of a command of size 1 through the columns of ``E``, with half the
-        widths as shares. In another set all components enter together."""
+        widths as shares, which are enclosed. In another set all components enter together."""
         bound = self.problem.measurable
         if bound is None or self.timing.answering:
             return None

@@ -43,11 +43,11 @@ class Scene:
     grid
         All breakpoints.
     control
-        The control on each piece of the grid, ``(m, 1)``.
+        The control on each piece of the grid, ``(m, 1)``; with a drift its last entry is 1.
     initial_state, initial_set
         The centre of the initial states, ``(d,)``, and the set of deviations from it.
     disturbance, changes
-        The set of the disturbance, and the breakpoints between which it is constant.
+        The set of the disturbance, ``None`` without one, and the breakpoints between which it is constant.
     lasting
         The components of the disturbance that are held over several of these intervals.
     """
@@ -189,7 +189,7 @@ class States:
         start, stop
             The ends of the part; both may be the same.
         order
-            The number of terms, ``J``, in the share of the part that has passed.
+            The largest number of terms, ``J``, in the share of the part that has passed; at a single time there is one.
 
         Returns
         -------
@@ -243,7 +243,7 @@ class States:
 
     @remembered(lambda: PATHS_KEPT, lambda self, segment, basis: (segment, basis.tobytes()))
     def _project_flow(self, segment: VerifiedSegment, basis: Array) -> Lines:
-        """Return the rows ``basis (b, d)`` of the flow on a segment."""
+        """Return the products of the rows ``basis (b, d)`` with the flow on a segment."""
         return Lines.of(segment, basis)
 
     def blur(self, place: int) -> Array:
@@ -280,8 +280,11 @@ class StatesOverBoxes:
 @final
 @dataclass(frozen=True, eq=False)
 class Lines:
-    """Rows of the flow on a segment of time: ``terms (N, M, b, d + w)`` in the share of the segment, their error bound
-    ``off (b, d + w)`` at any share, and bounds ``sizes (N, b, d + w)`` of the terms at every parameter."""
+    """Products of rows with the flow on a segment of time: ``terms (N, M, b, d + w)`` in powers of its share.
+
+    ``off (b, d + w)`` is the error bound of this polynomial at any share for which the segment is verified.
+    ``sizes (N, b, d + w)`` are upper bounds of the absolute values of the terms at every parameter.
+    """
 
     terms: Enclosed
     off: Array
@@ -289,14 +292,17 @@ class Lines:
 
     @staticmethod
     def of(segment: VerifiedSegment, basis: Array) -> Lines:
-        """Return the rows ``basis (b, d)`` of the flow on a segment."""
+        """Return the products of the rows ``basis (b, d)`` with the flow on a segment."""
         rows = exactly(basis)
         terms = enclosed([term.along(rows) for term in segment.terms])
         return Lines(terms, np.abs(basis) @ segment.off * OUTWARD, np.abs(basis) @ segment.powers.sizes * OUTWARD)
 
     def shifted(self, first: float, width: float, order: int) -> Enclosed:
-        """Return the rows on a part of the segment, from the share ``first`` on and of this ``width``: ``order`` terms
-        in the share of the part, ``(J, M, b, d + w)``, with the remainder in the radius of the first."""
+        """Return the rows on a part of the segment, from the share ``first`` on and of this ``width``.
+
+        They are at most ``order`` terms in powers of the share of the part, ``(J, M, b, d + w)``. The remainder is in
+        the radius of the first.
+        """
         count = len(self.terms.mid)
         table = shifted(first, width, count)
         kept, size = table[:order], np.abs(self.terms.mid)

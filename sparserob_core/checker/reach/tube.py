@@ -37,7 +37,7 @@ class Polynomial:
     """A polynomial with an error bound, near the largest ``c'x`` on a cell of time and a box of parameters.
 
     The true value exceeds the polynomial by at most ``error``. The polynomial plus ``error`` exceeds the true value by
-    at most twice the ``error`` plus ``kinks``; for a chord this holds at its ends.
+    at most twice the ``error`` plus ``kinks``; for a chord this holds at its ends only.
 
     Attributes
     ----------
@@ -135,7 +135,8 @@ class VerifiedTube:
         return Enclosed.of(stacked(table))
 
     def cells(self, piece: int, start: float, stop: float, z: Array, sharp: bool = False) -> list[Polynomial]:
-        """Return polynomials above ``c'x`` for every direction ``c = z_i'basis``, over all deviations.
+        """Return polynomials near the largest ``c'x`` over all deviations, with their errors, for every direction
+        ``c = z_i'basis``.
 
         Parameters
         ----------
@@ -186,7 +187,7 @@ class VerifiedTube:
 def bound_supports(
     shape: Shape, monomials: Monomials, every: Array, errors: Array, z: Array, sharp: bool
 ) -> tuple[Array, Array, Array, Array]:
-    """Return upper bounds of the sum over pieces of a set's support function.
+    """Return polynomials that, with their errors, are upper bounds of the sum over pieces of a set's support function.
 
     Parameters
     ----------
@@ -231,7 +232,8 @@ def bound_supports(
 def _bound_linearly(
     shape: Shape, every: Array, errors: Array, z: Array, count: int
 ) -> tuple[Array, Array, Array, Array, Array, Array]:
-    """Return linear bounds of the support function of each piece, by a point of the set that is best or nearly so.
+    """Return linear upper bounds of the support function of each piece, by a point of the set that is best or nearly
+    so in the middle of the range of the arguments.
 
     Returns
     -------
@@ -293,7 +295,7 @@ class LoopTube:
 
     @remembered(key=lambda self, piece, time, z: (piece, time, z.tobytes()))
     def _enclose_heights(self, piece: int, time: float, z: Array) -> Enclosed:
-        """Return the largest ``c'x`` at a time in a piece of the grid, ``(k,)``."""
+        """Return the largest ``c'x`` at a time in a piece of the grid, with the answers of the control, ``(k,)``."""
         answers = None
         if self.gains.shape[1]:
             answers = exactly(_combine_rows(z, self.gains)) * self.loop.answers(self.loop.on(piece))
@@ -321,7 +323,7 @@ class Still:
 
 
 def _combine_rows(z: Array, basis: Array) -> Array | arb_mat:
-    """Return ``z'basis (k, d)``: as floats where this needs no rounding, as balls elsewhere."""
+    """Return the products of ``z (k, b)`` with ``basis (b, d)``: floats where they need no rounding, else balls."""
     is_exact = (np.count_nonzero(z, axis=1) <= 1).all() and np.isin(z, (-1.0, 0.0, 1.0)).all()
     return np.asarray(z @ basis) if is_exact else exactly(z) * exactly(basis)
 

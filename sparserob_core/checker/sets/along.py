@@ -72,8 +72,8 @@ class CurvedSide:
         Returns
         -------
         tuple[Array, Array, Array, Array]
-            Values, upper bounds of how much more and how much less the integral may be, and the largest support values,
-            ``(n,)`` each.
+            Values, upper bounds of how much more and how much less the integral may be, and upper bounds of the
+            absolute support values, ``(n,)`` each.
         """
         outputs = [np.zeros(0)] * 3
         for first in range(0, len(plain), AT_ONCE):

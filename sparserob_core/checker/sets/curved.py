@@ -68,8 +68,8 @@ class Ellipsoidal(Shape):
 
     @cached_property
     def missed(self) -> float:
-        """The difference between the matrix and ``L L'``, relative to ``L L'``, where ``L`` is the rounded Cholesky
-        factor: an upper bound, measured in balls."""
+        """The upper bound, in balls, of the difference between the matrix ``S`` and ``L L'`` relative to ``L L'``: of
+        the norm of ``L^-1 S L'^-1 - 1``, with the rounded Cholesky factor ``L``."""
         from flint import arb_mat, ctx
 
         L = self.source.factor

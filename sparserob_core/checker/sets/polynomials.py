@@ -54,7 +54,8 @@ class Enclosed:
 
     @property
     def with_exact_zeros(self) -> Enclosed:
-        """The numbers of a ball matrix, of which an exact 0 has the radius 0 in place of `TINY`."""
+        """The numbers of a ball matrix, of which an exact 0 has the radius 0 in place of `TINY`. So has a number that
+        is too small for a float."""
         return Enclosed(self.mid, np.where(self.rad > TINY, self.rad, 0.0))
 
 

@@ -194,7 +194,7 @@ class Shape(ABC):
         raise Unchecked(f"the checker cannot tell who is in a {self.source.kind}")
 
     def far(self, direction: Sequence[arb]) -> list[arb]:
-        """Return the approximate offset from the centre to the point of the set farthest out in a direction."""
+        """Return balls near the offset from the centre to the point of the set farthest out in a direction."""
         raise Unchecked(f"the checker does not know how far a {self.source.kind} reaches")
 
     def point(self, direction: Array) -> list[arb]:

@@ -101,8 +101,8 @@ class Places:
 
 
 def held_at(problem: OptimalControlProblem, breakpoints: Array, answering: bool) -> list[tuple[str, ConvexSet, Places]]:
-    """The sets that a problem's control must stay in, by name, and where: its own on every piece, and that of its
-    steps. A single piece that repeats follows itself; where it is ``answering``, by another value."""
+    """Return the sets that a problem's control must stay in, by name, and where: its own on every piece, and that of
+    its steps. A single piece that repeats follows itself; where it is ``answering``, by another value."""
     m, pieces, first, step = problem.system.controls, breakpoints.size - 1, before(problem), problem.control_step
     sets = [(of_control(problem), problem.control, Places.of_values(breakpoints, m))]
     seam = bool(problem.repeat) and (pieces > 1 or answering)
@@ -151,7 +151,7 @@ class ControlConstraint(Source):
         return ControlConstraint(name, convex, places, csr_array(dictionary.sparse @ places.table), beside)
 
     def family(self) -> ConstraintFamily:
-        """The constraint as a family; it does not depend on any uncertainty."""
+        """Return the constraint as a family; it does not depend on any uncertainty."""
         m = self.set.dimension
         low, high = self.places.starts[:1], np.array([self.places.stop])
         index_set = Box(np.concatenate([low, -np.ones(m)]), np.concatenate([high, np.ones(m)]))
@@ -167,7 +167,7 @@ class ControlConstraint(Source):
         return replace(family, nominal=family, sample=lambda count, rng: family, literal=family)
 
     def rows(self, indices: Array) -> tuple[Array, Array]:
-        """``G (k, 1, n)``, ``rhs (k, 1)`` at indices ``(k, 1 + m)``."""
+        """Return ``G (k, 1, n)``, ``rhs (k, 1)`` at indices ``(k, 1 + m)``."""
         directions, places = unit(self.set, indices[:, 1:]), self.places.at(indices[:, 0])
         G = np.einsum("kc,kn->kcn", directions, self.values[:, places].toarray().T).reshape(indices.shape[0], 1, -1)
         G = np.pad(G, ((0, 0), (0, 0), (0, self.beside)))
@@ -179,16 +179,16 @@ class ControlConstraint(Source):
         return of_gauge()
 
     def gradient(self, x: Array, indices: Array, rows: Array) -> Array:
-        """The derivative ``(k, 1 + m)`` of ``row x - rhs`` in the index: 0 in time, since the control is constant on
-        every piece."""
+        """Return the derivative ``(k, 1 + m)`` of ``row x - rhs`` in the index: 0 in time, since the control is
+        constant on every piece."""
         z = np.asarray(indices, dtype=float)[:, 1:]
         point = self._evaluate_places(x)[self.places.at(indices[:, 0])]
         slopes = across(self.set, z, (point - self.set.support_point(unit(self.set, z))) @ self.set.frame.T)
         return np.hstack([np.zeros((z.shape[0], 1)), slopes])
 
     def worst(self, x: Array) -> Separation:
-        """The places furthest outside, each with its worst direction; the bound is exact, since the places are finitely
-        many."""
+        """Return the places furthest outside, each with the worst direction that a climb finds. The bound is the
+        largest gauge less 1 over all places, which is exact but for rounding."""
         points = self._evaluate_places(x)
         outside = self.set.gauge(points) - 1.0
         places = np.argsort(-outside, kind="stable")[:CLIMBED]
@@ -222,8 +222,8 @@ class ControlConstraint(Source):
 
 
 def differences(pieces: int, at_start: bool, seam: bool = False) -> csr_array:
-    """The matrix ``(K, q)`` from values on pieces to their changes from one to the next; ``at_start``: from 0 before
-    the first too, ``seam``: from the last to the first too, after the others."""
+    """Return the matrix ``(K, q)`` from values on pieces to their changes from one to the next; ``at_start``: from 0
+    before the first too, ``seam``: from the last to the first too, after the others."""
     from scipy.sparse import csr_array, eye_array, hstack
 
     changes = csr_array(eye_array(pieces) - eye_array(pieces, k=1))

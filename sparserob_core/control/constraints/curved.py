@@ -43,8 +43,9 @@ STEP = 0.1  # first step of directions, on the cube of edge 2
 @dataclass(frozen=True, eq=False)
 class CurvedConstraint(StateConstraint):
     """``x(t)`` in a curved set for all ``t`` in ``[start, stop]``, ``p`` and ``w``: ``c'x(t) <= h(c)`` for every
-    direction ``c``, normalised such that ``h(c) - c'm = unit`` for the middle ``m`` of the set: what is exceeded is the
-    gauge of ``x(t)`` less 1, in multiples of ``unit``. A set with a ``reference`` moves: it holds ``x(t) - r(t)``.
+    direction ``c``, normalised such that ``h(c) - c'm = 1 / unit`` for the interior point ``m`` of the set. The largest
+    violation is the gauge of ``x(t)`` about ``m`` less 1, in multiples of ``unit``. A set with a ``reference`` moves:
+    it holds ``x(t) - r(t)``.
 
     The index is ``(t, p, z)`` with ``z`` in ``[-1, 1]^b`` a direction, not normalised, in the coordinates of the set's
     `ConvexSet.frame`.
@@ -94,8 +95,8 @@ class CurvedConstraint(StateConstraint):
 
     @shaped
     def worst(self, x: Float[Array, " n"]) -> Separation:
-        """The largest local maxima over a lattice of times, parameters and directions, climbed from until the steps
-        vanish."""
+        """Return the largest local maxima over a lattice of times, parameters and directions, climbed from until the
+        steps vanish."""
         flat, box, times = self._outer_constraint, self.index_set, self._outer_constraint.times
         values = flat.on_lattice(x)
         worst_indices, heights = self._find_worst_indices(x, values)
@@ -126,9 +127,9 @@ class CurvedConstraint(StateConstraint):
     def _find_worst_indices(
         self, x: Float[Array, " n"], values: Float[Array, "v r t"]
     ) -> tuple[Float[Array, "t j"], Float[Array, " t"]]:
-        """The worst index at every sampled time and its violation, at the worst sampled parameter, in a direction that
-        is climbed to from the sampled ones wherever these say that the set may be left. Samples are lower by what lies
-        between directions, which hides where along a wall that is ridden it is left."""
+        """Return the worst index at every sampled time and its violation, at the worst sampled parameter, in a
+        direction that is climbed to from the sampled ones wherever these say that the set may be left. Samples are
+        lower by what lies between directions, which hides where along a wall that is ridden it is left."""
         places, likely = turns(values.max(axis=0), neighbours(self._cube_dimension), self.unit)
         rows, at = places.T
         heights = values[:, rows, at].max(axis=0)
@@ -143,7 +144,7 @@ class CurvedConstraint(StateConstraint):
     def _climb_directions(
         self, x: Float[Array, " n"], indices: Float[Array, "k j"]
     ) -> tuple[Float[Array, "k j"], Float[Array, " k"]]:
-        """Indices at the same times and parameters, their directions climbed from, and the violations there."""
+        """Return indices at the same times and parameters, their directions climbed from, and the violations there."""
         if not indices.size:
             return indices, np.zeros(0)
         indices, first = self._project_indices(indices), 1 + self.parameters.count
@@ -162,7 +163,7 @@ class CurvedConstraint(StateConstraint):
 
     @shaped
     def _build_indices(self, times: Float[Array, " k"], positions: Int[np.ndarray, "k q"]) -> Float[Array, "k j"]:
-        """Indices ``(t, p, z)`` of positions on the lattice, at these times."""
+        """Return indices ``(t, p, z)`` of positions on the lattice, at these times."""
         return np.hstack(
             [
                 times[:, None],
@@ -189,7 +190,7 @@ class CurvedConstraint(StateConstraint):
 
     @shaped
     def _project_indices(self, points: Float[Array, "k j"]) -> Float[Array, "k j"]:
-        """The nearest indices to points ``(k, j)``, directions on the surface of their cube."""
+        """Return the nearest indices to points ``(k, j)``, directions on the surface of their cube."""
         box, count = self.index_set, self.parameters.count
         inside = np.clip(points, box.lower, box.upper)
         return np.hstack(
@@ -209,8 +210,8 @@ class CurvedConstraint(StateConstraint):
 
     @shaped
     def enclosure(self, x: Float[Array, " n"], lower: Float[Array, "k j"], upper: Float[Array, "k j"]) -> Enclosure:
-        """Proven upper bounds of the violation on cells ``(k, 1 + nu + b)``; where nothing is violated, in the length
-        of the cube's directions."""
+        """Return proven upper bounds of the violation on cells ``(k, 1 + nu + b)``; where nothing is violated, in the
+        length of the cube's directions."""
         nu = self.parameters.count
         touched = self.parameters.touches(lower[:, 1 : 1 + nu], upper[:, 1 : 1 + nu])
         enclosure = enclose(lower, upper, touched, nu, lambda low, high: self._enclose_cell(x, low, high))
@@ -222,8 +223,8 @@ class CurvedConstraint(StateConstraint):
 
     @shaped
     def _bound_extents(self, low: Float[Array, "k b"], high: Float[Array, "k b"]) -> Float[Array, " k"]:
-        """Lower bounds ``(k,)`` of ``h(c) - c'm`` for the directions of cells: a point ``p`` of the set far out in the
-        middle direction gives at least ``c'(p - m)``."""
+        """Return lower bounds ``(k,)`` of ``h(c) - c'm`` for the directions of cells: a point ``p`` of the set far out
+        in the middle direction gives at least ``c'(p - m)``."""
         frame = self.set.frame
         centre, radius = (low + high) / 2, (high - low) / 2
         outwards = (self.set.support_point(centre @ frame) - self.set.interior_point()) @ frame.T
@@ -317,8 +318,8 @@ class CurvedConstraint(StateConstraint):
     def _compute_minorant(
         self, H: Float[Array, "r d"], joined: Combination, nu: int
     ) -> tuple[Float[Array, "1 M"], Float[Array, " j"]]:
-        """A quadratic polynomial below ``h(c_0 + sum_j eta_j c_j)``, ``(1, M')``, and how far below at the ends of
-        every coordinate."""
+        """Return a quadratic polynomial below ``h(c_0 + sum_j eta_j c_j)``, ``(1, M')``, and how far below at the ends
+        of every coordinate."""
         value, gradient, hessian = self.set.support_minorant(H[0], H[1:])
         rhs = np.zeros((1, joined.space.size))
         rhs[0, 0] = value

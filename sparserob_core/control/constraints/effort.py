@@ -24,7 +24,7 @@ class FeedbackEffort(Source):
     nominal control's entries.
 
     An index is a sign of every entry, ``s (m K,)``, or with the deviations ``(s, w)``: the constraint is that of
-    ``s``, and where deviations are symmetric that of ``-s`` too, for all signs.
+    ``s``, and where deviations are a box that of ``-s`` too, for all signs.
     """
 
     name: str
@@ -34,8 +34,8 @@ class FeedbackEffort(Source):
     _efforts: dict[bytes, Effort] = field(default_factory=dict, repr=False)
 
     def normals_in(self, units: Units) -> tuple[Array, Array]:
-        """Return one normal ``(1,)`` for each of two rows, and the unit of the cost: the rows are costs, whatever the
-        deviations."""
+        """Return one normal ``(1,)`` for each of at most two rows, and the unit of the cost: the rows are costs,
+        whatever the deviations."""
         return np.ones((2, 1)), np.array([units.cost])
 
     def index_units(self, units: Units) -> Array:
@@ -43,7 +43,7 @@ class FeedbackEffort(Source):
         return np.zeros(0)
 
     def family(self) -> ConstraintFamily:
-        """The constraint as a family."""
+        """Return the constraint as a family."""
         ones, radii = np.ones(self.prices.size), self.loop.spread.radii
         family = ConstraintFamily(
             name=self.name,
@@ -76,13 +76,13 @@ class FeedbackEffort(Source):
         )
 
     def excess(self, x: Array, indices: Array) -> Array:
-        """Violations ``(k, r)`` for signs ``(k, m K)`` under the worst disturbances."""
+        """Return violations ``(k, r)`` for signs ``(k, m K)`` under the worst disturbances."""
         a, A = self._price_control(x)
         signs = indices[:, None] * self._row_signs[:, None]
         return np.asarray(signs @ a + self.loop.spread.support(signs @ A) - x[self.bound])
 
     def uncertain(self, index: Array) -> UncertainRows:
-        """The rows of one sign of every entry."""
+        """Return the rows of one sign of every entry."""
         from scipy.sparse import csr_array
 
         loop, weight, count = self.loop, self.prices * index, self._row_signs.size
@@ -114,13 +114,13 @@ class FeedbackEffort(Source):
         return answer
 
     def worst(self, x: Array) -> Separation:
-        """The signs of the largest efforts that were found, worst first."""
+        """Return the signs of the largest efforts that were found, worst first."""
         effort = self.effort(x)
         rows = np.zeros(effort.values.size, dtype=int)
         return Separation(effort.signs, rows, effort.values - x[self.bound], effort.upper - float(x[self.bound]))
 
     def enclosure(self, x: Array, lower: Array, upper: Array) -> Enclosure:
-        """A proven bound of the violation, for all signs."""
+        """Return a proven bound of the violation, for all signs."""
         violation = self.settled(x)[self.bound] - x[self.bound]
         return Enclosure(np.full(len(lower), violation), np.zeros(len(lower), dtype=int))
 

@@ -417,16 +417,16 @@ def explanation(
 
 
 def _separate_corner(normal: Array, names: Names) -> tuple[Array, str | None]:
-    """A normal on the states that were stated, and the corner of the parameters beside the time that it is about;
-    itself, and ``None``, where it is about several at once."""
+    """Return a normal on the states that were stated, and the corner of the parameters beside the time that it is
+    about; itself, and ``None``, where it is about several at once."""
     corner = names.corners.at(normal)
     return (normal, None) if corner is None else (names.corners.without(normal), corner)
 
 
 def combination(direction: Array, names: Names, suffix: str = "", states: int | None = None) -> str:
-    """``c'x`` in words, such as ``x1(5)`` or ``x1(5) - 0.5 x2(5)``; the suffix stands behind every state's name. What
-    is beyond the number of ``states`` is the control's, such as ``u1(5)``. Of more than `ENTRIES` terms the largest,
-    and how many more there are."""
+    """Return ``c'x`` in words, such as ``x1(5)`` or ``x1(5) - 0.5 x2(5)``; the suffix stands behind every state's name.
+    What is beyond the number of ``states`` is the control's, such as ``u1(5)``. Of more than `ENTRIES` terms the
+    largest, and how many more there are."""
     last = direction.size if states is None else states
     words: list[str] = []
     terms = np.flatnonzero(direction)
@@ -443,13 +443,13 @@ def combination(direction: Array, names: Names, suffix: str = "", states: int | 
 
 
 def _find_opposite_limit(H: Array, h: Array, row: int) -> float | None:
-    """The least right-hand side of the rows that look the other way; ``None`` without one."""
+    """Return the least right-hand side of the rows that look the other way; ``None`` without one."""
     limits = h[(-H[row] == H).all(axis=1)]
     return float(limits.min()) if limits.size else None
 
 
 def _format_bound(words: str, limit: float, opposite: float | None, sign: float) -> str:
-    """``|x1| <= 0.7``, ``-0.2 <= x1 <= 0.3`` or ``x1 >= -0.7``, of a quantity in words."""
+    """Return ``|x1| <= 0.7``, ``-0.2 <= x1 <= 0.3`` or ``x1 >= -0.7``, of a quantity in words."""
     if opposite is None:
         return f"{words} {'>=' if sign < 0 else '<='} {limit:.6g}"
     low, high = sorted([limit, -sign * opposite + 0.0])

@@ -33,7 +33,7 @@ SAME = 1e-12  # of the largest one, a singular value of equations that depend on
 
 
 def not_linear(indices: Array) -> tuple[Array, Array]:
-    """A family has no rows that are linear in the decision."""
+    """Raise `InputError`: the family has no rows that are linear in the decision."""
     raise InputError("under feedback a constraint is no row of the decision: the method exchange knows such programs")
 
 
@@ -53,16 +53,16 @@ class Uncertain(Protocol):
         """The unit of every row, empty where it has none that is known."""
 
     def excess(self, x: Array, indices: Array) -> Array:
-        """Violations ``(k, r)`` at indices, under the worst deviations."""
+        """Return violations ``(k, r)`` at indices, under the worst deviations."""
 
     def uncertain(self, index: Array) -> UncertainRows:
-        """The rows at one index."""
+        """Return the rows at one index."""
 
     def worst(self, x: Array) -> Separation:
-        """The largest violations."""
+        """Return the largest violations."""
 
     def enclosure(self, x: Array, lower: Array, upper: Array) -> Enclosure:
-        """Proven bounds on cells."""
+        """Return proven bounds on cells."""
 
     @property
     def cells(self) -> tuple[Array, Array]:
@@ -74,7 +74,7 @@ class Uncertain(Protocol):
 
 
 def indexed(constraint: Uncertain, index_set: Box, start: Array, source: Source) -> ConstraintFamily:
-    """A constraint as a family; in its literal form, deviations are part of the index."""
+    """Return a constraint as a family; in its literal form, deviations are part of the index."""
     family = ConstraintFamily(
         name=constraint.name,
         index_set=index_set,
@@ -147,7 +147,7 @@ class FeedbackConstraint(Source):
         return self.flat
 
     def family(self) -> ConstraintFamily:
-        """The constraint as a family."""
+        """Return the constraint as a family."""
         start, stop = self.flat.start, self.flat.stop
         positions = np.unique(np.linspace(0, self.times.size - 1, min(BEGUN, self.times.size)).round().astype(int))
         source = self if self.exact else self.flat
@@ -165,7 +165,7 @@ class FeedbackConstraint(Source):
         return np.unique(np.concatenate([self.flat.cells[0][:, 0], self.flat.cells[1][:, 0]]))
 
     def excess(self, x: Array, indices: Array) -> Array:
-        """Violations ``(k, r)`` at times ``(k, 1)`` under the worst disturbances."""
+        """Return violations ``(k, r)`` at times ``(k, 1)`` under the worst disturbances."""
         violations = self.loop.height(self._compute_left_sides(x, indices[:, 0])) - self.flat.h
         measurable = self.loop.measurable
         if measurable is not None:
@@ -174,8 +174,8 @@ class FeedbackConstraint(Source):
         return violations
 
     def _group_rows(self, times: Array) -> list[tuple[slice, np.ndarray]]:
-        """The rows that look at the state at times ``(k,)`` in the same pieces of the grid, and these pieces: those of
-        a mixed constraint before and after the control jumps."""
+        """Return the rows that look at the state at times ``(k,)`` in the same pieces of the grid, and these pieces:
+        those of a mixed constraint before and after the control jumps."""
         flat, loop = self.flat, self.loop
         if flat.gains is None or loop.measurable is None:
             return [(slice(None), loop.seen_from(times))]
@@ -197,7 +197,7 @@ class FeedbackConstraint(Source):
         return np.asarray(values)
 
     def uncertain(self, index: Array) -> UncertainRows:
-        """The rows at one time."""
+        """Return the rows at one time."""
         flat, time = self.flat, index[:1]
         allowed = flat.h - flat.moved(time)[0]
         if flat.gains is None:
@@ -213,8 +213,8 @@ class FeedbackConstraint(Source):
         )
 
     def against(self, x: Array, index: Array, row: int) -> tuple[Array, float, int | None]:
-        """A deviation ``(Q,)`` that is the worst at an index, what the control adds to the row then, and the piece of
-        the control that does so."""
+        """Return a deviation ``(Q,)`` that is the worst at an index, what the control adds to the row then, and the
+        piece of the control that does so."""
         time, gains = index[:1], self.flat.gains
         w = self.loop.spread.worst(self._compute_left_sides(x, time)[0, row, 1:])
         if gains is None:
@@ -224,7 +224,8 @@ class FeedbackConstraint(Source):
         return w, float(gains[row] @ (control[:, 0] + control[:, 1:] @ w)), acting
 
     def met(self, x: Array) -> Array:
-        """The nearest decision that meets an equality to rounding; one that no control enters is left as it is."""
+        """Return the nearest decision that meets an equality to rounding; one that no control enters is left as it
+        is."""
         table, rhs = self.uncertain(np.array([self.flat.stop])).equations
         has_control = abs(table).max(axis=1).toarray().ravel() > IDLE * abs(table).max()
         table, rhs = table[has_control], rhs[has_control]
@@ -243,7 +244,7 @@ class FeedbackConstraint(Source):
         return np.tile(part, 2), np.tile(factor, 2)
 
     def worst(self, x: Array) -> Separation:
-        """The largest local maxima of the violation over the window, refined between the samples."""
+        """Return the largest local maxima of the violation over the window, refined between the samples."""
         times, values = self._sample_violations(x)
         positions = local_maxima(values.T[None], (1,), KEPT)
         rows, at = positions[:, 1], positions[:, 2]
@@ -273,8 +274,8 @@ class FeedbackConstraint(Source):
         return Separation(best[order][:, None], rows[order], violations[order])
 
     def _sample_violations(self, x: Array) -> tuple[Array, Array]:
-        """Times ``(k,)`` in order and the violations there ``(k, r)``: halfway between two of them again and again,
-        where a larger violation can be."""
+        """Return times ``(k,)`` in order and the violations there ``(k, r)``: halfway between two of them again and
+        again, where a larger violation can be."""
         times = self.flat.times
         step = max(1, STATES // ((1 + self.loop.spread.size) * self.flat.H.shape[1]))
         values = np.concatenate(
@@ -303,7 +304,8 @@ class FeedbackConstraint(Source):
         return self.flat.cells
 
     def enclosure(self, x: Array, lower: Array, upper: Array) -> Enclosure:
-        """Proven upper bounds of the violation on cells of time, each within one piece, with the control of that."""
+        """Return proven upper bounds of the violation on cells of time, each within one piece, with the control of
+        that."""
         flat, ends = self.flat, (lower[:, 0], upper[:, 0])
         proven = flat.h.size if flat.gains is None else flat.h.size // 2
         additions = [flat.moved(times)[:, :proven, None] for times in ends]
@@ -404,7 +406,7 @@ class FeedbackControl(Source):
         return float(sizes[sizes > 0.0].min(initial=1.0))
 
     def family(self) -> ConstraintFamily:
-        """The constraint as a family."""
+        """Return the constraint as a family."""
         index_set = Box(self.places.starts[:1], np.array([self.places.stop]))
         family = indexed(self, index_set, self.places.times[:, None], self)
         family = replace(family, scaled=self.scaled) if self.loop.scales else family
@@ -415,7 +417,7 @@ class FeedbackControl(Source):
         return replace(self, loop=self.loop.scaled(factor)).family()
 
     def limits(self, x: Array) -> Array:
-        """The right-hand sides ``(q, r)``."""
+        """Return the right-hand sides ``(q, r)``."""
         q = self.places.times.size
         if self.bound is None:
             return np.broadcast_to(self.h, (q, self.h.size))
@@ -423,13 +425,13 @@ class FeedbackControl(Source):
         return np.asarray((np.abs(self.H) @ p).T, dtype=float)
 
     def heights(self, x: Array) -> tuple[Array, Array]:
-        """Violations ``(q, r)`` at all places, and the sizes of the numbers that were added up."""
+        """Return violations ``(q, r)`` at all places, and the sizes of the numbers that were added up."""
         (values, size), limits = acting(self.loop, self.places, x), self.limits(x)
         radii = np.concatenate([[1.0], self.loop.spread.radii])
         return self.loop.height(self.H @ values) - limits, np.abs(self.H) @ size @ radii + np.abs(limits)
 
     def settled(self, x: Array) -> Array:
-        """Return the same decision with the peaks at the largest values that they bound."""
+        """Return the same decision with the peaks at the largest values that they bound, at least 0."""
         assert self.bound is not None
         peaks = np.zeros((self.H.shape[1], self.places.times.size))
         violations = self.heights(np.concatenate([x[: self.bound], peaks.ravel()]))[0]
@@ -439,12 +441,12 @@ class FeedbackControl(Source):
         return settled
 
     def excess(self, x: Array, indices: Array) -> Array:
-        """Violations ``(k, r)`` at the places of times ``(k, 1)`` under the worst disturbances."""
+        """Return violations ``(k, r)`` at the places of times ``(k, 1)`` under the worst disturbances."""
         violations: Array = self.heights(x)[0][self.places.at(indices[:, 0])]
         return violations
 
     def uncertain(self, index: Array) -> UncertainRows:
-        """The rows at the place of one time."""
+        """Return the rows at the place of one time."""
         (place,) = self.places.at(index[:1]).tolist()
         if self.bound is None:
             return rows_at(self.loop, self.places, place, self.H, self.h)
@@ -454,7 +456,7 @@ class FeedbackControl(Source):
         return rows_at(self.loop, self.places, place, self.H, self.h, extra)
 
     def worst(self, x: Array) -> Separation:
-        """The worst row of every place, worst first."""
+        """Return the worst row of every place, worst first."""
         return worst_of_each(self.heights(x)[0], self.places.times)
 
     @property
@@ -464,7 +466,8 @@ class FeedbackControl(Source):
         return lower[:, None], upper[:, None]
 
     def enclosure(self, x: Array, lower: Array, upper: Array) -> Enclosure:
-        """The violation itself: nothing changes between places."""
+        """Return the violations at the places of the cells, plus an allowance for rounding: nothing changes between
+        places."""
         violations, size = self.heights(x)
         bounds = (violations + ROUND_OFF * size).max(axis=1)[self.places.at((lower[:, 0] + upper[:, 0]) / 2)]
         return Enclosure(bounds, np.zeros(bounds.size, dtype=int))

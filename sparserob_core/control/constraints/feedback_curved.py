@@ -1,7 +1,8 @@
 """Curved sets of states and of controls under feedback: the normal direction is one more index, as without feedback.
 
-For a fixed direction a row is as any other. What proves all directions of a cell at once: for a point ``p`` of the set,
-``max_w c'x(t) - h(c) <= max_w c'x(t) - c'p``, and the right side is convex in ``c``, so that it is largest at a corner.
+For a fixed direction a row is as any other. All directions of a cell are proven at once: for a point ``p`` of the set,
+``max_w c'x(t) - h(c) <= max_w c'x(t) - c'p``. The right side is convex in ``c``, so that it is largest at a corner of
+the cell.
 """
 
 from __future__ import annotations
@@ -33,8 +34,8 @@ BEGUN = 5  # times that a method begins with, in the directions of the axes
 class Turning(ABC):
     """Constraint under feedback that a quantity stays in the curved ``set``, in every direction ``c``.
 
-    Directions are normalised such that ``h(c) - c'm = unit`` for the middle ``m`` of the set. The index is ``(t, z)``,
-    with a direction ``z`` in the coordinates of the set's frame, or ``(t, z, w)`` with the deviations.
+    Directions are normalised such that ``h(c) - c'm = 1 / unit`` for the interior point ``m`` of the set. The index is
+    ``(t, z)``, with a direction ``z`` in the coordinates of the set's frame, or ``(t, z, w)`` with the deviations.
     """
 
     loop: ClosedLoop
@@ -66,7 +67,7 @@ class Turning(ABC):
 
     @abstractmethod
     def answers(self, x: Array, times: Array) -> Array:
-        """The nominal quantity and its answers to the deviations at times ``(k,)``: ``(k, d, 1 + Q)``."""
+        """Return the nominal quantity and its answers to the deviations at times ``(k,)``: ``(k, d, 1 + Q)``."""
 
     @abstractmethod
     def between(self, x: Array, lower: Array, upper: Array, H: Array) -> tuple[Array, Array]:
@@ -75,11 +76,11 @@ class Turning(ABC):
 
     @abstractmethod
     def rows(self, time: float, H: Array, h: Array) -> UncertainRows:
-        """The rows ``H q(t) <= h``, ``H (1, d)``."""
+        """Return the rows ``H q(t) <= h``, ``H (1, d)``."""
 
     @abstractmethod
     def explained(self, index: Array) -> TimedExplanation:
-        """The constraint at an index ``(t, z)`` without deviations."""
+        """Return the constraint at an index ``(t, z)`` without deviations."""
 
     @property
     @abstractmethod
@@ -92,7 +93,7 @@ class Turning(ABC):
         return ("",)
 
     def family(self) -> ConstraintFamily:
-        """The constraint as a family."""
+        """Return the constraint as a family."""
         cube = np.ones(self._cube_dimension)
         low, high = (ends[position] for ends, position in zip(self.spans, (0, -1), strict=True))
         index_set = Box(np.append(low, -cube), np.append(high, cube))
@@ -119,28 +120,28 @@ class Turning(ABC):
         return z, c, self.set.support(c)
 
     def normals(self, z: Array) -> Array:
-        """The directions ``(k, d)`` of cube points ``(k, b)``, normalised."""
+        """Return the directions ``(k, d)`` of cube points ``(k, b)``, normalised."""
         return unit(self.set, z) / self.unit
 
     def excess(self, x: Array, indices: Array) -> Array:
-        """Violations ``(k, 1)`` at indices ``(k, 1 + b)`` under the worst deviations."""
+        """Return violations ``(k, 1)`` at indices ``(k, 1 + b)`` under the worst deviations."""
         c = self.normals(indices[:, 1:])
         along = np.einsum("kd,kdq->kq", c, self.answers(x, indices[:, 0]))
         return np.asarray(self.loop.height(along) - self.set.support(c))[:, None]
 
     def uncertain(self, index: Array) -> UncertainRows:
-        """The row at one time and direction."""
+        """Return the row at one time and direction."""
         c = self.normals(index[None, 1:])
         return self.rows(float(index[0]), c, self.set.support(c))
 
     def worst(self, x: Array) -> Separation:
-        """The largest local maxima over times and directions, climbed from until the steps vanish."""
-        (z, c, reach), times = self._lattice, self.times
+        """Return the largest local maxima over times and directions, climbed from until the steps vanish."""
+        (z, c, support_values), times = self._lattice, self.times
         step = max(1, STATES // ((1 + self.loop.spread.size) * max(c.shape)))
         values = np.concatenate(
             [self.loop.height(c @ self.answers(x, times[first : first + step])) for first in range(0, times.size, step)]
         )
-        values = values - reach
+        values = values - support_values
         places, likely = turns(values.T, neighbours(self._cube_dimension), self.unit)
         rows, at = places.T
         heights, worst_indices = values[at, rows], np.hstack([times[at, None], z[rows]])
@@ -198,7 +199,7 @@ class Turning(ABC):
         return corner_lists[0], corner_lists[1]
 
     def enclosure(self, x: Array, lower: Array, upper: Array) -> Enclosure:
-        """Proven upper bounds of the violation on cells of times and directions, by a point ``p`` of the set for
+        """Return proven upper bounds of the violation on cells of times and directions, by a point ``p`` of the set for
         each."""
         frame, low, high = self.set.frame / self.unit, lower[:, 1:], upper[:, 1:]
         ends = np.stack(
@@ -224,7 +225,8 @@ class Turning(ABC):
         return Enclosure(violations, split)
 
     def against(self, x: Array, index: Array, row: int) -> tuple[Array, float, int | None]:
-        """A deviation ``(Q,)`` that is the worst at an index, and what stands beside the state then: no control."""
+        """Return a deviation ``(Q,)`` that is the worst at an index, and what stands beside the state then: no
+        control."""
         along = self.normals(index[None, 1:])[0] @ self.answers(x, index[:1])[0]
         return self.loop.spread.worst(along[1:]), 0.0, None
 
@@ -338,8 +340,8 @@ class FeedbackCurvedControl(Turning, Source):
 
     def worst(self, x: Array) -> Separation:
         """Return every place with its worst direction, worst first."""
-        controls, (z, c, reach) = acting(self.loop, self.places, x)[0], self._lattice
-        start = z[(self.loop.height(c @ controls) - reach).argmax(axis=1)]
+        controls, (z, c, support_values) = acting(self.loop, self.places, x)[0], self._lattice
+        start = z[(self.loop.height(c @ controls) - support_values).argmax(axis=1)]
 
         def excess(at: Array, which: np.ndarray) -> Array:
             directions = self.normals(at)
@@ -360,7 +362,7 @@ class FeedbackCurvedControl(Turning, Source):
 
 
 def of_state(constraint: object, loop: ClosedLoop) -> FeedbackConstraint | FeedbackCurved:
-    """A constraint on the state under feedback."""
+    """Return a constraint on the state under feedback."""
     if isinstance(constraint, CurvedConstraint):
         return FeedbackCurved(loop, constraint)
     return FeedbackConstraint(constraint, loop)  # type: ignore[arg-type]

@@ -43,7 +43,7 @@ ARRIVED = 1e-11  # what a vertex that was arrived at may still promise
 INSIDE, MOST_INSIDE = 3, 64  # times sampled inside every piece, beside its ends: more where the system moves on it
 STENCIL = np.array([-1.0, 0.0, 1.0])
 SMOOTH = 0.1  # norm of A times the spacing of samples between which a parabola is a good guide
-CLIMBED = 10  # of them, those that parameters are climbed for
+CLIMBED = 10  # largest number of candidates that are climbed from, in parameters, or in time beside a kink
 KEPT = 64  # separated constraints per row and round
 # Numbers of the rows that are imposed along the spans of one row, of which there is at least one. On 10 000 pieces four
 # controls had 268 rows in the first round where 64 say as much, and took twice the time; on 100 000 eight for each row
@@ -122,7 +122,8 @@ class Samples:
         return self.apart(np.concatenate([[start], inside, [stop]]))
 
     def apart(self, times: Array) -> Array:
-        """The times in increasing order, those closer than rounding as one; not where a control may jump between."""
+        """Return the times in increasing order, those closer than rounding as one; not where a control may jump
+        between."""
         horizon = float(self._response.grid.breakpoints[-1])
         return np.unique(times) if self.gains is not None else distinct_times(times, horizon)
 
@@ -145,13 +146,13 @@ class Samples:
 
     @cached_property
     def outputs(self) -> Outputs:
-        """``H x`` at the sampled times and parameters; of rows that are opposite to others by these. The states
-        themselves where there are fewer of them than rows."""
+        """``H x`` at the sampled times and parameters, once for rows that are equal or opposite. The states themselves
+        where there are fewer of them than rows."""
         rows = np.eye(self.H.shape[1]) if self._has_fewer_states else self.H[self._distinct_rows[0]]
         return Outputs(self._response.propagator, rows, self.times, self.lattice[0])
 
     def along(self, response: Response, control: Array) -> Array:
-        """``H x (v, r, times)`` from the initial state of a response, under a control ``(m, K)``."""
+        """Return ``H x (v, r, times)`` from the initial state of a response, under a control ``(m, K)``."""
         if self.undivided is not None:
             return self.undivided[0].along(response, control) / self.undivided[1][None, :, None]
         outputs, (_, inverse, signs) = self.outputs.at(response, control), self._distinct_rows
@@ -294,13 +295,14 @@ class FlatConstraint(StateConstraint):
 
     @shaped
     def moved(self, times: Float[Array, " k"]) -> Float[Array, "k r"]:
-        """``-H r(t)``."""
+        """Return ``-H r(t)``."""
         return Moving(self.reference, self.H).at(times)
 
     @shaped
     def commanded(self, times: Float[Array, " k"]) -> Int[np.ndarray, "k r"]:
-        """The piece of the control's dictionary that every row looks at: the first half the one that a time ends or is
-        in, the second half the one that it begins or is in; among those that meet the window in positive length."""
+        """Return the piece of the control's dictionary that every row looks at. For the first half of the rows it is
+        the piece that a time ends or is in, for the second half the piece that it begins or is in. Only pieces that
+        meet the window in positive length count."""
         ends = self.functionals.dictionary.breakpoints
         first, last = np.searchsorted(ends, self.start, side="right") - 1, np.searchsorted(ends, self.stop) - 1
         pieces = np.stack([np.searchsorted(ends, times, side=side) - 1 for side in ("left", "right")], axis=1)
@@ -308,8 +310,8 @@ class FlatConstraint(StateConstraint):
 
     @shaped
     def worst(self, x: Float[Array, " n"]) -> Separation:
-        """The largest local maxima of the violation over the index set, times refined between the nodes, parameters
-        between lattice points; remembered, since the proof asks for them again."""
+        """Return the largest local maxima of the violation over the index set, times refined between the nodes,
+        parameters between lattice points; remembered, since the proof asks for them again."""
         key = x.tobytes()
         return (
             self._separations[key]
@@ -406,8 +408,8 @@ class FlatConstraint(StateConstraint):
 
     @shaped
     def enclosure(self, x: Float[Array, " n"], lower: Float[Array, "k j"], upper: Float[Array, "k j"]) -> Enclosure:
-        """Proven upper bounds of the violation on cells ``(k, 1 + nu)``, each within one piece; cells of parameters
-        share their work."""
+        """Return proven upper bounds of the violation on cells ``(k, 1 + nu)``, each within one piece; cells of
+        parameters share their work."""
         touched = self.parameters.touches(lower[:, 1:], upper[:, 1:])
         return enclose(lower, upper, touched, self.parameters.count, lambda low, high: self._enclose_cell(x, low, high))
 
@@ -459,7 +461,7 @@ class FlatConstraint(StateConstraint):
 
     @shaped
     def on_lattice(self, x: Float[Array, " n"]) -> Float[Array, "v r t"]:
-        """Violations ``(v, r, times)`` at every lattice point and sampled time."""
+        """Return violations ``(v, r, times)`` at every lattice point and sampled time."""
         along = self.samples.along(self.functionals.response, self.functionals.control(x))
         answer: Array = along - self.samples.margins
         if self.functionals.execution is not None:
@@ -486,10 +488,10 @@ class FlatConstraint(StateConstraint):
         predicted: Float[Array, " k"],
         heights: Float[Array, " q"],
     ) -> tuple[Float[Array, " k"], Float[Array, " k"]]:
-        """Times ``(k,)`` near the vertices of parabolas, and the violations there with the parameters of ``indices``:
-        by parabolas through nearer and nearer samples, as long as one may be the largest of all, or a violation; where
-        these are no guide, at a kink or beyond one, the candidate is climbed from. ``predicted (k,)``, ``heights
-        (q,)``: what the first parabolas say, and what is known at samples."""
+        """Return times ``(k,)`` near the vertices of parabolas, and the violations there with the parameters of
+        ``indices``. They are found by parabolas through nearer and nearer samples, as long as one may be the largest of
+        all, or a violation. Where parabolas are no guide, at a kink or beyond one, the candidate is climbed from.
+        ``predicted (k,)``, ``heights (q,)``: what the first parabolas say, and what is known at samples."""
         spacing = float((self.times[1:] - self.times[:-1]).max())
         middle, violations, live = indices[:, 0].copy(), predicted.copy(), np.arange(rows.size)
         width = np.full(rows.size, min(spacing / NEARER, (self.stop - self.start) / 2))

@@ -28,7 +28,7 @@ class LiteralConstraint:
     disturbance: DisturbanceModel
 
     def family(self, reduced: ConstraintFamily) -> ConstraintFamily:
-        """The constraint as a family; proofs go through ``reduced``."""
+        """Return the constraint as a family; proofs go through ``reduced``."""
         lower, upper = self.base.index_set.lower, self.base.index_set.upper
         block, count = self._blocks.box, self.disturbance.block_count
         index_set = Box(
@@ -52,11 +52,11 @@ class LiteralConstraint:
         )
 
     def explain(self, index: Array, row: int) -> Explanation:
-        """The reduced constraint at the time and the parameter of the index."""
+        """Return the reduced constraint at the time and the parameter of the index."""
         return self.base.explain(self._split_indices(index[None])[0][0], row)
 
     def rows(self, indices: Array) -> tuple[Array, Array]:
-        """``G (k, r, n)``, ``rhs (k, r)`` at indices ``(k, 1 + beta + ...)``."""
+        """Return ``G (k, r, n)``, ``rhs (k, r)`` at indices ``(k, 1 + beta + ...)``."""
         reduced, beta = self._split_indices(indices)
         times, directions, parameters, rhs = self.base.functionals_at(reduced)
         per_index = times.size // indices.shape[0]
@@ -68,7 +68,7 @@ class LiteralConstraint:
         return G.reshape(*shape, -1), (rhs - offset).reshape(shape)
 
     def worst(self, x: Array) -> Separation:
-        """The separation of the reduced constraint, with the worst disturbance of each index written out."""
+        """Return the separation of the reduced constraint, with the worst disturbance of each index written out."""
         separation = self.base.worst(x)
         times, directions, parameters, _ = self.base.functionals_at(separation.indices)
         per_index = times.size // separation.rows.size
@@ -80,8 +80,8 @@ class LiteralConstraint:
         return Separation(indices, separation.rows, separation.violations, separation.bound)
 
     def gradient(self, x: Array, indices: Array, rows: Array) -> Array:
-        """The derivative ``(k, d)`` of ``row x - rhs`` in the index (`Sensitivity`); in ``Beta``: the functional on
-        every block."""
+        """Return the derivative ``(k, d)`` of ``row x - rhs`` in the index (`Sensitivity`); in ``Beta``: the functional
+        on every block."""
         reduced, beta = self._split_indices(np.asarray(indices, dtype=float))
         slopes, weights = self._sensitivity.slopes(x, reduced, rows, self._compute_signals(beta))
         size, moves = self.disturbance.set.dimension, np.tile(self._is_movable, self.disturbance.block_count)
@@ -91,7 +91,8 @@ class LiteralConstraint:
         return np.hstack([slopes[:, :1], in_beta * moves, slopes[:, 1:]])
 
     def steepest(self, x: Array, indices: Array, rows: np.ndarray) -> Separation:
-        """The worst disturbance of every index for one row, ``rows (k,)``; for -1 of the row that is violated most."""
+        """Return the worst disturbance of every index for one row, ``rows (k,)``; for -1 of the row that is violated
+        most."""
         reduced, beta = self._split_indices(np.asarray(indices, dtype=float))
         times, directions, parameters, _ = self.base.functionals_at(reduced)
         r = times.size // len(reduced)
@@ -118,7 +119,7 @@ class LiteralConstraint:
         return ParameterIndex(self.disturbance.set)
 
     def _split_indices(self, indices: Array) -> tuple[Array, Array]:
-        """The reduced index, and the coefficients of the disturbance."""
+        """Return the reduced index, and the coefficients of the disturbance."""
         beta = self.disturbance.block_count * self.disturbance.set.dimension
         if indices.shape[1] == 1 + beta:
             return indices[:, :1], indices[:, 1:]

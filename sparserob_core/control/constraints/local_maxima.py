@@ -33,7 +33,7 @@ INWARD, DIFFERENCE = 1e-3, 1e-7  # shares of the set: how far inside it differen
 
 
 def local_maxima(values: Array, lattice: tuple[int, ...], kept: int) -> np.ndarray:
-    """Positions ``(k, 3)`` in ``values (v, r, times)`` of the largest local maxima, at most ``kept`` per row.
+    """Return positions ``(k, 3)`` in ``values (v, r, times)`` of the largest local maxima, at most ``kept`` per row.
 
     ``v`` runs over a tensor lattice of shape ``lattice``; neighbours are those along its axes and in time.
     """
@@ -57,9 +57,9 @@ def local_maxima(values: Array, lattice: tuple[int, ...], kept: int) -> np.ndarr
 
 
 def along_spans(values: Array, maxima: np.ndarray, pieces: np.ndarray, kept: int) -> np.ndarray:
-    """Positions ``(k, 3)`` in ``values (v, r, times)`` along spans where a row is above 0 and none of its ``maxima (j,
-    3)`` is near: the highest sample of every piece of the control, of which ``pieces (times,)`` are the numbers,
-    thinned evenly to ``kept`` a row.
+    """Return positions ``(k, 3)`` in ``values (v, r, times)`` along spans where a row is above 0 and none of its
+    ``maxima (j, 3)`` is near. They are the highest sample of every piece of the control, thinned evenly to ``kept`` a
+    row. ``pieces (times,)``: the numbers of the pieces.
 
     A state that leaves a wall for good has one maximum, at the end. Imposed there alone, the wall would be left a
     piece later in the next round, and rounds would grow with its length.
@@ -80,9 +80,10 @@ def along_spans(values: Array, maxima: np.ndarray, pieces: np.ndarray, kept: int
 
 
 def beside_kinks(values: Array, times: Array, kinks: np.ndarray, kept: int) -> np.ndarray:
-    """Positions ``(k, 3)`` in ``values (v, r, times)`` next to ``kinks``, the places among ``times`` at which anything
-    turns or jumps, where the violation may rise above 0 before the next samples, at most ``kept`` before and ``kept``
-    behind such times: a parabola across a kink does not see that, one on either side of it does."""
+    """Return positions ``(k, 3)`` in ``values (v, r, times)`` next to ``kinks``, the places among ``times`` at which
+    anything turns or jumps. At these positions the violation may rise above 0 between samples; there are at most
+    ``kept`` before and ``kept`` behind kinks. A parabola across a kink does not see that, one on either side of it
+    does."""
     positions = [np.zeros((0, 3), dtype=int)]
     for step in (-1, 1) if times.size > 2 else ():
         at = kinks[(kinks + 2 * step >= 0) & (kinks + 2 * step < times.size)]
@@ -100,9 +101,10 @@ def beside_kinks(values: Array, times: Array, kinks: np.ndarray, kept: int) -> n
 
 
 def turns(heights: Array, beside: np.ndarray, unit: float) -> tuple[np.ndarray, int]:
-    """Positions ``(k, 2)`` in ``heights (r, times)`` of local maxima over directions, at most `TURNS` at a time, and
-    how many of them, the first ones, may be above 0 between the sampled directions; ``beside (r, j)``: the numbers of
-    the directions that are neighbours of each.
+    """Return positions ``(k, 2)`` in ``heights (r, times)`` of local maxima over directions, at most `TURNS` at a time,
+    and how many of them are to be climbed from. These are the first ones: those that may be above 0 between the sampled
+    directions, but at least `TOLD` and at most `HELD`. ``beside (r, j)``: the numbers of the directions that are
+    neighbours of each.
 
     The worst case of a disturbance that has corners has several maxima: what lies between sampled directions may make
     any of them the largest.
@@ -161,9 +163,9 @@ def ridden(
     Returns
     -------
     indices : ndarray, shape (k, j)
-        Indices of the violations.
+        Indices of the violations, at most `MOST`. The best `TOLD` are returned even where nothing is violated.
     violations : ndarray, shape (k,)
-        Violations, worst first.
+        Violations, worst first; negative where there is a margin.
     """
     line, times = heights[None, None], held[:, 0]
     peaks = local_maxima(line, (1,), MOST)
@@ -188,7 +190,8 @@ def ridden(
 def _move_to_vertices(
     points: Array, spacing: float, turned: Callable[[Array], tuple[Array, Array]]
 ) -> tuple[Array, Array]:
-    """Points ``(k, j)`` moved along time to the vertices of parabolas through nearer and nearer ones, ``turned``."""
+    """Return points ``(k, j)`` moved along time to the vertices of parabolas through nearer and nearer ones,
+    ``turned``."""
     if not points.size:
         return points, np.zeros(0)
     width = spacing / NEARER
@@ -204,7 +207,7 @@ def _move_to_vertices(
 
 
 def _select_distinct(indices: Array, found: Array) -> np.ndarray:
-    """Positions of different maxima, highest first."""
+    """Return positions of different maxima, highest first."""
     remaining, kept = np.argsort(-found, kind="stable"), []
     while remaining.size:
         kept.append(int(remaining[0]))
@@ -213,8 +216,8 @@ def _select_distinct(indices: Array, found: Array) -> np.ndarray:
 
 
 def vertices(values: Array, positions: np.ndarray, times: Array) -> tuple[Array, Array]:
-    """The vertex of the parabola through every position's sample and the two beside it: its time ``(k,)`` and height
-    ``(k,)``."""
+    """Return the vertex of the parabola through every position's sample and the two beside it: its time ``(k,)`` and
+    height ``(k,)``."""
     v, r, t = positions.T
     vertex_times, heights = times[t].copy(), values[v, r, t].copy()
     inner = (t > 0) & (t < times.size - 1)
@@ -268,8 +271,8 @@ def climb(
 def step_out(
     evaluate: Callable[[Array, np.ndarray], Array], points: Array, values: Array, convex: ConvexSet
 ) -> tuple[Array, Array]:
-    """Steps to where the gradient is highest on a set (Frank and Wolfe 1956), from points ``(k, D)`` whose coordinates
-    but the first are in it.
+    """Step to where the gradient is highest on a set (Frank and Wolfe 1956), from points ``(k, D)`` whose
+    coordinates but the first are in it.
 
     A climb that is drawn back to the set gets stuck short of its corners. ``evaluate`` as for `climb`; its differences
     are taken a little inside the set. Returns the points and their ``values (k,)``, none of which gets lower.

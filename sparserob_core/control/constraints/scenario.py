@@ -37,7 +37,7 @@ class ScenarioConstraint:
     deviations: Array | None = None
 
     def family(self) -> ConstraintFamily:
-        """The constraint as a family."""
+        """Return the constraint as a family."""
         last = float(self.parameters.shape[0] - 1)
         index_set = Box(np.array([self.base.start, 0.0]), np.array([self.base.stop, last]))
         return ConstraintFamily(
@@ -58,7 +58,7 @@ class ScenarioConstraint:
         return self.base.explain(np.append(index[0], self.parameters[sample]), row).of_sample(sample)
 
     def rows(self, indices: Array) -> tuple[Array, Array]:
-        """``G (k, r, n)``, ``rhs (k, r)`` at indices ``(k, 2)``."""
+        """Return ``G (k, r, n)``, ``rhs (k, r)`` at indices ``(k, 2)``."""
         k, r = indices.shape[0], self.h.size
         samples = np.repeat(np.rint(indices[:, 1]).astype(int), r)
         times, directions = np.repeat(indices[:, 0], r), np.tile(self.H, (k, 1))
@@ -70,7 +70,7 @@ class ScenarioConstraint:
         return G.reshape(k, r, -1), self.h - self.base.beside(zero_decision, indices[:, 0]) - offset.reshape(k, r)
 
     def worst(self, x: Array) -> Separation:
-        """Local maxima in time of the worst sample's violation, at the breakpoints and between them."""
+        """Return local maxima in time of the worst sample's violation, at the breakpoints and between them."""
         values, sample = self._find_worst_samples(x)
         positions = local_maxima(values[None], (1,), KEPT)
         times = vertices(values[None], positions, self._times)[0]
@@ -82,7 +82,7 @@ class ScenarioConstraint:
         return Separation(indices[order], rows[order], violations[order])
 
     def _find_worst_samples(self, x: Array) -> tuple[Array, np.ndarray]:
-        """Largest violation over the samples, ``(r, times)``, and the sample that has it."""
+        """Return the largest violation over the samples, ``(r, times)``, and the sample that has it."""
         additions = self.base.beside(x, self._times).T
         if self.parameters.shape[1] == 0:
             margins, sample = self._margins
@@ -142,7 +142,7 @@ class ScenarioConstraint:
         return best, best_sample
 
     def _compute_states(self, x: Array, part: slice, disturbances: Array | None, deviations: Array | None) -> Array:
-        """States ``(s, times, d)`` of some samples."""
+        """Return states ``(s, times, d)`` of some samples."""
         signal, deviation = (None if samples is None else samples[part] for samples in (disturbances, deviations))
         path = self._fine_response.states(self.base.functionals.on_grid(x), self.parameters[part], signal, deviation)
         return path[:, self._window_positions]
@@ -172,13 +172,13 @@ class ScenarioConstraint:
 
 
 def sample_disturbances(model: DisturbanceModel, count: int, rng: np.random.Generator) -> Array:
-    """``count`` disturbances ``(count, mw, L)`` on the grid's pieces: every block uniform in its set, independent of
-    the others."""
+    """Return ``count`` disturbances ``(count, mw, L)`` on the grid's pieces: every block uniform in its set,
+    independent of the others."""
     blocks = model.block_count
     points = model.set.sample(count * blocks, rng).reshape(count, blocks, -1)
     return model.signals(points)
 
 
 def sample_parameters(convex_set: ConvexSet | None, count: int, rng: np.random.Generator) -> Array:
-    """``count`` parameters ``(count, nu)``, uniform in their set."""
+    """Return ``count`` parameters ``(count, nu)``, uniform in their set."""
     return np.zeros((count, 0)) if convex_set is None else convex_set.sample(count, rng)

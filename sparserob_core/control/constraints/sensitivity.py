@@ -61,7 +61,7 @@ class Functional:
         return self._combine_directions(self.gains)
 
     def force(self, control: Array, signals: Array | None) -> Array:
-        """``B u + E w`` and its derivatives, ``(k, L, 1 + nu, d)``, from inputs on the pieces, ``(m, L)`` and
+        """Return ``B u + E w`` and its derivatives, ``(k, L, 1 + nu, d)``, from inputs on the pieces, ``(m, L)`` and
         ``(k, mw, L)``."""
         force: Array = np.swapaxes(self.grid.driven(self.B, control), 1, 2)
         return force if signals is None else force + np.swapaxes(self.grid.driven(self.W, signals[:, None]), 1, 2)
@@ -72,13 +72,13 @@ class Functional:
         return self.grid.through(self.driven[:, :, 0], self.W[:, 0])
 
     def in_time(self, force: Array) -> Array:
-        """``c'(A x(t) + B u(t) + E w(t))``, as ``(k, 1)``."""
+        """Return ``c'(A x(t) + B u(t) + E w(t))``, as ``(k, 1)``."""
         drift = (self.moving[0] * self.start).sum(axis=1) + (self.moving[1] * force[:, :, 0]).sum(axis=(1, 2))
-        sigma = (self.direction * force[np.arange(self.now.size), self.now, 0]).sum(axis=1)
-        return np.asarray(drift + sigma)[:, None]
+        input_terms = (self.direction * force[np.arange(self.now.size), self.now, 0]).sum(axis=1)
+        return np.asarray(drift + input_terms)[:, None]
 
     def in_parameters(self, force: Array) -> Array:
-        """The derivatives ``(k, nu)`` of ``c'x(t)`` in the parameters, the inputs fixed."""
+        """Return the derivatives ``(k, nu)`` of ``c'x(t)`` in the parameters, the inputs fixed."""
         through_A = np.einsum("klad,kld->ka", self.driven[:, :, 1:], force[:, :, 0])
         return np.asarray(
             np.einsum("kad,kd->ka", self.free[:, 1:], self.start)
@@ -87,7 +87,7 @@ class Functional:
         )
 
     def states(self, force: Array) -> Array:
-        """``directions_b'x(t)``, ``(k, b)``."""
+        """Return ``directions_b'x(t)``, ``(k, b)``."""
         return np.asarray(
             np.einsum("kbd,kd->kb", self.along[:, :, 0], self.start)
             + np.einsum("kbld,kld->kb", self.gains[:, :, :, 0], force[:, :, 0])
@@ -102,7 +102,7 @@ class Sensitivity:
     """The derivatives of ``max_w c'x(t) - h(c)`` in the index, at a decision.
 
     Time: ``c'(A x + B u + E w - r')``. Inputs jump at breakpoints, so the constraint, and with it the value of a
-    relaxed program, has kinks there: the derivative is the one from the left, except at the start of the window, where
+    relaxed program, has kinks there. The derivative is the one from the left, except at the start of the window, where
     it is the one from the right. Parameters: the functional is propagated together with its derivatives (`tangent`),
     and through the map of a box onto a set that is not one (`ParameterIndex.pulled_back`). Direction ``z``: the state
     less the support point of ``c``, across ``z``; 0 at ``z = 0``. Where the worst disturbance (or the support point) is
@@ -117,12 +117,12 @@ class Sensitivity:
     constraint: StateConstraint
 
     def gradient(self, x: Array, indices: Array, rows: Array) -> Array:
-        """The derivative ``(k, d)`` of ``row x - rhs`` at ``indices (k, d)``, one row of the family per index,
+        """Return the derivative ``(k, d)`` of ``row x - rhs`` at ``indices (k, d)``, one row of the family per index,
         ``rows (k,)``."""
         return self.slopes(x, indices, rows)[0]
 
     def slopes(self, x: Array, indices: Array, rows: Array, signals: Array | None = None) -> tuple[Array, Array]:
-        """The gradient ``(k, d)``, and the weights ``(k, L, mw)`` of the disturbance on the pieces of the grid.
+        """Return the gradient ``(k, d)``, and the weights ``(k, L, mw)`` of the disturbance on the pieces of the grid.
 
         ``signals (k, mw, L)``: the disturbance of every index; the worst one if not given.
         """
@@ -159,8 +159,12 @@ class Sensitivity:
             in_time = self._differentiate_in_time(times[:, 0], parameters, at, x, signals)
             in_parameters = self._differentiate_in_parameters(times[:, 0], parameters, at, x, signals)
         if closed:
-            sigma = self._differentiate_support(times[:, 0], parameters, at)
-            in_time, in_parameters, states = in_time + sigma[0], in_parameters + sigma[1], states + sigma[2]
+            support_slopes = self._differentiate_support(times[:, 0], parameters, at)
+            in_time, in_parameters, states = (
+                in_time + support_slopes[0],
+                in_parameters + support_slopes[1],
+                states + support_slopes[2],
+            )
         execution = self.constraint.functionals.execution
         if execution is not None:
             control = self.constraint.functionals.control(x)
@@ -218,8 +222,8 @@ class Sensitivity:
     def _compute_rate_weights(
         self, times: Array, parameters: Array, c: Array, known: tuple[Array, Array, Array], pieces: np.ndarray
     ) -> tuple[Array, Array]:
-        """The weights of ``c'A x(t)``: those of ``c'x(t)`` times ``A``, which commutes with ``e^{As}``; of a system
-        that changes those of the direction ``A'c``, with the ``A`` of the time of the index."""
+        """Return the weights of ``c'A x(t)``: those of ``c'x(t)`` times ``A``, which commutes with ``e^{As}``; of a
+        system that changes those of the direction ``A'c``, with the ``A`` of the time of the index."""
         response, mode_of_piece = self._response, self._response.grid.mode
         if response.grid.varying:  # whose derivative in time is made otherwise
             return np.zeros(known[0][:, 0, 0].shape), np.zeros(known[1][:, 0, :, 0].shape)
@@ -236,7 +240,7 @@ class Sensitivity:
     def _differentiate_in_parameters(
         self, times: Array, parameters: Array, at: Functional, x: Array, signals: Array | None
     ) -> Array:
-        """`Functional.in_parameters` of a system that changes with time, by differences of ``c'x(t)``."""
+        """Return `Functional.in_parameters` of a system that changes with time, by differences of ``c'x(t)``."""
         control, box = self.constraint.functionals.on_grid(x), self.constraint.parameters
 
         def value(p: Array, of: np.ndarray) -> Array:
@@ -250,7 +254,7 @@ class Sensitivity:
     def _differentiate_in_time(
         self, times: Array, parameters: Array, at: Functional, x: Array, signals: Array | None
     ) -> Array:
-        """`Functional.in_time` of a system that changes with time, ``c'(A(t) x(t) + B(t) u + E(t) w)``."""
+        """Return `Functional.in_time` of a system that changes with time, ``c'(A(t) x(t) + B(t) u + E(t) w)``."""
         A, inputs = self._response.propagator.law.entries(times, parameters)
         along, pushes = (at.direction[:, None] @ A)[:, 0], (at.direction[:, None] @ inputs)[:, 0]
         weights = self._response.weights(times, along, parameters)
@@ -262,14 +266,14 @@ class Sensitivity:
         return np.asarray(values + (pushes[:, : acting.shape[1]] * acting).sum(axis=1))[:, None]
 
     def _locate_pieces(self, times: Array) -> np.ndarray:
-        """The pieces on which the times are approached: from the left, but from the right at the start of the
+        """Return the pieces on which the times are approached: from the left, but from the right at the start of the
         window."""
         grid = self._response.grid
         right_pieces = np.clip(np.searchsorted(grid.breakpoints, times, side="right") - 1, 0, grid.pieces - 1)
         return np.where(times <= self.constraint.start, right_pieces, grid.locate(times))
 
     def _fill_entered_pieces(self, weights: Array, at: Functional) -> Array:
-        """The weights on the disturbance, with a trace of a piece that is only just entered and has none yet."""
+        """Return the weights on the disturbance, with a trace of a piece that is only just entered and has none yet."""
         fresh = np.flatnonzero(~at.driven[np.arange(at.now.size), at.now, 0].any(axis=1))
         if not fresh.size:
             return weights
@@ -339,7 +343,7 @@ class Sensitivity:
 
 
 def _evaluate_functionals(known: Weights, start: Array, control: Array, signals: Array | None) -> Array:
-    """The functionals ``(k,)`` with these weights, from states ``start (k, d)``, under inputs on the pieces, ``(m, L)``
-    and ``(k, mw, L)``."""
+    """Return the functionals ``(k,)`` with these weights, from states ``start (k, d)``, under inputs on the pieces,
+    ``(m, L)`` and ``(k, mw, L)``."""
     values = (known.free * start).sum(axis=1) + np.einsum("klm,ml->k", known.control, control)
     return np.asarray(values if signals is None else values + np.einsum("klw,kwl->k", known.disturbance, signals))

@@ -61,18 +61,18 @@ class StateConstraint(Source):
     def functionals_at(
         self, indices: Float[Array, "k j"]
     ) -> tuple[Float[Array, " n"], Float[Array, "n d"], Float[Array, "n nu"], Float[Array, " n"]]:
-        """Times ``(k r,)``, directions ``(k r, d)``, parameters ``(k r, nu)`` and right-hand sides ``(k r,)`` of all
-        rows of every index ``(k, ...)``, index by index."""
+        """Return times ``(k r,)``, directions ``(k r, d)``, parameters ``(k r, nu)`` and right-hand sides ``(k r,)`` of
+        all rows of every index ``(k, ...)``, index by index."""
 
     @abstractmethod
     def violations(
         self, x: Float[Array, " n"], indices: Float[Array, "k j"], rows: Int[np.ndarray, " k"]
     ) -> Float[Array, " k"]:
-        """``row x - rhs`` for one row per index, ``(k,)``, without building rows."""
+        """Return ``row x - rhs`` for one row per index, ``(k,)``, without building rows."""
 
     @abstractmethod
     def worst(self, x: Float[Array, " n"]) -> Separation:
-        """The largest local maxima of the violation over the index set."""
+        """Return the largest local maxima of the violation over the index set."""
 
     @property
     @abstractmethod
@@ -81,7 +81,7 @@ class StateConstraint(Source):
 
     @abstractmethod
     def enclosure(self, x: Float[Array, " n"], lower: Float[Array, "k j"], upper: Float[Array, "k j"]) -> Enclosure:
-        """Proven upper bounds of the violation on cells of the index set, each within one piece."""
+        """Return proven upper bounds of the violation on cells of the index set, each within one piece."""
 
     @abstractmethod
     def explain(self, index: Float[Array, " j"], row: int) -> TimedExplanation:
@@ -104,22 +104,23 @@ class StateConstraint(Source):
 
     @shaped
     def looked_at_in(self, units: Float[Array, " r"]) -> StateConstraint:
-        """Return the `divided` constraint, which shares the samples of this one."""
+        """Return the `divided` constraint, which shares the samples of this one where it has any."""
         return self.divided(units)
 
     @abstractmethod
     def directions(
         self, z: Float[Array, "k b"], rows: Int[np.ndarray, " k"]
     ) -> tuple[Float[Array, "k e d"], Float[Array, "k e"]]:
-        """Directions ``(k, b, d)`` and shares ``(k, b)`` whose combinations are the normals ``(k, d)`` at one row
-        ``(k,)`` and direction ``z (k, b)`` each; ``b`` is 1 for a set with flat sides."""
+        """Return directions ``(k, b, d)`` and shares ``(k, b)`` whose combinations are the normals ``(k, d)`` at one
+        row ``(k,)`` and direction ``z (k, b)`` each; ``b`` is 1 for a set with flat sides."""
 
     @shaped
     def turned(
         self, z: Float[Array, "k b"], directions: Float[Array, "k d"], states: Float[Array, "k e"]
     ) -> Float[Array, "k b"]:
-        """The derivative ``(k, b)`` of the violation in the direction ``z``, with the normals ``directions (k, d)`` and
-        ``states (k, b)``, the states along the directions of `directions`; nothing, ``(k, 0)``, for flat sides."""
+        """Return the derivative ``(k, b)`` of the violation in the direction ``z``, with the normals
+        ``directions (k, d)`` and ``states (k, b)``, the states along the directions of `directions`; nothing,
+        ``(k, 0)``, for flat sides."""
         return z
 
     @abstractmethod
@@ -132,8 +133,8 @@ class StateConstraint(Source):
 
     @abstractmethod
     def outwardness(self, states: Float[Array, "d n"], beside: Float[Array, " j"] | None = None) -> Float[Array, " n"]:
-        """A cheap measure ``(n,)`` of states ``(d, n)`` at one time, with what is `beside` them: positive outside the
-        set, not positive inside, growing outwards."""
+        """Return a cheap measure ``(n,)`` of states ``(d, n)`` at one time, with what is `beside` them: positive
+        outside the set, not positive inside, growing outwards."""
 
     @shaped
     def excess(self, states: Float[Array, "d n"], beside: Float[Array, " j"] | None = None) -> Float[Array, " n"]:
@@ -149,7 +150,7 @@ class StateConstraint(Source):
 
     @shaped
     def normals_at(self, index: Float[Array, " j"]) -> Float[Array, "r q"]:
-        """The normals of all rows at one index, those of a mixed constraint with their part on the control,
+        """Return the normals of all rows at one index, those of a mixed constraint with their part on the control,
         ``(r, d + m)``."""
         directions, gains = self.functionals_at(index[None])[1], self.gains
         return directions if gains is None else np.hstack([directions, gains])
@@ -167,12 +168,13 @@ class StateConstraint(Source):
 
     @shaped
     def sizes(self, x: Float[Array, " n"]) -> Float[Array, " q"]:
-        """The sizes ``(q,)`` of `sized_rows` at a decision ``x (n,)``: a claim may excuse a billionth of them."""
+        """Return the sizes ``(q,)`` of `sized_rows` at a decision ``x (n,)``: a claim may excuse a billionth of
+        them."""
         rows, sizes = self.sized_rows
         return np.maximum(sizes, self._compute_row_sizes(x, rows))
 
     def scale(self, x: Array) -> float:
-        """The least of the `sizes` at a decision ``x (n,)``, 1 where none is below that."""
+        """Return the least of the `sizes` at a decision ``x (n,)``, 1 where none is below that."""
         rows, sizes = self.sized_rows
         small = sizes < 1.0
         if not small.any():
@@ -224,7 +226,7 @@ class StateConstraint(Source):
 
     @shaped
     def at(self, x: Float[Array, " n"], indices: Float[Array, "k j"]) -> Float[Array, "k r"]:
-        """`violations` of all rows at indices ``(k, ...)``, ``(k, r)``."""
+        """Return `violations` of all rows at indices ``(k, ...)``, ``(k, r)``."""
         times, directions, parameters, rhs = self.functionals_at(indices)
         violations, direct = self.functionals.values(x, times, directions, parameters) - rhs, self.direct(indices[:, 0])
         shape = (indices.shape[0], times.size // max(1, indices.shape[0]))
@@ -234,7 +236,7 @@ class StateConstraint(Source):
     def chosen(
         self, indices: Float[Array, "k j"], rows: Int[np.ndarray, " k"]
     ) -> tuple[Float[Array, "k n"], Float[Array, " k"]]:
-        """``G (k, n)``, ``rhs (k,)`` of one row of each index ``(k, ...)``, none of the others made."""
+        """Return ``G (k, n)``, ``rhs (k,)`` of one row of each index ``(k, ...)``, none of the others made."""
         times, directions, parameters, rhs = self.functionals_at(indices)
         positions = np.arange(rows.size) * (times.size // max(1, rows.size)) + rows
         G, offset = self.functionals.rows(times[positions], directions[positions], parameters[positions])
@@ -243,7 +245,7 @@ class StateConstraint(Source):
 
     @shaped
     def rows(self, indices: Float[Array, "k j"]) -> tuple[Float[Array, "k r n"], Float[Array, "k r"]]:
-        """``G (k, r, n)``, ``rhs (k, r)`` at indices ``(k, ...)``."""
+        """Return ``G (k, r, n)``, ``rhs (k, r)`` at indices ``(k, ...)``."""
         times, directions, parameters, rhs = self.functionals_at(indices)
         G, offset = self.functionals.rows(times, directions, parameters)
         direct = self.direct(indices[:, 0])

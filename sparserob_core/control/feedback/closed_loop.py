@@ -156,7 +156,7 @@ class ClosedLoop:
         return slice(last - (self.answers.shape[0] * self.answers.shape[3] if noisy else 0), last)
 
     def noises(self, deviation: Array) -> Array | None:
-        """The noise ``(K, p)`` of a deviation ``(Q,)``; ``None`` where there is none."""
+        """Return the noise ``(K, p)`` of a deviation ``(Q,)``; ``None`` where there is none."""
         point = (self.spread.middle + deviation)[self.noise]
         return point.reshape(self.answers.shape[0], -1) if point.size else None
 
@@ -252,7 +252,8 @@ class ClosedLoop:
         return np.asarray(flow @ nodes[pieces] + input_flow @ drives[pieces])
 
     def _enclose_states(self, x: Array, times: Array, pieces: np.ndarray) -> tuple[Array, Array]:
-        """The `states` at ``times (k,)`` on these pieces, and their rounding error under any deviation, ``(k, d)``."""
+        """Return the `states` at ``times (k,)`` on these pieces, and bounds ``(k, d)`` of their rounding errors under
+        any deviation."""
         nodes, drives = self.path(x)
         flow, input_flow = self._compute_flows(pieces, np.clip(times - self.grid.breakpoints[pieces], 0.0, None))
         sizes, drive_sizes, errors = self._bound_rounding_errors(x)
@@ -261,11 +262,11 @@ class ClosedLoop:
         return np.asarray(flow @ nodes[pieces] + input_flow @ drives[pieces]), rounding_errors[:, :, 0]
 
     def _bound_rounding_errors(self, x: Array) -> tuple[Array, Array, Array]:
-        """The sizes of the nodes ``(L + 1, d)`` and of what drives them ``(L, ..)`` under any deviation, and the
-        rounding error of every node.
+        """Return bounds under any deviation: of the sizes of the nodes ``(L + 1, d)`` and of what drives them
+        ``(L, ..)``, and of the rounding error of every node.
 
-        Each step rounds `ROUND_OFF` of what it adds up, and the transitions to the node amplify that. Those of a system
-        that changes with time are counted by its motion.
+        Each step is allowed an error of `ROUND_OFF` times the absolute numbers that it adds up, and the transitions to
+        the node amplify that. Those of a system that changes with time are counted by its motion.
         """
         key = x.tobytes()
         if key not in self._rounding_bounds:
@@ -313,17 +314,17 @@ class ClosedLoop:
         return self._flows[key]
 
     def height(self, along: Array) -> Array:
-        """``max_w`` of functionals ``(..., 1 + Q)`` of the nominal state and the responses."""
+        """Return ``max_w`` of functionals ``(..., 1 + Q)`` of the nominal state and the responses."""
         return np.asarray(along[..., 0] + self.spread.support(along[..., 1:]))
 
     def values(self, x: Array, times: Array, H: Array) -> Array:
-        """``max_w H x(t)`` at ``times (k,)`` for ``H (r, d)``: ``(k, r)``."""
+        """Return ``max_w H x(t)`` at ``times (k,)`` for ``H (r, d)``: ``(k, r)``."""
         heights = self.height(H @ self.states(x, times))
         return heights if self.measurable is None else heights + self.measurable.within(times, H)
 
     def bounds(self, x: Array, lower: Array, upper: Array, H: Array) -> Array:
-        """Upper bounds ``(k, r)`` of ``max_w H x(t)`` over cells of time ``[lower, upper] (k,)``, each within one piece
-        of the grid."""
+        """Return upper bounds ``(k, r)`` of ``max_w H x(t)`` over cells of time ``[lower, upper] (k,)``, each within
+        one piece of the grid."""
         return self.bounded(x, lower, upper, H)[0]
 
     def bounded(
@@ -334,8 +335,9 @@ class ClosedLoop:
         H: Array,
         beside: tuple[Array, Array] | None = None,
     ) -> tuple[Array, Array]:
-        """The bounds, ``H (r, d)`` or ``(k, r, d)``, and how much of each is owed to the length of the cell;
-        ``beside``: what is added at both ends, ``(k, r, 1 + Q)`` or ``(k, r, 1)`` each, and linear between.
+        """Return the `bounds` for ``H (r, d)`` or ``(k, r, d)``, and the part of each that is due to the length of the
+        cell. ``beside``: terms that are added at both ends, ``(k, r, 1 + Q)`` or ``(k, r, 1)`` each, and linear
+        between.
 
         On a cell every functional is within ``(b - a)^2 / 8`` times its largest second derivative of its chord, and a
         support function of a chord lies below the chord of the support functions.
@@ -401,7 +403,7 @@ class ClosedLoop:
         return motion.left_out(state_sizes, input_sizes)
 
     def worst(self, x: Array, time: float, direction: Array) -> Array:
-        """A deviation ``(Q,)`` that attains the worst case of ``c'x(t)``."""
+        """Return a deviation ``(Q,)`` that attains the worst case of ``c'x(t)``."""
         along = direction @ self.states(x, np.array([time]))[0]
         return self.spread.worst(along[1:])
 
@@ -431,7 +433,7 @@ class ClosedLoop:
         return self.functionals.response.grid.breakpoints, (self.entries @ (self.spread.middle + deviation)).T
 
     def begun(self, deviation: Array) -> Array:
-        """The initial state ``(d,)`` of a deviation ``(Q,)``."""
+        """Return the initial state ``(d,)`` of a deviation ``(Q,)``."""
         return np.asarray(self.start + self.begins @ deviation)
 
     def state_rows(
@@ -439,8 +441,8 @@ class ClosedLoop:
     ) -> UncertainRows:
         """Return the rows ``H x(t) <= h`` at one time as `UncertainRows`.
 
-        Row ``r`` is ``factor_r`` times the first row of its part, ``part_r``. With ``acting (r,)``, the rows will also
-        contain the control on these pieces (`with_control`).
+        The direction of row ``r`` is ``factor_r`` times that of the first row of its part, ``part_r``. With
+        ``acting (r,)``, the rows will also contain the control on these pieces (`with_control`).
         """
         count = H.shape[0]
         firsts = [int(np.flatnonzero(part == p)[0]) for p in range(int(part.max()) + 1)]
@@ -494,7 +496,7 @@ class ClosedLoop:
         return replace(rows, g=g, C=tuple(matrices))
 
     def control_rows(self, piece: int, H: Array, h: Array, extra: Array | None = None) -> UncertainRows:
-        """The rows ``H u_k <= h`` on one piece for every deviation; ``extra (r, n)`` is added on the left."""
+        """Return the rows ``H u_k <= h`` on one piece for every deviation; ``extra (r, n)`` is added on the left."""
         part, factor = shared(H, self.spread)
         firsts = [int(np.flatnonzero(part == p)[0]) for p in range(int(part.max()) + 1)]
         position, variable, value = self.of_piece(piece)
@@ -515,7 +517,7 @@ class ClosedLoop:
         return UncertainRows(g, h, part, factor, tuple(matrices), np.zeros((len(firsts), Q)))
 
     def controls(self, x: Array) -> Array:
-        """The nominal control and its answers to the deviations on every piece, ``(K, m, 1 + Q)``."""
+        """Return the nominal control and its answers to the deviations on every piece, ``(K, m, 1 + Q)``."""
         return np.concatenate([self.nominal(x).T[:, :, None], self.effects(x)], axis=2)
 
     def of_piece(self, piece: int) -> tuple[np.ndarray, np.ndarray, Array]:
@@ -560,7 +562,7 @@ def deviations_of(
     measured: int = 0,
     periods: int = 1,
 ) -> Spread:
-    """The deviations of a disturbance with values in ``bound``, ``blocks`` times, of a ``noise``, ``measured`` times,
-    and of the initial state where its own are in ``initial``, of so many ``periods``."""
+    """Return the deviations of a disturbance with values in ``bound``, ``blocks`` times, of a ``noise``, ``measured``
+    times, and of the initial state where its own are in ``initial``, of so many ``periods``."""
     counted_sets = ((blocks, bound), (measured, noise), (periods, initial))
     return Spread(tuple((count, convex) for count, convex in counted_sets if convex is not None))

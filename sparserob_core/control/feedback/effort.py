@@ -2,7 +2,7 @@
 
 For signs ``s`` the sum ``s'(a + A w)`` has its largest value over the deviations in closed form, and the largest of
 these over all signs is the effort. So signs are what is branched on. Where ``a_k + A_k w`` lies between ``l < 0 < u``,
-its absolute value lies below its chord ``-2 l u / (u - l) + (u + l) / (u - l) (a_k + A_k w)``: with the chords of all
+its absolute value lies below its chord ``-2 l u / (u - l) + (u + l) / (u - l) (a_k + A_k w)``. With the chords of all
 entries whose sign is open, the bound of a part is in closed form too (McCormick 1976). The deviation at which it is
 attained is a candidate, from which signs and deviations are improved in turn.
 """
@@ -33,11 +33,11 @@ class Effort:
     Parameters
     ----------
     lower, upper : float
-        Bounds of the largest effort.
+        Bounds of the largest effort, without an allowance for rounding.
     signs : ndarray, shape (c, n)
         Signs with the largest efforts, the largest first.
     values : ndarray, shape (c,)
-        Effort of each row of signs, the largest over all deviations.
+        Largest value of ``s'(a + A w)`` over all deviations, for each row ``s`` of signs.
     """
 
     lower: float
@@ -47,7 +47,7 @@ class Effort:
 
 
 def largest_effort(a: Array, A: Array, spread: Spread, parts: int = PARTS) -> Effort:
-    """``max_w sum_k |a_k + A_k w|`` of ``a (n,)`` and ``A (n, Q)``, over the deviations of the ``spread``."""
+    """Return ``max_w sum_k |a_k + A_k w|`` of ``a (n,)`` and ``A (n, Q)``, over the deviations of the ``spread``."""
     return _Search(a, A, spread).run(parts)
 
 

@@ -187,7 +187,7 @@ def answers(D: Array, mask: np.ndarray, channels: int, seen: Array | None = None
     D : ndarray, shape (K, d, Q)
         Innovations that are answered, in units in which states and deviations are of ordinary size.
     mask : ndarray of bool, shape (K, K)
-        For each piece, a row of the innovations that it responds to.
+        True at ``[k, j]`` where piece ``k`` responds to the innovation at breakpoint ``j``.
     channels : int
         Number ``m`` of controls.
     seen : ndarray, shape (K, d, Q), optional
@@ -264,7 +264,8 @@ def _flatten_entries(at: Array, which: Array, value: Array) -> tuple[np.ndarray,
 
 
 def _cluster_breakpoints(where: np.ndarray) -> list[np.ndarray]:
-    """The breakpoints ``(K, Q)`` that see something in common, together; those that see nothing are left out."""
+    """Return the breakpoints of ``where (K, Q)`` in groups that see an entry in common; those that see nothing are left
+    out."""
     clusters: list[tuple[set[int], np.ndarray]] = []
     for j in np.flatnonzero(where.any(axis=1)):
         union, disjoint = ({int(j)}, where[j].copy()), []
@@ -310,7 +311,7 @@ def _compute_coordinates(seen: Array) -> tuple[np.ndarray, np.ndarray, Array, Ar
 
 
 def _join_entries(parts: list[tuple[np.ndarray, np.ndarray, Array]]) -> tuple[np.ndarray, np.ndarray, Array]:
-    """Positions, variables and values, in the order of the variables."""
+    """Return positions, variables and values, in the order of the variables."""
     if not parts:
         return np.zeros(0, dtype=int), np.zeros(0, dtype=int), np.zeros(0)
     position, variable, value = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))

@@ -152,7 +152,7 @@ class OfDisturbances(Knowledge):
         return np.asarray(np.abs(self.N * self.worst).sum(axis=1))
 
     def history(self, signal: Array, reports: int) -> bytes:
-        """The deviations bit by bit."""
+        """Return the deviations bit by bit."""
         return signal[: reports * self.width].tobytes()
 
     def gives(self, signals: Array, beside: Array) -> Array:
@@ -203,7 +203,7 @@ class OfDisturbances(Knowledge):
         return sums(gives[:, ::-1])[:, ::-1]
 
     def by_block(self, a: Array) -> Array:
-        """Numbers of every deviation, block by block."""
+        """Return numbers of every deviation, block by block."""
         return a.reshape(*a.shape[:-1], self.reports, max(1, self.width))
 
 
@@ -342,7 +342,7 @@ class OfOutputs(Knowledge):
         return signal[self.N.shape[1] :].reshape(self.C.shape[:2])
 
     def history(self, signal: Array, reports: int) -> bytes:
-        """The outputs bit by bit."""
+        """Return the outputs bit by bit."""
         return self.outputs(signal)[:reports].tobytes()
 
     def signal(self, z: Array, beside: Array, noise: Array, reports: int) -> Array:
@@ -355,7 +355,7 @@ class OfOutputs(Knowledge):
     def gives(self, signals: Array, beside: Array) -> Array:
         """Solve one linear program for each row and report, the most promising ones first.
 
-        Once one of them lifts a row above 0, no more than `LOOKED` programs are solved for a signal. Entries that were
+        For a signal, this ends when at least `LOOKED` programs were solved and some row is above 0. Entries that were
         not found are ``-inf``.
         """
         values = np.full(beside.shape, -np.inf)
@@ -425,8 +425,8 @@ class OfOutputs(Knowledge):
     def known(self, z: Array) -> Array:
         """Return the signal of a disturbance with the noise that hides it from the outputs as far as it can.
 
-        The initial state is the middle of its set, unless ``z`` holds it. A ``z`` that holds outputs is returned as it
-        is.
+        A noise whose set is no box stays in its middle. The initial state is the middle of its set, unless ``z`` holds
+        it. A ``z`` that holds outputs is returned as it is.
         """
         if z.size > self.N.shape[1]:
             return z
@@ -494,7 +494,8 @@ class OfOutputs(Knowledge):
 
 
 def about(convex: ConvexSet) -> tuple[Array, Array] | None:
-    """Half-spaces ``(H, h)`` of a set about its middle, ``None`` where it is curved or its middle is on its border."""
+    """Return half-spaces ``(H, h)`` of a set about its middle, ``None`` where it is curved or its middle is on its
+    border."""
     flat = convex.halfspaces()
     if flat is None:
         return None
@@ -503,8 +504,8 @@ def about(convex: ConvexSet) -> tuple[Array, Array] | None:
 
 
 def hiding(noise: ConvexSet) -> tuple[Array, Array] | None:
-    """Half-spaces about the middle of what a noise can certainly be: its own, or where it is curved those of a box in
-    it; ``None`` where there are none."""
+    """Return half-spaces about the middle of what a noise can certainly be: its own, or where it is curved those of a
+    box in it; ``None`` where there are none."""
     flat = about(noise)
     if flat is None and noise.halfspaces() is None and noise.dimension <= CORNERS:
         axes, middle = np.eye(noise.dimension), noise.middle()

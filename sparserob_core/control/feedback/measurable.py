@@ -124,7 +124,8 @@ class MeasurablePieces:
         """Return the largest contribution, until ``times (k,)``, of the piece that holds the time to ``H x(t)``:
         ``(k, r)``.
 
-        The contribution of the middle of the disturbance is not included. ``pieces (k,)`` names the pieces; without it
+        It is computed by a quadrature, whose error `allowance` allows for. The contribution of the middle of the
+        disturbance is not included. ``pieces (k,)`` names the pieces; without it
         they are those of the grid that hold the times.
         """
         response, k, r = self.functionals.response, times.size, H.shape[0]
@@ -144,7 +145,8 @@ class MeasurablePieces:
     def allowance(self, lower: Array, upper: Array, H: Array, pieces: np.ndarray) -> Array:
         """Bound the excess of `within` over its chord on cells ``[lower, upper] (k,)`` of ``pieces (k,)``: ``(k, r)``.
 
-        The bound uses that the integrand is Lipschitz, and it includes the quadrature error of `within`.
+        The bound uses that the integrand is Lipschitz. It includes the relative error `MISSED` that is allowed for the
+        quadrature of `within`.
         """
         response, (A, E) = self.functionals.response, self._matrices
         offsets = np.clip(lower - response.grid.breakpoints[pieces], 0.0, None)
@@ -240,7 +242,7 @@ class MeasurablePieces:
         return effects
 
     def _compose_arcs(self, deviation: Array) -> list[Arc]:
-        """The signals on all pieces that have a deviation ``(Q,)``."""
+        """Return the signals on all pieces that have a deviation ``(Q,)``."""
         self.compose([deviation])
         zero_arc = Arc(np.ones(1), np.zeros((1, self.middle.size)))
         points = [deviation[self.at(piece)[0]].tobytes() for piece in range(len(self.zonoids))]
@@ -285,7 +287,7 @@ class VaryingPieces(MeasurablePieces):
         return self.errors.motion
 
     def _build_unit_command(self, piece: int) -> Array:
-        """The command that is 1 on one piece alone, ``(m, L)``."""
+        """Return the command that is 1 on one piece alone, ``(m, L)``."""
         command = np.zeros((self.errors.shares.size, self.functionals.response.grid.pieces))
         command[:, piece] = 1.0
         return command
@@ -362,7 +364,7 @@ class VaryingPieces(MeasurablePieces):
 
 
 def _compute_leading_signs(H: Array) -> Array:
-    """The signs ``(r,)`` with which the first numbers of ``H (r, d)`` other than 0 are positive."""
+    """Return the signs ``(r,)`` with which the first numbers of ``H (r, d)`` other than 0 are positive."""
     first = H[np.arange(len(H)), (H != 0.0).argmax(axis=1)]
     return np.where(first < 0.0, -1.0, 1.0)
 

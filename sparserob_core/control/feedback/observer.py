@@ -26,8 +26,8 @@ TELLING = 1e-10
 
 
 def between(response: Response, control: Dictionary) -> Array:
-    """The transitions of the state ``(K - 1, d, d)`` from each breakpoint of the control to the next, without what
-    drives it."""
+    """Return the transitions of the state ``(K - 1, d, d)`` from each breakpoint of the control to the next, without
+    what drives it."""
     K, d = control.pieces, response.initial_state.size
     flows = np.tile(np.eye(d), (max(0, K - 1), 1, 1))
     steps, commanded = response.steps(KNOWN), response.grid.commanded(control.breakpoints)

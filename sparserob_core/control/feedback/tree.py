@@ -2,16 +2,15 @@
 signals did.
 
 Let ``w_1 .. w_S`` be signals of the disturbance's set. Whatever a causal policy does, its controls on piece ``k`` under
-two of them are equal unless the signals differ before ``tau_k``: a difference within the piece comes too late, and a
+two of them are equal unless the signals differ before ``tau_k``. A difference within the piece comes too late, and a
 policy that sees less than the disturbance itself can do no more. Where a noise hides the difference, they are equal for
-longer (`knowledge`). So the controls under the signals are a point of a linear program, the tree of the signals, and
-the value of this is a lower bound of the cost of every causal policy with this dictionary, affine or not (the scenarios
-of Hadjiyiannis, Goulart and Kuhn 2011, who have two stages; here with every stage, and with finitely many times).
+longer (`knowledge`). So the controls under the signals are a point of a linear program, the tree of the signals. Its
+value is a lower bound of the cost of every causal policy with this dictionary, affine or not. These are the scenarios
+of Hadjiyiannis, Goulart and Kuhn (2011), who have two stages; here there is every stage, and finitely many times.
 
-Most signals need no variables. A signal that leaves one of the tree at a report, and is the worst for one row from
-there on, is met by the controls that can know of it as that row would have it: the least of a linear function over the
-set of the control, a number. So every signal of the tree stands for many, and those that have multipliers are written
-out.
+Most signals need no variables. Take a signal that leaves one of the tree at a report, and is the worst for one row from
+there on. The controls that can know of it respond as is best for that row: the least of a linear function over the set
+of the control, a number. So every signal of the tree stands for many, and those that have multipliers are written out.
 """
 
 from __future__ import annotations
@@ -77,9 +76,10 @@ class Sampled:
 @final
 @dataclass(frozen=True, eq=False)
 class Grown:
-    """A solved tree: the controls ``u (S, m, K)`` under every signal, the ``value`` of its program, and of the rows
-    with a multiplier the signal, the row, the report from which on the worst for that row replaces the signal, and the
-    multiplier; ``x``: the columns; ``shares``: with the cost ``worst`` what every signal's effort counts."""
+    """A solved tree, with the controls ``u (S, m, K)`` under every signal and the ``value`` of its program. For each
+    row with a multiplier it has the signal, the row, the multiplier, and the report from which on the worst for that
+    row replaces the signal. ``x``: the columns; ``shares``: with the cost ``worst``, the weight of every signal's
+    effort."""
 
     value: float
     x: Array
@@ -265,7 +265,8 @@ class Tree:
 
     @cached_property
     def _forced_contributions(self) -> Array:
-        """Least contribution of the control to every row where its bounds exclude 0, ``(R, m, K)``; 0 elsewhere."""
+        """Contribution above 0 to every row that the control cannot avoid, since its bounds exclude 0, ``(R, m, K)``; 0
+        elsewhere."""
         T = self._control_coefficients
         return np.asarray(
             T
@@ -285,8 +286,9 @@ class Tree:
         return self._solve_tree()
 
     def relaxed(self, budget: float = np.inf, central: bool = False) -> Grown | None:
-        """The least relaxation, in the rows' units, that a cost within a ``budget`` needs (below 0: how far within all
-        rows it can stay); the ``value`` is that. ``central``: in the middle of all controls that need no more."""
+        """Return the least relaxation, in the rows' units, that a cost within a ``budget`` needs (below 0: how far
+        within all rows it can stay); the ``value`` is that. ``central``: in the middle of all controls that need no
+        more."""
         highs = self._program.highs
         highs.changeColBounds(0, -ROOM, np.inf)
         highs.changeColCost(0, 1.0)
@@ -310,7 +312,7 @@ class Tree:
             highs.changeRowBounds(self._budget_row, -np.inf, np.inf)
 
     def _solve_tree(self, relaxed: bool = False) -> Grown | None:
-        """The program with every sampled row, which are imposed as they are violated."""
+        """Solve the program with every sampled row; rows are imposed as they are violated."""
         solution = None
         for _ in range(PASSES):
             is_solved, _, x, y = self._program.solve(self.seconds())

@@ -43,7 +43,7 @@ def has_corners(bound: ConvexSet) -> bool:
 
 
 def corners(bound: ConvexSet) -> list[Array]:
-    """Corners ``(v, mw)`` of sets that add up to a set less its middle: of a box one set for every channel."""
+    """Return corners ``(v, mw)`` of sets that add up to a set less its middle: of a box one set for every channel."""
     if bound.is_box:
         box = bound.bounding_box()
         radii = (box.upper - box.lower) / 2
@@ -142,7 +142,7 @@ class Zonoid(ConvexSet):
 
     @staticmethod
     def of(pushes: Pushes, bound: ConvexSet) -> Zonoid:
-        """The set of one piece, in the coordinates in which the ellipsoid of its second moments is a ball."""
+        """Return the set of one piece, in the coordinates in which the ellipsoid of its second moments is a ball."""
         corner_sets, (d, mw) = tuple(corners(bound)), pushes.terms.shape[2:]
         nodes, weights = np.polynomial.legendre.leggauss(32)
         share = weights * pushes.halves[:, None]
@@ -166,7 +166,7 @@ class Zonoid(ConvexSet):
         return int(self.into.shape[0])
 
     def middle(self) -> Array:
-        """The middle of ``W`` throughout: 0."""
+        """Return the middle of ``W`` throughout: 0."""
         return np.zeros(self.dimension)
 
     def interior_point(self) -> Array:
@@ -253,8 +253,8 @@ class Zonoid(ConvexSet):
         return points.reshape(np.shape(directions))
 
     def signals(self, points: Array) -> list[Arc]:
-        """A signal that leads to each of the points ``(k, r)`` of the set: a mean of at most ``r`` that attain support
-        functions and of the middle (Caratheodory)."""
+        """Return a signal that leads nearly to each of the points ``(k, r)`` of the set (`reached` says where): a mean
+        of at most ``r`` that attain support functions and of the middle (Caratheodory)."""
         all_directions, shares = self._decompose_points(points)
         return [
             _combine_arcs([self.best(a) for a in directions[share > 0.0]], share[share > 0.0], self.channels)
@@ -262,12 +262,12 @@ class Zonoid(ConvexSet):
         ]
 
     def best(self, direction: Array) -> Arc:
-        """The signal that attains the support function of a direction ``(r,)``."""
+        """Return the signal that attains the support function of a direction ``(r,)``."""
         arcs = [self._sweep_corners(corner_set, direction[None]).arc() for corner_set in self.parts]
         return _combine_arcs(arcs, np.ones(len(arcs)), self.channels)
 
     def reached(self, signal: Arc) -> Array:
-        """The point ``(r,)`` that a signal leads to."""
+        """Return the point ``(r,)`` that a signal leads to."""
         ends, halves = self.pushes.ends, self.pushes.halves
         times_left = ends[-1] * (1.0 - np.concatenate([[0.0], signal.ends]))
         part_numbers = np.clip(np.searchsorted(ends, times_left, side="right") - 1, 0, self.count - 1)
@@ -286,9 +286,9 @@ class Zonoid(ConvexSet):
         return _Sweep(self, part, directions)
 
     def _decompose_points(self, points: Array) -> tuple[Array, Array]:
-        """Directions ``(k, r, r)`` and shares ``(k, r)``, at most 1 together, such that the support points of the
-        directions in these shares are ``points (k, r)`` of the set, nearly: the gauge of a point as a linear program
-        whose columns are generated, as in `ConvexSet`. By how much they miss it, `reached` says."""
+        """Return directions ``(k, r, r)`` and shares ``(k, r)``, at most 1 together, such that the support points of
+        the directions in these shares add up nearly to ``points (k, r)`` of the set. The gauge of a point is a linear
+        program whose columns are generated, as in `ConvexSet`. By how much they miss it, `reached` says."""
         k, r = points.shape
         signs = np.where(points < 0.0, -1.0, 1.0)
         lengths = np.linalg.norm(points, axis=1)
@@ -320,7 +320,8 @@ class _Sweep:
     """Best corners of ``part (v, mw)`` along a piece, for ``directions (N, r)``.
 
     On parts of the piece that are `clean` one corner is best throughout. The other parts are cut into cells
-    ``[low, high]``, each with its best corner.
+    ``[low, high]``, each with the corner that is best at its ends. After `HALVINGS` a cell keeps this corner without a
+    proof that it is best inside, so that `values` may be too small there.
     """
 
     def __init__(self, zonoid: Zonoid, part: Array, directions: Array) -> None:
@@ -383,7 +384,7 @@ class _Sweep:
         return np.asarray(points)
 
     def arc(self) -> Arc:
-        """The signal of the first direction."""
+        """Return the signal of the first direction."""
         _, s, low, high, best = self.cells
         ends = self.zonoid.pushes.ends
         clean_parts, halves, begins = np.flatnonzero(self.clean[0]), np.diff(ends) / 2.0, ends[:-1]
@@ -435,7 +436,7 @@ def _is_nonnegative(left: Array, right: Array, bent: Array, spare: Array | float
 
 
 def _evaluate_polynomials(P: Array, u: Array) -> Array:
-    """Polynomials ``(M, p + 1, ...)`` at ``u (M,)``."""
+    """Return polynomials ``(M, p + 1, ...)`` at ``u (M,)``."""
     u = u.reshape(-1, *([1] * (P.ndim - 2)))
     value = P[:, -1]
     for order in range(P.shape[1] - 2, -1, -1):
@@ -444,8 +445,8 @@ def _evaluate_polynomials(P: Array, u: Array) -> Array:
 
 
 def _find_roots(P: Array, low: Array, high: Array) -> Array:
-    """A root of polynomials ``(M, p + 1)`` between ``low`` and ``high (M,)`` where the signs there differ, their middle
-    elsewhere."""
+    """Return a root of polynomials ``(M, p + 1)`` between ``low`` and ``high (M,)`` where the signs there differ, their
+    middle elsewhere."""
     first, last = _evaluate_polynomials(P, low), _evaluate_polynomials(P, high)
     middle = (low + high) / 2.0
     is_crossing = first * last < 0.0
@@ -483,7 +484,7 @@ def _solve_shares(columns: Array, point: Array) -> Array:
 
 
 def _combine_arcs(signals: Sequence[Arc], shares: Array, channels: int) -> Arc:
-    """The sum of signals in these shares, constants that are equal joined."""
+    """Return the sum of signals in these shares, constants that are equal joined."""
     ends = np.unique(np.concatenate([[1.0], *(signal.ends for signal in signals)]))
     total = np.zeros((ends.size, channels))
     for signal, share in zip(signals, shares, strict=True):

@@ -39,11 +39,12 @@ from sparserob_core.sip.finite import Spread
 from sparserob_core.sip.program import Formulation
 
 PEAK, EFFORT = "peak", "effort"  # names of the families that are about the control
-# Of the size of a row, what an entry of a deviation does to it at most that nothing answers. With a thousandth,
+# Largest effect on a row, relative to its size, of an entry of the deviations that no gain answers. With a thousandth,
 # programs with sets of 1e-12 fail; with ten times as much, costs are off by more than decision 0088 excuses.
 STILL = 1e-9
-# Of its unit, how far an entry deviates at least whose effects are variables as they are: those on less are numbers of
-# 1e8 beside others of 1. With a millionth of it programs of initial states that deviate by 1e-8 fail.
+# Least deviation of an entry, in its unit, whose effects are variables in this unit; those of smaller ones are
+# rescaled, since they would be numbers of 1e8 beside others of 1. With a millionth of it programs of initial states
+# that deviate by 1e-8 fail.
 SMALL = 2.0**-10
 FINER = 2.0**-11  # of the numbers that are added up, the unit of an equality: it is met to `EQUALITY` of them
 
@@ -361,11 +362,11 @@ def _collect_deviations(posed: Posed, acting: MeasurablePieces | None, still: np
 
 
 def _find_ineffective_entries(own: Posed, spread: Spread) -> np.ndarray:
-    """Return which entries ``(Q,)`` of the disturbance and of the initial state have no effect on any row that double
-    precision resolves, relative to the size of the row (decision 0088). Gains on such entries would be unbounded.
+    """Return a mask ``(Q,)`` of the entries of the disturbance and of the initial state that move no row by more than
+    `STILL` of its size (decision 0088). Gains on such entries would be unbounded.
 
-    All entries of one coordinate of a box are in the list together; of another set, all entries at all. Where one of
-    them is answered, the similar ones count too. With fixed final states the list is empty, since these hold at every
+    The entries of one coordinate of a box, at all times, are in the mask together or not at all; of any other set, all
+    its entries. Entries of the noise are never in it. With fixed final states nothing is, since these hold at every
     deviation.
     """
     is_still, model = np.zeros(spread.size, dtype=bool), own.functionals.disturbance

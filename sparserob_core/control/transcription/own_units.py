@@ -19,7 +19,7 @@ from sparserob_core.sip.convex_set import Array, ConvexSet
 TIMES = 17  # at most, at which a reach is looked at
 AT_ONCE = 2_000_000  # numbers that functionals are made of
 LOOKED_AT = 1000  # pieces, in about so many of which a reach is computed
-PARAMETERS = 9  # at most, at which a reach is looked at
+PARAMETERS = 9  # at most, at which a reach is looked at: the middle and ends of axes; the diagonal adds two
 RESOLVED = 2.0**-18  # of the numbers that are added up, the least unit: 1e-9 of it is 17 units of rounding
 # Of the numbers that are added up: a set that is thinner holds no point that a solver of doubles finds, and counts as a
 # point there. With a thousandth of it, balls of radius 1e-12 end undecided; with a thousand times as much, sets that
@@ -92,7 +92,8 @@ def _choose_control_units(problem: OptimalControlProblem) -> Array:
 
 
 def _estimate_cost_per_time(problem: OptimalControlProblem, states: Array, time: float) -> float:
-    """Return the largest cost per time, where states are as large as their units or their references."""
+    """Estimate the largest cost per time, where states are as large as their units. Their distance from a reference
+    counts as the unit plus the reference."""
     size = extent(problem.control)
     total = float((problem.prices(np.array([0.0, problem.horizon]))[:, 0] * size).sum()) / problem.horizon
     state, control, final = problem.cost.terms
@@ -107,7 +108,8 @@ def row_units(constraint: StateConstraint, control: ConvexSet) -> Array:
     """Return the unit ``(r,)`` of each row of a constraint (`units_of_sides`).
 
     The rows of a curved set are multiples of its gauge. Their unit is 1, or the resolution of double precision where
-    that is larger. For a set that is a point to rounding, the unit is the reach of the row in these multiples.
+    that is larger. For a set that is a point to rounding, the unit is `POINT` times the least reach of the rows in
+    these multiples, at least 1.
     """
     functionals, sides = constraint.functionals.coarser(LOOKED_AT), constraint.sides
     times = window_times(functionals, constraint.start, constraint.stop)
@@ -169,10 +171,10 @@ def units_of_sides(H: Array, h: Array, reach: Array, added: Array, driven: Array
     """Return the unit ``(r,)`` of rows ``H x <= h``: the least of ``reach (r,)``, ``|h|`` and the width to the opposite
     row.
 
-    The result is a power of two, 1.2 to 2.5 times below this value. The value is never below the resolution of double
-    precision for the sums ``added (r,)``. Left out are numbers that are 0, or below `THIN` times ``added``, or below
-    `THIN` times the sums without growth and control, ``driven (r,)``. For a row whose width is that small, only
-    ``reach`` counts, since nothing is left to keep away from the row.
+    The result is a power of two, 1.2 to 2.5 times below this value. The value is never below `RESOLVED` times the sums
+    ``added (r,)``. Left out are numbers that are 0, and of ``|h|`` and the width those below `THIN` times the smaller
+    one of ``added`` and ``driven (r,)``, the sums without growth and control. For a row whose width is that small, only
+    `POINT` times ``reach`` counts, since nothing is left to keep away from the row.
     """
     least_sums = np.minimum(added, driven)
     across, thin = widths(H, h), np.where(np.isfinite(added), THIN * least_sums, 0.0)
@@ -268,7 +270,7 @@ def reaches(
 
 
 def _estimate_uncontrolled_reach(functionals: WorstCase, parameters: ParameterIndex) -> float:
-    """Return the largest distance of any state from 0 over the whole horizon, in own units, due to the initial state,
+    """Estimate the largest distance of any state from 0 over the whole horizon, in own units, due to the initial state,
     drift, disturbance and one coupling. Amplification by an instability is left out, and so is the control, which need
     not act."""
     response, time = functionals.response, float(functionals.response.grid.breakpoints[-1])
@@ -340,7 +342,7 @@ def _measure_widths(convex: ConvexSet) -> Array:
 
 def walls(problem: OptimalControlProblem) -> Array:
     """Return the least bound other than 0 that a row or an equality gives each state by itself; 1 for a state without
-    one."""
+    one. A set with a bound of 0 on either side of a state counts as none."""
     least = np.full(problem.system.states, np.inf)
     bounds = [np.abs(np.where(np.isnan(end.values), 0.0, end.values)) for end in problem.terminal_equalities]
     axes = np.eye(problem.system.states)

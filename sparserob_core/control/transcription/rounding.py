@@ -1,7 +1,8 @@
 """Effect of rounding on a lower bound.
 
-An upper bound of this effect is subtracted before the bound is reported. A later derivation of the bound from its
-multipliers then never finds a smaller one.
+An allowance for this effect is subtracted before the bound is reported. A later derivation of the bound from its
+multipliers is then not to find a smaller one. The allowance is a fixed `SHARE` of the numbers that are added up, not a
+count of their operations.
 """
 
 from __future__ import annotations
@@ -22,24 +23,24 @@ from sparserob_core.sip.inner.simplex.counterpart import robust_bound
 from sparserob_core.sip.result import Result
 
 SHARE = 64 * 2.0**-52  # of the numbers that are added up to a row: products of a few matrices and sums of many terms
-INTEGRATED = 8.0  # as often do integrals of absolute values count: whoever encloses them adds up many parts of each
-SMALL_GAP = 1e-11  # by which the gap may be wider then than it was to be
+INTEGRATED = 8.0  # weight of integrals of absolute values: enclosures of them add up many parts of each
+SMALL_GAP = 1e-11  # excess of the gap over its tolerance, after the reduction, that leaves a result certified
 UNPROVEN = "nothing is feasible, but the signals that were found for the worst disturbances do not prove it"
 
 
 def rounded_down(model: Transcription, result: Result, tolerance: float | None, prices: Array | None = None) -> Result:
-    """Return the same result with a lower bound that rounding cannot have raised. The result is no longer ``certified``
-    where this opens the gap beyond the relative ``tolerance``.
+    """Return the same result with its lower bound reduced by an allowance for rounding. The result is no longer
+    ``certified`` where this opens the gap beyond the relative ``tolerance``. A bound of at most 0 is left as it is.
 
     A row ``c'x(t) <= b`` is a sum of the contributions of the initial state, every piece of the control and every piece
     of the disturbance to ``c'x(t)``. The absolute values of these contributions, at their largest, times the
-    multipliers of the rows and `SHARE`, bound the effect of all their rounding on the bound (Higham 2002, section 3.1).
+    multipliers of the rows and `SHARE`, are the allowance for the rounding of them all (Higham 2002, section 3.1).
     A piece of the control whose switching function is below its price by more than that contributes 0 to the bound,
     whatever is rounded (`_sum_control_magnitudes`).
 
     Further errors are subtracted as well. A multiplier of the wrong sign has an error (`_bound_sign_error`).
-    Transitions have a relative error (`_bound_transition_error`), and the truncation error of a law as a series in the
-    parameters (`_bound_law_truncation`). With fewer functions than pieces, multipliers of the pieces have rounding
+    Transitions have a relative error (`_estimate_transition_error`), and the truncation error of a law as a series in
+    the parameters (`_bound_law_truncation`). With fewer functions than pieces, multipliers of the pieces have rounding
     errors too (`_bound_image_error`). Signals of measurable disturbances under feedback prove only the deviations that
     they attain, not those that they were composed for (`_bound_signal_loss`); where these do not prove that nothing is
     feasible, the result does not claim it. ``prices (n,)`` are the prices of the decision, where the bound is the least
@@ -49,7 +50,7 @@ def rounded_down(model: Transcription, result: Result, tolerance: float | None, 
         return replace(result, status="failed", message=UNPROVEN, infeasible=None, lower_bound=-np.inf)
     if not np.isfinite(result.lower_bound) or result.lower_bound <= 0.0:  # without multipliers 0 is exact
         return result
-    share = SHARE + _bound_transition_error(model)
+    share = SHARE + _estimate_transition_error(model)
     error = share * (
         _sum_row_magnitudes(model, result, share, prices) + _sum_tangent_magnitudes(model, result) + result.lower_bound
     )
@@ -68,13 +69,13 @@ def rounded_down(model: Transcription, result: Result, tolerance: float | None, 
     return replace(answer, status="verified", message=message)
 
 
-def _bound_transition_error(model: Transcription) -> float:
+def _estimate_transition_error(model: Transcription) -> float:
     """Return the relative error of transitions. For a system that changes with time it is the truncation error of their
     expansion.
 
-    Otherwise there is one rounding for every time in which the system moves by its size. Transitions over a long time
-    are squares of transitions over a short one (Moler and Van Loan 2003, method 3). The transitions of a known system
-    are rounded once, but later products with rows may cancel as much.
+    Otherwise it is an estimate at a middle parameter: one rounding for every time in which the system moves by its
+    size. Transitions over a long time are squares of transitions over a short one (Moler and Van Loan 2003, method 3).
+    The transitions of a known system are rounded once, but later products with rows may cancel as much.
     """
     if model.response.system.varies:
         return model.response.propagator.slack

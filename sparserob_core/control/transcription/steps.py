@@ -116,7 +116,8 @@ def refuse_without_steps(problem: OptimalControlProblem, dictionary: Dictionary)
     """Raise `InputError` where no control in its set takes steps within theirs, whatever the state does.
 
     A control that never changes takes steps of 0. So the check is made only where 0 is no admissible step, or where the
-    control before time 0 is outside the set. The check uses cutting planes (Kelley 1960): a refusal is proven.
+    control before time 0 is outside the set. The check uses cutting planes (Kelley 1960). A refusal rests on tangents
+    of the sets, and on the word of HiGHS that these cannot hold together.
     """
     step, m = problem.control_step, problem.system.controls
     start = before(problem)
@@ -127,14 +128,14 @@ def refuse_without_steps(problem: OptimalControlProblem, dictionary: Dictionary)
     steps = differences(K, start is not None).toarray().T
     first = np.zeros((len(steps), m)) if start is None else np.vstack([-start / units, np.zeros((K - 1, m))])
     constraints = [(problem.control.in_units(units), np.eye(K), np.zeros((K, m))), (step.in_units(units), steps, first)]
-    if _is_provably_infeasible(constraints, K, m):
+    if _has_infeasible_tangents(constraints, K, m):
         condition = "" if start is None else f" and begins at the initial_control {start.tolist()}"
         raise InputError(f"no control that stays in its set{condition} changes by such steps only", path="control_step")
 
 
-def _is_provably_infeasible(held: list[tuple[ConvexSet, Array, Array]], K: int, m: int) -> bool:
-    """Return whether tangents prove that no ``u (K, m)`` has every row of ``M u + offset`` in its set, for all ``(set,
-    M, offset)``."""
+def _has_infeasible_tangents(held: list[tuple[ConvexSet, Array, Array]], K: int, m: int) -> bool:
+    """Return whether HiGHS finds that no ``u (K, m)`` has every row of ``M u + offset`` within tangents of its set, for
+    all ``(set, M, offset)``."""
     from scipy.optimize import linprog
 
     rows: list[Array] = []

@@ -197,8 +197,8 @@ def _scale_to_own_units(posed: Posed, wide: bool = False) -> tuple[Posed, Units]
     units.
 
     For a control of very large range, double precision may not resolve the bounds of the state. The units are then
-    those of a control with the largest range for which it does. With ``wide`` they are those of the whole range
-    nonetheless.
+    those of a control with a smaller range, for which it does, if there is one. With ``wide`` they are those of the
+    whole range nonetheless.
     """
     controls = np.ones(posed.problem.system.controls)
     own, units = _scale_to_shares(posed, controls)

@@ -37,12 +37,12 @@ class NewVariables:
 
 
 def in_new_variables(program: FiniteProgram) -> NewVariables | None:
-    """The program in coordinates that make it easier; ``None`` where it has such coordinates already."""
+    """Return the program in coordinates that make it easier; ``None`` where it has such coordinates already."""
     return _change_to_image(program) if program.S is not None else _rescale_variables(program)
 
 
 def _change_to_image(program: FiniteProgram) -> NewVariables | None:
-    """The coordinates ``s = S x``, in which the program is separable; ``None`` unless ``S`` is square and well
+    """Return the coordinates ``s = S x``, in which the program is separable; ``None`` unless ``S`` is square and well
     conditioned and ``P`` becomes diagonal."""
     S = program.S
     if S is None or S.shape[0] != S.shape[1]:
@@ -62,8 +62,8 @@ def _change_to_image(program: FiniteProgram) -> NewVariables | None:
 
 
 def in_round_coordinates(program: FiniteProgram) -> NewVariables | None:
-    """The coordinates ``v = L'x`` with ``P = L L'``, in which the quadratic cost is ``1/2 v'v``; ``None`` where ``P``
-    is diagonal, is not positive definite, or there are norms of blocks.
+    """Return the coordinates ``v = L'x`` with ``P = L L'``, in which the quadratic cost is ``1/2 v'v``; ``None`` where
+    ``P`` is diagonal or not positive definite, and for norms of blocks, an image, or more than `LARGE` variables.
 
     Bounds and absolute values are then those of the image ``x = L^-T v``. The condition of ``L`` is the square root of
     that of ``P``, so that at 1e12 a solver has ten digits instead of four.
@@ -91,8 +91,8 @@ def in_round_coordinates(program: FiniteProgram) -> NewVariables | None:
 
 
 def _rescale_variables(program: FiniteProgram) -> NewVariables | None:
-    """The variables ``x_k / unit_k``, with powers of two for units, which change no number but its exponent; ``None``
-    where the bounds of all variables are of ordinary size."""
+    """Return the variables ``x_k / unit_k``, with powers of two for units, which change no number but its exponent;
+    ``None`` where the bounds of all variables are of ordinary size."""
     if program.blocks is not None:  # a norm has one unit for all its entries
         return None
     sources = (program.lower, program.upper, program.weights)

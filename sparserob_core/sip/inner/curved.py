@@ -1,8 +1,8 @@
 """Lower bounds of programs with a quadratic cost whose matrix is positive definite.
 
 A tangent of the cost bounds an entry without bounds only where its slope is exactly 0, which numbers seldom are, and an
-entry between distant bounds poorly. The cost itself does better: with ``P >= diag(c)`` for some ``c > 0``,
-``1/2 x'P x`` is at least its tangent at any point plus ``1/2 (x - at)'diag(c)(x - at)``, so that residual slopes ``r``
+entry between distant bounds poorly. The cost itself does better. With ``P >= diag(c)`` for some ``c > 0``,
+``1/2 x'P x`` is at least its tangent at any point plus ``1/2 (x - at)'diag(c)(x - at)``. Residual slopes ``r`` then
 cost no more than ``sum_k r_k^2 / (2 c_k)``. All of it is evaluated in extended precision: with a matrix of condition
 1e12, double precision has no digits left for the slopes.
 """
@@ -31,13 +31,13 @@ _curvatures = Memory(4)
 
 
 def least_curvature(P: Array) -> Array | None:
-    """Positive numbers ``c (n,)`` such that ``P - diag(c)`` is proven to be positive definite; ``None`` where none are
-    found.
+    """Return positive numbers ``c (n,)`` such that ``P - diag(c)`` is proven to be positive definite; ``None`` where
+    none are found.
 
     ``P (n, n)`` is scaled to a diagonal of about 1 by powers of two, so that units do not matter, and shifted by a part
-    of its least eigenvalue. Where the Cholesky factorisation then ends, what it proves is off by no more than
-    ``(n + 2) eps`` of the trace (Rump 2006, "Verification of positive definiteness", BIT 46, theorem 2.3), and by no
-    more than what the product of the factors is off by, which is computed where the former is too much.
+    of its least eigenvalue. Where the Cholesky factorisation then succeeds, it proves this up to ``(n + 2) eps`` of the
+    trace (Rump 2006, "Verification of positive definiteness", BIT 46, theorem 2.3), which is doubled here. It also
+    proves it up to the error of the product of the factors, which is bounded where the former is too much.
     """
     n, diagonal = len(P), P.diagonal()
     if not (diagonal > 0.0).all() or not np.isfinite(P).all():
@@ -60,8 +60,9 @@ def least_curvature(P: Array) -> Array | None:
 
 
 def _bound_factor_error(scaled: Array, share: float, factor: np.ndarray) -> float:
-    """A bound of the norm of ``scaled - share I - factor factor'``, by the sums of its rows; every entry is a sum of
-    ``n + 2`` terms, and off by at most so many roundings of their absolute values (Higham 2002, section 3.1)."""
+    """Return an upper bound of the norm of ``scaled - share I - factor factor'``, by the sums of its rows. Every entry
+    is a sum of ``n + 2`` terms, and off by at most so many roundings of their absolute values (Higham 2002, section
+    3.1)."""
     wide, size = factor.astype(WIDE), np.abs(factor)
     shift = share * np.eye(len(scaled))
     residual = np.abs(scaled.astype(WIDE) - shift - wide @ wide.T)
@@ -72,7 +73,8 @@ def _bound_factor_error(scaled: Array, share: float, factor: np.ndarray) -> floa
 def curvature_of(program: FiniteProgram) -> Array | None:
     """Return numbers ``c (n,)`` with ``P >= diag(c)`` for the matrix of a quadratic cost, remembered between calls.
 
-    ``None`` where nothing is proven, where a tangent of the cost bounds it as well, or beyond `LARGE` entries.
+    ``None`` without a quadratic cost, for an image, for norms of blocks, beyond `LARGE` entries, and where nothing is
+    proven; also for a diagonal ``P``, which a dual bound minimises entry by entry.
     """
     P = program.P
     if P is None or program.S is not None or program.blocks is not None or program.separable or program.n > LARGE:
@@ -81,7 +83,7 @@ def curvature_of(program: FiniteProgram) -> Array | None:
 
 
 def with_curvature(program: FiniteProgram, solution: FiniteSolution) -> FiniteSolution:
-    """The solution with the lower bound that the curvature of its cost proves, where that is a better one."""
+    """Return the solution with the lower bound that the curvature of its cost proves, where that is a better one."""
     bend = curvature_of(program)
     if bend is None or not np.isfinite(solution.x).all():
         return solution
@@ -92,8 +94,9 @@ def with_curvature(program: FiniteProgram, solution: FiniteSolution) -> FiniteSo
 
 
 def curved_bound(program: FiniteProgram, bend: Array, y: Array, mu: Array, at: Array) -> tuple[float, Array]:
-    """A lower bound of ``program`` by the multipliers ``y (r,)``, at least 0, and ``mu (e,)``, with the tangent of its
-    cost at ``at (n,)``, or at the point nearby that is better, and the curvature ``bend (n,)``; and that point.
+    """Return a lower bound of ``program`` by the multipliers ``y (r,)``, at least 0, and ``mu (e,)``, and the point of
+    its tangent. The bound takes the tangent of the cost at ``at (n,)``, or at a point nearby that is better, and the
+    curvature ``bend (n,)``.
 
     Rounding is counted: every sum of ``k`` products is off by at most ``(k + 2) eps`` of their absolute values (Higham
     2002, section 3.1).
@@ -110,7 +113,7 @@ def curved_bound(program: FiniteProgram, bend: Array, y: Array, mu: Array, at: A
 
 
 def _find_stationary_point(program: FiniteProgram, wide: np.ndarray, pull: np.ndarray, at: np.ndarray) -> np.ndarray:
-    """The point near ``at`` where the slope of every entry is 0 that no bound and no kink holds."""
+    """Return the point near ``at`` where the slope of every entry is 0 that no bound and no kink holds."""
     low, high, weights = program.lower, program.upper, program.weights
     width = np.where(np.isfinite(high - low), high - low, 1.0)
     is_held = (at - low <= NEAR * width) | (high - at <= NEAR * width) | (weights > 0.0) & (at == 0.0)
@@ -136,7 +139,7 @@ def _find_stationary_point(program: FiniteProgram, wide: np.ndarray, pull: np.nd
 def _evaluate_bound(
     program: FiniteProgram, wide: np.ndarray, bend: Array, given: tuple[np.ndarray, ...], at: np.ndarray
 ) -> float:
-    """The bound with the tangent at one point."""
+    """Return the bound with the tangent at one point."""
     y, mu, h, pull = given
     terms = program.n + y.size + mu.size + 4
     size = np.abs(wide) @ np.abs(at)

@@ -93,8 +93,8 @@ def not_separable(program: FiniteProgram) -> str:
 
 
 def from_nothing(program: FiniteProgram, accuracy: float, points: int) -> tuple[FiniteSolution, int]:
-    """The best answer to a separable program that at most so many proximal points find from nothing, and how many it
-    took; it is not sought further once residual and gap are at most ``accuracy``."""
+    """Return the best answer to a separable program that at most so many proximal points find from nothing, and how
+    many it took; it is not sought further once residual and gap are at most ``accuracy``."""
     from scipy.sparse import dia_array
 
     curvature = program.curvature
@@ -131,8 +131,8 @@ def _measure_error(solution: FiniteSolution) -> float:
 def polish(
     program: FiniteProgram, x: Float[Array, " n"], y: Float[Array, " r"], mu: Float[Array, " e"]
 ) -> FiniteSolution | None:
-    """The optimum to round-off from a nearby claim, by `newton_solve` or, where the curvature is too small for it,
-    `proximal_polish`."""
+    """Return the optimum to round-off from a nearby claim, by `newton_solve` or, where the curvature is too small for
+    it, `proximal_polish`."""
     curvature = program.curvature if program.separable else None
     if curvature is None or x.shape != program.q.shape or y.shape != program.h.shape or mu.shape != program.b.shape:
         return None
@@ -145,8 +145,8 @@ def polish(
 def proximal_polish(
     program: FiniteProgram, x: Float[Array, " n"], y: Float[Array, " r"], mu: Float[Array, " e"]
 ) -> FiniteSolution | None:
-    """Proximal points ``min cost + 1/2 weight |x - centre|^2`` (Rockafellar 1976) from a near-optimal ``x``, each by
-    `newton_solve`.
+    """Take proximal points ``min cost + 1/2 weight |x - centre|^2`` (Rockafellar 1976) from a near-optimal ``x``, each
+    by `newton_solve`.
 
     A polyhedral program ends after finitely many rounds at an exact optimum. A strictly convex one needs weights as
     small as its curvature to bring ``x`` itself, not only the value, to the optimiser. The best round is returned.
@@ -180,8 +180,8 @@ def proximal_polish(
 
 
 def _list_weights(cost: float, curvature: float) -> Iterator[float]:
-    """Constant for a polyhedral program; otherwise down to the curvature, where each round halves the distance to the
-    optimiser."""
+    """Yield weights: a constant one for a polyhedral program; otherwise down to the curvature, where each round halves
+    the distance to the optimiser."""
     weight = 0.1 * cost
     for _ in range(30):
         yield weight
@@ -218,7 +218,7 @@ class _Dual:
 
     @shaped
     def decision(self, slope: Float[Array, " n"]) -> Float[Array, " n"]:
-        """The minimising ``x (n,)`` of the Lagrangian whose linear part is ``slope (n,)``."""
+        """Return the minimising ``x (n,)`` of the Lagrangian whose linear part is ``slope (n,)``."""
         program = self.program
         return bent_minimisers(program.weights, self.curvature, slope, program.lower, program.upper)
 
@@ -228,7 +228,7 @@ class _Dual:
         return _Point(dual, x, self.M @ x - self.c)
 
     def error(self, point: _Point) -> float:
-        """The largest complementarity error ``|min(y_i, h_i - G_i x)|``, or ``|A_i x - b_i|``."""
+        """Return the largest complementarity error ``|min(y_i, h_i - G_i x)|``, or ``|A_i x - b_i|``."""
         natural = np.where(self.signed, np.minimum(point.dual, -point.gradient), point.gradient)
         return float(np.abs(natural).max(initial=0.0))
 
@@ -240,7 +240,7 @@ class _Dual:
 
     @shaped
     def hessian(self, point: _Point, damping: float = DAMPING) -> Float[Array, "v v"]:
-        """Minus the generalised Hessian, damped so that duplicated and flat directions stay solvable."""
+        """Return minus the generalised Hessian, damped so that duplicated and flat directions stay solvable."""
         free = self.free(point.x)
         rows = self.M[:, free]
         hessian: Array = (rows / self.curvature[free]) @ rows.T
@@ -260,8 +260,9 @@ def newton_solve(
     patience: int = PATIENCE,
     x0: Float[Array, " n"] | None = None,
 ) -> FiniteSolution | None:
-    """The optimum of a program with identity image and a positive diagonal ``P``, from dual variables ``y0 (r,)``,
-    ``mu0 (e,)``; or from those that go with the entries of ``x0 (n,)`` that are free, where these are nearer.
+    """Return the optimum of a program with identity image and a positive diagonal ``P``, from dual variables
+    ``y0 (r,)``, ``mu0 (e,)``; or from those that go with the entries of ``x0 (n,)`` that are free, where these are
+    nearer.
 
     Semismooth Newton (Qi and Sun 1993) on the dual, whose minimising ``x`` is explicit: a soft threshold and a clip per
     entry. Converges in a finite number of steps, as the dual is piecewise quadratic, but from far away it may take too
@@ -296,8 +297,8 @@ def newton_solve(
 
 @shaped
 def _predict_multipliers(dual: _Dual, start: Float[Array, " v"], x: Float[Array, " n"]) -> Float[Array, " v"]:
-    """The multipliers under which the free entries of ``x (n,)`` move to where the rows hold, while the others stay:
-    where the program has changed a little, or only its curvature, mostly the optimal ones."""
+    """Return the multipliers under which the free entries of ``x (n,)`` move to where the rows hold, while the others
+    stay: where the program has changed a little, or only its curvature, mostly the optimal ones."""
     x = np.minimum(np.maximum(x, dual.program.lower), dual.program.upper)
     free, residual = dual.free(x), dual.M @ x - dual.c
     rows, curvature = dual.M[:, free], dual.curvature[free]
@@ -341,9 +342,9 @@ def _solve_non_negative(
     signed: Bool[np.ndarray, " v"],
     support: Bool[np.ndarray, " v"],
 ) -> Float[Array, " v"]:
-    """argmin ``1/2 v'Hv - linear'v``, ``v >= 0`` where signed, by active sets from a first support (Lawson and Hanson
-    1974, chapter 23). Raises `numpy.linalg.LinAlgError` where they go round, as rounding lets them where rows crowd:
-    a step to such a point has never led to an optimum, and takes as long as all others together."""
+    """Return the argmin of ``1/2 v'Hv - linear'v``, ``v >= 0`` where signed, by active sets from a first support
+    (Lawson and Hanson 1974, chapter 23). Raises `numpy.linalg.LinAlgError` where they go round, as rounding lets them
+    where rows crowd: a step to such a point has never led to an optimum, and takes as long as all others together."""
     passive = support | ~signed
     v = np.zeros(signed.size)
     for _ in range(3 * signed.size + 10):
@@ -371,8 +372,8 @@ def _solve_non_negative(
 
 @shaped
 def _search_line(dual: _Dual, point: _Point, step: Float[Array, " v"]) -> float:
-    """A feasible length at which the dual's derivative along ``step`` has fallen to a tenth, by bisection and false
-    position."""
+    """Return a feasible length at which the dual's derivative along ``step`` has fallen to a tenth, by bisection and
+    false position."""
     slope, change, constant = dual.program.q + point.dual @ dual.M, step @ dual.M, float(dual.c @ step)
     first = float(point.gradient @ step)
     if not first > 0:

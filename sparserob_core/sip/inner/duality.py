@@ -1,8 +1,9 @@
 """Lower bounds of a finite program that hold for *any* multipliers, however inaccurate the solver that offered them.
 
-`dual_bound` and `farkas_bound` are weak duality, less the rounding of their own evaluation; `measure` is everything
-that can be checked about a claim. Better multipliers make better bounds: `repaired` gives unbounded variables the exact
-slopes that they ask for, and `vertex_multipliers` are those of the plain program at the optimiser of a regularised one.
+`dual_bound` and `farkas_bound` are weak duality, less an allowance for the rounding of their own evaluation; `measure`
+is everything that can be checked about a claim. Better multipliers make better bounds: `repaired` gives unbounded
+variables the exact slopes that they ask for, and `vertex_multipliers` are those of the plain program at the optimiser
+of a regularised one.
 """
 
 from __future__ import annotations
@@ -21,13 +22,13 @@ from sparserob_core.sip.inner.equalities import onto_equalities
 from sparserob_core.sip.inner.extended import extended_bound
 from sparserob_core.sip.inner.image import onto_stationary, within_bounds
 
-# Entries of a sum are evaluated with a relative error of at most this (Higham 2002, section 3.1, for sums of up to ~1e2
-# terms).
+# Allowance for the error of a sum, relative to the sum of the absolute values (Higham 2002, section 3.1). It is proven
+# for sums of up to 90 terms only; longer sums are allowed no more.
 ROUND_OFF = 1e-14
 
 NOTABLE = 1e-11  # of a bound: where its evaluation may be off by more, it is evaluated with more digits
 NEAR = 1e-6  # a slope this close to its limit, or beyond it, is moved onto the limit
-LEAST = 1e300  # what a bound of one block that is infinite is compared as
+LEAST = 1e300  # an infinite bound of one block is compared as minus this number
 REPAIRS = 4
 FREE = 1e-7  # an entry further than this from 0 and from both bounds, relative to their distance, is free
 TIGHT = 1e-9  # a row with a slack below this may carry a multiplier
@@ -45,7 +46,8 @@ Multipliers: TypeAlias = tuple[Array, Array, Array | None, Array | None]
 @dataclass(frozen=True)
 class Terms:
     """``bound = constant + sum_k min weights_k |s| + 1/2 curvature_k s^2 + slope_k s`` over the bounds; ``noise (k,)``
-    of the slope. ``at (k,)``: an image where norms of blocks may be replaced by their tangents."""
+    of the slope: the sum of the absolute values of its terms. ``magnitude``: that sum for the ``constant``.
+    ``at (k,)``: an image where norms of blocks may be replaced by their tangents."""
 
     constant: float
     slope: Array
@@ -64,7 +66,7 @@ def dual_bound(
     z: Float[Array, " k"] | None = None,
     at: Float[Array, " n"] | None = None,
 ) -> float:
-    """A lower bound of the program's value, by weak duality; ``-inf`` when these multipliers prove nothing.
+    """Return a lower bound of the program's value, by weak duality; ``-inf`` when these multipliers prove nothing.
 
     ``y (r,)`` (negative entries count as 0) and ``mu (e,)`` multiply ``G x <= h`` and ``A x = b``. A diagonal ``P``
     with ``S`` the identity is minimised entry by entry; any other ``P`` is replaced by its tangent at ``at (n,)``,
@@ -83,8 +85,8 @@ def proving(
     z: Float[Array, " k"] | None = None,
     at: Float[Array, " n"] | None = None,
 ) -> tuple[float, Float[Array, " r"], Float[Array, " e"], Float[Array, " k"] | None]:
-    """`dual_bound` with the ``y``, ``mu`` and ``z`` that prove it: those given, or where these prove nothing the ones
-    that they were moved to. Whoever writes the bound down must write these."""
+    """Return `dual_bound` with the ``y``, ``mu`` and ``z`` that prove it: those given, or where these prove nothing the
+    ones that they were moved to. Whoever writes the bound down must write these."""
     y = _clip_multipliers(program, y)
     return _prove_bound(program, _compute_terms(program, y, mu, z, at), y, mu, z, at)
 
@@ -118,11 +120,12 @@ def _prove_bound(
 def farkas_bound(
     program: FiniteProgram, y: Float[Array, " r"], mu: Float[Array, " e"], z: Float[Array, " k"] | None = None
 ) -> float:
-    """A lower bound of the infeasibility of the rows, after normalising ``sum_i y_i |G_i| + sum_i |mu_i| |A_i| = 1``.
+    """Return a lower bound of the infeasibility of the rows, after normalising
+    ``sum_i y_i |G_i| + sum_i |mu_i| |A_i| = 1``.
 
     Positive proves that no ``x`` within the bounds meets the rows (Farkas); the number bounds from below how far, in
-    the unit-norm scaling of `FiniteSolution.infeasibility`, they must be relaxed. Round-off, and what
-    `FiniteProgram.residual` forgives, is the caller's to compare with: see `farkas_margin`.
+    the unit-norm scaling of `FiniteSolution.infeasibility`, they must be relaxed. An allowance for rounding is
+    subtracted; the caller compares the bound with what `FiniteProgram.residual` forgives (`farkas_margin`).
     """
     return farkas_margin(program, y, mu, z)[0]
 
@@ -131,7 +134,7 @@ def farkas_bound(
 def farkas_margin(
     program: FiniteProgram, y: Float[Array, " r"], mu: Float[Array, " e"], z: Float[Array, " k"] | None = None
 ) -> tuple[float, float]:
-    """`farkas_bound`, and the magnitude of the terms that cancelled in it."""
+    """Return the `farkas_bound`, and the magnitude of the terms that cancelled in its constant."""
     y = _clip_multipliers(program, y)
     total = float(y @ np.linalg.norm(program.G, axis=1) + np.abs(mu) @ np.linalg.norm(program.A, axis=1))
     if not (np.isfinite(total) and total > 0):
@@ -147,8 +150,8 @@ def farkas_margin(
 
 
 def farkas_proof(program: FiniteProgram, y: Array, mu: Array, z: Array | None, tolerance: float) -> float | None:
-    """The `farkas_bound` of multipliers where it is positive by more than a ``tolerance`` of the terms that cancelled
-    in it, and of 1: then they prove that nothing is feasible; ``None`` where they do not."""
+    """Return the `farkas_bound` of multipliers where it is positive by more than a ``tolerance`` of the terms that
+    cancelled in it, and of 1: then they prove that nothing is feasible; ``None`` where they do not."""
     bound, magnitude = farkas_margin(program, y, mu, z)
     return bound if bound > tolerance * max(1.0, magnitude) else None
 
@@ -172,8 +175,9 @@ def measure(
 ) -> FiniteSolution:
     """Return a claim with its value, residual, lower bound and gap, computed here, as a `FiniteSolution`.
 
-    The decision is first moved into its bounds and onto the equalities, and the multipliers are made usable. The status
-    is ``failed``, since the solution is not judged yet.
+    The decision is first moved into its bounds and onto the equalities. Multipliers that are negative, or of rows
+    without a finite right-hand side, become 0. The lower bound may be that of multipliers that were moved further,
+    which are not returned: see `proving`. The status is ``failed``, since the solution is not judged yet.
 
     Parameters
     ----------
@@ -211,14 +215,14 @@ def minimisers(
     lower: Float[Array, " k"],
     upper: Float[Array, " k"],
 ) -> Float[Array, " k"]:
-    """The minimiser of ``weights |s| + 1/2 curvature s^2 + slope s`` over ``[lower, upper]``, entry by entry; may be
-    infinite."""
+    """Return the minimiser of ``weights |s| + 1/2 curvature s^2 + slope s`` over ``[lower, upper]``, entry by entry;
+    may be infinite."""
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         return bent_minimisers(weights, 0.0 if curvature is None else curvature, slope, lower, upper)
 
 
 def bent_minimisers(weights: Array, curvature: Array | float, slope: Array, lower: Array, upper: Array) -> Array:
-    """`minimisers`, which may warn of a division by a curvature of 0."""
+    """Return `minimisers`, which may warn of a division by a curvature of 0."""
     pull = -slope - np.minimum(np.maximum(-slope, -weights), weights)
     free = np.where(pull == 0, 0.0, pull / curvature)
     return np.asarray(np.minimum(np.maximum(free, lower), upper))
@@ -269,12 +273,12 @@ def _compute_terms(
 
 
 def _weigh_rows(y: Array, rows: Array, mu: Array, equalities: Array) -> Array:
-    """``y'rows + mu'equalities``."""
+    """Return ``y'rows + mu'equalities``."""
     return np.asarray(y @ rows + mu @ equalities if mu.size else y @ rows)
 
 
 def without_norms(terms: Terms, program: FiniteProgram) -> Terms:
-    """Every block's ``weight |s|`` replaced by ``d's`` for the ``|d| <= weight`` that bounds more: that nearest to what
+    """Replace every block's ``weight |s|`` by ``d's`` for the ``|d| <= weight`` that bounds more: that nearest to what
     the slope asks for, or that of the tangent at an image."""
     blocks = program.blocks
     if blocks is None or not np.isfinite(terms.slope).all():
@@ -328,9 +332,9 @@ def _evaluate_bound(terms: Terms, program: FiniteProgram) -> float:
 
 
 def _find_overshoot(terms: Terms, program: FiniteProgram, bound: float) -> Bool[np.ndarray, " k"] | None:
-    """The entries whose slope is beyond their weight by a little, `NEAR` of it, where that costs a notable share of the
-    bound because their bounds are far away; ``None`` where there is none, or shrinking the multipliers is no way out
-    (`_shrink_multipliers`)."""
+    """Return a mask of the entries whose slope is beyond their weight by a little, `NEAR` of it, where that costs a
+    notable share of the bound because their bounds are far away. ``None`` where there is none, or where shrinking the
+    multipliers is no way out (`_shrink_multipliers`)."""
     if program.q.any() or program.P is not None or program.blocks is not None or not isfinite(bound):
         return None
     excess = np.abs(terms.slope) - terms.weights
@@ -351,8 +355,9 @@ def _shrink_multipliers(
     at: Float[Array, " n"] | None,
     beyond: Bool[np.ndarray, " k"],
 ) -> tuple[float, Float[Array, " r"], Float[Array, " e"], Float[Array, " k"] | None]:
-    """`proving`: without a linear cost, multipliers may be scaled towards 0 until the slope of every entry ``beyond``
-    its weight is within it: of those without a bound, or with one so far away that rounding of the slope costs more."""
+    """Return the result of `proving` with multipliers scaled towards 0, for a program without a linear cost. They are
+    scaled until the slope of every entry ``beyond`` its weight is within it. Such entries have no bound, or one so far
+    away that rounding of the slope costs more than the scaling."""
     slope = _compute_terms(program, y, mu, z, at).slope
     with np.errstate(invalid="ignore"):
         factor = float((program.weights[beyond] / np.abs(slope[beyond])).min(initial=1.0)) * (1 - ROUND_OFF)
@@ -370,8 +375,8 @@ def repaired(
     z: Float[Array, " k"] | None,
     at: Float[Array, " n"] | None,
 ) -> Multipliers | None:
-    """``(y, mu, z, at)`` after the least-norm correction that gives every unbounded entry the slope that it needs, or
-    ``None``.
+    """Return ``(y, mu, z, at)`` after the least-norm correction that gives every unbounded entry the slope that it
+    needs, or ``None``.
 
     Only positive ``y``, ``mu``, the point ``at`` of the tangent to ``P``, and the ``z`` of bounded images are moved.
     """
@@ -422,7 +427,7 @@ def _correct_multipliers(
 
 @shaped
 def _is_at_limit(program: FiniteProgram, z: Float[Array, " k"]) -> Bool[np.ndarray, " k"]:
-    """Unbounded images whose multiplier is at its limit, the weight, or beyond."""
+    """Return unbounded images whose multiplier is at its limit, the weight, or beyond."""
     near = np.abs(z) > program.weights - NEAR * (1.0 + program.weights)
     return near & (np.isposinf(program.upper) & (z >= 0) | np.isneginf(program.lower) & (z <= 0))
 
@@ -441,8 +446,8 @@ def _solve_least_norm(blocks: list[Array], target: Array) -> list[Array] | None:
 def vertex_multipliers(
     program: FiniteProgram, x: Float[Array, " n"], y: Float[Array, " r"], mu: Float[Array, " e"]
 ) -> tuple[Float[Array, " r"], Float[Array, " e"]]:
-    """``(y, mu)`` that make the linearised cost stationary in the free entries of ``x (n,)``, in the least-squares
-    sense, with ``y >= 0``.
+    """Return ``(y, mu)`` that make the linearised cost stationary in the free entries of ``x (n,)``, in the
+    least-squares sense, with ``y >= 0``.
 
     The multipliers ``y (r,)``, ``mu (e,)`` of a regularised program differ from those of the plain one by the slope of
     the regulariser; at an exactly regularised optimiser these are the plain ones (Friedlander and Tseng 2007, section
@@ -483,12 +488,12 @@ def vertex_multipliers(
 def nearest_multipliers(
     program: FiniteProgram, y: Float[Array, " r"], mu: Float[Array, " e"]
 ) -> tuple[Float[Array, " r"], Float[Array, " e"]]:
-    """The multipliers nearest to ``(y, mu)`` with ``y >= 0`` that give every entry without bounds the slope 0.
+    """Return multipliers near ``(y, mu)`` with ``y >= 0`` that give every entry without bounds nearly the slope 0.
 
     A vertex of nearly parallel rows has multipliers that are negative by a little; where these are put to 0 and entries
     are free, nothing is proven. Those of the other rows make up for it: non-negative least squares with the slopes as
     rows that weigh `HEAVY` times as much (Lawson and Hanson 1974, chapter 23, section 4). Any answer is safe. ``S``
-    must be the identity, and ``P``, norms and weights of the free entries absent, otherwise the multipliers come back
+    must be the identity, ``P`` absent, and the weights of the free entries 0, otherwise the multipliers come back
     unchanged.
     """
     free = np.isinf(program.lower) & np.isinf(program.upper)

@@ -18,10 +18,12 @@ RANK = 1e-12
 
 @shaped
 def onto_equalities(program: FiniteProgram, x: Float[Array, " n"]) -> Float[Array, " n"]:
-    """A point that is nearly ``x (n,)`` and meets ``A x = b`` but for rounding; ``x`` itself where there is none.
+    """Return a point near ``x (n,)`` that misses ``A x = b`` by less, down to rounding where that is possible.
 
-    The least-norm correction among those that leave every image at 0 and at its bounds where it is: the cost has its
-    kinks there, and an entry of 0 is to stay 0. What is missed is summed in extended precision.
+    ``x`` itself is returned where it is as good already, where it misses an equality by more than `NEARLY`, and where
+    nothing is better. The correction is the least-norm correction among those that leave every image at 0 and at its
+    bounds where it is: the cost has its kinks there, and an entry of 0 is to stay 0. What is missed is summed in
+    extended precision.
     """
     share = program.missed(x)
     if not ROUNDED < share <= NEARLY:
@@ -49,7 +51,7 @@ def onto_equalities(program: FiniteProgram, x: Float[Array, " n"]) -> Float[Arra
 
 @shaped
 def _find_active_images(program: FiniteProgram, x: Float[Array, " n"]) -> Bool[np.ndarray, " k"]:
-    """Images at a bound, and those of 0 that cost something: they are to stay where they are."""
+    """Return images at a bound, and those of 0 that cost something: they are to stay where they are."""
     image, still = program.image(x), np.zeros(program.weights.size, dtype=bool)
     terms = np.abs(x) if program.S is None else np.asarray(abs(program.S) @ np.abs(x))
     for bound in (program.lower, program.upper, np.where(program.weights > 0.0, 0.0, np.inf)):

@@ -19,13 +19,14 @@ UNIT = float(np.finfo(WIDE).eps)  # at least twice the unit roundoff, whatever t
 
 @shaped
 def extended_bound(program: FiniteProgram, y: Float[Array, " r"], mu: Float[Array, " e"]) -> float:
-    """``constant - y'h - mu'b + sum_k min_s weights_k |s| + 1/2 p_k s^2 + slope_k s`` over the bounds, with
-    ``slope = q + G'y + A'mu``, rounded downwards: a lower bound of the value for any ``y >= 0``, ``mu``.
+    """Return a lower bound of the value for any ``y >= 0``, ``mu``. It is
+    ``constant - y'h - mu'b + sum_k min_s weights_k |s| + 1/2 p_k s^2 + slope_k s`` over the bounds, with
+    ``slope = q + G'y + A'mu``, rounded downwards.
 
     ``-inf`` for a program of another structure than an identity image, finite bounds and a diagonal ``P``.
 
     Why it is a bound (Higham 2002, sections 3.1 and 4.2). A sum of ``n`` products in floating point is off by at most
-    ``gamma(n) = n u / (1 - n u)`` times the sum of their absolute values; here ``u`` is doubled (`UNIT`), which pays
+    ``gamma(n) = n u / (1 - n u)`` times the sum of their absolute values. Here ``u`` is doubled (`UNIT`), which pays
     for the rounding of that sum of absolute values, and of ``gamma``, itself. So the exact slope is in
     ``[slope - error, slope + error]``. The minimum over ``s`` is concave in the slope, so over that interval it is
     least at one of the two ends. Without curvature it is attained at ``lower``, 0 or ``upper``. With curvature ``p``
@@ -58,7 +59,7 @@ def _bound_rounding(count: int) -> float:
 
 
 def _minimise_entries(program: FiniteProgram, curvature: Array, slope: Array) -> Array:
-    """The minima ``(n,)`` over the bounds at a slope ``(n,)``; rounding of the terms apart."""
+    """Return the minima ``(n,)`` over the bounds at a slope ``(n,)``; rounding of the terms apart."""
     lower, upper, weights = (array.astype(WIDE) for array in (program.lower, program.upper, program.weights))
     is_curved = curvature > 0.0
     pull = -slope - np.clip(-slope, -weights, weights)

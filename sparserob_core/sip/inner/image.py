@@ -51,7 +51,8 @@ _factors = Memory(12)
 
 @shaped
 def onto_stationary(program: FiniteProgram, z: Float[Array, " k"], slope: Float[Array, " n"]) -> Float[Array, " k"]:
-    """A ``z (k,)`` near the given one with ``S'z + slope = 0`` to round-off, ``slope (n,)``; NaN where there is none.
+    """Return a ``z (k,)`` near the given one with ``S'z + slope = 0`` to round-off, ``slope (n,)``; NaN where there is
+    none.
 
     Where an image is unbounded its multiplier may not exceed its weight: it is held there, and the others make up for
     it.
@@ -78,8 +79,8 @@ def onto_stationary(program: FiniteProgram, z: Float[Array, " k"], slope: Float[
 
 @shaped
 def within_bounds(program: FiniteProgram, x: Float[Array, " n"]) -> Float[Array, " n"]:
-    """The decision ``x (n,)`` with every entry that is an image by itself, or a multiple of one, moved into the bounds
-    of that image: an entry that may only be 0 is 0, and no dust that a solver left."""
+    """Return the decision ``x (n,)`` with every entry that is an image by itself, or a multiple of one, moved into the
+    bounds of that image. An entry that may only be 0 is then 0, without the dust that a solver left."""
     if program.S is None:
         return np.minimum(np.maximum(x, program.lower), program.upper)
     rows, entries, factors = _factors.recall((program.S,), "alone", partial(_find_single_entries, program.S))
@@ -91,7 +92,8 @@ def within_bounds(program: FiniteProgram, x: Float[Array, " n"]) -> Float[Array,
 
 
 def _find_single_entries(S: csc_array) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64], Array]:
-    """The images that are one entry times a factor: their numbers, those of the entries, and the factors, ``(a,)``."""
+    """Return the images that are one entry times a factor: their numbers, those of the entries, and the factors,
+    ``(a,)``."""
     by_row = S.tocsr()
     by_row.eliminate_zeros()
     rows = np.flatnonzero(np.diff(by_row.indptr) == 1)
@@ -105,7 +107,7 @@ def _is_stationary(S: csc_array, z: Array, slope: Array, share: float = CANCELLE
 
 
 def _factor_projection(S: csc_array, used: npt.NDArray[np.bool_]) -> Callable[[Array], Array]:
-    """``r -> S (S'S)^{-1} r`` on the used images."""
+    """Return the map ``r -> S (S'S)^{-1} r`` on the used images."""
     from scipy.sparse.linalg import splu
 
     selected = S[np.flatnonzero(used)].tocsc()

@@ -24,12 +24,13 @@ RANK = 1e-13  # of the largest entry: what is left of a row that depends on othe
 
 
 def refined(program: QuadraticProgram, solver: Solver, start: Claim | None, accuracy: float) -> Iterator[Claim]:
-    """Better and better claims from ``start``, or from zero; ends where the solver gives no numbers.
+    """Yield better and better claims from ``start``, or from zero; ends where the solver gives no numbers.
 
-    Inequalities become ``G x + s = h`` with ``s >= 0``, so that only equalities ``M w = c`` and bounds on ``w = (x,
-    s)`` are left; these may be combined (`_orthogonalise_rows`). With multipliers ``y`` and factors ``p, d`` (powers of
-    two, the inverses of what is missed) the next program is: minimise ``d/(2p) v'P v + d (q + P w + M'y)'v`` subject to
-    ``M v = p (c - M w)`` and ``p (lower - w) <= v <= p (upper - w)``; then ``w + v/p`` and ``y + y'/d`` miss less.
+    Inequalities become ``G x + s = h`` with ``s >= 0``, so that only equalities ``M w = c`` and bounds on
+    ``w = (x, s)`` are left; these may be combined (`_orthogonalise_rows`). Take multipliers ``y`` and factors ``p, d``,
+    which are powers of two and the inverses of what is missed. The next program minimises
+    ``d/(2p) v'P v + d (q + P w + M'y)'v`` subject to ``M v = p (c - M w)`` and ``p (lower - w) <= v <= p (upper - w)``.
+    Then ``w + v/p`` and ``y + y'/d`` miss less.
     """
     from scipy.sparse import block_array, block_diag, csc_array, diags_array
 
@@ -78,8 +79,8 @@ def refined(program: QuadraticProgram, solver: Solver, start: Claim | None, accu
 
 
 def _orthogonalise_rows(G: Array) -> Array:
-    """A nonsingular ``T (r, r)`` for which ``T G`` has orthonormal rows, and rows of 0 where ``G (r, n)`` has rows that
-    depend on others."""
+    """Return a nonsingular ``T (r, r)`` for which ``T G`` has orthonormal rows, and rows of 0 where ``G (r, n)`` has
+    rows that depend on others."""
     from scipy.linalg import qr, solve_triangular
 
     count = G.shape[0]
@@ -94,7 +95,7 @@ def _orthogonalise_rows(G: Array) -> Array:
 
 
 def _choose_factor(before: float, missed: float) -> float:
-    """The power of two that makes what is missed of size 1, at most `GROWTH` times the one before."""
+    """Return the power of two that makes what is missed of size 1, at most `GROWTH` times the one before."""
     wanted = LARGEST if missed < 1.0 / LARGEST else float(np.exp2(np.floor(-np.log2(missed))))
     return float(min(max(wanted, before), GROWTH * before, LARGEST))
 

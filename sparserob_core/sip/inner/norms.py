@@ -20,7 +20,7 @@ NOTHING = 1e-14  # of the largest norm: a block that has no direction
 
 
 def around(blocks: Blocks) -> Directions:
-    """Directions all round for every block, to begin with."""
+    """Return directions all round for every block, to begin with."""
     width = blocks.table.shape[1]
     sizes = (blocks.table >= 0).sum(axis=1)
     groups = [Directions(np.zeros(0, dtype=int), np.zeros((0, width)))]
@@ -51,7 +51,7 @@ def towards(
     mu: Float[Array, " e"],
     z: Float[Array, " k"] | None,
 ) -> Directions:
-    """The directions of the blocks of ``S x``, and those that the multipliers of the rows ask for."""
+    """Return the directions of the blocks of ``S x``, and those that the multipliers of the rows ask for."""
     slope = program.q + y @ program.G + mu @ program.A
     slope = slope if program.P is None else slope + program.P @ x
     wanted = -slope
@@ -77,8 +77,9 @@ def near(directions: Directions, wanted: Directions) -> Directions:
 def bent(
     program: FiniteProgram, blocks: Blocks, x: Float[Array, " n"], moving: Bool[np.ndarray, " b"]
 ) -> FiniteProgram:
-    """The program with the norm of every ``moving (b,)`` block replaced by its second-order expansion at ``x (n,)``:
-    ``weight d's + weight/(2 |s_0|) |s - (d's) d|^2`` with ``d = s_0 / |s_0|``. ``S`` must be the identity."""
+    """Return the program with the norm of every ``moving (b,)`` block replaced by its second-order expansion at
+    ``x (n,)``: ``weight d's + weight/(2 |s_0|) |s - (d's) d|^2`` with ``d = s_0 / |s_0|``. ``S`` must be the
+    identity."""
     from scipy.sparse import csc_array
 
     of = blocks.of
@@ -109,8 +110,8 @@ def _renumber(number: np.ndarray) -> np.ndarray:
 
 
 def of_the_rest(directions: Directions, moving: Bool[np.ndarray, " b"], width: int) -> Directions:
-    """The directions of the blocks that are not ``moving (b,)``, by their numbers among those, of which the largest has
-    ``width`` entries."""
+    """Return the directions of the blocks that are not ``moving (b,)``, by their numbers among those, of which the
+    largest has ``width`` entries."""
     kept = ~moving[directions.block]
     numbers = np.cumsum(~moving) - 1
     return Directions(numbers[directions.block[kept]], directions.vectors[kept, :width])

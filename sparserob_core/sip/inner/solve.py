@@ -3,8 +3,8 @@
 The walk of `solve_finite`, each step only where the ones before gave no answer that is believed:
 
 1. `_find_contradiction`: bounds that cross, rows without entries that ask for the impossible.
-2. `_list_cheap_answers`: the optimum without rows, and Newton's method from a guess (`polish`), or from nothing where
-   it is large, unless a solver was named.
+2. `_list_cheap_answers`: the optimum without rows, the simplex method for a linear program of very many entries, and
+   Newton's method from a guess (`polish`), or from nothing where it is large, unless a solver was named.
 3. `_solve_in_new_variables`: the program in other variables, where that makes it easier (`change_of_variables`), solved
    by this walk.
 4. `_try_forms`: the program in the form that a solver takes (`standard_form`), form after form and accuracy after
@@ -66,7 +66,7 @@ POINTS = 40  # proximal points then: 37 were needed at most; with four only easy
 # With one, programs are left that the second form solves; with ten, a first-order method takes a minute for a run that
 # others end in two seconds.
 LOST = 3
-CRUDE = 1e-6  # a residual of an answer whose gap says something
+CRUDE = 1e-6  # largest residual of an answer whose gap says something
 
 ADVICE = "try another solver, or state the problem in units in which its numbers are of one size"
 
@@ -77,7 +77,8 @@ class _Case:
 
     ``best`` is the best answer that is not believed; ``attempts`` says why each was not believed. ``blunt`` is the best
     believed answer that is not sharp. ``crude``: the fault of the solver's own answer, where Newton's method turned it
-    into one that holds. ``lost``: how often in a row the solver has not solved a program.
+    into one that holds. ``lost``: how often in a row the solver has neither solved a program nor called it infeasible.
+    ``elastic``: whether the elastic program was asked. ``small``: see `solve_finite`.
     """
 
     program: FiniteProgram
@@ -112,8 +113,8 @@ class _Case:
         return max(abs(solution.value), self.small * self.program.added(solution.x))
 
     def judge(self, solution: FiniteSolution, name: str, by: str = "") -> FiniteSolution | None:
-        """The solution, which is ``by`` somebody, as ``optimal`` if believed and sharp; otherwise keep it, or note why
-        it is not believed."""
+        """Return the solution, which is ``by`` somebody, as ``optimal`` if believed and sharp; otherwise keep it, or
+        note why it is not believed."""
         if solution.residual <= self.tolerance and not self.believes(solution):
             solution = with_curvature(self.program, solution)
         if self.believes(solution):
@@ -189,9 +190,9 @@ def _solve_case(case: _Case, guess: FiniteSolution | None) -> FiniteSolution:
 
 
 def _solve_by_directions(case: _Case, blocks: Blocks, guess: FiniteSolution | None) -> FiniteSolution:
-    """Norms of blocks as second-order cones, where there is a solver that takes them (`_solve_conic`); else as the
-    largest of ``d's`` over finitely many directions (Kelley 1960), those of the answers and those that their
-    multipliers ask for, until the cost with the norms themselves meets the bound."""
+    """Treat norms of blocks as second-order cones, where there is a solver that takes them (`_solve_conic`). Otherwise
+    treat them as the largest of ``d's`` over finitely many directions (Kelley 1960), those of the answers and those
+    that their multipliers ask for. This ends where the cost with the norms themselves meets the bound."""
     program, directions = case.program, around(blocks)
     if guess is not None and np.isfinite(guess.x).all():
         wanted = towards(program, blocks, guess.x, guess.y, guess.mu, guess.z)
@@ -218,9 +219,9 @@ def _solve_by_directions(case: _Case, blocks: Blocks, guess: FiniteSolution | No
 
 
 def _solve_conic(case: _Case, blocks: Blocks, directions: Directions) -> FiniteSolution | None:
-    """A believed answer of a solver that takes second-order cones, or its proof that there is none; ``None`` without
-    such a solver. Along a norm whose bounds are reached the cost is flat, and the bound asks for more digits of the
-    decision than such a solver has: Newton's method goes on from there, with ``directions`` for the blocks that are
+    """Return a believed answer of a solver that takes second-order cones, or its proof that there is none; ``None``
+    without such a solver. Along a norm whose bounds are reached the cost is flat, and the bound asks for more digits of
+    the decision than such a solver has: Newton's method goes on from there, with ``directions`` for the blocks that are
     0."""
     program, cones = case.program, case.solver.cones
     if cones is None or not has_cones(program, blocks):
@@ -242,8 +243,8 @@ def _solve_conic(case: _Case, blocks: Blocks, directions: Directions) -> FiniteS
 def _solve_by_kelley(
     case: _Case, blocks: Blocks, accuracy: float, directions: Directions
 ) -> tuple[FiniteSolution | None, FiniteSolution | None, Directions]:
-    """A believed answer, or a proof that there is none, or neither; and the directions used. Where an answer is near,
-    Newton's method is tried from it: it knows the curvature of the norms, but not which blocks are 0."""
+    """Return a believed answer, or a proof that there is none, or neither; and the directions used. Where an answer is
+    near, Newton's method is tried from it: it knows the curvature of the norms, but not which blocks are 0."""
     program, closest, tried, idle = case.program, np.inf, np.inf, 0
     for _ in range(DIRECTIONS):
         claim, answer = _ask_solver(case, program, "epigraph", accuracy, directions)
@@ -274,8 +275,8 @@ def _solve_by_kelley(
 def _judge_answer(
     case: _Case, answer: Recovered, name: str = "by directions", by: str = ""
 ) -> tuple[FiniteSolution | None, float]:
-    """A believed solution, if the answer is one, and its gap: with its own multipliers or those of the tangent there,
-    whichever prove more."""
+    """Return a believed solution, if the answer is one, and its gap: with its own multipliers or those of the tangent
+    there, whichever prove more."""
     x, y, mu, z = answer
     gap = np.inf
     for offer in ((y, mu), vertex_multipliers(case.program.tangent(x), x, y, mu)):
@@ -290,8 +291,8 @@ def _judge_answer(
 def _refine_by_newton(
     case: _Case, blocks: Blocks, accuracy: float, directions: Directions, answer: Recovered, gap: float
 ) -> tuple[FiniteSolution | None, Recovered, float]:
-    """A believed solution, the best answer and its gap, by second-order expansions of the norms that are not 0; the
-    others keep their directions."""
+    """Return a believed solution, the best answer and its gap, by second-order expansions of the norms that are not 0;
+    the others keep their directions."""
     program = case.program
     norms = blocks.norms(answer[0])
     moving = norms > SMALLEST * norms.max(initial=0.0)
@@ -314,7 +315,7 @@ def _refine_by_newton(
 
 
 def _try_forms(case: _Case) -> FiniteSolution:
-    """Form after form, accuracy after accuracy."""
+    """Try form after form, accuracy after accuracy."""
     attempts = _order_attempts(case.program)
     for form, factor in attempts:
         claim, answer = _ask_solver(case, case.program, form, factor * case.tolerance)
@@ -344,15 +345,15 @@ def _try_forms(case: _Case) -> FiniteSolution:
 
 
 def _order_attempts(program: FiniteProgram) -> tuple[tuple[Form, float], ...]:
-    """The forms and accuracies in the order in which they are tried: parts would double a dense matrix."""
+    """Return the forms and accuracies in the order in which they are tried: parts would double a dense matrix."""
     dense = program.P is not None and program.S is None and program.curvature is None
     return (ATTEMPTS[1], ATTEMPTS[0], *ATTEMPTS[2:]) if dense else ATTEMPTS
 
 
 def _sharpen(case: _Case, claim: Claim | None, answer: Recovered | None) -> FiniteSolution | None:
-    """The first answer that is believed and sharp: more digits of the ``claim``, and a vertex, which comes first where
-    the solver has an answer that lacks digits, and last where it goes somewhere and does not arrive. One that raises,
-    or has nothing to say, is told of."""
+    """Return the first answer that is believed and sharp: more digits of the ``claim``, and a vertex, which comes first
+    where the solver has an answer that lacks digits, and last where it goes somewhere and does not arrive. One that
+    raises, or has nothing to say, is told of."""
     solved = claim is not None and claim.status == "solved" and answer is not None
     believed = _solve_by_simplex(case) if solved else None
     believed = believed or _refine_digits(case, claim)
@@ -361,9 +362,9 @@ def _sharpen(case: _Case, claim: Claim | None, answer: Recovered | None) -> Fini
 
 
 def _solve_by_simplex(case: _Case) -> FiniteSolution | None:
-    """The answer of the simplex method to a linear program, if it is believed and sharp: where an interior-point method
-    lacks digits, as with rows that are nearly parallel, or goes in circles, a vertex is a system of equations. Nothing
-    where a solver was named."""
+    """Return the answer of the simplex method to a linear program, if it is believed and sharp. An interior-point
+    method may lack digits, as with rows that are nearly parallel, or go in circles; a vertex is a system of equations.
+    Nothing where a solver was named."""
     program = case.program
     if HIGHS not in case.solver.quick or program.P is not None or program.blocks is not None:
         return None
@@ -383,7 +384,7 @@ def _solve_by_simplex(case: _Case) -> FiniteSolution | None:
 
 
 def _refine_digits(case: _Case, claim: Claim | None) -> FiniteSolution | None:
-    """The first refined answer that is believed and sharp, from nothing and then from the ``claim``."""
+    """Return the first refined answer that is believed and sharp, from nothing and then from the ``claim``."""
     form, factor = ATTEMPTS[0]
     qp, recover = standard_form(case.program, form)
     usable = claim is not None and _is_well_formed(claim, qp) and np.isfinite(claim.x).all()
@@ -407,7 +408,7 @@ def _refine_digits(case: _Case, claim: Claim | None) -> FiniteSolution | None:
 
 
 def _solve_in_new_variables(case: _Case, easier: NewVariables, guess: FiniteSolution | None) -> FiniteSolution | None:
-    """The answer found in easier variables, checked in those of the program."""
+    """Return the answer found in easier variables, checked in those of the program."""
     program = case.program
     start = guess if guess is None or guess.x.size != program.n else replace(guess, x=easier.to(guess.x))
     inner = _Case(easier.program, case.solver, case.tolerance, case.small)
@@ -461,7 +462,8 @@ def _list_cheap_answers(case: _Case, guess: FiniteSolution | None) -> Iterator[t
 def _ask_solver(
     case: _Case, program: FiniteProgram, form: Form, accuracy: float, directions: Directions | None = None
 ) -> tuple[Claim | None, Recovered | None]:
-    """The solver's claim, and its numbers in terms of the program if they have the right shapes and are finite."""
+    """Return the solver's claim, and its numbers in terms of the program if they have the right shapes and are
+    finite."""
     qp, recover = standard_form(program, form, directions)
     try:
         claim = case.solver.solve(qp, accuracy)
@@ -500,7 +502,7 @@ def _list_candidates(case: _Case, answer: Recovered | None, said: str) -> Iterat
 
 
 def _find_elastic_proof(case: _Case, known: FiniteSolution | None) -> FiniteSolution | None:
-    """The sharpest proof of infeasibility, from the elastic program or already known; sought once."""
+    """Return the sharpest proof of infeasibility, from the elastic program or already known; sought once."""
     if case.elastic:
         return known
     case.elastic = True
@@ -517,7 +519,7 @@ def _find_elastic_proof(case: _Case, known: FiniteSolution | None) -> FiniteSolu
 
 
 def _check_proof(case: _Case, answer: Recovered | None, source: str) -> FiniteSolution | None:
-    """The answer as ``infeasible``, if its multipliers prove that."""
+    """Return the answer as ``infeasible``, if its multipliers prove that."""
     if answer is None:
         return None
     program, (x, y, mu, z) = case.program, answer
@@ -533,10 +535,12 @@ def _check_proof(case: _Case, answer: Recovered | None, source: str) -> FiniteSo
 
 
 def elastic_program(program: FiniteProgram) -> FiniteProgram:
-    """minimise ``t >= 0`` subject to the bounds, ``G_i x <= h_i + t |G_i|`` and ``|A_i x - b_i| <= t |A_i|``.
+    """Return the program that minimises ``t >= 0`` subject to the bounds, ``G_i x <= h_i + t |G_i|`` and
+    ``|A_i x - b_i| <= t |A_i|``.
 
     Its decision is ``(x, t)``; its rows are those of ``G``, then ``A x - b <= t |A|``, then ``b - A x <= t |A|``. It is
-    always feasible (when the bounds are), and a positive value proves the program infeasible.
+    always feasible (when the bounds are, and rows without entries hold), and a positive value proves the program
+    infeasible.
     """
     images = program.weights.size
     rows = np.vstack([program.G, program.A, -program.A])
@@ -562,7 +566,7 @@ def elastic_program(program: FiniteProgram) -> FiniteProgram:
 
 
 def unrelaxed(program: FiniteProgram, answer: Recovered) -> Recovered:
-    """An answer to the elastic program in terms of ``program``: its ``x``, and multipliers that may prove
+    """Return an answer to the elastic program in terms of ``program``: its ``x``, and multipliers that may prove
     infeasibility."""
     x, multipliers, _, z = answer
     r, e = program.h.size, program.b.size
@@ -571,7 +575,8 @@ def unrelaxed(program: FiniteProgram, answer: Recovered) -> Recovered:
 
 
 def _find_contradiction(program: FiniteProgram, tolerance: float) -> FiniteSolution | None:
-    """Bounds that cross, and rows without entries that ask for the impossible."""
+    """Return ``infeasible`` for bounds that cross, or rows without entries that ask for the impossible, else
+    ``None``."""
     y, mu, x = np.zeros(program.h.size), np.zeros(program.b.size), np.zeros(program.n)
     crossed = program.lower - program.upper
     if crossed.max(initial=0.0) > 0:

@@ -48,8 +48,8 @@ _models = Memory(16)
 def standard_form(
     program: FiniteProgram, form: Form = "split", directions: Directions | None = None
 ) -> tuple[QuadraticProgram, Callable[[Claim], Recovered]]:
-    """The program as a `QuadraticProgram`, and the way back from a claim to ``(x, y, mu, z)`` of the program (``z`` or
-    ``None``).
+    """Return the program as a `QuadraticProgram`, and the way back from a claim to ``(x, y, mu, z)`` of the program
+    (``z`` or ``None``).
 
     ``split``: weighted images are differences ``a - b`` of non-negative parts. ``epigraph``: they get ``t >= |s|``.
     With ``S`` the identity ``x`` is substituted (a diagonal ``P`` is put on both parts, which are complementary at an
@@ -88,7 +88,7 @@ def _build_model(program: FiniteProgram, form: Form) -> ImageModel:
 
 
 def _build_epigraph_model(program: FiniteProgram, alone: npt.NDArray[np.bool_]) -> ImageModel:
-    """``alone (k,)``: the entries that count with their absolute values."""
+    """Return the model with ``t >= |s|``; ``alone (k,)``: the entries that count with their absolute values."""
     from scipy.sparse import csc_array
 
     lower, upper, weights = program.lower, program.upper, np.where(alone, program.weights, 0.0)
@@ -115,7 +115,8 @@ def _build_epigraph_model(program: FiniteProgram, alone: npt.NDArray[np.bool_]) 
 
 
 def _add_norms(model: ImageModel, program: FiniteProgram, blocks: Blocks, directions: Directions) -> ImageModel:
-    """The model with one variable ``t`` for every block, which costs the block's weight, and rows ``d's <= t``."""
+    """Return the model with one variable ``t`` for every block, which costs the block's weight, and rows
+    ``d's <= t``."""
     from scipy.sparse import csc_array, vstack
 
     model = _add_block_bounds(model, program, blocks)
@@ -137,8 +138,8 @@ def _add_norms(model: ImageModel, program: FiniteProgram, blocks: Blocks, direct
 
 
 def _add_cones(model: ImageModel, program: FiniteProgram, blocks: Blocks) -> ImageModel:
-    """The model with one variable for every block, which costs the block's weight and is at least its norm. An entry
-    that is fixed is fixed at 0 (`has_cones`), and is in no cone."""
+    """Return the model with one variable for every block, which costs the block's weight and is at least its norm. An
+    entry that is fixed is fixed at 0 (`has_cones`), and is in no cone."""
     model, tops = _add_block_bounds(model, program, blocks), model.entry.size
     places = _number_variables(model, program)[blocks.table]
     return replace(
@@ -148,7 +149,7 @@ def _add_cones(model: ImageModel, program: FiniteProgram, blocks: Blocks) -> Ima
 
 
 def _add_block_bounds(model: ImageModel, program: FiniteProgram, blocks: Blocks) -> ImageModel:
-    """The model with one variable more for every block, at least 0, which costs the block's weight."""
+    """Return the model with one variable more for every block, at least 0, which costs the block's weight."""
     from scipy.sparse import csc_array, hstack
 
     count = blocks.first.size
@@ -181,7 +182,7 @@ def has_cones(program: FiniteProgram, blocks: Blocks) -> bool:
 
 
 def _substitute(program: FiniteProgram, model: ImageModel) -> tuple[QuadraticProgram, Callable[[Claim], Recovered]]:
-    """Variables ``v``; ``x = T v + offset``."""
+    """Return the program in the variables ``v`` alone, with ``x = T v + offset``."""
     from scipy.sparse import csc_array
 
     curvature = program.curvature
@@ -212,7 +213,8 @@ def _substitute(program: FiniteProgram, model: ImageModel) -> tuple[QuadraticPro
 
 
 def _lift(program: FiniteProgram, model: ImageModel) -> tuple[QuadraticProgram, Callable[[Claim], Recovered]]:
-    """Variables ``(x, v)``; equality rows ``S x - T v = offset`` for every image that has a weight or a bound."""
+    """Return the program in the variables ``(x, v)``, with equality rows ``S x - T v = offset`` for every image that
+    has a weight or a bound."""
     from scipy.sparse import block_diag, csc_array, hstack, vstack
 
     n, size, k = program.n, model.entry.size, program.weights.size
@@ -259,7 +261,8 @@ def _lift(program: FiniteProgram, model: ImageModel) -> tuple[QuadraticProgram, 
 def _normalise_rows(
     rows: Float[Array, "r n"], rhs: Float[Array, " r"], model: ImageModel
 ) -> tuple[Float[Array, "p v"], Float[Array, " p"], Int[np.ndarray, " p"], Float[Array, " p"]]:
-    """Rows over ``v`` and right-hand sides, divided by the norm of the row; which rows were kept, and their norms."""
+    """Return rows over ``v`` and right-hand sides, divided by the norm of the row; which rows were kept, and their
+    norms."""
     limits = rhs - rows @ model.offset
     block = rows[:, model.entry] * model.sign
     norms = np.sqrt(np.einsum("ij,ij->i", block, block))

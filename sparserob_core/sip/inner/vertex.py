@@ -1,7 +1,8 @@
 """Linear programs by the simplex method: vertices, which have many zeros, and multipliers that others judge.
 
-Of a linear program with ``r`` active rows at most ``r`` entries of ``S x`` are strictly between 0 and their bounds at a
-vertex (Dantzig 1951). Nothing here is believed: whoever uses it checks decisions and multipliers like any other.
+Of a linear program with ``r`` active rows, and as many entries of ``S x`` as variables, at most ``r`` of these entries
+are strictly between 0 and their bounds at a vertex (Dantzig 1951). Nothing here is believed: whoever uses it checks
+decisions and multipliers like any other.
 """
 
 from __future__ import annotations
@@ -36,8 +37,8 @@ class Corner:
 
 
 def vertex(program: FiniteProgram, y: Array | None = None, mu: Array | None = None) -> Array | None:
-    """An optimal vertex ``(n,)`` of a program without a quadratic cost; ``None`` where none is found. Multipliers
-    ``y (r,)``, ``mu (e,)`` that are nearly optimal spare most of the work."""
+    """Return an optimal vertex ``(n,)`` of a program without a quadratic cost; ``None`` where none is found.
+    Multipliers ``y (r,)``, ``mu (e,)`` that are nearly optimal spare most of the work."""
     if program.P is not None or program.blocks is not None:
         return None
     corner = sifted(program, y, mu) if many(program) else simplex(program)
@@ -55,8 +56,9 @@ def many(program: FiniteProgram) -> bool:
 
 
 def sifted(program: FiniteProgram, y: Array | None = None, mu: Array | None = None) -> Corner:
-    """`simplex` on the entries that may be between 0 and their bounds, while the others stay where the multipliers put
-    them; until none of these is in the wrong place (sifting, Bixby, Gregory, Lustig, Marsten and Shanno 1992).
+    """Apply `simplex` to the entries that may be between 0 and their bounds, while the others stay where the
+    multipliers put them; until none of these is in the wrong place (sifting, Bixby, Gregory, Lustig, Marsten and Shanno
+    1992).
 
     ``y (r,)``, ``mu (e,)``: multipliers to begin with.
     """
@@ -99,7 +101,7 @@ def _evaluate_entries(program: FiniteProgram, y: Array, mu: Array) -> tuple[Arra
 
 
 def _restrict(program: FiniteProgram, near: np.ndarray, far: Array) -> FiniteProgram:
-    """The program in some of the entries, the others at ``far (n,)``."""
+    """Return the program in some of the entries, the others at ``far (n,)``."""
     return replace(
         program,
         q=program.q[near],
@@ -115,8 +117,8 @@ def _restrict(program: FiniteProgram, near: np.ndarray, far: Array) -> FinitePro
 
 
 def simplex(program: FiniteProgram, turns: int | None = None) -> Corner:
-    """The program without its quadratic cost, by the dual simplex method of HiGHS, in at most so many ``turns``. Rows
-    whose right-hand side is infinite ask for nothing."""
+    """Solve the program without its quadratic cost by the dual simplex method of HiGHS, in at most so many ``turns``.
+    Rows whose right-hand side is infinite ask for nothing."""
     from scipy.optimize import linprog
 
     is_finite = program.h < np.inf
@@ -152,14 +154,14 @@ def simplex(program: FiniteProgram, turns: int | None = None) -> Corner:
 
 
 def _split_bounds(program: FiniteProgram) -> tuple[list[Array], list[Array]]:
-    """Bounds of the positive and of the negative part of an image, so that a vertex has exact zeros."""
+    """Return bounds of the positive and of the negative part of an image, so that a vertex has exact zeros."""
     lower, upper = program.lower, program.upper
     plus = [np.maximum(lower, 0.0), np.maximum(upper, 0.0)]
     return plus, [np.maximum(-upper, 0.0), np.maximum(-lower, 0.0)]
 
 
 def _build_separable_columns(program: FiniteProgram) -> dict[str, Any]:
-    """``x = plus - minus``."""
+    """Return the columns of the linear program with ``x = plus - minus``."""
     plus, minus = _split_bounds(program)
     return {
         "c": np.concatenate([program.weights + program.q, program.weights - program.q]),
@@ -171,7 +173,7 @@ def _build_separable_columns(program: FiniteProgram) -> dict[str, Any]:
 
 
 def _build_image_columns(program: FiniteProgram) -> dict[str, Any]:
-    """``x`` is free, ``S x = plus - minus``."""
+    """Return the columns of the linear program with free ``x`` and ``S x = plus - minus``."""
     from scipy.sparse import csr_array, eye_array, hstack, vstack
 
     n, k = program.n, program.weights.size

@@ -21,7 +21,8 @@ from sparserob_core.sip.program import TOLERANCE, ConstraintFamily, SemiInfinite
 CELLS = 400_000  # cells examined per family before the proof is given up
 BATCH = 4096  # cells bounded at a time
 PROBED = 16  # number of worst cells at whose centres a witness is sought
-# Halvings after which an ascent also searches for a witness: a cell's centre may be far from the worst corner of a set.
+# Rounds of bounding, from 1, in which an ascent also searches for a witness: a cell's centre may be far from the worst
+# corner of a set.
 CLIMBED = (
     3,
     6,
@@ -35,7 +36,9 @@ OFTEN = 1.0  # seconds between events within a round of bounding
 STALLED, ADVANCED = 30.0, 0.99  # a proof is stuck if its worst bound has not fallen to this share within these seconds
 MORE = "more seconds (limits.seconds) would help"
 ADVICE = "a larger method.tolerance would help, as it keeps decisions farther away, or narrower index sets"
-REST, TINY = 8, 1e-5  # halvings without progress after which a bound below `TINY` of its unit counts as rounding
+# Halvings without progress after which the difference between bound and violation counts as rounding, and the largest
+# such difference, or such bound, in the units of the rows.
+REST, TINY = 8, 1e-5
 # Share of the excess of a tiny bound that may still fall with the size of a cell. With ten times as much, a proof
 # reports a larger bound than necessary, and decisions keep a larger distance; with a tenth, more cells are needed.
 FALLING = 0.06
@@ -54,7 +57,8 @@ def prove(
 ) -> tuple[Proof, ...]:
     """Prove or refute every family at a decision.
 
-    Past the deadline, every family is bounded once.
+    Past the deadline, only the first cells of each family are bounded, once. Families for which there is no time at all
+    are undecided.
 
     Parameters
     ----------
@@ -179,7 +183,10 @@ def prove_family(
 
 
 def _prove(family: ConstraintFamily, x: Array, notify: Notify, cells: int, deadline: Deadline) -> Proof:
-    """Return the proof of one family; raise `OutOfTime` where the deadline comes before every cell was bounded once."""
+    """Return the proof of one family; raise `OutOfTime` where the deadline interrupts a step.
+
+    An interrupt from the keyboard is recorded in the deadline, and the family is undecided.
+    """
     try:
         if family.enclosure is None:
             return _prove_by_separation(family, x)
@@ -462,18 +469,18 @@ def _form_answers(
 
 
 def _is_stalled(slacks: Sequence[float]) -> bool:
-    """Return whether a tiny worst bound no longer approaches the largest violation found as cells shrink.
+    """Return whether the worst bound no longer approaches the largest violation found as cells shrink.
 
-    The difference is then rounding.
+    Only a difference of at most `TINY` is judged; it then counts as rounding.
     """
     return len(slacks) > 2 * REST and slacks[-1] <= TINY and slacks[-1] > ADVANCED * slacks[-1 - REST]
 
 
 def _is_rounding(bound: float, bend: float, limit: float) -> bool:
-    """Return whether the excess of a tiny bound over the ``limit`` is rounding, for a cell with one coordinate.
+    """Return whether the excess of a tiny bound over the ``limit`` counts as rounding, for a cell with one coordinate.
 
-    Such an excess does not fall with the cell's width: it comes from the values at the cell's ends. No shorter cell
-    with that end is closed.
+    At most the share `FALLING` of such an excess falls with the cell's width. The rest comes from the values at the
+    cell's ends, so that no shorter cell with that end is closed.
     """
     return bound <= TINY and bend <= FALLING * (bound - limit)
 
@@ -485,8 +492,8 @@ def _bound_cells(course: Course, x: Array, lower: Array, upper: Array) -> tuple[
     The last is ``None`` where it is not known. Bounds are infinite for cells for which there was no time. Cells are
     bounded in batches, so that memory does not grow with their number. Only where a deadline is set do the batches
     depend on the time that they take: the cost of a cell is not known before, and a result without a limit must not
-    depend on the speed of the machine. Cells that differ in their first coordinate only share work (`enclose`), so they
-    belong to one batch.
+    depend on the speed of the machine. Cells that differ only in their first coordinate share work, so they follow one
+    another.
     """
     family, count = course.family, lower.shape[0]
     bounds, split, bend = np.full(count, np.inf), (upper - lower).argmax(axis=1), np.full(count, np.inf)
@@ -532,10 +539,12 @@ def _divide_towards_peaks(
     """Return cells ``(k, 1)`` after a division towards the peaks of the violation; ``None`` where it does not apply.
 
     A cell near or around a peak is divided at once into parts that are short at the peak and longer with the distance
-    from it. The others are halved. ``None`` is returned where no cell would be divided so, or too many are open.
+    from it. The others are halved. ``None`` is returned where no cell would be divided so, where too many are open, and
+    where a part would be too short for floating point.
 
-    From ``D`` to ``(1 + g) D`` next to a smooth peak of height ``v`` and curvature ``c``, the bound is about ``v - c
-    D^2 / 2 + b (g D)^2 / 8``, with ``b`` the bound of the second derivative. So ``g = 2 sqrt(c / b)`` suffices.
+    Take the part from ``D`` to ``(1 + g) D`` next to a smooth peak of height ``v`` and curvature ``c``, with the bound
+    ``b`` of the second derivative. Its bound is about ``v - c D^2 / 2 + b (g D)^2 / 8``. So ``g = 2 sqrt(c / b)``
+    suffices.
     """
     if not peaks.violations.size or lower.shape[0] > MOST_CUT:
         return None
@@ -549,9 +558,9 @@ def _divide_towards_peaks(
         cuts = np.array([low, (low + high) / 2, high])
         if away[i, nearest] <= width and 0.0 < short < width / 4:
             inside, grow = min(at - low, high - at), 0.5
-            if inside > width / 8:  # the peak is higher than the ends by its curvature times the square of the distance
-                curved = max(top - (bounds[i] - bend[i]), 0.0) / bend[i] * (width / inside) ** 2 / 4
-                grow = float(np.clip(2 * SHARE * np.sqrt(curved), *GROWN))
+            if inside > width / 8:  # the peak is higher than the ends by half its curvature times the squared distance
+                curvature_ratio = max(top - (bounds[i] - bend[i]), 0.0) / bend[i] * (width / inside) ** 2 / 4
+                grow = float(np.clip(2 * SHARE * np.sqrt(curvature_ratio), *GROWN))
             offsets = short * (1 + grow) ** np.arange(np.ceil(np.log(width / short) / np.log1p(grow)))
             cuts = np.concatenate([[low], at - offsets[::-1], at + offsets, [high]])
             cuts = np.concatenate([[low], cuts[(cuts > low) & (cuts < high)], [high]])
@@ -618,8 +627,8 @@ def _halve_cells(lower: Array, upper: Array, split: Array) -> tuple[Array, Array
 def _prove_by_separation(family: ConstraintFamily, x: Array) -> Proof:
     """Return the proof of a family without an enclosure, from its separation.
 
-    A proven bound of the separation is believed, except where the rows at the ends of the index set contradict it.
-    Otherwise the family stays undecided.
+    A bound that the separation states is believed, except where the rows at two corners of the index set contradict it.
+    A violation of more than `TOLERANCE` refutes the family. Otherwise the family stays undecided.
     """
     if family.worst is None:
         return Proof(

@@ -19,12 +19,13 @@ MANY = 40
 
 
 def irreducible(relaxed: RelaxedProgram, rows: Rows, solution: FiniteSolution) -> tuple[Rows, FiniteSolution]:
-    """Return rows that cannot hold together although all but any one of them can, with the multipliers that prove it.
+    """Return rows that cannot hold together, none of which was found to be dispensable, with multipliers as a proof.
 
     A constraint that is impossible by itself, or two constraints that leave nothing between them, are returned at once
     (`reasons`). Otherwise the deletion filter (Chinneck and Dravnieks 1991) is applied. The filter leaves every row out
     once, the least important first. A row stays out if the others are infeasible without it. A row that was needed
-    stays needed when others are removed. A row whose absence could not be judged stays.
+    stays needed when others are removed. The multipliers prove that the rows cannot hold together. That all but any one
+    of them can is not proven: a row also stays where no proof of infeasibility was found without it.
 
     Parameters
     ----------
@@ -67,8 +68,8 @@ def irreducible(relaxed: RelaxedProgram, rows: Rows, solution: FiniteSolution) -
 def _move_to_vertex(relaxed: RelaxedProgram, rows: Rows, solution: FiniteSolution) -> FiniteSolution:
     """Return a solution whose proof has few rows, where the given proof has many.
 
-    The new multipliers are at a vertex of the multipliers of the least relaxation that makes the program feasible. At a
-    vertex, no more multipliers are positive than there are variables.
+    The new multipliers are an optimal vertex of the dual of the elastic program. At a vertex, no more multipliers are
+    positive than that program has variables: one more than the decision has.
     """
     fixed, size = relaxed.program.finite.h.size, np.count_nonzero(solution.y)
     if size <= MANY:

@@ -56,10 +56,11 @@ class Reason:
 
 
 def reasons(program: SemiInfiniteProgram) -> list[Reason]:
-    """Return the constraints that are impossible at the corners and centres of every family's cells.
+    """Return the constraints that are impossible at corners and centres of the families' cells.
 
-    There is at most one reason for every row of a family. Of rows that mean the same in several cases, only the worst
-    is returned.
+    At most `LOOKED_AT` indices of a family are examined. Families without cells, and families whose rows have
+    deviations, are left out. There is at most one reason for every row of a family. Of rows that mean the same in
+    several cases, only the worst is returned.
     """
     candidates = [
         reason
@@ -120,7 +121,9 @@ def _list_reasons(base: FiniteProgram, family: ConstraintFamily) -> Iterator[Rea
 
 
 def least_of(base: FiniteProgram, G: Array, h: Array) -> Array:
-    """Return proven lower bounds of ``G x - h`` over the bounds of the program.
+    """Return lower bounds of ``G x - h`` over the bounds of the program.
+
+    Where the image is the decision itself, their rounding is not subtracted: `REAL` allows for it.
 
     Parameters
     ----------
@@ -182,10 +185,10 @@ def _choose_indices(family: ConstraintFamily) -> Array:
 
 
 def _list_opposite_rows(G: Array, h: Array, size: Array) -> Iterator[tuple[int, int, Array, Array]]:
-    """Yield pairs of rows with opposite normals.
+    """Yield all pairs of rows.
 
     Each item holds the numbers of the two rows, the weight ``(k,)`` of the second, and the violation ``(k,)`` of their
-    sum.
+    weighted sum at every index; ``-inf`` where their normals are not opposite.
     """
     count = h.shape[1]
     for first in range(count):

@@ -225,8 +225,9 @@ def infeasible_subsystem(
 ) -> tuple[InfeasibleSubsystem, WorstConstraint | None]:
     """Return the reasons for infeasibility, and the most important constraint.
 
-    All separate reasons that need no solver are returned. Where there is none, the rows that cannot hold together are
-    returned, with the demand of their weighted sum on the decision.
+    A single imposed row that no decision meets is returned alone, where its violation is larger than that of any reason
+    that needs no solver. Otherwise the first `NAMED` of these reasons are returned. Where there is none, the rows that
+    cannot hold together are returned, with the demand of their weighted sum on the decision.
 
     Parameters
     ----------
@@ -244,7 +245,7 @@ def infeasible_subsystem(
     subsystem : InfeasibleSubsystem
         The reasons.
     worst : WorstConstraint or None
-        The most important constraint.
+        Constraint of the first reason, or with the largest multiplier.
     """
     from sparserob_core.sip.proof.reasons import least_of, least_within, reasons, sentence
 
@@ -277,7 +278,10 @@ def infeasible_subsystem(
 def _describe_subsystem(
     program: SemiInfiniteProgram, rows: Rows, multipliers: Array, order: np.ndarray, amount: float
 ) -> InfeasibleSubsystem:
-    """Return several rows that cannot hold together, by their descriptions, with the weighted sum that proves it."""
+    """Return several rows that cannot hold together, by their descriptions.
+
+    The demand of their weighted sum is added where this sum alone proves it.
+    """
     from sparserob_core.sip.proof.reasons import least_of, least_within
 
     explanations = [_explain_cut(program, rows.cuts[i]) for i in order[:NAMED]]

@@ -298,7 +298,8 @@ class Ledger:
     def stopped(self, error: KeyboardInterrupt, prover: Prover) -> Result:
         """Return the result after a deadline or an interrupt: the best proven decision, or else the best so far.
 
-        The latter has the proofs of one look at it, since a proof whose deadline has passed bounds every family once.
+        The latter has the proofs of one look at it, since a proof whose deadline has passed bounds the first cells of
+        each family once.
 
         Parameters
         ----------

@@ -320,7 +320,8 @@ class RobustRows(Working):
         return missed.violation
 
     def tightened(self, ledger: Ledger, answer: Answer, margin: float) -> Answer | None:
-        """Return the optimum of the imposed rows tightened by ``margin``, no more accurate than its margin costs."""
+        """Return the optimum of the imposed rows tightened by ``margin``, accurate to a tenth of what the first margin
+        may cost, or as accurate as the rounds."""
         accuracy = min(self.accuracy, SHARPER * SPARED) * size_of(self.program, answer)
         solution = self.solve(margin, accuracy, left(ledger.tools))
         self._record_calls(ledger)

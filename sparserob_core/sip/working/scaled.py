@@ -14,7 +14,7 @@ SLACKENED = 200  # largest number of rounds
 
 
 def least_slack(program: SemiInfiniteProgram, tools: Tools, accuracy: float = 1e-9) -> float:
-    """Return the least amount by which all rows must be relaxed alike until some decision meets them.
+    """Return the least amount by which all rows must be relaxed alike until some decision meets them, unproven.
 
     Parameters
     ----------
@@ -60,7 +60,8 @@ def least_slack(program: SemiInfiniteProgram, tools: Tools, accuracy: float = 1e
 
 
 def largest_factor(program: SemiInfiniteProgram, tools: Tools, highest: float, accuracy: float = 1e-9) -> float | None:
-    """Return the largest factor by which all deviations can be multiplied so that some decision meets every row.
+    """Return the largest factor by which all deviations can be multiplied so that some decision meets every row,
+    unproven.
 
     With deviations ``f`` times as large, a row is ``g x + w'(C (f x) + f d) <= h``. The row is linear in ``f``, in the
     product ``f x`` for variables that answer deviations, and in the other variables.

@@ -75,9 +75,9 @@ def _has_bounds(program: SemiInfiniteProgram) -> bool:
 def first_rows(program: SemiInfiniteProgram) -> list[tuple[Array, np.ndarray, str]]:
     """Return rows that usually make an unbounded relaxed program bounded.
 
-    A family has at least one index more than the decision has variables, if at most `FEW` coordinates of its index can
-    move; otherwise it has one index. The indices are dense at the faces of the index set, where polynomials and cosines
-    grow most (nodes of Chebyshev). Nothing is returned where the decision has bounds.
+    A family gets at least one index more than the decision has variables, if at most `FEW` coordinates of its index can
+    move, and some do; otherwise it gets one index. The indices are dense at the faces of the index set, where
+    polynomials and cosines grow most (nodes of Chebyshev). Nothing is returned where the decision has bounds.
     """
     rows: list[tuple[Array, np.ndarray, str]] = []
     if _has_bounds(program):

@@ -30,11 +30,11 @@ class Eliminated(Protocol):
     """A block that is eliminated."""
 
     def forward(self, r: Array) -> tuple[State, Array]:
-        """A right-hand side among the pivots, and what it makes of the parts: ``B' M^-1 r``."""
+        """Return a right-hand side among the pivots, and what it makes of the parts: ``B' M^-1 r``."""
         ...
 
     def back(self, state: State, parts: Array) -> Array:
-        """The variables: ``M^-1 (r - B parts)``."""
+        """Return the variables: ``M^-1 (r - B parts)``."""
         ...
 
 
@@ -50,27 +50,27 @@ class Left:
         self._added, self._subtracted = list[Array](), list[Array]()
 
     def at(self, columns: np.ndarray, values: Array) -> None:
-        """Entries of the diagonal."""
+        """Add ``values`` to entries of the diagonal."""
         self._diagonal += np.bincount(columns, values, self.parts)
 
     def cross(self, at: np.ndarray, rows: Array) -> None:
-        """Rows, and their transposes."""
+        """Add rows, and their transposes."""
         self._cross[at] += rows
 
     def more(self, X: Array) -> None:
-        """``X' X``, at once where ``X`` is as tall as it is wide or nearly."""
+        """Add ``X' X``, at once where ``X`` is as tall as it is wide or nearly."""
         if 4 * X.shape[0] > self.parts:
             self._total += X.T @ X
         elif X.size:
             self._added.append(X)
 
     def less(self, X: Array) -> None:
-        """``- X' X``."""
+        """Subtract ``X' X``."""
         if X.size:
             self._subtracted.append(X)
 
     def total(self) -> Array:
-        """The sum."""
+        """Return the sum."""
         for sign, matrices in ((1.0, self._added), (-1.0, self._subtracted)):
             if matrices:
                 tall = np.vstack(matrices)
@@ -93,14 +93,14 @@ class Whole:
     parts: int
 
     def forward(self, r: Array) -> tuple[State, Array]:
-        """A right-hand side among the pivots, and what it makes of the parts."""
+        """Return a right-hand side among the pivots, and what it makes of the parts."""
         block, u = self.block, self._solve_with_factor(r)
         reduced_rhs: Array = np.bincount(block.columns, self.single * u[block.of], self.parts).astype(float)
         reduced_rhs += np.bincount(block.mixed, self.rows @ u, self.parts)
         return (r,), reduced_rhs
 
     def back(self, state: State, parts: Array) -> Array:
-        """The variables."""
+        """Return the variables."""
         block = self.block
         r = state[0] - np.bincount(block.of, self.single * parts[block.columns], state[0].size)
         return self._solve_with_factor(r - parts[block.mixed] @ self.rows)
@@ -115,10 +115,10 @@ class Whole:
 @final
 @dataclass(eq=False)
 class Lean:
-    """A block by its pivots: the safe entries ``1 / inverse`` of the diagonal; the rows, by the factor ``T`` of
-    ``W^-1 + A D^-1 A'`` over the safe entries; and the ``others``, by the factor ``H`` of ``D + Z' Z``, where ``Z`` is
-    ``T^-1 A``. ``Q (k, p)`` and ``R`` are the coupling among the pivots of rows and of the others, ``single`` and
-    ``kept`` what is coupled of single absolute values and of rows."""
+    """A block by its pivots. First come the safe entries ``1 / inverse`` of the diagonal; then the rows, by the factor
+    ``T`` of ``W^-1 + A D^-1 A'`` over the safe entries. The ``others`` follow, by the factor ``H`` of ``D + Z' Z``,
+    where ``Z`` is ``T^-1 A``. ``Q (k, p)`` and ``R`` are the coupling among the pivots of rows and of the others,
+    ``single`` and ``kept`` what is coupled of single absolute values and of rows."""
 
     block: Block
     inverse: Array
@@ -132,7 +132,7 @@ class Lean:
     R: Array
 
     def forward(self, r: Array) -> tuple[State, Array]:
-        """A right-hand side among the pivots, and what it makes of the parts."""
+        """Return a right-hand side among the pivots, and what it makes of the parts."""
         lapack = _import_lapack()
         block, u = self.block, self.inverse * r
         reduced_rhs = np.zeros(self.Q.shape[1])
@@ -150,7 +150,7 @@ class Lean:
         return (r, y, v), reduced_rhs
 
     def back(self, state: State, parts: Array) -> Array:
-        """The variables."""
+        """Return the variables."""
         lapack = _import_lapack()
         block = self.block
         r = state[0] - np.bincount(block.of, self.single * parts[block.columns], self.inverse.size)
@@ -168,8 +168,8 @@ class Lean:
 
 
 def eliminate(block: Block, D: Array, weight: Array, lean: Array, left: Left) -> Eliminated:
-    """A block eliminated, and what it leaves added to ``left``. ``D (n,)``: the diagonal; of all absolute values:
-    ``weight (J,)``, and ``lean (J,)``, by which its part is coupled to it."""
+    """Eliminate a block, and add what it leaves to ``left``. ``D (n,)``: the diagonal; of all absolute
+    values: ``weight (J,)``, and ``lean (J,)``, by which its part is coupled to it."""
     lean_block = _eliminate_lean(block, D, weight, lean, left) if block.once and D.size > LARGE else None
     return _eliminate_whole(block, D, weight, lean, left) if lean_block is None else lean_block
 
@@ -194,11 +194,11 @@ def _eliminate_whole(block: Block, D: Array, weight: Array, lean: Array, left: L
 
 
 def _eliminate_lean(block: Block, D: Array, weight: Array, lean: Array, left: Left) -> Lean | None:
-    """The pivots, where they are few enough.
+    """Return the block by its pivots; ``None`` where these are too many.
 
-    A part is coupled by ``B = S + A' m``. ``[A' m; 0]`` is ``[D, A'; A, -W^-1] [0; m]`` and ``[0; W^-1 m]``, so that a
-    row of great weight, of which the diagonal would leave a small difference of large numbers, takes a small right-hand
-    side of its own instead (``m^2 / w`` is what is left then); of the other rows ``m`` is ``kept``.
+    A part is coupled by ``B = S + A' m``. ``[A' m; 0]`` is the sum of ``[D, A'; A, -W^-1] [0; m]`` and ``[0; W^-1 m]``.
+    For a row of great weight the diagonal would leave a small difference of large numbers. Such a row takes a small
+    right-hand side of its own instead, which leaves ``m^2 / w``; of the other rows ``m`` is ``kept``.
     """
     lapack = _import_lapack()
     A, w, m = block.A, weight[block.at], lean[block.at]
@@ -245,14 +245,14 @@ def _eliminate_lean(block: Block, D: Array, weight: Array, lean: Array, left: Le
 
 @cache
 def _import_lapack() -> Any:
-    """The routines, imported once: blocks ask for them ten thousand times in a step."""
+    """Return the routines of LAPACK, imported once: blocks ask for them ten thousand times in a step."""
     from scipy.linalg import lapack
 
     return lapack
 
 
 def cholesky(M: Array) -> Array:
-    """The lower factor of a positive definite matrix, whose diagonal is enlarged until it is one."""
+    """Return the lower factor of a positive definite matrix, whose diagonal is enlarged until it is one."""
     lapack = _import_lapack()
     diagonal, increase = M.reshape(-1)[:: M.shape[0] + 1], GREATER
     while increase < 1e-6:

@@ -97,8 +97,8 @@ class Interior:
         return False
 
     def solve(self, margin: float, accuracy: float, seconds: float = np.inf) -> RobustAnswer:
-        """The optimum with every row tightened by ``margin``, to about ``accuracy`` in the cost. It is not solved where
-        ``seconds`` do not suffice, and says how far it has come."""
+        """Return the optimum with every row tightened by ``margin``, to about ``accuracy`` in the cost. It is not
+        solved where ``seconds`` do not suffice, and says how far it has come."""
         until = time.monotonic() + seconds
         if self._is_initialised and margin != self._margin:
             self._change_margin(margin)
@@ -125,8 +125,9 @@ class Interior:
         return self._form_answer(False, f"the interior point method took {STEPS} steps")
 
     def _change_margin(self, margin: float) -> None:
-        """Go on with another margin: where the last solve with it ended, for the way back from rows that were tightened
-        for one decision is as long as the way there, or else in the middle of rows that the difference violates."""
+        """Go on with another margin, from where the last solve with it ended. The way back from rows that were
+        tightened for one decision is as long as the way there. Without such a solve, go on in the middle of rows that
+        the difference of the margins violates."""
         current = self._mu, self._z, self._f, self._s, self._y, self._plus, self._minus, self._alpha, self._beta
         stored, self._stored_iterate = self._stored_iterate, (self._margin, current)
         if stored is not None and stored[0] == margin:
@@ -136,7 +137,7 @@ class Interior:
         self._margin, self._is_stale = margin, True
 
     def _initialise(self, margin: float) -> None:
-        """Joint variables, absolute values of those that cost, and the rows that bound them."""
+        """Begin with joint variables, absolute values of those that cost, and the rows that bound them."""
         from scipy.sparse import coo_array, csr_array
 
         program, joint = self.program, self._layout.joint
@@ -168,7 +169,7 @@ class Interior:
         self._is_initialised, self._margin, self._stored_iterate = True, margin, None
 
     def _extend_iterate(self, margin: float) -> None:
-        """Places, slacks and multipliers of what is new."""
+        """Give everything that is new a place, slacks and multipliers."""
         from scipy.sparse import csr_array, hstack, vstack
 
         kept, L = self._layout.arrange(), self._layout
@@ -199,8 +200,8 @@ class Interior:
         self._is_stale, self._tightening = False, 0.0
 
     def _add_slacks(self, had: int, before: Array, a: Array, free: Array, room: Array) -> None:
-        """Slacks and multipliers of new rows, and those of all absolute values; ``room (r,)``: what a row of this
-        freedom ``free`` has as slack in the middle."""
+        """Add slacks and multipliers of new rows, and renew those of all absolute values; ``room (r,)``: what a row of
+        this freedom ``free`` has as slack in the middle."""
         L, first = self._layout, self._limits.size
         y, old_count = np.concatenate([self._y[first:], self._mu / room[had:]]), self._plus.size
         eta = np.bincount(L.of, L.scale * y, L.parts)
@@ -227,7 +228,7 @@ class Interior:
         self._beta = np.maximum(np.append(self._beta, none), self._mu / self._minus)
 
     def _compute_residuals(self) -> tuple[float, float, float]:
-        """The gap, what the residuals of the dual take from a bound, and the largest of the primal."""
+        """Return the gap, what the residuals of the dual take from a bound, and the largest of the primal."""
         L, first = self._layout, self._limits.size
         tau = np.bincount(L.part, L.radius * (self._plus + self._minus) / 2, L.parts)
         eta: Array = np.bincount(L.of, L.scale * self._y[first:], L.parts).astype(float)
@@ -305,14 +306,14 @@ class Interior:
         return cast(Direction, combined), lengths[0], lengths[1]
 
     def _compute_relative_changes(self, move: Direction) -> tuple[Array, Array]:
-        """The changes of all slacks and of all multipliers, relative to what they are."""
+        """Return the changes of all slacks and of all multipliers, relative to what they are."""
         slacks, prices = _split_changes(move)
         over = np.concatenate([d / v for v, d in zip((self._s, self._plus, self._minus), slacks, strict=True)])
         under = np.concatenate([d / v for v, d in zip((self._y, self._alpha, self._beta), prices, strict=True)])
         return over, under
 
     def _factorise(self) -> None:
-        """Blocks, then what they leave of the rows, then the joint variables."""
+        """Factorise the blocks, then what they leave of the rows, then the joint variables."""
         from scipy.linalg import lapack
         from scipy.sparse import diags_array
 
@@ -341,8 +342,8 @@ class Interior:
         self._K = cholesky(table + self._Y.T @ self._Y)
 
     def _compute_direction(self, rows: Array, over: Array, under: Array) -> Direction:
-        """The Newton direction for these changes of the products of slacks and multipliers: of ``z``, ``f``, and the
-        slacks and multipliers of rows and of both sides of absolute values."""
+        """Return the Newton direction for these changes of the products of slacks and multipliers: of ``z``, ``f``, and
+        the slacks and multipliers of rows and of both sides of absolute values."""
         from scipy.linalg import lapack
 
         L, D, first = self._layout, self._D, self._limits.size
@@ -390,13 +391,14 @@ class Interior:
         return RobustAnswer(solved, said, x, y, signs[:, None] * table[L.of], np.zeros(0))
 
     def _balance_multipliers(self, eta: Array) -> tuple[Array, Array, Array]:
-        """Weights ``(p,)`` of parts that weigh ``eta``, with the multipliers ``(J,)`` of what is in their absolute
-        values, such that variables that answer have no slope, and the slopes ``(n,)`` that some have all the same.
+        """Return weights ``(p,)`` of parts that weigh ``eta``, with the multipliers ``(J,)`` of what is in their
+        absolute values, such that variables that answer have no slope, and the slopes ``(n,)`` that some have all the
+        same.
 
         What is left of ten thousand slopes, times how far each variable can go, is more than the tolerated gap. Every
-        such variable is alone in an absolute value, of its effect on the control, whose deviation takes the slope;
-        where that is at its end the part weighs more, by all its rows alike, so that opposite ones move no joint
-        variable.
+        such variable is alone in an absolute value, of its effect on the control, whose deviation takes the slope.
+        Where this deviation is at its end the part weighs more, by all its rows alike, so that opposite rows move no
+        joint variable.
         """
         L = self._layout
         leaning = L.radius * (self._alpha - self._beta) / np.maximum(self._alpha + self._beta, TINY)
@@ -413,13 +415,13 @@ class Interior:
 
 
 def _compute_step_length(changes: Array, share: float) -> float:
-    """A step of which these relative changes leave a share of the way to 0."""
+    """Return the longest step, at most 1, that goes no further than a ``share`` of the way to where a number is 0."""
     least = float(changes.min(initial=0.0))
     return min(1.0, share / -least) if least < 0.0 else 1.0
 
 
 def _split_changes(move: Direction) -> tuple[tuple[Array, Array, Array], tuple[Array, Array, Array]]:
-    """The changes of the slacks, and of their multipliers."""
+    """Return the changes of the slacks, and of their multipliers."""
     _, _, ds, dy, dplus, dminus, dalpha, dbeta = move
     return (ds, dplus, dminus), (dy, dalpha, dbeta)
 
@@ -427,7 +429,7 @@ def _split_changes(move: Direction) -> tuple[tuple[Array, Array, Array], tuple[A
 def _compute_corrections(
     value: Array, price: Array, dvalue: Array, dprice: Array, primal: float, dual: float, aim: float
 ) -> Array:
-    """Return corrections that bring products back to ``[0.1 aim, 10 aim]`` where a longer step would take them
-    outside."""
+    """Return corrections towards ``[0.1 aim, 10 aim]`` for products that a longer step would take outside; none is
+    larger than ``10 aim``."""
     product = (value + primal * dvalue) * (price + dual * dprice)
     return np.clip(np.clip(product, 0.1 * aim, 10.0 * aim) - product, -10.0 * aim, 10.0 * aim)

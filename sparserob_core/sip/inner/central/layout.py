@@ -59,11 +59,12 @@ class Group:
 class Layout:
     """The rows that were added, taken apart.
 
-    Absolute values ``j``: ``entry``, ``part``, ``radius`` and ``offset (J,)``, and ``a = C f + offset`` of the
-    answering variables ``f``, whose numbers are ``answering``; ``single`` are those in which a variable stands alone,
-    and ``squares (n, J)`` what is in ``C`` there. Rows: coefficients ``g (r, z)`` of the joint variables, whose numbers
-    are ``joint``; ``of (r,)`` their part, ``scale (r,)`` its weight, ``h (r,)`` their limits and ``rest (r,)`` the
-    worst case of entries that no variable enters, with ``at_rest (p, Q)`` these entries of it.
+    Absolute values ``j`` have ``entry``, ``part``, ``radius`` and ``offset (J,)``. They are those of
+    ``a = C f + offset`` of the answering variables ``f``, whose numbers are ``answering``. ``single``: those in which a
+    variable stands alone; ``squares (n, J)``: the squares of the entries of ``C`` there. Rows have coefficients
+    ``g (r, z)`` of the joint variables, whose numbers are ``joint``; their part ``of (r,)``, its weight ``scale (r,)``,
+    and limits ``h (r,)``. ``rest (r,)`` is the worst case of entries that no variable enters, and ``at_rest (p, Q)``
+    are the deviations of these entries in it.
     """
 
     def __init__(self, program: FiniteProgram, spread: Spread) -> None:
@@ -229,7 +230,7 @@ class Layout:
 
 
 def _hash_arrays(*arrays: np.ndarray) -> bytes:
-    """A short name of arrays, the same for equal ones."""
+    """Return a short name of arrays, the same for equal ones."""
     hasher = hashlib.blake2b(digest_size=16)
     for array in arrays:
         hasher.update(array.size.to_bytes(8, "little"))

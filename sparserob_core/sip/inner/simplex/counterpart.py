@@ -279,7 +279,7 @@ class Counterpart:
         return self._tangents is not None
 
     def solve(self, margin: float = 0.0, accuracy: float = 0.0, seconds: float = np.inf) -> RobustAnswer:
-        """The optimum with every row tightened by ``margin``, to about ``accuracy`` in the cost where that has
+        """Return the optimum with every row tightened by ``margin``, to about ``accuracy`` in the cost where that has
         tangents; where it is elastic, how far the rows must be relaxed so that they can be met. It is not solved where
         ``seconds`` do not suffice."""
         if margin != self._margin:
@@ -308,7 +308,8 @@ class Counterpart:
         return RobustAnswer(True, message, x, y, deviations, mu, slack, at)
 
     def _recover_multipliers(self, even: Array, mu: Array, touched: Array | None) -> tuple[Array, Array]:
-        """The multipliers ``(r,)`` of all rows, and the deviations ``(r, Q)`` that those of the parts stand for."""
+        """Return the multipliers ``(r,)`` of all rows, and the deviations ``(r, Q)`` that those of the parts stand
+        for."""
         y, deviations = self._read_multipliers(even)
         terms = [(np.zeros(0, dtype=int), np.zeros(0))]
         late: list[tuple[UncertainRows, int, _Part, np.ndarray, float]] = []
@@ -347,8 +348,8 @@ class Counterpart:
         return y, deviations
 
     def _read_multipliers(self, even: Array) -> tuple[Array, Array]:
-        """The multipliers of all rows, and the deviations of exact ones, 0 for the others. The multipliers of equations
-        are those of one row at a deviation and of its opposite at none."""
+        """Return the multipliers of all rows, and the deviations of exact ones, 0 for the others. The multipliers of
+        equations are those of one row at a deviation and of its opposite at none."""
         y, deviations = [np.zeros(0)], [np.zeros((0, self.spread.size))]
         for block, (where, _, parts) in zip(self.blocks, self._imposed_rows, strict=True):
             multipliers, w = np.maximum(even[where], 0.0), np.zeros((block.h.size, self.spread.size))
@@ -364,7 +365,7 @@ class Counterpart:
         return np.concatenate(y), np.vstack(deviations)
 
     def _split_product(self, plain: float, answers: Array) -> tuple[float, Array]:
-        """A multiplier of at least ``plain`` and a deviation whose product is ``answers (Q,)``."""
+        """Return a multiplier of at least ``plain`` and a deviation whose product is ``answers (Q,)``."""
         free = self.spread.radii > 0.0
         answers = np.where(free, answers, 0.0)
         size = max(plain, float((np.abs(answers[free]) / self.spread.radii[free]).max(initial=0.0)))
@@ -376,7 +377,7 @@ class Counterpart:
         return multiplier, answers / multiplier
 
     def _find_constant_deviations(self, block: UncertainRows, p: int) -> Array:
-        """The worst deviations where no decision enters a part; 0 elsewhere."""
+        """Return the worst deviations where no decision enters a part; 0 elsewhere."""
         w = np.zeros(self.spread.size)
         if self.spread.is_box:
             bare = np.diff(block.C[p].indptr) == 0
@@ -386,8 +387,8 @@ class Counterpart:
     def _balance_slopes(
         self, slope: Array, deviations: Array, late: list[tuple[UncertainRows, int, _Part, np.ndarray, float]]
     ) -> None:
-        """Deviations of the parts whose entries are single variables: such that no slope is left in these, as far as
-        their sets allow, shared by the rows in which a variable is."""
+        """Set the deviations of the parts whose entries are single variables, such that no slope is left in these, as
+        far as their sets allow, shared by the rows in which a variable is."""
         reach = np.zeros(self.program.n)
         for block, p, part, _, total in late:
             np.add.at(reach, block.C[p].indices, total * np.abs(block.C[p].data) * self.spread.radii[part.entries])
@@ -425,7 +426,7 @@ class Growing:
             self.highs.setOptionValue(name, value)
 
     def variables(self, lower: Array, upper: Array, cost: Array) -> np.ndarray:
-        """New columns with these bounds and costs, by number."""
+        """Add columns with these bounds and costs, and return their numbers."""
         none = np.zeros(0, dtype=np.int32)
         starts = np.zeros(lower.size, dtype=np.int32)
         self.highs.addCols(lower.size, cost, lower, upper, 0, starts, none, np.zeros(0))
@@ -433,7 +434,7 @@ class Growing:
         return np.arange(self.columns - lower.size, self.columns)
 
     def rows(self, entries: list[tuple[np.ndarray, np.ndarray, Array]], lower: Array, upper: Array) -> np.ndarray:
-        """New rows, by number; ``entries`` are rows counted from 0, columns and values."""
+        """Add rows, and return their numbers; ``entries`` are rows counted from 0, columns and values."""
         import highspy
 
         row, column, value = (np.concatenate(arrays) for arrays in zip(*entries, strict=True))
@@ -510,7 +511,7 @@ class Growing:
         return True, message, np.array(solution.col_value), -np.array(solution.row_dual)
 
     def _ask_solver(self, asked: Asked) -> tuple[bool, str, Array, Array] | str:
-        """The answer of who is asked, from nothing, where it holds; in words why it does not."""
+        """Return the answer of who is asked, from nothing, where it holds; in words why it does not."""
         import highspy
         from scipy.sparse import csc_array, csr_array, diags_array, vstack
 
@@ -570,15 +571,15 @@ class Growing:
 
 
 def weighted(weights: Array, table: csr_array) -> tuple[np.ndarray, Array]:
-    """The terms of ``weights @ table`` of a sparse ``table (r, n)``: columns and values, which are still to be added
-    up; of thousands of small tables at once that is far less than their products."""
+    """Return the terms of ``weights @ table`` of a sparse ``table (r, n)``: columns and values, which are still to be
+    added up; of thousands of small tables at once that is far less than their products."""
     row = np.repeat(weights, np.diff(table.indptr))
     used = np.flatnonzero(row)
     return table.indices[used], row[used] * table.data[used]
 
 
 def _split_signs(row: np.ndarray, column: np.ndarray, value: Array, n: int) -> tuple[np.ndarray, np.ndarray, Array]:
-    """Entries of the decision in its positive and its negative part."""
+    """Return entries of the decision in its positive and its negative part."""
     return np.concatenate([row, row]), np.concatenate([column, column + n]), np.concatenate([value, -value])
 
 
@@ -591,10 +592,11 @@ def robust_bound(
     priced: bool,
     at: Array | None = None,
 ) -> tuple[float, float]:
-    """A lower bound of the cost by weak duality, from multipliers ``y (r,) >= 0`` of rows at ``deviations (r, Q)`` and
-    ``mu (e,)``: the minimum over the bounds of the program alone; quadratic terms are replaced by their tangent ``at
-    (n,)``, of 0 unless given. Not ``priced``: of the weighted sum of the rows, which is positive only where nothing is
-    feasible. With it the sum of the numbers that were added up."""
+    """Return a lower bound of the cost by weak duality, but for rounding, from multipliers ``y (r,) >= 0`` of rows at
+    ``deviations (r, Q)`` and ``mu (e,)``. It is the minimum over the bounds of the program alone. Quadratic terms are
+    replaced by their tangent ``at (n,)``, of 0 unless given. Not ``priced``: of the weighted sum of the rows, which is
+    positive only where nothing is feasible. The second number is the sum of the absolute numbers that were added up, a
+    share of which the caller subtracts for rounding."""
     cost = program.tangent(np.zeros(program.n) if at is None else at)
     slope, constant = (cost.q.copy() if priced else np.zeros(program.n)), -float(mu @ program.b)
     constant, size = constant + cost.constant * priced, abs(constant) + abs(cost.constant) * priced

@@ -72,8 +72,8 @@ def with_integers(
     seconds: float,
     gap: float,
 ) -> Array | None:
-    """A point ``(n,)`` of least ``cost (n,)`` up to a relative ``gap``, of which all entries but the first so many are
-    whole numbers; the best that is known after ``seconds``, ``None`` where none is."""
+    """Return a point ``(n,)`` of least ``cost (n,)`` up to a relative ``gap``, of which all entries but the first so
+    many are whole numbers; the best that is known after ``seconds``, ``None`` where none is."""
     import highspy
     from scipy.sparse import csr_array, vstack
 

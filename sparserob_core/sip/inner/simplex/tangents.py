@@ -1,8 +1,8 @@
 """The convex terms of a cost in a linear program that grows: each is one variable above its tangents (Kelley 1960).
 
 A quadratic form is a sum of squares along its eigenvectors, ``x'P x / 2 = sum_i t_i^2 / 2``, and every square has a
-variable of its own: tangents of one square are exact where they touch, and nowhere further below than an eighth of the
-square of the distance to the next, so that they are as close as is wanted after a few rounds, however many squares
+variable of its own. Tangents of one square are exact where they touch, and between two of them below it by no more than
+an eighth of the square of their distance. So they are as close as is wanted after a few rounds, however many squares
 there are. (One variable for the whole form would need as many rounds as there are directions.) The norm of a block is
 the largest of ``d's`` over unit vectors ``d``.
 """
@@ -35,10 +35,10 @@ class Linear(Protocol):
     """A linear program to which columns and rows are added."""
 
     def variables(self, lower: Array, upper: Array, cost: Array) -> np.ndarray:
-        """New columns, by number."""
+        """Add columns, and return their numbers."""
 
     def rows(self, entries: Entries, lower: Array, upper: Array) -> np.ndarray:
-        """New rows, by number."""
+        """Add rows, and return their numbers."""
 
 
 @final
@@ -92,7 +92,7 @@ class Tangents:
             self._add_directions(Directions(directions.block[kept], directions.vectors[kept]))
 
     def _add_directions(self, directions: Directions) -> None:
-        """``d's`` is at most the norm of its block."""
+        """Add rows by which the variable of a block's norm is at least ``d's``."""
         blocks, n = self.program.blocks, self.program.n
         assert blocks is not None
         count = directions.block.size
@@ -119,9 +119,9 @@ class Tangents:
         return shortfall, x, t
 
     def touching(self, x: Array, multipliers: Array) -> Array:
-        """The decision ``(n,)`` at which the slope of the cost is that of all tangents with their multipliers: there
-        one tangent proves at least as much as they do together. Of a block whose entries have squares too it is only
-        nearly that of the norm."""
+        """Return the decision ``(n,)`` at which the slope of the cost is that of all tangents with their multipliers:
+        there one tangent proves at least as much as they do together. Of a block whose entries have squares too it is
+        only nearly that of the norm."""
         blocks, answer = self.program.blocks, x
         if blocks is not None:
             answer = x.copy()
@@ -140,7 +140,7 @@ class Tangents:
 
 
 def _factor_quadratic(program: FiniteProgram) -> Array:
-    """Columns ``(n, c)``, at right angles, whose squares along a decision add up to ``x'P x``."""
+    """Return columns ``(n, c)``, at right angles, whose squares along a decision add up to ``x'P x``."""
     if program.P is None:
         return np.zeros((program.n, 0))
     if program.curvature is not None:
