@@ -21,6 +21,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
+from math import factorial
 
 import numpy as np
 
@@ -37,7 +38,11 @@ from sparserob_core.errors import NotEnclosable
 from sparserob_core.sip.convex_set import Array, ConvexSet
 
 KNOWN = TaylorSpace(0, 0)
-GROWN = 8  # terms of an exponential of bounds, whose tail is added; half of them, and third derivatives count twice
+GROWN, MOST_GROWN = 8, 32
+"""Terms of an exponential of bounds, at least and at most. With half of them third derivatives count twice."""
+TAIL = 2.0**-60
+"""Share of a norm that the terms beyond may be. They are bounded in the norm of all coefficients of a cell. With a
+thousand times more they were a floor under the coefficients of high degree, and no halving of a cell closed it."""
 OUTWARD = 1.0 + 1e-12  # for sums of some thousand numbers that are not negative
 AT_ONCE = 4_000_000  # numbers of weights that are made at once
 TINY = float(np.finfo(float).tiny)
@@ -362,13 +367,13 @@ class VaryingMotion:
         """
         matrix_bounds, pace = self.most[pieces][:, :, : self.states], self.paces[pieces] * width
         units = self.expansion.units * self.expansion.ratios[self._segments[pieces]]
-        total, term = sizes.astype(float), sizes.astype(float)
-        for n in range(1, GROWN):
+        total, term, count = sizes.astype(float), sizes.astype(float), _count_terms(float(pace.max(initial=0.0)))
+        for n in range(1, count):
             term = np.einsum("kij,kj->ki", matrix_bounds, term) * (width / n)[:, None]
             total = total + term
-        tail_factors = (pace / GROWN) / np.maximum(1.0 - pace / (GROWN + 1), 0.1)
+        tail_factors = (pace / count) / np.maximum(1.0 - pace / (count + 1), 0.1)
         tail = self.expansion.over_parts((term / units)[:, :, None])[:, :, 0] * tail_factors[:, None]
-        tail = np.where(pace[:, None] < 0.8 * GROWN, tail, np.inf)
+        tail = np.where(pace[:, None] < 0.8 * count, tail, np.inf)
         return np.asarray((total + units * tail) * OUTWARD)
 
     def place(self, times: Array) -> np.ndarray:
@@ -470,6 +475,14 @@ class VaryingMotion:
             effects[k + 1, :, : piece + 1] = np.einsum("ij,jlw->ilw", step, effects[k, :, : piece + 1])
             effects[k + 1, :, piece] += input_effects[k]
         return effects
+
+
+def _count_terms(pace: float) -> int:
+    """Return the number of terms of ``e^pace`` whose tail is at most `TAIL`, within `GROWN` and `MOST_GROWN`."""
+    count, pace = GROWN, min(pace, float(MOST_GROWN))
+    while count < MOST_GROWN and pace**count > TAIL * factorial(count):
+        count += 2
+    return count
 
 
 @dataclass(frozen=True, eq=False)

@@ -96,6 +96,19 @@ def test_cells_of_time_end_where_a_segment_of_any_part_does() -> None:
         assert np.isin(propagator.on_cell(*cell).marks, propagator.marks).all()
 
 
+def test_growth_within_a_piece_is_no_floor_under_the_coefficients_of_a_small_cell() -> None:
+    breaks = np.linspace(0.0, 3.0, 7)
+    propagator = Propagator(SYSTEM, merge_grids(breaks, breaks, varying=True))
+    for width in (1e-2, 1e-4):
+        motion = SpreadMotion.of(propagator.on_cell(np.array([0.1]), np.array([0.1 + width])), np.ones(1), None).motion
+        sizes = np.zeros((motion.grid.pieces, motion.states))
+        sizes[:, 0] = 1.0  # of the constant coefficient
+        grown = motion.grown(motion.every, motion.grid.lengths, sizes)
+        assert (grown[:, 0] >= 1.0).all()
+        orders = np.arange(1, motion.states)
+        assert (grown[:, 1:] <= 2.0 * width**orders + 1e-15).all()
+
+
 PARTS = expansions.Parts((np.array([0.0, 1.0, 3.0]), np.array([-1.0, 0.0])), ((None, None),) * 2)  # type: ignore[arg-type]
 
 
