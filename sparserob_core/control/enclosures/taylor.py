@@ -19,6 +19,7 @@ import numpy.typing as npt
 
 from sparserob_core.control.enclosures.elementary import (
     Series,
+    cos_series,
     exp_series,
     kepler_series,
     log_series,
@@ -234,7 +235,9 @@ class TaylorModel:
             return self * other.reciprocal()
         if not isinstance(other, _NUMBERS):
             return NotImplemented
-        return self * (1.0 / float(other)) if other else undefined("a division by zero")
+        if not other:
+            undefined("a division by zero")
+        return _add_rounding(self.space, self.coefficients / float(other), self.remainder / abs(float(other)))
 
     def __rtruediv__(self, other: object) -> TaylorModel:
         return self.reciprocal().__mul__(other)
@@ -296,7 +299,7 @@ class TaylorModel:
             remainder += sum(
                 rounding(4 * k) * abs(coefficient) * reach**k for k, coefficient in enumerate(coefficients)
             )
-        return TaylorModel(self.space, result.coefficients, result.remainder + remainder)
+        return TaylorModel(self.space, result.coefficients, (result.remainder + remainder) * OUTWARD)
 
     def _describe_domain(self) -> tuple[int, float, float, float]:
         return self.space.degree, float(self.coefficients[0]), *self.bounds()
@@ -311,7 +314,7 @@ class TaylorModel:
 
     def cos(self) -> TaylorModel:
         """Cosine."""
-        return (self + 0.5 * math.pi).sin()
+        return self._compose(cos_series(*self._describe_domain()))
 
     def tan(self) -> TaylorModel:
         """Tangent; the values must stay between two of its poles."""

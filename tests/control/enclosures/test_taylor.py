@@ -93,6 +93,31 @@ def test_on_a_small_cell_the_remainder_holds_what_is_rounded(text: str, radius: 
                 assert off <= flint.arb(float(model.remainder))
 
 
+@pytest.mark.parametrize("of", ["sin", "cos"])
+@pytest.mark.parametrize("centre", [1000.2, -1.5707963, 31.4])
+def test_of_a_wave_far_from_0_the_remainder_holds_what_is_rounded(of: str, centre: float) -> None:
+    flint = pytest.importorskip("flint")
+    (p,) = TaylorSpace(1, 8).variables(np.array([centre]), np.array([0.02]))
+    model = getattr(p, of)()
+    for delta in (-1.0, 0.37, 1.0):
+        with flint.ctx.workprec(300):
+            at = flint.arb(centre) + flint.arb(0.02) * flint.arb(delta)
+            said = height(model, [Fraction(delta)])
+            off = abs(getattr(at, of)() - flint.arb(flint.fmpq(said.numerator, said.denominator)))
+            assert off <= flint.arb(float(model.remainder))
+
+
+@pytest.mark.parametrize("number", [99.0, -3.0, 1e-3, 7.0])
+def test_of_a_quotient_by_a_number_the_remainder_holds_what_is_rounded(number: float) -> None:
+    rng = np.random.default_rng(1)
+    for radius in (204.0, *rng.uniform(0.1, 300.0, 50)):
+        (p,) = TaylorSpace(1, 3).variables(np.zeros(1), np.array([radius]))
+        model = p / number
+        off = abs(height(model, [Fraction(1)]) - Fraction(radius) / Fraction(number))
+        assert off <= Fraction(model.remainder)
+        assert model.remainder <= 2e-16 * abs(radius / number)
+
+
 @pytest.mark.parametrize("left", ["constant", "line", "plane", "dense"])
 @pytest.mark.parametrize("right", ["constant", "line", "plane", "dense"])
 def test_of_a_product_the_remainder_holds_what_is_rounded(left: str, right: str) -> None:
