@@ -553,13 +553,13 @@ class Worst:
     def _evaluate_inputs(self, times: Array) -> tuple[Array, Array]:
         """Return what the known inputs add to the row at ``times (k,)``, and the error bounds, ``(k,)`` each.
 
-        An interval on which the middles of all inputs are 0 counts as one without inputs.
+        An interval on which all inputs are exactly 0 counts as one without inputs.
         """
         mid, rad, size = np.zeros(times.size), np.zeros(times.size), np.zeros(times.size)
         used = self.drives.mid.shape[0]
         for k, (start, stop) in enumerate(zip(self.grid[:-1], self.grid[1:], strict=True)):
             u, u_rad = self.drives.mid[:, k], self.drives.rad[:, k]
-            if u.any():
+            if u.any() or u_rad.any():
                 effects = self.adjoint.between(times, float(start), float(stop))
                 mid += effects.mid[:, :used] @ u
                 rad += effects.rad[:, :used] @ (np.abs(u) + u_rad) + np.abs(effects.mid[:, :used]) @ u_rad
@@ -720,7 +720,7 @@ class Worst:
         times = [np.asarray(more, dtype=float)]
         if isinstance(self.adjoint, AdjointRow):
             times.append(np.arange(self.adjoint.count + 1) * self.adjoint.step)
-        times += [self.grid] if self.drives.mid.any() else []
+        times += [self.grid] if self.drives.mid.any() or self.drives.rad.any() else []
         times += [self.changes] if self.pushed is not None and self.changes is not None else []
         return np.unique(np.concatenate(times))
 
