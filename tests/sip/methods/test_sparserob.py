@@ -119,16 +119,16 @@ def test_an_interrupted_search_returns_what_it_has_proven(tmp_path, monkeypatch)
 
     def interrupted(g, point):
         interrupted.weights.append(g.epsilon)
-        if interrupted.weights.count(g.epsilon) == left and len(set(interrupted.weights)) == search:
+        if (len(set(interrupted.weights)), interrupted.weights.count(g.epsilon)) == interrupted.at:
             raise KeyboardInterrupt
         return evaluated(g, point)
 
     monkeypatch.setattr(TupleValue, "at", interrupted)
     three = {"indices": 8, "sc1": {"name": "iterations", "count": 3}}, NEAR[1]
-    for search, left, status in ((1, 30, "refuted"), (3, 5, "verified")):  # the second search is as near as `NEAR` is
-        interrupted.weights = []
+    for at, status in (((1, 30), "refuted"), ((3, 5), "verified")):  # the second search is as near as `NEAR` is
+        interrupted.weights, interrupted.at = [], at  # of which search which evaluation
         result = experiment1(tmp_path / status, *three, **FEW).result
-        assert result.status == status, search
+        assert result.status == status, at
         assert result.stopped == "interrupted from the keyboard"
         assert np.isfinite(result.upper_bound) == (status == "verified")
 
