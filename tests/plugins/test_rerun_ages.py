@@ -19,7 +19,7 @@ import pytest
 
 import sparserob_core as sr
 from tests.support.places import CONFIGS
-from tests.support.recordings import read, rows, slowness
+from tests.support.recordings import pace, read, rows, slowness
 
 pytest.importorskip("rerun", reason="a recording needs the extra rerun")
 
@@ -99,7 +99,7 @@ def test_what_is_seen_of_a_search_is_of_this_moment(
             observers=[clock],
         )
     # a machine that is busy with other things gives the recorder as little as the run
-    factor = max(BUSY if busy or BESIDE else 1.0, clock.slowness)
+    factor = max(BUSY if busy or BESIDE else 1.0, clock.slowness) * pace()
     found = read(tmp_path / "run" / "recording.rrd")
     start = clock.heard[0][0]
     first = {

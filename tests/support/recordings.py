@@ -98,6 +98,14 @@ def walk_of(trace: sr.SearchTrace) -> np.ndarray:
     return walk
 
 
+def pace(turns: int = 1_000_000, usual: float = 0.06) -> float:
+    """How many times as long as usual the processor itself takes, in seconds of its own for so many turns."""
+    own, total = time.process_time(), 0
+    for turn in range(turns):
+        total += turn
+    return max(1.0, (time.process_time() - own) / usual)
+
+
 def slowness(seconds: float = 0.1) -> float:
     """How many times as long as it takes by itself a computation takes here now."""
     wall, own = time.perf_counter(), time.process_time()
