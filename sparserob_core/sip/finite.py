@@ -481,6 +481,11 @@ class FiniteSolution:
     by: str = ""
     unanswered: str = ""
 
+    @property
+    def error(self) -> float:
+        """Residual plus gap, by which two answers are compared; a negative gap counts as 0."""
+        return self.residual + max(self.gap, 0.0)
+
 
 @final
 @dataclass(frozen=True, eq=False)

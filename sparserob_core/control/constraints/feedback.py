@@ -91,14 +91,13 @@ def indexed(constraint: Uncertain, index_set: Box, start: Array, source: Source)
         along=constraint.loop.functionals.names.time,
         source=source,
     )
-    radii = np.concatenate([constraint.loop.spread.radii])
+    radii = constraint.loop.spread.radii
     box = Box(np.concatenate([index_set.lower, -radii]), np.concatenate([index_set.upper, radii]))
     literal = replace(
         family,
         index_set=box,
         formulation="literal",
         reduced=family,
-        explain=constraint.explain,
         worst=None,
         excess=None,
     )

@@ -40,19 +40,19 @@ def exp_series(degree: int, centre: float, low: float, high: float) -> Series:
 
 def sin_series(degree: int, centre: float, low: float, high: float) -> Series:
     """The sine, of which every derivative is at most 1."""
-    sine, cosine = math.sin(centre), math.cos(centre)
-    return _turn((sine, cosine, -sine, -cosine), degree)
+    return _build_wave_series(degree, centre, 0)
 
 
 def cos_series(degree: int, centre: float, low: float, high: float) -> Series:
     """The cosine, of which every derivative is at most 1."""
+    return _build_wave_series(degree, centre, 1)
+
+
+def _build_wave_series(degree: int, centre: float, order: int) -> Series:
+    """Return the series of a derivative of the sine, of this ``order``. None is larger than 1."""
     sine, cosine = math.sin(centre), math.cos(centre)
-    return _turn((cosine, -sine, -cosine, sine), degree)
-
-
-def _turn(derivatives: tuple[float, float, float, float], degree: int) -> Series:
-    """Return the series of a function whose derivatives come again after four, none of them above 1."""
-    terms = [derivatives[k % 4] / math.factorial(k) for k in range(degree + 1)]
+    derivatives = (sine, cosine, -sine, -cosine)
+    terms = [derivatives[(k + order) % 4] / math.factorial(k) for k in range(degree + 1)]
     return terms, 1.0 / math.factorial(degree + 1)
 
 

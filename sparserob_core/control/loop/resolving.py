@@ -114,8 +114,6 @@ class Plan:
         numbers = np.flatnonzero(response.grid.control_piece == piece).tolist()
         if response.propagator.laws is not None:  # which parameters did it is not known
             return None
-        if problem.execution is not None:  # nor what was delivered
-            return None
         if problem.disturbance is None or signal is None or signal.starts is None or len(numbers) != 1:
             return None
         steps, length = response.steps(KNOWN), int(response.which[numbers[0]])

@@ -389,16 +389,16 @@ class VaryingMotion:
         """``[A F]`` and its derivative at times on pieces, ``(k, d, d + m + mw)`` each."""
         size = max(1, AT_ONCE // self.expansion.coefficients[0].size)
         if times.size > size:
-            every = [slice(begin, begin + size) for begin in range(0, times.size, size)]
-            pairs = [self.law(times[chunk], pieces[chunk]) for chunk in every]
+            chunks = [slice(begin, begin + size) for begin in range(0, times.size, size)]
+            pairs = [self.law(times[chunk], pieces[chunk]) for chunk in chunks]
             return np.concatenate([law for law, _ in pairs]), np.concatenate([slope for _, slope in pairs])
         segments = self._segments[pieces]
         begin, end = self.expansion.ends[segments], self.expansion.ends[segments + 1]
-        every = self.expansion.coefficients[segments]
-        radius, orders = (end - begin) / 2, np.arange(every.shape[1])
+        coefficients = self.expansion.coefficients[segments]
+        radius, orders = (end - begin) / 2, np.arange(coefficients.shape[1])
         powers = ((times - (begin + end) / 2) / radius)[:, None] ** orders
-        law = np.einsum("kn,knij->kij", powers, every)
-        slope = np.einsum("kn,knij->kij", powers[:, :-1] * orders[1:] / radius[:, None], every[:, 1:])
+        law = np.einsum("kn,knij->kij", powers, coefficients)
+        slope = np.einsum("kn,knij->kij", powers[:, :-1] * orders[1:] / radius[:, None], coefficients[:, 1:])
         return law, slope
 
     @cached_property

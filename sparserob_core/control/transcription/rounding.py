@@ -14,11 +14,11 @@ import numpy as np
 from sparserob_core.control.enclosures.decoupling import pace
 from sparserob_core.control.enclosures.matrix_exponential import EPSILON
 from sparserob_core.control.response.response import Weights
-from sparserob_core.control.transcription.own_units import fixed
+from sparserob_core.control.transcription.own_units import extent, fixed
 from sparserob_core.control.transcription.program import slanted
 from sparserob_core.control.transcription.record import Transcription
 from sparserob_core.control.transcription.steps import Steps
-from sparserob_core.sip.convex_set import Array, ConvexSet
+from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.inner.simplex.counterpart import robust_bound
 from sparserob_core.sip.result import Result
 
@@ -94,7 +94,7 @@ def _sum_row_magnitudes(model: Transcription, result: Result, share: float, pric
         if explanation is not None and constraint is not None and cut.multiplier > 0.0:
             rows.append((cut.multiplier, explanation.time, explanation.direction, explanation.parameter_or(middle)))
             if explanation.gain is not None:
-                extra += cut.multiplier * float(np.abs(explanation.gain) @ _bound_components(model.problem.control))
+                extra += cut.multiplier * float(np.abs(explanation.gain) @ extent(model.problem.control))
             extra += cut.multiplier * float(constraint.reference.reach(explanation.direction))
             uses_prices = uses_prices and explanation.gain is None
         elif cut.multiplier > 0.0:
@@ -144,7 +144,7 @@ def _sum_control_magnitudes(
 def _bound_law_truncation(model: Transcription, result: Result) -> float:
     """Return an upper bound of the truncation error of a law as a series in the parameters, over all rows with a
     multiplier."""
-    truncation, error = model.functionals.beyond(_bound_components(model.problem.control)), 0.0
+    truncation, error = model.functionals.beyond(extent(model.problem.control)), 0.0
     if truncation.any():
         for cut, explanation in zip(result.dual.cuts, model.explained(result.dual.cuts), strict=True):
             error += (
@@ -201,7 +201,7 @@ def added_up(model: Transcription, times: Array, directions: Array, parameters: 
 def _bound_control_contributions(model: Transcription, weights: Array) -> Array:
     """Return the largest absolute contributions ``(k, J, m)`` of every piece of the control to rows with ``weights (k,
     L, m)``."""
-    return np.asarray(np.abs(model.functionals.decided(weights)) * _bound_components(model.problem.control))
+    return np.asarray(np.abs(model.functionals.decided(weights)) * extent(model.problem.control))
 
 
 def _sum_other_contributions(
@@ -212,11 +212,11 @@ def _sum_other_contributions(
     functionals, free = model.functionals, np.abs(weights.free)
     sizes = free @ np.abs(model.response.initial_state)
     if model.problem.initial_set is not None:
-        sizes += free @ _bound_components(model.problem.initial_set)
+        sizes += free @ extent(model.problem.initial_set)
     sizes += np.einsum("klm,ml->k", np.abs(weights.control), np.abs(functionals.known))
     if functionals.execution is not None:
         lengths = functionals.execution.lengths(times, functionals.execution.seen(directions, parameters))
-        sizes += INTEGRATED * (lengths @ np.repeat(_bound_components(model.problem.control), model.control.pieces))
+        sizes += INTEGRATED * (lengths @ np.repeat(extent(model.problem.control), model.control.pieces))
     return np.asarray(sizes + _sum_disturbance_contributions(model, weights.disturbance, times, directions, parameters))
 
 
@@ -227,7 +227,7 @@ def _sum_disturbance_contributions(
     mw)``."""
     if model.problem.disturbance is None:
         return np.zeros(times.size)
-    sizes: Array = (np.abs(on_noise) @ _bound_components(model.problem.disturbance)).sum(axis=1)
+    sizes: Array = (np.abs(on_noise) @ extent(model.problem.disturbance)).sum(axis=1)
     measurable = model.functionals.measurable
     if measurable is None:
         return sizes
@@ -280,21 +280,15 @@ def _bound_sign_error(model: Transcription, result: Result) -> float:
     sides, remaining = np.split(result.dual.z[controls * pieces :], [h.size * pieces])
     error = float(np.maximum(-sides, 0.0).reshape(h.size, pieces).sum(axis=1) @ np.maximum(bound.support(-H), 0.0))
     # of opposite sides of a set without interior multipliers may be as large as they like
-    error += SHARE * float(np.abs(sides).reshape(h.size, pieces).sum(axis=1) @ (np.abs(H) @ _bound_components(bound)))
+    error += SHARE * float(np.abs(sides).reshape(h.size, pieces).sum(axis=1) @ (np.abs(H) @ extent(bound)))
     steps = Steps.of(model.problem, model.control)
     if steps.count:
         own = remaining[: steps.upper.size * steps.times.size]  # what follows bounds sizes from both sides
         step_multipliers, magnitudes = (
             own.reshape(steps.upper.size, steps.times.size),
-            2.0 * np.abs(steps.H) @ _bound_components(bound),
+            2.0 * np.abs(steps.H) @ extent(bound),
         )
         wrong_signs = np.where(np.isfinite(steps.upper), 0.0, np.maximum(step_multipliers, 0.0).sum(axis=1))
         wrong_signs += np.where(np.isfinite(steps.lower), 0.0, np.maximum(-step_multipliers, 0.0).sum(axis=1))
         error += float((wrong_signs + SHARE * np.abs(step_multipliers).sum(axis=1)) @ magnitudes)
     return error
-
-
-def _bound_components(convex: ConvexSet) -> Array:
-    """Return the largest absolute value of each component of a bounded set, ``(d,)``."""
-    axes = np.eye(convex.dimension)
-    return np.maximum(np.abs(convex.support(axes)), np.abs(convex.support(-axes)))

@@ -115,16 +115,12 @@ def from_nothing(program: FiniteProgram, accuracy: float, points: int) -> tuple[
             continue
         solution = measure(program, near.x, near.y, near.mu, message="dual Newton")
         x, y, mu = solution.x, solution.y, solution.mu
-        is_better = _measure_error(solution) < 0.5 * _measure_error(best)
+        is_better = solution.error < 0.5 * best.error
         best, idle = (solution, 0) if is_better else (best, idle + 1)
         if best.residual <= accuracy and best.gap <= max(0.1 * accuracy, _estimate_rounding(best)):
             break
         weight = max(LIGHTER * weight, LIGHTEST * cost)
     return best, number
-
-
-def _measure_error(solution: FiniteSolution) -> float:
-    return solution.residual + max(solution.gap, 0.0)
 
 
 @shaped

@@ -125,7 +125,7 @@ class _Case:
             if self.blunt is None or solution.gap < self.blunt.gap:
                 self.blunt = believed
             return None
-        if self.best is None or _measure_error(solution) < _measure_error(self.best):
+        if self.best is None or solution.error < self.best.error:
             self.best = solution
         self.attempts.append(
             f"{name}: {solution.message}; not believed: residual {solution.residual:.1e}, gap {solution.gap:.1e}"
@@ -399,7 +399,7 @@ def _refine_digits(case: _Case, claim: Claim | None) -> FiniteSolution | None:
                 if believed:  # digits are what was asked for: of those that are believed, the one that misses least
                     return min(believed, key=lambda solution: solution.residual)
                 before = badness
-                badness = min([badness, *(_measure_error(solution) for _, solution in candidates)])
+                badness = min([badness, *(solution.error for _, solution in candidates)])
                 if badness > 0.5 * before or case.given_up:
                     break
         except Exception as error:  # noqa: BLE001  as in `_ask_solver`
@@ -614,7 +614,3 @@ def _describe_errors(solution: FiniteSolution) -> str:
     side = "above" if solution.gap >= 0.0 else "below"  # where it misses its rows
     bound = "has no lower bound" if solution.gap == np.inf else f"is {abs(solution.gap):.1e} {side} its lower bound"
     return f"misses its rows by {solution.residual:.1e} and {bound}"
-
-
-def _measure_error(solution: FiniteSolution) -> float:
-    return solution.residual + max(solution.gap, 0.0)
