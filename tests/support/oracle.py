@@ -58,7 +58,7 @@ SOLVED = 1e-9  # the tolerance that HiGHS is given; ten times smaller is refused
 KEPT = 1e-7  # of a bound, by how much a row may be missed that is not imposed; ten times more is seen in a cost
 INTEGER = 5e-6  # the same of a program in integers, whose values HiGHS rounds by about as much
 ROUNDS, CUTS = 400, 60  # of a program whose rows are added as they are violated, and rows at once
-ANSWERED = 24  # such rounds under feedback: most pairs end before, in some seconds; others take minutes
+ANSWERED = 100  # such rounds under feedback: where many policies cost the same, each row is met by another one
 AGREED = 2e-6  # of a cost: `KEPT` times the multipliers of rows, some ten in sum; with ten times more much is missed
 NEAR = 1e-7  # of a cost: tangents of its curved terms are added until they are as near as this
 
