@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, final
 import numpy as np
 
 from sparserob_core.control.constraints.control import before, differences
+from sparserob_core.control.enclosures.matrix_exponential import rounding
 from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.control.problem.units import power_of_two
@@ -117,29 +118,31 @@ def refuse_without_steps(problem: OptimalControlProblem, dictionary: Dictionary)
 
     A control that never changes takes steps of 0. So the check is made only where 0 is no admissible step, or where the
     control before time 0 is outside the set. The check uses cutting planes (Kelley 1960). A refusal rests on tangents
-    of the sets, and on the word of HiGHS that these cannot hold together.
+    of the sets, and on multipliers that show that these cannot hold together (Farkas' lemma).
     """
     step, m = problem.control_step, problem.system.controls
     start = before(problem)
     may_stay = step is None or bool(step.contains(np.zeros(m)))
     if step is None or (may_stay and (start is None or bool(problem.control.contains(start)))):
         return
-    K, units = 1 if may_stay else dictionary.pieces, power_of_two(problem.control.reach(np.eye(m)))
+    reach = problem.control.reach(np.eye(m))
+    K, units = 1 if may_stay else dictionary.pieces, power_of_two(reach)
     steps = differences(K, start is not None).toarray().T
     first = np.zeros((len(steps), m)) if start is None else np.vstack([-start / units, np.zeros((K - 1, m))])
     constraints = [(problem.control.in_units(units), np.eye(K), np.zeros((K, m))), (step.in_units(units), steps, first)]
-    if _has_infeasible_tangents(constraints, K, m):
+    if _has_infeasible_tangents(constraints, np.tile(reach / units, K)):
         condition = "" if start is None else f" and begins at the initial_control {start.tolist()}"
         raise InputError(f"no control that stays in its set{condition} changes by such steps only", path="control_step")
 
 
-def _has_infeasible_tangents(held: list[tuple[ConvexSet, Array, Array]], K: int, m: int) -> bool:
-    """Return whether HiGHS finds that no ``u (K, m)`` has every row of ``M u + offset`` within tangents of its set, for
-    all ``(set, M, offset)``."""
+def _has_infeasible_tangents(held: list[tuple[ConvexSet, Array, Array]], reach: Array) -> bool:
+    """Return whether multipliers show that no ``u (K, m)``, with entries of at most ``reach (K m,)``, has every row of
+    ``M u + offset`` within tangents of its set, for all ``(set, M, offset)``."""
     from scipy.optimize import linprog
 
     rows: list[Array] = []
     heights: list[float] = []
+    m, n = held[0][0].dimension, reach.size
     axes = np.vstack([np.eye(m), -np.eye(m)])
     cuts = [(convex, M, offset, index, c) for convex, M, offset in held for index in range(len(M)) for c in axes]
     for _ in range(MOST_CUTS):
@@ -148,12 +151,14 @@ def _has_infeasible_tangents(held: list[tuple[ConvexSet, Array, Array]], K: int,
             if np.isfinite(height):
                 rows.append(np.kron(M[index], c))
                 heights.append(height - float(c @ offset[index]))
-        solution = linprog(np.zeros(K * m), rows, heights, bounds=(None, None), method="highs")
-        if solution.status == 2:
-            return True
+        wider = np.column_stack([rows, -np.ones(len(rows))])  # the last variable: by how much rows are missed
+        limits = [(None, None)] * n + [(0.0, None)]
+        solution = linprog(np.eye(n + 1)[-1], wider, heights, bounds=limits, method="highs")
         if solution.x is None:
             return False
-        points = [(convex, M, offset, M @ solution.x.reshape(K, m) + offset) for convex, M, offset in held]
+        if _contradict(np.array(rows), np.array(heights), np.maximum(-solution.ineqlin.marginals, 0.0), reach):
+            return True
+        points = [(convex, M, offset, M @ solution.x[:-1].reshape(-1, m) + offset) for convex, M, offset in held]
         cuts = []
         for convex, M, offset, at in points:
             flat = convex.halfspaces()
@@ -164,3 +169,11 @@ def _has_infeasible_tangents(held: list[tuple[ConvexSet, Array, Array]], K: int,
         if not cuts:
             return False
     return False
+
+
+def _contradict(rows: Array, heights: Array, multipliers: Array, reach: Array) -> bool:
+    """Return whether nonnegative ``multipliers (r,)`` prove that no ``u`` with entries of at most ``reach (n,)`` has
+    ``rows u <= heights``: the sum of the rows is then above that of the heights for every such ``u``."""
+    slopes, height = multipliers @ rows, float(multipliers @ heights)
+    rounded = rounding(len(rows) + 8) * float(multipliers @ (np.abs(rows) @ reach + np.abs(heights)))
+    return height + float(np.abs(slopes) @ reach) + rounded < 0.0
