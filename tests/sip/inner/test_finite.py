@@ -170,6 +170,23 @@ def test_the_elastic_value_is_the_relaxation_that_makes_the_program_feasible():
     assert solve_finite(replace(program, h=program.h + less), PIQP).status == "infeasible"
 
 
+def test_what_a_solver_gives_up_is_proven_infeasible_before_it_is_asked_for_more_digits():
+    """A program that is infeasible by little keeps an interior-point method busy; a vertex of the elastic program has
+    the proof, and nobody asks the solver again."""
+    asked = []
+
+    class Lost(sr.Solver):
+        def solve(self, program, accuracy):
+            asked.append(accuracy)
+            return replace(PIQP.solve(program, accuracy), status="failed", message="lost")
+
+    program = regularised(robust_terminal(spread=2.0), 1e-2)
+    value = solve_finite(program, PIQP).infeasibility
+    solution = solve_finite(program, Lost())
+    assert (solution.status, solution.by, len(asked)) == ("infeasible", "highs", 1)
+    assert solution.infeasibility == pytest.approx(value, rel=1e-6)
+
+
 def test_infeasibility_is_proven_by_the_multipliers_that_come_with_it():
     for instance in infeasible_instances():
         solution = solve_finite(instance.program, PIQP)
