@@ -351,7 +351,7 @@ class WorstRow:
         return np.asarray(curvature + total)
 
     def enclosed(self, lower: Array, upper: Array) -> Array:
-        """Proven upper bounds ``(k,)`` on cells of times ``(k,)``, each between two `cuts`."""
+        """Upper bounds ``(k,)`` on cells of times ``(k,)``, each between two `cuts`; but for `lost` they are proven."""
         ends, indices = np.unique(np.concatenate([lower, upper]), return_inverse=True)
         count, middles = lower.size, (lower + upper) / 2
         if self.beside is None:
