@@ -67,6 +67,26 @@ def test_all_that_is_beyond_the_degree_is_needed_at_a_corner_and_no_more_is_adde
     assert (radii <= beyond * (1 + 1e-6)).all()
 
 
+@pytest.mark.parametrize(("count", "degree"), [(0, 0), (1, 1), (1, 4), (2, 2), (2, 3)])
+@pytest.mark.parametrize("dense", [True, False])
+def test_a_sum_of_products_is_what_the_products_add_up_to(count, degree, dense):
+    """Whether factors have all coefficients, and are one matrix, or few, and are multiplied one by one."""
+    rng, known = np.random.default_rng(7), Monomials(count, degree)
+    with ctx.workprec(96):
+        lefts, rights = ([random(rng, known, shape, wide=1e-9)[0] for _ in range(3)] for shape in ((3, 2), (2, 4)))
+        if not dense:
+            lefts = [Series(known, [*one.parts[:-1], one.parts[-1] * 0]) for one in lefts]
+        found = dot(lefts, rights)
+        terms = [left * right for left, right in zip(lefts, rights, strict=True)]
+        truth = terms[0] + terms[1] + terms[2]
+        assert found.size == pytest.approx(truth.size, rel=1e-7)  # radii have thirty bits
+        for ours, theirs in zip(found.parts, truth.parts, strict=True):
+            for a, b in zip(ours.entries(), theirs.entries(), strict=True):
+                assert a.overlaps(b)
+                assert float(a.mid()) == pytest.approx(float(b.mid()), abs=1e-12)
+                assert float(a.rad()) == pytest.approx(float(b.rad()), rel=1e-7, abs=1e-20)
+
+
 def test_factors_of_which_most_is_nothing_lose_nothing_either():
     known = Monomials(2, 2)
     with ctx.workprec(96):
