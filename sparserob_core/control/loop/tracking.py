@@ -18,8 +18,10 @@ from sparserob_core.control.constraints.flat import FlatConstraint
 from sparserob_core.control.feedback.innovations import KNOWN
 from sparserob_core.control.transcription.record import Transcription
 from sparserob_core.sip.convex_set import Array
+from sparserob_core.sip.finite import FiniteProgram
+from sparserob_core.sip.inner.duality import dual_bound
+from sparserob_core.sip.inner.simplex.counterpart import Growing
 from sparserob_core.sip.program import TOLERANCE
-from sparserob_core.sip.relaxed.warm import WarmProgram
 
 PARTS, LEVELS = 32, 3  # a cell that is open is cut in so many parts, so many times
 SHARP = 2  # the level on which the instant of a new row lies at least
@@ -177,21 +179,27 @@ class Tracking:
         self._start_program()
 
     def _start_program(self) -> None:
-        self._program = WarmProgram(*self.limits)
+        """Begin with a program without rows, whose columns are the positive and the negative parts of the control."""
+        weights, low, high = self.limits
+        self._program = Growing()
+        for reach in (high, -low):
+            self._program.variables(np.zeros(reach.size), np.maximum(reach, 0.0), weights)
         self._row_instants: list[tuple[int, int, int, int]] = []  # row, piece, level and number of an instant
-        self._state_rows, self._right_hand_sides = np.zeros((0, self.H.shape[1])), np.zeros(0)
+        self._input_rows, self._state_rows = np.zeros((0, weights.size)), np.zeros((0, self.H.shape[1]))
+        self._right_hand_sides = np.zeros(0)
 
     def solve(self, state: Array) -> Tracked | None:
         """Return the answer from an initial state; ``None`` where none was proven."""
         if len(self._row_instants) > KEPT:
             self._drop_idle_rows()
-        nominal = self._propagate_uncontrolled(state)
+        nominal, (weights, low, high) = self._propagate_uncontrolled(state), self.limits
         for round_ in range(ROUNDS):
             h = self._right_hand_sides - self._state_rows @ state
-            solution = self._program.solve(h - MARGIN)
-            if solution is None:
+            self._program.limit(np.arange(h.size), h - MARGIN)
+            solved, _, parts, y = self._program.solve()
+            if not solved:
                 return None
-            x, y = solution
+            x = np.clip(parts[: low.size] - parts[low.size :], low, high)
             open_instants = self._find_unproven_instants(x, *nominal)
             if open_instants is None:
                 return None
@@ -200,8 +208,9 @@ class Tracking:
                     *self._recent_instants,
                     *(self._row_instants[i] for i in np.flatnonzero(y > 0.0)),
                 ][-RECENT:]
-                weights = self.limits[0]
-                return Tracked(x, float(weights @ np.abs(x)), self._program.bound(h, y))
+                q, A, b = np.zeros(low.size), np.zeros((0, low.size)), np.zeros(0)
+                program = FiniteProgram(q, weights, low, high, self._input_rows, h, A, b)
+                return Tracked(x, float(weights @ np.abs(x)), dual_bound(program, y, b))
             new_instants = [instant for instant in open_instants if instant not in self._row_instants]
             if not new_instants:
                 return None
@@ -209,11 +218,10 @@ class Tracking:
         return None
 
     def _drop_idle_rows(self) -> None:
-        """Remove the rows without a multiplier in the last solutions."""
-        needed = set(list(dict.fromkeys(self._recent_instants))[-KEPT // 2 :])
-        kept = self._program.keep(np.array([instant in needed for instant in self._row_instants], dtype=bool))
-        self._row_instants = [self._row_instants[i] for i in np.flatnonzero(kept)]
-        self._state_rows, self._right_hand_sides = self._state_rows[kept], self._right_hand_sides[kept]
+        """Begin anew with the rows that had a multiplier in the last solutions."""
+        needed = list(dict.fromkeys(reversed(self._recent_instants)))[: KEPT // 2]
+        self._start_program()
+        self._impose_rows(needed)
 
     def _bisect_instants(self, fresh: list[tuple[int, int, int, int]]) -> list[tuple[int, int, int, int]]:
         """Return instants halfway from new rows to the next rows on both sides. Without them, a peak between two rows
@@ -228,7 +236,7 @@ class Tracking:
         ]
 
     def _impose_rows(self, places: list[tuple[int, int, int, int]]) -> None:
-        G, F, right = [], [], []
+        inputs, F, right = list[Array](), list[Array](), list[float]()
         for row, piece, level, number in places:
             c, input_row, support_value = self.H[row], np.zeros(self.H.shape[1]), self._support_values[piece, row]
             if level:
@@ -242,11 +250,15 @@ class Tracking:
             g = (c @ self.nodes[piece]).reshape(self.m, self.K)
             if level:
                 g[:, piece] += input_row @ self.B
-            G.append(g.ravel())
+            inputs.append(g.ravel())
             F.append(c @ self.powers[piece])
             right.append(self.h[row] - c @ self.fixed[piece] - input_row @ self.drift - support_value)
-        self._program.add(np.array(G))
-        self._state_rows = np.vstack([self._state_rows, F])
+        G = np.array(inputs).reshape(-1, self._input_rows.shape[1])
+        (at, column), free = np.indices(G.shape).reshape(2, -1), np.full(len(G), np.inf)
+        entries = [(at, column, G.ravel()), (at, column + G.shape[1], -G.ravel())]
+        self._program.rows(entries, -free, free)
+        self._input_rows = np.vstack([self._input_rows, G])
+        self._state_rows = np.vstack([self._state_rows, *F])
         self._right_hand_sides = np.concatenate([self._right_hand_sides, right])
         self._row_instants += places
 

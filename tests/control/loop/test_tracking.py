@@ -1,20 +1,17 @@
-"""Guards control/loop/tracking and sip/relaxed/warm: the quick way from one initial state to the next proves what
+"""Guards control/loop/tracking: the quick way from one initial state to the next proves what
 the long way proves, and claims no more."""
 
 from __future__ import annotations
-
-from unittest.mock import patch
 
 import numpy as np
 import pytest
 
 import sparserob_core as sr
-from sparserob_core.control.loop.tracking import PARTS, SHARP, Tracking, trackable
+from sparserob_core.control.loop.tracking import KEPT, PARTS, SHARP, Tracking, trackable
 from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.transcription.transcribe import from_state, in_own_units, prepare
 from sparserob_core.sip.program import TOLERANCE
 from sparserob_core.sip.proof.branch_and_bound import prove
-from sparserob_core.sip.relaxed.warm import WarmProgram
 
 
 def spring(pieces=40, disturbance=None, **more) -> object:
@@ -126,63 +123,24 @@ def test_from_where_nothing_is_feasible_it_says_nothing() -> None:
 
 def test_many_states_do_not_let_it_grow() -> None:
     own, units = spring(pieces=12)
-    tracking, rng = Tracking(own), np.random.default_rng(3)
+    tracking, rng, largest = Tracking(own), np.random.default_rng(3), 0
     for _ in range(60):
-        assert tracking.solve((np.array([-1, 1]) + 0.1 * rng.uniform(-1, 1, 2)) / units.states) is not None
-    assert len(tracking._row_instants) < 100
+        state = (np.array([-1, 1]) + 0.1 * rng.uniform(-1, 1, 2)) / units.states
+        found, began = tracking.solve(state), Tracking(own).solve(state)
+        assert found is not None and began is not None
+        assert found.lower <= began.cost + 1e-12 and began.lower <= found.cost + 1e-12
+        largest = max(largest, len(tracking._row_instants))
+    assert KEPT < largest < 100
+    assert len(tracking._row_instants) == tracking._program.count
+
+
+def test_without_a_row_that_mattered_it_begins_with_none() -> None:
+    tracking = Tracking(spring()[0])
+    tracking._impose_rows([(0, piece, 0, 0) for piece in range(1, 40)])
+    tracking._drop_idle_rows()
+    assert not tracking._row_instants and not tracking._program.count and not tracking._state_rows.size
 
 
 def test_what_it_does_not_know_it_leaves_to_the_exchange() -> None:
     assert not trackable(spring(control_step=sr.Box([-0.2], [0.2]))[0])
     assert not trackable(spring(initial_set=sr.Box([-0.1, -0.1], [0.1, 0.1]))[0])
-
-
-def test_rows_that_are_not_active_are_left_out_and_the_optimum_stays() -> None:
-    rng = np.random.default_rng(5)
-    warm, G = WarmProgram(rng.uniform(0.5, 2, 12), -np.ones(12), np.ones(12)), rng.standard_normal((9, 12))
-    warm.add(G)
-    h = rng.uniform(-1.5, 2.0, 9)
-    x, y = warm.solve(h)
-    kept = warm.keep(np.arange(9) == 3)
-    assert kept[3]
-    assert kept[y > 0.0].all()
-    assert 2 <= kept.sum() < 9
-    with patch.object(WarmProgram, "_find_step_end", side_effect=AssertionError):  # the basis is one of what is left
-        again, multipliers = warm.solve(h[kept])
-    assert again == pytest.approx(x, abs=1e-9)
-    assert multipliers == pytest.approx(y[kept], abs=1e-9)
-    warm.add(G[~kept])
-    right = np.concatenate([h[kept], h[~kept]])
-    assert warm.bound(right, warm.solve(right)[1]) == pytest.approx(warm.weights @ np.abs(x), abs=1e-9)
-
-
-def test_rows_that_were_never_solved_or_have_no_solution_are_left_out_too() -> None:
-    for begun in (False, True):
-        warm = WarmProgram(np.ones(2), -np.ones(2), np.ones(2))
-        warm.add(np.array([[1.0, 0.0], [0.0, 1.0], [-1.0, 0.0]]))
-        if begun:
-            assert warm.solve(np.array([-2.0, 0.0, 0.0])) is None
-        warm.add(np.array([[0.0, -1.0]]))
-        kept = warm.keep(np.array([False, True, False, True]))
-        assert kept[[1, 3]].all()
-        x, y = warm.solve(np.array([0.0, 1.0, 0.0, -0.5])[kept])
-        assert x == pytest.approx([0.0, 0.5], abs=1e-9)
-        assert warm.bound(np.array([0.0, 1.0, 0.0, -0.5])[kept], y) == pytest.approx(0.5, abs=1e-9)
-
-
-def test_the_bound_of_a_linear_program_is_its_optimum() -> None:
-    from scipy.optimize import linprog
-
-    rng = np.random.default_rng(4)
-    n = 12
-    weights, low, high = rng.uniform(0.5, 2, n), -rng.uniform(0.5, 2, n), rng.uniform(0.5, 2, n)
-    warm, G = WarmProgram(weights, low, high), rng.standard_normal((5, n))
-    warm.add(G)
-    for _ in range(5):
-        h = -rng.uniform(0.0, 1.0, 5)
-        x, y = warm.solve(h)
-        plain = linprog(np.tile(weights, 2), np.hstack([G, -G]), h, bounds=[(0, u) for u in (*high, *-low)])
-        assert weights @ np.abs(x) == pytest.approx(plain.fun, abs=1e-9)
-        assert warm.bound(h, y) == pytest.approx(plain.fun, abs=1e-9)
-        assert warm.bound(h, y) <= plain.fun
-        assert warm.bound(h, rng.uniform(0, 1, 5)) <= plain.fun
