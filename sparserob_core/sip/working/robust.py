@@ -492,7 +492,6 @@ class RobustRows(Working):
             active_indices = {cut.index.tobytes(): cut.index for cut in answer.active if cut.family == family.name}
             start = np.zeros((0, family.index_set.dimension)) if family.start is None else family.start
             working.add(family, np.array(list(active_indices.values())) if active_indices else start)
-        violated: Violated = ()
         for number in range(1, CHOOSING + 1):
             if tools.deadline.passed:
                 return None
@@ -502,7 +501,8 @@ class RobustRows(Working):
             x = np.clip(solution.x, second.finite.lower, second.finite.upper)
             x = x if second.settle is None else second.settle(x)
             violated = [above(*pair) for pair in separate(second, x, tools, ALLOWED, number)]
-            if not (working.impose([*violated, *self._find_violated(second, x)]) or counterpart.sharpen(x)):
+            violated += self._find_violated(second, x)
+            if not (working.impose(violated) or counterpart.sharpen(x)):
                 break
         self.calls += working.calls
         self._record_calls(ledger)
@@ -510,7 +510,7 @@ class RobustRows(Working):
             return None
         return x[:shared] if program.settle is None else program.settle(x[:shared])
 
-    def _find_violated(self, second: SemiInfiniteProgram, x: Array) -> Violated:
+    def _find_violated(self, second: SemiInfiniteProgram, x: Array) -> list[tuple[Array, np.ndarray, str]]:
         """Return the indices imposed here that a decision of the ``second`` program violates."""
         violated = []
         for family in second.families:
