@@ -17,7 +17,7 @@ import numpy as np
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.events import ignore
 from sparserob_core.sip.evidence import Cut, Dual, InfeasibleSubsystem
-from sparserob_core.sip.finite import INTERIOR, FiniteSolution
+from sparserob_core.sip.finite import FiniteSolution
 from sparserob_core.sip.inner.central.interior import Interior
 from sparserob_core.sip.inner.simplex.counterpart import Counterpart, RobustAnswer, robust_bound
 from sparserob_core.sip.method import Tools
@@ -115,20 +115,16 @@ class RobustRows(Working):
         central, solver = Interior(program.finite, program.spread), ledger.relaxed.counted
         working = RobustRows(program, counterpart=central, close=close, tolerance=ledger.tolerance)
         working.asked = None if solver.instead is None else solver
-        if working.asked is not None or program.guide is not None or not central.many:
-            working.by_simplex()
         for family in program.families:
             assert family.start is not None
             working.add(family, family.start)
-        if not (isinstance(working.counterpart, Interior) and central.fits()):
+        if working.asked is not None or program.guide is not None or not central.fits():
             working.by_simplex()
         ledger.improve(working.at_rest)
         return working
 
     def by_simplex(self) -> None:
         """Continue with the simplex method, which solves every counterpart, or with the named solver."""
-        if isinstance(self.counterpart, Counterpart):
-            return
         blocks = self.counterpart.blocks
         self.counterpart = Counterpart(self.program.finite, self.counterpart.spread, asked=self.asked)
         for block in blocks:
@@ -151,13 +147,9 @@ class RobustRows(Working):
         RobustAnswer
             The answer.
         """
-        if isinstance(self.counterpart, Interior):
-            answer = self.counterpart.solve(margin, accuracy, seconds)
-            self.calls[INTERIOR] += 1
-        else:
-            before = Counter(self.counterpart.answered)
-            answer = self.counterpart.solve(margin, accuracy, seconds)
-            self.calls += self.counterpart.answered - before
+        before = Counter(self.counterpart.answered)
+        answer = self.counterpart.solve(margin, accuracy, seconds)
+        self.calls += self.counterpart.answered - before
         return answer
 
     def relax(self, ledger: Ledger, prover: Prover, last: bool) -> Answer | Result:

@@ -13,13 +13,14 @@ slacks of the size of the violation are in the middle, and the next solve begins
 from __future__ import annotations
 
 import time
+from collections import Counter
 from dataclasses import dataclass, field
 from typing import cast, final
 
 import numpy as np
 
 from sparserob_core.sip.convex_set import Array
-from sparserob_core.sip.finite import FiniteProgram, Spread, UncertainRows
+from sparserob_core.sip.finite import INTERIOR, FiniteProgram, Spread, UncertainRows
 from sparserob_core.sip.inner.central.elimination import Eliminated, Left, State, cholesky, eliminate
 from sparserob_core.sip.inner.central.layout import Block, Layout
 from sparserob_core.sip.inner.simplex.counterpart import RobustAnswer
@@ -49,11 +50,12 @@ Iterate = tuple[float, Array, Array, Array, Array, Array, Array, Array, Array]
 @dataclass(eq=False)
 class Interior:
     """Uncertain rows over one program and one box of deviations, to which rows are added; every solve begins where the
-    last one ended."""
+    last one ended. ``answered``: how many answers there were."""
 
     program: FiniteProgram
     spread: Spread
     steps: int = 0
+    answered: Counter[str] = field(default_factory=Counter)
     blocks: list[UncertainRows] = field(default_factory=list)
 
     def __post_init__(self) -> None:
@@ -77,11 +79,6 @@ class Interior:
         """Always true: the accuracy of an answer can be chosen."""
         return True
 
-    @property
-    def many(self) -> bool:
-        """True where the program has so many variables that this method may be faster than the simplex method."""
-        return self._layout.many
-
     def fits(self) -> bool:
         """Return whether this method can solve the program, and is worth it.
 
@@ -99,6 +96,7 @@ class Interior:
     def solve(self, margin: float, accuracy: float, seconds: float = np.inf) -> RobustAnswer:
         """Return the optimum with every row tightened by ``margin``, to about ``accuracy`` in the cost. It is not
         solved where ``seconds`` do not suffice, and says how far it has come."""
+        self.answered[INTERIOR] += 1
         until = time.monotonic() + seconds
         if self._is_initialised and margin != self._margin:
             self._change_margin(margin)

@@ -205,11 +205,6 @@ class Layout:
             block.alone = np.bincount(block.of, minlength=block.last - block.first) <= 1
         self.groups.append(Group(tuple(blocks), parts))
 
-    @property
-    def many(self) -> bool:
-        """True where the program has at least `WORTH` variables."""
-        return self.program.n >= WORTH
-
     def fits(self) -> bool:
         """Return whether the interior point method suits the program: many answering variables, and small blocks of
         them.
@@ -218,7 +213,7 @@ class Layout:
         plain coefficients of answering variables. The rows are arranged for the answer.
         """
         program = self.program
-        if not self.count or not self.many or program.b.size or program.P is not None or program.S is not None:
+        if not self.count or program.n < WORTH or program.b.size or program.P is not None or program.S is not None:
             return False
         if program.G.shape[0] or not (program.lower < program.upper).all():
             return False
