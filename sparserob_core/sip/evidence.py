@@ -79,8 +79,8 @@ NO_BOUND = Dual(-np.inf, (), np.zeros(0))
 class InfeasibleSubsystem:
     """Reasons for infeasibility, one sentence each.
 
-    Either ``reasons`` holds sentences each of which suffices alone, or ``members`` is an irreducible infeasible
-    subsystem (Chinneck and Dravnieks 1991): constraints that cannot hold together.
+    Either ``reasons`` holds sentences each of which suffices alone, or ``members`` are constraints that cannot hold
+    together: an irreducible infeasible subsystem (Chinneck and Dravnieks 1991) where ``irreducible`` is true.
 
     Parameters
     ----------
@@ -100,7 +100,7 @@ class InfeasibleSubsystem:
     decides : str, default "decision"
         Name of the decision in the field of the problem.
     irreducible : bool, default True
-        Whether every member is needed.
+        Whether a decision was found for the members without any one of them.
     """
 
     reasons: tuple[str, ...] = ()

@@ -18,14 +18,15 @@ from sparserob_core.sip.relaxed.relaxed import RelaxedProgram, Rows
 MANY = 40
 
 
-def irreducible(relaxed: RelaxedProgram, rows: Rows, solution: FiniteSolution) -> tuple[Rows, FiniteSolution]:
+def irreducible(relaxed: RelaxedProgram, rows: Rows, solution: FiniteSolution) -> tuple[Rows, FiniteSolution, bool]:
     """Return rows that cannot hold together, none of which was found to be dispensable, with multipliers as a proof.
 
     A constraint that is impossible by itself, or two constraints that leave nothing between them, are returned at once
     (`reasons`). Otherwise the deletion filter (Chinneck and Dravnieks 1991) is applied. The filter leaves every row out
     once, the least important first. A row stays out if the others are infeasible without it. A row that was needed
-    stays needed when others are removed. The multipliers prove that the rows cannot hold together. That all but any one
-    of them can is not proven: a row also stays where no proof of infeasibility was found without it.
+    stays needed when others are removed. The multipliers prove that the rows cannot hold together. A row also stays where
+    neither a decision nor a proof of infeasibility was found without it. Then all but any one of the rows need not be
+    feasible.
 
     Parameters
     ----------
@@ -42,27 +43,30 @@ def irreducible(relaxed: RelaxedProgram, rows: Rows, solution: FiniteSolution) -
         Rows of the subsystem.
     solution : FiniteSolution
         Solution with the multipliers that prove it.
+    shown : bool
+        Whether a decision was found for the rows without any one of them.
     """
     fixed = relaxed.program.finite.h.size
     plain = _find_evident_reason(relaxed, solution)
     if plain is not None:
-        return plain
+        return *plain, False
     solution = _move_to_vertex(relaxed, rows, solution)
     y = solution.y[fixed:]
     support = np.flatnonzero(y > 0.0)
     rows, y = rows.take(support), y[support]
-    needed = np.zeros(y.size, dtype=bool)
+    needed, shown = np.zeros(y.size, dtype=bool), True
     while not needed.all() and y.size > 1:
         position = int(np.flatnonzero(~needed)[np.argmin(y[~needed])])
         keep = np.arange(y.size) != position
         without = relaxed.solve(rows.take(keep), 0.0)
         if without.status != "infeasible":
             needed[position] = True
+            shown = shown and without.status == "optimal"
             continue
         solution, y = without, without.y[fixed:]
         rows, needed, positive = rows.take(keep), needed[keep], y > 0.0
         rows, needed, y = rows.take(positive), needed[positive], y[positive]
-    return rows, replace(solution, y=np.concatenate([solution.y[:fixed], y]))
+    return rows, replace(solution, y=np.concatenate([solution.y[:fixed], y])), shown
 
 
 def _move_to_vertex(relaxed: RelaxedProgram, rows: Rows, solution: FiniteSolution) -> FiniteSolution:

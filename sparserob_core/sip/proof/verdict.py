@@ -221,7 +221,7 @@ def explained(program: SemiInfiniteProgram, bare: WorstConstraint) -> WorstConst
 
 
 def infeasible_subsystem(
-    program: SemiInfiniteProgram, rows: Rows, y: Array, amount: float
+    program: SemiInfiniteProgram, rows: Rows, y: Array, amount: float, shown: bool
 ) -> tuple[InfeasibleSubsystem, WorstConstraint | None]:
     """Return the reasons for infeasibility, and the most important constraint.
 
@@ -239,6 +239,8 @@ def infeasible_subsystem(
         Farkas multipliers of the fixed rows, then of ``rows``.
     amount : float
         Proven infeasibility, in multiples of the norms of the rows.
+    shown : bool
+        Whether a decision was found for the rows without any one of them.
 
     Returns
     -------
@@ -272,7 +274,8 @@ def infeasible_subsystem(
         return InfeasibleSubsystem(amount=amount, equalities=equalities), None
     order = active[np.argsort(-multipliers[active], kind="stable")]
     worst = _make_worst_constraint(program, rows.cuts[order[0]], amount)
-    return _describe_subsystem(program, rows, multipliers, order, amount), worst
+    subsystem = _describe_subsystem(program, rows, multipliers, order, amount)
+    return replace(subsystem, irreducible=shown), worst
 
 
 def _describe_subsystem(

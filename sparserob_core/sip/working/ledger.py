@@ -347,10 +347,11 @@ class Ledger:
             return self.result("failed", solution.message, answer)
         from sparserob_core.sip.proof.irreducible import irreducible
 
-        rows, solution = irreducible(self.relaxed, answer.rows, solution)
+        rows, solution, shown = irreducible(self.relaxed, answer.rows, solution)
         answer = replace(answer, rows=rows, solution=solution)
-        subsystem, worst = infeasible_subsystem(self.relaxed.program, rows, solution.y, solution.infeasibility)
-        self.dual = self.relaxed.dual(rows, solution.y, solution.mu, solution.z, solution.infeasibility, priced=False)
+        amount = solution.infeasibility
+        subsystem, worst = infeasible_subsystem(self.relaxed.program, rows, solution.y, amount, shown)
+        self.dual = self.relaxed.dual(rows, solution.y, solution.mu, solution.z, amount, priced=False)
         return replace(self.result("infeasible", subsystem.sentence(), answer, worst), infeasible=subsystem)
 
     def salvaged(self, failed: Result) -> Result:

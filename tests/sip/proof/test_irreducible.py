@@ -14,6 +14,7 @@ import sparserob_core as sr
 from sparserob_core.experiment.figures.clash import clash_strips, draw_clash
 from sparserob_core.sip.evidence import InfeasibleSubsystem
 from sparserob_core.sip.proof.irreducible import irreducible
+from sparserob_core.sip.proof.verdict import infeasible_subsystem
 from sparserob_core.sip.relaxed.relaxed import RelaxedProgram, Rows, rows_at
 from tests.support.places import CONFIGS
 
@@ -60,7 +61,8 @@ def test_without_any_one_row_of_a_clash_something_is_feasible(seed):
     program, rows = half_spaces(seed)
     assert not feasible(rows, 3.0)
     relaxed = RelaxedProgram(program, sr.load_registry().build("solver", "piqp", {}))
-    kept, solution = irreducible(relaxed, rows, relaxed.solve(rows, 0.0))
+    kept, solution, shown = irreducible(relaxed, rows, relaxed.solve(rows, 0.0))
+    assert shown
     count = kept.h.size
     assert 1 <= count <= 5
     assert not feasible(kept, 3.0)
@@ -89,13 +91,31 @@ def test_a_proof_by_many_rows_is_made_one_of_few_before_any_is_left_out() -> Non
     relaxed = Counted(program, sr.load_registry().build("solver", "piqp", {}))
     every = replace(relaxed.solve(rows, 0.0), y=np.full(120, 1.0 / 120))  # as an interior point proves it
     asked.clear()
-    kept, solution = irreducible(relaxed, rows, every)
+    kept, solution, _ = irreducible(relaxed, rows, every)
     assert 2 <= kept.h.size <= 3
     assert len(asked) <= 6  # of 120 rows one by one
     y = solution.y
     amount = (-np.abs(y @ kept.G).sum() * 3.0 - y @ kept.h) / y.sum()
     assert amount > 0.0
     assert solution.infeasibility == pytest.approx(amount, rel=1e-6)
+
+
+@pytest.mark.parametrize("lost", [False, True])
+def test_that_all_but_any_one_can_hold_is_said_only_where_a_decision_was_found_for_each(lost: bool) -> None:
+    """Without one row the solver fails: nothing is known of the others, and nothing is said of them."""
+    program, rows = half_spaces(0)
+
+    class Lost(RelaxedProgram):
+        def solve(self, rows, epsilon, *more):
+            solution = super().solve(rows, epsilon, *more)
+            return replace(solution, status="failed") if lost and solution.status == "optimal" else solution
+
+    relaxed = Lost(program, sr.load_registry().build("solver", "piqp", {}))
+    kept, solution, shown = irreducible(relaxed, rows, relaxed.solve(rows, 0.0))
+    assert kept.h.size > 1 and not feasible(kept, 3.0)
+    subsystem, _ = infeasible_subsystem(program, kept, solution.y, solution.infeasibility, shown)
+    assert subsystem.irreducible is not lost
+    assert ("though all but any one of them can" in subsystem.sentence()) is not lost
 
 
 def test_experiment_1_as_printed_has_its_separate_reasons_one_sentence_each(tmp_path):

@@ -107,7 +107,7 @@ def test_one_row_that_slanted_sides_forbid_is_told_by_what_a_linear_program_miss
     for limit in (truth - 0.4, (truth + loose) / 2):
         rows = Rows(row[None], np.array([limit]), (Cut("walls", np.zeros(1), 0, 0.0),))
         for y in (1.0, 7.0):
-            told, worst = infeasible_subsystem(made, rows, np.array([y]), 1e-9)
+            told, worst = infeasible_subsystem(made, rows, np.array([y]), 1e-9, True)
             assert len(told.reasons) == 1 and worst is not None
             assert worst.violation == pytest.approx(truth - limit, rel=1e-6)
 
@@ -119,7 +119,7 @@ def test_of_many_reasons_those_that_are_not_named_are_counted():
     h = np.tile(-G[0].sum(axis=1) - missing, (9, 1))
     made = program(G, h)
     rows = Rows(G[0], h[0], tuple(Cut("walls", np.zeros(1), row, 0.0) for row in range(9)))
-    told, worst = infeasible_subsystem(made, rows, np.full(9, 0.1), 0.01)
+    told, worst = infeasible_subsystem(made, rows, np.full(9, 0.1), 0.01, True)
     assert (len(told.reasons), told.others) == (6, 3) and len({*told.reasons}) == 6
     assert worst is not None and worst.violation == pytest.approx(missing[0])
 
@@ -138,7 +138,7 @@ def test_rows_that_clash_together_are_told_with_what_their_sum_asks_for(factor, 
     h = np.array([-0.6, -0.4 * factor, 5.0])
     made = program(np.tile(G, (9, 1, 1)), np.tile(h, (9, 1)), lower=np.array([-9.0, -0.9]), upper=np.full(2, 9.0))
     rows = Rows(G, h, tuple(Cut("walls", np.zeros(1), row, 0.0) for row in range(3)))
-    told, worst = infeasible_subsystem(made, rows, np.array([1.0, 1.0 / factor, 0.0]), 0.02)
+    told, worst = infeasible_subsystem(made, rows, np.array([1.0, 1.0 / factor, 0.0]), 0.02, True)
     assert len(told.members) == 2 and (told.others, told.amount, told.equalities) == (0, 0.02, False)
     assert told.demand == demand
     assert worst is not None and worst.violation == 0.02
