@@ -22,9 +22,11 @@ from sparserob_core.sip.inner.equalities import onto_equalities
 from sparserob_core.sip.inner.extended import extended_bound
 from sparserob_core.sip.inner.image import onto_stationary, within_bounds
 
-# Allowance for the error of a sum, relative to the sum of the absolute values (Higham 2002, section 3.1). It is proven
-# for sums of up to 90 terms only; longer sums are allowed no more.
+# Least allowance for the error of a sum, relative to the sum of the absolute values (see `_bound_rounding`). With a
+# tenth of it, slopes of 0 are refused for what a projection leaves; ten times as much costs digits of bounds.
 ROUND_OFF = 1e-14
+EPSILON = float(np.finfo(float).eps)
+SPARE = 16  # roundings beside those of long sums: of products with a weight, of what is added last
 
 NOTABLE = 1e-11  # of a bound: where its evaluation may be off by more, it is evaluated with more digits
 NEAR = 1e-6  # a slope this close to its limit, or beyond it, is moved onto the limit
@@ -47,7 +49,8 @@ Multipliers: TypeAlias = tuple[Array, Array, Array | None, Array | None]
 class Terms:
     """``bound = constant + sum_k min weights_k |s| + 1/2 curvature_k s^2 + slope_k s`` over the bounds; ``noise (k,)``
     of the slope: the sum of the absolute values of its terms. ``magnitude``: that sum for the ``constant``.
-    ``at (k,)``: an image where norms of blocks may be replaced by their tangents."""
+    ``at (k,)``: an image where norms of blocks may be replaced by their tangents. ``round_off``: what the rounding of
+    all these sums may be, relative to those absolute values."""
 
     constant: float
     slope: Array
@@ -56,6 +59,7 @@ class Terms:
     curvature: Array | None
     magnitude: float
     at: Array | None = None
+    round_off: float = ROUND_OFF
 
 
 @shaped
@@ -96,7 +100,7 @@ def _prove_bound(
 ) -> tuple[float, Array, Array, Array | None]:
     bound = _evaluate_bound(terms, program)
     if bound > -np.inf:
-        large = ROUND_OFF * terms.magnitude > NOTABLE * abs(bound)
+        large = terms.round_off * terms.magnitude > NOTABLE * abs(bound)
         bound = max(bound, extended_bound(program, y, mu)) if large else bound
         is_beyond = _find_overshoot(terms, program, bound)
         if is_beyond is not None:
@@ -260,16 +264,46 @@ def _compute_terms(
         at = np.zeros(program.n) if at is None else at
         gradient = np.asarray(program.P @ at)
         sizes = np.asarray(abs(program.P) @ np.abs(at))  # what may cancel in the slope and in the square, and rounds
-        constant -= 0.5 * float(at @ gradient)
+        constant -= 0.5 * _add_pairwise(at * gradient)
         magnitude += 0.5 * float(np.abs(at) @ sizes)
         slope, noise = slope + gradient, noise + sizes
     if program.P is None:
         curvature = None
+    round_off = _bound_rounding(_count_terms(program, y))
     if program.S is None:
-        return Terms(constant, slope, noise, program.weights, curvature, magnitude, image)
+        return Terms(constant, slope, noise, program.weights, curvature, magnitude, image, round_off)
     start = np.zeros(program.weights.size) if z is None else z
     z = onto_stationary(program, start, slope)
-    return Terms(constant, -z, np.abs(z) + np.abs(noise).max(initial=0.0), program.weights, None, magnitude, image)
+    noise = np.abs(z) + noise.max(initial=0.0)
+    return Terms(constant, -z, noise, program.weights, None, magnitude, image, round_off)
+
+
+def _bound_rounding(count: int) -> float:
+    """Return the allowance for the rounding of a sum of ``count`` terms, relative to the sum of their absolute values.
+
+    A chain of ``n`` roundings errs by at most ``n u / (1 - n u)`` (Higham 2002, section 3.1). Twice ``n u`` is allowed,
+    which pays for the rounding of the absolute values too.
+    """
+    return max(ROUND_OFF, (count + SPARE) * EPSILON)
+
+
+def _count_terms(program: FiniteProgram, y: Array) -> int:
+    """Return the largest number of terms that are added up one after the other in a bound by multipliers ``y (r,)``.
+
+    A slope has a term for each positive multiplier and each equality, and what ``P``, or the image, adds to it. The
+    number of entries counts by its logarithm only (`_add_pairwise`).
+    """
+    longest = sum(int(np.diff(term.indptr).max(initial=0)) for term in (program.P, program.S) if term is not None)
+    pairs = max(program.n, program.weights.size).bit_length()
+    return int(np.count_nonzero(y)) + program.b.size + longest + pairs
+
+
+def _add_pairwise(values: Array) -> float:
+    """Return the sum of ``values (k,)``, to which each value adds the rounding of at most ``log2 k + 1`` additions."""
+    while values.size > 1:
+        half = values.size // 2
+        values = np.append(values[:half] + values[half : 2 * half], values[2 * half :])
+    return float(values.sum())
 
 
 def _weigh_rows(y: Array, rows: Array, mu: Array, equalities: Array) -> Array:
@@ -284,7 +318,7 @@ def without_norms(terms: Terms, program: FiniteProgram) -> Terms:
     if blocks is None or not np.isfinite(terms.slope).all():
         return terms
     entries, of = blocks.entries, blocks.of
-    weights = terms.weights[blocks.first] * (1.0 - ROUND_OFF)
+    weights = terms.weights[blocks.first] * (1.0 - _bound_rounding(blocks.table.shape[1]))
     offers = [-terms.slope * _compute_shrink_factors(weights, blocks.norms(terms.slope))[_clip_numbers(blocks.number)]]
     if terms.at is not None:
         offers.append(blocks.directions(terms.at) * weights[_clip_numbers(blocks.number)])
@@ -321,14 +355,14 @@ def _evaluate_bound(terms: Terms, program: FiniteProgram) -> float:
     s = minimisers(terms.weights, terms.curvature, slope, program.lower, program.upper)
     away = None if program.bounded else ~np.isfinite(s)
     if away is not None and away.any():
-        if (np.abs(slope[away]) - terms.weights[away] > ROUND_OFF * 10 * terms.noise[away]).any():
+        if (np.abs(slope[away]) - terms.weights[away] > 10 * terms.round_off * terms.noise[away]).any():
             return -np.inf
         s = np.where(away, np.clip(0.0, program.lower, program.upper), s)
     values = terms.weights * np.abs(s) + slope * s
     if terms.curvature is not None:
         values += 0.5 * terms.curvature * s * s
     size = terms.magnitude + float(np.abs(s) @ (terms.noise + terms.weights))
-    return terms.constant + float(values.sum()) - ROUND_OFF * size
+    return terms.constant + _add_pairwise(values) - terms.round_off * size
 
 
 def _find_overshoot(terms: Terms, program: FiniteProgram, bound: float) -> Bool[np.ndarray, " k"] | None:

@@ -24,9 +24,8 @@ def irreducible(relaxed: RelaxedProgram, rows: Rows, solution: FiniteSolution) -
     A constraint that is impossible by itself, or two constraints that leave nothing between them, are returned at once
     (`reasons`). Otherwise the deletion filter (Chinneck and Dravnieks 1991) is applied. The filter leaves every row out
     once, the least important first. A row stays out if the others are infeasible without it. A row that was needed
-    stays needed when others are removed. The multipliers prove that the rows cannot hold together. A row also stays where
-    neither a decision nor a proof of infeasibility was found without it. Then all but any one of the rows need not be
-    feasible.
+    stays needed when others are removed. The multipliers prove that the rows cannot hold together. A row also stays
+    where neither a decision nor a proof of infeasibility was found without it.
 
     Parameters
     ----------

@@ -96,6 +96,28 @@ def test_a_bound_is_the_dual_function_less_its_own_rounding(kind: str, apart: fl
         assert dual_bound(program, less, mu, None, at) == dual_bound(program, np.maximum(less, 0.0), mu, None, at)
 
 
+@pytest.mark.parametrize("along", ["rows", "equalities", "curvature"])
+def test_a_bound_by_many_terms_allows_for_what_their_sum_loses(along: str) -> None:
+    """A slope of 1 and of 50 000 terms, each too small to change a sum of 1: together they are 1.4e-13 of it."""
+    count, small = 50_000, 2.0**-53 / 40.0
+    terms = np.append(1.0, np.full(count, small))
+    n = terms.size if along == "curvature" else 3
+    q, none, box, tall = np.zeros(n), np.zeros((0, n)), np.ones(n), np.tile(terms[:, None], (1, 3))
+    program = FiniteProgram(q, q, -box, box, none, np.zeros(0), none, np.zeros(0))
+    y, mu, at, truth = np.zeros(0), np.zeros(0), None, 3 * (1 + count * Fraction(small))
+    if along == "rows":
+        program, y = replace(program, G=tall, h=np.zeros(terms.size)), np.ones(terms.size)
+    elif along == "equalities":
+        program, mu = replace(program, A=tall, b=np.zeros(terms.size)), np.ones(terms.size)
+    else:  # the tangent at (1, ..., 1) of a square whose first row has all these terms, and so its first column
+        first = csc_array((terms, (np.arange(n), np.zeros(n, dtype=int))), shape=(n, n))
+        P = csc_array(first + first.T - csc_array(([1.0], ([0], [0])), shape=(n, n)))
+        program, at, truth = replace(program, P=P), np.ones(n), Fraction(3, 2) + 3 * count * Fraction(small)
+    bound = dual_bound(program, y, mu, None, at)
+    assert Fraction(bound) <= -truth
+    assert bound >= -float(truth) - 1e-10
+
+
 def test_what_refutes_is_the_dual_function_of_the_rows_alone_per_size_of_the_multipliers() -> None:
     rng = np.random.default_rng(2)
     for kind in ("plain", "open rows", "diagonal"):
