@@ -1,5 +1,4 @@
-"""Coordinates in which a program is easier: those of a square image, units in which every variable is of size 1, and
-those in which the quadratic cost is a sum of squares."""
+"""Coordinates in which a program is easier: those of a square image, and units in which every variable is of size 1."""
 
 from __future__ import annotations
 
@@ -18,7 +17,6 @@ if TYPE_CHECKING:
     from scipy.sparse import csc_array
 
 WORST = 1e6  # condition number above which coordinates are left alone
-LARGE = 600  # variables above which no matrix is factorised in full; ten times as many take a minute
 ORDINARY = 1e3  # variables whose bounds are within this factor of 1 are left in their units
 _inverses = Memory(4)
 _curvatures = Memory(4)
@@ -59,35 +57,6 @@ def _change_to_image(program: FiniteProgram) -> NewVariables | None:
         return None
     easier = replace(program, S=None, P=P, q=program.q @ inverse, G=program.G @ inverse, A=program.A @ inverse)
     return NewVariables(easier, program.image, lambda s: np.asarray(inverse @ s), lambda z: z)
-
-
-def in_round_coordinates(program: FiniteProgram) -> NewVariables | None:
-    """Return the coordinates ``v = L'x`` with ``P = L L'``, in which the quadratic cost is ``1/2 v'v``; ``None`` where
-    ``P`` is diagonal or not positive definite, and for norms of blocks, an image, or more than `LARGE` variables.
-
-    Bounds and absolute values are then those of the image ``x = L^-T v``. The condition of ``L`` is the square root of
-    that of ``P``, so that at 1e12 a solver has ten digits instead of four.
-    """
-    if program.P is None or program.S is not None or not program.n <= LARGE or program.separable or program.blocks:
-        return None
-    try:
-        factor = np.linalg.cholesky(program.P.toarray())
-        inverse = np.linalg.inv(factor).T
-    except np.linalg.LinAlgError:
-        return None
-    if not np.isfinite(inverse).all():
-        return None
-    from scipy.sparse import csc_array, eye_array
-
-    easier = replace(
-        program,
-        S=csc_array(inverse),
-        P=eye_array(program.n, format="csc"),
-        q=program.q @ inverse,
-        G=program.G @ inverse,
-        A=program.A @ inverse,
-    )
-    return NewVariables(easier, lambda x: factor.T @ x, lambda v: np.asarray(inverse @ v), lambda z: z)
 
 
 def _rescale_variables(program: FiniteProgram) -> NewVariables | None:

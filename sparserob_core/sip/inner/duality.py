@@ -15,7 +15,7 @@ from typing import TypeAlias
 
 import numpy as np
 
-from sparserob_core.shapes import Bool, Float, Int, shaped
+from sparserob_core.shapes import Bool, Float, shaped
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.finite import FiniteProgram, FiniteSolution
 from sparserob_core.sip.inner.equalities import onto_equalities
@@ -35,12 +35,6 @@ REPAIRS = 4
 FREE = 1e-7  # an entry further than this from 0 and from both bounds, relative to their distance, is free
 TIGHT = 1e-9  # a row with a slack below this may carry a multiplier
 ACTIVE = 1e-9  # a row with a multiplier above this, relative to the largest, is active
-
-# Weight of what must hold beside what is wanted. With a hundredth of it slopes are left that free entries do not bear;
-# with a million times as much the wanted is lost in rounding.
-HEAVY = 1e5
-# Steps for each multiplier at most. With a tenth of them degenerate vertices are given up; more was not needed.
-PATIENT = 30
 
 Multipliers: TypeAlias = tuple[Array, Array, Array | None, Array | None]
 
@@ -204,10 +198,8 @@ def measure(
     value, residual = program.objective(x), program.residual(x)
     terms = _compute_terms(program, y, mu, z, x)
     lower = _prove_bound(program, terms, y, mu, z, x)[0]
-    if z is None and program.S is None:
+    if z is None:
         z = -terms.slope if terms.curvature is None else -(terms.slope + terms.curvature * x)
-    elif z is None:
-        z = onto_stationary(program, np.zeros(program.weights.size), _compute_slope(program, y, mu, x))
     return FiniteSolution("failed", x, value, lower, y, mu, z, residual, value - lower, message)
 
 
@@ -235,14 +227,6 @@ def bent_minimisers(weights: Array, curvature: Array | float, slope: Array, lowe
 @shaped
 def _clip_multipliers(program: FiniteProgram, y: Float[Array, " r"]) -> Float[Array, " r"]:
     return np.where(np.isfinite(program.h) & np.isfinite(y), np.maximum(y, 0.0), 0.0)
-
-
-@shaped
-def _compute_slope(
-    program: FiniteProgram, y: Float[Array, " r"], mu: Float[Array, " e"], at: Float[Array, " n"] | None
-) -> Float[Array, " n"]:
-    slope = program.q + _weigh_rows(y, program.G, mu, program.A)
-    return slope if program.P is None or at is None else slope + program.P @ at
 
 
 @shaped
@@ -319,9 +303,10 @@ def without_norms(terms: Terms, program: FiniteProgram) -> Terms:
         return terms
     entries, of = blocks.entries, blocks.of
     weights = terms.weights[blocks.first] * (1.0 - _bound_rounding(blocks.table.shape[1]))
-    offers = [-terms.slope * _compute_shrink_factors(weights, blocks.norms(terms.slope))[_clip_numbers(blocks.number)]]
+    number, norms = np.maximum(blocks.number, 0), blocks.norms(terms.slope)
+    offers = [-terms.slope * np.minimum(1.0, weights / np.where(norms > 0.0, norms, 1.0))[number]]
     if terms.at is not None:
-        offers.append(blocks.directions(terms.at) * weights[_clip_numbers(blocks.number)])
+        offers.append(blocks.directions(terms.at) * weights[number])
     bounds, slopes = [], []
     low, high = program.lower[entries], program.upper[entries]
     for offer in offers:
@@ -336,15 +321,6 @@ def without_norms(terms: Terms, program: FiniteProgram) -> Terms:
     weights[entries] = 0.0
     noise[entries] += terms.weights[entries]
     return replace(terms, slope=slope, weights=weights, noise=noise)
-
-
-def _clip_numbers(number: Int[np.ndarray, " k"]) -> Int[np.ndarray, " k"]:
-    answer: np.ndarray = np.maximum(number, 0)
-    return answer
-
-
-def _compute_shrink_factors(weights: Array, norms: Array) -> Array:
-    return np.minimum(1.0, weights / np.where(norms > 0.0, norms, 1.0))
 
 
 def _evaluate_bound(terms: Terms, program: FiniteProgram) -> float:
@@ -516,36 +492,3 @@ def vertex_multipliers(
     plain = np.zeros_like(y)
     plain[active] = np.maximum(multipliers[0], 0.0)
     return plain, multipliers[1]
-
-
-@shaped
-def nearest_multipliers(
-    program: FiniteProgram, y: Float[Array, " r"], mu: Float[Array, " e"]
-) -> tuple[Float[Array, " r"], Float[Array, " e"]]:
-    """Return multipliers near ``(y, mu)`` with ``y >= 0`` that give every entry without bounds nearly the slope 0.
-
-    A vertex of nearly parallel rows has multipliers that are negative by a little; where these are put to 0 and entries
-    are free, nothing is proven. Those of the other rows make up for it: non-negative least squares with the slopes as
-    rows that weigh `HEAVY` times as much (Lawson and Hanson 1974, chapter 23, section 4). Any answer is safe. ``S``
-    must be the identity, ``P`` absent, and the weights of the free entries 0, otherwise the multipliers come back
-    unchanged.
-    """
-    free = np.isinf(program.lower) & np.isinf(program.upper)
-    if not free.any() or program.S is not None or program.P is not None or program.weights[free].any():
-        return y, mu
-    from scipy.optimize import nnls  # only here: its import takes as long as a small run
-
-    slopes = np.hstack([program.G[:, free].T, program.A[:, free].T, -program.A[:, free].T])
-    target = np.concatenate([np.maximum(y, 0.0), np.maximum(mu, 0.0), np.maximum(-mu, 0.0)])
-    is_usable = np.concatenate([np.isfinite(program.h), np.ones(2 * mu.size, dtype=bool)])
-    columns = np.vstack([HEAVY * slopes, np.eye(target.size)])[:, is_usable]
-    try:
-        multipliers, _ = nnls(
-            columns, np.concatenate([-HEAVY * program.q[free], target]), maxiter=PATIENT * target.size
-        )
-    except RuntimeError:  # its iteration limit: these multipliers were an offer only
-        return y, mu
-    nearest = np.zeros(target.size)
-    nearest[is_usable] = multipliers
-    first, second, third = np.split(nearest, [y.size, y.size + mu.size])
-    return first, second - third

@@ -11,7 +11,6 @@ The walk of `solve_finite`, each step only where the ones before gave no answer 
    accuracy; every claim is polished, measured (`duality.measure`) and judged. Where the first is not believed, or not
    sharp enough, the solver is asked for more digits of it (`more_digits`). Where the solver says infeasible, or nothing
    is believed, the elastic program is asked how far the rows must be relaxed: its multipliers may prove infeasibility.
-   `_solve_in_new_variables` again where it is the curvature that is hard (`in_round_coordinates`).
 5. `_report_failure`: the best of what was not believed, and what was wrong with it. Where a solver was named, the walk
    begins anew without it (`solver.Asked.instead`).
 """
@@ -34,10 +33,10 @@ from sparserob_core.sip.finite import (
     FiniteProgram,
     FiniteSolution,
 )
-from sparserob_core.sip.inner.change_of_variables import NewVariables, in_new_variables, in_round_coordinates
+from sparserob_core.sip.inner.change_of_variables import NewVariables, in_new_variables
 from sparserob_core.sip.inner.curved import with_curvature
 from sparserob_core.sip.inner.dual_newton import from_nothing, polish
-from sparserob_core.sip.inner.duality import farkas_proof, measure, minimisers, nearest_multipliers, vertex_multipliers
+from sparserob_core.sip.inner.duality import farkas_proof, measure, minimisers, vertex_multipliers
 from sparserob_core.sip.inner.more_digits import refined
 from sparserob_core.sip.inner.norms import around, bent, near, of_the_rest, towards
 from sparserob_core.sip.inner.standard_form import Form, Recovered, has_cones, standard_form
@@ -184,9 +183,7 @@ def _solve_case(case: _Case, guess: FiniteSolution | None) -> FiniteSolution:
         return _solve_by_directions(case, program.blocks, guess)
     if answer is not None:
         return answer
-    answer = _try_forms(case)
-    rounder = in_round_coordinates(program) if answer.status == "failed" else None
-    return answer if rounder is None else _solve_in_new_variables(case, rounder, guess) or _report_failure(case)
+    return _try_forms(case)
 
 
 def _solve_by_directions(case: _Case, blocks: Blocks, guess: FiniteSolution | None) -> FiniteSolution:
@@ -377,8 +374,6 @@ def _solve_by_simplex(case: _Case) -> FiniteSolution | None:
     offers = [(corner.y, corner.mu)]
     if program.S is None:
         offers.append(vertex_multipliers(program, corner.x, corner.y, corner.mu))
-    if not program.bounded:
-        offers.append(nearest_multipliers(program, corner.y, corner.mu))
     for y, mu in offers:
         believed = case.judge(measure(program, corner.x, y, mu, corner.z, message="simplex method"), "a vertex", HIGHS)
         if believed is not None:
