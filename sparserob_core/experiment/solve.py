@@ -18,7 +18,7 @@ from sparserob_core.experiment.plugins.components import Registry
 from sparserob_core.experiment.plugins.guards import guarded, origin_of
 from sparserob_core.experiment.plugins.registry import load_registry
 from sparserob_core.sip.convex_set import Array, Box
-from sparserob_core.sip.events import ignore
+from sparserob_core.sip.events import Event, ignore
 from sparserob_core.sip.limits.deadline import as_seconds
 from sparserob_core.sip.maximiser import Maximiser, Report
 
@@ -129,7 +129,7 @@ def maximise(
         whole("budget", budget, 1),
         np.random.default_rng(whole("seed", seed, 0)),
         rules,
-        _wrap_notify(notify),
+        wrap_notify(notify),
         _check_points(start, box),
         _check_known(known, box),
     )
@@ -354,13 +354,15 @@ class _ReportedFunction:
         return self.asked
 
 
-def _wrap_notify(notify: Notify) -> Notify:
+def wrap_notify(notify: Notify) -> Callable[[Any], None]:
+    """Return a function that passes events on to a user's function until that raises, and ignores all else."""
     if notify is ignore:
         return ignore
     heard = careful("notify", notify)
 
-    def pass_on(event: Any) -> None:
-        heard(event)
+    def pass_on(event: object) -> None:
+        if isinstance(event, Event):
+            heard(event)
 
     return pass_on
 

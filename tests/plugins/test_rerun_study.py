@@ -42,7 +42,7 @@ def watched(config: Path, axes: Sequence[str], out: Path, *observers: sr.Observe
 
 @pytest.fixture(autouse=True)
 def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("sparserob_core.experiment.sweep.figure.write_study_figure", lambda study: [])
+    monkeypatch.setattr("sparserob_core.experiment.sweep.figure.draw_study", lambda study: None)
 
 
 def pages(file: Path, part: str = "state") -> list[str]:

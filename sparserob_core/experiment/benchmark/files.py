@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sparserob_core.experiment.comparison.profiles_figure import write_profiles
+from sparserob_core.experiment.comparison.profiles_figure import draw_profiles
 from sparserob_core.experiment.directory.artefacts import RunDirectory, finite
-from sparserob_core.experiment.figures.style import missing_matplotlib
+from sparserob_core.experiment.figures.style import missing_matplotlib, save_figure
 
 if TYPE_CHECKING:
     from sparserob_core.experiment.benchmark.searches import Benchmark, Search
@@ -42,7 +42,7 @@ def write(found: Benchmark, directory: RunDirectory) -> Benchmark:
         directory.write_text(name, text)
     if missing := missing_matplotlib():
         return replace(found, profiles=replace(found.profiles, undrawn=missing))
-    write_profiles(directory.path / "profiles.png", found.profiles)
+    save_figure(directory.path / "profiles.png", draw_profiles, found.profiles)
     return found
 
 

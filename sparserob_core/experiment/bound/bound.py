@@ -14,13 +14,13 @@ from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.control.studies.suprema import bound_rows
 from sparserob_core.control.transcription.terms.accumulated import accumulated
-from sparserob_core.errors import InputError, SparseRobError
+from sparserob_core.errors import InputError
 from sparserob_core.experiment.assemble import build, control_problem_of, dictionaries_of, name_of
 from sparserob_core.experiment.bound.record import Bound, WorstCase, summary_of_bound, worst_case
 from sparserob_core.experiment.config.load import Loaded, load_config
 from sparserob_core.experiment.config.matrices.arrays import read_arrays
-from sparserob_core.experiment.config.reading.reader import write_yaml
-from sparserob_core.experiment.directory.artefacts import RunDirectory, create_directory
+from sparserob_core.experiment.directory.artefacts import RunDirectory
+from sparserob_core.experiment.directory.study import open_study
 from sparserob_core.experiment.run.events import StudyProgress
 from sparserob_core.experiment.run.given import GivenConfig, as_config, as_run
 from sparserob_core.experiment.run.outcome import Outcome, SolvedProblem
@@ -94,14 +94,14 @@ def bound(
     def told(text: str, done: int, total: int) -> None:
         notify(StudyProgress(text=text, done=done, total=total))
 
-    def found() -> Bound:
+    with open_study(loaded, out, "The experiment whose worst cases were bounded.", "-bound", write) as directory:
         theta = np.zeros(shape) if control is None else control
         try:
             bounded_rows = bound_rows(problem, dictionaries, theta, float(tolerance), told, notify, deadline)
         except InputError as error:
             raise loaded.located(("problem",), error) from error
         rows = tuple(worst_case(problem, row) for row in bounded_rows)
-        return Bound(
+        result = Bound(
             loaded.config.title or name_of(loaded),
             "undecided" if any(row.reason for row in rows) else "certified",
             rows,
@@ -117,14 +117,7 @@ def bound(
             ),
             time_unit=problem.names.time,
         )
-
-    if out is None and not write:
-        return found()
-    with create_directory(out, f"{name_of(loaded)}-bound", loaded.config.digest()) as directory:
-        directory.write_text(
-            "config.yaml", write_yaml(loaded.config.plain(), "The experiment whose worst cases were bounded.")
-        )
-        return _write_files(directory, found(), loaded)
+        return result if directory is None else _write_files(directory, result, loaded)
 
 
 def _has_answering_policy(loaded: Loaded, problem: OptimalControlProblem, control: Dictionary) -> bool:
@@ -164,16 +157,15 @@ def _write_files(directory: RunDirectory, found: Bound, loaded: Loaded) -> Bound
 
     The figure is an extra: where it cannot be drawn, the numbers are written all the same, and there is a warning.
     """
-    from sparserob_core.experiment.bound.figure import write_bound_figure
+    from sparserob_core.experiment.bound.figure import draw_bound
+    from sparserob_core.experiment.figures.style import draw_extra
 
     directory.write_arrays(
         "envelopes.npz",
         {f"{name}{i}": getattr(row, name) for i, row in enumerate(found.rows) for name in ("edges", "low", "high")},
     )
     if any(row.edges.size for row in found.rows):
-        try:
-            write_bound_figure(directory.path / "bound.png", found)
-        except SparseRobError as error:
-            found = replace(found, remarks=(*found.remarks, str(error)))
+        remarks = draw_extra(directory.path / "bound.png", draw_bound, found)
+        found = replace(found, remarks=(*found.remarks, *remarks))
     directory.write_json("bound.json", {**summary_of_bound(found), "config": loaded.config.digest()})
     return replace(found, directory=directory.path)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -18,16 +17,6 @@ if TYPE_CHECKING:
 
 MOST = 8  # largest number of panels: more of them are too small to be read on a page
 ROOM = 0.12  # empty space above and below the curves, as a share of their height
-
-
-def write_bound_figure(file: Path, found: Bound) -> None:
-    """Draw worst cases into a file (.png, .pdf, .svg), which is complete or does not exist.
-
-    Raises `InputError` where matplotlib is missing, and where the file cannot be written.
-    """
-    look.require_matplotlib()
-    with look.style():
-        look.write_figure(file, draw_bound(found))
 
 
 def draw_bound(found: Bound) -> Figure:

@@ -13,13 +13,13 @@ import numpy as np
 from sparserob_core.errors import InputError
 from sparserob_core.experiment.comparison.comparison import Comparison
 from sparserob_core.experiment.comparison.curve import WITHOUT_CURVE, Curve, read_curve
-from sparserob_core.experiment.comparison.figure import write_comparison
+from sparserob_core.experiment.comparison.figure import draw_comparison
 from sparserob_core.experiment.comparison.labels import labels
 from sparserob_core.experiment.comparison.profiles import Measure, Profiles
-from sparserob_core.experiment.comparison.profiles_figure import write_profiles
+from sparserob_core.experiment.comparison.profiles_figure import draw_profiles
 from sparserob_core.experiment.comparison.studies import ACCURACY, SLACK, is_study, read_profiles
 from sparserob_core.experiment.config.plain import difference, value_text
-from sparserob_core.experiment.figures.style import missing_matplotlib, require_writable
+from sparserob_core.experiment.figures.style import missing_matplotlib, require_writable, save_figure
 from sparserob_core.experiment.run.events import Broadcast, Event, Observer, SweepFinished, SweepStarted
 from sparserob_core.experiment.run.given import GivenRun, as_run
 
@@ -67,14 +67,22 @@ def compare(
     comparison = read_profiles(studies, accuracy, measure) if studies else _compare_runs(directories)
     if out is not None and (missing := missing_matplotlib()):
         comparison = replace(comparison, undrawn=missing)
-    elif out is not None and isinstance(comparison, Profiles):
-        write_profiles(Path(out), comparison)
-    elif out is not None and isinstance(comparison, Comparison):
-        write_comparison(Path(out), comparison)
+    elif out is not None:
+        _draw_comparison(Path(out), comparison)
     if broadcast.heard and isinstance(comparison, Comparison):
         for event in events_of(comparison):
             broadcast(event)
     return comparison
+
+
+def _draw_comparison(file: Path, comparison: Comparison | Profiles) -> None:
+    """Draw a comparison into a file; raises `InputError` where there is nothing to draw, or it cannot be written."""
+    if isinstance(comparison, Profiles):
+        save_figure(file, draw_profiles, comparison)
+        return
+    if not any(curve.bound.size for curve in comparison.curves):
+        raise InputError(f"{file}: nothing to draw; no run has a lower bound to show")
+    save_figure(file, draw_comparison, comparison)
 
 
 def events_of(comparison: Comparison) -> Iterator[Event]:

@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 from math import ceil
-from pathlib import Path
 from textwrap import fill
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sparserob_core.errors import InputError
 from sparserob_core.experiment.figures import style as look
 from sparserob_core.experiment.figures.figure_data import measured, plain
-from sparserob_core.experiment.figures.style import require_matplotlib, require_writable, style, write_figure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -29,20 +26,6 @@ LINE = 84
 """Letters of a label in one line of the legend; half of them when two labels share the line."""
 VIEW = 1.5
 """The view reaches down by this many times the size of the optimum; first bounds of a search may be far below."""
-
-
-def write_comparison(file: Path, comparison: Comparison) -> None:
-    """Draw a comparison into a file, whose ending (.png, .pdf, .svg) is its kind.
-
-    Raises `InputError` for another ending, when no run has a curve, when matplotlib is missing, and when the file
-    cannot be written.
-    """
-    require_writable(file)
-    if not any(curve.bound.size for curve in comparison.curves):
-        raise InputError(f"{file}: nothing to draw; no run has a lower bound to show")
-    require_matplotlib()
-    with style():
-        write_figure(file, draw_comparison(comparison))
 
 
 def draw_comparison(comparison: Comparison) -> Figure:

@@ -4,7 +4,6 @@ may spend."""
 from __future__ import annotations
 
 from math import ceil
-from pathlib import Path
 from textwrap import fill
 from typing import TYPE_CHECKING, Any
 
@@ -13,20 +12,12 @@ import numpy as np
 from sparserob_core.experiment.comparison.figure import COLOURS, DASHES, LINE, MARKERS
 from sparserob_core.experiment.comparison.profiles import LOWER, MIDDLE, UPPER, Profiles
 from sparserob_core.experiment.figures import style as look
-from sparserob_core.experiment.figures.style import style, write_figure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
     from sparserob_core.sip.convex_set import Array
-
-
-def write_profiles(file: Path, profiles: Profiles) -> None:
-    """Draw profiles into a file, whose ending (.png, .pdf, .svg) is its kind; raises `InputError` when it cannot be
-    written."""
-    with style():
-        write_figure(file, draw_profiles(profiles))
 
 
 def draw_profiles(profiles: Profiles) -> Figure:

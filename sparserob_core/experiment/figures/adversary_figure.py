@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from pathlib import Path
 from textwrap import shorten
 from typing import TYPE_CHECKING, Any
 
@@ -12,7 +11,7 @@ import numpy as np
 from sparserob_core.experiment.figures import style as look
 from sparserob_core.experiment.figures.figure_data import FigureData, plain
 from sparserob_core.experiment.figures.run_figures import draw_time_axis, draw_walls
-from sparserob_core.experiment.figures.style import draw_legend, held, panels, require_matplotlib, style, write_figure
+from sparserob_core.experiment.figures.style import draw_legend, held, panels
 from sparserob_core.sip.convex_set import Array
 
 if TYPE_CHECKING:
@@ -21,14 +20,6 @@ if TYPE_CHECKING:
 
 COLOURS = (look.BLUE, look.GREEN, look.PURPLE, look.ORANGE, look.INK)  # vermillion is the terminal set's
 DASHES: tuple[Any, ...] = ("solid", (0, (5, 2)), (0, (1.5, 1.5)))
-
-
-def write_adversary(file: Path, arrays: Mapping[str, Array], data: FigureData) -> list[Path]:
-    """Draw the contents of ``adversary.npz`` into a file (.png, .pdf, .svg), or with another ending into two (see
-    `write_figure`); raises `InputError` when they cannot be written, and without matplotlib."""
-    require_matplotlib()
-    with style():
-        return write_figure(file, draw_adversary(arrays, data))
 
 
 def draw_adversary(arrays: Mapping[str, Array], data: FigureData) -> Figure:

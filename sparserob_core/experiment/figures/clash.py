@@ -5,7 +5,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, final
 
 import numpy as np
@@ -77,12 +76,6 @@ class Strip:
         target = (low + high) / 2 if np.isfinite(low + high) else low if np.isfinite(low) else high
         target = float(np.clip(self.reach_low, low, high)) if low <= high and np.isinf(high - low) else target
         return float(np.clip(target, self.reach_low, self.reach_high))
-
-
-def draw_clash(experiment: Experiment, result: Result, directory: Path) -> list[Path]:
-    """Draw why nothing is feasible into ``directory/figures``: ``clash.pdf`` and ``clash.png``. Returns the files;
-    raises `InputError` as `clash_figure`."""
-    return look.write_figure(directory / "figures" / "clash", clash_figure(experiment, result))
 
 
 def clash_figure(experiment: Experiment, result: Result) -> Figure:

@@ -4,14 +4,12 @@ maximiser noted."""
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from sparserob_core.experiment.figures import style as look
 from sparserob_core.experiment.figures.figure_data import measured
-from sparserob_core.experiment.figures.style import require_matplotlib, style, write_figure
 from sparserob_core.sip.result import SearchTrace
 
 if TYPE_CHECKING:
@@ -27,18 +25,6 @@ FINEST = 1e-10  # of the highest value: what is nearer to it is drawn there
 VIEW = 1.5  # the view of the bound reaches down by this many times the size of the optimum
 MANY = 3000  # dots beyond which a figure for print holds them as a picture
 FIRST = ("temperature", "accepted", "scale", "depth", "constant")
-
-
-def write_climb(
-    directory: Path, trace: SearchTrace, title: str, upper: float = np.inf, *, exact: bool = False, unit: str = ""
-) -> list[Path]:
-    """Draw ``climb`` into ``directory``, as PDF and PNG. ``upper``: the proven upper bound of the unregularised
-    program, ``inf`` where there is none; ``exact``: the two bounds have met, so that it is its value; ``unit``: that of
-    the cost, where it is known. Returns the files; raises `InputError` where they cannot be written, and without
-    matplotlib."""
-    require_matplotlib()
-    with style():
-        return write_figure(directory / "climb", draw_climb(trace, title, upper, exact=exact, unit=unit))
 
 
 def draw_climb(trace: SearchTrace, title: str, upper: float = np.inf, *, exact: bool = False, unit: str = "") -> Figure:

@@ -3,10 +3,9 @@ them."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -20,7 +19,7 @@ from sparserob_core.control.studies.answer import Tube, supports, tube
 from sparserob_core.control.transcription.record import Transcription
 from sparserob_core.experiment.assemble import ControlExperiment, Experiment, counting
 from sparserob_core.experiment.directory.sparsity import sparsity
-from sparserob_core.experiment.figures.active import Active
+from sparserob_core.experiment.figures.active import Active, stored_active
 from sparserob_core.experiment.figures.figure_data import (
     MOST_STATES,
     FigureData,
@@ -34,6 +33,9 @@ from sparserob_core.experiment.terminal.printing import printable
 from sparserob_core.sip.convex_set import Array, ConvexSet
 from sparserob_core.sip.events import RoundFinished
 
+if TYPE_CHECKING:
+    from sparserob_core.experiment.directory.finished import FinishedRun
+
 TIMES = 400  # drawn at most
 SMOOTH = 200  # drawn at least, about
 ROUGH = 6  # times at which it is told which states move far: with 2 a state that comes back seems to rest; with 60 the
@@ -43,35 +45,6 @@ CORNERS = 48  # of the polygon around every place, which reaches 0.2 % beyond a 
 # segment: with a tenth a path is twice as wide as it is; ten times takes seconds and looks the same
 STEPS = 33  # times of a window at which a side that moves is drawn
 QUANTILES = (0.05, 0.5, 0.95)
-
-
-def draw_experiment(
-    experiment: Experiment,
-    theta: Array,
-    active: Active | None,
-    history: Sequence[RoundFinished],
-    directory: Path,
-    cost: float | None,
-    worst: Mapping[str, Array],
-    status: str,
-    push: Array | None = None,
-) -> list[Path]:
-    """Draw the figures of a decision (``theta (m, N)``, or whole) into ``directory/figures``; raises `InputError` when
-    there is nothing to draw. Where the ``status`` claims no proof, their titles say so.
-
-    ``worst``: the arrays of `adversaries`, empty when there is no constraint to be driven against. ``push``: the
-    switching function, where it is known.
-    """
-    from sparserob_core.experiment.figures.adversary_figure import write_adversary
-    from sparserob_core.experiment.figures.run_figures import write_figures
-
-    shown = _choose_states(experiment, theta)
-    data = figure_data(experiment, theta, active, history, cost, draws=DRAWS, status=status, states=shown)
-    data = replace(data, push=push)
-    files = write_figures(directory / "figures", data)
-    if worst:
-        files += write_adversary(directory / "figures" / "adversary", worst, data)
-    return files
 
 
 def figure_data(
@@ -122,6 +95,13 @@ def figure_data(
     return replace(data, title=unproven)
 
 
+def stored_figure_data(finished: FinishedRun) -> FigureData:
+    """Return the data for figures of the decision of a finished run."""
+    active = stored_active(finished.experiment.transcription, finished.solution)
+    status = str(finished.summary["status"])
+    return figure_data(finished.experiment, finished.decision, active, (), None, status=status)
+
+
 def _collect_data(
     experiment: ControlExperiment,
     theta: Array,
@@ -167,7 +147,7 @@ def _collect_data(
     )
 
 
-def _choose_states(experiment: Experiment, theta: Array) -> Sequence[int] | None:
+def choose_states(experiment: Experiment, theta: Array) -> Sequence[int] | None:
     """The states that figures show of a system of very many, whose tubes would take longer than the control: of all of
     them the reach is told at a few times. ``None``: all."""
     model = experiment.model

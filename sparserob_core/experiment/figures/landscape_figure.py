@@ -4,14 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import TYPE_CHECKING, final
 
 import numpy as np
 
 from sparserob_core.errors import InputError
 from sparserob_core.experiment.figures import style as look
-from sparserob_core.experiment.figures.style import require_matplotlib, style, write_figure
 from sparserob_core.sip.convex_set import Array
 
 if TYPE_CHECKING:
@@ -61,14 +59,6 @@ class LandscapeData:
         return bool(
             finite_values.size == self.values.size and spread <= FLAT * max(1.0, float(np.abs(finite_values).max()))
         )
-
-
-def write_landscape(directory: Path, data: LandscapeData) -> list[Path]:
-    """Draw ``landscape`` into ``directory``, as PDF and PNG. Returns the files; raises `InputError` where they cannot
-    be written, and without matplotlib."""
-    require_matplotlib()
-    with style():
-        return write_figure(directory / "landscape", draw_landscape(data))
 
 
 def draw_landscape(data: LandscapeData) -> Figure:

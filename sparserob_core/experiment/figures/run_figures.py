@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from functools import partial
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -12,7 +11,7 @@ import numpy as np
 from sparserob_core.experiment.figures import style as look
 from sparserob_core.experiment.figures.figure_data import MOST_STATES, FigureData, Wall, measured, plain
 from sparserob_core.experiment.figures.plane_figure import draw_plane
-from sparserob_core.experiment.figures.style import draw_legend, held, panels, require_matplotlib, style, write_figure
+from sparserob_core.experiment.figures.style import draw_legend, held, panels
 from sparserob_core.sip.result import relative_gap
 
 if TYPE_CHECKING:
@@ -27,18 +26,6 @@ FLAT = (
 )
 HEADROOM = 1.15  # of the largest push, above it: at 1 it is on the frame, at 10 the band is a line
 IDLE = 1e-7  # of the control's bound: less than that is no action but rounding
-
-
-def write_figures(directory: Path, data: FigureData) -> list[Path]:
-    """Draw ``control``, where that is known ``switching``, ``states``, ``plane`` where the system moves in one, under
-    feedback ``outputs`` where these are measured, ``gains``, ``effort`` and ``answers``, and when there is a history
-    ``convergence`` into ``directory``, each as PDF and PNG.
-
-    Returns the files. Raises `InputError` when matplotlib is missing.
-    """
-    require_matplotlib()
-    with style():
-        return [file for name, draw in run_pictures(data).items() for file in write_figure(directory / name, draw())]
 
 
 def run_pictures(data: FigureData) -> dict[str, Callable[[], Figure]]:

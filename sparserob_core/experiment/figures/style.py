@@ -6,11 +6,11 @@ import logging
 import os
 import re
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from io import BytesIO
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ParamSpec
 
 import numpy as np
 
@@ -41,6 +41,8 @@ KINDS: dict[str, dict[str, Any]] = {
     ".svg": {"metadata": {"Date": None, "Creator": None}},
 }
 """Kinds of files, by their endings, and what is left out of them so that the same figure gives the same bytes."""
+
+P = ParamSpec("P")
 
 logger = logging.getLogger("sparserob")
 _reported_letters = set[str]()
@@ -104,6 +106,29 @@ def draw_legend(figure: Figure, axes: list[Axes]) -> None:
         handlelength=1.4,
         handletextpad=0.6,
     )
+
+
+def save_figure(file: Path, draw: Callable[P, Figure | None], *arguments: P.args, **options: P.kwargs) -> list[Path]:
+    """Draw a figure in the style of all figures, and write it as `write_figure` does.
+
+    Returns the files; none where ``draw`` returns ``None``, since there is nothing to draw. Raises `InputError` where
+    matplotlib is missing, and where a file cannot be written.
+    """
+    require_matplotlib()
+    with style():
+        figure = draw(*arguments, **options)
+        return [] if figure is None else write_figure(file, figure)
+
+
+def draw_extra(
+    file: Path, draw: Callable[P, Figure | None], *arguments: P.args, **options: P.kwargs
+) -> tuple[str, ...]:
+    """Draw a figure as `save_figure` does, and return its error as a remark: numbers do without their figure."""
+    try:
+        save_figure(file, draw, *arguments, **options)
+    except SparseRobError as error:
+        return (str(error),)
+    return ()
 
 
 def write_figure(file: Path, figure: Figure) -> list[Path]:

@@ -3,15 +3,12 @@ colour."""
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from sparserob_core.errors import InputError
 from sparserob_core.experiment.figures import style as look
 from sparserob_core.experiment.figures.figure_data import label, measured, plain
-from sparserob_core.experiment.figures.style import require_matplotlib, style, write_figure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -27,16 +24,6 @@ MARGIN = 0.07  # of the set's extent, around it
 HEIGHT = 5.3
 REACH = 0.35  # of the set's extent: an initial state that is no further away than this is in the picture
 FLAT = 1e-6  # of the picture, the least extent of a set that is drawn as one with interior
-
-
-def write_initial_states(file: Path, found: InitialStates) -> None:
-    """Draw into a file (.png, .pdf, .svg), whole; the same set gives the same bytes. Raises `InputError` when
-    matplotlib is missing, when there is nothing to draw, and when the file cannot be written."""
-    require_matplotlib()
-    if not found.outer.shape[0]:
-        raise InputError(f"{file}: nothing to draw; the set is empty")
-    with style():
-        write_figure(file, draw_initial_states(found))
 
 
 def draw_initial_states(found: InitialStates) -> Figure:

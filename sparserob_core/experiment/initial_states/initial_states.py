@@ -15,11 +15,11 @@ from sparserob_core.control.response.reference import Reference
 from sparserob_core.control.studies.initial_states import InitialPlane, check_states
 from sparserob_core.control.transcription.own_units import walls
 from sparserob_core.control.transcription.transcribe import from_state, in_own_units
-from sparserob_core.errors import InputError, SparseRobError
-from sparserob_core.experiment.assemble import assemble, name_of, tools_of, transcribed_by
+from sparserob_core.errors import InputError
+from sparserob_core.experiment.assemble import assemble, tools_of, transcribed_by
 from sparserob_core.experiment.config.load import Loaded, load_config
-from sparserob_core.experiment.config.reading.reader import write_yaml
-from sparserob_core.experiment.directory.artefacts import RunDirectory, create_directory
+from sparserob_core.experiment.directory.artefacts import RunDirectory
+from sparserob_core.experiment.directory.study import open_study
 from sparserob_core.experiment.initial_states.feasible_set import ON_EDGE, InitialStates
 from sparserob_core.experiment.initial_states.search import InitialStatesSearch
 from sparserob_core.experiment.initial_states.section import section
@@ -84,18 +84,12 @@ def initial_states(
     plane = InitialPlane(own, pair, np.zeros(2), size)
     search = InitialStatesSearch(plane, tools, _get_tolerance(loaded), notify, least, x, limit is not None)
 
-    def find() -> InitialStates:
+    heading = "The experiment whose feasible initial states were sought."
+    with open_study(loaded, out, heading, "", write=False) as directory:
         feasible_set = search.states(experiment.title, directions, values)
-        return _convert_to_user_units(
-            replace(feasible_set, path=_intersect_path_sets(own.problem, feasible_set)), units, limit
-        )
-
-    if out is None:
-        return find()
-    with create_directory(out, name_of(loaded), loaded.config.digest()) as directory:
-        heading = "The experiment whose feasible initial states were sought."
-        directory.write_text("config.yaml", write_yaml(loaded.config.plain(), heading))
-        return _write_files(directory, find())
+        feasible_set = replace(feasible_set, path=_intersect_path_sets(own.problem, feasible_set))
+        result = _convert_to_user_units(feasible_set, units, limit)
+        return result if directory is None else _write_files(directory, result)
 
 
 def _convert_to_user_units(own: InitialStates, units: Units, limit: float | None) -> InitialStates:
@@ -179,14 +173,13 @@ def _intersect_path_sets(problem: OptimalControlProblem, found: InitialStates) -
 
 
 def _write_files(directory: RunDirectory, found: InitialStates) -> InitialStates:
-    """The figure is an extra: where it cannot be drawn, the numbers are there all the same, with a remark."""
-    from sparserob_core.experiment.initial_states.figure import write_initial_states
+    """Write the files of a set of initial states; a figure that cannot be drawn is a remark."""
+    from sparserob_core.experiment.figures.style import draw_extra
+    from sparserob_core.experiment.initial_states.figure import draw_initial_states
 
     if found.outer.shape[0]:
-        try:
-            write_initial_states(directory.path / "initial_states.png", found)
-        except SparseRobError as error:
-            found = replace(found, remarks=(*found.remarks, str(error)))
+        remarks = draw_extra(directory.path / "initial_states.png", draw_initial_states, found)
+        found = replace(found, remarks=(*found.remarks, *remarks))
     directory.write_json("initial_states.json", found.summary())
     directory.write_arrays("initial_states.npz", found.arrays())
     return found

@@ -2,23 +2,19 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from sparserob_core.experiment.figures import style as look
-from sparserob_core.experiment.figures.active import stored_active
 from sparserob_core.experiment.figures.adversary_figure import caption, draw_tube, finish_panel
-from sparserob_core.experiment.figures.drawing import figure_data
 from sparserob_core.experiment.figures.figure_data import FigureData
-from sparserob_core.experiment.figures.style import panels, style, write_figure
+from sparserob_core.experiment.figures.style import panels
 from sparserob_core.experiment.simulation.simulation import ADVERSARY
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from sparserob_core.experiment.directory.finished import FinishedRun
     from sparserob_core.experiment.loop.study import ClosedLoops
 
 PLAN = (0, (3, 1))
@@ -29,18 +25,6 @@ COLOURS = {
     "slow": look.PURPLE,
     "neighbours": look.ORANGE,
 }
-
-
-def write_loops(file: Path, loops: ClosedLoops, finished: FinishedRun) -> None:
-    """Draw loops over the tube of their plan into a file (.png, .pdf, .svg).
-
-    Raises `InputError` where the file cannot be written.
-    """
-    active = stored_active(finished.experiment.transcription, finished.solution)
-    status = str(finished.summary["status"])
-    data = figure_data(finished.experiment, finished.decision, active, (), None, status=status)
-    with style():
-        write_figure(file, draw_loops(loops, data))
 
 
 def draw_loops(loops: ClosedLoops, data: FigureData) -> Figure:

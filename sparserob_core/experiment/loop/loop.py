@@ -95,8 +95,9 @@ def loop(
         If the directory is no finished run with a proven control, or another argument is at fault. It is raised before
         anything is written.
     """
-    from sparserob_core.experiment.figures.style import missing_matplotlib, require_writable
-    from sparserob_core.experiment.loop.figure import write_loops
+    from sparserob_core.experiment.figures.drawing import stored_figure_data
+    from sparserob_core.experiment.figures.style import missing_matplotlib, require_writable, save_figure
+    from sparserob_core.experiment.loop.figure import draw_loops
 
     count = (RESOLVED_LOOPS if resolve else LOOPS) if trajectories is None else whole("trajectories", trajectories, 1)
     whole("seed", seed, 0)
@@ -117,7 +118,7 @@ def loop(
     if out is not None and (missing := missing_matplotlib()):
         return replace(loops, undrawn=missing)
     if out is not None:
-        write_loops(Path(out), loops, finished)
+        save_figure(Path(out), draw_loops, loops, stored_figure_data(finished))
     return loops
 
 

@@ -12,16 +12,16 @@ import numpy as np
 
 from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.control.studies.causal import Ended
-from sparserob_core.errors import InputError, SparseRobError, named
-from sparserob_core.experiment.assemble import assemble, name_of, tools_of, transcribed_by
+from sparserob_core.errors import InputError, named
+from sparserob_core.experiment.assemble import assemble, tools_of, transcribed_by
 from sparserob_core.experiment.config.load import Loaded, load_config
 from sparserob_core.experiment.config.problems import ProblemKeys
-from sparserob_core.experiment.config.reading.reader import write_yaml
-from sparserob_core.experiment.directory.artefacts import RunDirectory, create_directory, finite
+from sparserob_core.experiment.directory.artefacts import RunDirectory, finite
+from sparserob_core.experiment.directory.study import open_study
 from sparserob_core.experiment.margin.causal import causal_upper
 from sparserob_core.experiment.margin.horizon import HORIZON, HorizonSearch, horizon_search
 from sparserob_core.experiment.margin.points import Point, Points
-from sparserob_core.experiment.margin.scaling import Scaling, scaling
+from sparserob_core.experiment.margin.scaling import scaling
 from sparserob_core.experiment.margin.search import Margin, MarginSearch
 from sparserob_core.experiment.run.events import Broadcast, Observer, SweepFinished, SweepStarted
 from sparserob_core.experiment.run.given import GivenConfig, as_config
@@ -106,16 +106,12 @@ def margin(
         search = _build_search(loaded, tools, str(of), float(tolerance), heard if broadcast.heard else notify)
     answer, stopped, deadline = "", "", search.tools.deadline
     try:
-        if out is None and not write:
-            broadcast(_make_start_event(search, Path()))
+        heading = f"The experiment whose margin of {of} was sought."
+        with open_study(loaded, out, heading, "-margin", write) as directory:
+            broadcast(_make_start_event(search, Path() if directory is None else directory.path))
             result = search.margin(int(curve))
-        else:
-            with create_directory(out, f"{name_of(loaded)}-margin", loaded.config.digest()) as directory:
-                heading = f"The experiment whose margin of {of} was sought."
-                directory.write_text("config.yaml", write_yaml(loaded.config.plain(), heading))
-                broadcast(_make_start_event(search, directory.path))
-                result = search.margin(int(curve))
-                result = _write_files(directory, result, None if isinstance(search, HorizonSearch) else search.scaling)
+            if directory is not None:
+                result = _write_files(directory, result, search)
         answer, stopped = "; ".join(f"{name}: {value}" for name, value in margin_rows(result)[:3]), deadline.reason
         return result
     except BaseException as error:
@@ -278,21 +274,18 @@ def _choose_method(loaded: Loaded) -> Exchange:
     return built if isinstance(built, Exchange) else Exchange()
 
 
-def _write_files(directory: RunDirectory, found: Margin, varied: Scaling | None) -> Margin:
-    """Write the files of a margin, and return it with its directory.
+def _write_files(directory: RunDirectory, found: Margin, search: MarginSearch | HorizonSearch) -> Margin:
+    """Write the files of a margin, and return it with its directory; a figure that cannot be drawn is a warning."""
+    from sparserob_core.experiment.figures.style import draw_extra
+    from sparserob_core.experiment.margin.figure import draw_horizons, draw_margin
 
-    The figure is an extra: where it cannot be drawn, the numbers are written all the same, and there is a warning.
-    """
     if len(found.curve) > 1:
-        from sparserob_core.experiment.margin.figure import write_margin_figure
-        from sparserob_core.experiment.margin.horizon_figure import write_horizon_figure
-
-        try:
-            if varied is None:
-                write_horizon_figure(directory.path / "margin.png", found)
-            else:
-                write_margin_figure(directory.path / "margin.png", found, varied)
-        except SparseRobError as error:
-            found = replace(found, remarks=(*found.remarks, str(error)))
+        file = directory.path / "margin.png"
+        remarks = (
+            draw_extra(file, draw_horizons, found)
+            if isinstance(search, HorizonSearch)
+            else draw_extra(file, draw_margin, found, search.scaling)
+        )
+        found = replace(found, remarks=(*found.remarks, *remarks))
     directory.write_json("margin.json", summary_of_margin(found))
     return replace(found, directory=directory.path)

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import Executor
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, TypeVar, final
+from typing import TYPE_CHECKING, Any, Generic, TypeVar, final
 
 import numpy as np
 
@@ -61,14 +61,18 @@ def origin_of(kind: str, component: object) -> str:
     return f"{kind} {type(component).__name__} ({type(component).__module__})"
 
 
-@final
-class _Problem(ProblemFactory):
-    def __init__(self, problem: ProblemFactory, origin: str) -> None:
-        self._problem, self.origin = problem, origin
+class _Guard(Generic[Component]):
+    """A component that is ``behind`` its check; messages call it ``origin``."""
 
+    def __init__(self, behind: Component, origin: str) -> None:
+        self.behind, self.origin = behind, origin
+
+
+@final
+class _Problem(_Guard[ProblemFactory], ProblemFactory):
     def build(self) -> OptimalControlProblem | SemiInfiniteProgram:
         with attributed(self.origin, "build"):
-            built: object = self._problem.build()
+            built: object = self.behind.build()
         if not isinstance(built, OptimalControlProblem | SemiInfiniteProgram):
             raise PluginError(
                 f"{self.origin}: build returned {short_repr(built)}, expected an OptimalControlProblem or a "
@@ -78,12 +82,9 @@ class _Problem(ProblemFactory):
 
 
 @final
-class _Dictionary(DictionaryFactory):
-    def __init__(self, dictionary: DictionaryFactory, origin: str) -> None:
-        self._dictionary, self.origin = dictionary, origin
-
+class _Dictionary(_Guard[DictionaryFactory], DictionaryFactory):
     def build(self, horizon: float) -> Dictionary:
-        built = asked(self.origin, "build", lambda: self._dictionary.build(horizon), Dictionary)
+        built = asked(self.origin, "build", lambda: self.behind.build(horizon), Dictionary)
         first, last = float(built.breakpoints[0]), float(built.breakpoints[-1])
         if first != 0.0 or abs(last - horizon) > 1e-9 * horizon:
             raise PluginError(
@@ -93,11 +94,8 @@ class _Dictionary(DictionaryFactory):
 
 
 @final
-class _Policy(Policy):
+class _Policy(_Guard[Policy], Policy):
     """A checked policy; `sparserob_core.control.policies.policy.answers_of` checks its answers."""
-
-    def __init__(self, policy: Policy, origin: str) -> None:
-        self.behind, self.origin = policy, origin
 
     @property
     def knows(self) -> frozenset[Quantity]:
@@ -112,12 +110,9 @@ class _Policy(Policy):
 
 
 @final
-class _Method(Method):
-    def __init__(self, method: Method, origin: str) -> None:
-        self._method, self.origin = method, origin
-
+class _Method(_Guard[Method], Method):
     def solve(self, program: SemiInfiniteProgram, tools: Tools) -> Result:
-        result = asked(self.origin, "solve", lambda: self._method.solve(program, tools), Result)
+        result = asked(self.origin, "solve", lambda: self.behind.solve(program, tools), Result)
         if result.status not in MEANING:
             raise PluginError(
                 f"{self.origin}: solve returned the status {short_repr(result.status)}, expected one of"
@@ -135,39 +130,33 @@ class _Method(Method):
 
 
 @final
-class _Executors(ExecutorFactory):
-    def __init__(self, executors: ExecutorFactory, origin: str) -> None:
-        self._executors, self.origin = executors, origin
-
+class _Executors(_Guard[ExecutorFactory], ExecutorFactory):
     @property
     def parallel(self) -> bool:
-        return asked(self.origin, "parallel", lambda: self._executors.parallel, bool)
+        return asked(self.origin, "parallel", lambda: self.behind.parallel, bool)
 
     @contextmanager
     def open(self) -> Iterator[Executor]:
         with ExitStack() as stack:
-            yield asked(self.origin, "open", lambda: stack.enter_context(self._executors.open()), Executor)
+            yield asked(self.origin, "open", lambda: stack.enter_context(self.behind.open()), Executor)
 
 
 @final
-class _Solver(Solver):
-    def __init__(self, solver: Solver, origin: str) -> None:
-        self._solver, self.origin = solver, origin
-
+class _Solver(_Guard[Solver], Solver):
     @property
     def delegate(self) -> str:
-        return asked(self.origin, "delegate", lambda: self._solver.delegate, str)
+        return asked(self.origin, "delegate", lambda: self.behind.delegate, str)
 
     @property
     def conic(self) -> bool:  # type: ignore[override]
-        return self._solver.conic
+        return self.behind.conic
 
     @property
     def aborts(self) -> bool:  # type: ignore[override]
-        return self._solver.aborts
+        return self.behind.aborts
 
     def solve(self, program: QuadraticProgram, accuracy: float) -> Claim:
-        claim = asked(self.origin, "solve", lambda: self._solver.solve(program, accuracy), Claim)
+        claim = asked(self.origin, "solve", lambda: self.behind.solve(program, accuracy), Claim)
         if claim.status not in ("solved", "infeasible", "failed"):
             raise PluginError(
                 f"{self.origin}: solve claimed {short_repr(claim.status)}, expected solved, infeasible or failed"
@@ -185,41 +174,35 @@ class _Solver(Solver):
 
 
 @final
-class _Maximiser(Maximiser):
+class _Maximiser(_Guard[Maximiser], Maximiser):
     """A maximiser with its name in messages; `sparserob_core.sip.search.search.maximise` checks its answer."""
 
     @property
     def scaled(self) -> bool:  # type: ignore[override]
-        return asked(self.origin, "scaled", lambda: self._maximiser.scaled, bool)
+        return asked(self.origin, "scaled", lambda: self.behind.scaled, bool)
 
     @property
     def apart(self) -> bool:  # type: ignore[override]
-        return asked(self.origin, "apart", lambda: self._maximiser.apart, bool)
+        return asked(self.origin, "apart", lambda: self.behind.apart, bool)
 
     @property
     def whole(self) -> bool:  # type: ignore[override]
-        return asked(self.origin, "whole", lambda: self._maximiser.whole, bool)
-
-    def __init__(self, maximiser: Maximiser, origin: str) -> None:
-        self._maximiser, self.origin = maximiser, origin
+        return asked(self.origin, "whole", lambda: self.behind.whole, bool)
 
     @property
     def polished(self) -> float:
-        return self._maximiser.polished
+        return self.behind.polished
 
     def search(self, objective: Objective, rng: np.random.Generator) -> float:
-        return self._maximiser.search(objective, rng)
+        return self.behind.search(objective, rng)
 
 
 @final
-class _Regulariser(Regulariser):
-    def __init__(self, regulariser: Regulariser, origin: str) -> None:
-        self._regulariser, self.origin = regulariser, origin
-
+class _Regulariser(_Guard[Regulariser], Regulariser):
     def quadratic(self, image: ControlImage) -> tuple[csc_array, Array]:
         from scipy.sparse import csc_array
 
-        answer = asked(self.origin, "quadratic", lambda: self._regulariser.quadratic(image), tuple)
+        answer = asked(self.origin, "quadratic", lambda: self.behind.quadratic(image), tuple)
         n = image.S.shape[1]
         with attributed(self.origin, "quadratic: what it returned"):
             P, q = csc_array(answer[0]), np.asarray(answer[1], dtype=float)

@@ -19,7 +19,7 @@ from sparserob_core.experiment.directory.adversary import adversaries
 from sparserob_core.experiment.directory.finished import read_finished, stored_run
 from sparserob_core.experiment.figures.active import active_of
 from sparserob_core.experiment.figures.figure_data import plain
-from sparserob_core.experiment.figures.landscape_figure import LandscapeData, write_landscape
+from sparserob_core.experiment.figures.landscape_figure import LandscapeData
 from sparserob_core.experiment.figures.switching import Switching
 from sparserob_core.experiment.run.events import StudyProgress
 from sparserob_core.experiment.run.inspection import Inspection, RelaxedValue
@@ -42,6 +42,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 Drawing: TypeAlias = Callable[[], list[Path]]
+Picture: TypeAlias = "Callable[[], Figure | None]"
+Group: TypeAlias = Callable[[], Mapping[str, Picture]]
 
 logger = logging.getLogger("sparserob")
 
@@ -104,10 +106,7 @@ def draw_run(directory: Path, plugins: Iterable[str | Path] = (), notify: Notify
 def drawings(
     experiment: Experiment, result: Result, directory: Path, worst: Mapping[str, Array], notify: Notify = ignore
 ) -> Iterator[Drawing]:
-    """Yield the figures of a result, each as a function that writes into ``directory/figures`` and returns its files.
-
-    The figures are that of the irreducible infeasible subsystem where a control problem is infeasible, those of the
-    decision where there is one, and those of a search.
+    """Yield the figures of a result in groups, each as a function that writes into ``directory/figures``.
 
     Parameters
     ----------
@@ -125,78 +124,64 @@ def drawings(
     Yields
     ------
     callable
-        A function without arguments; it raises `InputError` where the figure cannot be drawn.
+        A function without arguments that returns the files; it raises `InputError` where a figure cannot be drawn.
     """
-    from sparserob_core.experiment.figures.clash import draw_clash
-    from sparserob_core.experiment.figures.climb_figure import write_climb
-    from sparserob_core.experiment.figures.drawing import draw_experiment
+    from sparserob_core.experiment.figures.style import save_figure
 
-    model = experiment.model
-    if model is not None and result.status == "infeasible":
-        yield lambda: draw_clash(experiment, result, directory)
-    elif model is not None and result.decision is not None:
-        active, decision = active_of(model, result.indices), np.asarray(result.decision, dtype=float).ravel()
-        yield lambda: draw_experiment(
-            experiment,
-            decision,
-            active,
-            result.history,
-            directory,
-            result.cost,
-            worst,
-            result.status,
-            switching(experiment, result),
-        )
-    trace = result.trace
-    if trace is not None and np.isfinite(trace.value).any():
-        exact = result.status == "certified"
-        yield lambda: write_climb(
-            directory / "figures",
-            trace,
-            plain(experiment.title),
-            result.upper_bound,
-            exact=exact,
-            unit=_get_cost_unit(experiment),
-        )
-        yield lambda: _draw_landscape(experiment, result, directory, notify)
+    def write(group: Group) -> list[Path]:
+        return [file for name, draw in group().items() for file in save_figure(directory / "figures" / name, draw)]
+
+    for group in _list_groups(experiment, result, lambda decision: worst, notify):
+        yield partial(write, group)
 
 
-def pictures(experiment: Experiment, result: Result) -> dict[str, Callable[[], Figure | None]]:
-    """Return the figures of a result by name, each as a function that draws it.
+def _list_groups(
+    experiment: Experiment, result: Result, worst: Callable[[Array], Mapping[str, Array]], notify: Notify = ignore
+) -> Iterator[Group]:
+    """Yield the groups of figures of a result: functions that return figures by name, each as a function.
 
-    The function returns ``None`` where nothing can move in the figure.
+    They are the figure of the irreducible infeasible subsystem where a control problem is infeasible, those of the
+    decision where there is one, and the two of a search. ``worst`` returns the arrays of `adversaries` at a decision.
     """
-    from sparserob_core.experiment.figures.adversary_figure import draw_adversary
     from sparserob_core.experiment.figures.clash import clash_figure
     from sparserob_core.experiment.figures.climb_figure import draw_climb
-    from sparserob_core.experiment.figures.drawing import DRAWS, figure_data
-    from sparserob_core.experiment.figures.landscape_figure import draw_landscape
+
+    model, trace = experiment.model, result.trace
+    if model is not None and result.status == "infeasible":
+        yield lambda: {"clash": partial(clash_figure, experiment, result)}
+    elif model is not None and result.decision is not None:
+        yield lambda: _prepare_decision_figures(experiment, result, worst)
+    if trace is not None and np.isfinite(trace.value).any():
+        yield lambda: {
+            "climb": lambda: draw_climb(
+                trace,
+                plain(experiment.title),
+                result.upper_bound,
+                exact=result.status == "certified",
+                unit="" if experiment.problem is None else experiment.problem.cost_unit,
+            )
+        }
+        yield lambda: {"landscape": partial(_draw_landscape, experiment, trace, notify)}
+
+
+def _prepare_decision_figures(
+    experiment: Experiment, result: Result, worst: Callable[[Array], Mapping[str, Array]]
+) -> Mapping[str, Picture]:
+    """Return the figures of a decision by name.
+
+    That of the worst cases is among them unless there is no constraint against which they could be driven.
+    """
+    from sparserob_core.experiment.figures.adversary_figure import draw_adversary
+    from sparserob_core.experiment.figures.drawing import DRAWS, choose_states, figure_data
     from sparserob_core.experiment.figures.run_figures import run_pictures
 
-    figures: dict[str, Callable[[], Figure | None]] = {}
-    model = experiment.model
-    if model is not None and result.status == "infeasible":
-        figures["clash"] = lambda: clash_figure(experiment, result)
-    elif model is not None and result.decision is not None:
-        decision, active = np.asarray(result.decision, dtype=float).ravel(), active_of(model, result.indices)
-        data = figure_data(experiment, decision, active, result.history, result.cost, DRAWS, result.status)
-        figures |= run_pictures(replace(data, push=switching(experiment, result)))
-        worst = adversaries(experiment, decision)
-        if worst:
-            figures["adversary"] = lambda: draw_adversary(worst, data)
-    trace = result.trace
-    if trace is not None and np.isfinite(trace.value).any():
-        title, exact = plain(experiment.title), result.status == "certified"
-        figures["climb"] = lambda: draw_climb(
-            trace, title, result.upper_bound, exact=exact, unit=_get_cost_unit(experiment)
-        )
-
-        def landscape() -> Figure | None:
-            landscape_data = landscape_of(Inspection(experiment.loaded, experiment), trace, title)
-            return None if landscape_data is None else draw_landscape(landscape_data)
-
-        figures["landscape"] = landscape
-    return figures
+    assert experiment.model is not None
+    decision = np.asarray(result.decision, dtype=float).ravel()
+    active, states = active_of(experiment.model, result.indices), choose_states(experiment, decision)
+    data = figure_data(experiment, decision, active, result.history, result.cost, DRAWS, result.status, states)
+    data = replace(data, push=switching(experiment, result))
+    cases = worst(decision)
+    return {**run_pictures(data), **({"adversary": partial(draw_adversary, cases, data)} if cases else {})}
 
 
 def plot(experiment: Experiment, result: Result, name: str | None) -> Figure:
@@ -209,7 +194,7 @@ def plot(experiment: Experiment, result: Result, name: str | None) -> Figure:
     result : Result
         Its result.
     name : str or None
-        One of the names of `pictures`. Where it is ``None``, the figure is that of the states, or of the irreducible
+        A name such as ``control``. Where it is ``None``, the figure is that of the states, or of the irreducible
         infeasible subsystem of an infeasible problem.
 
     Returns
@@ -225,7 +210,8 @@ def plot(experiment: Experiment, result: Result, name: str | None) -> Figure:
     from sparserob_core.experiment.figures.style import require_matplotlib, style
 
     require_matplotlib()
-    figures = pictures(experiment, result)
+    groups = _list_groups(experiment, result, partial(adversaries, experiment))
+    figures = {name: draw for group in groups for name, draw in group().items()}
     name = name or ("clash" if result.status == "infeasible" else "states")
     if name not in figures:
         available = ", ".join(figures) or f"none: the result is {result.status}, without a control"
@@ -259,10 +245,6 @@ def picture(experiment: Experiment, result: Result) -> bytes | None:
         return None
 
 
-def _get_cost_unit(experiment: Experiment) -> str:
-    return "" if experiment.problem is None else experiment.problem.cost_unit
-
-
 def switching(experiment: Experiment, result: Result) -> Array | None:
     """Return the switching function ``(m, K)`` of a result: the effect of the constraints on the control.
 
@@ -277,11 +259,12 @@ def switching(experiment: Experiment, result: Result) -> Array | None:
     return function.push([cut for cut in result.indices if cut.multiplier > 0.0], None) if values is None else values
 
 
-def _draw_landscape(experiment: Experiment, result: Result, directory: Path, notify: Notify) -> list[Path]:
-    assert result.trace is not None
-    inspection = Inspection(experiment.loaded, experiment)
-    data = landscape_of(inspection, result.trace, plain(experiment.title), notify)
-    return [] if data is None else write_landscape(directory / "figures", data)
+def _draw_landscape(experiment: Experiment, trace: SearchTrace, notify: Notify) -> Figure | None:
+    """Return the figure of the landscape of g; ``None`` where nothing can move in it."""
+    from sparserob_core.experiment.figures.landscape_figure import draw_landscape
+
+    data = landscape_of(Inspection(experiment.loaded, experiment), trace, plain(experiment.title), notify)
+    return None if data is None else draw_landscape(data)
 
 
 def landscape_of(

@@ -20,12 +20,12 @@ from sparserob_core.control.studies.adversary import Adversary
 from sparserob_core.control.studies.answer import ControlResult, Tube
 from sparserob_core.control.transcription.record import Transcription
 from sparserob_core.errors import InputError
-from sparserob_core.experiment.assemble import ControlExperiment, Experiment, assemble, name_of, tools_of
+from sparserob_core.experiment.assemble import ControlExperiment, Experiment, assemble, tools_of
 from sparserob_core.experiment.config.load import Loaded, load_config
 from sparserob_core.experiment.config.reading.reader import Source, require_readable, write_yaml
 from sparserob_core.experiment.config.stated.source import component_keys, dictionary_keys, source_of
-from sparserob_core.experiment.directory.artefacts import create_directory
 from sparserob_core.experiment.directory.provenance import git_revision, provenance
+from sparserob_core.experiment.directory.study import open_directory
 from sparserob_core.experiment.plugins.registry import load_registry
 from sparserob_core.experiment.run.conclusion.bound import bounded, unbounded
 from sparserob_core.experiment.run.conclusion.causal import with_causal
@@ -222,11 +222,9 @@ class SolvedProblem(ControlResult):
         if isinstance(tools.solver, Named):  # the counts of solver calls go on from those of the result
             tools.solver.failures.resume(self.counts.get("solver_calls", 0), self.unanswered)
         plain = loaded.config.plain()
-        text = write_yaml(plain, HEADING)
-        require_readable(plain, text)
+        require_readable(plain, write_yaml(plain, HEADING))
         result = self if "directory" in self.__dict__ else concluded(experiment, self, tools)
-        with create_directory(path, name_of(loaded), loaded.config.digest()) as directory:
-            directory.write_text("config.yaml", text)
+        with open_directory(loaded, path, HEADING) as directory:
             journal = Journal(directory, experiment, provenance(plain, git_revision(loaded.source.folder)))
             journal.asked = True  # nothing listened to the search: no note may claim that the maximiser was idle
             control, summary, remarks = journal.finish(result, figures)

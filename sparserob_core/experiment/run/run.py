@@ -16,6 +16,7 @@ from sparserob_core.experiment.config.reading.reader import write_yaml
 from sparserob_core.experiment.directory.artefacts import create_directory
 from sparserob_core.experiment.directory.finished import UNFINISHED
 from sparserob_core.experiment.directory.provenance import git_revision, provenance
+from sparserob_core.experiment.directory.study import open_directory
 from sparserob_core.experiment.run.events import Broadcast, Event, Observer, RunFinished, RunStarted
 from sparserob_core.experiment.run.given import GivenConfig, as_config
 from sparserob_core.experiment.run.inspection import Inspection
@@ -200,8 +201,7 @@ def _write_untranscribed(
     """Write the directory of a problem that was not transcribed in time, and return its outcome."""
     loaded = experiment.loaded
     result = Result(status="undecided", message=experiment.reason, lower_bound=0.0, stopped=experiment.reason)
-    with create_directory(out, name_of(loaded), loaded.config.digest()) as directory:
-        directory.write_text("config.yaml", write_yaml(loaded.config.plain(), HEADING))
+    with open_directory(loaded, out, HEADING) as directory:
         control, summary, remarks = Journal(directory, experiment, origin).finish(result, figures=False)
         return Outcome(result, directory.path, experiment, control, summary, remarks)
 

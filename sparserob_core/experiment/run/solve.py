@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING, Any, TypedDict, overload
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, TypedDict, overload
 
 import numpy as np
 
@@ -16,9 +16,9 @@ from sparserob_core.control.transcription.record import Transcription
 from sparserob_core.errors import InputError
 from sparserob_core.experiment.plugins.components import Registry
 from sparserob_core.experiment.plugins.registry import load_registry
-from sparserob_core.experiment.solve import PIECES, Choice, careful, component, dictionary, indicators
+from sparserob_core.experiment.solve import PIECES, Choice, component, dictionary, indicators, wrap_notify
 from sparserob_core.sip.convexity import Regulariser
-from sparserob_core.sip.events import Event, ignore
+from sparserob_core.sip.events import ignore
 from sparserob_core.sip.limits.deadline import Deadline, as_seconds
 from sparserob_core.sip.maximiser import Maximiser
 from sparserob_core.sip.method import GAP_TOLERANCE, Continuation, Method, Tools, require_suited
@@ -166,7 +166,7 @@ def solve(
         budget=whole("budget", budget, 1),
         polish=None if polish is None else share("polish", polish),
         rng=np.random.default_rng(whole("seed", seed, 0)),
-        notify=_wrap_notify(notify),
+        notify=wrap_notify(notify),
         deadline=deadline,
     )
     chosen: Method = component(registry, "method", _add_tolerance(registry, method, tolerance), Method)
@@ -279,15 +279,3 @@ def _add_tolerance(registry: Registry, method: object, tolerance: float | None) 
         return entry
     takes_it = "tolerance" in registry.get("method", entry["name"]).options_type().model_fields
     return {"tolerance": tolerance, **entry} if takes_it else entry
-
-
-def _wrap_notify(notify: Notify) -> Callable[[Any], None]:
-    if notify is ignore:
-        return ignore
-    heard = careful("notify", notify)
-
-    def pass_on(event: object) -> None:
-        if isinstance(event, Event):
-            heard(event)
-
-    return pass_on

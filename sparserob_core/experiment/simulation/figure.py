@@ -2,54 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from sparserob_core.experiment.figures import style as look
-from sparserob_core.experiment.figures.active import stored_active
-from sparserob_core.experiment.figures.adversary_figure import caption, draw_tube, finish_panel, write_adversary
-from sparserob_core.experiment.figures.drawing import figure_data
+from sparserob_core.experiment.figures.adversary_figure import caption, draw_tube, finish_panel
 from sparserob_core.experiment.figures.figure_data import FigureData
-from sparserob_core.experiment.figures.style import panels, style, write_figure
-from sparserob_core.sip.convex_set import Array
+from sparserob_core.experiment.figures.style import panels
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from sparserob_core.experiment.directory.finished import FinishedRun
     from sparserob_core.experiment.simulation.simulation import Simulation
-
-
-def write_simulation(
-    file: Path, simulation: Simulation, finished: FinishedRun, worst: Mapping[str, Array] | None = None
-) -> None:
-    """Draw a simulation over the worst case of its run into a file (.png, .pdf, .svg).
-
-    Parameters
-    ----------
-    file : Path
-        The file.
-    simulation : Simulation
-        The simulation.
-    finished : FinishedRun
-        The run.
-    worst : mapping, optional
-        Adversaries, which are drawn instead of the simulation.
-
-    Raises
-    ------
-    InputError
-        If the file cannot be written.
-    """
-    active = stored_active(finished.experiment.transcription, finished.solution)
-    status = str(finished.summary["status"])
-    data = figure_data(finished.experiment, finished.decision, active, (), None, status=status)
-    if worst is not None:
-        write_adversary(file, worst, data)
-        return
-    with style():
-        write_figure(file, draw_simulation(simulation, data))
 
 
 def draw_simulation(simulation: Simulation, data: FigureData) -> Figure:

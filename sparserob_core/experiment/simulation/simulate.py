@@ -97,8 +97,10 @@ def simulate(
         If the directory is no finished run with a control, or another argument is at fault. It is raised before
         anything is written.
     """
-    from sparserob_core.experiment.figures.style import missing_matplotlib, require_writable
-    from sparserob_core.experiment.simulation.figure import write_simulation
+    from sparserob_core.experiment.figures.adversary_figure import draw_adversary
+    from sparserob_core.experiment.figures.drawing import stored_figure_data
+    from sparserob_core.experiment.figures.style import missing_matplotlib, require_writable, save_figure
+    from sparserob_core.experiment.simulation.figure import draw_simulation
 
     count = _check_arguments(law, trajectories, seed)
     if out is not None:
@@ -132,8 +134,10 @@ def simulate(
     RunDirectory(finished.directory).write_json(f"simulation-{law}.json", simulation.summary())
     if out is not None and (missing := missing_matplotlib()):
         return replace(simulation, undrawn=missing)
-    if out is not None:
-        write_simulation(Path(out), simulation, finished, replayed)
+    if out is not None and replayed is not None:
+        save_figure(Path(out), draw_adversary, replayed, stored_figure_data(finished))
+    elif out is not None:
+        save_figure(Path(out), draw_simulation, simulation, stored_figure_data(finished))
     return simulation
 
 

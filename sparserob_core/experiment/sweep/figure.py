@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from textwrap import shorten
 from typing import TYPE_CHECKING, Any, final
 
@@ -23,7 +22,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-NAME = "sweep"
 COLOURS = (look.BLUE, look.VERMILLION, look.GREEN, look.PURPLE, look.ORANGE, look.SKY, look.GREY)
 DASHES: tuple[Any, ...] = ("solid", (0, (4, 1.5)), (0, (1, 1)))
 MARKS: Mapping[str, str] = {
@@ -39,16 +37,6 @@ FILLED = "osDvX"
 LETTERS = 44  # largest length of a label
 CELLS = 5  # number of values of each axis from which a map is clearer than curves
 SEVERAL = 5  # number of seeds from which a box is clearer than points
-
-
-def write_study_figure(study: Study) -> list[Path]:
-    """Draw a study into ``sweep.pdf`` and ``sweep.png`` of its directory.
-
-    Raises `InputError` where there is nothing to draw, or matplotlib is missing.
-    """
-    look.require_matplotlib()
-    with look.style():
-        return look.write_figure(study.directory / NAME, draw_study(study))
 
 
 def draw_study(study: Study) -> Figure:

@@ -623,11 +623,12 @@ def _format_duration(seconds: float) -> str:
 
 def _draw_figure(study: Study) -> Study:
     """Draw the figure of a study; where it cannot be drawn, there is a warning."""
-    from sparserob_core.experiment.sweep.figure import write_study_figure
+    from sparserob_core.experiment.figures.style import save_figure
+    from sparserob_core.experiment.sweep.figure import draw_study
 
     try:
         if study.table and not study.stopped:
-            write_study_figure(study)
+            save_figure(study.directory / "sweep", draw_study, study)
     except KeyboardInterrupt:
         return replace(study, remarks=(*study.remarks, "no figure: it was interrupted"))
     except SparseRobError as error:

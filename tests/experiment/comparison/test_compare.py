@@ -18,10 +18,11 @@ import pytest
 
 import sparserob_core as sr
 from sparserob_core.experiment.comparison.compare import compare, comparison_remarks, comparison_table
-from sparserob_core.experiment.comparison.figure import draw_comparison, write_comparison
+from sparserob_core.experiment.comparison.figure import draw_comparison
 from sparserob_core.experiment.comparison.labels import labels
 from sparserob_core.experiment.config.reading.reader import write_yaml
 from sparserob_core.experiment.directory.artefacts import RunDirectory
+from sparserob_core.experiment.figures.style import save_figure
 from tests.support.stub import Command
 
 EXACT = 2.0
@@ -370,7 +371,7 @@ def test_a_missing_matplotlib_is_named_with_the_line_that_brings_it(
     comparison = compare([runs.rounds("a")])
     monkeypatch.setitem(sys.modules, "matplotlib", None)
     with pytest.raises(sr.InputError, match=r"pip install .matplotlib"):
-        write_comparison(tmp_path / "picture.png", comparison)
+        save_figure(tmp_path / "picture.png", draw_comparison, comparison)
 
 
 def test_the_command_prints_a_table_and_writes_the_picture(runs: Runs, command: Command, tmp_path: Path) -> None:

@@ -14,7 +14,8 @@ from hypothesis import strategies as st
 
 import sparserob_core as sr
 from sparserob_core.experiment.comparison.profiles import LOWER, MIDDLE, UPPER, Instance, Profiles
-from sparserob_core.experiment.comparison.profiles_figure import draw_profiles, write_profiles
+from sparserob_core.experiment.comparison.profiles_figure import draw_profiles
+from sparserob_core.experiment.figures.style import save_figure
 
 NEVER = np.inf
 
@@ -124,7 +125,7 @@ def test_the_figure_shows_the_steps_of_every_contender():
 
 def test_contenders_who_solve_nothing_are_drawn_too(tmp_path):
     pytest.importorskip("matplotlib")
-    write_profiles(tmp_path / "none.png", profiles_of([[NEVER, NEVER], [NEVER, NEVER]]))
+    save_figure(tmp_path / "none.png", draw_profiles, profiles_of([[NEVER, NEVER], [NEVER, NEVER]]))
     assert (tmp_path / "none.png").stat().st_size
 
 

@@ -18,8 +18,15 @@ from sparserob_core.experiment.config.load import load_config
 from sparserob_core.experiment.figures import drawing
 from sparserob_core.experiment.figures.active import Active, active_of, stored_active
 from sparserob_core.experiment.figures.figure_data import MOST_STATES, FigureData, Wall
-from sparserob_core.experiment.figures.run_figures import draw_control, draw_convergence, draw_states, write_figures
-from sparserob_core.experiment.figures.style import _report_missing_letters, draw_legend, held, panels, style
+from sparserob_core.experiment.figures.run_figures import draw_control, draw_convergence, draw_states, run_pictures
+from sparserob_core.experiment.figures.style import (
+    _report_missing_letters,
+    draw_legend,
+    held,
+    panels,
+    save_figure,
+    style,
+)
 from sparserob_core.sip.events import RoundFinished
 from tests.support.drafts import whole
 from tests.support.problems import double_integrator
@@ -49,6 +56,10 @@ def data() -> FigureData:
         tolerance=1e-6,
         walls=[Wall(state=0, upper=1.2, start=0.0, end=2.0), Wall(state=1, lower=-1.5, upper=0.5, start=2.0, end=2.0)],
     )
+
+
+def write_figures(directory: Path, data: FigureData) -> list[Path]:
+    return [file for name, draw in run_pictures(data).items() for file in save_figure(directory / name, draw)]
 
 
 @pytest.fixture(scope="module")
@@ -201,7 +212,7 @@ def test_of_very_many_states_no_more_is_computed_than_is_drawn(policy: str, monk
 
     monkeypatch.setattr(drawing, "tube", counted)
     experiment, decision = result.experiment, np.asarray(result.decision)
-    shown = drawing._choose_states(experiment, decision)
+    shown = drawing.choose_states(experiment, decision)
     assert shown is not None and set(shown) == {*range(MOST_STATES)}
     data = drawing.figure_data(experiment, decision, None, (), None, states=shown)
     assert data.drawn_states == tuple(shown) and data.of_states == f", {MOST_STATES} of {n} states"

@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 
 from sparserob_core.errors import InputError
-from sparserob_core.experiment.figures.climb_figure import draw_climb, write_climb
-from sparserob_core.experiment.figures.landscape_figure import LandscapeData, draw_landscape, write_landscape
+from sparserob_core.experiment.figures.climb_figure import draw_climb
+from sparserob_core.experiment.figures.landscape_figure import LandscapeData, draw_landscape
+from sparserob_core.experiment.figures.style import save_figure
 from sparserob_core.sip.result import SearchTrace
 
 pytest.importorskip("matplotlib")
@@ -87,7 +88,7 @@ def test_a_walk_that_is_heated_again_within_a_stage_is_marked_there_only(trace: 
 
 def test_a_search_without_a_finite_value_is_drawn_without_one(trace: SearchTrace, tmp_path: Path) -> None:
     lost = replace(trace, value=np.full(8, np.inf), bound=np.full(8, -np.inf), notes={})
-    assert len(write_climb(tmp_path, lost, "Lost")) == 2
+    assert len(save_figure(tmp_path / "climb", draw_climb, lost, "Lost")) == 2
 
 
 def landscape(**changes: object) -> LandscapeData:
@@ -113,7 +114,10 @@ def test_the_map_shows_the_values_where_they_belong(tmp_path: Path) -> None:
     data = landscape()
     (mesh,) = [part for part in draw_landscape(data).axes[0].collections if hasattr(part, "get_coordinates")]
     assert np.array_equal(np.asarray(mesh.get_array()).reshape(3, 5), data.values.T)
-    assert {file.name for file in write_landscape(tmp_path, data)} == {"landscape.pdf", "landscape.png"}
+    assert {file.name for file in save_figure(tmp_path / "landscape", draw_landscape, data)} == {
+        "landscape.pdf",
+        "landscape.png",
+    }
 
 
 def test_a_flat_slice_says_so_with_its_value() -> None:
@@ -133,7 +137,7 @@ def test_what_no_control_meets_is_named(tmp_path: Path) -> None:
     values[2:, :] = np.inf
     labels = draw_landscape(landscape(values=values)).axes[0].get_legend_handles_labels()[1]
     assert "no control meets these constraints" in labels
-    assert len(write_landscape(tmp_path, landscape(values=np.full((5, 3), np.inf)))) == 2
+    assert len(save_figure(tmp_path / "landscape", draw_landscape, landscape(values=np.full((5, 3), np.inf)))) == 2
 
 
 def test_a_single_coordinate_is_a_curve() -> None:

@@ -52,7 +52,7 @@ def coarse(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_the_figures_of_a_search_are_drawn_from_its_directory(
     searched: sr.Outcome, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("sparserob_core.experiment.figures.drawing.draw_experiment", lambda *_: [])
+    monkeypatch.setattr(drawing, "_prepare_decision_figures", lambda *_: {})
     said: list[sr.Event] = []
     files = draw_run(searched.directory, notify=said.append)
     assert {file.name for file in files} == FIGURES and all(file.is_file() for file in files)
@@ -76,8 +76,8 @@ def test_a_figure_that_cannot_be_drawn_is_a_remark_and_costs_no_other(
     def broken(*_: object, **__: object) -> None:
         raise RuntimeError("no ink")
 
-    monkeypatch.setattr("sparserob_core.experiment.figures.drawing.draw_experiment", broken)
-    monkeypatch.setattr("sparserob_core.experiment.figures.climb_figure.write_climb", broken)
+    monkeypatch.setattr(drawing, "_prepare_decision_figures", broken)
+    monkeypatch.setattr("sparserob_core.experiment.figures.climb_figure.draw_climb", broken)
     remarks = drawn(searched.experiment, searched.result, tmp_path, {})
     assert remarks == ("the figures could not be drawn: RuntimeError: no ink",)
     assert {file.stem for file in (tmp_path / "figures").iterdir()} == {"landscape"}

@@ -14,7 +14,7 @@ import pytest
 
 import sparserob_core as sr
 from sparserob_core.experiment.comparison.compare import comparison_table
-from sparserob_core.experiment.margin.horizon_figure import draw_horizons
+from sparserob_core.experiment.margin.figure import draw_horizons
 from sparserob_core.experiment.margin.margin import margin_rows
 from sparserob_core.experiment.terminal.table import _format_worst, result_rows
 

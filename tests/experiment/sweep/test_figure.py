@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 
 import sparserob_core as sr
+from sparserob_core.experiment.figures.style import save_figure
 from sparserob_core.experiment.sweep.axes import parse_axes
-from sparserob_core.experiment.sweep.figure import MARKS, draw_study, write_study_figure
+from sparserob_core.experiment.sweep.figure import MARKS, draw_study
 from sparserob_core.experiment.sweep.study import Study, shown
 from sparserob_core.experiment.sweep.table import axis_unit, columns_text
 from sparserob_core.sip.result import MEANING
@@ -152,7 +153,9 @@ def test_without_a_cost_there_is_nothing_to_draw() -> None:
 def test_one_point_and_very_many_curves_can_be_drawn(tmp_path: Path, count: int) -> None:
     rows = [{"x": 1.0, "method": f"m{k}", "cost": float(k)} for k in range(count)]
     methods = [f"m{k}" for k in range(count)]
-    written = write_study_figure(study({"x": [1.0, 2.0], "method": methods}, rows, out=tmp_path))
+    written = save_figure(
+        tmp_path / "sweep", draw_study, study({"x": [1.0, 2.0], "method": methods}, rows, out=tmp_path)
+    )
     assert [path.name for path in written] == ["sweep.pdf", "sweep.png"]
 
 

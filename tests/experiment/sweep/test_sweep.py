@@ -91,7 +91,7 @@ def counting(tmp_path: Path) -> Path:
 def undrawn(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
     """Figures take longer than all the rest; test_figure.py is about them."""
     if request.function is not test_a_study_leaves_what_is_documented:
-        monkeypatch.setattr("sparserob_core.experiment.sweep.figure.write_study_figure", lambda study: [])
+        monkeypatch.setattr("sparserob_core.experiment.sweep.figure.draw_study", lambda study: None)
 
 
 def calls(config: Path) -> Counter[int]:
@@ -655,7 +655,7 @@ def test_an_interrupt_while_the_figure_is_drawn_costs_the_figure_only(
     def press(study: sr.Study) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("sparserob_core.experiment.sweep.figure.write_study_figure", press)
+    monkeypatch.setattr("sparserob_core.experiment.sweep.figure.draw_study", press)
     study = sr.sweep(counting, {"method.number": [1, 2]}, out=tmp_path / "out")
     assert (len(study.table), study.remarks) == (2, ("no figure: it was interrupted",))
 

@@ -11,7 +11,8 @@ import pytest
 from scipy.optimize import linprog
 
 import sparserob_core as sr
-from sparserob_core.experiment.figures.clash import clash_strips, draw_clash
+from sparserob_core.experiment.figures.clash import clash_figure, clash_strips
+from sparserob_core.experiment.figures.style import save_figure
 from sparserob_core.sip.evidence import InfeasibleSubsystem
 from sparserob_core.sip.proof.irreducible import irreducible
 from sparserob_core.sip.proof.verdict import infeasible_subsystem
@@ -200,13 +201,11 @@ def test_the_strips_of_the_figure_are_the_closed_forms(tmp_path):
 
 def test_the_figure_of_a_clash_is_drawn_and_only_for_an_infeasible_run(tmp_path):
     outcome = solved(tmp_path, disturbance={"box": [0.0, 0.3]}, terminal=[{"box": [None, 0.5]}])
-    assert [file.name for file in draw_clash(outcome.experiment, outcome.result, tmp_path)] == [
-        "clash.pdf",
-        "clash.png",
-    ]
+    files = save_figure(tmp_path / "clash", clash_figure, outcome.experiment, outcome.result)
+    assert [file.name for file in files] == ["clash.pdf", "clash.png"]
     fine = solved(tmp_path / "fine", terminal=[{"box": [1.0, 1.0]}])
     with pytest.raises(sr.InputError, match="infeasible"):
-        draw_clash(fine.experiment, fine.result, tmp_path)
+        clash_figure(fine.experiment, fine.result)
 
 
 def test_two_states_that_the_control_moves_alike_are_named_as_the_combination_that_it_cannot_move(tmp_path):

@@ -8,7 +8,8 @@ import click
 
 from sparserob_core.experiment.cli.shell.options import json_option
 from sparserob_core.experiment.cli.shell.process import status_unless_interrupted
-from sparserob_core.experiment.terminal.printing import EXIT, print_json, printable, say
+from sparserob_core.experiment.cli.shell.report import report
+from sparserob_core.experiment.terminal.printing import EXIT
 
 
 @click.command()
@@ -52,14 +53,10 @@ def bound(
     from sparserob_core.experiment.bound.bound import bound as find
     from sparserob_core.experiment.bound.record import bound_rows_told, columns_told, summary_of_bound
     from sparserob_core.experiment.cli.shell.live_line import LiveLine
-    from sparserob_core.experiment.terminal.table import print_table
 
     with LiveLine() as line:
         bounds = find(config, overrides, tolerance=tolerance, seconds=seconds, out=out, write=True, notify=line.receive)
-    if as_json:
-        print_json(summary_of_bound(bounds))
-    else:
-        print_table(bounds.title, columns_told(bounds), bound_rows_told(bounds))
-        for remark in (*bounds.remarks, f"{bounds.status} in {bounds.seconds:.2f} s", f"written to {bounds.directory}"):
-            say(printable(remark))
+    tables = [(bounds.title, columns_told(bounds), bound_rows_told(bounds))]
+    remarks = (*bounds.remarks, f"{bounds.status} in {bounds.seconds:.2f} s", f"written to {bounds.directory}")
+    report(as_json, summary_of_bound(bounds), tables, remarks)
     return status_unless_interrupted(EXIT[bounds.status])

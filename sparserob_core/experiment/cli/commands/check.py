@@ -8,7 +8,8 @@ from pathlib import Path
 import click
 
 from sparserob_core.experiment.cli.shell.options import json_option, plugins_option
-from sparserob_core.experiment.terminal.printing import EXIT, print_json, say
+from sparserob_core.experiment.cli.shell.report import report
+from sparserob_core.experiment.terminal.printing import EXIT
 
 
 @click.command()
@@ -34,26 +35,20 @@ def check(directory: Path, as_json: bool, plugins: tuple[Path, ...], seconds: fl
     from dataclasses import asdict
 
     from sparserob_core.experiment.check.check import check as verify
-    from sparserob_core.experiment.terminal.table import print_table
 
     verification = verify(directory, plugins, seconds)
-    if as_json:
-        print_json(
-            {
-                "title": verification.title,
-                "status": verification.status,
-                "seconds": verification.seconds,
-                "claims": [asdict(claim) for claim in verification.claims],
-                "not_compared": list(verification.not_compared),
-            }
-        )
-    else:
-        print_table(
-            verification.title,
-            ("claim", "verdict", "what was derived"),
-            [(c.name, c.verdict, c.text) for c in verification.claims],
-        )
-        all_hold = "every claim holds; " if verification.status == "verified" else ""
-        say(f"not compared: {'; '.join(verification.not_compared) or 'nothing'}")
-        say(f"{verification.status}: {all_hold}in {verification.seconds:.2f} s")
+    summary = {
+        "title": verification.title,
+        "status": verification.status,
+        "seconds": verification.seconds,
+        "claims": [asdict(claim) for claim in verification.claims],
+        "not_compared": list(verification.not_compared),
+    }
+    rows = [(claim.name, claim.verdict, claim.text) for claim in verification.claims]
+    all_hold = "every claim holds; " if verification.status == "verified" else ""
+    remarks = (
+        f"not compared: {'; '.join(verification.not_compared) or 'nothing'}",
+        f"{verification.status}: {all_hold}in {verification.seconds:.2f} s",
+    )
+    report(as_json, summary, [(verification.title, ("claim", "verdict", "what was derived"), rows)], remarks)
     return EXIT[verification.status]

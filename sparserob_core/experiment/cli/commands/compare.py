@@ -11,7 +11,7 @@ import click
 
 from sparserob_core.errors import InputError
 from sparserob_core.experiment.cli.shell.options import json_option, watching_options
-from sparserob_core.experiment.terminal.printing import print_json, printable, say
+from sparserob_core.experiment.cli.shell.report import report
 
 
 @click.command()
@@ -60,36 +60,26 @@ def compare(
     which share it solves within a budget; medians and quartiles over seeds.
     """
     from sparserob_core.experiment.comparison.compare import compare as side_by_side
-    from sparserob_core.experiment.comparison.compare import comparison_remarks, comparison_summary, comparison_table
+    from sparserob_core.experiment.comparison.compare import comparison_summary, comparison_table
     from sparserob_core.experiment.comparison.profiles import LISTED, Profiles
     from sparserob_core.experiment.comparison.studies import ACCURACY
-    from sparserob_core.experiment.directory.artefacts import finite
     from sparserob_core.experiment.run.viewer import recorded, recorder
-    from sparserob_core.experiment.terminal.table import print_table
 
     watched = watch or serve or save is not None or connect is not None
     observers = [recorder(save, serve, connect)] if watched else []
     options: dict[str, Any] = {"accuracy": ACCURACY if accuracy is None else accuracy, "measure": measure}
     comparison = side_by_side(runs, out, **options, observers=observers)
     recordings = [line for observer in observers for line in recorded(observer, save)]
-    if as_json:
-        summary = comparison.summary() if isinstance(comparison, Profiles) else comparison_summary(comparison)
-        print_json(finite({**summary, **({"remarks": [*summary["remarks"], *recordings]} if recordings else {})}))
-        return 0
+    summary = comparison.summary() if isinstance(comparison, Profiles) else comparison_summary(comparison)
     tables = (
         [comparison.table(), comparison.times_table()]
         if isinstance(comparison, Profiles)
         else [comparison_table(comparison)]
     )
-    for number, (columns, rows) in enumerate(tables):
-        if number == 0 or len(rows) <= LISTED:
-            print_table((comparison.title or "Comparison") if number == 0 else "", columns, rows)
-    for line in comparison.remarks() if isinstance(comparison, Profiles) else comparison_remarks(comparison):
-        say(printable(line))
-    if not comparison.undrawn:
-        say(f"written to {out}")
-    for line in recordings:
-        say(printable(line))
+    titles = [comparison.title or "Comparison", *[""] * (len(tables) - 1)]
+    shown = [(title, *table) for title, table in zip(titles, tables, strict=True) if title or len(table[1]) <= LISTED]
+    notes = [*summary["remarks"], *([] if comparison.undrawn else [f"written to {out}"]), *recordings]
+    report(as_json, {**summary, "remarks": [*summary["remarks"], *recordings]}, shown, notes)
     return 0
 
 
@@ -132,8 +122,6 @@ def benchmark(
     """
     from sparserob_core.experiment.benchmark.benchmark import benchmark as side_by_side
     from sparserob_core.experiment.cli.shell.live_line import LiveLine
-    from sparserob_core.experiment.directory.artefacts import finite
-    from sparserob_core.experiment.terminal.table import print_table
 
     choices = [_parse_choice(text) for text in maximisers]
     with LiveLine() as line:
@@ -148,15 +136,10 @@ def benchmark(
             out=out,
             notify=line.receive,
         )
-    if as_json:
-        print_json(finite(results.summary()))
-        return 0
-    for title, (columns, rows) in ((results.profiles.title, results.table()), ("", results.times_table())):
-        print_table(title, columns, rows)
-    for remark in results.remarks():
-        say(printable(remark))
-    if out is not None:
-        say(f"written to {out}")
+    summary = results.summary()
+    tables = [(results.profiles.title, *results.table()), ("", *results.times_table())]
+    written = [] if out is None else [f"written to {out}"]
+    report(as_json, summary, tables, [*summary["remarks"], *written])
     return 0
 
 

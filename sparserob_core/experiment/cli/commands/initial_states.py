@@ -9,7 +9,8 @@ import click
 from sparserob_core.errors import InputError
 from sparserob_core.experiment.cli.shell.options import json_option
 from sparserob_core.experiment.cli.shell.process import status_unless_interrupted
-from sparserob_core.experiment.terminal.printing import EXIT, print_json, printable, say
+from sparserob_core.experiment.cli.shell.report import report
+from sparserob_core.experiment.terminal.printing import EXIT
 
 
 @click.command("initial-states")
@@ -69,9 +70,7 @@ def initial_states(
     proven, 130 interrupted.
     """
     from sparserob_core.experiment.cli.shell.live_line import LiveLine
-    from sparserob_core.experiment.directory.artefacts import finite
     from sparserob_core.experiment.initial_states.initial_states import initial_states as find
-    from sparserob_core.experiment.terminal.table import print_table
 
     chosen = [int(number) - 1 for number in _parse_numbers("states", states)]
     try:
@@ -91,12 +90,8 @@ def initial_states(
         if error.path != ("states",):
             raise
         raise InputError(path="--states", expected="two different states, counted from 1", got=repr(states)) from None
-    if as_json:
-        print_json(finite(feasible_set.summary()))
-    else:
-        print_table(feasible_set.title, (), feasible_set.rows())
-        for remark in (*feasible_set.remarks, *([f"written to {out}"] if out is not None else [])):
-            say(printable(remark))
+    remarks = (*feasible_set.remarks, *([f"written to {out}"] if out is not None else []))
+    report(as_json, feasible_set.summary(), [(feasible_set.title, (), feasible_set.rows())], remarks)
     return status_unless_interrupted(EXIT[feasible_set.status])
 
 

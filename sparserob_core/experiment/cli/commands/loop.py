@@ -8,7 +8,8 @@ import click
 
 from sparserob_core.experiment.cli.shell.options import figures_option, json_option, plugins_option, seed_option
 from sparserob_core.experiment.cli.shell.process import status_unless_interrupted
-from sparserob_core.experiment.terminal.printing import EXIT, print_json, printable, say
+from sparserob_core.experiment.cli.shell.report import report
+from sparserob_core.experiment.terminal.printing import EXIT, printable
 
 
 @click.command()
@@ -52,10 +53,8 @@ def loop(
     from sparserob_core.control.loop.resolving import PROVEN
     from sparserob_core.errors import InputError
     from sparserob_core.experiment.cli.shell.live_line import LiveLine
-    from sparserob_core.experiment.directory.artefacts import finite
     from sparserob_core.experiment.loop.loop import loop as close
     from sparserob_core.experiment.run.run import run
-    from sparserob_core.experiment.terminal.table import print_table
 
     finished: object = source
     if source.is_dir():
@@ -85,10 +84,6 @@ def loop(
             plugins=plugins,
             notify=line.receive,
         )
-    if as_json:
-        print_json(finite(loops.summary()))
-    else:
-        print_table(f"{loops.title}: closed loop", *loops.table())
-        for remark in (*loops.remarks(), f"written to {directory / 'loop.json'}"):
-            say(printable(remark))
+    remarks = (*loops.remarks(), f"written to {directory / 'loop.json'}")
+    report(as_json, loops.summary(), [(f"{loops.title}: closed loop", *loops.table())], remarks)
     return status_unless_interrupted(4 if loops.contradicts else 0)

@@ -9,7 +9,7 @@ import click
 
 from sparserob_core.experiment.cli.shell.options import json_option, watching_options
 from sparserob_core.experiment.cli.shell.process import status_unless_interrupted
-from sparserob_core.experiment.terminal.printing import print_json, printable, say
+from sparserob_core.experiment.cli.shell.report import Table, report
 
 EXIT = {"certified": 0, "unbounded": 0, "infeasible": 3, "undecided": 4}
 
@@ -77,7 +77,6 @@ def margin(
     from sparserob_core.experiment.margin.margin import curve_rows, margin_rows, summary_of_margin
     from sparserob_core.experiment.margin.margin import margin as find
     from sparserob_core.experiment.run.viewer import recorded, recorder
-    from sparserob_core.experiment.terminal.table import print_table
 
     observers = [recorder(save, serve, connect)] if watch or serve or save is not None or connect is not None else []
     options: dict[str, Any] = {
@@ -89,16 +88,13 @@ def margin(
     }
     with LiveLine() as line:
         answer = find(config, of, overrides, notify=line.receive, **options)
-    if as_json:
-        print_json(summary_of_margin(answer))
-    else:
-        print_table(answer.title, (), margin_rows(answer))
-        if answer.of == "horizon" and answer.curve:
-            columns = ("horizon", "status", "lower bound", "upper bound")
-            print_table("Cost against the horizon", columns, curve_rows(answer))
-        recordings = (recording for observer in observers for recording in recorded(observer, save))
-        for remark in (*answer.remarks, f"written to {answer.directory}", *recordings):
-            say(printable(remark))
+    tables: list[Table] = [(answer.title, (), margin_rows(answer))]
+    if answer.of == "horizon" and answer.curve:
+        columns = ("horizon", "status", "lower bound", "upper bound")
+        tables.append(("Cost against the horizon", columns, curve_rows(answer)))
+    recordings = (recording for observer in observers for recording in recorded(observer, save))
+    remarks = (*answer.remarks, f"written to {answer.directory}", *recordings)
+    report(as_json, summary_of_margin(answer), tables, remarks)
     if serve and answer.status != "undecided":  # the Ctrl-C that ends a page has cut nothing short
         return EXIT[answer.status]
     return status_unless_interrupted(EXIT[answer.status])

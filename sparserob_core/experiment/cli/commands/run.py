@@ -8,7 +8,8 @@ import click
 
 from sparserob_core.experiment.cli.shell.options import figures_option, json_option
 from sparserob_core.experiment.cli.shell.process import status_unless_interrupted
-from sparserob_core.experiment.terminal.printing import EXIT, print_json, printable, say
+from sparserob_core.experiment.cli.shell.report import report
+from sparserob_core.experiment.terminal.printing import EXIT
 
 
 @click.command()
@@ -32,13 +33,11 @@ def run(config: Path, overrides: tuple[str, ...], out: Path | None, quiet: bool,
     """
     from sparserob_core.experiment.directory.artefacts import finite
     from sparserob_core.experiment.run.run import run as run_experiment
-    from sparserob_core.experiment.terminal.table import print_table, result_rows
+    from sparserob_core.experiment.terminal.table import result_rows
 
     outcome = run_experiment(config, overrides, out, quiet=quiet or as_json, figures=figures)
-    if as_json:
-        print_json(finite(outcome.summary))
-    elif not quiet:
-        print_table(outcome.experiment.title, (), result_rows(finite(outcome.summary)))
-        for line in (*outcome.remarks, f"written to {outcome.directory}"):
-            say(printable(line))
+    if as_json or not quiet:
+        summary = finite(outcome.summary)
+        remarks = (*outcome.remarks, f"written to {outcome.directory}")
+        report(as_json, summary, [(outcome.experiment.title, (), result_rows(summary))], remarks)
     return status_unless_interrupted(EXIT[outcome.status])

@@ -7,7 +7,7 @@ from pathlib import Path
 import click
 
 from sparserob_core.experiment.cli.shell.options import json_option, plugins_option, seed_option
-from sparserob_core.experiment.terminal.printing import print_json, printable, say
+from sparserob_core.experiment.cli.shell.report import report
 
 
 @click.command()
@@ -49,20 +49,14 @@ def simulate(
     interrupted.
     """
     from sparserob_core.experiment.cli.shell.live_line import LiveLine
-    from sparserob_core.experiment.directory.artefacts import finite
     from sparserob_core.experiment.simulation.simulate import simulate as propagate
-    from sparserob_core.experiment.terminal.table import print_table
 
     with LiveLine() as line:
         simulation = propagate(directory, trajectories, law, seed, out=out, plugins=plugins, notify=line.receive)
-    if as_json:
-        print_json(finite(simulation.summary()))
-    else:
-        print_table(f"{simulation.title}: {simulation.law}", *simulation.table())
-        for remark in (
-            *simulation.remarks(),
-            *([] if out is None or simulation.undrawn else [f"drawn into {out}"]),
-            f"written to {simulation.directory / f'simulation-{simulation.law}.json'}",
-        ):
-            say(printable(remark))
+    remarks = (
+        *simulation.remarks(),
+        *([] if out is None or simulation.undrawn else [f"drawn into {out}"]),
+        f"written to {simulation.directory / f'simulation-{simulation.law}.json'}",
+    )
+    report(as_json, simulation.summary(), [(f"{simulation.title}: {simulation.law}", *simulation.table())], remarks)
     return 4 if simulation.contradicts else 0

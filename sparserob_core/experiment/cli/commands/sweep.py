@@ -12,7 +12,7 @@ import click
 from sparserob_core.errors import InputError
 from sparserob_core.experiment.cli.shell.options import watching_options
 from sparserob_core.experiment.cli.shell.process import status_unless_interrupted
-from sparserob_core.experiment.terminal.printing import print_json, printable, say
+from sparserob_core.experiment.cli.shell.report import report
 
 if TYPE_CHECKING:
     from sparserob_core.experiment.sweep.sweep import Outline
@@ -83,7 +83,6 @@ def sweep(
     from sparserob_core.experiment.sweep.study import remarks_of, shown
     from sparserob_core.experiment.sweep.sweep import outline
     from sparserob_core.experiment.sweep.sweep import sweep as run_study
-    from sparserob_core.experiment.terminal.table import print_table
     from sparserob_core.sip.events import ignore
 
     if resume is not None and config is not None and "=" in str(config):
@@ -122,17 +121,10 @@ def sweep(
     study = replace(
         study, remarks=(*study.remarks, *(line for observer in observers for line in recorded(observer, save)))
     )
-    if as_json:
-        print_json({**study.summary(), "table": study.table})
-    elif not quiet:
-        print_table(study.title, *shown(study))
-        hint = (
-            ""
-            if point is None
-            else f"; the table of all points: sparserob sweep --resume {quote(str(study.directory))}"
-        )
-        for remark in (*remarks_of(study), f"written to {study.directory}{hint}"):
-            say(printable(remark))
+    if as_json or not quiet:
+        resume_hint = f"; the table of all points: sparserob sweep --resume {quote(str(study.directory))}"
+        remarks = (*remarks_of(study), f"written to {study.directory}{'' if point is None else resume_hint}")
+        report(as_json, {**study.summary(), "table": study.table}, [(study.title, *shown(study))], remarks)
     status = 5 if study.failed else 0
     # the Ctrl-C that ends a page has cut nothing short
     return status if serve and not study.stopped else status_unless_interrupted(status)
@@ -140,13 +132,8 @@ def sweep(
 
 def _print_outline(planned: Outline, quiet: bool, as_json: bool) -> None:
     """Print the points of a study that is not run."""
-    from sparserob_core.experiment.terminal.table import print_table
-
     data = planned.summary()
-    if as_json:
-        print_json(data)
-    elif not quiet:
-        print_table(data["title"], *planned.shown())
-        ended = sum(row["finished"] for row in data["points"])
-        count = len(data["points"])
-        say(f"{count} point{'s' * (count != 1)}, {ended} finished; nothing was run or written")
+    count, ended = len(data["points"]), sum(row["finished"] for row in data["points"])
+    remark = f"{count} point{'s' * (count != 1)}, {ended} finished; nothing was run or written"
+    if as_json or not quiet:
+        report(as_json, data, [(data["title"], *planned.shown())], [remark])

@@ -8,7 +8,8 @@ import click
 
 from sparserob_core.experiment.cli.shell.options import figures_option
 from sparserob_core.experiment.cli.shell.process import status_unless_interrupted
-from sparserob_core.experiment.terminal.printing import EXIT, printable, say
+from sparserob_core.experiment.cli.shell.report import report
+from sparserob_core.experiment.terminal.printing import EXIT
 
 
 @click.command()
@@ -42,10 +43,9 @@ def watch(
     """
     from sparserob_core.experiment.directory.artefacts import finite
     from sparserob_core.experiment.run.watch import watch as watch_run
-    from sparserob_core.experiment.terminal.table import print_table, result_rows
+    from sparserob_core.experiment.terminal.table import result_rows
 
     outcome = watch_run(config, overrides, out, save=save, serve=serve, connect=connect, figures=figures)
-    print_table(outcome.experiment.title, (), result_rows(finite(outcome.summary)))
-    for line in (f"written to {outcome.directory}", *outcome.remarks):
-        say(printable(line))
+    tables = [(outcome.experiment.title, (), result_rows(finite(outcome.summary)))]
+    report(False, {}, tables, (f"written to {outcome.directory}", *outcome.remarks))
     return EXIT[outcome.status] if serve else status_unless_interrupted(EXIT[outcome.status])
