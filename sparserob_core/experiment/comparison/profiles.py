@@ -4,7 +4,7 @@ Wild 2009) of studies."""
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, Literal, final
 
 import numpy as np
@@ -59,15 +59,12 @@ class Profiles:
     notes: Sequence[str] = ()
     undrawn: str = ""
     """Why there is no figure, where one was asked for."""
-    _cache: dict[float, Array] = field(default_factory=dict, repr=False)
 
     __repr__ = brief
 
     def quantile(self, share: float) -> Array:
         """The least times ``(P, S)`` within which that share of the seeds had solved the problem."""
-        if share not in self._cache:
-            self._cache[share] = np.array([[_compute_quantile(times, share) for times in row] for row in self.times])
-        return self._cache[share]
+        return np.array([[_compute_quantile(times, share) for times in row] for row in self.times])
 
     def ratios(self, share: float = MIDDLE) -> Array:
         """Performance ratios ``(P, S)``: the quantile of the times, divided by the best median of the problem; infinite

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from textwrap import shorten
-from typing import TYPE_CHECKING, Any, final
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -65,22 +64,13 @@ def draw_study(study: Study) -> Figure:
     return _draw_categories(study, categorical)
 
 
-@final
-@dataclass(frozen=True)
-class _Quartiles:
-    """The median and the quartiles of rows that differ in the seed only; nan where there are none."""
+def _compute_quartiles(values: Sequence[float | None]) -> Array:
+    """Return the lower quartile, the median and the upper quartile of rows that differ in the seed only, ``(3,)``.
 
-    middle: float
-    low: float
-    high: float
-
-
-def _compute_quartiles(values: Sequence[float | None]) -> _Quartiles:
+    They are NaN where no value is known.
+    """
     known_values = [value for value in values if value is not None]
-    if not known_values:
-        return _Quartiles(np.nan, np.nan, np.nan)
-    low, middle, high = (float(quantile) for quantile in np.quantile(known_values, (0.25, 0.5, 0.75)))
-    return _Quartiles(middle, low, high)
+    return np.quantile(known_values, (0.25, 0.5, 0.75)) if known_values else np.full(3, np.nan)
 
 
 def _group_rows(rows: Sequence[Row], axes: Sequence[Axis]) -> dict[str, list[Row]]:
@@ -111,14 +101,12 @@ def _draw_curves(study: Study, along: Axis, others: Sequence[Axis]) -> Figure:
         for row in rows:
             by_value.setdefault(float(row[along.key]), []).append(row)
         x = np.array(sorted(by_value))
-        cost = [_compute_quartiles([row.get("cost") for row in by_value[value]]) for value in x]
-        lower = [_compute_quartiles([row.get("lower_bound") for row in by_value[value]]) for value in x]
-        middle, below = _extract_values(cost, "middle"), _extract_values(lower, "middle")
+        cost = np.array([_compute_quartiles([row.get("cost") for row in by_value[value]]) for value in x])
+        lower = np.array([_compute_quartiles([row.get("lower_bound") for row in by_value[value]]) for value in x])
+        middle, below = cost[:, 1], lower[:, 1]
         ax.fill_between(x, below, middle, color=colour, alpha=0.15, linewidth=0, zorder=1)
         if max(map(len, by_value.values())) > 1:
-            ax.fill_between(
-                x, _extract_values(cost, "low"), _extract_values(cost, "high"), color=colour, alpha=0.3, linewidth=0
-            )
+            ax.fill_between(x, cost[:, 0], cost[:, 2], color=colour, alpha=0.3, linewidth=0)
         ax.plot(x, middle, color=colour, linestyle=dash, linewidth=1.4, zorder=3, label=label or "cost")
         ax.plot(x, below, color=colour, linestyle=dash, linewidth=0.8, zorder=2)
         _draw_marks(ax, x, middle, [_find_worst_status(by_value[value]) for value in x], colour)
@@ -171,7 +159,7 @@ def _draw_map(study: Study, axes: Sequence[Axis]) -> Figure:
     _scale_axis(ax.set_yscale, second, y)
     if study.arrangement in ("random", "sobol"):
         points = np.array(list(cells))
-        costs = np.array([_compute_quartiles([row.get("cost") for row in rows]).middle for rows in cells.values()])
+        costs = np.array([_compute_quartiles([row.get("cost") for row in rows])[1] for rows in cells.values()])
         is_finite = np.isfinite(costs)
         drawn: Any = ax.scatter(
             points[is_finite, 0], points[is_finite, 1], c=costs[is_finite], cmap="viridis", s=26, linewidths=0
@@ -179,9 +167,8 @@ def _draw_map(study: Study, axes: Sequence[Axis]) -> Figure:
     else:
         costs = np.full((y.size, x.size), np.nan)
         for (first_value, second_value), rows in cells.items():
-            costs[np.searchsorted(y, second_value), np.searchsorted(x, first_value)] = _compute_quartiles(
-                [r.get("cost") for r in rows]
-            ).middle
+            median = _compute_quartiles([row.get("cost") for row in rows])[1]
+            costs[np.searchsorted(y, second_value), np.searchsorted(x, first_value)] = median
         drawn = ax.pcolormesh(
             _compute_edges(x, first.log), _compute_edges(y, second.log), costs, cmap="viridis", linewidth=0
         )
@@ -289,10 +276,6 @@ def _finish_figure(figure: Figure, ax: Axes, study: Study, told: bool, marked: I
 def _find_worst_status(rows: Sequence[Row]) -> str:
     """Return the status of several seeds that proves least."""
     return max((str(row["status"]) for row in rows), key=list(MARKS).index)
-
-
-def _extract_values(spreads: Sequence[_Quartiles], name: str) -> Array:
-    return np.array([getattr(spread, name) for spread in spreads])
 
 
 def _compute_edges(values: Array, log: bool) -> Array:
