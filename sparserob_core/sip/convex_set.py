@@ -1078,6 +1078,11 @@ class Scaled(ConvexSet):
         return np.asarray(np.where(finite, scaled_height, height))
 
     @shaped
+    def continued(self, centre: Float[Array, "k d"], spread: Float[Array, "k d"]) -> Float[Array, " k"] | None:
+        bounds, shift = self.base.continued(centre, spread), np.abs((1.0 - self.factor) * self.about)
+        return None if bounds is None else self.factor * bounds + (np.abs(centre) + spread) @ shift
+
+    @shaped
     def support_point(self, directions: Float[Array, "*k d"]) -> Float[Array, "*k d"]:
         return self._scale_points(self.base.support_point(directions))
 

@@ -124,9 +124,9 @@ class MeasurablePieces:
         """Return the largest contribution, until ``times (k,)``, of the piece that holds the time to ``H x(t)``:
         ``(k, r)``.
 
-        It is computed by a quadrature, whose error `allowance` allows for. The contribution of the middle of the
-        disturbance is not included. ``pieces (k,)`` names the pieces; without it
-        they are those of the grid that hold the times.
+        It is the middle of its bounds, for whose distance `allowance` allows. The contribution of the middle of the
+        disturbance is not included. ``pieces (k,)`` names the pieces; without it they are those of the grid that hold
+        the times.
         """
         response, k, r = self.functionals.response, times.size, H.shape[0]
         pieces = response.grid.locate(times) if pieces is None else pieces
@@ -145,8 +145,8 @@ class MeasurablePieces:
     def allowance(self, lower: Array, upper: Array, H: Array, pieces: np.ndarray) -> Array:
         """Bound the excess of `within` over its chord on cells ``[lower, upper] (k,)`` of ``pieces (k,)``: ``(k, r)``.
 
-        The bound uses that the integrand is Lipschitz. It includes the relative error `MISSED` that is allowed for the
-        quadrature of `within`.
+        The bound uses that the integrand is Lipschitz. It includes the relative error `MISSED` that is allowed for
+        `within`.
         """
         response, (A, E) = self.functionals.response, self._matrices
         offsets = np.clip(lower - response.grid.breakpoints[pieces], 0.0, None)

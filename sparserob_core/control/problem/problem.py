@@ -231,11 +231,11 @@ class OptimalControlProblem(Term):
             self._set_field("control_step", None if restricts_nothing(step) else step)
         self._check_disturbance()
         bound = self.measurable
-        if self.system.varies and bound is not None and not enclosed(bound):
+        if bound is not None and not enclosed(bound):
             raise InputError(
                 path="disturbance",
-                expected="a box, polytope, ellipsoid, ball or zonotope where the system changes with time and"
-                " disturbances are measurable",
+                expected="a box, polytope, ellipsoid, ball or zonotope, or another set that states its `continued`,"
+                " where disturbances are measurable",
                 got=bound.kind,
             )
         self._set_field("measurements", self._check_measurements())

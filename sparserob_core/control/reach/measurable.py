@@ -27,16 +27,12 @@ from sparserob_core.control.reach.varying_motion import (
 )
 from sparserob_core.control.response.lifted import LiftedSystem
 from sparserob_core.control.response.response import Response, TimeGrid, unique_rows
-from sparserob_core.control.sets.integrals import HALVINGS, enclosed, integrated
-from sparserob_core.shapes import Float, Int, shaped
+from sparserob_core.control.sets.integrals import HALVINGS, integrated
+from sparserob_core.shapes import Float, shaped
 from sparserob_core.sip.convex_set import Array, Box, ConvexSet
 
-LEGENDRE = np.polynomial.legendre.Legendre.basis(5)
-# Gauss-Lobatto: the ends are nodes, so that no kink hides beside them
-NODES = np.concatenate([[-1.0], LEGENDRE.deriv().roots().real, [1.0]])
-WEIGHTS = 1.0 / (15.0 * LEGENDRE(NODES) ** 2)
 ACCURACY = 1e-14  # of an integral over one interval, relative to the largest integrand times the horizon
-MISSED = 1e-12  # of a support function of a curved set, the error of its quadrature that a proof allows for: estimated
+MISSED = 1e-12  # of a support value under feedback, the error that the run's proof allows for; `check` encloses it
 ORDER = 12  # of the expansion that encloses a row; what is left of it on a short interval is 1e-14 of the row
 SHORT = 0.5  # time times speed that such an interval takes: twice as much leaves 1e-10, half as much doubles the work
 TINY = float(np.finfo(float).tiny)
@@ -55,19 +51,17 @@ GUESSED = 8
 class _IntegralTable:
     """Integrals along one direction, between the times ``starts (n + 1,)``.
 
-    ``sums (n + 1, c)`` are the integrals up to each time, or their lower and upper bounds. For the interval after each
-    time there are either ``rows (n + 1, d)``, or polynomials with ``terms (n, ORDER + 1, mw)`` and error bounds
-    ``lost (n,)``. ``accuracy`` is the goal for the error of an integral, and ``late`` the error from the rounding of a
-    time.
+    ``sums (n + 1, 2)`` are lower and upper bounds of the integrals up to each time. For the interval after each time
+    there are polynomials with ``terms (n, ORDER + 1, mw)`` and error bounds ``lost (n,)``. ``accuracy`` is the goal for
+    the error of an integral, and ``late`` the error from the rounding of a time.
     """
 
     starts: Array
     sums: Array
-    rows: Array = field(default_factory=lambda: np.zeros((0, 0)))
-    terms: Array = field(default_factory=lambda: np.zeros((0, 0, 0)))
-    lost: Array = field(default_factory=lambda: np.zeros(0))
-    accuracy: float = 0.0
-    late: float = 0.0
+    terms: Array
+    lost: Array
+    accuracy: float
+    late: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,17 +112,13 @@ class MeasurableSupport:
     def __call__(
         self, times: Float[Array, " k"], directions: Float[Array, "k d"], parameters: Float[Array, "k nu"]
     ) -> Float[Array, " k"]:
-        """Return ``sigma (k,)`` at ``times (k,)``, ``directions (k, d)``, ``parameters (k, nu)``, to its quadrature.
-
-        The value is the middle of the bounds where these are close (`is_enclosed`), and a quadrature otherwise.
-        """
+        """Return ``sigma (k,)`` at ``times (k,)``, ``directions (k, d)``, ``parameters (k, nu)``: the middle of its
+        bounds."""
         unique, parameter_indices = np.unique(parameters, axis=0, return_inverse=True)
         result = np.empty(times.size)
         for position, parameter in enumerate(unique):
             members = np.flatnonzero(parameter_indices.reshape(-1) == position)
-            result[members] = self._integrate_phases(
-                times[members], directions[members], parameter, self.is_enclosed
-            ).mean(axis=1)
+            result[members] = self._integrate_phases(times[members], directions[members], parameter).mean(axis=1)
         return result
 
     @shaped
@@ -189,22 +179,15 @@ class MeasurableSupport:
         class."""
         return np.zeros(times.size)
 
-    @property
-    def is_enclosed(self) -> bool:
-        """True where the bounds of `enclosed` are close: the set is flat, or its support function is known to be
-        analytic."""
-        return enclosed(self.bound)
-
     @shaped
     def enclosed(
         self, times: Float[Array, " k"], directions: Float[Array, "k d"], leg: int | None = None
     ) -> Float[Array, "k 2"]:
-        """Return lower and upper bounds ``(k, 2)`` of ``sigma`` of a known system, which are close for the sets of
-        `is_enclosed`.
+        """Return lower and upper bounds ``(k, 2)`` of ``sigma`` of a known system.
 
         With a phase ``leg`` of a switched system, ``times`` are counted from the beginning of that phase.
         """
-        bounds = self._integrate_phases(times, directions, np.zeros(0), enclosed=True, leg=leg)
+        bounds = self._integrate_phases(times, directions, np.zeros(0), leg)
         rounding_errors = rounding(self.response.grid.pieces) * np.abs(bounds).max(axis=1, initial=0.0)
         return np.asarray(bounds + rounding_errors[:, None] * [-1.0, 1.0])
 
@@ -234,19 +217,18 @@ class MeasurableSupport:
         times: Float[Array, " k"],
         directions: Float[Array, "k d"],
         parameter: Float[Array, " nu"],
-        enclosed: bool = False,
         leg: int | None = None,
-    ) -> Float[Array, "k n"]:
-        """Return the integrals ``(k, 1)``, or with ``enclosed`` their lower and upper bounds ``(k, 2)``.
+    ) -> Float[Array, "k 2"]:
+        """Return lower and upper bounds ``(k, 2)`` of the integrals.
 
         The mode that acts last contributes from the beginning of its phase. Each phase before it contributes for the
         rows to which the transitions from its end take the directions.
         """
         begins = np.array([grid.elapsed for grid in self._phase_grids])
-        total = np.zeros((times.size, 2 if enclosed else 1))
+        total = np.zeros((times.size, 2))
         if self._differing_states is not None and not directions[:, self._differing_states].any():
             A, E = (matrix[0] for matrix in self.response.system.modes[0].matrices(parameter[None])[::2])
-            since, key = (0.0 if leg is None else begins[leg]), parameter.tobytes() + b"all" + bytes([enclosed])
+            since, key = (0.0 if leg is None else begins[leg]), parameter.tobytes() + b"all"
             return total + self._integrate_until(A, E, self.response.grid.breakpoints, times + since, directions, key)
         if leg is None:
             legs = np.maximum(np.searchsorted(begins, times) - 1, 0)
@@ -258,10 +240,10 @@ class MeasurableSupport:
             A, E = (matrix[0] for matrix in self.response.system.modes[number].matrices(parameter[None])[::2])
             ages, length = self._phase_grids[number].breakpoints, float(self._phase_grids[number].breakpoints[-1])
             last, through = np.flatnonzero(legs == number), np.flatnonzero(legs > number)
-            key = parameter.tobytes() + number.to_bytes(4) + bytes([enclosed])
+            key = parameter.tobytes() + number.to_bytes(4)
             total[last] += self._integrate_until(A, E, ages, times[last], rows[last], key)
             if through.size:
-                total[through] += self._integrate_whole_phase(A, E, length, rows[through], enclosed)
+                total[through] += self._integrate_whole_phase(A, E, length, rows[through])
             if number:
                 members = np.flatnonzero(legs >= number)
                 durations = np.where(legs[members] == number, times[members], length)
@@ -270,42 +252,35 @@ class MeasurableSupport:
         return total
 
     def _integrate_until(self, A: Array, E: Array, ages: Array, times: Array, directions: Array, key: bytes) -> Array:
-        """Return the contribution of one mode until ``times (k,)`` from the beginning of its phase, ``(k, 1)``, or its
-        lower and upper bounds, ``(k, 2)``.
+        """Return bounds ``(k, 2)`` of the contribution of one mode from the beginning of its phase until
+        ``times (k,)``.
 
-        Integrals up to ``ages (L + 1,)`` are remembered for the parameter and the mode that ``key`` names. The last
-        byte of ``key`` says whether the integrals are enclosed.
+        Integrals up to ``ages (L + 1,)`` are remembered for the parameter and the mode that ``key`` names.
         """
         if not times.size:
-            return np.zeros((0, 1))
+            return np.zeros((0, 2))
         unique, table_indices = unique_rows(directions)
         tables = self._look_up_tables(A, E, ages, unique, key)
         starts = tables[0].starts
         intervals = np.clip(np.searchsorted(starts, times, side="right") - 1, 0, starts.size - 2)
         within = np.clip(times - starts[intervals], 0.0, None)
-        before, partial = np.array([tables[i].sums[j] for i, j in zip(table_indices, intervals, strict=True)]), None
-        if key[-1]:
-            terms = np.array([tables[i].terms[j] for i, j in zip(table_indices, intervals, strict=True)])
-            errors = np.array([tables[i].lost[j] for i, j in zip(table_indices, intervals, strict=True)])
-            accuracy = np.array([table.accuracy for table in tables])[table_indices]
-            shares = within / np.diff(starts)[intervals]
-            terms = terms * (shares[:, None] ** np.arange(ORDER + 1))[..., None]
-            late = np.where(times > 0.0, np.array([table.late for table in tables])[table_indices], 0.0)
-            partial = integrated(self.bound, terms, within, accuracy) + (shares * errors + late)[:, None] * [-1.0, 1.0]
-        else:
-            rows = np.stack([tables[i].rows[j] for i, j in zip(table_indices, intervals, strict=True)])
-            partial = self._integrate_rows(A, E, rows, within, table_indices)[:, None]
+        before, terms, errors = (
+            np.array([getattr(tables[i], name)[j] for i, j in zip(table_indices, intervals, strict=True)])
+            for name in ("sums", "terms", "lost")
+        )
+        accuracy, late = np.array([(table.accuracy, table.late) for table in tables])[table_indices].T
+        shares = within / np.diff(starts)[intervals]
+        terms = terms * (shares[:, None] ** np.arange(ORDER + 1))[..., None]
+        errors = shares * errors + np.where(times > 0.0, late, 0.0)
+        partial = integrated(self.bound, terms, within, accuracy) + errors[:, None] * [-1.0, 1.0]
         return np.asarray(before + partial)
 
-    def _integrate_whole_phase(self, A: Array, E: Array, length: float, directions: Array, enclosed: bool) -> Array:
-        """Return the contribution of one mode over a whole phase of this ``length``, for rows ``directions (k, d)`` at
-        its end.
+    def _integrate_whole_phase(self, A: Array, E: Array, length: float, directions: Array) -> Array:
+        """Return bounds ``(k, 2)`` of the contribution of one mode over a whole phase of this ``length``, for rows
+        ``directions (k, d)`` at its end.
 
         Nothing is remembered, since the rows are different at every time.
         """
-        if not enclosed:
-            lengths, owners = np.full(len(directions), length), np.arange(len(directions))
-            return self._integrate_rows(A, E, directions, lengths, owners)[:, None]
         starts = self._divide_intervals(A, np.array([0.0, length]))
         lengths, values = np.diff(starts), np.empty((len(directions), 2))
         chunk_size = max(1, AT_ONCE // (lengths.size * (ORDER + 1) * max(E.shape)))
@@ -326,21 +301,11 @@ class MeasurableSupport:
         keys = [direction.tobytes() + key for direction in directions]
         tables = {table_key: self._tables[table_key] for table_key in keys if table_key in self._tables}
         missing = np.array([number for number, table_key in enumerate(keys) if table_key not in tables], dtype=int)
-        make = self._enclose_tables if key[-1] else self._estimate_tables
-        for number, table in zip(missing.tolist(), make(A, E, ages, directions[missing]), strict=True):
+        for number, table in zip(missing.tolist(), self._make_tables(A, E, ages, directions[missing]), strict=True):
             tables[keys[number]] = remember(self._tables, keys[number], table, TABLES_KEPT)
         return [tables[table_key] for table_key in keys]
 
-    def _estimate_tables(self, A: Array, E: Array, ages: Array, directions: Array) -> Iterator[_IntegralTable]:
-        """Yield the table of each of ``directions (k, d)``, with integrals by quadrature from one of ``ages (L + 1,)``
-        to the next."""
-        for direction in directions:
-            rows = _propagate_rows(A, direction[None], ages[None])[0]
-            lengths, owners = np.diff(ages), np.zeros(ages.size - 1, dtype=int)
-            sums = np.append(0.0, np.cumsum(self._integrate_rows(A, E, rows[:-1], lengths, owners)))
-            yield _IntegralTable(ages, sums[:, None], rows=rows)
-
-    def _enclose_tables(self, A: Array, E: Array, ages: Array, directions: Array) -> Iterator[_IntegralTable]:
+    def _make_tables(self, A: Array, E: Array, ages: Array, directions: Array) -> Iterator[_IntegralTable]:
         """Yield the table of each of ``directions (k, d)``, with lower and upper bounds at the ends of short intervals.
 
         On short intervals a row is a polynomial ``f`` with a remainder. In Bernstein's form ``f`` is a convex
@@ -361,9 +326,7 @@ class MeasurableSupport:
             for number, interval_bounds in enumerate(bounds):
                 sums = np.vstack([np.zeros(2), np.cumsum(interval_bounds, axis=0)])
                 own = float(accuracy[number]), float(late[number])
-                yield _IntegralTable(
-                    starts, sums, terms=terms[number], lost=errors[number], accuracy=own[0], late=own[1]
-                )
+                yield _IntegralTable(starts, sums, terms[number], errors[number], *own)
 
     def _divide_intervals(self, A: Array, ages: Array) -> Array:
         """The ends ``(n + 1,)`` of short intervals, as many between all neighbours of ``ages (L + 1,)``."""
@@ -415,53 +378,6 @@ class MeasurableSupport:
         tallest = radius * np.linalg.norm(sizes, axis=1).reshape(count, -1).max(axis=1, initial=0.0)
         return np.stack(terms, axis=1).reshape(count, -1, ORDER + 1, E.shape[1]), errors.reshape(count, -1), tallest
 
-    @shaped
-    def _integrate_rows(
-        self,
-        A: Float[Array, "d d"],
-        E: Float[Array, "d mw"],
-        starts: Float[Array, "l d"],
-        lengths: Float[Array, " l"],
-        member: Int[np.ndarray, " l"],
-    ) -> Float[Array, " l"]:
-        """Return estimates ``(l,)`` of ``int_0^length h(E' y(s)) ds`` from rows ``y(0) = starts (l, d)``.
-
-        The quadrature is that of Gauss and Lobatto, which halves intervals that have not converged, as at kinks.
-        ``member (l,)`` is the index of the functional of each row, whose largest integrand sets the accuracy.
-        """
-        total = np.zeros(lengths.size)
-        fastest = min(float(np.linalg.norm(A, 2)), 4.0 * float(np.abs(np.linalg.eigvals(A)).max()))
-        count = int(np.clip(np.ceil(fastest * lengths.max(initial=0.0)), 1, MOST_SHORT))
-        owner = np.repeat(np.arange(lengths.size), count)  # short intervals, on which the quadrature is at home
-        offsets = np.outer(lengths, np.arange(count) / count)
-        starts = _propagate_rows(A, starts, offsets).reshape(-1, A.shape[0])
-        lengths = lengths[owner] / count
-        estimate, size = self._apply_quadrature(A, E, starts, lengths)
-        largest = np.zeros(int(member.max(initial=0)) + 1)
-        np.maximum.at(largest, member[owner], size)
-        accuracy = ACCURACY * np.maximum(largest[member] * float(self.response.grid.breakpoints[-1]), TINY)
-        for _ in range(HALVINGS):
-            middles = _propagate_rows(A, starts, lengths[:, None] / 2)[:, 0]
-            first_half, second_half = (
-                self._apply_quadrature(A, E, starts, lengths / 2)[0],
-                self._apply_quadrature(A, E, middles, lengths / 2)[0],
-            )
-            open_ = np.abs(first_half + second_half - estimate) > accuracy[owner]
-            np.add.at(total, owner[~open_], (first_half + second_half)[~open_])
-            starts, lengths = np.vstack([starts[open_], middles[open_]]), np.tile(lengths[open_] / 2, 2)
-            estimate, owner = np.concatenate([first_half[open_], second_half[open_]]), np.tile(owner[open_], 2)
-            if not owner.size:
-                return total
-        np.add.at(total, owner, estimate)
-        return total
-
-    @shaped
-    def _apply_quadrature(
-        self, A: Float[Array, "d d"], W: Float[Array, "d mw"], starts: Float[Array, "l d"], lengths: Float[Array, " l"]
-    ) -> tuple[Float[Array, " l"], Float[Array, " l"]]:
-        values = self.bound.support(_propagate_rows(A, starts, lengths[:, None] * (NODES + 1) / 2) @ W)
-        return (values * WEIGHTS).sum(axis=1) * lengths / 2, np.abs(values).max(axis=1, initial=0.0)
-
 
 def _propagate_rows(A: Array, rows: Array, durations: Array) -> Array:
     """``c'e^{A r} (k, q, d)`` of ``rows (k, d)`` over ``durations (k, q)`` of their own."""
@@ -487,17 +403,8 @@ class MeasurableCellSupport(KnownCellSupport):
     def at(
         self, times: Float[Array, " k"], ends: Float[Array, "k r 0"]
     ) -> tuple[Float[Array, "k r 1"], Float[Array, "k r"]]:
-        """Return support values ``(k, r, 1)`` and their errors ``(k, r)``; ``ends (k, r, 0)`` is empty.
-
-        The errors are bounds where the bounds of `MeasurableSupport.enclosed` are close. For other sets they are an
-        estimate of the error of the quadrature, the share `MISSED` of the value.
-        """
-        pairs = self.repeated(times)
-        if self.support.is_enclosed:
-            return self.between(self.support.enclosed(*pairs, leg=self.lifted.turn))
-        k, r = times.size, self.rows.shape[0]
-        sigma = self.support(pairs[0] + self.lifted.grid.elapsed, pairs[1], np.zeros((k * r, 0))).reshape(k, r)
-        return sigma[..., None], MISSED * np.abs(sigma)
+        """Return support values ``(k, r, 1)`` and their error bounds ``(k, r)``; ``ends (k, r, 0)`` is empty."""
+        return self.between(self.support.enclosed(*self.repeated(times), leg=self.lifted.turn))
 
     @shaped
     def deviation(self, start: Float[Array, " k"], widths: Float[Array, " k"]) -> Float[Array, "k r"]:

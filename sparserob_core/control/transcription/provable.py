@@ -11,7 +11,6 @@ from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.control.problem.system import System
 from sparserob_core.control.reach.functional import WITHOUT_PROOF
 from sparserob_core.control.response.parameters import ParameterIndex
-from sparserob_core.control.sets.integrals import enclosed
 from sparserob_core.control.sets.strangers import strangers
 from sparserob_core.control.transcription.terms.in_time import within_reach
 from sparserob_core.control.transcription.terms.superposed import superposed
@@ -72,29 +71,14 @@ def remarked(problem: OptimalControlProblem, result: Result, feedback: bool = Fa
 
 def remark(problem: OptimalControlProblem, feedback: bool = False) -> str:
     """Return the unproven assumptions of a claim about a problem; empty where there are none. They are the properties
-    that sets of plugins state of themselves, and the accuracy of integrals over the set of measurable disturbances,
-    unless these are enclosed."""
+    that sets of plugins state of themselves, and under ``feedback`` the accuracy of integrals over the set of
+    measurable disturbances, which the checker encloses."""
     kinds = sorted({convex.kind for convex in strangers(problem)})
     assumption = f"what sets of the kind {', '.join(kinds)} say of themselves is believed" if kinds else ""
-    return "; ".join(filter(None, [assumption, _describe_integral_assumption(problem, feedback)]))
-
-
-def _describe_integral_assumption(problem: OptimalControlProblem, feedback: bool) -> str:
-    """Return the assumption about the integrals over measurable disturbances. Under ``feedback`` the checker proves
-    it."""
-    if problem.measurable is None:
-        return ""
-    if feedback:
-        return (
-            "the integrals over measurable disturbances are allowed a relative error of 1e-12, which sparserob check"
-            " encloses"
-        )
-    if enclosed(problem.measurable):
-        return ""
-    return (
-        "the integrals over measurable disturbances in a set that is known by its support function alone are allowed a"
-        " relative error of 1e-12, which is estimated, not enclosed"
-    )
+    if problem.measurable is None or not feedback:
+        return assumption
+    allowed = "the integrals over measurable disturbances are allowed a relative error of 1e-12, which sparserob check"
+    return "; ".join(filter(None, [assumption, f"{allowed} encloses"]))
 
 
 def growth(system: System, horizon: float) -> float:

@@ -12,6 +12,7 @@ from sparserob_core.control.problem.terms.windows import PathConstraint
 from sparserob_core.control.sets.sets import Box, Ellipsoid, Equality, NormBall, Polytope
 from sparserob_core.errors import InputError
 from sparserob_core.experiment.config.problems import LinearProblem
+from tests.control.sets.test_sets import ByItsSupport
 
 SYSTEM = LinearSystem([[0, 1], [0, 0]], [[0], [1]])
 UNIT = Box([-1.0], [1.0])
@@ -66,6 +67,10 @@ def test_an_initial_state_outside_the_path_set_is_legal() -> None:
         ({"disturbance": UNIT}, "disturbance: expected a set of dimension 2, the number of columns of E"),
         ({"disturbance": Box([0, 0], [np.inf, 1])}, "disturbance: the set must be bounded"),
         ({"disturbance_class": "white"}, "disturbance_class: expected one of piecewise_constant, measurable, l1_ball"),
+        (
+            {"disturbance": ByItsSupport(SQUARE), "disturbance_class": "measurable"},
+            "disturbance: expected a box, polytope, ellipsoid, ball or zonotope, or another set that states its",
+        ),
         ({"disturbance": Box([0.0, 0.0], [1.0, 1.0]), "disturbance_class": "l1_ball"}, "symmetric"),
         ({"disturbance": NormBall(2, 1, dimension=2), "disturbance_class": "l1_ball"}, "symmetric"),
         ({"path": [PathConstraint(SQUARE, 3.0, 2.0)]}, r"path\.0: expected 0 <= from <= to <= 5"),
