@@ -303,7 +303,7 @@ class ClosedLoop:
         """Return the matrices that propagate a state, and the terms that drive it, over the first ``durations (k,)`` of
         ``pieces (k,)`` of the grid."""
         if self.motion is None:
-            return self.functionals.response.flows_in(pieces, durations)
+            return self.functionals.response.propagator.flows_in(pieces, durations)
         starts = self.grid.breakpoints[pieces]
         key = np.concatenate([starts, durations]).tobytes()
         if key not in self._flows:

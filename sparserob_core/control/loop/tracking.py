@@ -120,7 +120,8 @@ class Tracking:
         sizes = [flat.h.size for flat in flats]
         self.start = np.repeat([round(flat.start / self.length) for flat in flats], sizes).astype(int)
         self.stop = np.repeat([round(flat.stop / self.length) for flat in flats], sizes).astype(int)
-        self.kernel = np.ascontiguousarray(response.kernel.swapaxes(0, 1))  # (K, d, d): what a piece of an age gives
+        kernel = response.propagator.kernel  # what a piece of an age gives, (d, K, d)
+        self.kernel = np.ascontiguousarray(kernel.swapaxes(0, 1))
         self.powers = response.flows(response.grid.breakpoints)[0]
         control_response, effects = self.kernel @ self.B, np.cumsum(self.kernel @ self.drift, axis=0)
         nodes = np.zeros((self.K + 1, d, self.m, self.K))

@@ -484,16 +484,6 @@ class WorstCase:
         return result
 
     @shaped
-    def worst_disturbance(
-        self, time: float, direction: Float[Array, " d"], parameter: Float[Array, " nu"]
-    ) -> Float[Array, "mw L"] | None:
-        """Return a disturbance ``(mw, L)`` on the pieces of the merged grid that is the worst one at one index.
-
-        Of measurable disturbances it is the worst one of those that are constant on pieces.
-        """
-        return self.parts(time, direction, parameter).disturbance
-
-    @shaped
     def parts(self, time: float, direction: Float[Array, " d"], parameter: Float[Array, " nu"]) -> Parts:
         """Return the contributions to the largest ``c'x(t)`` at one index, without the contribution of the control."""
         index = (np.array([time]), direction[None], parameter[None])

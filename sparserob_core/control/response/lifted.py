@@ -258,12 +258,6 @@ class LiftedSystem:
         path = self._compute_path(control)
         return path if self.fine is self.grid else path[self.ends]
 
-    def state_remainder(self, control: Array) -> tuple[Array, Array]:
-        """Return norm bounds ``(L, q)``, per piece and block, of the remainder of the Taylor models of the state,
-        rounding included; and norm bounds of the Taylor models themselves, summed over their coefficients."""
-        left_out, sizes, _ = self._get_remainder_bounds(control)
-        return left_out[self.shared], sizes[self.shared]
-
     def moved(self, within: Array, pieces: np.ndarray, begun: Array, inputs: Array) -> Array:
         """Return the coefficients ``(k, M, d)`` at times ``within (k,)`` the ``pieces (k,)``, from those at their
         beginning, ``begun (k, M, d)``, under ``inputs (k, m)``. Short steps use the exponential series, long ones
@@ -357,21 +351,19 @@ class LiftedSystem:
             [sum(float(np.linalg.norm(coefficients[i])) for coefficients in (self.A, self.B, self.W)) for i in indices]
         )
 
-    @property
-    def shared(self) -> np.ndarray | slice:
-        """Index of the bound of `along` that belongs to every piece of the grid."""
-        return self.span if self.spans.size < self.fine.pieces else slice(None)
-
     def along(self, control: Array, rows: Array, others: Array) -> Array:
-        """Return the two bounds of `state_remainder`, multiplied by ``rows`` and ``others (r, q)`` and added up: ``(r,
-        L)``."""
+        """Return sums ``(r, L)`` of norm bounds on every piece of the grid, block by block (`Motion.along`).
+
+        ``rows (r, q)`` are the weights of the remainder of the Taylor models of the state, rounding included, and
+        ``others (r, q)`` those of the models themselves, summed over their coefficients.
+        """
         left_out, sizes, _ = self._get_remainder_bounds(control)
-        answer: Array = (product(rows, left_out.T) + product(others, sizes.T))[:, self.shared]
-        return answer
+        answer: Array = product(rows, left_out.T) + product(others, sizes.T)
+        return answer[:, self.span] if self.spans.size < self.fine.pieces else answer
 
     def _get_remainder_bounds(self, control: Array) -> tuple[Array, Array, Array]:
-        """Return the two bounds of `state_remainder`, on the spans where these are many pieces, and the bound of the
-        remainder at the end, ``(q,)``; remembered."""
+        """Return the two bounds of `along`, ``(L, q)`` each, on the spans where these are many pieces, and the bound
+        of the remainder at the end, ``(q,)``; remembered."""
         key = control.tobytes()
         if key not in self._remainder_cache:
             remember(self._remainder_cache, key, self._compute_remainder_bounds(control), PATHS_KEPT)
@@ -575,7 +567,8 @@ class LiftedSystem:
                 self._bound_speed(size_bounds, driven, rows),
             )
             end_rounding, inner_rounding = (
-                relative + delay * speed for delay in (self._backward_fine if rows else self.forward).lateness
+                relative + delay * speed
+                for delay in (self._backward_fine if rows else self.forward).propagator.lateness
             )
             # the state at the end of a piece is the one that the next begins with
             inner_rounding = np.maximum(end_rounding, inner_rounding)
@@ -620,7 +613,7 @@ class LiftedSystem:
             delay = 2.0 * propagator.drift + inner_delay
         if rows:  # the ends of the spans are computed by transitions of their own
             share = share + 2.0 * self._bound_transition_rounding(self._span_durations)
-            delay = delay + 2.0 * self._backward_spans.lateness[0]
+            delay = delay + 2.0 * self._backward_spans.propagator.lateness[0]
         sizes = self.comparison.sizes.T if rows else self.comparison.sizes
         first_order = product(peak.matrices, share.max() * np.eye(sizes.shape[0]) + delay * sizes)
         is_small = (product(first_order, peak.matrices) <= 0.5 * peak.matrices).all()

@@ -1040,24 +1040,10 @@ class Response:
         """Return ``e^{A r}`` and its integral ``(k, d, d)`` for durations ``(k,)`` (`Propagator.flows`)."""
         return self.propagator.flows(durations)
 
-    def flows_in(self, pieces: np.ndarray, durations: Array) -> tuple[Array, Array]:
-        """Return ``e^{A r}`` and its integral ``(k, d, d)`` for durations on given pieces (`Propagator.flows_in`)."""
-        return self.propagator.flows_in(pieces, durations)
-
     @property
     def uniform(self) -> bool:
         """True where all pieces of the grid are equally long and of one mode (`Propagator.uniform`)."""
         return self.propagator.uniform
-
-    @property
-    def lateness(self) -> tuple[float, float]:
-        """Upper bounds of the errors of durations, of pieces and within a piece (`Propagator.lateness`)."""
-        return self.propagator.lateness
-
-    @property
-    def kernel(self) -> Array:
-        """Table of the impulse response in every direction of the state (`Propagator.kernel`)."""
-        return self.propagator.kernel
 
     @property
     def which(self) -> np.ndarray:

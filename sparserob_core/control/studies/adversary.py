@@ -149,7 +149,7 @@ def worst_signal(functionals: WorstCase, time: float, direction: Array, paramete
     """
     grid, model, support = functionals.response.grid, functionals.disturbance, functionals.measurable
     if model is None or support is None:
-        return grid.breakpoints, functionals.worst_disturbance(time, direction, parameter)
+        return grid.breakpoints, functionals.parts(time, direction, parameter).disturbance
     bound = support.bound
     flow = _build_adjoint(functionals.response, parameter, time, direction)
     starts = np.concatenate(

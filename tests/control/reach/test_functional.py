@@ -180,7 +180,7 @@ def test_rows_and_flows_at_times_are_exponentials(turns: bool) -> None:
     grid = merge_grids(GRID.breakpoints, GRID.breakpoints, switches=[1.0] if turns else [])
     response = Response(system, grid, np.array([0.7, -0.4]))
     pieces, durations = np.array([0, 1, 2, 5]), np.array([0.1, 0.5, 0.0, 0.3])
-    flow, driven = response.flows_in(pieces, durations)
+    flow, driven = response.propagator.flows_in(pieces, durations)
     for piece, duration, F, D in zip(pieces, durations, flow, driven, strict=True):
         M = np.zeros((4, 4))
         M[:2, :2], M[:2, 2:] = A.T if turns and piece >= 2 else A, np.eye(2)

@@ -107,6 +107,12 @@ def made(name, grid, scale=1.0, bound=None):
     )
 
 
+def state_remainder(lifted, control):
+    """Norm bounds ``(L, q)`` of the remainder of the state's Taylor models, and of these, piece by piece."""
+    every, none = np.eye(lifted.starts.size), np.zeros((lifted.starts.size,) * 2)
+    return lifted.along(control, every, none).T, lifted.along(control, none, every).T
+
+
 def deltas(rng, nu):
     return np.vstack([rng.uniform(-1, 1, (6, nu)), np.sign(rng.normal(size=(4, nu)))])
 
@@ -121,7 +127,7 @@ def test_the_taylor_model_of_the_state_encloses_every_trajectory_of_the_cell(nam
     system, response = functionals.response.system, functionals.response
     control = rng.normal(size=(1, GRIDS[grid].pieces))
     nodes = lifted.nodes(control)
-    remainder, _ = lifted.state_remainder(control)
+    remainder, _ = state_remainder(lifted, control)
     _, _, _, centre, radius = SYSTEMS[name]
     for delta in deltas(rng, lifted.space.nu):
         p = np.array(centre) + scale * np.array(radius) * delta
@@ -179,7 +185,7 @@ def test_the_remainder_vanishes_with_the_cell(name):
     sizes = []
     for scale in (0.5, 0.25, 0.125):
         _, lifted = made(name, "uniform", scale)
-        sizes.append(lifted.state_remainder(control)[0].max())
+        sizes.append(state_remainder(lifted, control)[0].max())
     assert sizes[1] <= sizes[0] / 60
     assert sizes[2] <= sizes[1] / 60
 
@@ -230,7 +236,7 @@ def test_of_a_known_system_only_rounding_is_left_out():
     system = LinearSystem([[0, 1], [-1, 0]], [[0.0], [1.0]])
     functionals = worst_case(system, GRIDS["uniform"], bound=Box([-1, -1], [1, 1]), initial_state=[1.0, 0.0])
     lifted = lift(system.phases[0], functionals.response.grid, np.array([1.0, 0.0]), np.zeros(0), np.zeros(0))
-    assert lifted.state_remainder(np.ones((1, 6)))[0].max() < 1e-11
+    assert state_remainder(lifted, np.ones((1, 6)))[0].max() < 1e-11
     assert DisturbanceSupport(lifted, functionals.disturbance, lifted.transform).neglected.max() < 1e-11
     states = functionals.response.states(np.ones((1, 6)), np.zeros((1, 0)))[0]
     assert np.allclose(lifted.nodes(np.ones((1, 6)))[:, 0] @ lifted.transform.T, states)
@@ -366,10 +372,10 @@ def test_what_rounding_changes_over_spans_of_many_pieces_is_no_hundred_times_tha
     monkeypatch.setattr(lifted_module, "SHORT", np.inf)
     spanned = lifting()
     assert spanned.spans.size == 12
-    for mine, alone in zip(spanned.state_remainder(control), plain.state_remainder(control), strict=True):
+    for mine, alone in zip(state_remainder(spanned, control), state_remainder(plain, control), strict=True):
         assert mine.max() <= 100.0 * alone.max()
     met = block_norms(spanned.nodes(control)[:, 0], spanned.starts)
-    assert (spanned.state_remainder(control)[1] >= np.maximum(met[:-1], met[1:])).all()
+    assert (state_remainder(spanned, control)[1] >= np.maximum(met[:-1], met[1:])).all()
     supports = [DisturbanceSupport(one, functionals.disturbance, rows @ one.transform) for one in (spanned, plain)]
     mine, alone = (support.neglected for support in supports)
     assert (mine.max(axis=1) <= 100.0 * alone.max(axis=1)).all()
@@ -388,7 +394,7 @@ def test_states_and_rows_are_as_near_to_the_truth_as_spans_of_many_pieces_say(na
     d, breaks = A.shape[0], functionals.response.grid.breakpoints
     control = np.random.default_rng(4).choice([-1.0, 0.0, 1.0], size=(1, 60))
     rows = np.random.default_rng(6).normal(size=(2, d))
-    nodes, remainder = lifted.nodes(control)[:, 0], lifted.state_remainder(control)[0]
+    nodes, remainder = lifted.nodes(control)[:, 0], state_remainder(lifted, control)[0]
     weights = lifted.backward.adjoint(breaks[1:], np.repeat(rows[:1], 60, axis=0), np.zeros((60, 0)))[0]
     missed = lifted.row_bounds(rows, by_age=blocks)[1][0][lifted.span]
     assert (lifted._block_size == 8) == blocks
@@ -433,7 +439,7 @@ def test_what_the_proof_leaves_out_of_known_systems_does_not_grow_with_the_piece
         control = np.ones((1, pieces))
         control[:, pieces // 3 :] = -1.0
         rows = np.eye(2) @ lifted.transform
-        left = lifted.state_remainder(control)[0].max()
+        left = state_remainder(lifted, control)[0].max()
         found.append((left, DisturbanceSupport(lifted, functionals.disturbance, rows).neglected.max()))
     assert (np.array(found[1]) <= 4.0 * np.array(found[0])).all()
     assert max(found[1]) <= 1e-10
@@ -445,7 +451,7 @@ def test_spans_of_many_pieces_are_short_where_the_system_moves_much():
     lifted = lift(system.phases[0], grid, np.ones(2), np.zeros(0), np.zeros(0))
     assert lifted.spans.size < 2000
     assert 30.0 * np.diff(grid.breakpoints[lifted.spans]).max() <= lifted_module.SHORT
-    assert np.isfinite(lifted.state_remainder(np.ones((1, 2000)))[0]).all()
+    assert np.isfinite(state_remainder(lifted, np.ones((1, 2000)))[0]).all()
 
 
 def test_what_is_bounded_of_many_states_takes_no_more_memory_than_the_path():

@@ -68,7 +68,7 @@ def test_rows_times_the_decision_are_the_simulated_worst_case(seed, control, dis
     signal = theta.reshape(2, -1) @ control.values
     for k, time in enumerate(times):
         A, B, E = (matrix[0] for matrix in system.phases[0].matrices(parameters[k][None]))
-        worst = functionals.worst_disturbance(time, directions[k], parameters[k])
+        worst = functionals.parts(time, directions[k], parameters[k]).disturbance
         state = simulated(
             A, [(B, control.breakpoints, signal), (E, grid.breakpoints, worst)], start, time, grid.breakpoints
         )
@@ -194,7 +194,7 @@ def test_ages_are_powers_of_the_transition():
     A = response.system.phases[0].matrices(np.zeros((1, 0)))[0][0]
     _, F = transitions(A[None], np.array([2 / 11]))
     for age in range(11):
-        assert np.allclose(response.kernel[:, age], expm(A * age * 2 / 11) @ F[0], rtol=1e-11, atol=1e-12)
+        assert np.allclose(response.propagator.kernel[:, age], expm(A * age * 2 / 11) @ F[0], rtol=1e-11, atol=1e-12)
 
 
 @pytest.mark.parametrize("states", [1, 2, 4])
