@@ -39,12 +39,8 @@ class DisturbanceSupport:
     def steepness(self, times: Array) -> Array:
         """Return bounds ``(k, r, nu)`` of the slope of the functionals in each parameter over the cell, under *any* one
         disturbance."""
-        if self._has_uniform_blocks:
-            return np.asarray(
-                self._sum_over_blocks(times, self._bound_coefficients) @ self._space.exponents[self._monomials]
-            )
-        self._last_blocks["blocks"] = times, (blocks := self._stack_functionals(self.blocks(times)))
-        return np.asarray(self._bound_coefficients(blocks).sum(axis=2) @ self._space.exponents[self._monomials])
+        bounds = self._sum_over_blocks(times, self._bound_coefficients)
+        return np.asarray(bounds @ self._space.exponents[self._monomials])
 
     def at(self, times: Array, ends: Array) -> tuple[Array, Array]:
         """Taylor coefficients ``(k, r, M)`` of the support function under the worst disturbance of a centre, and its
@@ -53,15 +49,6 @@ class DisturbanceSupport:
         ``ends (k, r, nu)``: parameters that are known to be at an end of the cell (-1 or 1); the centre is that of the
         face they leave.
         """
-        if (
-            not self._has_uniform_blocks
-        ):  # and `steepness` has just been asked for these times, where there are parameters
-            last_times, blocks = self._last_blocks.pop("blocks", (None, None))
-            if blocks is None or last_times is not times:
-                blocks = self._stack_functionals(self.blocks(times))
-            return over_faces(
-                self._space, ends, lambda selection, face: self._majorise_blocks(blocks[selection], face).sum(axis=2)
-            )
         return over_faces(
             self._space,
             ends,
@@ -211,11 +198,6 @@ class DisturbanceSupport:
         """Return whether a time within a piece is its beginning or, up to the share `SAME` of it, its end."""
         length = float(self.lifted.backward.propagator.lengths[0])
         return within == 0.0 or abs(within - length) <= SAME * length
-
-    @cached_property
-    def _last_blocks(self) -> dict[str, tuple[Array, Array]]:
-        """The times that `steepness` was last asked for, and the blocks there, until `at` has used them."""
-        return {}
 
     @cached_property
     def _cached_sums(self) -> dict[tuple[str, float], Array]:
