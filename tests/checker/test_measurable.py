@@ -10,9 +10,7 @@ import pytest
 
 import sparserob_core as sr
 from sparserob_core.checker.claims import claims
-from sparserob_core.control.transcription.provable import remark
 from tests.checker.test_check import DECAY, SPRING, on
-from tests.control.sets.test_sets import ByItsSupport
 from tests.support.tampering import Forgery, forged
 
 STIRRED = {**SPRING, "disturbance_class": "measurable", "disturbance": {"box": [0.03, 0.03]}}
@@ -82,24 +80,6 @@ def test_a_higher_lower_bound_and_another_violation_are_refuted(tmp_path: Path) 
         place = tmp_path / kind
         place.mkdir()
         assert sr.check(forged(run(kind, place), place / "forged", change, consistent=True)).status == "refuted"
-
-
-def test_of_a_set_that_only_tells_its_support_function_a_run_says_what_is_estimated() -> None:
-    problems = [
-        sr.OptimalControlProblem(
-            system=sr.LinearSystem([[0, 1], [-1, -0.4]], [[0], [1]], [[1, 0], [0, 1]]),
-            horizon=2.0,
-            initial_state=[-0.5, 0.5],
-            control=sr.Box([-1.0], [1.0]),
-            terminal=[sr.Box([-0.2, -0.2], [0.2, 0.2])],
-            disturbance=bound,
-            disturbance_class="measurable",
-        )
-        for bound in (ByItsSupport(sr.NormBall(2.0, 0.03, dimension=2)), sr.NormBall(2.0, 0.03, dimension=2))
-    ]
-    assert ["estimated" in remark(problem) for problem in problems] == [True, False]
-    costs = [sr.solve(problem, control={"name": "piecewise_constant", "pieces": 4}).cost for problem in problems]
-    assert costs[0] == pytest.approx(costs[1], rel=1e-7)
 
 
 def test_a_lower_bound_above_the_cost_of_what_keeps_everything_is_a_contradiction(
