@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import logging
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 import pytest
@@ -14,7 +13,6 @@ import sparserob_core as sr
 from sparserob_core.control.transcription import provable
 from sparserob_core.experiment.directory.artefacts import RunDirectory
 from sparserob_core.experiment.run.events import Broadcast, Event
-from tests.control.sets.test_sets import ByItsSupport
 
 KEYS = {
     "status",
@@ -209,24 +207,3 @@ def test_what_can_never_be_certified_is_said_before_anything_is_solved(
     result = sr.solve(problem, control={"name": "piecewise_constant", "pieces": 4})
     assert result.stopped == "the limit of 0.001 s is reached"
     assert "the search for a witness ends after 0.001 s" in caplog.text
-
-
-def test_a_claim_that_rests_on_quadrature_says_so() -> None:
-    def said(disturbance: sr.ConvexSet, kind: Literal["measurable", "piecewise_constant"] = "measurable") -> str:
-        problem = sr.OptimalControlProblem(
-            system=sr.LinearSystem(A=[[0, 1], [0, 0]], B=[[0], [1]]),
-            horizon=2.0,
-            initial_state=[0.6, 0.0],
-            control=sr.Box([-1.0], [1.0]),
-            disturbance=disturbance,
-            disturbance_class=kind,
-            terminal=[sr.Box([-0.3, -0.3], [0.3, 0.3])],
-        )
-        found = sr.solve(problem, control={"name": "piecewise_constant", "pieces": 4})
-        assert found.status == "certified"
-        return found.message
-
-    ball = sr.NormBall(2.0, 0.01, dimension=2)
-    assert "not enclosed" in said(ByItsSupport(ball))
-    assert "not enclosed" not in said(ByItsSupport(ball), "piecewise_constant") + said(ball)
-    assert "not enclosed" not in said(sr.Box([-0.01, -0.01], [0.01, 0.01]))
