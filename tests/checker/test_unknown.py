@@ -16,7 +16,6 @@ from sparserob_core.checker.claims import case, cells, constraints, followed
 from sparserob_core.checker.claims.answers import feedback_of
 from sparserob_core.checker.claims.case import Case
 from sparserob_core.checker.cost import effort
-from sparserob_core.checker.cost.gains import _compute_chords
 from sparserob_core.checker.flow.flow import VerifiedFlow
 from sparserob_core.checker.flow.plant import Plant
 from sparserob_core.checker.outcome import Broken, Clock, Unchecked
@@ -163,7 +162,7 @@ UNKNOWN: dict[str, tuple[Callable[[], object], type[Exception], str]] = {
     ),
     "the least of nothing": (lambda: flat._find_least([]), Unchecked, "the set of controls has no corners"),
     "a set without chords": (
-        lambda: _compute_chords(Cylinder(NormBall(3.0, 1.0, dimension=2), 3), np.zeros(3)),
+        lambda: known(Cylinder(NormBall(3.0, 1.0, dimension=2), 3)).chords(np.zeros(3)),
         Unchecked,
         "how long the disturbance's set is along the axes",
     ),

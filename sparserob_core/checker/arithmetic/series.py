@@ -71,10 +71,8 @@ class Series:
 
     @cached_property
     def size(self) -> Array:
-        """The upper bounds ``(rows, columns)`` of the absolute values of the entries; 0 also where a bound is too small
-        for a float."""
-        entries = np.array([float(x.abs_upper()) for coefficient in self.parts for x in coefficient.entries()])
-        bounds = np.where(entries > 0.0, entries + TINY, 0.0)
+        """The upper bounds ``(rows, columns)`` of the absolute values of the entries; 0 where an entry is exactly 0."""
+        bounds = np.array([upper(x) for coefficient in self.parts for x in coefficient.entries()])
         return np.asarray(bounds.reshape(len(self.parts), *self.shape).sum(axis=0) * OUTWARD)
 
     @property
@@ -175,6 +173,12 @@ class Series:
     def transpose(self) -> Series:
         """Return the transpose."""
         return Series(self.monomials, [coefficient.transpose() for coefficient in self.parts])
+
+
+def upper(x: arb) -> float:
+    """Return an upper bound of an absolute value, up to `OUTWARD`: 0 for an exact 0 alone, since floats underflow."""
+    size = float(x.abs_upper())
+    return 0.0 if size == 0.0 and x.is_zero() else size + TINY
 
 
 def sizes_of(series: Sequence[Series]) -> Array:

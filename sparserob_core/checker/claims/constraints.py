@@ -344,9 +344,7 @@ def _is_uncertain(case: Case, state: int) -> bool:
     acting_columns = [*range(d + m), *(d + m + int(w) for w in np.flatnonzero(case.disturbances.middle))]
     is_uncertain = bool(is_parametric[np.ix_(rows, acting_columns)].any())
     bound = case.problem.disturbance
-    free_disturbances = (
-        [] if bound is None else [w for w, axis in enumerate(np.eye(bound.dimension)) if _is_wide(bound, axis)]
-    )
+    free_disturbances = [] if bound is None else [w for w in range(bound.dimension) if _is_wide(bound, w)]
     is_disturbed = bool(is_nonzero[np.ix_(rows, [d + m + w for w in free_disturbances])].any())
     initial_set = case.problem.initial_set
     has_uncertain_start = initial_set is not None and any(
@@ -355,10 +353,9 @@ def _is_uncertain(case: Case, state: int) -> bool:
     return is_uncertain or is_disturbed or has_uncertain_start
 
 
-def _is_wide(bound: ConvexSet, axis: Array) -> bool:
+def _is_wide(bound: ConvexSet, channel: int) -> bool:
     """Return whether a set may be more than one point along an axis; False only where it provably is one."""
-    width = known(bound).support(balls(axis)) + known(bound).support(balls(-axis))
-    return not width <= math.ulp(0.0)
+    return not known(bound).width(channel) <= math.ulp(0.0)
 
 
 def _is_at_rest(case: Case, state: int) -> bool:

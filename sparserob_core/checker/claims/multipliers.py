@@ -71,12 +71,7 @@ def weighted(case: Case, data: object) -> tuple[list[tuple[float, ConstraintRow]
         raise Broken(f"{nu.size} multipliers of equalities, expected {len(case.equalities)}")
     for multiplier, (state, value) in zip(nu.tolist(), case.equalities, strict=False):
         direction = np.eye(case.problem.system.states)[state]
-        if case.followed.are_best:
-            row = _derive_adjoint_row(case, direction, case.problem.horizon, ball(value), disturbed=False)
-        else:
-            row = case.duality.row(
-                direction, case.problem.horizon, case.nominal_parameter, ball(value), disturbed=False
-            )
+        row = _derive_row(case, direction, case.problem.horizon, case.nominal_parameter, ball(value), disturbed=False)
         # a disturbance of one point counts; where none may reach the state, any member of its set may stand for it
         rows.append((multiplier, replace(row, constant=row.constant + pushed_by_middle(case, state))))
     if case.control.functions >= case.control.pieces:  # every piece has a function of its own
@@ -177,13 +172,10 @@ def _derive_base_row(
     _, direction, time, parameter = said
     c, gain = np.split(direction, [case.problem.system.states])
     limit = fixed_limit(case, direction, time) if window is None else window.limit(direction, time)
-    if case.followed.are_best:
-        row = _derive_adjoint_row(case, c, time, limit)
-    else:
-        row = case.duality.row(c, time, parameter.tolist(), limit, disturbed=not case.answering)
-        measurable_input = case.sources.strayed_at(parameter.tolist())
-        if measurable_input is not None:
-            row = replace(row, constant=row.constant + balls([measurable_input.added(c, time)[0]])[0])
+    row = _derive_row(case, c, time, parameter.tolist(), limit, disturbed=not case.answering)
+    measurable_input = None if case.followed.are_best else case.sources.strayed_at(parameter.tolist())
+    if measurable_input is not None:
+        row = replace(row, constant=row.constant + ball(measurable_input.added(c, time)[0]))
     sizes, early_bound = case.sources.erring(c, time, parameter.tolist())
     row = replace(row, constant=row.constant + early_bound, sizes=sizes)
     if window is not None and window.is_mixed:
@@ -192,10 +184,14 @@ def _derive_base_row(
     return row
 
 
-def _derive_adjoint_row(case: Case, c: Array, time: float, limit: arb, disturbed: bool = True) -> ConstraintRow:
-    """Return the constraint ``c'x(t) <= limit`` by the adjoint of its row, for the worst deviations or without them.
+def _derive_row(
+    case: Case, c: Array, time: float, parameter: Sequence[float], limit: arb, disturbed: bool
+) -> ConstraintRow:
+    """Return the constraint ``c'x(t) <= limit`` for the worst deviations or without them.
 
-    No transition matrix is computed, because each would take a minute for hundreds of states."""
+    By the adjoint of its row no transition matrix is computed; each would take a minute for hundreds of states."""
+    if not case.followed.are_best:
+        return case.duality.row(c, time, parameter, limit, disturbed)
     worst, problem, delay = case.followed.worst(c, None), case.problem, case.problem.system.delay
     m, starts = problem.system.controls, np.append(case.control.breakpoints[:-1] + delay, np.inf)
     initial_weights, input_weights = worst.carried(time), worst.weights(time, starts[:-1], starts[1:])

@@ -23,7 +23,6 @@ from sparserob_core.checker.flow.flows import VerifiedFlows
 from sparserob_core.checker.outcome import Broken
 from sparserob_core.checker.problem.lasting import Lasting, summed
 from sparserob_core.checker.problem.timing import before
-from sparserob_core.checker.sets.flat import Boxed
 from sparserob_core.checker.sets.known import known
 from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.problem.problem import OptimalControlProblem
@@ -236,15 +235,9 @@ class Duality:
                     tilted_slope[c], remaining[c] = slope[c] + component, sizes[c]
             candidates.append((remaining, tilted_slope))
         shape = known(self.problem.control)
-        if not isinstance(shape, Boxed):
-            return largest([shape.least(remaining, remaining, tilted_slope) for remaining, tilted_slope in candidates])
-        singles = [[c] for c in range(len(slope)) if not any(c in block for block in groups)]
-        shares = [shape.shares_of_least(remaining, remaining, tilted_slope) for remaining, tilted_slope in candidates]
-        total = ball(0.0)
-        for block in (*groups, *singles):
-            values = [sum((share[c] for c in block), ball(0.0)) for share in shares]
-            total = total + largest(values)
-        return total
+        blocks = [*groups, *([c] for c in range(len(slope)) if not any(c in block for block in groups))]
+        parts = [shape.least_by(remaining, remaining, tilted, blocks) for remaining, tilted in candidates]
+        return sum(map(largest, zip(*parts, strict=True)), ball(0.0))
 
     def summed(
         self,

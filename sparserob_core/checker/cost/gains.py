@@ -6,22 +6,18 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from functools import cached_property
-from itertools import pairwise
 from typing import TYPE_CHECKING, final
 
 import numpy as np
 
-from sparserob_core.checker.arithmetic.balls import ball, balls, largest, rational, smallest
+from sparserob_core.checker.arithmetic.balls import ball, balls, largest, rational
 from sparserob_core.checker.arithmetic.remembered import remembered
-from sparserob_core.checker.arithmetic.series import exactly, stacked
+from sparserob_core.checker.arithmetic.series import stacked
 from sparserob_core.checker.cost.duality import ConstraintRow
-from sparserob_core.checker.outcome import Unchecked
 from sparserob_core.checker.reach.closed_loop import VerifiedLoop
 from sparserob_core.checker.reach.preimages import Pushed, SeenDeviations
 from sparserob_core.checker.sets.known import known
-from sparserob_core.checker.sets.shape import NEAR, along
-from sparserob_core.control.sets.sets import Ellipsoid, NormBall, Product
-from sparserob_core.sip.convex_set import Array, ConvexSet
+from sparserob_core.sip.convex_set import ConvexSet
 
 if TYPE_CHECKING:
     from flint import arb, arb_mat
@@ -51,7 +47,7 @@ class GainsBound:
         slopes = stacked([[ball(y) * row.slope[k][i] for y, row in rows] for k in range(K) for i in range(m)])
         innovations = stacked([[x for innovation in row.innovations for x in innovation] for _, row in rows])
         product = (slopes * innovations).tolist()
-        width = [_compute_width(self.control, i) for i in range(m)]
+        width = [known(self.control).width(i) for i in range(m)]
         for k in range(K):
             clusters = self._cluster_breakpoints(k)
             for i in range(m):
@@ -152,79 +148,15 @@ class GainsBound:
         """For every block the directions along which its set is long, with the lengths; empty for a block that cannot
         deviate, which is never measured."""
         loop = self.loop
-        segments = {id(shape): _segments(shape, middle) for shape, middle in loop.deviations.sets}
+        segments = {id(shape): known(shape).spans(middle) for shape, middle in loop.deviations.sets}
         return [segments[id(shape)] for shape, _ in loop.deviations.sets]
-
-
-def _evaluate_along_axis(shape: ConvexSet, channel: int, sign: float) -> arb:
-    return known(shape).support(balls(sign * np.eye(shape.dimension)[channel]))
-
-
-def _compute_width(shape: ConvexSet, channel: int) -> arb:
-    return _evaluate_along_axis(shape, channel, 1.0) + _evaluate_along_axis(shape, channel, -1.0)
 
 
 def reach(shape: ConvexSet, channel: int) -> arb:
     """Return the largest absolute value of a channel over a set."""
-    return (
-        _evaluate_along_axis(shape, channel, 1.0)
-        .max(_evaluate_along_axis(shape, channel, -1.0))
-        .max(_evaluate_along_axis(shape, channel, 1.0) * 0)
-    )
-
-
-def _segments(shape: ConvexSet, middle: Array) -> list[tuple[list[Fraction], arb]]:
-    """Return vectors ``v (d,)`` that span the directions along which points of a set differ, each with a number ``c >
-    0``.
-
-    The width of the set along any ``a`` is at least ``c |a'v|``. The vectors are along the axes, except for a set
-    without an interior.
-    """
-    if isinstance(shape, Product):
-        return [
-            ([*[Fraction(0)] * indices.start, *vector, *[Fraction(0)] * (shape.dimension - indices.stop)], length)
-            for factor, point, indices in _split_product(shape, middle)
-            for vector, length in _segments(factor, point)
-        ]
-    chords, axes = _compute_chords(shape, middle), np.eye(shape.dimension)
-    widths = [_compute_width(shape, channel) for channel in range(shape.dimension)]
-    if all(widths[b].is_zero() or chord > NEAR * widths[b] for b, chord in enumerate(chords)):
-        channels = [b for b, width in enumerate(widths) if not width.is_zero()]
-        return [([Fraction(float(v)) for v in axes[b]], chords[b]) for b in channels]
-    segments = known(shape).segments
-    if segments is None:
-        raise Unchecked(f"the checker does not know how long the {shape.kind} is along the axes")
-    return [(vector, rational(length)) for vector, length in segments]
-
-
-def _split_product(shape: Product, middle: Array) -> list[tuple[ConvexSet, Array, slice]]:
-    """Return every part of a product, each with its part of a point and its place."""
-    ends = np.cumsum([0, *(factor.dimension for factor in shape.parts)]).tolist()
-    slices = [slice(begin, end) for begin, end in pairwise(ends)]
-    return [(factor, middle[indices], indices) for factor, indices in zip(shape.parts, slices, strict=True)]
-
-
-def _compute_chords(shape: ConvexSet, middle: Array) -> list[arb]:
-    """Return numbers ``c_b`` such that the width of a set along any ``a`` is at least ``c_b |a_b|``: the lengths of its
-    chords along the axes through its middle, in balls."""
-    if isinstance(shape, Product):
-        return [chord for factor, point in shape.split(middle) for chord in _compute_chords(factor, point)]
-    if isinstance(shape, NormBall):
-        return [2 * ball(shape.radius)] * shape.dimension
-    if isinstance(shape, Ellipsoid):
-        inverse = exactly(shape.shape).inv()
-        return [2 / inverse[b, b].sqrt() for b in range(shape.dimension)]
-    facets = known(shape).facets
-    if facets is None:
-        raise Unchecked("the checker does not know how long the disturbance's set is along the axes")
-    chords = []
-    for axis in range(shape.dimension):
-        distances = []
-        for sign in (1.0, -1.0):
-            ends = [(b - along(c, balls(middle))) / ball(abs(c[axis])) for c, b in facets if sign * c[axis] > 0]
-            distances.append(smallest(ends))
-        chords.append(distances[0] + distances[1])
-    return chords
+    axis = np.eye(shape.dimension)[channel]
+    high, low = (known(shape).support(balls(sign * axis)) for sign in (1.0, -1.0))
+    return high.max(low).max(high * 0)
 
 
 def _multiply_by_segments(push: arb_mat, segments: Sequence[tuple[list[Fraction], arb]]) -> list[list[arb]]:

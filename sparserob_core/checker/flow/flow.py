@@ -83,7 +83,6 @@ class VerifiedFlow:
     sharp: float = SHARP
     _segments: dict[tuple[float, float], VerifiedSegment] = field(default_factory=dict, repr=False)
     _segment_stops: dict[float, float] = field(default_factory=dict, repr=False)
-    _float_flows: dict[tuple[int, float], tuple[Array, Array]] = field(default_factory=dict, repr=False)
 
     @remembered(lambda: POINTS_KEPT, lambda self, parameter: tuple(map(float, parameter)))
     def at(self, parameter: Sequence[float]) -> VerifiedFlow:
@@ -194,22 +193,25 @@ class VerifiedFlow:
     def about(self, start: float, stop: float) -> tuple[Array, Array, Array]:
         """Return the three factors of `over` as floats with rounding errors. Units of rows are made of them; no claim
         rests on them."""
-        phases, d = self.plant.phases, self.states
+        d = self.states
         if d < COARSE or self.plant.is_timed:
             of_states, of_controls, of_disturbances = (middles(factor.matrix) for factor in self.over(start, stop))
             return of_states, of_controls, of_disturbances
         flow = np.hstack([np.eye(d), np.zeros((d, self.plant.inputs))])
-        for number, phase in enumerate(phases):
+        for number, phase in enumerate(self.plant.phases):
             length = min(stop, phase.until) - max(start, phase.begin)
             if length > 0.0:
-                key = number, length
-                if key not in self._float_flows:
-                    table = called(phase, np.array([phase.begin, *self.box.middle])).astype(float)
-                    self._float_flows[key] = held_about(table[:, :d], table[:, d:], length)
-                Phi, Gamma = self._float_flows[key]
+                Phi, Gamma = self._estimate_flow(number, length)
                 flow = Phi @ flow
                 flow[:, d:] += Gamma
         return flow[:, :d], flow[:, d : d + self.driven], flow[:, d + self.driven :]
+
+    @remembered()
+    def _estimate_flow(self, number: int, length: float) -> tuple[Array, Array]:
+        """Return the flow of a phase over a length of time, in floats."""
+        phase, d = self.plant.phases[number], self.states
+        table = called(phase, np.array([phase.begin, *self.box.middle])).astype(float)
+        return held_about(table[:, :d], table[:, d:], length)
 
     def parts(self, start: float, stop: float) -> Iterator[FlowPart]:
         """Yield the parts of an interval, one after another."""
@@ -223,12 +225,10 @@ class VerifiedFlow:
                 share, length, doublings = share / 2, length / 2, doublings + 1
             yield FlowPart(self._solve_constant_stretch(stretch), share, length, doublings)
 
+    @remembered(key=lambda self, stretch: stretch.start)
     def _solve_constant_stretch(self, stretch: Stretch) -> VerifiedSegment:
         """Return the verified segment of a stretch on which nothing changes with time."""
-        key = (-1.0, stretch.start)
-        if key not in self._segments:
-            self._segments[key] = solve(*stretch.between(0.0, stretch.stride), stretch.units, self.sharp)
-        return self._segments[key]
+        return solve(*stretch.between(0.0, stretch.stride), stretch.units, self.sharp)
 
     def within(self, begin: float, end: float, start: float, stop: float, order: int) -> tuple[list[Series], Array]:
         """Return the flow from ``begin`` to the times in ``[start, stop]`` as a polynomial.

@@ -14,7 +14,7 @@ import numpy as np
 
 from sparserob_core.checker.arithmetic.models import Frame, Model
 from sparserob_core.checker.arithmetic.monomials import NONE, Monomials
-from sparserob_core.checker.arithmetic.series import OUTWARD, Series, stacked
+from sparserob_core.checker.arithmetic.series import OUTWARD, Series, stacked, upper
 from sparserob_core.checker.flow.plant import Plant, called
 from sparserob_core.checker.flow.segment import SHARP
 from sparserob_core.checker.flow.units import balanced, pace
@@ -126,17 +126,16 @@ class Stretch:
 
     @cached_property
     def sizes(self) -> tuple[Array, Array]:
-        """The upper bounds of the absolute values of the law and of its derivative in time, ``(d, d + w)`` each; 0 also
-        where a bound is too small for a float."""
+        """The upper bounds of the absolute values of the law and of its derivative in time, ``(d, d + w)`` each."""
         half = (self.stop - self.start) / 2.0
         sizes = np.zeros((2, len(self.table[0]), len(self.table[0][0])))
         for table in self.table:
             for i, row in enumerate(table):
                 for j, entry in enumerate(row):
                     for n, c in enumerate(entry.coeffs()):
-                        size = float(c.abs_upper()) * OUTWARD
+                        size = upper(c)
                         sizes[:, i, j] += size, size * n / half
-        return sizes[0] * OUTWARD, sizes[1] * OUTWARD
+        return sizes[0] * OUTWARD**2, sizes[1] * OUTWARD**2
 
 
 def most(table: Sequence[Sequence[arb_poly]]) -> Array:
@@ -186,7 +185,8 @@ class Law:
     def _sampled_sizes(self) -> tuple[Array, Array]:
         """The largest absolute values of the entries of ``A``, and of every column of ``[B c E]``, at sample times in
         the middle of the box. Units are made of them; any values would be right."""
-        samples = np.array([np.abs(table) for table in self.plant.looked_at(self.box.middle)])
+        none = np.zeros((self.plant.states, self.plant.states + self.plant.inputs))  # where every time is skipped
+        samples = np.array([none, *(np.abs(table) for table in self.plant.looked_at(self.box.middle))])
         with np.errstate(invalid="ignore"):
             A, inputs = (
                 samples[..., : self.plant.states].max(axis=0),

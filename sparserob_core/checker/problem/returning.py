@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from sparserob_core.checker.arithmetic.balls import balls
 from sparserob_core.checker.outcome import Unchecked
 from sparserob_core.checker.sets.known import known
 from sparserob_core.control.problem.problem import OptimalControlProblem
@@ -47,6 +46,4 @@ def single(problem: OptimalControlProblem) -> list[int]:
     bound, d = problem.initial_set, problem.system.states
     if bound is None:
         return list(range(d))
-    axes = np.eye(d).tolist()
-    heights = ((known(bound).support(balls(c)), known(bound).support(balls([-v for v in c]))) for c in axes)
-    return [i for i, (up, down) in enumerate(heights) if (up + down).is_zero()]
+    return [i for i in range(d) if known(bound).width(i).is_zero()]

@@ -22,10 +22,10 @@ from sparserob_core.checker.arithmetic.series import Series, middles, stacked, z
 from sparserob_core.checker.flow.segment import VerifiedSegment, solve
 from sparserob_core.checker.flow.units import balanced
 from sparserob_core.checker.outcome import Clock, Unchecked
-from sparserob_core.checker.reach.measurable import Side
 from sparserob_core.checker.sets.along import CurvedSide
-from sparserob_core.checker.sets.known import known, middle
+from sparserob_core.checker.sets.known import known, middle, sides_of
 from sparserob_core.checker.sets.polynomials import HALF_ULP, OUTWARD, TINY, Enclosed, rounding
+from sparserob_core.checker.sets.summands import Side
 from sparserob_core.sip.convex_set import Array, ConvexSet
 
 if TYPE_CHECKING:
@@ -642,7 +642,7 @@ class Worst:
     def _disturbance_integrals(self) -> SupportIntegrals:
         """The integrals of the support functions of a measurable disturbance about the middle of its set."""
         assert self.pushed is not None
-        return SupportIntegrals(self._single_adjoint, self._disturbance_columns, Side.of(self.pushed))
+        return SupportIntegrals(self._single_adjoint, self._disturbance_columns, sides_of(self.pushed))
 
     def _evaluate_measurable(self, times: Array) -> tuple[Array, Array]:
         """Return what the worst measurable disturbance adds to the row at ``times (k,)``, and error bounds, ``(k,)``

@@ -24,7 +24,7 @@ from sparserob_core.checker.arithmetic.series import around, exactly, identity, 
 from sparserob_core.checker.flow.flow import VerifiedFlow
 from sparserob_core.checker.flow.plant import Plant
 from sparserob_core.checker.flow.still import modes_at
-from sparserob_core.checker.reach.deviations import Deviations, HeldDeviations
+from sparserob_core.checker.reach.deviations import Deviations
 from sparserob_core.checker.reach.preimages import Pushed
 from sparserob_core.checker.sets.polynomials import OUTWARD, Enclosed, rounding
 from sparserob_core.control.sets.sets import ConvexSet
@@ -94,7 +94,7 @@ class VerifiedLoop:
         """The deviations that the control may have to answer."""
         noise, K = None if self.measured is None else self.measured.noise, len(self.breakpoints) - 1
         width, noises = self.system.disturbances, 0 if noise is None else K
-        return HeldDeviations(self.shape, width, self.initial, len(self.changes), noise, noises)
+        return Deviations(self.shape, width, self.initial, len(self.changes), noise, noises)
 
     @property
     def outputs(self) -> int:

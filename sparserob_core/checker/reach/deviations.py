@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import accumulate
-from typing import TYPE_CHECKING, final
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -21,42 +20,54 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, eq=False)
-class Deviations(ABC):
-    """The deviations of a disturbance with ``width`` entries in the set ``shape``, and the initial deviation, of a
-    state in the set ``initial``, as the last block. A set is ``None`` where there is no such deviation."""
+class Deviations:
+    """The deviations that a control may answer, block by block. A set is ``None`` where there is no such deviation.
+
+    They are those of a disturbance with ``width`` entries in the set ``shape``, constant on each of ``held`` blocks; of
+    the ``noise`` of ``noises`` measurements; and of the initial state in the set ``initial``, as the last block.
+    """
 
     shape: ConvexSet | None
     width: int
     initial: ConvexSet | None
+    held: int
+    noise: ConvexSet | None = None
+    noises: int = 0
 
     @property
-    @abstractmethod
     def blocks(self) -> int:
         """The number of blocks of the disturbance."""
+        return 0 if self.shape is None else self.held
 
     @property
-    @abstractmethod
     def begun(self) -> int:
         """The index of the block of the initial deviation, where there is one: the last block."""
+        return self.blocks + self.noises
 
-    @property
-    @abstractmethod
+    @cached_property
     def sets(self) -> list[tuple[ConvexSet, Array]]:
         """The set and its middle of every block that has a set of its own, that of the initial state last."""
+        sets = [] if self.shape is None else [(self.shape, self.middle)] * self.blocks
+        sets += [] if self.noise is None else [(self.noise, middle(self.noise))] * self.noises
+        return sets if self.initial is None else [*sets, (self.initial, middle(self.initial))]
 
-    @property
-    @abstractmethod
+    @cached_property
     def starts(self) -> list[int]:
         """The index of the first entry of every block, and at the end the number of all entries, ``Q``."""
+        return [0, *accumulate(shape.dimension for shape, _ in self.sets)]
 
-    @property
-    @abstractmethod
+    @cached_property
     def radii(self) -> Array:
         """The upper bound of the absolute value of each entry of a deviation, ``(Q,)``, rounded up."""
+        return rounded_radii([], self.sets)
 
-    @abstractmethod
     def supports(self, every: Sequence[list[arb]]) -> list[arb]:
         """Return the support values ``max z'a`` over all deviations ``z``, for every ``a (Q,)`` in balls."""
+        return [self._evaluate_support(a) for a in every]
+
+    def _evaluate_support(self, a: list[arb]) -> arb:
+        blocks = (a[first : first + shape.dimension] for first, (shape, _) in zip(self.starts, self.sets, strict=False))
+        return sum((of_block(*pair, block) for pair, block in zip(self.sets, blocks, strict=True)), ball(0))
 
     def support(self, a: list[arb]) -> arb:
         """Return the support value ``max z'a`` over all deviations ``z``, for one ``a (Q,)`` in balls."""
@@ -78,46 +89,6 @@ class Deviations(ABC):
                 assert point is not None
                 differences[id(shape)] = [x - m for x, m in zip(point, balls(about), strict=True)]
         return [differences[id(shape)] for shape, _ in self.sets]
-
-
-@final
-@dataclass(frozen=True, eq=False)
-class HeldDeviations(Deviations):
-    """The deviations of a disturbance that is constant on each of ``held`` blocks, and of the ``noise`` of ``noises``
-    measurements."""
-
-    held: int
-    noise: ConvexSet | None
-    noises: int
-
-    @property
-    def blocks(self) -> int:
-        return 0 if self.shape is None else self.held
-
-    @property
-    def begun(self) -> int:
-        return self.blocks + self.noises
-
-    @cached_property
-    def sets(self) -> list[tuple[ConvexSet, Array]]:
-        sets = [] if self.shape is None else [(self.shape, self.middle)] * self.blocks
-        sets += [] if self.noise is None else [(self.noise, middle(self.noise))] * self.noises
-        return sets if self.initial is None else [*sets, (self.initial, middle(self.initial))]
-
-    @cached_property
-    def starts(self) -> list[int]:
-        return [0, *accumulate(shape.dimension for shape, _ in self.sets)]
-
-    @cached_property
-    def radii(self) -> Array:
-        return rounded_radii([], self.sets)
-
-    def supports(self, every: Sequence[list[arb]]) -> list[arb]:
-        return [self._evaluate_support(a) for a in every]
-
-    def _evaluate_support(self, a: list[arb]) -> arb:
-        blocks = (a[first : first + shape.dimension] for first, (shape, _) in zip(self.starts, self.sets, strict=False))
-        return sum((of_block(*pair, block) for pair, block in zip(self.sets, blocks, strict=True)), ball(0))
 
 
 def of_block(shape: ConvexSet, about: Array, a: list[arb]) -> arb:

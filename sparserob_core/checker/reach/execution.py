@@ -21,8 +21,8 @@ from sparserob_core.checker.flow.still import modes_at
 from sparserob_core.checker.outcome import Clock
 from sparserob_core.checker.reach.adjoint import AdjointFlow, AdjointRow, SupportIntegrals, subtract_times
 from sparserob_core.checker.reach.kernels import BoundedInputHere
-from sparserob_core.checker.reach.measurable import Side
 from sparserob_core.checker.sets.polynomials import OUTWARD, Enclosed, rounding
+from sparserob_core.checker.sets.summands import channels
 from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.sip.convex_set import Array
 
@@ -54,9 +54,7 @@ class FollowedExecution(BoundedInputHere):
     def absolute(self, c: Array) -> SupportIntegrals:
         """Return the integrals of ``|c'e^{A s} B_j|`` for an exact direction ``c (d,)``; the direction ``-c`` has the
         same ones."""
-        axes = np.eye(self.shares.size)
-        sides = [Side(np.stack([axis, -axis]), 0.0 * axes[:2]) for axis in axes]
-        return SupportIntegrals(AdjointRow.of(self.motion, c + 0.0), slice(None), sides)
+        return SupportIntegrals(AdjointRow.of(self.motion, c + 0.0), slice(None), channels(self.shares.size))
 
     def integrals(self, c: Array, times: Array, points: Array) -> tuple[Array, Array]:
         """Return lower and upper bounds ``(k, q, m)`` each of ``F_j(a)`` at the ages ``a = times (k,) - points (q,)``,

@@ -102,7 +102,7 @@ class FollowedRows:
             np.asarray(problem.initial_state, dtype=float),
             problem.initial_set,
             np.array(self.timing.grid),
-            table.with_exact_zeros,
+            table,
             problem.disturbance,
             None if jumps is None else np.append(jumps, problem.horizon),
         )

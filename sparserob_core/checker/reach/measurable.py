@@ -2,22 +2,19 @@
 
 On a piece of the grid a disturbance ``w = m + z`` moves the state by ``e = int e^{A r} E z dr``, where ``r`` is the
 time that is left of the piece. The control of later pieces answers ``e``, and nothing else of the disturbance. So the
-largest ``a'e`` is the integral of the support function of ``E'e^{A'r} a``. This integral is enclosed. On every cell the
-corner of the set that is best there stands for all corners, and the error bound says how much better another corner
-could be.
+largest ``a'e`` is the integral of the support function of ``E'e^{A'r} a``, which is enclosed.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import accumulate, pairwise
 from typing import TYPE_CHECKING, final
 
 import numpy as np
 
-from sparserob_core.checker.arithmetic.balls import balls
 from sparserob_core.checker.arithmetic.remembered import remembered
 from sparserob_core.checker.arithmetic.series import identity, stacked
 from sparserob_core.checker.flow.flow import VerifiedFlow
@@ -25,114 +22,15 @@ from sparserob_core.checker.reach.closed_loop import VerifiedLoop
 from sparserob_core.checker.reach.deviations import Deviations, of_block, rounded_radii
 from sparserob_core.checker.reach.kernels import above_chord, pushes
 from sparserob_core.checker.sets.along import CurvedSide
-from sparserob_core.checker.sets.flat import Boxed, Cornered, Segments
-from sparserob_core.checker.sets.known import known, middle
+from sparserob_core.checker.sets.known import middle, sides_of
 from sparserob_core.checker.sets.polynomials import OUTWARD, Enclosed, product, rounding
+from sparserob_core.checker.sets.summands import Side, integrate
 from sparserob_core.sip.convex_set import Array, ConvexSet
 
 if TYPE_CHECKING:
     from flint import arb, arb_mat
 
-SETTLED = 2.0**-49  # relative to the support values: how much another corner may add on a cell that is cut no further
-ROUNDS = 60  # in which cells are cut
-# Rounds that always cut where two corners are equally good. Later every second one halves the cell: where two corners
-# touch at an end, that point lies next to this end, and such cuts gain little.
-CROSSING = 8
-SECANTS = 12  # steps of the search for the point where two corners are equally good
 KEPT = 4096  # intervals from the beginning of a piece to a time in it, whose kernels are remembered
-
-
-@final
-@dataclass(frozen=True, eq=False)
-class Side:
-    """A summand of the set of the deviations, by its ``corners (v, mw)`` with error bounds ``rad (v, mw)``."""
-
-    corners: Array
-    rad: Array
-
-    @staticmethod
-    def of(shape: ConvexSet) -> list[Side | CurvedSide]:
-        """Return sets whose sum is a given set minus its middle: for a box one for every channel, for a zonotope one
-        for every segment and one for its centre, for another set with corners, and for a curved set, one."""
-        from flint import arb, fmpq
-
-        about, known_shape = [arb(float(m)) for m in middle(shape)], known(shape)
-        if isinstance(known_shape, Boxed):
-            sides = []
-            for i, m in enumerate(about):
-                axis = balls(np.eye(known_shape.dimension)[i])
-                ends = [known_shape.support(axis) - m, -known_shape.support([-x for x in axis]) - m]
-                sides.append([[end if j == i else arb(0) for j in range(known_shape.dimension)] for end in ends])
-        elif isinstance(known_shape, Segments):
-            sides = [[[arb(float(c)) - m for c, m in zip(known_shape.source.centre, about, strict=True)]]]
-            for segment in known_shape.generators:
-                end = [arb(fmpq(x.numerator, x.denominator)) for x in segment]
-                sides.append([end, [-x for x in end]])
-        elif isinstance(known_shape, Cornered):
-            exact = [[arb(fmpq(x.numerator, x.denominator)) for x in corner] for corner in known_shape.corners]
-            sides = [[[x - m for x, m in zip(corner, about, strict=True)] for corner in exact]]
-        else:
-            curved = CurvedSide(known_shape, middle(shape))
-            _ = curved.far  # raises `Unchecked` for a set that the checker does not know
-            return [curved]
-        return [Side(enclosure.mid, enclosure.rad) for enclosure in (Enclosed.of(stacked(rows)) for rows in sides)]
-
-    @property
-    def dimension(self) -> int:
-        """The number of coordinates, ``mw``."""
-        return int(self.corners.shape[1])
-
-    @cached_property
-    def far(self) -> Array:
-        """The upper bound of the absolute value of every coordinate on the set, ``(mw,)``."""
-        return np.asarray((np.abs(self.corners) + self.rad).max(axis=0) * OUTWARD)
-
-    def swept(self, plain: Array, off: Array, sizes: Array, ends: Array) -> tuple[Array, Array, Array, Array]:
-        """Return the integrals of the support function of the set along polynomials, over ``u`` from -1 to
-        ``ends (n,)``.
-
-        Parameters
-        ----------
-        plain, off, sizes
-            The coefficients of the polynomials, ``(n, p + 1, mw)``; their error bounds, ``(n, mw)``; the sums of the
-            absolute values of the coefficients, ``(n, mw)``.
-        ends
-            The upper limits of the integrals, ``(n,)``.
-
-        Returns
-        -------
-        tuple
-            Values, how much more and how much less the true integral may be, and bounds of the absolute support values
-            without their errors, ``(n,)`` each.
-        """
-        P = np.einsum("npw,vw->npv", plain, self.corners)
-        e = (off @ (np.abs(self.corners) + self.rad).T + sizes @ self.rad.T) * OUTWARD
-        return *swept(P, e, ends), np.abs(P).sum(axis=1).max(axis=1)
-
-
-@final
-@dataclass(frozen=True, eq=False)
-class Together:
-    """The Minkowski sum of several ``sides``, at least one: its support function is the sum of theirs."""
-
-    sides: Sequence[Side | CurvedSide]
-
-    @property
-    def dimension(self) -> int:
-        """The number of coordinates, ``mw``."""
-        return self.sides[0].dimension
-
-    @cached_property
-    def far(self) -> Array:
-        """The upper bound of the absolute value of every coordinate on the sum, ``(mw,)``."""
-        return np.asarray(np.sum([side.far for side in self.sides], axis=0) * OUTWARD)
-
-    def swept(self, plain: Array, off: Array, sizes: Array, ends: Array) -> tuple[Array, Array, Array, Array]:
-        """Return the sums over all sides of what `Side.swept` returns, with the rounding errors of these sums."""
-        integrals = [side.swept(plain, off, sizes, ends) for side in self.sides]
-        value, excess, deficit, tops = (np.sum(values, axis=0) for values in zip(*integrals, strict=True))
-        rounded = rounding(len(integrals)) * 2.0 * tops
-        return value, (excess + rounded) * OUTWARD, (deficit + rounded) * OUTWARD, tops
 
 
 @final
@@ -166,111 +64,11 @@ class VerifiedKernel:
     def most(self, a: Enclosed, sides: Sequence[Side | CurvedSide]) -> Enclosed:
         """Return the integral of the support function of ``K(r)'a`` over all parts, for ``a (N, d)``, as middles and
         radii ``(N,)``. The set is the sum of ``sides``."""
-        size, count = np.abs(a.mid), self.count
-        large = np.einsum("nd,spdw->nsw", size, np.abs(self.coefficients))
-        plain, errors = self.along(a)
-        low, high, rounding_error = np.zeros(len(size)), np.zeros(len(size)), np.zeros(len(size))
-        flat = [arrays.reshape(-1, *arrays.shape[2:]) for arrays in (plain, errors, large)]
-        errors = flat[1] + rounding(errors.shape[2] + 2 * self.coefficients.shape[1] + 6) * flat[2]
-        for side in sides:
-            integrals = side.swept(flat[0], errors, flat[2], np.ones(len(errors)))
-            *bounds, tops = (values.reshape(len(size), -1) for values in integrals)
-            value, excess, deficit = (values.sum(axis=1) for values in bounds)
-            low, high = low + value - deficit, high + value + excess
-            rounding_error += rounding(4 * count + 8) * 2.0 * tops.sum(axis=1)
-        low, high = low / 2.0, high / 2.0  # u runs from -1 to 1, an interval of length 2
-        rad = (high - low) / 2.0 + (rounding_error / 2.0 + rounding(4) * (np.abs(low) + np.abs(high)))
-        return Enclosed((low + high) / 2.0, rad * OUTWARD)
-
-
-def swept(P: Array, e: Array, ends: Array) -> tuple[Array, Array, Array]:
-    """Return the integral of the largest of several polynomials, over ``u`` from -1 to ``ends (M,)``.
-
-    Parameters
-    ----------
-    P
-        The coefficients of ``v`` polynomials for each of ``M`` integrals, ``(M, p + 1, v)``.
-    e
-        The error bounds of the polynomials, ``(M, v)``. They allow for the rounding errors in the sum of two of their
-        values.
-    ends
-        The upper limits of the integrals, ``(M,)``.
-
-    Returns
-    -------
-    tuple
-        Values, and how much more and how much less the true integral may be, ``(M,)`` each.
-    """
-    orders = np.arange(P.shape[1])
-    owners, start, stop = np.arange(len(P)), -np.ones(len(P)), ends.copy()
-    value, excess, deficit = np.zeros(len(P)), np.zeros(len(P)), np.zeros(len(P))
-    allowed = SETTLED * np.abs(P).sum(axis=1).max(axis=1)
-    weights = 1.0 / (orders + 1.0)
-    for iteration in range(ROUNDS + 1):
-        Q = P[owners]
-        start_values, stop_values = _evaluate_polynomials(Q, start), _evaluate_polynomials(Q, stop)
-        best, rows, width = (start_values + stop_values).argmax(axis=1), np.arange(owners.size), stop - start
-        G = Q[rows, :, best][:, :, None] - Q
-        g = [values[rows, best][:, None] - values for values in (start_values, stop_values)]
-        below = np.maximum(0.0, -np.minimum(*g))
-        bend = (np.abs(G) * (orders * (orders - 1))[:, None]).sum(axis=1)
-        # a function with |f''| <= bend that is not negative at the ends is nowhere negative where this holds
-        near = (np.sqrt(np.maximum(g[0], 0.0)) + np.sqrt(np.maximum(g[1], 0.0))) ** 2
-        dips = np.where(near >= bend * (width**2 / 2.0)[:, None], 0.0, bend * (width**2 / 8.0)[:, None])
-        shortfall = (below + dips) * (1.0 + 1e-13)
-        shortfall[rows, best] = 0.0
-        shortfall = shortfall.max(axis=1)
-        # where the corners differ by less than their error bounds, no further cut helps
-        is_settled = (
-            (shortfall * width <= allowed[owners]) | (shortfall <= e[owners].max(axis=1)) | (iteration == ROUNDS)
-        )
-        settled, targets = rows[is_settled], owners[is_settled]
-        chosen = Q[settled, :, best[settled]] * weights
-        area = (
-            _evaluate_polynomials(chosen, stop[settled]) * stop[settled]
-            - _evaluate_polynomials(chosen, start[settled]) * start[settled]
-        )
-        own_errors, largest_errors = e[targets, best[settled]], e[targets].max(axis=1)
-        np.add.at(value, targets, area)
-        # ``e`` allows for the rounding errors of two parts; with more parts, those at both ends of each are added
-        rounded = 2.0 * rounding(orders.size + 4) * np.abs(chosen).sum(axis=1) * (iteration > 1)
-        np.add.at(excess, targets, (shortfall[settled] + own_errors + 2.0 * largest_errors) * width[settled] + rounded)
-        np.add.at(deficit, targets, own_errors * width[settled] + rounded)
-        if is_settled.all():
-            break
-        open_cells = rows[~is_settled]
-        a, b = start_values[open_cells].argmax(axis=1), stop_values[open_cells].argmax(axis=1)
-        cut = (start[open_cells] + stop[open_cells]) / 2.0
-        if iteration < CROSSING or iteration % 2:
-            cut = _find_crossings(Q[open_cells, :, a] - Q[open_cells, :, b], start[open_cells], stop[open_cells])
-        owners = np.tile(owners[open_cells], 2)
-        start, stop = np.concatenate([start[open_cells], cut]), np.concatenate([cut, stop[open_cells]])
-    return value, excess * OUTWARD, deficit * OUTWARD
-
-
-def _evaluate_polynomials(P: Array, u: Array) -> Array:
-    """Return the values of polynomials ``(M, p + 1, ...)`` at ``u (M,)``."""
-    powers = u[:, None] ** np.arange(P.shape[1])
-    return np.asarray(np.einsum("mp,mp...->m...", powers, P))
-
-
-def _find_crossings(P: Array, start: Array, stop: Array) -> Array:
-    """Return points near a root of polynomials ``(M, p + 1)`` that differ in sign at the ends, by the Illinois method:
-    secants in which the value at the older end is halved. Elsewhere return the middle. All bounds hold wherever the
-    points are."""
-    a, b, fa, fb = start, stop, _evaluate_polynomials(P, start), _evaluate_polynomials(P, stop)
-    middle_of = (a + b) / 2.0
-    crossing, cut = fa * fb < 0.0, middle_of
-    for _ in range(SECANTS):
-        with np.errstate(divide="ignore", invalid="ignore"):
-            cut = np.where(crossing, b - fb * (b - a) / (fb - fa), middle_of)
-        cut = np.where(np.isfinite(cut), cut, middle_of)
-        f = _evaluate_polynomials(P, cut)
-        has_changed = f * fb < 0.0
-        a, fa = np.where(has_changed, b, a), np.where(has_changed, fb, fa / 2.0)
-        b, fb = cut, f
-    margin = 1e-9 * (stop - start)
-    return np.asarray(np.where(crossing & (cut > start + margin) & (cut < stop - margin), cut, middle_of))
+        polynomials = (values.reshape(-1, *values.shape[2:]) for values in self.along(a))
+        ends = np.stack(integrate(sides, *polynomials)).reshape(2, len(a.mid), -1)
+        low, high = ends.sum(axis=2)
+        rounded = rounding(ends.shape[2] + 4) * np.abs(ends).sum(axis=(0, 2))
+        return Enclosed((low + high) / 2.0, ((high - low) / 2.0 + rounded) * OUTWARD)
 
 
 @final
@@ -279,16 +77,8 @@ class MeasurableDeviations(Deviations):
     """The effects of measurable disturbances on the state at the end of every piece of the ``grid``, ``(d,)`` each, by
     a ``flow``; and the initial deviation."""
 
-    flow: VerifiedFlow
-    grid: list[float]
-
-    @property
-    def blocks(self) -> int:
-        return len(self.grid) - 1
-
-    @property
-    def begun(self) -> int:
-        return self.blocks
+    flow: VerifiedFlow = field(kw_only=True)
+    grid: list[float] = field(kw_only=True)
 
     @cached_property
     def starts(self) -> list[int]:
@@ -302,7 +92,7 @@ class MeasurableDeviations(Deviations):
     def sides(self) -> list[Side | CurvedSide]:
         """The sets whose sum is the set of the disturbances about its middle."""
         assert self.shape is not None
-        return Side.of(self.shape)
+        return sides_of(self.shape)
 
     def kernel(self, piece: int) -> VerifiedKernel:
         """Return the kernel of a piece of the grid."""
@@ -345,7 +135,7 @@ class MeasurableDeviations(Deviations):
         from flint import arb
 
         d, blocks = self.flow.states, self.blocks
-        table = Enclosed.of(stacked(every)).with_exact_zeros
+        table = Enclosed.of(stacked(every))
         mid, rad = (values[:, : blocks * d].reshape(len(every), blocks, d) for values in (table.mid, table.rad))
         groups: dict[int, tuple[VerifiedKernel, list[int]]] = {}
         for piece in range(blocks):
@@ -375,7 +165,8 @@ class MeasurableLoop(VerifiedLoop):
 
     @cached_property
     def deviations(self) -> MeasurableDeviations:
-        return MeasurableDeviations(self.shape, self.system.disturbances, self.initial, self.flow, self.grid)
+        held, width = len(self.grid) - 1, self.system.disturbances
+        return MeasurableDeviations(self.shape, width, self.initial, held, flow=self.flow, grid=self.grid)
 
     @cached_property
     def seen(self) -> list[dict[int, arb_mat]]:
@@ -452,10 +243,3 @@ class MeasurableLoop(VerifiedLoop):
 def as_enclosed(rows: Array | arb_mat) -> Enclosed:
     """Return rows of floats, or of balls, with their error bounds."""
     return Enclosed(rows, np.zeros_like(rows)) if isinstance(rows, np.ndarray) else Enclosed.of(rows)
-
-
-def signed(P: Array, off: Array) -> tuple[Array, Array]:
-    """Return polynomials ``(n, p + 1, m)`` one after another with their opposites, ``(n m, p + 1, 2)``, and the error
-    bounds of both, ``(n m, 2)``, from ``off (n, m)``."""
-    flat = np.moveaxis(P, 2, 1).reshape(-1, P.shape[1])
-    return np.stack([flat, -flat], axis=2), np.repeat(off.reshape(-1, 1), 2, axis=1)

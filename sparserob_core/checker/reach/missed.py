@@ -22,12 +22,12 @@ from sparserob_core.checker.flow.flow import VerifiedFlow
 from sparserob_core.checker.flow.flows import VerifiedFlows
 from sparserob_core.checker.flow.law import ParameterBox
 from sparserob_core.checker.reach.kernels import Added, BoundedInput, BoundedInputHere, above_chord, pushes
-from sparserob_core.checker.reach.measurable import Side, Together, signed, swept
 from sparserob_core.checker.reach.states import enclosed, ring
 from sparserob_core.checker.reach.tube import Around
 from sparserob_core.checker.sets.along import CurvedSide
 from sparserob_core.checker.sets.parameters import Corners
 from sparserob_core.checker.sets.polynomials import OUTWARD, Enclosed, rounding
+from sparserob_core.checker.sets.summands import Side, integrate
 from sparserob_core.sip.convex_set import Array
 
 if TYPE_CHECKING:
@@ -47,50 +47,41 @@ class SizedInput:
 
     Attributes
     ----------
-    shares, off
-        The shares, ``(m,)``, and their error bounds, ``(m,)``.
+    shares
+        The shares, ``(S,)``.
     breakpoints, pieces
-        The breakpoints ``(K + 1,)`` of the command, and its pieces, ``(m, 1)`` each.
+        The breakpoints ``(K + 1,)`` of the command, and the sizes of its pieces, ``(S, 1)`` each.
+    sides
+        The ``S`` sets whose sum enters by ``m`` columns, each times the size of its own share of the command.
     first
         The first of the columns of ``[B c E]`` by which the input enters.
     numb
         States that no error reaches: integrals of the command.
-    side
-        The set of what enters by all columns together, instead of one channel for each column. Then there is one share,
-        which is 1, and the support function of the set takes the place of the absolute value.
     """
 
     shares: Array
     breakpoints: Array
     pieces: Sequence[arb_mat]
+    sides: Sequence[Side | CurvedSide]
     first: int = 0
-    off: Array | None = None
     numb: Sequence[int] = ()
-    side: Side | CurvedSide | Together | None = None
 
     @cached_property
     def sizes(self) -> Enclosed:
-        """The size of the input on every piece of the command, ``(K, m)``, with error bounds."""
+        """The size of the input on every piece of the command, ``(K, S)``, with error bounds."""
         control = Enclosed.all(self.pieces, (len(self.pieces), self.shares.size))
-        size, share_errors = (
-            self.shares * np.abs(control.mid),
-            np.zeros(self.shares.size) if self.off is None else self.off,
-        )
-        error = share_errors * (np.abs(control.mid) + control.rad)
-        return Enclosed(size, (self.shares * control.rad + error + rounding(2) * size) * OUTWARD)
+        size = self.shares * np.abs(control.mid)
+        return Enclosed(size, (self.shares * control.rad + rounding(2) * size) * OUTWARD)
 
     @property
     def columns(self) -> slice:
         """The columns of ``[B c E]`` by which the input enters."""
-        return slice(self.first, self.first + (self.shares.size if self.side is None else self.side.dimension))
+        return slice(self.first, self.first + self.sides[0].dimension)
 
     @cached_property
     def far(self) -> Array:
-        """The upper bound of what enters by each of the `columns`, in absolute value, as a multiple of the size of the
-        input: 1, or the extent of the `side`."""
-        if self.side is None:
-            return np.ones(self.shares.size)
-        return self.side.far
+        """The upper bounds ``(S, m)`` of what enters by each of the `columns`, in absolute value, for a size of 1."""
+        return np.array([side.far for side in self.sides])
 
     def piece_at(self, time: float) -> int:
         """Return the index of the piece of the command from a time on; before the first and after the last piece, that
@@ -101,7 +92,7 @@ class SizedInput:
     def largest(self, piece: int) -> Array:
         """Return upper bounds of the absolute values of what enters by each of the `columns` on a piece, up to
         rounding."""
-        return np.asarray((self.sizes.mid[piece] + self.sizes.rad[piece]) * self.far)
+        return np.asarray((self.sizes.mid[piece] + self.sizes.rad[piece]) @ self.far)
 
     def reaching(self, rows: Array) -> Array:
         """Return ``rows (n, d)`` with 0 for the states that the input does not reach."""
@@ -127,7 +118,7 @@ class BoundedInputAt(BoundedInputHere):
         return np.searchsorted(self.input.breakpoints, np.array(self.marks[:-1]), side="right") - 1
 
     def least(self, c: Array, time: float) -> Array:
-        """Return lower bounds ``(K, m)`` of what the worst input adds to ``c'x(t)``, for a command of size 1 on one
+        """Return lower bounds ``(K, S)`` of what the worst input adds to ``c'x(t)``, for a command of size 1 on one
         piece in one channel."""
         bounds = np.zeros((self.input.breakpoints.size - 1, self.input.shares.size))
         low, _, indices = self._bound_integrals(c[None], time, np.arange(len(self.marks) - 1))
@@ -141,10 +132,8 @@ class BoundedInputAt(BoundedInputHere):
 
     def bent(self, c: Array, start: float, stop: float) -> float:
         """Return an upper bound of how far `added` lies above its chord on ``[start, stop]``."""
-        d = c.size
-        start_bounds = self._bound_effects(np.eye(d), start)[1]
-        if self.input.side is not None:
-            start_bounds = np.maximum(start_bounds, self._bound_effects(-np.eye(d), start)[1])
+        axes = np.eye(c.size)
+        start_bounds = self._bound_effects(np.vstack([axes, -axes]), start)[1].reshape(2, -1).max(axis=0)
         size = self.input.largest(self.input.piece_at(start))
         return float(above_chord(self.law, c[None], start, stop, start_bounds, size, self.input.first)[0])
 
@@ -155,23 +144,20 @@ class BoundedInputAt(BoundedInputHere):
         low, high, indices = self._bound_integrals(rows, time, np.flatnonzero(np.isin(self.owner, used)))
         owner = self.owner[indices]
         mid, rad = self.input.sizes.mid[owner, None], self.input.sizes.rad[owner, None]
-        # absolute values are not negative; a support function may be, where the middle of a thin set is not in it
-        if self.input.side is None:
-            low = np.maximum(low, 0.0)
+        # a support function may be negative, where the middle of a thin set is not in it
         at_least = np.where(low > 0.0, low * np.maximum(mid - rad, 0.0), low * (mid + rad)).sum(axis=(0, 2))
         at_most = (high * (mid + rad)).sum(axis=(0, 2))
         rounding_error = rounding(2 * indices.size * self.input.shares.size + 8) * at_most
         return at_least - rounding_error * OUTWARD, at_most + rounding_error * OUTWARD
 
     def _bound_integrals(self, rows: Array, time: float, pieces: np.ndarray) -> tuple[Array, Array, np.ndarray]:
-        """Return bounds of ``int |c'Phi(t, s) B_j(s)| ds`` for ``rows (n, d)``, over the intervals between marks among
-        ``pieces`` that begin before ``time``.
+        """Return bounds of the integrals of the support functions of all sides along ``c'Phi(t, s) B(s)`` for ``rows
+        (n, d)``, over the intervals between marks among ``pieces`` that begin before ``time``.
 
         Returns
         -------
         tuple
-            Lower bounds ``(q, n, m)``, upper bounds ``(q, n, m)``, and the indices ``(q,)`` of these intervals. With a
-            `side` the integrals are those of its support function, and ``m`` is 1.
+            Lower bounds ``(q, n, S)``, upper bounds ``(q, n, S)``, and the indices ``(q,)`` of these intervals.
         """
         begins, rows = np.array(self.marks[:-1]), self.input.reaching(rows)
         indices = pieces[begins[pieces] < time]
@@ -200,25 +186,9 @@ class BoundedInputAt(BoundedInputHere):
         sizes = np.abs(K.mid).sum(axis=1)
         errors = np.einsum("qnd,qdm->qnm", np.abs(a), rounding(a.shape[2] + 1) * sizes + K.rad.sum(axis=1))
         errors = (errors + np.einsum("qnd,qdm->qnm", rad, sizes + K.rad.sum(axis=1))) * OUTWARD
-        errors = errors + rounding(4 * order + 32) * np.abs(plain).sum(axis=2)  # rounding of the sums that follow
-        if self.input.side is not None:
-            return *self._bound_support_integrals(self.input.side, plain, errors), indices
-        flat = signed(plain.reshape(-1, *plain.shape[2:]), errors.reshape(-1, errors.shape[2]))
-        value, excess, deficit = (values.reshape(errors.shape) / 2.0 for values in swept(*flat, np.ones(errors.size)))
-        rounding_error = rounding(4) * (np.abs(value) + excess)
-        return value - deficit - rounding_error, value + excess + rounding_error, indices
-
-    @staticmethod
-    def _bound_support_integrals(side: Side | CurvedSide | Together, plain: Array, off: Array) -> tuple[Array, Array]:
-        """Return lower and upper bounds ``(q, n, 1)`` of the integrals of the support function of a set along
-        polynomials ``(q, n, p + 1, m)`` with error bounds ``off (q, n, m)``."""
-        q, n, order, m = plain.shape
-        sizes = np.abs(plain).sum(axis=2).reshape(q * n, m)
-        errors = off.reshape(q * n, m) + rounding(4 * order + 32 + m) * sizes
-        integrals = side.swept(plain.reshape(q * n, order, m), errors, sizes, np.ones(q * n))
-        value, excess, deficit, _ = (values.reshape(q, n, 1) / 2.0 for values in integrals)
-        rounding_error = rounding(4) * (np.abs(value) + excess)
-        return value - deficit - rounding_error, np.maximum(value + excess, 0.0) + rounding_error
+        ends = integrate(self.input.sides, plain.reshape(-1, order, plain.shape[3]), errors.reshape(-1, plain.shape[3]))
+        low, high = (end.reshape(*plain.shape[:2], -1) for end in ends)
+        return low, np.maximum(high, 0.0), indices
 
     @remembered(lambda: TIMES_KEPT)
     def _compute_kernel(self, start: float, stop: float) -> Enclosed:
@@ -246,9 +216,8 @@ class BoundedInputOver(BoundedInput):
     in shares of half its interval. A function ``f`` differs from its chord by at most half of the largest ``|f''|``,
     and the absolute value of a chord is not above the chord of the absolute values. So the integrals of ``|f|`` are at
     most the interpolation of their values at the corners, linear in each parameter, plus half of the integrals of the
-    largest ``|f''|``. The second derivatives are bounded by an expansion, whose remainder counts twice. The support
-    function of a ``side`` may take the place of the absolute value: it is convex, and that of a sum of directions is at
-    most the sum of both values.
+    largest ``|f''|``. The second derivatives are bounded by an expansion, whose remainder counts twice. The same holds
+    of support functions: they are convex, and that of a sum of directions is at most the sum of both values.
     """
 
     flows: VerifiedFlows
@@ -346,7 +315,7 @@ class BoundedInputOver(BoundedInput):
         ends = [t for t in self.input.breakpoints.tolist() if t < time]
         marks = flow.marks([*ends, time]) if ends else [time]
         steps = [flow.over(*pair)[0] for pair in pairwise(marks)]
-        d, m = flow.states, self.input.far.size
+        d, m = flow.states, self.input.far.shape[1]
         if not steps:
             none = np.zeros((2, 0, flow.monomials.size, d, d)), np.zeros((2, 0, 1, flow.monomials.size, d, m))
             return Enclosed(*none[0]), Enclosed(*none[1]), np.zeros(0, dtype=int)

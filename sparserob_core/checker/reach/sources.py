@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, final
+from typing import TYPE_CHECKING, final
 
 import numpy as np
 
@@ -17,9 +17,9 @@ from sparserob_core.checker.outcome import Unchecked
 from sparserob_core.checker.problem.timing import Timing, before
 from sparserob_core.checker.reach.execution import FollowedExecution
 from sparserob_core.checker.reach.kernels import BoundedInput, BoundedInputHere
-from sparserob_core.checker.reach.measurable import Side, Together
 from sparserob_core.checker.reach.missed import BoundedInputAt, BoundedInputOver, SizedInput
-from sparserob_core.checker.sets.known import middle
+from sparserob_core.checker.sets.known import sides_of
+from sparserob_core.checker.sets.summands import channels
 from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.sip.convex_set import Array
 
@@ -42,27 +42,18 @@ class Sources:
     @cached_property
     def strayed(self) -> BoundedInput | None:
         """The measurable disturbances, counted from the middle of their set, where the control does not answer them;
-        else ``None``. In a box, they are the errors of a command of size 1 through the columns of ``E``, with half the
-        widths as shares, which are enclosed. In another set all components enter together."""
+        else ``None``. They are the errors of a command of size 1 through the columns of ``E``."""
         bound = self.problem.measurable
         if bound is None or self.timing.answering:
             return None
-        ends, system = np.array([0.0, self.timing.grid[-1]]), self.problem.system
-        first = system.controls + system.drifts
-        if not bound.is_box:
-            side = Together(Side.of(bound))
-            return self._build_bounded_input(np.ones(1), ends, [stacked([balls([1.0])])], first, side=side)
-        box, about = bound.bounding_box(), middle(bound)
-        sides, is_single = np.stack([box.upper - about, about - box.lower]), box.upper == box.lower
-        largest = np.where(is_single, 0.0, np.nextafter(sides.max(axis=0), np.inf))
-        smallest = np.where(is_single, 0.0, np.maximum(np.nextafter(sides.min(axis=0), -np.inf), 0.0))
-        half = smallest + (largest - smallest) / 2.0
-        errors = np.nextafter(np.maximum(largest - half, half - smallest), np.inf)
-        return self._build_bounded_input(half, ends, [stacked([[v] for v in balls([1.0] * half.size)])], first, errors)
+        sides, system = sides_of(bound), self.problem.system
+        one, ends = stacked([[v] for v in balls(np.ones(len(sides)))]), np.array([0.0, self.timing.grid[-1]])
+        return self._build_bounded_input(
+            SizedInput(np.ones(len(sides)), ends, [one], sides, system.controls + system.drifts)
+        )
 
-    def _build_bounded_input(self, *errors: Any, **more: Any) -> BoundedInput:
+    def _build_bounded_input(self, entering: SizedInput) -> BoundedInput:
         """Return a bounded input of this size at every parameter of the system."""
-        entering = SizedInput(*errors, **more)
         if self.flows.box.middle:
             return BoundedInputOver(self.flows, entering)
         return BoundedInputAt(self.flows.at(()), entering)
@@ -89,7 +80,8 @@ class Sources:
             pieces = [stacked([[v] for v in balls(before(self.problem))]), *pieces][
                 : breakpoints.size - 1 if pieces else 0
             ]
-        return self._build_bounded_input(shares, breakpoints, pieces, numb=self.problem.commanded)
+        sides = channels(shares.size)
+        return self._build_bounded_input(SizedInput(shares, breakpoints, pieces, sides, numb=self.problem.commanded))
 
     def delivered_at(self, parameter: Sequence[float]) -> BoundedInputHere | None:
         """Return `execution` at one parameter."""

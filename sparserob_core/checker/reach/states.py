@@ -5,9 +5,8 @@ from __future__ import annotations
 
 from bisect import bisect_right
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
-from itertools import pairwise
 from typing import TYPE_CHECKING, final
 
 import numpy as np
@@ -62,20 +61,28 @@ class Scene:
 
 
 @final
+@dataclass(frozen=True, eq=False)
+class StateBlock:
+    """The flow over ``2^level`` consecutive intervals: the transition ``Phi (d, d)``, and the effects of the
+    disturbances on each of them, ``Delta``. The controls of a single interval enter by ``Gamma``."""
+
+    Phi: Series
+    Delta: Series
+    Gamma: Series
+
+    @cached_property
+    def effect(self) -> Enclosed:
+        """``Delta`` as floats with radii."""
+        return single(self.Delta)
+
+
+@final
 @dataclass(eq=False)
 class States:
     """The states that a ``flow`` makes of a ``scene``, as polynomials in the parameters."""
 
     flow: VerifiedFlow
     scene: Scene
-    _block_matrices: dict[int, tuple[Series, Series]] = field(default_factory=dict, repr=False)
-    _block_effects: dict[int, Enclosed] = field(default_factory=dict, repr=False)
-    _block_numbers: dict[tuple[object, ...], int] = field(default_factory=dict, repr=False)
-    _interval_blocks: dict[tuple[int, int], int] = field(default_factory=dict, repr=False)
-    _node_states: dict[int, Series] = field(default_factory=dict, repr=False)
-    _control_effects: dict[tuple[int, int], Series] = field(default_factory=dict, repr=False)
-    _shared_effects: dict[tuple[int, ...], Series] = field(default_factory=dict, repr=False)
-    _input_matrices: dict[int, Series] = field(default_factory=dict, repr=False)
 
     @cached_property
     def marks(self) -> list[float]:
@@ -92,44 +99,34 @@ class States:
         last = bisect_right(self.pieces, piece) - 1
         return min(bisect_right(self.marks, time) - 1, last)
 
-    @cached_property
-    def _step_flows(self) -> list[Series]:
-        return [self.flow.step(*ends) for ends in pairwise(self.marks)]
-
     @property
     def last(self) -> Series:
         """The undisturbed state at the end, ``(d, 1)``."""
         return self.node(len(self.marks) - 1)
 
+    @remembered()
     def node(self, mark: int) -> Series:
         """Return the undisturbed state at a mark, ``(d, 1)``, from blocks of intervals as in `effect`."""
-        if mark not in self._node_states:
-            x = Series.constant(self.flow.monomials, stacked([[v] for v in balls(self.scene.initial_state)]))
-            for level, number in _list_blocks(mark):
-                x = self._block_matrices[self._find_block(level, number)][0] * x + self._compute_control_effect(
-                    level, number
-                )
-            self._node_states[mark] = x
-        return self._node_states[mark]
+        x = Series.constant(self.flow.monomials, stacked([[v] for v in balls(self.scene.initial_state)]))
+        for level, number in _list_blocks(mark):
+            x = self._find_block(level, number).Phi * x + self._compute_control_effect(level, number)
+        return x
 
+    @remembered()
     def _compute_control_effect(self, level: int, number: int) -> Series:
         """Return what the control adds to the state over ``2^level`` consecutive intervals, ``(d, 1)``."""
-        if (level, number) not in self._control_effects:
-            block, last = self._find_block(level, number), 2 * number + 1
-            if level:
-                effects = [self._compute_control_effect(level - 1, number) for number in (last - 1, last)]
-                key: tuple[int, ...] = (block, *map(id, effects))
-            else:
-                u = self.scene.control[self.pieces[number]]
-                key = block, id(u)
-            if key not in self._shared_effects:  # most pieces of a sparse control are the same
-                self._shared_effects[key] = (
-                    self._block_matrices[self._find_block(level - 1, last)][0] * effects[0] + effects[1]
-                    if level
-                    else self._input_matrices[block].scaled(u)
-                )
-            self._control_effects[level, number] = self._shared_effects[key]
-        return self._control_effects[level, number]
+        if not level:
+            return self._apply_control(self._find_block(0, number), self.scene.control[self.pieces[number]])
+        early, late = (self._compute_control_effect(level - 1, 2 * number + i) for i in range(2))
+        return self._join_effects(self._find_block(level - 1, 2 * number + 1), early, late)
+
+    @remembered(key=lambda self, block, u: (id(block), id(u)))
+    def _apply_control(self, block: StateBlock, u: arb_mat) -> Series:
+        return block.Gamma.scaled(u)
+
+    @remembered(key=lambda self, *parts: tuple(map(id, parts)))  # most pieces of a sparse control are the same
+    def _join_effects(self, block: StateBlock, early: Series, late: Series) -> Series:
+        return block.Phi * early + late
 
     @remembered(lambda: EFFECTS_KEPT)
     def effect(self, mark: int) -> tuple[Enclosed, Enclosed]:
@@ -140,40 +137,29 @@ class States:
         monomials = self.flow.monomials
         after, effects = Series.constant(monomials, identity(d)), [Enclosed(*np.zeros((2, monomials.size, d, 0)))]
         for block in reversed(blocks):
-            effects.insert(1, ring(monomials, single(after), self._block_effects[block]))
-            after = after * self._block_matrices[block][0]
+            effects.insert(1, ring(monomials, single(after), block.effect))
+            after = after * block.Phi
         mid, rad = (np.concatenate([getattr(effect, name) for effect in effects], axis=2) for name in ("mid", "rad"))
         return single(after), Enclosed(mid, rad)
 
-    def _find_block(self, level: int, number: int) -> int:
-        """Return the number of the block of ``2^level`` consecutive intervals. Blocks with the same flow share one
-        number. The transition of the block and the effects of the disturbances on its intervals are kept under this
-        number."""
-        if (level, number) in self._interval_blocks:
-            return self._interval_blocks[level, number]
+    @remembered()
+    def _find_block(self, level: int, number: int) -> StateBlock:
+        """Return the block of ``2^level`` consecutive intervals. Blocks with the same flow are one object."""
         if not level:
-            name: tuple[object, ...] = self.flow.kind(self.marks[number], self.marks[number + 1])
-        else:
-            name = (level, *(self._find_block(level - 1, 2 * number + i) for i in range(2)))
-        if name not in self._block_numbers:
-            block = self._block_numbers[name] = len(self._block_numbers)
-            if not level:
-                d, step = self.flow.states, self._step_flows[number]
-                Delta = step.columns(d + self.flow.driven, None) if self._has_disturbance else step.columns(0, 0)
-                self._block_matrices[block] = step.columns(0, d), Delta
-                self._input_matrices[block] = step.columns(d, d + self.flow.driven)
-            else:
-                (Phi, early), (onward, late) = (
-                    self._block_matrices[self._find_block(level - 1, 2 * number + i)] for i in range(2)
-                )
-                self._block_matrices[block] = onward * Phi, (onward * early).beside(late)
-            self._block_effects[block] = single(self._block_matrices[block][1])
-        self._interval_blocks[level, number] = self._block_numbers[name]
-        return self._interval_blocks[level, number]
+            return self._make_block(self.marks[number], self.marks[number + 1])
+        return self._join_blocks(*(self._find_block(level - 1, 2 * number + i) for i in range(2)))
 
-    @property
-    def _has_disturbance(self) -> bool:
-        return self.scene.disturbance is not None
+    @remembered(key=lambda self, start, stop: self.flow.kind(start, stop))
+    def _make_block(self, start: float, stop: float) -> StateBlock:
+        step, d, driven = self.flow.step(start, stop), self.flow.states, self.flow.states + self.flow.driven
+        has_disturbance = self.scene.disturbance is not None
+        Delta = step.columns(driven, None) if has_disturbance else step.columns(0, 0)
+        return StateBlock(step.columns(0, d), Delta, step.columns(d, driven))
+
+    @remembered(key=lambda self, *pair: tuple(map(id, pair)))
+    def _join_blocks(self, first: StateBlock, second: StateBlock) -> StateBlock:
+        Delta = (second.Phi * first.Delta).beside(second.Delta)
+        return StateBlock(second.Phi * first.Phi, Delta, second.Gamma.columns(0, 0))
 
     def seen(
         self, basis: Array, place: int, start: float, stop: float, order: int

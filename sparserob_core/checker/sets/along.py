@@ -9,21 +9,19 @@ at most the support function of the change of the argument.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
-from fractions import Fraction
+from dataclasses import dataclass, replace
 from functools import cache, cached_property
 from math import comb
-from typing import final
+from typing import TYPE_CHECKING, final
 
 import numpy as np
 
 from sparserob_core.checker.outcome import Unchecked
-from sparserob_core.checker.sets.curved import Ball, Ellipsoidal, Joint
-from sparserob_core.checker.sets.flat import Boxed, Cornered, Segments
 from sparserob_core.checker.sets.polynomials import HALF_ULP, OUTWARD, TINY, rounding
-from sparserob_core.checker.sets.shape import Shape
 from sparserob_core.sip.convex_set import Array
+
+if TYPE_CHECKING:
+    from sparserob_core.checker.sets.shape import Shape
 
 DISC = 3.0  # radius: with 2 the error of the rule is 1e-9, with 4 cells are halved once more
 NODES = 16  # of Gauss' rule: its relative error is then 3e-15
@@ -38,47 +36,43 @@ AT_ONCE = 20_000  # cells that are evaluated together: some 50 MB
 @final
 @dataclass(frozen=True, eq=False)
 class CurvedSide:
-    """A set relative to a point ``about (mw,)``, with integrals of its support function along polynomials."""
+    """A set relative to a point ``about (d,)``, with integrals of its support function along polynomials. Further
+    coordinates ``before`` and ``after`` its own are 0."""
 
     shape: Shape
     about: Array
+    before: int = 0
+    after: int = 0
 
     @property
     def dimension(self) -> int:
-        """The number of coordinates."""
-        return self.shape.dimension
+        """The number of coordinates, ``mw``."""
+        return self.before + self.shape.dimension + self.after
+
+    def widened(self, before: int, after: int) -> CurvedSide:
+        """Return the set with 0 in further coordinates before and after its own."""
+        return replace(self, before=self.before + before, after=self.after + after)
+
+    @cached_property
+    def _radii(self) -> Array:
+        """The upper bounds ``(d,)`` of the distance from the point to the set's ends along its own coordinates."""
+        axes = np.vstack([np.eye(self.shape.dimension), -np.eye(self.shape.dimension)])
+        heights, errors = _evaluate_support(self.shape, self.about, axes)
+        return np.asarray((heights + errors).reshape(2, -1).max(axis=0) * OUTWARD)
 
     @cached_property
     def far(self) -> Array:
         """The upper bounds ``(mw,)`` of the distance from the point to the set's ends along every coordinate."""
-        axes = np.vstack([np.eye(self.dimension), -np.eye(self.dimension)])
-        heights, errors = _evaluate_support(self.shape, self.about, axes)
-        return np.asarray((heights + errors).reshape(2, -1).max(axis=0) * OUTWARD)
+        return np.pad(self._radii, (self.before, self.after))
 
     def swept(self, plain: Array, off: Array, sizes: Array, ends: Array) -> tuple[Array, Array, Array, Array]:
-        """Return the integral over ``u`` from -1 to ``ends (n,)`` of the support function at polynomials of ``u``.
-
-        Parameters
-        ----------
-        plain
-            Coefficients ``(n, p + 1, mw)`` of the polynomials.
-        off
-            Upper bounds ``(n, mw)`` of the errors of the polynomials.
-        sizes
-            The sums ``(n, mw)`` of the absolute values of the coefficients; not used here.
-        ends
-            The ends ``(n,)`` of the integrals.
-
-        Returns
-        -------
-        tuple[Array, Array, Array, Array]
-            Values, upper bounds of how much more and how much less the integral may be, and upper bounds of the
-            absolute support values, ``(n,)`` each.
-        """
+        """Return the integrals of the support function along polynomials, as `Side.swept` does; ``sizes`` are not
+        used."""
+        own = plain[:, :, self.before : self.before + self.shape.dimension]
         outputs = [np.zeros(0)] * 3
         for first in range(0, len(plain), AT_ONCE):
             batch = slice(first, first + AT_ONCE)
-            batch_outputs = self._integrate(plain[batch], ends[batch])
+            batch_outputs = self._integrate(own[batch], ends[batch])
             outputs = [np.concatenate(pair) for pair in zip(outputs, batch_outputs, strict=True)]
         value, errors, tops = outputs
         errors = (errors + (ends + 1.0) * (off @ self.far)) * OUTWARD
@@ -86,7 +80,7 @@ class CurvedSide:
 
     def _integrate(self, plain: Array, ends: Array) -> tuple[Array, Array, Array]:
         count = plain.shape[1]
-        owner, radii = np.arange(len(plain)), self.far
+        owner, radii = np.arange(len(plain)), self._radii
         value, errors, length = np.zeros(len(plain)), np.zeros(len(plain)), (ends + 1.0) / 2.0
         tops = np.abs(plain).sum(axis=1) @ radii
         # on the cell from -1 to the end, with s from -1 to 1: u = -1 + length (1 + s) = (length - 1) + length s
@@ -165,47 +159,14 @@ def _rescale_polynomials(plain: Array, length: Array) -> Array:
     return polynomials
 
 
-def _split_product(shape: Shape, about: Array, *arrays: Array) -> list[tuple[Shape, list[Array]]]:
-    """Return the factors of a product of sets, each with its columns of the arrays; another set is its own only
-    factor."""
-    if not isinstance(shape, Joint):
-        return [(shape, [about, *arrays])]
-    pairs = zip(shape.parts, shape.places, strict=True)
-    return [(factor, [about[columns], *(array[:, columns] for array in arrays)]) for factor, columns in pairs]
-
-
-def _evaluate_support(shape: Shape, about: Array, values: Array) -> tuple[Array, Array]:
-    """Return the support function of the set minus the point at exact directions ``(k, mw)``, and error bounds,
-    ``(k,)`` each."""
-    total, total_error = np.zeros(len(values)), np.zeros(len(values))
-    for factor, (point, c) in _split_product(shape, about, values):
-        height, error = _evaluate_factor(factor, point, c)
-        total, total_error = total + height, total_error + error + HALF_ULP * np.abs(total + height)
-    return total, total_error * OUTWARD
-
-
-def _evaluate_factor(part: Shape, about: Array, c: Array) -> tuple[Array, Array]:
-    size = np.abs(c)
-    if isinstance(part, Boxed):
-        middle, half, error = _shift_box(part, about)
-        high = c @ middle + size @ half
-        return high, (size @ (error + rounding(c.shape[1] + 2) * (np.abs(middle) + half))) * OUTWARD
-    if isinstance(part, Cornered):
-        corners, error = _shift_corners(part, about)
-        high = (c @ corners.T).max(axis=1)
-        return high, (size @ (error + rounding(c.shape[1] + 2) * np.abs(corners)).T).max(axis=1) * OUTWARD
-    if isinstance(part, Segments):
-        ends, offset = np.abs(part.source.generators).T, part.source.centre - about
-        high = np.abs(c @ part.source.generators.T).sum(axis=1) + c @ offset
-        error = rounding(sum(ends.shape) + 2) * (size @ ends).sum(axis=1)
-        return high, (error + rounding(len(ends) + 4) * (size @ np.abs(offset))) * OUTWARD
-    L, share, q = _find_norm_matrix(part)
-    y = c @ L
-    norm = _compute_norms(y, q)
+def _evaluate_support(shape: Shape, about: Array, c: Array) -> tuple[Array, Array]:
+    """Return the support function of the set minus the point at exact directions ``(k, d)``, and error bounds, ``(k,)``
+    each."""
+    (L, share, q), size, offset = shape.norm_matrix(), np.abs(c), shape.centre - about
+    norm = _compute_norms(c @ L, q)
     norm_error = _compute_norms(size @ np.abs(L), q) * rounding(2 * len(L) + 8) + norm * (
         2.0 * share + rounding(64 * len(L))
     )
-    offset = part.centre - about
     norm_error = norm_error + (size @ np.abs(offset)) * rounding(len(L) + 2)
     return norm + c @ offset, norm_error * OUTWARD
 
@@ -214,51 +175,26 @@ def _bound_support(shape: Shape, about: Array, c: Array, spread: Array) -> Array
     """Return bounds ``(k,)`` of the absolute value of the support function of the set minus the point at complex
     directions.
 
-    The directions are those within ``spread (k, mw)`` of ``c (k, mw)``. A bound is ``inf`` where the function is not
+    The directions are those within ``spread (k, d)`` of ``c (k, d)``. A bound is ``inf`` where the function is not
     shown to be analytic at all of them.
     """
-    total = np.zeros(len(c))
-    for factor, (point, value, deviation) in _split_product(shape, about, c, spread):
-        reach = np.abs(value) + deviation
-        if isinstance(factor, Boxed):
-            middle, half, error = _shift_box(factor, point)
-            is_fixed = (np.abs(value) > deviation) | (half + error == 0.0) | (reach == 0.0)
-            bound = np.where(is_fixed.all(axis=1), reach @ (np.abs(middle) + half + error), np.inf)
-        elif isinstance(factor, Cornered):
-            corners, error = _shift_corners(factor, point)
-            heights = value @ corners.T
-            best = corners[heights.argmax(axis=1)]
-            rounding_error = 2.0 * (reach @ (error + rounding(value.shape[1] + 2) * np.abs(corners)).T)
-            gap = heights.max(axis=1, keepdims=True) - heights - rounding_error
-            is_below = np.einsum("kvw,kw->kv", np.abs(best[:, None] - corners), deviation) < gap
-            is_dominated = is_below | (best[:, None] == corners).all(axis=2)
-            bound = np.where(is_dominated.all(axis=1), (reach @ (np.abs(corners) + error).T).max(axis=1), np.inf)
-        elif isinstance(factor, Segments):
-            ends = np.abs(factor.source.generators).T
-            change = deviation @ ends + rounding(len(ends) + 2) * (reach @ ends)
-            is_fixed = (np.abs(value @ factor.source.generators.T) > change) | (change == 0.0)
-            heights = (reach @ ends).sum(axis=1) + reach @ (np.abs(factor.source.centre - point) * OUTWARD)
-            bound = np.where(is_fixed.all(axis=1), heights, np.inf)
-        else:
-            L, share, q = _find_norm_matrix(factor)
-            y, b = np.abs(value @ L), deviation @ np.abs(L)
-            unit = np.maximum((y + b).max(axis=1, keepdims=True), TINY)
-            y, b = y / unit, b / unit
-            if q == 2.0:  # |sum (y + b)^2 - sum y^2| <= 2 |y| |b| + |b|^2
-                norm, change = np.linalg.norm(y, axis=1), np.linalg.norm(b, axis=1)
-                power_sum, change = norm**2, 2.0 * norm * change + change**2
-                is_analytic = change < ROOM * power_sum
-            else:  # the slope of z^q is at most q (y + b)^(q - 1) between
-                power_sum, change = (y**q).sum(axis=1), (q * b * (y + b) ** (q - 1.0)).sum(axis=1)
-                is_analytic = (change < ROOM * power_sum) & (q < STEEP)
-            norm_bound = np.where(is_analytic, (power_sum + change) ** (1.0 / q), np.inf)
-            if q != 2.0:
-                is_smooth = ((y * ROOM > b) | (y + b == 0.0)).all(axis=1)
-                norm_bound = np.where(is_smooth, np.minimum(norm_bound, _bound_dominated_norm(y, b, q)), np.inf)
-            offset = np.abs(factor.centre - point) * OUTWARD
-            bound = unit[:, 0] * norm_bound * (1.0 + 2.0 * share) + reach @ offset
-        total = total + bound
-    return total * OUTWARD
+    L, share, q = shape.norm_matrix()
+    y, b = np.abs(c @ L), spread @ np.abs(L)
+    unit = np.maximum((y + b).max(axis=1, keepdims=True), TINY)
+    y, b = y / unit, b / unit
+    if q == 2.0:  # |sum (y + b)^2 - sum y^2| <= 2 |y| |b| + |b|^2
+        norm, change = np.linalg.norm(y, axis=1), np.linalg.norm(b, axis=1)
+        power_sum, change = norm**2, 2.0 * norm * change + change**2
+        is_analytic = change < ROOM * power_sum
+    else:  # the slope of z^q is at most q (y + b)^(q - 1) between
+        power_sum, change = (y**q).sum(axis=1), (q * b * (y + b) ** (q - 1.0)).sum(axis=1)
+        is_analytic = (change < ROOM * power_sum) & (q < STEEP)
+    norm_bound = np.where(is_analytic, (power_sum + change) ** (1.0 / q), np.inf)
+    if q != 2.0:
+        is_smooth = ((y * ROOM > b) | (y + b == 0.0)).all(axis=1)
+        norm_bound = np.where(is_smooth, np.minimum(norm_bound, _bound_dominated_norm(y, b, q)), np.inf)
+    offset = np.abs(shape.centre - about) * OUTWARD
+    return np.asarray((unit[:, 0] * norm_bound * (1.0 + 2.0 * share) + (np.abs(c) + spread) @ offset) * OUTWARD)
 
 
 def _bound_dominated_norm(y: Array, b: Array, q: float) -> Array:
@@ -282,32 +218,3 @@ def _compute_norms(y: Array, q: float) -> Array:
     size = np.abs(y).max(axis=1, keepdims=True)
     safe = np.where(size > 0.0, size, 1.0)
     return np.asarray(size[:, 0] * np.linalg.norm(y / safe, ord=q, axis=1))
-
-
-def _find_norm_matrix(part: Shape) -> tuple[Array, float, float]:
-    """Return ``L (d, d)``, the relative error of ``L``, and ``q`` with ``h(c) = c'm + |L'c|_q``."""
-    if isinstance(part, Ball) and part.source.p > 1.0:
-        p = part.source.p
-        return part.source.radius * np.eye(part.dimension), HALF_ULP, p / (p - 1.0)
-    if isinstance(part, Ellipsoidal):
-        return part.source.factor, part.missed, 2.0
-    raise Unchecked(
-        "the checker knows measurable disturbances in boxes, polytopes, ellipsoids, balls, zonotopes, and products of"
-        " these; balls of the 1-norm in up to 10 dimensions"
-    )
-
-
-def _shift_box(part: Boxed, about: Array) -> tuple[Array, Array, Array]:
-    """Return the middle of a box minus a point, half its widths, and the error bound of both together, ``(d,)``
-    each."""
-    ends = part.exact
-    middle = [float((low + high) / 2 - Fraction(float(m))) for (low, high), m in zip(ends, about, strict=True)]
-    half = [float((high - low) / 2) for low, high in ends]
-    return np.array(middle), np.array(half), HALF_ULP * 2.0 * (np.abs(middle) + np.array(half))
-
-
-def _shift_corners(part: Cornered, about: Array) -> tuple[Array, Array]:
-    """Return the corners of a set minus a point, and their error bounds, ``(v, d)`` each."""
-    exact: Sequence[Sequence[Fraction]] = part.corners
-    corners = [[float(x - Fraction(float(m))) for x, m in zip(corner, about, strict=True)] for corner in exact]
-    return np.array(corners), HALF_ULP * np.abs(corners)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from fractions import Fraction
 from functools import cached_property
 from itertools import pairwise, product
 from typing import TYPE_CHECKING, final
@@ -11,9 +12,12 @@ from typing import TYPE_CHECKING, final
 import numpy as np
 
 from sparserob_core.checker.arithmetic.balls import above, ball, balls, largest
+from sparserob_core.checker.arithmetic.series import exactly
 from sparserob_core.checker.outcome import Broken, Unchecked
-from sparserob_core.checker.sets.polynomials import OUTWARD, ROUNDING
+from sparserob_core.checker.sets.along import CurvedSide
+from sparserob_core.checker.sets.polynomials import HALF_ULP, OUTWARD, ROUNDING
 from sparserob_core.checker.sets.shape import NEAR, Shape, along, total
+from sparserob_core.checker.sets.summands import Side
 from sparserob_core.control.sets.sets import Cylinder, Ellipsoid, NormBall, Product
 from sparserob_core.sip.convex_set import Array
 
@@ -65,6 +69,13 @@ class Ellipsoidal(Shape):
     @cached_property
     def round(self) -> tuple[Array, Array]:
         return self.centre, self.source.factor * np.nextafter(1.0 + self.missed, np.inf) * OUTWARD
+
+    def chords(self, middle: Array) -> list[arb]:
+        inverse = exactly(self.source.shape).inv()
+        return [2 / inverse[b, b].sqrt() for b in range(self.dimension)]
+
+    def norm_matrix(self) -> tuple[Array, float, float]:
+        return self.source.factor, self.missed, 2.0
 
     @cached_property
     def missed(self) -> float:
@@ -151,6 +162,15 @@ class Ball(Shape):
         scaled = vectors / np.where(size > 0.0, size, 1.0)
         norms: Array = self.source.radius * size[..., 0] * np.linalg.norm(scaled, ord=self.source.dual, axis=-1)
         return norms
+
+    def chords(self, middle: Array) -> list[arb]:
+        return [2 * ball(self.source.radius)] * self.dimension
+
+    def norm_matrix(self) -> tuple[Array, float, float]:
+        p = self.source.p
+        if p == 1.0:
+            return super().norm_matrix()
+        return self.source.radius * np.eye(self.dimension), HALF_ULP, p / (p - 1.0)
 
     @cached_property
     def round(self) -> tuple[Array, Array] | None:
@@ -245,6 +265,20 @@ class Joint(Shape):
         members = [factor.member(point[columns], near) for factor, columns in zip(self.parts, self.places, strict=True)]
         proven = [member for member in members if member is not None]
         return [x for member in proven for x in member] if len(proven) == len(members) else None
+
+    def spans(self, middle: Array) -> list[tuple[list[Fraction], arb]]:
+        return [
+            ([*[Fraction(0)] * columns.start, *vector, *[Fraction(0)] * (self.dimension - columns.stop)], length)
+            for factor, columns in zip(self.parts, self.places, strict=True)
+            for vector, length in factor.spans(middle[columns])
+        ]
+
+    def sides(self, about: Array) -> list[Side | CurvedSide]:
+        return [
+            side.widened(columns.start, self.dimension - columns.stop)
+            for factor, columns in zip(self.parts, self.places, strict=True)
+            for side in factor.sides(about[columns])
+        ]
 
     def bound(self, value: Array, spread: Array) -> tuple[Array, Array]:
         bounds = [

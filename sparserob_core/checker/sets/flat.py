@@ -13,9 +13,12 @@ from typing import TYPE_CHECKING, final
 import numpy as np
 
 from sparserob_core.checker.arithmetic.balls import above, ball, balls, below, largest, rational, smallest, spanning
+from sparserob_core.checker.arithmetic.series import stacked
 from sparserob_core.checker.outcome import Broken, Unchecked
-from sparserob_core.checker.sets.polynomials import HALF_ULP, OUTWARD, rounding
+from sparserob_core.checker.sets.along import CurvedSide
+from sparserob_core.checker.sets.polynomials import HALF_ULP, OUTWARD, Enclosed, rounding
 from sparserob_core.checker.sets.shape import NEAR, Facet, Shape, along, dot, facet, total
+from sparserob_core.checker.sets.summands import Side
 from sparserob_core.control.sets.sets import Box, NormBall, Polytope, Zonotope
 from sparserob_core.sip.convex_set import Array
 
@@ -29,18 +32,18 @@ class Flat(Shape):
     """A set that is given by its facets."""
 
     @property
-    def sides(self) -> list[Facet]:
+    def listed(self) -> list[Facet]:
         """The facets, for a set whose facets are listed."""
         assert self.facets is not None
         return self.facets
 
     def holds(self, point: Sequence[arb]) -> bool:
-        return all(bool(along(c, point) <= b) for c, b in self.sides)
+        return all(bool(along(c, point) <= b) for c, b in self.listed)
 
     @property
     def holding(self) -> list[Facet]:
         """The half-spaces that contain the set."""
-        return self.sides
+        return self.listed
 
     def least(self, ups: Sequence[arb], downs: Sequence[arb], slope: Sequence[arb]) -> arb:
         """Return a lower bound of ``min sum_i ups_i max(u_i, 0) + downs_i max(-u_i, 0) + slope_i u_i`` over the set.
@@ -59,7 +62,7 @@ class Flat(Shape):
     def shares(self, direction: Array) -> Array:
         from scipy.optimize import nnls
 
-        multipliers: Array = nnls(np.array([c for c, _ in self.sides]).T, direction)[0]
+        multipliers: Array = nnls(np.array([c for c, _ in self.listed]).T, direction)[0]
         return multipliers
 
 
@@ -75,16 +78,6 @@ class Boxed(Flat):
         else:
             middles, radius = [ball(v) for v in source.centre], ball(source.radius)
             self._lower_corner, self._upper_corner = [m - radius for m in middles], [m + radius for m in middles]
-
-    @cached_property
-    def exact(self) -> list[tuple[Fraction, Fraction]]:
-        """The two ends of every side of a bounded box, as fractions."""
-        if isinstance(self.source, Box):
-            ends = zip(self.source.lower.tolist(), self.source.upper.tolist(), strict=True)
-            return [(Fraction(low), Fraction(high)) for low, high in ends]
-        assert isinstance(self.source, NormBall)
-        radius, middles = Fraction(float(self.source.radius)), [Fraction(float(m)) for m in self.source.centre]
-        return [(m - radius, m + radius) for m in middles]
 
     @cached_property
     def facets(self) -> list[Facet]:
@@ -114,19 +107,26 @@ class Boxed(Flat):
         return w, (np.maximum(spread - np.abs(value), 0.0) * (high - low)).sum(axis=1) * OUTWARD
 
     def least(self, ups: Sequence[arb], downs: Sequence[arb], slope: Sequence[arb]) -> arb:
-        return total(self.shares_of_least(ups, downs, slope))
+        return total(self.least_by(ups, downs, slope, [range(self.dimension)]))
 
-    def shares_of_least(self, ups: Sequence[arb], downs: Sequence[arb], slope: Sequence[arb]) -> list[arb]:
-        """Return the contribution of every component to `least`."""
+    def least_by(
+        self, ups: Sequence[arb], downs: Sequence[arb], slope: Sequence[arb], blocks: Sequence[Sequence[int]]
+    ) -> list[arb]:
         ends = zip(self._lower_corner, self._upper_corner, strict=True)
         points = [[low, high] + ([0 * low] if low <= 0 and high >= 0 else []) for low, high in ends]
-        return [
+        shares = [
             _find_least([_evaluate_cost(up, down, s, v) for v in values])
             for up, down, s, values in zip(ups, downs, slope, points, strict=True)
         ]
+        return [total(shares[c] for c in block) for block in blocks]
 
     def shares(self, direction: Array) -> Array:
-        return np.maximum(0.0, np.array([c for c, _ in self.sides]) @ direction)
+        return np.maximum(0.0, np.array([c for c, _ in self.listed]) @ direction)
+
+    def sides(self, about: Array) -> list[Side | CurvedSide]:
+        ends = enumerate(zip(self._upper_corner, self._lower_corner, balls(about), strict=True))
+        axes = [[ball(i == j) for j in range(self.dimension)] for i in range(self.dimension)]
+        return _round_corners([[[x * (end - m) for x in axes[i]] for end in (up, low)] for i, (up, low, m) in ends])
 
 
 class Cornered(Flat):
@@ -140,6 +140,12 @@ class Cornered(Flat):
     def support(self, direction: Sequence[arb]) -> arb:
         corners = ([rational(x) for x in corner] for corner in self.corners)
         return largest(total(x * c for x, c in zip(corner, direction, strict=True)) for corner in corners)
+
+    def sides(self, about: Array) -> list[Side | CurvedSide]:
+        middle = balls(about)
+        return _round_corners(
+            [[[rational(x) - m for x, m in zip(corner, middle, strict=True)] for corner in self.corners]]
+        )
 
     @cached_property
     def segments(self) -> list[tuple[list[Fraction], Fraction]] | None:
@@ -210,12 +216,12 @@ class Polyhedral(Cornered):
 
     def limit(self, direction: Array) -> arb:
         """Return the right-hand side of the facet whose normal the direction is, times the factor between the two."""
-        number, factor = facet(self.sides, direction)
-        return self.sides[number][1] * rational(factor)
+        number, factor = facet(self.listed, direction)
+        return self.listed[number][1] * rational(factor)
 
     def shares(self, direction: Array) -> Array:
-        number, factor = facet(self.sides, direction)
-        multipliers: Array = float(factor) * np.eye(len(self.sides))[number]
+        number, factor = facet(self.listed, direction)
+        multipliers: Array = float(factor) * np.eye(len(self.listed))[number]
         return multipliers
 
     def _list_sizes(self, limit: arb) -> list[float]:
@@ -275,7 +281,7 @@ class Segments(Flat):
 
     @property
     def holding(self) -> list[Facet]:
-        return [(c, self.support(balls(c))) for c, _ in self.sides]
+        return [(c, self.support(balls(c))) for c, _ in self.listed]
 
     @property
     def _normals(self) -> list[tuple[Fraction, ...]]:
@@ -336,6 +342,11 @@ class Segments(Flat):
         """The segments ``(q, d)`` whose sum the set is, exactly."""
         return [[Fraction(float(v)) for v in row] for row in self.source.generators if row.any()]
 
+    def sides(self, about: Array) -> list[Side | CurvedSide]:
+        ends = [[rational(x) for x in segment] for segment in self.generators]
+        centre = [c - m for c, m in zip(balls(self.source.centre), balls(about), strict=True)]
+        return _round_corners([[centre], *([end, [-x for x in end]] for end in ends)])
+
     def nearest(self, point: Array) -> list[arb]:
         """Return a point close to another one: the middle plus each segment times a number in ``[-1, 1]``."""
         from scipy.optimize import lsq_linear
@@ -378,6 +389,11 @@ class Segments(Flat):
     def least(self, ups: Sequence[arb], downs: Sequence[arb], slope: Sequence[arb]) -> arb:
         has_facets = self.facets is not None
         return super().least(ups, downs, slope) if has_facets else Shape.least(self, ups, downs, slope)
+
+
+def _round_corners(sides: Sequence[Sequence[Sequence[arb]]]) -> list[Side | CurvedSide]:
+    """Return sets from their corners in balls."""
+    return [Side(corners.mid, corners.rad) for corners in (Enclosed.of(stacked(rows)) for rows in sides)]
 
 
 def _compute_length(row: Sequence[Fraction]) -> float:

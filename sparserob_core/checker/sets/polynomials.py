@@ -44,19 +44,16 @@ class Enclosed:
 
     @staticmethod
     def all(matrices: Sequence[arb_mat], shape: tuple[int, ...]) -> Enclosed:
-        """Return the entries of ball matrices in an array of that shape, one matrix after another, row by row."""
+        """Return the entries of ball matrices in an array of that shape, one matrix after another, row by row.
+
+        An exact 0 has the radius 0, and no other number has it."""
         entries = [x for matrix in matrices for x in matrix.entries()]
         mid = np.array([*map(float, entries)]).reshape(shape)
         rad = np.array([float(x.rad()) for x in entries]).reshape(shape)
         if not (np.isfinite(mid).all() and np.isfinite(rad).all()):
             raise Unchecked("the response grows beyond what numbers can hold")
-        return Enclosed(mid, (rad + HALF_ULP * np.abs(mid)) * OUTWARD + TINY)
-
-    @property
-    def with_exact_zeros(self) -> Enclosed:
-        """The numbers of a ball matrix, of which an exact 0 has the radius 0 in place of `TINY`. So has a number that
-        is too small for a float."""
-        return Enclosed(self.mid, np.where(self.rad > TINY, self.rad, 0.0))
+        inexact = np.array([not x.is_zero() for x in entries]).reshape(shape)
+        return Enclosed(mid, (rad + HALF_ULP * np.abs(mid)) * OUTWARD + TINY * inexact)
 
 
 def product(left: Enclosed, right: Enclosed) -> Enclosed:

@@ -11,8 +11,11 @@ from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 
-from sparserob_core.checker.arithmetic.balls import above, ball, balls
+from sparserob_core.checker.arithmetic.balls import above, ball, balls, rational
+from sparserob_core.checker.arithmetic.balls import smallest as least_of
 from sparserob_core.checker.outcome import RESOLVED, Broken, Unchecked
+from sparserob_core.checker.sets.along import CurvedSide
+from sparserob_core.checker.sets.summands import Side
 from sparserob_core.sip.convex_set import Array, ConvexSet
 
 if TYPE_CHECKING:
@@ -138,6 +141,38 @@ class Shape(ABC):
         """Return directions ``(k, b)`` of the `spanned` coordinates as directions ``(k, d)`` of the set."""
         return directions
 
+    def width(self, channel: int) -> arb:
+        """Return the width of the set along an axis."""
+        axis = np.eye(self.dimension)[channel]
+        return self.support(balls(axis)) + self.support(balls(-axis))
+
+    def chords(self, middle: Array) -> list[arb]:
+        """Return the lengths of the chords along the axes through the ``middle`` of the set: its width along any ``a``
+        is at least such a length times ``|a_b|``."""
+        if self.facets is None:
+            raise Unchecked("the checker does not know how long the disturbance's set is along the axes")
+        chords = []
+        for axis in range(self.dimension):
+            ends = [
+                [(b - along(c, balls(middle))) / ball(abs(c[axis])) for c, b in self.facets if sign * c[axis] > 0]
+                for sign in (1.0, -1.0)
+            ]
+            chords.append(sum(map(least_of, ends), ball(0)))
+        return chords
+
+    def spans(self, middle: Array) -> list[tuple[list[Fraction], arb]]:
+        """Return vectors ``v (d,)`` that span the directions along which points of the set differ, each with a number
+        ``c > 0``: the width of the set along any ``a`` is at least ``c |a'v|``. The vectors are along the axes, except
+        for a set without an interior."""
+        chords, axes = self.chords(middle), np.eye(self.dimension).tolist()
+        widths = [self.width(channel) for channel in range(self.dimension)]
+        if all(width.is_zero() or chord > NEAR * width for width, chord in zip(widths, chords, strict=True)):
+            spans = zip(axes, chords, widths, strict=True)
+            return [([*map(Fraction, axis)], chord) for axis, chord, width in spans if not width.is_zero()]
+        if self.segments is None:
+            raise Unchecked(f"the checker does not know how long the {self.source.kind} is along the axes")
+        return [(vector, rational(length)) for vector, length in self.segments]
+
     # Flat sets
 
     @cached_property
@@ -213,7 +248,25 @@ class Shape(ABC):
             spare = spare * 1024
         return middle
 
+    def norm_matrix(self) -> tuple[Array, float, float]:
+        """Return ``L (d, d)``, the relative error of ``L``, and ``q`` with ``h(c) = c'm + |L'c|_q``, ``m`` the
+        centre."""
+        raise Unchecked(
+            "the checker knows measurable disturbances in boxes, polytopes, ellipsoids, balls, zonotopes, and products"
+            " of these; balls of the 1-norm in up to 10 dimensions"
+        )
+
     # All of them
+
+    def sides(self, about: Array) -> list[Side | CurvedSide]:
+        """Return sets whose sum is the set minus a point ``about (d,)``.
+
+        A box has one for every channel, a zonotope one for every segment and one for its centre, a product those of its
+        factors.
+        """
+        curved = CurvedSide(self, about)
+        _ = curved.far  # raises `Unchecked` for a set that the checker does not know
+        return [curved]
 
     def limit(self, direction: Array) -> arb:
         """Return the largest ``c'x`` over the set, or an upper bound of it."""
@@ -230,6 +283,13 @@ class Shape(ABC):
             for up, down, s in zip(ups, downs, slope, strict=True)
         ]
         return -self.support([-t for t in tilt])
+
+    def least_by(
+        self, ups: Sequence[arb], downs: Sequence[arb], slope: Sequence[arb], blocks: Sequence[Sequence[int]]
+    ) -> list[arb]:
+        """Return numbers that add up to `least`: for a box those of every one of ``blocks``, which hold each component
+        once; for another set one number."""
+        return [self.least(ups, downs, slope)]
 
     def towards(self, offset: Array) -> Array:
         """Return a normal that separates the set from a point outside, at this ``offset (d,)`` from the centre."""

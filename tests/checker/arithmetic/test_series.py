@@ -197,3 +197,10 @@ def test_a_coefficient_that_is_only_close_to_nothing_is_kept():
         assert near.there == [True, True, False]
         assert (near * near).parts[1][0, 0].contains(arb(2e-20))
         assert NONE.size == 1
+
+
+def test_sizes_of_numbers_that_underflow_are_above_them_and_0_is_the_size_of_0() -> None:
+    small = [arb(2) ** -1200, -(arb(2) ** -1074) * 3 / 2, arb(0, 1) * arb(2) ** -5000]
+    size = Series(NONE, [arb_mat(1, 4, [*small, arb(0)])]).size[0]
+    assert all(arb(bound) > abs(x) for bound, x in zip(size.tolist(), small, strict=False))
+    assert size[3] == 0.0 < size[:3].min() <= size[:3].max() < 1e-299

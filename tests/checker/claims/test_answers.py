@@ -20,7 +20,7 @@ from sparserob_core.checker.claims import claims, constraints, replay
 from sparserob_core.checker.claims import multipliers as bounds
 from sparserob_core.checker.claims.answers import VerifiedFeedback, feedback_of
 from sparserob_core.checker.claims.case import Case
-from sparserob_core.checker.cost.gains import _compute_chords, _compute_width, _segments, reach
+from sparserob_core.checker.cost.gains import reach
 from sparserob_core.checker.outcome import Broken, Unchecked
 from sparserob_core.checker.sets.known import known
 from sparserob_core.control.policies.affine import AffinePolicy
@@ -433,7 +433,7 @@ def test_chords_are_how_long_a_set_is_through_its_middle(shape, chords):
     if chords is None:  # the triangle (0, 0), (1, 0), (0, 2)
         x, y = middle
         chords = [1.0 - y / 2, 2.0 - 2 * x]
-    assert [float(c.mid()) for c in _compute_chords(shape, middle)] == pytest.approx(chords)
+    assert [float(c.mid()) for _, c in known(shape).spans(middle)] == pytest.approx(chords)
 
 
 def test_a_policy_is_refused_where_the_checker_does_not_know_the_system():
@@ -453,7 +453,7 @@ def test_how_far_and_how_wide_a_set_is_along_a_channel():
         (Box([-3.0, -5.0], [1.0, -2.0]), (4.0, 3.0), (3.0, 5.0)),
         (NormBall(p=2.0, radius=2.0, centre=[0.5, -1.0]), (4.0, 4.0), (2.5, 3.0)),
     ):
-        assert [float(_compute_width(shape, c).mid()) for c in (0, 1)] == pytest.approx(wide)
+        assert [float(known(shape).width(c).mid()) for c in (0, 1)] == pytest.approx(wide)
         assert [float(reach(shape, c).mid()) for c in (0, 1)] == pytest.approx(far)
 
 
@@ -523,16 +523,16 @@ def test_innovations_of_a_flat_set_are_those_of_differences_of_its_points():
 
 def test_chords_of_a_thin_set_are_those_of_its_segments_and_else_along_the_axes():
     line = np.array([0.3, 0.7])
-    ((vector, length),) = _segments(sr.Zonotope(np.zeros(2), line[None]), np.zeros(2))
+    ((vector, length),) = known(sr.Zonotope(np.zeros(2), line[None])).spans(np.zeros(2))
     assert [float(v) for v in vector] == line.tolist() and float(length.mid()) == 2.0
-    every = _segments(Box([-1.0, 0.0], [1.0, 0.0]), np.zeros(2))
+    every = known(Box([-1.0, 0.0], [1.0, 0.0])).spans(np.zeros(2))
     assert [([float(v) for v in vector], float(length.mid())) for vector, length in every] == [([1.0, 0.0], 2.0)]
-    both = _segments(Product((sr.Zonotope(np.zeros(2), line[None]), Box([-1.0], [2.0]))), np.zeros(3))
+    both = known(Product((sr.Zonotope(np.zeros(2), line[None]), Box([-1.0], [2.0])))).spans(np.zeros(3))
     assert [[float(v) for v in vector] for vector, _ in both] == [[0.3, 0.7, 0.0], [0.0, 0.0, 1.0]]
-    assert _segments(NormBall(2.0, 0.0, [0.0, 0.0]), np.zeros(2)) == []
+    assert known(NormBall(2.0, 0.0, [0.0, 0.0])).spans(np.zeros(2)) == []
     H = np.array([[1.0, 1.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
     plate = Polytope(
         np.vstack([H, -H]), np.array([1e-10, 1.0, 1.0] * 2)
     )  # next to a plane, of which no corner is known
     with pytest.raises(Unchecked, match="how long the polytope is along the axes"):
-        _segments(plate, np.zeros(3))
+        known(plate).spans(np.zeros(3))

@@ -270,3 +270,17 @@ def test_a_plant_is_looked_at_where_it_is_finite() -> None:
     system = VaryingSystem.of([["1/(0.03125 + t)"]], [["1"]], 2.0)
     looks = [one[0, 0] for one in Plant.of(system, 2.0).looked_at([])]
     assert len(looks) == 17 and looks[0] == 32.0 and all(a > b > 0.0 for a, b in pairwise(looks))
+
+
+def test_an_entry_that_underflows_is_there_and_has_a_size() -> None:
+    A = parse_matrix("A", [["0", "p1*1e-200*1e-200"], ["0", "0"]], ("p1",))
+    system = LinearSystem(A, np.array([[0.0], [1.0]]), parameters=sr.Box([1], [2]))
+    law = Law(Plant.of(system, 1.0), 1.0, ParameterBox((1.5,), (0.5,)), 1)
+    assert law.there[0, 1] and not law.there[1, 0]
+    assert 0.0 < law.stretches[0].sizes[0][0, 1] < 1e-299
+
+
+def test_a_plant_that_is_finite_at_no_time_that_is_looked_at_has_units(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Plant, "looked_at", lambda plant, parameter: iter(()))
+    law = Law(Plant.of(VaryingSystem.of([["t"]], [[1]], 2.0), 2.0), 2.0, ParameterBox())
+    assert law.units.tolist() == [1.0] and law.stretches[-1].stop == 2.0

@@ -9,15 +9,10 @@ import numpy as np
 import pytest
 from flint import arb_mat, ctx
 
-from sparserob_core.checker.reach.measurable import (
-    MeasurableLoop,
-    Side,
-    Together,
-    _evaluate_polynomials,
-    _find_crossings,
-    swept,
-)
+from sparserob_core.checker.reach.measurable import MeasurableLoop
+from sparserob_core.checker.sets.known import sides_of
 from sparserob_core.checker.sets.polynomials import Enclosed, product
+from sparserob_core.checker.sets.summands import _evaluate_polynomials, _find_crossings, channels, integrate, swept
 from sparserob_core.control.problem.system import LinearSystem
 from sparserob_core.control.sets.sets import Box, NormBall, Zonotope
 
@@ -63,15 +58,21 @@ def test_many_parts_are_added_up_with_what_rounding_does_to_them():
 
 def test_segments_together_reach_as_far_as_all_of_them():
     generators = np.array([[0.5, -0.25], [0.25, 1.0], [-0.125, 0.5]])
-    together = Together(Side.of(Zonotope(np.array([3.0, -2.0]), generators)))
-    assert together.dimension == 2
-    np.testing.assert_allclose(together.far, np.abs(generators).sum(axis=0), rtol=1e-11)
-    assert (together.far >= np.abs(generators).sum(axis=0)).all()
+    sides = sides_of(Zonotope(np.array([3.0, -2.0]), generators))
+    far = sum(side.far for side in sides)
+    np.testing.assert_allclose(far, np.abs(generators).sum(axis=0), rtol=1e-11)
+    assert (far >= np.abs(generators).sum(axis=0)).all()
     plain, zero = np.array([[[1.0, 0.5], [0.2, -0.3]]]), np.zeros((1, 2))
-    value, more, less, tops = together.swept(plain, zero, np.abs(plain).sum(axis=1), np.ones(1))
+    low, high = (end.sum() for end in integrate(sides, plain, zero))
     u = np.linspace(-1.0, 1.0, 20_001)
-    true = float(np.trapezoid(np.abs((plain[0, 0] + u[:, None] * plain[0, 1]) @ generators.T).sum(axis=1), u))
-    assert abs(value[0] - true) < 1e-7 and 0.0 < less[0] <= more[0] < 1e-13 and tops[0] > 0.0
+    true = float(np.trapezoid(np.abs((plain[0, 0] + u[:, None] * plain[0, 1]) @ generators.T).sum(axis=1), u)) / 2.0
+    assert abs(low - true) < 1e-7 and low < high < low + 1e-13
+
+
+def test_channels_are_those_whose_support_functions_are_absolute_values():
+    low, high = integrate(channels(2), np.array([[[0.0, -3.0], [1.0, 0.0]]]), np.array([[0.0, 0.5]]))
+    assert low[0] == pytest.approx([0.5, 2.5]) and high[0] == pytest.approx([0.5, 4.5])
+    assert low[0, 0] <= 0.5 <= high[0, 0]
 
 
 def test_errors_of_polynomials_are_errors_of_the_integral():
@@ -105,7 +106,7 @@ def kernel_of(A, E, length):
 def test_the_integral_of_an_exponential_is_the_closed_form(rate):
     """``|a| (2 e^{rate r}) c`` with ``|w| <= c``, up to any time."""
     with ctx.workprec(128):
-        sides, a = Side.of(Box([-0.5], [0.5])), Enclosed(np.array([[1.0], [-3.0]]), np.zeros((2, 1)))
+        sides, a = sides_of(Box([-0.5], [0.5])), Enclosed(np.array([[1.0], [-3.0]]), np.zeros((2, 1)))
         for length in (0.08, 0.2, 0.5, 0.8):
             kernel = kernel_of(rate, 2.0, length)
             found = kernel.most(a, sides)
@@ -119,9 +120,9 @@ def test_the_integral_of_an_exponential_is_the_closed_form(rate):
 
 
 def test_sides_are_segments_of_a_box_and_corners_of_what_has_them():
-    box = Side.of(Box([-1.0, 2.0], [3.0, 5.0]))
+    box = sides_of(Box([-1.0, 2.0], [3.0, 5.0]))
     assert [side.corners.tolist() for side in box] == [[[2.0, 0.0], [-2.0, 0.0]], [[0.0, 1.5], [0.0, -1.5]]]
-    (ball,) = Side.of(NormBall(1.0, 0.5, centre=[1.0, 2.0]))
+    (ball,) = sides_of(NormBall(1.0, 0.5, centre=[1.0, 2.0]))
     assert sorted(ball.corners.tolist()) == [[-0.5, 0.0], [0.0, -0.5], [0.0, 0.5], [0.5, 0.0]]
     assert (ball.rad < 1e-15).all()
     # in two channels the segments add up, the ball is the largest of its corners

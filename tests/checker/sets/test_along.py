@@ -11,7 +11,7 @@ from flint import arb, ctx
 from sparserob_core.checker.arithmetic.balls import balls
 from sparserob_core.checker.outcome import Unchecked
 from sparserob_core.checker.sets.along import LEFT, NODES, CurvedSide, _bound_support, _evaluate_support, rule
-from sparserob_core.checker.sets.known import known, middle
+from sparserob_core.checker.sets.known import known, middle, sides_of
 from sparserob_core.checker.sets.shape import Shape
 from sparserob_core.control.sets.sets import Box, ConvexSet, Cylinder, Ellipsoid, NormBall, Polytope, Zonotope, product
 
@@ -27,6 +27,7 @@ SETS: dict[str, ConvexSet] = {
     "with segments": product([NormBall(2.0, 0.5, [0.1, 0.0]), Zonotope(np.array([0.2, 0.1]), SEGMENTS)]),
     "with a triangle": product([Polytope([[-1, 0], [0, -1], [1, 1]], [0.4, -0.1, 1.0]), NormBall(2.0, 0.5, [1, 0])]),
 }
+CURVED = ("ellipsoid", "long ellipsoid", "ball", "3-norm", "1.3-norm")
 
 
 def curve(bound: ConvexSet) -> CurvedSide:
@@ -34,7 +35,7 @@ def curve(bound: ConvexSet) -> CurvedSide:
 
 
 @pytest.mark.first(2)
-@pytest.mark.parametrize("name", SETS)
+@pytest.mark.parametrize("name", CURVED)
 @pytest.mark.parametrize("size", [1.0, 1e-180, 1e150])
 def test_heights_are_those_of_the_set_in_balls(name: str, size: float) -> None:
     bound, rng = SETS[name], np.random.default_rng(1)
@@ -54,36 +55,42 @@ def test_heights_are_those_of_the_set_in_balls(name: str, size: float) -> None:
 @pytest.mark.parametrize("end", [1.0, -0.4])
 def test_integrals_hold_what_balls_of_many_digits_say_and_are_close(name: str, end: float) -> None:
     bound, rng = SETS[name], np.random.default_rng(3)
-    some, count = curve(bound), 8
+    sides, about, count = sides_of(bound), middle(bound), 8
     plain = rng.normal(size=(5, count, bound.dimension)) * 0.4 ** np.arange(count)[:, None]
     plain[:3, 0] += 2.0 * np.sign(plain[:3, 0])  # the other two may go through 0
     plain[:3, 0, 0] += 3.0 * np.sign(plain[:3, 0, 0])  # one corner of the triangle is best
     plain[4], vector = 0.0, rng.normal(size=bound.dimension)
     plain[4, 0], plain[4, 1] = 0.75 * vector, vector  # a multiple of one vector, 0 at -0.75
     zero = np.zeros((5, bound.dimension))
-    value, more, less, tops = some.swept(plain, zero, zero, np.full(5, end))
+    sizes, ends = np.abs(plain).sum(axis=1), np.full(5, end)
+
+    def swept(off: np.ndarray) -> list[np.ndarray]:
+        return [
+            np.sum(one, axis=0) for one in zip(*(side.swept(plain, off, sizes, ends) for side in sides), strict=True)
+        ]
+
+    value, more, less, tops = swept(zero + 1e-15 * sizes)
     fine, shares = np.polynomial.legendre.leggauss(60)
     for k in range(3):
         total = 0.0
         for a, b in zip(*(np.linspace(-1.0, end, 31)[i : 30 + i] for i in (0, 1)), strict=True):
             u = (a + b) / 2 + (b - a) / 2 * fine
             at = u[:, None] ** np.arange(count) @ plain[k]
-            total += float((bound.support(at) - at @ some.about) @ shares) * (b - a) / 2
+            total += float((bound.support(at) - at @ about) @ shares) * (b - a) / 2
         assert -less[k] - 2e-15 * tops[k] <= total - value[k] <= more[k] + 2e-15 * tops[k]
-    (ahead, back), _ = _evaluate_support(some.shape, some.about, np.array([vector, -vector]))
+    ahead, back = (float(bound.support(c)) - c @ about for c in (vector, -vector))
     exact = back * 0.25**2 / 2 + ahead * (end + 0.75) ** 2 / 2
-    assert -less[4] <= exact - value[4] <= more[4]
+    assert -less[4] - 1e-15 <= exact - value[4] <= more[4] + 1e-15
     assert ((more + less) <= (1e-11 if "long" in name else 3e-13) * tops).all()
-    moved = some.swept(plain, zero + 1e-3, zero, np.full(5, end))
-    assert (moved[1] >= more + 1e-3 * (end + 1.0) * some.far.sum() * (1 - 1e-12)).all()
-    np.testing.assert_allclose(moved[0], value)
+    moved = swept(zero + 1e-3)
+    assert (moved[1] >= more + 1e-3 * (end + 1.0) * sum(side.far.sum() for side in sides) * (1 - 1e-9)).all()
+    np.testing.assert_allclose(moved[0], value, rtol=0.0, atol=2e-3 * sum(side.far.sum() for side in sides))
 
 
 def test_heights_count_from_any_point_and_allow_for_what_the_factor_of_a_long_ellipsoid_misses() -> None:
     long = Ellipsoid([0.0, 0.0], [[1.0, 1.99999999], [1.99999999, 4.0]])
     values = np.array([[-1.99999999, 1.0], [-2.0, 1.0], [0.3, -0.2]])  # the first two along the shorter axis
-    segments = Zonotope(np.array([0.2, 0.1]), SEGMENTS)
-    away = ((SETS["ball"], np.array([0.3, -0.2])), (SETS["ellipsoid"], np.ones(2)), (segments, np.array([1.0, -2.0])))
+    away = ((SETS["ball"], np.array([0.3, -0.2])), (SETS["ellipsoid"], np.ones(2)))
     for bound, about in ((long, np.zeros(2)), *away):
         heights, off = _evaluate_support(known(bound), about, values)
         with ctx.workprec(300):
@@ -105,8 +112,6 @@ def test_the_rule_of_gauss_is_the_one_whose_remainder_is_told() -> None:
 
 
 def test_where_a_root_or_an_absolute_value_may_be_0_nothing_is_analytic() -> None:
-    corners = Polytope([[-1, 0], [0, -1], [1, 1]], [0.0, 0.0, 1.0])
-
     def analytic(bound: ConvexSet, centre: list[float], spread: list[float]) -> bool:
         return bool(
             np.isfinite(_bound_support(known(bound), np.zeros(len(centre)), np.array([centre]), np.array([spread]))[0])
@@ -116,10 +121,6 @@ def test_where_a_root_or_an_absolute_value_may_be_0_nothing_is_analytic() -> Non
     assert not analytic(ball, [1.0, 0.0], [0.0, 1.0])  # 1 + i^2 = 0
     assert not analytic(ball, [1.0, 0.0], [1.0, 0.0]) and analytic(ball, [1.0, 0.0], [0.2, 0.2])
     assert not analytic(third, [1.0, 0.1], [0.0, 0.1]) and analytic(third, [1.0, 0.0], [0.1, 0.0])
-    assert analytic(Box([-1.0], [1.0]), [1.0], [0.99]) and not analytic(Box([-1.0], [1.0]), [1.0], [1.0])
-    assert analytic(corners, [1.0, 0.5], [0.24, 0.24]) and not analytic(corners, [1.0, 0.5], [0.26, 0.26])
-    segments = Zonotope(np.zeros(2), np.array([[1.0, 0.0], [1.0, 1.0]]))
-    assert analytic(segments, [1.0, 0.5], [0.2, 0.2]) and not analytic(segments, [1.0, -0.5], [0.3, 0.3])
     with pytest.raises(Unchecked, match="1-norm in up to 10"):  # whose support function has no curvature to speak of
         _ = CurvedSide(known(NormBall(1.0, 1.0, dimension=12)), [arb(0)] * 12).far
     with pytest.raises(Unchecked, match="boxes, polytopes, ellipsoids"):
@@ -127,7 +128,7 @@ def test_where_a_root_or_an_absolute_value_may_be_0_nothing_is_analytic() -> Non
 
 
 @pytest.mark.first(1)
-@pytest.mark.parametrize("name", SETS)
+@pytest.mark.parametrize("name", CURVED)
 def test_what_is_said_of_complex_directions_holds_of_those_that_are_real(name: str) -> None:
     bound, rng = SETS[name], np.random.default_rng(2)
     some, centre = curve(bound), rng.normal(size=(200, bound.dimension))
@@ -185,3 +186,11 @@ def test_balls_that_are_nearly_those_of_the_1_norm_take_few_cells(p: float, monk
     assert -less[0] - 1e-15 <= exact - value[0] <= more[0] + 1e-15
     assert more[0] + less[0] <= 1e-12
     assert sum(cells) < 1500
+
+
+def test_sides_of_a_product_are_those_of_its_factors_in_their_own_columns() -> None:
+    inner = product([NormBall(2.0, 0.5, dimension=2), Box([-1.0], [2.0])])
+    ball, box, last = sides_of(product([inner, Box([0.0], [4.0])]))
+    assert [side.dimension for side in (ball, box, last)] == [4, 4, 4]
+    np.testing.assert_allclose([side.far for side in (ball, box, last)],
+                               [[0.5, 0.5, 0, 0], [0, 0, 1.5, 0], [0, 0, 0, 2]], rtol=1e-11)  # fmt: skip
