@@ -25,6 +25,7 @@ from sparserob_core.checker.problem.turns import in_turns
 from sparserob_core.checker.reach import followed as followed_rows
 from sparserob_core.checker.reach.preimages import Pushed
 from sparserob_core.checker.sets import flat
+from sparserob_core.checker.sets.known import known
 from sparserob_core.control.policies import policy
 from sparserob_core.control.policies.affine import AffinePolicy
 from sparserob_core.control.problem.system import LinearSystem, VaryingSystem

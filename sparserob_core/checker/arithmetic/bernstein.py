@@ -44,17 +44,9 @@ def _compute_conversion(degree: int, symmetric: bool) -> Array:
 
 
 def bernstein(coefficients: Array, symmetric: Sequence[bool], absolute: bool = False) -> Array:
-    """Return the Bernstein coefficients of polynomials that are given by the coefficients of powers.
-
-    Parameters
-    ----------
-    coefficients
-        Coefficients ``(k, n_1, ..., n_v)`` of powers of the ``v`` variables.
-    symmetric
-        For each variable, True where it runs over ``[-1, 1]``, and False where it runs over ``[0, 1]``.
-    absolute
-        True to add up absolute values instead, which bound the rounding error.
-    """
+    """Return the Bernstein coefficients of polynomials with coefficients ``(k, n_1, ..., n_v)``, on ``[-1, 1]`` for a
+    ``symmetric`` variable and on ``[0, 1]`` for others. With ``absolute`` add up absolute values, which bounds rounding
+    errors."""
     b = np.abs(coefficients) if absolute else coefficients
     for axis, both in enumerate(symmetric):
         matrix = _compute_conversion(b.shape[axis + 1] - 1, both)
@@ -64,11 +56,9 @@ def bernstein(coefficients: Array, symmetric: Sequence[bool], absolute: bool = F
 
 
 def highest(coefficients: Array, symmetric: Sequence[bool], errors: Array, limit: float) -> Array:
-    """Return upper bounds ``(k,)`` of each polynomial plus its ``errors (k,)`` and the rounding errors made here.
-
-    A bound is at most ``limit`` where halving boxes can show that, and ``inf`` where the coefficients overflow. Halving
-    ends as soon as a bound is at most ``limit``, or certainly cannot become so; hence no bound need be sharp.
-    """
+    """Return upper bounds ``(k,)`` of each polynomial plus its ``errors (k,)`` and the rounding errors made here;
+    ``inf`` where numbers overflow. Boxes are halved until a bound is at most ``limit``, or certainly cannot become
+    so."""
     with np.errstate(over="ignore", invalid="ignore"):
         slack = errors + ROUNDING * bernstein(coefficients, symmetric, absolute=True).reshape(
             coefficients.shape[0], -1

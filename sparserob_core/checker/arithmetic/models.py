@@ -228,12 +228,8 @@ def _bound_truncated_terms(monomials: Monomials, left: Sequence[Part], right: Se
 
 
 def _expand_tangent(argument: arb_series, value: arb, slope: arb, sign: int) -> arb_series:
-    """Return the tangent of ``c + s``, or with the ``sign`` -1 the hyperbolic one, from its value and its slope at
-    ``c``.
-
-    With ``g' = h`` and ``h = 1 + sign g g`` it is ``h' = 2 sign g h``. For wide balls this recursion is sharper than
-    quotients.
-    """
+    """Return the tangent of ``c + s``, or with the ``sign`` -1 the hyperbolic one, from value and slope at ``c``. With
+    ``g' = h`` and ``h = 1 + sign g g`` it is ``h' = 2 sign g h``: for wide balls that is sharper than quotients."""
     from flint import arb_series
 
     g, h = [value], [slope]
@@ -244,10 +240,8 @@ def _expand_tangent(argument: arb_series, value: arb, slope: arb, sign: int) -> 
 
 
 def kepler_series(anomaly: arb_series, eccentricity: float, length: int) -> arb_series:
-    """Return the first ``length`` terms of the ``E`` with ``E - e sin E`` equal to a series ``M``.
-
-    The constant of ``M`` may be any number of a ball. The terms follow from ``E' = M' + e E' cos E``, one by one.
-    """
+    """Return the first ``length`` terms of the ``E`` with ``E - e sin E`` equal to a series ``M``, by ``E' = M' + e E'
+    cos E``."""
     from flint import arb, arb_series
 
     e, M = arb(eccentricity), anomaly[0]
@@ -277,11 +271,8 @@ def matrix_at(entry: Any, p: np.ndarray) -> np.ndarray:
 
 
 def kepler_root(anomaly: arb, e: arb) -> arb:
-    """Return a ball that contains the ``E`` with ``E - e sin E = M`` for a number ``M``.
-
-    Newton's method finds the middle. The radius is one at which the sign of the residual changes; raise `Unchecked`
-    where none is found.
-    """
+    """Return a ball that contains the ``E`` with ``E - e sin E = M`` for a number ``M``: at its ends the residual
+    changes its sign. Newton's method finds the middle."""
     from flint import arb, ctx
 
     E = anomaly

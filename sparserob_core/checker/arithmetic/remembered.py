@@ -14,15 +14,8 @@ T = TypeVar("T")
 def remembered(
     most: Callable[[], int] | None = None, key: Callable[..., Hashable] | None = None
 ) -> Callable[[Callable[Concatenate[S, P], T]], Callable[Concatenate[S, P], T]]:
-    """Return a decorator that remembers values of a method on each object; beyond the limit the oldest are forgotten.
-
-    Parameters
-    ----------
-    most
-        A function that returns the limit, called whenever a value is made; without it all values are remembered.
-    key
-        A function of the object and the arguments that returns what a value is stored under; without it the arguments.
-    """
+    """Return a decorator that remembers values of a method on each object, under a ``key`` of the object and the
+    arguments. Beyond ``most()`` values the oldest are forgotten."""
 
     def of(method: Callable[Concatenate[S, P], T]) -> Callable[Concatenate[S, P], T]:
         attribute = f"_{method.__name__}_remembered"

@@ -258,10 +258,8 @@ def norm(matrix: arb_mat) -> arb:
 
 
 def products(steps: Sequence[Series]) -> list[Series]:
-    """Return ``Z_k = Phi_N ... Phi_{k+1}`` for ``k = 0, ..., N``, of steps ``Phi_1, ..., Phi_N``.
-
-    Products are made in pairs, level by level. Each ``Z_k`` is then made of at most two products for each level.
-    """
+    """Return ``Z_k = Phi_N ... Phi_{k+1}`` for ``k = 0, ..., N``, of steps ``Phi_1, ..., Phi_N``: in pairs, level by
+    level."""
     unit = Series.constant(steps[0].monomials, identity(steps[0].shape[0]))
     if len(steps) == 1:
         return [steps[0], unit]

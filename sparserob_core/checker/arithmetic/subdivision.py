@@ -13,18 +13,9 @@ MOST_CELLS = 100_000
 
 
 def fill(lower: Array, upper: Array, low: Array, high: Array, clock: Clock = NO_LIMIT) -> None:
-    """Raise `Broken` unless the cells ``[lower_i, upper_i]`` (``(k, d)``) fill the box ``[low, high]`` without overlap.
-
-    Cells fill the box where they lie inside, share no more than faces, and have the volume of the box together. A
-    coordinate in which the box is a point does not count in the volume, and must be that point in every cell.
-
-    Raises
-    ------
-    Broken
-        Where a cell lies outside, two cells overlap, or a part of the box is not covered.
-    Unchecked
-        Where the time is up, or there are too many cells.
-    """
+    """Raise `Broken` unless the cells ``[lower_i, upper_i]`` (``(k, d)``) fill the box ``[low, high]`` without overlap:
+    they lie inside, share no more than faces, and have the volume of the box together. A coordinate in which the box is
+    a point does not count in the volume."""
     if (
         lower.ndim != 2
         or lower.shape != upper.shape

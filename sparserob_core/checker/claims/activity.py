@@ -40,10 +40,8 @@ def acted(case: Case) -> float:
 
 
 def shared(case: Case, rows: Rows, pieces: Any) -> tuple[Rows, Any]:
-    """Return multipliers of the cost as multipliers of the count, with those of the pieces, ``(m, K)`` or ``None``.
-
-    The multipliers are divided by the largest absolute value of a channel times the factor ``l1`` of the cost. This
-    divisor is best where all channels have the same largest value; any positive divisor gives a valid bound."""
+    """Return multipliers of the cost as multipliers of the count, with those of the pieces, ``(m, K)`` or ``None``. Any
+    positive divisor is valid; best is the largest absolute value of a channel times the factor ``l1`` of the cost."""
     divisor = max(
         (max(float(abs(low).mid()), float(abs(high).mid())) for low, high in _enclose_ranges(case)), default=1.0
     )
@@ -53,10 +51,9 @@ def shared(case: Case, rows: Rows, pieces: Any) -> tuple[Rows, Any]:
 
 
 def least(case: Case, rows: Rows, pieces: Sequence[Sequence[float]] | None) -> float:
-    """Return the share of time, from 0 to 1, that every admissible control acts at least, by the given multipliers.
-
-    ``rows`` are the multipliers with their constraints, ``pieces (m, K)`` those of the control's pieces, if there are
-    any. The share is a whole number of pieces where all pieces count the same."""
+    """Return the share of time, from 0 to 1, that every admissible control acts at least: a whole number of pieces
+    where all count the same. ``rows`` are multipliers with their constraints, ``pieces (m, K)`` those of the control's
+    pieces."""
     total, slopes = case.duality.summed(rows, pieces)
     ranges = _enclose_ranges(case)
     counts = [[ball(c) * length for c in case.price.counts] for length in _enclose_lengths(case)]
@@ -117,10 +114,8 @@ def _bound_piece(
     off: Sequence[bool] = (),
     sizes: Sequence[arb] = (),
 ) -> arb:
-    """Return a lower bound of the sum that one piece contributes, over the controls of the set.
-
-    The sum is the count of the channels that act, the products of the ``slope (m,)`` and the control, and
-    ``sizes (m,)`` times its absolute values. The channels marked in ``off`` are 0."""
+    """Return a lower bound over the set of the count of the channels that act on one piece, plus ``slope (m,)`` times
+    the control, plus ``sizes (m,)`` times its absolute values. The channels marked in ``off`` are 0."""
     ups, downs, certain = [], [], ball(0)
     for (low, high), count_i in zip(ranges, count, strict=True):
         excludes_zero = low > 0 or high < 0
@@ -174,24 +169,10 @@ ANY: Part = (-np.inf, np.inf, False)
 
 
 def proven(case: Case, nodes: Sequence[Any], weighted: Callable[[Mapping[str, Any]], Rows]) -> float:
-    """Return a lower bound of the time that every control acts, by the leaves of a tree of parts of the controls.
-
-    The bound is infinite where every leaf proves that its part holds no feasible control.
-
-    Parameters
-    ----------
-    case
-        The case.
-    nodes
-        The nodes of the tree as the certificate has them, the root first.
-    weighted
-        Returns the multipliers of a leaf with their constraints.
-
-    Raises
-    ------
-    Broken
-        Where the nodes are no tree whose leaves cover all controls, or a leaf does not prove what it says.
-    """
+    """Return a lower bound of the time that every control acts, by the leaves of a tree of parts of the controls, the
+    root first; infinite where every leaf proves that its part holds no feasible control. ``weighted`` returns the
+    multipliers of a leaf with their constraints. Raise `Broken` where the nodes are no tree whose leaves cover all
+    controls."""
     bound, open_nodes, visited = float("inf"), [(0, dict[tuple[int, int], Part]())], set[int]()
     while open_nodes:
         case.clock.check()
@@ -215,10 +196,8 @@ def proven(case: Case, nodes: Sequence[Any], weighted: Callable[[Mapping[str, An
 def _divide_part(
     case: Case, node: Mapping[str, Any], parts: Mapping[tuple[int, int], Part]
 ) -> tuple[dict[tuple[int, int], Part], dict[tuple[int, int], Part]]:
-    """Return two halves that together hold every control of a part.
-
-    With an alphabet, the values of one channel on a piece are divided between two letters. Without letters, one half
-    has the vector of the channel at 0 on the piece, and the other half counts it whatever its value."""
+    """Return two halves that together hold every control of a part: between two letters of an alphabet, or else the
+    vector of the channel at 0 on the piece, and counted whatever its value."""
     channel, piece = node.get("channel"), node.get("piece")
     m, K = case.problem.system.controls, case.control.pieces
     if type(channel) is not int or type(piece) is not int or not (0 <= channel < m and 0 <= piece < K):

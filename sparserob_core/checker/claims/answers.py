@@ -8,12 +8,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import cached_property
 from typing import TYPE_CHECKING, Any, final
 
 import numpy as np
 
 from sparserob_core.checker.arithmetic.balls import ball, balls, below
+from sparserob_core.checker.arithmetic.remembered import remembered
 from sparserob_core.checker.arithmetic.series import exactly, stacked
 from sparserob_core.checker.claims.case import STEP, Case, number, numbers, shaped
 from sparserob_core.checker.cost.duality import EFFORT, ConstraintRow, steps
@@ -126,11 +127,9 @@ class VerifiedFeedback:
         )
 
     def changes(self, k: int) -> list[arb_mat]:
-        """Return the step of the control at the beginning of piece ``k``, as parts whose sum it is.
-
-        Each part is ``(m, 1 + Q)``, and the parts have independent deviations. ``k = K`` is the seam of a plan that
-        repeats. There the last control of a period and the first control of the next answer the deviations of two
-        different periods, so the step has two parts."""
+        """Return the step of the control at the beginning of piece ``k``, as parts ``(m, 1 + Q)`` with independent
+        deviations. At the seam of a plan that repeats, ``k = K``, two controls answer the deviations of two different
+        periods."""
         if k == self.case.control.pieces:
             return [self.commands[0], -self.commands[k - 1]]
         if k:
@@ -139,10 +138,8 @@ class VerifiedFeedback:
         return [self.commands[0] - stacked([balls([u, *none]) for u in before(self.case.problem)])]
 
     def parts_at(self, name: str, time: float) -> list[arb_mat]:
-        """Return the control at a time, or its step there, as parts ``(m, 1 + Q)`` whose sum it is.
-
-        The parts have independent deviations. Raise `Broken` where a step is asked for and there is none at that
-        time."""
+        """Return the control at a time, or its step there, as parts ``(m, 1 + Q)`` with independent deviations, whose
+        sum it is."""
         case = self.case
         if name != STEP:
             return [self.commands[case.duality.control_piece(time)]]
@@ -182,10 +179,8 @@ class VerifiedFeedback:
         return total
 
     def cost(self) -> arb:
-        """Return the cost of the control as a ball.
-
-        With the cost ``worst`` it is the written cost; raise `Broken` or `Unchecked` where that is not shown to be
-        large enough, up to rounding."""
+        """Return the cost of the control as a ball. With the cost ``worst`` it is the written one, shown to be large
+        enough."""
         case, total = self.case, ball(0)
         if case.charge not in (PEAK, WORST):
             return case.price.of(case.pieces)
@@ -218,11 +213,8 @@ class VerifiedFeedback:
 
     def least(self, rows: Sequence[tuple[float, ConstraintRow]], priced: bool) -> arb:
         """Return a ball whose lower end bounds from below what gains, and charged peaks or an effort, add to the sum of
-        weighted ``rows``.
-
-        It is 0 where nothing is answered. ``priced`` says whether the cost is part of the sum. Peaks and the
-        effort are bounded by the set of the control alone. For the gains, the control that they cause is no wider than
-        its set: ``h(F_kl) + h(-F_kl) <= width``, summed over the blocks ``l``."""
+        weighted ``rows``, with the cost where ``priced``. Peaks and the effort are bounded by the set of the control
+        alone; the gains by its width: ``h(F_kl) + h(-F_kl) <= width``, summed over the blocks ``l``."""
         case, total, largest_effort = self.case, ball(0), ball(0)
         for k, costs in enumerate(case.price.costs if case.charge in (PEAK, WORST) else ()):
             for i, price in enumerate(costs):
@@ -245,10 +237,8 @@ class VerifiedFeedback:
 
     @cached_property
     def loop_at_rest(self) -> VerifiedLoop:
-        """The system without any control.
-
-        Measurable disturbances are replaced by some of them, which jump often enough to move the state in every
-        direction in which any of them does."""
+        """The system without any control. Of measurable disturbances there are some, which jump often enough to move
+        the state in every direction in which any of them does."""
         case = self.case
         if not case.measurable:
             return self._make_loop_at_rest(None)
@@ -267,10 +257,8 @@ class VerifiedFeedback:
         return [none] * self.case.control.pieces
 
     def named(self, entry: Mapping[str, Any], name: str) -> NamedDeviations:
-        """Return the deviations that an entry of a certificate names, for the constraint of that name.
-
-        With measurable disturbances the entry also says at which ``changes`` its disturbance jumps. Raise `Broken`
-        where a deviation is not shown to be in its set, or the times do not increase from 0 to before the end."""
+        """Return the deviations that an entry of a certificate names, each shown to be in its set. With measurable
+        disturbances the entry also says at which ``changes`` its disturbance jumps."""
         loop = self.loop_at_rest
         if self.case.measurable:
             changes = numbers(entry.get("changes"), f"{name}: changes")
@@ -282,10 +270,8 @@ class VerifiedFeedback:
         return NamedDeviations(self.case, loop, _read_deviations(self.case, loop, entry, name))
 
     def following(self, named: NamedDeviations, entry: Mapping[str, Any], name: str) -> NamedDeviations:
-        """Return the deviations that the first control of the next period answers, in a plan that repeats.
-
-        No disturbance has acted yet. The entry names the ``following`` deviation ``(d,)`` of the next initial state;
-        there is none where only one initial state exists. Raise `Broken` where it is not shown to be in its set."""
+        """Return the deviations that the first control of the next period answers, in a plan that repeats: the entry
+        names the ``following`` deviation ``(d,)`` of the next initial state, where there are several."""
         inner_deviations = named.loop.deviations.rests[: named.loop.deviations.begun]
         if self.case.problem.initial_set is None:
             return NamedDeviations(self.case, named.loop, inner_deviations)
@@ -306,7 +292,7 @@ def commanded(case: Case, name: str) -> ConvexSet | None:
     return {case.of_control: case.problem.control, STEP: case.problem.control_step}.get(name)
 
 
-@lru_cache(maxsize=2)
+@remembered()
 def feedback_of(case: Case) -> VerifiedFeedback:
     """Return the answers of the control of a case, which are made once."""
     return VerifiedFeedback(case)
@@ -328,11 +314,8 @@ class NamedDeviations:
 
     @property
     def innovations(self) -> list[list[arb]]:
-        """The innovations at every breakpoint, ``(K, p)``, less those under points of the sets next to the middles.
-
-        A rounded middle may lie outside of a set without an interior. Differences of two points of such a set lie in
-        its span; differences from the rounded middle do not. The nominal control includes the answers under these
-        points."""
+        """The innovations at every breakpoint, ``(K, p)``, less those under points of the sets next to the middles. A
+        rounded middle may lie outside of a thin set, and differences from it outside of its span."""
         pairs = zip(self.z, self.loop.deviations.rests, strict=True)
         z = [
             [ball(0)] * len(deviation)
@@ -370,11 +353,9 @@ class NamedDeviations:
 
 
 def _read_deviations(case: Case, loop: VerifiedLoop, entry: Mapping[str, Any], name: str) -> list[list[arb]]:
-    """Return the deviations from the middles that an entry names, block by block.
-
-    Raise `Broken` unless each point is shown to be in its set. A point that rounding took out of a thin set is replaced
-    by one of the set next to it. The entry holds the ``disturbance (mw, blocks)``, the ``noise (K, p)`` and the
-    ``deviation (d,)`` of the initial state from its centre."""
+    """Return the deviations from the middles that an entry names, block by block: its ``disturbance (mw, blocks)``,
+    ``noise (K, p)`` and ``deviation (d,)``. A point that rounding took out of a thin set is replaced by one of the
+    set."""
     from flint import arb
 
     points, loop_deviations = list[Array](), loop.deviations

@@ -125,10 +125,8 @@ class Case:
 
     @cached_property
     def returned(self) -> list[ConstraintWindow]:
-        """The constraints that every final state of a plan that repeats is one of the initial states.
-
-        There are none where the set of initial states is one point. A curved set has one for every corner of the
-        parameters that were made states."""
+        """The constraints that every final state of a plan that repeats is one of the initial states; none where that
+        is one point, and of a curved set one for every corner of the parameters that were made states."""
         return [
             _make_window(self.problem, entry, RETURN) for entry in self.problem.windows if isinstance(entry, Return)
         ]
@@ -242,10 +240,8 @@ class Case:
     def beside(
         self, window: ConstraintWindow, basis: Array, gains: Array, parameter: Sequence[float] | None = None
     ) -> Beside | None:
-        """Return the terms that are added to the state in the rows of a constraint, or ``None`` where there are none.
-
-        Rows are combinations of ``basis (b, d)`` on the state and ``gains (b, m)`` on the control. The terms are taken
-        at one ``parameter (nu,)``, or at all of them by default."""
+        """Return the terms that are added to the state in the rows ``basis (b, d)`` on the state and ``gains (b, m)``
+        on the control, ``None`` where there are none; at one ``parameter (nu,)``, or at all of them."""
         entering = self.sources.entering(parameter)
         if window.reference is None and not window.is_mixed and not entering:
             return None

@@ -42,27 +42,9 @@ SHARE = 1.0 - 2.0**-40  # of a price is shared, so that rounding does not share 
 
 
 def causal_bound(case: Case, data: Mapping[str, Any], priced: bool) -> arb:
-    """Return a ball whose lower end is the bound that signals and multipliers prove for every causal policy.
-
-    Where ``priced`` it bounds the cost. Otherwise it bounds the weighted sum of the constraints; where that is
-    positive, no causal policy exists.
-
-    Parameters
-    ----------
-    case
-        The case.
-    data
-        An entry ``causal`` of a certificate.
-    priced
-        Whether the cost is part of the sum.
-
-    Raises
-    ------
-    Broken
-        Where an entry is malformed, or a signal is not shown to be admissible.
-    Unchecked
-        For problems whose causal policies the checker does not bound.
-    """
+    """Return a ball whose lower end is the bound that the signals and multipliers of an entry ``causal`` prove for
+    every causal policy: of the cost where ``priced``, else of the weighted sum of the constraints, which no causal
+    policy meets where that is positive."""
     _require_supported(case)
     signals, nominal_report = _read_signals(case, data), middle_of(case)
     K, m, total = case.control.pieces, case.problem.system.controls, ball(0)
@@ -205,10 +187,8 @@ def _read_signals(case: Case, data: Mapping[str, Any]) -> list[Array]:
 
 
 def _read_initial_deviations(case: Case, data: Mapping[str, Any], count: int) -> list[list[arb]]:
-    """Return for every signal the deviation ``(d,)`` of its initial state from the middle of the set.
-
-    The deviations are empty where there is no set. Raise `Broken` unless every initial state is shown to be in the
-    set."""
+    """Return for every signal the deviation ``(d,)`` of its initial state, shown to be in its set, from the middle of
+    the set; empty where there is no set."""
     shape, entries = case.problem.initial_set, listed(data, "initial_states")
     if len(entries) != count:
         raise Broken(f"causal: {len(entries)} initial states of {count} signals")
@@ -226,10 +206,8 @@ def _read_initial_deviations(case: Case, data: Mapping[str, Any], count: int) ->
 def _read_outputs(
     case: Case, data: Mapping[str, Any], signals: list[Array], begun: list[list[arb]], known_at_all: int
 ) -> list[Array]:
-    """Return the outputs ``(p, K)`` under every signal, relative to the nominal ones.
-
-    At the first ``known_at_all`` breakpoints the remaining difference of each output must be a noise of the set; raise
-    `Broken` where that is not shown. Later outputs are known to no control."""
+    """Return the outputs ``(p, K)`` under every signal, relative to the nominal ones. At the first ``known_at_all``
+    breakpoints what remains of each must be shown to be a noise of the set."""
     measurements, entries, times = case.problem.measurements, listed(data, "outputs"), case.control.breakpoints
     assert measurements is not None
     C, K = np.asarray(measurements.C, dtype=float), case.control.pieces
@@ -262,10 +240,8 @@ def _read_outputs(
 
 
 def _bound_piece(case: Case, k: int, groups: dict[bytes, list[arb]], counts: dict[bytes, arb], priced: bool) -> arb:
-    """Return a lower bound of what the controls on one piece contribute to the weighted sum and the cost.
-
-    The controls of each group of signals are one vector with the slope ``groups[key]``. ``counts`` says which part of
-    the price a group pays, none where it has no entry; the price of a peak is shared among all groups."""
+    """Return a lower bound of what the controls on one piece contribute to the weighted sum and the cost: of each group
+    of signals one vector, with the slope ``groups[key]`` and the part ``counts[key]`` of the price."""
     m, control = case.problem.system.controls, case.problem.control
     prices = case.price.costs[k] if priced else [ball(0)] * m
     total, zero = ball(0), [ball(0)] * m

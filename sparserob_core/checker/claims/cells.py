@@ -56,33 +56,12 @@ def prove(
     clock: Clock,
     beside: Beside | None = None,
 ) -> Proven:
-    """Show that no row of the constraint exceeds its limit by more than its slack on the given cells.
+    """Show that no row exceeds its limit by more than its slack on any cell of the ``work``; return upper bounds of the
+    excess. ``tubes`` returns the reachable states over a box of parameters, ``beside`` are the terms that are added to
+    the state. A box that provably holds none of the ``parameters`` needs no proof.
 
-    Parameters
-    ----------
-    tubes
-        Returns the reachable states over a box of parameters.
-    parameters
-        The set of the parameters; a box that provably holds none of them needs no proof.
-    work
-        The boxes of parameters, each with the rows to bound on it and the intervals of time.
-    clock
-        When to stop.
-    beside
-        The terms that are added to the state in each row, if there are any.
-
-    Returns
-    -------
-    Proven
-        The upper bounds of the excess, and how many cells the proof took.
-
-    Raises
-    ------
-    Broken
-        Where a row certainly exceeds its limit by more than its slack.
-    Unchecked
-        Where neither could be shown with the cells and the time allowed.
-    """
+    Raise `Broken` where a row certainly exceeds its limit, `Unchecked` where neither is shown with the cells and the
+    time allowed."""
     work_by_box = dict[Corners, list[tuple[Sides, list[Interval]]]]()
     for box, sides, intervals in reversed(work):
         work_by_box.setdefault(box, []).append((sides, intervals))
@@ -198,10 +177,8 @@ def _examine(place: Place, sides: Sides, todo: Sequence[Interval], left: _OpenCe
 def _tighten_bound(
     place: Place, row: Bounded, interval: Interval, poly: Polynomial, top: float
 ) -> tuple[float, Polynomial]:
-    """Return a tighter bound with its polynomial, by means that take longer.
-
-    The polynomial is sharper where switching disturbances cause the error, and the half-spaces of the set of parameters
-    are used."""
+    """Return a tighter bound with its polynomial: sharper where switching disturbances cause the error, and by the
+    half-spaces of the set of parameters."""
     if poly.kinks > BLAME * row.slack:
         ((_, (sharper,), (sharper_top,)),) = _bound_rows(place, [row], [interval], sharp=True)
         if sharper_top < top:
@@ -212,12 +189,9 @@ def _tighten_bound(
 def _has_too_wide_directions(
     place: Place, sides: Sides, interval: Interval, failed: Sequence[tuple[Bounded, Polynomial]], worst: float
 ) -> bool:
-    """Return whether a cell fails, by at most ``worst``, because its directions differ too much.
-
-    The direction in the middle of the cell must not fail. The other directions must exceed it by more than smaller
-    cells of time and parameters could gain. Such a gain may be twice the error, because neighbours on both sides of a
-    switch have different worst disturbances. Raise `Broken` where the constraint is certainly violated at the start of
-    the cell."""
+    """Return whether a cell fails, by at most ``worst``, because its directions differ too much: the one in the middle
+    does not fail, and the others exceed it by more than smaller cells of time and parameters could gain, twice the
+    error."""
     middle = sides.centre
     if middle is None:
         _refute(place, interval, failed)
@@ -230,10 +204,8 @@ def _has_too_wide_directions(
 
 
 def _refute(place: Place, interval: Interval, rows: Sequence[tuple[Bounded, Polynomial]]) -> None:
-    """Raise `Broken` where a row certainly exceeds its limit by more than its slack.
-
-    The row is evaluated at the start of the interval and at the centre of the box, if that is proven to be a
-    parameter."""
+    """Raise `Broken` where a row certainly exceeds its limit by more than its slack, at the start of the interval and
+    at the centre of the box, if that is proven to be a parameter."""
     for row, poly in rows:
         least = float(poly.coefficients[0, 0]) - row.limit - poly.error - poly.kinks
         if least > row.slack and place.parameters.holds(np.array(place.tube.flow.centre)):
@@ -303,11 +275,9 @@ def _bound_by_halfspaces(place: Place, row: Bounded, poly: Polynomial) -> float:
 
 
 def _is_smaller_box_better(poly: Polynomial, top: float, interval: Interval) -> bool:
-    """Return whether a smaller box of parameters helps more than a shorter time against an excess of ``top``.
-
-    A smaller box helps more at a single time, and where the box or a chord in time causes more than a small share of
-    the error. Where the excess is more than errors explain, the larger change of the polynomial decides: over the box
-    or over the time. Halving then leads to a refutation, or to parameters outside their set."""
+    """Return whether a smaller box of parameters helps more than a shorter time: at a single time, where the box causes
+    the error, or where the polynomial changes more over the box than over the time and errors do not explain the
+    excess."""
     if interval[1] == interval[2] or poly.expansion + poly.turning > BLAME * poly.error:
         return True
     if top <= 2.0 * poly.error + poly.kinks:
@@ -316,11 +286,8 @@ def _is_smaller_box_better(poly: Polynomial, top: float, interval: Interval) -> 
 
 
 def _measure_influence(tube: Reached, poly: Polynomial) -> Array:
-    """Return how much each parameter contributes to what is left open, ``(nu,)``.
-
-    The influence is measured by the coefficients of the system where the expansion causes the error, else by those of
-    the polynomial. Where the size of the box in bounded inputs causes it, the share ``poly.bent`` of each parameter is
-    returned."""
+    """Return how much each parameter contributes to what is left open, ``(nu,)``: by the coefficients of the system
+    where the expansion causes the error, by bounded inputs where these do, else by the polynomial."""
     expansion = poly.expansion > BLAME * poly.error
     sizes = tube.flow.sizes if expansion else np.abs(poly.coefficients).sum(axis=0)
     influence: Array = np.array(tube.flow.monomials.exponents, dtype=float).T @ sizes

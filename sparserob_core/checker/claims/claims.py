@@ -95,10 +95,8 @@ def derived_bound(case: Case) -> float:
 
 
 def derived_causal_bound(case: Case, data: Mapping[str, Any], priced: bool) -> float:
-    """Return the lower bound that signals and multipliers prove for every causal policy, rounded down.
-
-    ``data`` is an entry ``causal`` of a certificate. The bound is one of the cost where ``priced``, else of the
-    weighted sum of the constraints. Raise `Broken` or `Unchecked` where none is proven."""
+    """Return the lower bound that an entry ``causal`` proves for every causal policy, rounded down: of the cost where
+    ``priced``, else of the weighted sum of the constraints."""
     from flint import ctx
 
     from sparserob_core.checker.claims.causal import causal_bound
@@ -108,10 +106,8 @@ def derived_causal_bound(case: Case, data: Mapping[str, Any], priced: bool) -> f
 
 
 def precision_of(case: Case) -> int:
-    """Return the bits of a number that the claims of a case need, at most `MOST_PRECISION`.
-
-    The exponential of a matrix is enclosed in a norm. Its smallest entries need more bits, as many as the system's
-    numbers differ by in the units that the user chose. The numbers are those at one parameter in the interior."""
+    """Return the bits of a number that the claims of a case need: more where the system's numbers, at one parameter,
+    differ by more in the user's units, since an exponential is enclosed in a norm."""
     problem = case.problem
     parameters = problem.system.parameters
     point = np.zeros((1, 0)) if parameters is None else parameters.interior_point()[None]
@@ -185,10 +181,8 @@ def _verify_control(case: Case) -> str:
 def _verify_in_set(
     case: Case, bound: ConvexSet, places: Sequence[int], parts: Callable[[int], list[arb_mat]], name: str
 ) -> str:
-    """Show that the control on the given pieces, or its change to them, is in its set for all deviations.
-
-    ``parts`` returns matrices ``(m, 1 + Q)`` with independent deviations, whose sum is the control or the change.
-    Return the largest excess in words."""
+    """Show that a sum of ``parts (m, 1 + Q)`` with independent deviations is in its set on the given pieces, for all
+    deviations; return the largest excess in words."""
     shape, feedback, worst, answering_pieces = known(bound), feedback_of(case), 0.0, list[int]()
     for k in places:
         case.clock.check()
@@ -245,10 +239,8 @@ def _zero_nominal(part: arb_mat) -> arb_mat:
 
 
 def _verify_repeat(case: Case, verdicts: Mapping[str, str]) -> str:
-    """Show that all constraints hold in every period of a plan that repeats.
-
-    Every final state is one of the initial states, and the claims about one period hold. Among these are the return and
-    the steps across the seam."""
+    """Show that all constraints hold in every period of a plan that repeats: every final state is one of the initial
+    states, and the claims about one period hold."""
     if case.certificate.get("repeat") is not True or not case.problem.repeat:
         raise Broken("the certificate and the problem differ about whether the plan repeats")
     if case.problem.system.delay > 0.0:
@@ -520,10 +512,8 @@ def _verify_status(case: Case, status: str, tolerance: float | None, claims: lis
 
 
 def relative_gap(case: Case, cost: float, lower: float) -> float:
-    """Return the gap between the cost and the lower bound relative to the larger of their absolute values.
-
-    Where a millionth of what is added up to the cost is larger, the gap is relative to that. The gap is 0 where the
-    bounds meet."""
+    """Return the gap between the cost and the lower bound relative to the larger of their absolute values, or to a
+    millionth of what is added up to the cost; 0 where the bounds meet."""
     return 0.0 if cost <= lower else (cost - lower) / max(abs(cost), abs(lower), SMALL_COST * added_up(case))
 
 
@@ -539,10 +529,7 @@ def added_up(case: Case) -> float:
 
 
 def compared(case: Case) -> float:
-    """Return the size of the numbers that the rounding error of a cost is relative to.
-
-    All products that are added up to the cost count. Their sum may be more than `added_up` where they cancel within the
-    matrix of one term."""
+    """Return the size that the rounding error of a cost is relative to: all products that are added up to it count."""
     return max(added_up(case), 0.0 if case.counts else case.price.terms(case.pieces))
 
 

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sparserob_core.checker.arithmetic.balls import balls, below
+from sparserob_core.checker.arithmetic.remembered import remembered
 from sparserob_core.checker.arithmetic.series import stacked
 from sparserob_core.checker.arithmetic.subdivision import fill
 from sparserob_core.checker.claims.answers import feedback_of
@@ -44,11 +45,8 @@ WIDER = 1e-12  # of their whole extent, by which boxes are widened where the set
 
 
 def bounded(case: Case, window: ConstraintWindow) -> str:
-    """Show that a constraint is kept at every time, for every disturbance and every parameter.
-
-    Return a sentence with the upper bound of the excess, what is excused, and the number of cells. Raise `Broken` where
-    the certificate holds no valid proof or the constraint is certainly violated, `Unchecked` where neither could be
-    shown."""
+    """Show that a constraint is kept at every time, for every disturbance and every parameter; return a sentence with
+    the upper bound of the excess, what is excused, and the number of cells."""
     data = case.certificate.get("proof", {})
     entry = data.get(window.name) if isinstance(data, Mapping) else None
     if not isinstance(entry, Mapping):
@@ -107,10 +105,8 @@ def _format_units(case: Case, window: ConstraintWindow) -> str:
 
 
 def normals_of(window: ConstraintWindow, data: object) -> Array:
-    """Return the vectors ``(b, d)`` whose combinations are the directions of a curved set.
-
-    ``data`` are the normals of the certificate; without them the axes of the coordinates that the set bounds serve.
-    Raise `Broken` where some direction in which the set is bounded is no combination of the normals."""
+    """Return the vectors ``(b, d)`` whose combinations are the directions of a curved set: the normals of the
+    certificate, or else the axes of the coordinates that the set bounds."""
     shape, b, d = window.seen, window.seen.spanned, window.shape.dimension
     if data is None:
         return shape.lifted(np.eye(b))
@@ -131,10 +127,8 @@ def parameters_of(case: Case) -> Parameters:
 
 
 def covered(case: Case, window: ConstraintWindow, lower: Array, upper: Array) -> None:
-    """Raise `Broken` unless the cells fill the window in time and the set of parameters.
-
-    For a curved set the cells must also fill every face of the cube of directions. ``lower`` and ``upper`` are the
-    corners of the cells, ``(k, 1 + nu + b)`` each, ``b = 0`` for a flat set."""
+    """Raise `Broken` unless the cells, with corners ``(k, 1 + nu + b)``, fill the window in time and the set of
+    parameters, and for a curved set every face of the cube of directions."""
     nu = case.problem.system.parameter_count
     b = 0 if window.seen.facets is not None else window.seen.spanned
     if lower.ndim != 2 or lower.shape != upper.shape or lower.shape[1] != 1 + nu + b:
@@ -153,10 +147,8 @@ def covered(case: Case, window: ConstraintWindow, lower: Array, upper: Array) ->
 
 
 def _find_extent(case: Case, window: ConstraintWindow, lower: Array, upper: Array) -> tuple[Array, Array]:
-    """Return the lower and the upper corner of the times and parameters that the cells must fill, ``(1 + nu,)`` each.
-
-    For a set of parameters that is no box, the corners are those of the box around the cells. This box must hold the
-    set, up to a share `WIDER` of its width."""
+    """Return the corners ``(1 + nu,)`` of the times and parameters that the cells must fill. For a set that is no box
+    they are those of the box around the cells, which must hold the set up to a share `WIDER` of its width."""
     nu, bound = case.problem.system.parameter_count, case.problem.system.parameters
     if bound is None:
         return np.array([window.start]), np.array([window.stop])
@@ -177,10 +169,8 @@ def _find_extent(case: Case, window: ConstraintWindow, lower: Array, upper: Arra
 def _prepare_work(
     case: Case, window: ConstraintWindow, normals: Array, lower: Array, upper: Array
 ) -> tuple[Array, Array, list[Work]]:
-    """Return the vectors that directions are combinations of, and the cells in the form that `prove` takes.
-
-    The vectors are ``(b, d)`` on the state and ``(b, m)`` on the control. Cells with the same parameters and directions
-    are put together. Their times are cut at every kink and jump."""
+    """Return the vectors that directions are combinations of, ``(b, d)`` on the state and ``(b, m)`` on the control,
+    and the cells in the form that `prove` takes, with their times cut at every kink and jump."""
     nu, units = case.problem.system.parameter_count, units_of(case, window)
     basis, gains, flat = _extract_facets(window, units)
     curved = None if flat is not None else Curved(window.seen, normals, units.least)
@@ -203,7 +193,7 @@ def cut_times(case: Case, window: ConstraintWindow, times: Sequence[tuple[float,
     return [interval for start, stop in times for interval in cut(np.array(case.timing.grid), cuts, start, stop)]
 
 
-@lru_cache(maxsize=2)
+@remembered()
 def _find_cuts(case: Case) -> Array:
     """Return the times between which one polynomial in time encloses the state, under one control."""
     return np.union1d(case.timing.grid, case.flows.marks(case.timing.grid))
@@ -243,11 +233,9 @@ def prove_on_cells(
 
 
 def tubes(case: Case, basis: Array, gains: Array, lower: Array, upper: Array) -> Callable[[Corners], Reached]:
-    """Return a function that makes the reachable states over a box of parameters.
-
-    Rows are combinations of ``basis (b, d)`` on the state and ``gains (b, m)`` on the control. ``lower`` and ``upper``
-    are the corners of the cells, ``(k, 1 + nu + b)`` each. For a set of parameters that is no box, every box is widened
-    by a share `WIDER` of the extent of all cells."""
+    """Return a function that makes the reachable states over a box of parameters, for combinations of ``basis (b, d)``
+    on the state and ``gains (b, m)`` on the control. Boxes of a set that is no box are widened by a share `WIDER` of
+    the cells."""
     if case.answering:
         loop_tube = LoopTube(feedback_of(case).loop, basis, gains)
         return lambda _: loop_tube
@@ -268,10 +256,8 @@ def tubes(case: Case, basis: Array, gains: Array, lower: Array, upper: Array) ->
 
 
 def equalities(case: Case) -> str:
-    """Show that every fixed state has its value at the end, for every parameter, disturbance and initial state.
-
-    Return a sentence with the largest residual. Raise `Broken` where a residual is not shown to be at most what is
-    excused, `Unchecked` where an uncertainty may reach a fixed state."""
+    """Show that every fixed state has its value at the end, for every parameter, disturbance and initial state; return
+    a sentence with the largest residual."""
     worst, states = 0.0, np.eye(case.problem.system.states)[[state for state, _ in case.equalities]]
     sizes = nominal_sizes(case, states, np.zeros((len(states), 0))).tolist()
     for (state, value), (residual, term_size), size, row in zip(
@@ -288,10 +274,8 @@ def equalities(case: Case) -> str:
 
 
 def missed(case: Case) -> list[tuple[arb, float]]:
-    """Return for every fixed state its largest absolute residual as a ball, and the size of the numbers added up to it.
-
-    The size counts what the initial state and the control contribute. Where the control answers deviations, it also
-    counts what these contribute, without the control and with it."""
+    """Return for every fixed state its largest absolute residual as a ball, and the size of the numbers added up to it:
+    initial state, control, and deviations without the control and with it."""
     scene, d = replace(case.scene, disturbance=None, initial_set=None), case.problem.system.states
     horizon, whole_space = case.problem.horizon, Box(np.full(d, -np.inf), np.full(d, np.inf))
     sums = WindowUnits(case.problem, case.flows, scene, whole_space, horizon, horizon).sums
@@ -333,10 +317,8 @@ def of_fixed(case: Case) -> str:
 
 
 def _is_uncertain(case: Case, state: int) -> bool:
-    """Return whether an uncertain entry, a disturbance or the choice of an initial state may reach a state.
-
-    States are linked by the entries of ``A`` that may differ from 0 at some time and parameter. An uncertain entry of
-    ``E`` counts where the middle of that disturbance is not 0."""
+    """Return whether an uncertain entry, a disturbance or the choice of an initial state may reach a state. An
+    uncertain entry of ``E`` counts where the middle of that disturbance is not 0."""
     reaching = _find_linked_states(case, state)
     rows = sorted(reaching)
     is_nonzero, is_parametric = case.flows.links

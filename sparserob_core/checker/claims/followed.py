@@ -38,10 +38,8 @@ class FollowedRow:
         return self.case.followed.worst(self.window.split(self.direction)[0], self.case.scene)
 
     def prove(self, limit: float) -> tuple[int, float]:
-        """Show that the row is at most ``limit`` at every time of its window.
-
-        Return the number of cells that the proof took, and an upper bound of the row. Raise `Broken` where the row is
-        certainly above ``limit``, and `Unchecked` where neither could be shown."""
+        """Show that the row is at most ``limit`` at every time of its window; return the number of cells, and an upper
+        bound of the row."""
         window = self.window
         times = self.worst.cuts([window.start, window.stop, *window.cuts(self.case.control.breakpoints.tolist())])
         times = times[(times >= window.start) & (times <= window.stop)]
@@ -64,10 +62,8 @@ class FollowedRow:
         raise Unchecked(f"neither shown nor refuted: after {count} cells more than {limit!r} is not excluded")
 
     def beside(self, time: float, inside: float) -> tuple[float, float]:
-        """Return a lower and an upper bound of the terms that the reference and the control add to the row at a time.
-
-        A mixed constraint takes the control of the piece that holds the time ``inside``. Raise `Broken` where that
-        piece does not meet the window at the time."""
+        """Return a lower and an upper bound of the terms that the reference and the control add to the row at a time. A
+        mixed constraint takes the control of the piece that holds the time ``inside``."""
         case, window, (state, gains) = self.case, self.window, self.window.split(self.direction)
         offset, _ = window.moved(time, time)
         total = -sum((a * b for a, b in zip(balls(state), offset, strict=True)), ball(0.0))
@@ -92,10 +88,8 @@ class FollowedRow:
         return (zeros, zeros) if execution is None else execution.added_at(self.window.split(self.direction)[0], times)
 
     def _bound_added_terms(self, start: Array, stop: Array) -> Array:
-        """Return upper bounds ``(2, k)``, at both ends of cells, of the terms that are added to the state.
-
-        The worst errors of execution are among these terms, with the largest distance by which they may lie above their
-        chord."""
+        """Return upper bounds ``(2, k)``, at both ends of cells, of the terms that are added to the state; among them
+        the worst errors of execution, with how far they may lie above their chord."""
         bounds, execution = np.zeros((2, start.size)), self._execution
         if self.window.reference is not None or self.window.is_mixed:
             cells = self.case.clock.each(zip(start.tolist(), stop.tolist(), strict=True))
@@ -107,10 +101,8 @@ class FollowedRow:
         return bounds
 
     def _refute(self, start: Array, stop: Array, limit: float) -> None:
-        """Raise `Broken` where the row is certainly above ``limit`` in the middle of a cell.
-
-        Nothing is refuted where a set of deviations is curved, because its computed support function need not be
-        sharp."""
+        """Raise `Broken` where the row is certainly above ``limit`` in the middle of a cell; never where a set of
+        deviations is curved, because its computed support function need not be sharp."""
         sets = (self.case.problem.initial_set, self.case.problem.disturbance)
         if any(deviation_set is not None and known(deviation_set).facets is None for deviation_set in sets):
             return

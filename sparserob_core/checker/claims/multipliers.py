@@ -5,14 +5,14 @@ also names the deviations; elsewhere the constraint is taken at the worst ones."
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import replace
-from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from sparserob_core.checker.arithmetic.balls import ball, balls
+from sparserob_core.checker.arithmetic.remembered import remembered
 from sparserob_core.checker.claims.answers import PEAK, WORST, NamedDeviations, feedback_of
 from sparserob_core.checker.claims.case import EQUALS, STEP, Case, listed, number, numbers, shaped
 from sparserob_core.checker.claims.constraints import pushed_by_middle
@@ -30,10 +30,8 @@ MOST_MULTIPLIERS = 100_000
 
 
 def multiplied(case: Case, priced: bool) -> arb:
-    """Return a ball whose lower end is the bound that the certificate's multipliers prove.
-
-    Where ``priced`` it bounds the cost. Otherwise it bounds the weighted sum of constraints over all controls; where
-    that is positive, no control is feasible."""
+    """Return a ball whose lower end is the bound that the certificate's multipliers prove: of the cost where
+    ``priced``, else of the weighted sum of constraints, where a positive one proves that no control is feasible."""
     data = case.certificate.get("multipliers")
     rows, pieces = weighted(case, data)
     price, touched = (case.price, touched_by(case, data)) if priced else (None, None)
@@ -42,22 +40,8 @@ def multiplied(case: Case, priced: bool) -> arb:
 
 
 def weighted(case: Case, data: object) -> tuple[list[tuple[float, ConstraintRow]], Any]:
-    """Return the multipliers with their constraints, and the multipliers of the control's pieces.
-
-    Parameters
-    ----------
-    case
-        The case.
-    data
-        The ``multipliers`` of a certificate, or a part of it of the same form.
-
-    Returns
-    -------
-    list of tuple
-        Each multiplier with its constraint.
-    Array or None
-        The multipliers ``(m, K)`` of the pieces; ``None`` where every piece has a function of its own.
-    """
+    """Return the ``multipliers`` of a certificate, or a part of the same form, with their constraints; and those ``(m,
+    K)`` of the control's pieces, ``None`` where every piece has a function of its own."""
     if data is None:
         raise Unchecked("the certificate holds no multipliers, which this method does not offer")
     if not isinstance(data, Mapping):
@@ -80,10 +64,8 @@ def weighted(case: Case, data: object) -> tuple[list[tuple[float, ConstraintRow]
 
 
 def touched_by(case: Case, data: object) -> Sequence[arb_mat] | None:
-    """Return the control ``(m, 1)`` on every piece at which the certificate replaces the cost by its tangent.
-
-    The control is ``None`` where the cost has neither quadratic terms nor norms of groups. Raise `Broken` where a
-    quadratic term is not convex."""
+    """Return the control ``(m, 1)`` on every piece at which the certificate replaces the cost by its tangent; ``None``
+    where the cost has neither quadratic terms, which must be convex, nor norms of groups."""
     if not (case.price.is_quadratic or any(len(block) > 1 for block in case.price.blocks)):
         return None
     entries = data if isinstance(data, Mapping) else {}
@@ -100,11 +82,9 @@ def norms_of(case: Case, data: object) -> Array | None:
 
 
 def rows_of(case: Case, entry: object) -> list[tuple[float, ConstraintRow]]:
-    """Return an entry's multiplier with its constraint, which must be one of the problem's.
-
-    Under feedback, a step across the seam of a plan that repeats gives two constraints with the same multiplier. The
-    first constraint is on the last control of a period, the second on the first control of the next. These controls
-    answer innovations of two different periods."""
+    """Return an entry's multiplier with its constraint, which must be one of the problem's. Under feedback a step
+    across the seam gives two: on the last control of a period and on the first of the next, which answer different
+    innovations."""
     case.clock.check()
     if not isinstance(entry, Mapping):
         raise Broken("multipliers: expected a constraint, a time, a parameter, a direction and a number each")
@@ -148,23 +128,19 @@ def _derive_state_row(
     sized(direction, case.problem.system.states if window is None else window.shape.dimension, name)
     if window is not None:
         admissible(case, window, time, parameter)
-    key = name, time, tuple(direction.tolist()), tuple(parameter.tolist()), repr(entry.get("piece"))
-    rows_by_key = _get_row_cache(case)
-    if key not in rows_by_key:
-        rows_by_key[key] = _derive_base_row(case, window, entry, said)
-    row = rows_by_key[key]
+    row = _derive_base_row(case, window, entry, said)
     if named is None:
         return row
     contribution = named.given(direction[: case.problem.system.states], time)
     return replace(row, constant=row.constant + contribution, innovations=named.innovations)
 
 
-@lru_cache(maxsize=2)
-def _get_row_cache(case: Case) -> dict[tuple[object, ...], ConstraintRow]:
-    """Return the constraints of a case that were derived before."""
-    return {}
+def _name_row(_: Case, window: object, entry: Mapping[str, Any], said: tuple[str, Array, float, Array]) -> Hashable:
+    name, direction, time, parameter = said
+    return name, time, tuple(direction.tolist()), tuple(parameter.tolist()), repr(entry.get("piece"))
 
 
+@remembered(key=_name_row)
 def _derive_base_row(
     case: Case, window: ConstraintWindow | None, entry: Mapping[str, Any], said: tuple[str, Array, float, Array]
 ) -> ConstraintRow:

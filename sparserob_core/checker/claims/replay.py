@@ -39,24 +39,12 @@ ROUNDED = 1e-11
 
 
 def reached(case: Case, time: float, parameter: Array, signal: object, deviation: object = None) -> list[arb]:
-    """Return the state at a time under the control of the case, ``(d,)`` balls.
+    """Return the state ``(d,)`` at a time and a parameter ``(nu,)`` under the control of the case, a disturbance
+    ``signal (mw, pieces)`` on the common grid and a ``deviation (d,)`` of the initial state; neither is read where the
+    problem has none.
 
-    Raise `Broken` where the disturbance or the deviation is not shown to be admissible, and `Unchecked` where the
-    disturbance is given on another grid.
-
-    Parameters
-    ----------
-    case
-        The case.
-    time
-        The time at which the state is computed.
-    parameter
-        The parameter of the system, ``(nu,)``.
-    signal
-        The disturbance ``(mw, pieces)`` on the pieces of the common grid; not read where the problem has none.
-    deviation
-        The deviation ``(d,)`` from the centre of the initial states; not read where these are one point.
-    """
+    Raise `Broken` where they are not shown to be admissible, and `Unchecked` where the disturbance is given on another
+    grid."""
     w = _read_disturbance(case, signal) if case.problem.disturbance is not None else None
     weights = case.flows.at(parameter.tolist()).weights([0.0, *(t for t in case.timing.grid[1:-1] if t < time), time])
     x = weights.free * _enclose_initial_state(case, deviation)
@@ -77,11 +65,8 @@ def _enclose_initial_state(case: Case, deviation: object) -> arb_mat:
 
 
 def witnessed(case: Case, data: Mapping[str, Any]) -> tuple[arb, float]:
-    """Return the excess of a witness over the constraint that it names, and how closely a figure of it must agree.
-
-    The witness names the time, the direction, the disturbance and the initial state, which must be admissible. Where
-    the control is delivered with errors, the worst errors are added. Raise `Broken` where the witness is not
-    admissible, and `Unchecked` where it holds no disturbance that can be followed."""
+    """Return the excess of a witness over the constraint that it names, and how closely a figure of it must agree. Its
+    disturbance and initial state must be admissible; the worst errors of execution are added."""
     name, time, direction = (
         str(data.get("constraint")),
         number(data, "time"),
@@ -135,10 +120,8 @@ def witnessed(case: Case, data: Mapping[str, Any]) -> tuple[arb, float]:
 
 
 def excused(case: Case, data: Mapping[str, Any], slack: float) -> float:
-    """Return the part of a witness's excess that counts as none.
-
-    For a constraint on the state it is what a claim excuses, but at most ``slack``, the accuracy of the figure. For
-    other constraints it is the ``slack``."""
+    """Return the part of a witness's excess that counts as none: what a claim excuses, but at most ``slack``, the
+    accuracy of the figure, which it is for constraints that are not on the state."""
     name, direction = str(data.get("constraint")), numbers(data.get("direction"), "direction")
     if commanded(case, name) is not None or (name == EQUALS and case.equalities):
         return slack
@@ -149,10 +132,8 @@ def excused(case: Case, data: Mapping[str, Any], slack: float) -> float:
 def _enclose_largest_value(
     case: Case, direction: tuple[Array, Array], time: float, parameter: Sequence[float], piece: int | None
 ) -> arb:
-    """Return a ball that holds the largest ``c'x(t) + gain'u`` under measurable disturbances, at a parameter.
-
-    ``direction`` is ``(c, gain)``, and ``u`` is the control on a ``piece``; where it is ``None``, ``gain'u`` is left
-    out."""
+    """Return a ball that holds the largest ``c'x(t) + gain'u`` under measurable disturbances, at a parameter, for a
+    ``direction`` ``(c, gain)`` and the control ``u`` on a ``piece``, where there is one."""
     (c, gain), zero, measurable_input = direction, ball(0.0), case.sources.strayed_at(parameter)
     assert measurable_input is not None
     row = case.duality.row(c, time, parameter, zero)
@@ -173,21 +154,11 @@ def _project_onto_direction(direction: Array, named: NamedDeviations | None, row
 
 
 def exceeded(case: Case, said: Mapping[str, object], begun: Array | None = None) -> tuple[list[float], float]:
-    """Return the excess of the worst disturbance over each row of a constraint at one time, as estimates with a slack.
+    """Return the excess of the worst disturbance over each row of the constraint, at the time and parameter that a
+    report has ``said``, as estimates; and a slack that says how closely a reported figure must agree. ``begun (d,)`` is
+    the initial state, by default the worst one.
 
-    The slack says how closely a reported figure must agree with them. A mixed constraint at a jump of the control has
-    its rows on both sides. Raise `Broken` where ``said`` names no constraint of the problem, or no time of it. Raise
-    `Unchecked` for a curved set, whose worst direction is not reported.
-
-    Parameters
-    ----------
-    case
-        The case.
-    said
-        A report with the keys ``constraint``, ``time``, ``parameter`` and ``violation``.
-    begun
-        The initial state ``(d,)``; by default the worst one; not used under feedback.
-    """
+    A mixed constraint at a jump of the control has its rows on both sides. A curved set is `Unchecked`."""
     name, time, control_set = (
         str(said.get("constraint")),
         number(said, "time"),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property, lru_cache, partial
+from functools import cached_property, partial
 from typing import TYPE_CHECKING, final
 
 import numpy as np
@@ -82,10 +82,9 @@ class WindowUnits:
         return np.asarray(np.minimum(resolved, np.where(sizes > 0.0, sizes, NOTHING * np.minimum(resolved, 1.0))))
 
     def least(self, direction: Array, width: float) -> float:
-        """Return the least unit of a direction ``c (d,)``, along which a curved set reaches ``width`` from its centre.
-
-        The least unit is what double precision resolves, but never more than the values of the states along the nominal
-        trajectory. Where the set is `THIN`, these values alone count."""
+        """Return the least unit of a direction ``c (d,)``, along which a curved set reaches ``width`` from its centre:
+        what double precision resolves, but at most the values along the nominal trajectory, which alone count where the
+        set is `THIN`."""
         size = np.abs(direction)
         floors = self._nominal_state_sizes if width < THIN * float(size @ self.sums) else self._least_units
         return float(size @ floors)
@@ -129,10 +128,8 @@ class WindowUnits:
         return self._measure_reach(self._interior_parameter, states=True)[1]
 
     def slack(self, direction: Array, limit: arb) -> float:
-        """Return how closely doubles determine ``c'x`` in a direction ``c (d,)`` with ``c'x <= limit`` on the set.
-
-        The direction of a flat set is a combination of normals with weights that are not negative. The numbers of these
-        facets are added up with the same weights."""
+        """Return how closely doubles determine ``c'x`` in a direction ``c (d,)`` with ``c'x <= limit`` on the set. Of a
+        flat set the direction is a weighted sum of normals, and so are the numbers that are added up."""
         return self._scale_tolerance(
             direction,
             limit,
@@ -147,10 +144,8 @@ class WindowUnits:
     def _scale_tolerance(
         self, direction: Array, limit: arb, facets: Callable[[], Array], least: Callable[[float], float]
     ) -> float:
-        """Return `TOLERANCE` of the unit of a direction.
-
-        A flat set takes the units ``facets (k,)``. A curved set takes its width, but at least the ``least`` unit for
-        that width."""
+        """Return `TOLERANCE` of the unit of a direction: of a flat set by the units ``facets (k,)``, of a curved one by
+        its width, but at least the ``least`` unit for that width."""
         shape = known(self.shape)
         if shape.facets is None:
             width = float(limit) - float(direction @ shape.centre)
@@ -174,10 +169,8 @@ class WindowUnits:
 
     @remembered()
     def _measure_reach(self, parameter: tuple[float, ...], states: bool) -> tuple[Array, Array]:
-        """Return how far rows reach over the window at one parameter, and the largest sums of absolute terms.
-
-        The rows are the normals of the facets, or all ``states``; both results are ``(k,)``. The intervals of time are
-        traversed once backwards from every time of the window that is examined, for as many times together as memory
+        """Return how far rows, the normals of the facets or all ``states``, reach over the window at one parameter, and
+        the largest sums of absolute terms, ``(k,)`` each. As many times are followed backwards together as memory
         allows."""
         with np.errstate(over="ignore", invalid="ignore"):
             nodes, places = self._find_nodes()
@@ -281,31 +274,15 @@ class WindowUnits:
         return nodes, window
 
 
-@lru_cache(maxsize=2)
-def _get_units_cache(case: Case) -> dict[ConstraintWindow, WindowUnits]:
-    """Return the units of the constraints of a case that were made before."""
-    return {}
-
-
+@remembered()
 def units_of(case: Case, window: ConstraintWindow) -> WindowUnits:
     """Return the units by which violations of a constraint are judged."""
-    units_by_window = _get_units_cache(case)
-    if window not in units_by_window:
-        units_by_window[window] = WindowUnits(
-            case.problem,
-            case.flows,
-            case.scene,
-            window.shape,
-            window.start,
-            window.stop,
-            window.reference,
-            None if case.answering else np.abs(case.control.control(case.theta)).max(axis=1),
-            partial(nominal_sizes, case),
-        )
-    return units_by_window[window]
+    acting = None if case.answering else np.abs(case.control.control(case.theta)).max(axis=1)
+    times = window.start, window.stop, window.reference
+    return WindowUnits(case.problem, case.flows, case.scene, window.shape, *times, acting, partial(nominal_sizes, case))
 
 
-@lru_cache(maxsize=2)
+@remembered()
 def _enclose_nominal_values(case: Case) -> tuple[Array, Array]:
     """Return the nominal ``(x, u)`` where pieces begin to act and at the end, ``(K', d + m)``, and the radii."""
     states = case.price.nominal_states(case.pieces)
@@ -315,18 +292,9 @@ def _enclose_nominal_values(case: Case) -> tuple[Array, Array]:
 
 
 def nominal_sizes(case: Case, rows: Array, gains: Array) -> Array:
-    """Return the largest ``|c'x + g'u|`` along the nominal trajectory of the decision, ``(k,)``, never too large.
-
-    The trajectory is evaluated where every piece of the control begins to act, and at the end. Under feedback, rows of
-    the state alone include the deviations.
-
-    Parameters
-    ----------
-    case
-        The case.
-    rows, gains
-        The coefficients ``c (k, d)`` of the state and ``g (k, m)`` of the control; ``g`` may have no columns.
-    """
+    """Return the largest ``|c'x + g'u|`` along the nominal trajectory of the decision, ``(k,)``, never too large, for
+    ``rows (k, d)`` and ``gains (k, m)`` or none: where pieces begin to act, and at the end. Under feedback, rows of the
+    state alone include the deviations."""
     if case.answering and not gains.any():
         return feedback_of(case).sizes(rows)
     mid, rad = _enclose_nominal_values(case)

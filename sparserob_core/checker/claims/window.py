@@ -70,10 +70,8 @@ class ConstraintWindow:
         return sum(terms, self.seen.limit(direction))
 
     def moved(self, start: float, stop: float) -> tuple[list[arb], list[arb]]:
-        """Return ``r(start)`` and the derivative ``r'`` on ``[start, stop]``, ``(d,)`` each.
-
-        No time of the reference lies between ``start`` and ``stop``. Outside the times of the reference ``r`` is
-        constant."""
+        """Return ``r(start)`` and the derivative ``r'`` on ``[start, stop]``, ``(d,)`` each, between two times of the
+        reference; outside of its times ``r`` is constant."""
         zero = [ball(0.0)] * self.states
         if self.reference is None:
             return zero, zero
@@ -128,21 +126,9 @@ class Beside:
         piece: int | None = None,
         within: tuple[Corners, Around] | None = None,
     ) -> list[Polynomial]:
-        """Return the polynomials of ``c'x`` on an interval with the added terms.
-
-        Parameters
-        ----------
-        found
-            The polynomials of ``c'x``, one for every row of ``z``.
-        start, stop
-            The ends of the interval, which no cut of the window divides.
-        z
-            The coordinates of the directions, ``(k, b)``.
-        piece
-            The piece whose control counts; by default the one at ``start``.
-        within
-            The box of parameters with the monomials on it; ``None`` at a single parameter.
-        """
+        """Return the polynomials ``found`` of ``c'x``, one for every row of ``z (k, b)``, on an interval with the added
+        terms. ``piece`` is the one whose control counts, by default that at ``start``; ``within`` the box of parameters
+        with its monomials."""
         offset, slope = self.window.moved(start, stop)
         basis = exactly(self.basis)
         level = -basis * stacked([[r] for r in offset])
@@ -192,9 +178,8 @@ class Beside:
         within: tuple[Corners, Around] | None,
     ) -> Polynomial:
         """Return a polynomial with the upper bound of what a bounded input adds to ``c'x`` at one time or between two.
-
-        The direction ``c`` has an error of at most ``off (d,)``. The addition is sublinear in the direction, so this
-        error adds at most ``off`` times the additions along the axes."""
+        It is sublinear in the direction, so an error ``off (d,)`` of ``c`` adds at most ``off`` times what the axes
+        add."""
         bounds = one.over(c, times, within)
         terms, error = bounds.ends[:1], bounds.off
         if len(bounds.ends) > 1:

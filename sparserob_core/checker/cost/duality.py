@@ -85,13 +85,7 @@ class Duality:
 
     def step_row(self, direction: Array, time: float) -> ConstraintRow:
         """Return the row of ``c'(u_k - u_{k-1}) <= h(c)`` for the step at a breakpoint, ``u_{-1}`` the control before
-        time 0.
-
-        Raises
-        ------
-        Broken
-            Where the problem has no such constraint, or no step at the time.
-        """
+        time 0; raise `Broken` where the problem has no such constraint, or no step at the time."""
         if self.problem.control_step is None:
             raise Broken("the problem has no constraint 'control_step'")
         matches = [k for k in steps(self.problem, self.control) if float(self.control.breakpoints[k]) == time]
@@ -112,10 +106,8 @@ class Duality:
     def row(
         self, direction: Array, time: float, parameter: Sequence[float], limit: arb, disturbed: bool = True
     ) -> ConstraintRow:
-        """Return the row of ``c'x(t) <= limit`` at one parameter.
-
-        With ``disturbed`` it is the row of the worst disturbance and initial state; otherwise of none.
-        """
+        """Return the row of ``c'x(t) <= limit`` at one parameter: of the worst disturbance and initial state, or of
+        none."""
         m, problem = self.problem.system.controls, self.problem
         delay, jumps = problem.system.delay, self.changes or []
         piece_starts = [float(s) + delay for s in self.control.breakpoints[:-1]]  # times at which a piece begins to act
@@ -146,10 +138,8 @@ class Duality:
         return ConstraintRow(constant, slope)
 
     def pushed(self, direction: Array, time: float, jumps: list[float] | None = None) -> list[list[arb]]:
-        """Return the coefficients ``(mw,)`` of every block of the disturbance in ``c'x(t)``, for a known system.
-
-        The blocks begin at ``jumps``, or by default at the `changes` of the problem.
-        """
+        """Return the coefficients ``(mw,)`` of every block of the disturbance in ``c'x(t)``, for a known system. The
+        blocks begin at ``jumps``, or by default at the `changes` of the problem."""
         jumps = self.changes if jumps is None else jumps
         if not jumps:
             return []
@@ -173,23 +163,12 @@ class Duality:
         lengths: bool = True,
         norms: Array | None = None,
     ) -> arb:
-        """Return a ball whose lower end is the bound that multipliers of rows prove.
+        """Return a ball whose lower end is the bound that multipliers of ``rows`` prove. ``pieces (m, K)`` are the
+        negated slopes for a dictionary with fewer functions than pieces; ``price`` is the cost, ``None`` to prove
+        infeasibility.
 
-        Parameters
-        ----------
-        rows
-            Multipliers ``y``, each with its row.
-        pieces
-            The negated slopes ``(m, K)`` of the certificate, for a dictionary with fewer functions than pieces.
-        price
-            The cost; ``None`` to prove infeasibility.
-        touched
-            The control ``(m, 1)`` on every piece at which quadratic terms, and norms, are replaced by their tangents.
-        lengths
-            True where absolute values of this control are charged, False where those of another one are.
-        norms
-            Vectors ``(m, K)`` for tangents of norms, besides those at ``touched``.
-        """
+        At ``touched``, controls ``(m, 1)``, quadratic terms and norms are replaced by their tangents; ``norms (m, K)``
+        are further vectors for that. ``lengths`` is False where absolute values of another control are charged."""
         tangent = None if price is None or touched is None or not price.is_quadratic else price.tangent(touched)
         constant, slopes = self.summed(rows, pieces, tangent)
         charges = price if lengths else None
@@ -217,13 +196,9 @@ class Duality:
     ) -> arb:
         """Return a lower bound of the least cost with norms of groups: ``weight |s| >= d's`` for any ``|d| <= weight``.
 
-        The vector ``d`` is the one that balances the slope, that of the tangent, or one that is ``offered``. For a box
-        each group has the best of the three; for another set all groups have the same. The cost ``sizes`` of absolute
-        values is subtracted from the balancing and the offered vectors.
-
-        In a corner of oblique facets the best vector is between the first two. The multipliers of the facets compensate
-        a part of the slope, and a tangent at a slightly wrong control tilts the corner.
-        """
+        The vector ``d`` balances the slope, is that of the tangent, or is ``offered``: for a box the best for each
+        group, for another set one for all. In a corner of oblique facets the multipliers of these balance a part of the
+        slope, and a tangent at a slightly wrong control tilts the corner."""
         balancing = _shrink([ball(-float(s)) for s in slope], sizes)
         optional = [] if offered is None else [(_shorten, _shrink(offered, sizes))]
         candidates = []
@@ -284,11 +259,8 @@ class Duality:
         self, slopes: list[list[arb]], pieces: Sequence[Sequence[float]]
     ) -> tuple[list[list[arb]], arb]:
         """Return the slopes of the certificate in place of the derived ones, and an upper bound of the difference that
-        this makes.
-
-        With fewer functions than pieces, different slopes may have the same effect on every control of the dictionary.
-        The difference of their effects is bounded by the largest coefficients that a control may have.
-        """
+        this makes: of the effects on every function of the dictionary, times the largest coefficients that a control
+        may have."""
         m, K, N = self.problem.system.controls, self.control.pieces, self.control.functions
         certified = [[-ball(pieces[c][k]) for c in range(m)] for k in range(K)]
         error_bound = ball(0.0)

@@ -29,33 +29,11 @@ TOGETHER = 200  # parts that are bounded by one product of matrices
 def at_most(
     a: list[arb], A: list[list[arb]], support: Callable[[list[arb]], arb], reach: Array, limit: arb, clock: Clock
 ) -> int:
-    """Show that the largest effort ``max_z sum_k |a_k + A_k z|`` is at most a limit.
+    """Show that the largest effort ``max_z sum_k |a_k + A_k z|``, ``A (n, Q)``, is at most a ``limit``; return the
+    number of parts that were examined. ``support`` is the support function of the deviations; approximate bounds
+    ``reach (Q,)`` of them decide the order of the search.
 
-    Parameters
-    ----------
-    a, A
-        Balls ``(n,)`` and ``(n, Q)``.
-    support
-        The support function of the deviations: the largest ``z'b`` for ``b (Q,)``.
-    reach
-        Approximate bounds ``(Q,)`` of the deviations, which decide only the order of the search.
-    limit
-        The limit to be shown.
-    clock
-        The time limit.
-
-    Returns
-    -------
-    int
-        The number of parts that were examined.
-
-    Raises
-    ------
-    Broken
-        Where the effort is certainly larger.
-    Unchecked
-        Where the question remains undecided.
-    """
+    Raise `Broken` where the effort is certainly larger, `Unchecked` where the question remains undecided."""
     high = [x + support(row) for x, row in zip(a, A, strict=True)]
     low = [x - support([-y for y in row]) for x, row in zip(a, A, strict=True)]
     slopes = np.array([_compute_chord_slope(float(u), float(v)) for u, v in zip(high, low, strict=True)])

@@ -66,13 +66,7 @@ class GainsBound:
 
     def _cluster_breakpoints(self, k: int) -> list[tuple[list[int], arb_mat, list[int]]]:
         """Return the breakpoints that the control on a piece answers, in clusters: those that measure a common block
-        are together.
-
-        Returns
-        -------
-        list[tuple[list[int], arb_mat, list[int]]]
-            For every cluster its breakpoints, the matrix of `_compute_inverse`, and its blocks.
-        """
+        are together. Each has its breakpoints, the matrix of `_compute_inverse`, and its blocks."""
         groups: list[tuple[list[int], set[int]]] = []
         for j in np.flatnonzero(self.answers[k, : k + 1]).tolist():
             measured_blocks = {block for block in self.loop.seen[j] if self._segments[block]}
@@ -90,11 +84,7 @@ class GainsBound:
     @remembered()
     def _compute_inverse(self, members: tuple[int, ...]) -> tuple[arb_mat, list[int]]:
         """Return a generalised inverse ``(q, J d)`` of the matrix from the blocks to the states measured at these
-        breakpoints.
-
-        From the measurements of any deviations it gives deviations of the blocks with the same measurements. The second
-        value is the numbers of the blocks.
-        """
+        breakpoints, and the numbers of the blocks. From measurements it gives deviations with the same measurements."""
         blocks = sorted({block for j in members for block in self.loop.seen[j] if self._segments[block]})
         d = self.loop.outputs
         table: list[list[arb]] = []

@@ -45,11 +45,9 @@ class Walk:
 
 
 def walked(nominal: NominalMotion, control: Dictionary, pieces: Sequence[arb_mat]) -> Walk:
-    """Return the quadratic terms of the cost at a control ``(m, 1)`` on every piece, and their derivatives.
-
-    ``z = (x, 1, u)`` is propagated along the nominal trajectory, and the costates of its cost backwards. A control acts
-    on the state after the delay of the system, and costs when it is commanded.
-    """
+    """Return the quadratic terms of the cost at a control ``(m, 1)`` on every piece, and their derivatives: ``z = (x,
+    1, u)`` is propagated along the nominal trajectory, and the costates backwards. A control acts after the delay, and
+    costs when it is commanded."""
     from flint import arb, arb_mat
 
     problem, x, steps = nominal.problem, nominal.begin, []
@@ -85,10 +83,8 @@ def walked(nominal: NominalMotion, control: Dictionary, pieces: Sequence[arb_mat
 
 
 def nominal_states(nominal: NominalMotion, control: Dictionary, pieces: Sequence[arb_mat]) -> list[arb_mat]:
-    """Return the nominal ``(x, 1, u)`` where every piece of the control begins to act, and at the end.
-
-    Every uncertainty is at its nominal point. ``u = 0`` before the first piece acts, and at the end.
-    """
+    """Return the nominal ``(x, 1, u)`` where every piece of the control begins to act, and at the end. ``u = 0`` before
+    the first piece acts, and at the end."""
     from flint import arb_mat
 
     x, zero_control, states = nominal.begin.tolist(), (nominal.before * 0).tolist(), []
@@ -107,10 +103,8 @@ def _sum_absolute_products(z: arb_mat, M: arb_mat) -> float:
 
 
 def _list_acting_intervals(problem: OptimalControlProblem, control: Dictionary) -> list[tuple[float, float, int]]:
-    """Return the intervals of time on which one piece of the control acts in one phase of the system.
-
-    Each interval has the number of its piece; -1 before the first piece acts.
-    """
+    """Return the intervals of time on which one piece of the control acts in one phase of the system, each with the
+    number of the piece; -1 before the first acts."""
     delay, horizon = problem.system.delay, float(control.breakpoints[-1])
     begins = [(float(t) + delay, k) for k, t in enumerate(control.breakpoints[:-1]) if float(t) + delay < horizon]
     begins = begins if delay == 0.0 else [(0.0, -1), *begins]
@@ -186,10 +180,7 @@ class NominalMotion:
 
     def _integrate(self, part: FlowPart) -> tuple[arb_mat, arb_mat]:
         """Return the square matrix of ``z`` over a share of a segment, and the cost of that time as a quadratic form.
-
-        Up to the share the flow is ``sum_n X_n x^n``, with a remainder in a ball at every ``x``. With ``M`` the cost
-        per time, the terms cost ``sum_ij X_i' M X_j x^(i + j) / (i + j + 1)`` per time.
-        """
+        With ``M`` the cost per time, terms ``X_n x^n`` cost ``sum_ij X_i' M X_j x^(i + j) / (i + j + 1)`` per time."""
         from flint import arb, arb_mat
 
         (terms, weighted_terms, error), share, M = self._tabulate(part.segment), part.share, self.running
@@ -215,10 +206,8 @@ class NominalMotion:
         return arb_mat(table), arb_mat(weighted_terms), self._lift(around(segment.off), 0)
 
     def _lift(self, term: arb_mat, one: int) -> arb_mat:
-        """Return a matrix ``(d, d + w)`` on states, controls, a drift and disturbances as a square matrix on ``z``.
-
-        The rows of the 1 and of the control are those of the identity times ``one``.
-        """
+        """Return a matrix ``(d, d + w)`` on states, controls, a drift and disturbances as a square matrix on ``z``, in
+        which the rows of the 1 and of the control are those of the identity times ``one``."""
         system, bound = self.problem.system, self.problem.disturbance
         d, m, mw = system.states, system.controls, system.disturbances
         w = np.zeros(mw) if bound is None else nominal_point(bound)

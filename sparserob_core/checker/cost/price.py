@@ -138,11 +138,9 @@ class Price:
         return Tangent(constant, quadratic.slope)
 
     def added(self, pieces: Sequence[arb_mat], lengths: arb | None = None) -> float:
-        """Return the sum of the absolute values of what the program adds up to the cost of a control.
-
-        It adds up the norms, or ``lengths`` where those are charged instead, and the linear, the quadratic and the
-        constant part of the quadratic terms.
-        """
+        """Return the sum of the absolute values of what the program adds up to the cost of a control: the norms, or
+        ``lengths`` where those are charged, and the linear, the quadratic and the constant part of the quadratic
+        terms."""
         pairs = zip(self.costs, pieces, strict=True)
         norms = lengths
         if norms is None:
@@ -158,19 +156,14 @@ class Price:
         return float((norms + abs(linear) + abs(curvature) + abs(constant)).mid())
 
     def terms(self, pieces: Sequence[arb_mat]) -> float:
-        """Return the sum of the absolute values of all products in the quadratic terms of a control.
-
-        Rounding errors are relative to this sum, also where products cancel within one matrix.
-        """
+        """Return the sum of the absolute values of all products in the quadratic terms of a control, which rounding is
+        relative to."""
         return self._evaluate_quadratic(pieces).terms if self.is_quadratic else 0.0
 
     @cached_property
     def largest(self) -> float:
         """The scale that gaps had in earlier versions: a bound of the cost of absolute values, plus the largest value
-        of the quadratic terms at some controls.
-
-        These controls stay 0, or one channel stays plus or minus its largest absolute value. It is an estimate.
-        """
+        of the quadratic terms where all channels stay 0, or one at plus or minus its largest absolute value."""
         m = self.problem.system.controls
         axes = np.eye(m)
         ends = [
@@ -215,10 +208,8 @@ class Price:
         return [stacked([[ball(0)]] * self.problem.system.controls)] * len(self._piece_lengths)
 
     def _evaluate_quadratic(self, pieces: Sequence[arb_mat]) -> Walk:
-        """Return the quadratic terms and their slopes, at the working precision that they need.
-
-        The latest are remembered, since the cost, its terms and its rounding error are needed for the same control.
-        """
+        """Return the quadratic terms and their slopes, at the working precision that they need; the latest are
+        remembered."""
         from flint import ctx
 
         for control, bits, quadratic in self._latest_walks:

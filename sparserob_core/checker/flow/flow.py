@@ -231,16 +231,9 @@ class VerifiedFlow:
         return solve(*stretch.between(0.0, stretch.stride), stretch.units, self.sharp)
 
     def within(self, begin: float, end: float, start: float, stop: float, order: int) -> tuple[list[Series], Array]:
-        """Return the flow from ``begin`` to the times in ``[start, stop]`` as a polynomial.
-
-        The flow must be a polynomial on ``[begin, end]``, which contains ``[start, stop]``.
-
-        Returns
-        -------
-        tuple[list[Series], Array]
-            At most ``order`` coefficients ``(d, d + w)`` of ``[Phi Gamma]``, in powers of the share of ``[start,
-            stop]``; and an upper bound ``(d, d + w)`` of the error of this polynomial.
-        """
+        """Return the flow ``[Phi Gamma]``, ``(d, d + w)``, from ``begin`` to the times in ``[start, stop]``: at most
+        ``order`` coefficients in powers of the share of ``[start, stop]``, and the error bound of this polynomial. The
+        flow must be a polynomial on ``[begin, end]``, which contains ``[start, stop]``."""
         segment, share = self.segment(begin, end)
         if begin == end:
             return segment.within(ball(0), ball(0), order)
@@ -249,17 +242,10 @@ class VerifiedFlow:
         return segment.within(first, width, order)
 
     def kernel(self, start: float, stop: float) -> tuple[list[Series], Array]:
-        """Return the kernel ``h Phi(stop, s) [B c E](s)`` of inputs at any time ``s`` of an interval without marks.
-
-        ``h`` is the length of the interval, and the kernel is the effect of the inputs on the state at its end. The
-        rows of ``Phi(stop, s)`` are the flow of the transposed system, backwards.
-
-        Returns
-        -------
-        tuple[list[Series], Array]
-            Coefficients ``(d, w)`` in powers of the share of the interval that is left at ``s``, and an upper bound
-            ``(d, w)`` of the error of this polynomial.
-        """
+        """Return the kernel ``h Phi(stop, s) [B c E](s)`` of inputs at any time ``s`` of an interval without marks, of
+        length ``h``: coefficients ``(d, w)`` in powers of the share of the interval that is left at ``s``, and the
+        error bound of this polynomial. The rows of ``Phi(stop, s)`` are the flow of the transposed system,
+        backwards."""
         stretch = self.law.stretches[self._find_stretch(start, stop)]
         A, F = stretch.between(start, stop, backwards=True)
         Phi, Phi_error = self._solve_backwards(stretch, A, start, stop)
@@ -301,14 +287,9 @@ class VerifiedFlow:
         return self.kind(start, stop) if inside else (start, stop)
 
     def sizes(self, start: float, stop: float) -> tuple[Array, Array, Array]:
-        """Return bounds of the law on the stretch that contains an interval.
-
-        Returns
-        -------
-        tuple[Array, Array, Array]
-            Upper bounds of the absolute values of ``[A B c E]`` and of its derivative in time, ``(d, d + w)`` each. The
-            third value is the units ``(d,)`` of the states, in which the law is small there.
-        """
+        """Return upper bounds of the absolute values of ``[A B c E]`` and of its derivative in time, ``(d, d + w)``
+        each, on the stretch that contains an interval; and the units ``(d,)`` of the states, in which the law is small
+        there."""
         stretch = self.law.stretches[self._find_stretch(start, stop)]
         return *stretch.sizes, stretch.units
 

@@ -75,11 +75,8 @@ class VerifiedFlows:
         return self.at(self.aside).marks(times)
 
     def holding(self, box: ParameterBox) -> VerifiedFlow:
-        """Return a flow over a box, or over a larger box that contains it.
-
-        The larger box is found by halving the box of all parameters until the remainder of its expansion is small. The
-        box after the last of the `HALVINGS` is taken without a test of its remainder, which is a bound all the same.
-        """
+        """Return a flow over a box, or over a larger one that contains it: the box of all parameters, halved until the
+        remainder of its expansion is small, or `HALVINGS` times."""
         if self._is_still:
             return self.over(box, self.degree)
         candidate, degree = self.box, WIDE.get(len(box.middle), 2)

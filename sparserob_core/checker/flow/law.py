@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, final
 import numpy as np
 
 from sparserob_core.checker.arithmetic.models import Frame, Model
-from sparserob_core.checker.arithmetic.monomials import NONE, Monomials
+from sparserob_core.checker.arithmetic.monomials import NONE, Monomials, monomials_of
 from sparserob_core.checker.arithmetic.series import OUTWARD, Series, stacked, upper
 from sparserob_core.checker.flow.plant import Plant, called
 from sparserob_core.checker.flow.segment import SHARP
@@ -65,10 +65,7 @@ class ParameterBox:
         return True
 
     def halved(self, axis: int) -> list[ParameterBox]:
-        """Return two boxes that cover the box across one parameter up to rounding, each a little larger than half.
-
-        Whether one of them holds a smaller box is for `holds` to test.
-        """
+        """Return two boxes that cover the box across one parameter up to rounding, each a little larger than half."""
         boxes = []
         for sign in (-0.5, 0.5):
             middle, halves = list(self.middle), list(self.halves)
@@ -101,12 +98,9 @@ class Stretch:
         return all(entry.length() <= 1 for table in self.table for row in table for entry in row)
 
     def between(self, start: float, stop: float, backwards: bool = False) -> tuple[list[Series], list[Series]]:
-        """Return ``A`` and ``[B c E]`` times the length of a part of the stretch, as one series for each power of a
-        share.
-
-        The polynomials are in the share of the part that has passed, or ``backwards`` in the share that is left. The
-        last powers of ``A`` may be in the balls of the first.
-        """
+        """Return ``A`` and ``[B c E]`` times the length of a part of the stretch, as one series for each power of the
+        share of the part that has passed, or ``backwards`` of the share that is left. The last powers of ``A`` may be
+        in the balls of the first."""
         from flint import arb, arb_poly
 
         half, length = (arb(self.stop) - arb(self.start)) / 2, arb(stop) - arb(start)
@@ -173,7 +167,7 @@ class Law:
     @cached_property
     def monomials(self) -> Monomials:
         """The monomials of the parameters."""
-        return Monomials(len(self.box.middle), self.degree) if self.degree else NONE
+        return monomials_of(len(self.box.middle), self.degree) if self.degree else NONE
 
     @cached_property
     def units(self) -> Array:
@@ -196,13 +190,8 @@ class Law:
 
     @cached_property
     def stretches(self) -> list[Stretch]:
-        """The law on consecutive parts of the horizon, each halved where it is too long.
-
-        Raises
-        ------
-        Unchecked
-            Where the law is not enclosed, since it is not finite or has a pole, or where it is too fast.
-        """
+        """The law on consecutive parts of the horizon, each halved where it is too long; `Unchecked` where it is not
+        finite, has a pole, or is too fast."""
         if self.timing is not None:
             return [self._rebuild_stretch(stretch) for stretch in self.timing.stretches]
         spans = [(phase.begin, min(phase.until, self.until), phase) for phase in self.plant.phases]
@@ -328,12 +317,9 @@ class Law:
 
 
 def _find_unit_factors(most: Array) -> Array | None:
-    """Return factors ``(d,)`` by which to multiply the units of the states, such that the system is small enough in the
-    new units; ``None`` where none are found.
-
-    In the old units the system moves the states by at most ``M = most (d, d)``. With ``g = SHORTER LONG`` the factors
-    ``u = (1 - M / g)^-1 1`` satisfy ``M u <= g u`` where they are positive.
-    """
+    """Return factors ``(d,)`` of the units of the states that make the system small enough, ``None`` where none are
+    found. It moves the states by at most ``M = most (d, d)``; with ``g = SHORTER LONG``, ``u = (1 - M / g)^-1 1``
+    satisfies ``M u <= g u`` where it is positive."""
     relative = most / (SHORTER * LONG)
     u = np.linalg.lstsq(np.eye(len(relative)) - relative, np.ones(len(relative)), rcond=None)[0]
     if not (np.isfinite(u).all() and u.min() > 0.0):

@@ -45,15 +45,8 @@ class Powers:
     off: Array
 
     def within(self, start: arb, width: arb, order: int) -> tuple[list[Series], Array]:
-        """Return the matrix on the shares from ``start`` to ``start + width`` as a polynomial in the share of the
-        ``width``.
-
-        Returns
-        -------
-        tuple[list[Series], Array]
-            At most ``order`` coefficients ``(d, n)``, and an upper bound ``(d, n)`` of the error of the polynomial that
-            they form.
-        """
+        """Return the matrix on the shares from ``start`` to ``start + width``: at most ``order`` coefficients ``(d,
+        n)`` in powers of the share of the ``width``, and the error bound of this polynomial."""
         from flint import arb, arb_mat
 
         (d, columns), count, kept = self.off.shape, self.count, min(order, self.count)
@@ -135,21 +128,9 @@ class VerifiedSegment:
 
 
 def shifted(start: float, width: float, count: int) -> Array:
-    """Return the matrix that turns coefficients of powers of ``start + width y`` into coefficients of powers of ``y``.
-
-    Parameters
-    ----------
-    start, width
-        Nonnegative numbers.
-    count
-        The number of powers.
-
-    Returns
-    -------
-    Array
-        The matrix ``(power of y, power)``. Each entry is increased by more than its rounding error, some ``8 count``
-        units of rounding.
-    """
+    """Return the matrix ``(power of y, power)`` from coefficients of powers of ``start + width y``, both nonnegative,
+    to those of powers of ``y``. Each entry is increased by more than its rounding error, some ``8 count`` units of
+    rounding."""
     n = np.arange(count)
     table = (
         _compute_binomials(count) * np.power(start, np.maximum(n[None] - n[:, None], 0)) * np.power(width, n)[:, None]
@@ -163,17 +144,9 @@ def _compute_binomials(count: int) -> Array:
 
 
 def solve(A: Sequence[Series], F: Sequence[Series], units: Array, sharp: float = SHARP) -> VerifiedSegment:
-    """Return the verified flow of ``x' = A x + F u`` with ``A = sum_k A_k x^k`` and ``F = sum_k F_k x^k``, from 0 to 1.
-
-    Parameters
-    ----------
-    A, F
-        Coefficients ``(d, d)`` and ``(d, w)`` in powers of the share of time.
-    units
-        Units ``(d,)`` of the states, in which the system is small.
-    sharp
-        The relative truncation error of the states at which the guess ends; at least `ROUGH` over a box of parameters.
-    """
+    """Return the verified flow of ``x' = A x + F u`` from 0 to 1, with coefficients of ``A (d, d)`` and ``F (d, w)`` in
+    powers of the share of time. The system is small in the ``units (d,)``; the guess ends at the relative truncation
+    error ``sharp``, at least `ROUGH` over a box of parameters."""
     equation = Equation(A, F)
     terms = guess(equation, units, max(sharp, ROUGH) if A[0].monomials.degree else sharp)
     return VerifiedSegment(terms, verify(equation, terms, units))
@@ -198,13 +171,8 @@ def guess(equation: Equation, units: Array, sharp: float = SHARP) -> list[Series
 
 
 def verify(equation: Equation, terms: Sequence[Series], units: Array) -> Array:
-    """Return an upper bound ``(d, d + w)`` of the error of a polynomial up to a share of `LONGER`.
-
-    Raises
-    ------
-    Unchecked
-        Where the exponent of Gronwall's inequality is too large for a bound.
-    """
+    """Return an upper bound ``(d, d + w)`` of the error of a polynomial up to a share of `LONGER`; raise `Unchecked`
+    where the exponent of Gronwall's inequality is too large."""
     A, F, last, d = equation.A, equation.F, len(terms) - 1, len(units)
     longer = LONGER ** (last + max(len(A), len(F)) + 1) * OUTWARD
     defects = [terms[n + 1].scaled(ball(n + 1)) - equation.slope(terms, n) for n in range(last)]

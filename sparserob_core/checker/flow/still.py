@@ -39,10 +39,8 @@ def modes_at(system: System, parameter: Sequence[float]) -> list[dict[str, arb_m
 
 
 def held_about(A: Array, inputs: Array, time: float) -> tuple[Array, Array]:
-    """Return ``e^{A time}`` and ``int_0^time e^{A s} ds inputs`` in floats.
-
-    The power series is summed over a short time, and the result is doubled until it covers ``time``.
-    """
+    """Return ``e^{A time}`` and ``int_0^time e^{A s} ds inputs`` in floats: a power series over a short time,
+    doubled."""
     d, size = A.shape[0], float(np.abs(A).sum(axis=1).max(initial=0.0)) * time
     halvings = max(0, int(np.ceil(np.log2(2.0 * size)))) if 0.0 < size < np.inf else 0
     short = time / 2.0**halvings

@@ -21,27 +21,12 @@ LEAST = 2.0**-900  # the smallest rate that takes part in the balancing; units a
 
 
 def balanced(A: Array, horizon: float, speed: Array) -> Array:
-    """Return units of the states, powers of two, in which each row of ``A`` is about as large as its column (Osborne
-    1960).
+    """Return units ``(d,)`` of the states, powers of two, in which each row of rates ``A (d, d)`` is about as large as
+    its column (Osborne 1960).
 
-    The sources take part as one more state. Where one state drives another but not the reverse, a small rate stands for
-    the reverse: the rate that makes the two as large as one becomes through the other within the horizon. A source does
-    not count where its effect on a state is negligible relative to the effect through other states.
-
-    Parameters
-    ----------
-    A
-        Rates ``(d, d)`` between the states.
-    horizon
-        The length of time.
-    speed
-        Rates ``(d,)`` at which the sources change the states.
-
-    Returns
-    -------
-    Array
-        Units ``(d,)``.
-    """
+    The sources, with rates ``speed (d,)``, take part as one more state, except where their effect is negligible beside
+    that of other states. Where one state drives another but not the reverse, a small rate stands for the reverse: the
+    one that makes the two as large as one becomes through the other within the ``horizon``."""
     rates = np.zeros((speed.size + 1, speed.size + 1))
     rates[:-1, :-1], rates[:-1, -1] = np.abs(A), speed
     np.fill_diagonal(rates, 0.0)

@@ -53,12 +53,8 @@ class Disturbances:
 
     @cached_property
     def changes(self) -> list[float] | None:
-        """The times at which the disturbance may jump; ``None`` without a disturbance.
-
-        A measurable disturbance may jump at any time; for it these are the times of the grid, since units of rows are
-        measured with disturbances that jump there. Classes other than measurable and piecewise constant raise
-        `Unchecked`.
-        """
+        """The times at which the disturbance may jump; ``None`` without one. For measurable ones, which may jump at any
+        time, these are the times of the grid: units of rows are measured with disturbances that jump there."""
         if self.problem.disturbance is None:
             return None
         if self.problem.measurable is not None and not self.several:
@@ -84,12 +80,9 @@ class Disturbances:
 
     @cached_property
     def held(self) -> ConvexSet | None:
-        """The set of the disturbances that stay constant between `changes`; ``None`` where there are none.
-
-        Without feedback, a measurable disturbance is at the middle of its set here, and a bounded input contains its
-        deviations from the middle. Where all disturbances are measurable and that middle is 0, the set is
-        ``None`` too.
-        """
+        """The set of the disturbances that stay constant between `changes`; ``None`` where there are none. Without
+        feedback, a measurable disturbance is at the middle of its set here, and a bounded input contains its
+        deviations."""
         bound, classes = self.problem.disturbance, self.problem.disturbance_class
         if self.timing.answering or self.problem.measurable is None or bound is None:
             return bound

@@ -69,13 +69,8 @@ DERIVED: dict[type, Callable[[Any, str], Rows]] = {
 
 
 def spelt(problem: OptimalControlProblem) -> OptimalControlProblem:
-    """Return the problem with all constraints written as windows and integrals; the problem itself where they are.
-
-    Raises
-    ------
-    InputError
-        For a constraint that is not among the `DERIVED` ones, so that no constraint is ignored.
-    """
+    """Return the problem with all constraints written as windows and integrals; the problem itself where they are. A
+    constraint that is not among the `DERIVED` ones raises `InputError`, so that none is ignored."""
     constraints = [(name, entry) for name, entries in problem.lists.items() for entry in entries]
     for name, entry in constraints:
         if type(entry) not in DERIVED:
@@ -123,14 +118,8 @@ def integrating(problem: OptimalControlProblem) -> OptimalControlProblem:
 def _derive_coordinates(
     problem: OptimalControlProblem,
 ) -> tuple[list[Coordinate], list[tuple[str, float, list[tuple[list[int], float, float]]]]]:
-    """Return the coordinates of all integrals, and how they are judged.
-
-    Returns
-    -------
-    tuple[list[Coordinate], list]
-        The coordinates; and for every integral its name, the time when it is judged, and for every row the coordinates
-        that are added up, with their bounds.
-    """
+    """Return the coordinates of all integrals; and for every integral its name, the time when it is judged, and for
+    every row the coordinates that are added up, with their bounds."""
     d, m = problem.system.states, problem.system.controls
     coordinates, windows = list[Coordinate](), list[tuple[str, float, list[tuple[list[int], float, float]]]]()
     for number, entry in enumerate(problem.integral):
@@ -268,10 +257,8 @@ def _extend_set(bound: ConvexSet, size: int) -> ConvexSet:
 
 
 def with_zeros(problem: OptimalControlProblem, more: int) -> dict[str, Any]:
-    """Return the initial states, the cost and the measurements of a problem with additional states.
-
-    The ``more`` states follow those of the problem, begin at 0 and cost nothing.
-    """
+    """Return the initial states, the cost and the measurements of a problem with ``more`` states, which begin at 0 and
+    cost nothing."""
     initial_set, zeros, d = problem.initial_set, np.zeros(more), problem.system.states
     if isinstance(initial_set, Box):
         initial_set = Box(np.append(initial_set.lower, zeros), np.append(initial_set.upper, zeros))

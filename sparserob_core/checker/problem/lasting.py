@@ -25,11 +25,8 @@ SAME = 1e-12  # relative to the horizon: nearer breakpoints are one up to roundi
 
 
 def on_one_grid(problem: OptimalControlProblem, dictionary: Dictionary) -> tuple[OptimalControlProblem, Dictionary]:
-    """Return a problem in which every disturbance of the list has breakpoints, and the dictionary of the common pieces.
-
-    A disturbance without breakpoints gets those of the ``dictionary``. All disturbances are constant on the common
-    pieces.
-    """
+    """Return a problem in which every disturbance of the list has breakpoints, by default those of the ``dictionary``;
+    and the dictionary of the pieces on which all are constant."""
     if not dictionary.is_complete:
         raise Unchecked("beside breakpoints the checker knows dictionaries that take any value on each piece")
     assert problem.disturbance_breakpoints is not None
@@ -73,20 +70,9 @@ class Lasting:
         return Lasting(changes, tuple(pairs))
 
     def gathered(self, mid: Array, rad: Array) -> tuple[Array, Array]:
-        """Return the coefficients of the pieces, added up over the intervals on which a component has one value.
-
-        Parameters
-        ----------
-        mid
-            The coefficients ``(pieces, ..., mw, b)`` of the first pieces of the disturbance.
-        rad
-            Their error bounds, of the same shape.
-
-        Returns
-        -------
-        tuple[Array, Array]
-            Both, of the same shapes: the sum of an interval is at its first piece, and its other pieces are 0.
-        """
+        """Return the coefficients ``(pieces, ..., mw, b)`` of the first pieces of the disturbance and their error
+        bounds, added up over the intervals on which a component has one value: at its first piece is the sum, at its
+        others 0."""
         mid, rad = mid.copy(), rad.copy()
         for columns, firsts in self.parts:
             starts = firsts[firsts < mid.shape[0]]

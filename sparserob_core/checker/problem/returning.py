@@ -20,12 +20,8 @@ INSIDE = 1e-8
 
 def returning(problem: OptimalControlProblem) -> OptimalControlProblem:
     """Return the problem with one more constraint for a plan that repeats: every final state is one of the initial
-    states.
-
-    Final states must be inside the set by the share `INSIDE` of its size. There is no such constraint where there is
-    only one initial state; coordinates with one initial value are left free. It is derived from the initial states
-    alone, whatever the problem's records say.
-    """
+    states, inside by the share `INSIDE` of the size of the set. It is derived from the initial states alone;
+    coordinates with one initial value are left free."""
     bound, end, fixed = problem.initial_set, problem.horizon, single(problem)
     path = [entry for entry in problem.windows if not isinstance(entry, Return)]
     if not problem.repeat or bound is None or len(fixed) == problem.system.states:

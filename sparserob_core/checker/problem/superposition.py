@@ -101,18 +101,9 @@ class ParameterExpansion:
         ]
 
     def depends(self, entry: object) -> tuple[np.ndarray, np.ndarray]:
-        """Return which entries of a matrix may differ from 0, and which depend on a parameter, at any time.
-
-        Returns
-        -------
-        tuple[np.ndarray, np.ndarray]
-            Booleans ``(rows, columns)`` and ``(nu, rows, columns)``.
-
-        Raises
-        ------
-        Unchecked
-            Where an entry is no affine function of the parameters.
-        """
+        """Return which entries of a matrix may differ from 0, and which depend on a parameter, at any time: Booleans
+        ``(rows, columns)`` and ``(nu, rows, columns)``; raise `Unchecked` where an entry is no affine function of the
+        parameters."""
         movable = [frozenset([j]) if scale else frozenset[int]() for j, scale in enumerate(self.scales)]
         matrix = _evaluate_matrix(entry, [Affine(), *map(Affine, movable)])
         nonzero, dependent = np.zeros(matrix.shape, dtype=bool), np.zeros((len(movable), *matrix.shape), dtype=bool)
@@ -125,10 +116,8 @@ class ParameterExpansion:
         return nonzero, dependent
 
     def tables(self, entry: object, time: object) -> list[np.ndarray]:
-        """Return ``f_0, f_1, ..., f_nu`` of a matrix at a time.
-
-        ``f_0`` is the matrix in the middle, and ``f_j`` its change where parameter ``j`` deviates by its `scales`.
-        """
+        """Return ``f_0, f_1, ..., f_nu`` of a matrix at a time: ``f_0`` in the middle, ``f_j`` its change where
+        parameter ``j`` deviates by its `scales`."""
         zero: Any = 0.0 * time  # type: ignore[operator]  # a number of the kind of the time
         middle, dependent = [zero + value for value in self.middle], self.depends(entry)[1]
         tables = [_evaluate_matrix(entry, [time, *middle])]
@@ -230,10 +219,8 @@ class Larger:
 
 
 def parted(problem: OptimalControlProblem) -> OptimalControlProblem:
-    """Return the problem with coordinates for the parameters of a system that changes with time.
-
-    It is the problem itself where there are no such parameters, or the state is not shown to be affine in them.
-    """
+    """Return the problem with coordinates for the parameters of a system that changes with time; the problem itself
+    where there are none, or the state is not shown to be affine in them."""
     system = problem.system
     if not system.varies or system.parameters is None:
         return problem
@@ -310,11 +297,8 @@ def _deduplicate_rows(blocks: list[Array]) -> Array:
 
 
 def _extend_set(bound: ConvexSet, corners: list[Array]) -> list[ConvexSet]:
-    """Return sets of the larger state: it is in all of them where ``x`` is in a given set at every corner.
-
-    A set with flat sides becomes one polytope with the rows of all corners, another set becomes one set for each
-    corner.
-    """
+    """Return sets of the larger state: it is in all of them where ``x`` is in a given set at every corner. A flat set
+    becomes one polytope, another set one set for each corner."""
     facets = bound.halfspaces()
     if facets is not None:
         rows = _deduplicate_rows([np.column_stack([facets[0] @ projection, facets[1]]) for projection in corners])

@@ -14,11 +14,8 @@ from sparserob_core.control.sets.sets import Box
 
 
 def in_turns(problem: OptimalControlProblem) -> OptimalControlProblem:
-    """Return the problem with such a system where that is needed, else the problem itself.
-
-    It is needed for errors of execution with switches, a delay or parameters, and for measurable disturbances with a
-    box of parameters.
-    """
+    """Return the problem with such a system where that is needed, else the problem itself: for errors of execution with
+    switches, a delay or parameters, and for measurable disturbances with a box of parameters."""
     system = problem.system
     is_execution_case = problem.execution is not None and bool(
         system.switches or system.delay or system.parameter_count

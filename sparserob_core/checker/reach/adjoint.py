@@ -68,13 +68,8 @@ class AdjointFlow:
 
     @staticmethod
     def of(A: arb_mat, F: arb_mat, horizon: float, clock: Clock) -> AdjointFlow:
-        """Return the flow up to the ``horizon``, with inputs by ``F (d, q)``.
-
-        Raises
-        ------
-        Unchecked
-            If the system is too fast, or has too many states, for this horizon.
-        """
+        """Return the flow up to the ``horizon``, with inputs by ``F (d, q)``; raise `Unchecked` where the system is too
+        fast, or has too many states."""
         plain, speed = middles(A), np.abs(middles(F)).sum(axis=1)
         units = balanced(plain, horizon, speed)
         step = choose_step(plain * units / units[:, None], horizon)
@@ -153,11 +148,8 @@ class AdjointFlow:
 
 def choose_step(A: Array, horizon: float) -> float:
     """Return the length of a step, a power of two, such that a polynomial has about `REST` of a row as truncation
-    error.
-
-    ``A`` is in units in which it is small. Floats suffice, since the truncation error is bounded wherever the step
-    ends. The choice uses a power of ``A``, which is often far smaller than the power of its norm.
-    """
+    error, which is bounded wherever the step ends. ``A`` is in units in which it is small; its power is often far
+    smaller than that of its norm."""
     size = float(np.abs(A).sum(axis=1).max(initial=0.0))
     if not size < 2.0**1000:
         raise Unchecked("the system is too fast for its horizon to be followed")
@@ -232,11 +224,9 @@ class AdjointRow:
 
     @cached_property
     def sums(self) -> Enclosed:
-        """The integrals of ``l'F`` from 0 to the ends of all steps, 0 itself first, ``(N + 1, q)``.
-
-        The radius grows from step to step by the error bound of this step. So the difference of two radii bounds the
-        error of the difference of both integrals, apart from the rounding of each to a float, which is not in it.
-        """
+        """The integrals of ``l'F`` from 0 to the ends of all steps, 0 itself first, ``(N + 1, q)``. The radius grows
+        from step to step, so that the difference of two radii bounds the error of the difference of both integrals,
+        apart from their rounding to floats."""
         increments, size = (
             self.step * np.einsum("kjq,j->kq", terms, self._integration_weights)
             for terms in (self.driven.mid, np.abs(self.driven.mid))
@@ -274,14 +264,8 @@ class AdjointRow:
         return Enclosed(mid, rad)
 
     def integrals(self, times: Array) -> tuple[Enclosed, Array]:
-        """Return the integrals of ``l'F`` from 0 to exact times ``(...)``, and 0 for negative times.
-
-        Returns
-        -------
-        tuple
-            The integrals ``(..., q)`` with radii as in `sums`, and bounds of the rounding errors made here and by the
-            floats of `sums`, ``(..., q)``.
-        """
+        """Return the integrals of ``l'F``, ``(..., q)``, from 0 to exact times ``(...)``, 0 for negative times, with
+        radii as in `sums`; and bounds of the rounding errors made here and by the floats of `sums`."""
         steps, shares = self.placed(np.maximum(times, 0.0))
         powers = self.step * shares[..., None] ** np.arange(1, ORDER + 2) * self._integration_weights
         mid = np.einsum("...jq,...j->...q", self.driven.mid[steps], powers)
@@ -519,18 +503,8 @@ class Worst:
         return slice(self.drives.mid.shape[0], None)
 
     def along(self, time: float, deviation: Array, changes: Array, signal: Array | None) -> tuple[float, float]:
-        """Return a lower and an upper bound of ``c'x(t)`` at a time along one trajectory.
-
-        Parameters
-        ----------
-        time
-            The time.
-        deviation
-            The initial deviation from the centre, ``(d,)``.
-        changes, signal
-            Times ``(M + 1,)``, and the disturbance between them, ``(mw, M)``; the signal is ``None`` without a
-            disturbance.
-        """
+        """Return a lower and an upper bound of ``c'x(t)`` at a time along one trajectory: with an initial ``deviation
+        (d,)`` from the centre, and a disturbance ``signal (mw, M)`` between ``changes (M + 1,)``, or ``None``."""
         times = np.array([time])
         row = self.adjoint.at(times)
         value, rad = self._evaluate_inputs(times)
@@ -551,10 +525,7 @@ class Worst:
         return float(value[0]) - error, float(value[0]) + error
 
     def _evaluate_inputs(self, times: Array) -> tuple[Array, Array]:
-        """Return what the known inputs add to the row at ``times (k,)``, and the error bounds, ``(k,)`` each.
-
-        An interval on which all inputs are exactly 0 counts as one without inputs.
-        """
+        """Return what the known inputs add to the row at ``times (k,)``, and the error bounds, ``(k,)`` each."""
         mid, rad, size = np.zeros(times.size), np.zeros(times.size), np.zeros(times.size)
         used = self.drives.mid.shape[0]
         for k, (start, stop) in enumerate(zip(self.grid[:-1], self.grid[1:], strict=True)):
@@ -696,10 +667,7 @@ class Worst:
 
     def over(self, start: Array, stop: Array, beside: Array | float = 0.0) -> Array:
         """Return upper bounds ``(k,)`` of the largest value on cells from ``start (k,)`` to ``stop (k,)``, each between
-        two `cuts`.
-
-        The values ``beside (2, k)`` are added at both ends of every cell, and linearly in between.
-        """
+        two `cuts`, with the values ``beside (2, k)`` at both ends, and linear in between."""
         ends, positions = np.unique(np.concatenate([start, stop]), return_inverse=True)
         batch_size = max(1, AT_ONCE // self.adjoint.motion.states)  # the adjoints at all ends take much memory
         bounds = [self.most(ends[k : k + batch_size])[0] for k in range(0, ends.size, batch_size)]

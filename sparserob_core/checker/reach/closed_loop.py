@@ -267,17 +267,9 @@ class VerifiedLoop:
         return bisect_right(self.breakpoints, (self.grid[piece] + self.grid[piece + 1]) / 2) - 1
 
     def heights(self, state: arb_mat, rows: Array | arb_mat, beside: arb_mat | None = None) -> list[arb]:
-        """Return the largest ``c'x`` over all deviations, for every row ``c``, in balls.
-
-        Parameters
-        ----------
-        state
-            The nominal state and the responses at a time, ``(d, 1 + Q)``.
-        rows
-            The rows ``c``, ``(r, d)``.
-        beside
-            A nominal value and responses that are added to each row, ``(r, 1 + Q)``.
-        """
+        """Return the largest ``c'x`` over all deviations, for every row ``c`` of ``rows (r, d)``, from a nominal
+        ``state`` and its responses ``(d, 1 + Q)``. A nominal value and responses ``beside (r, 1 + Q)`` are added to
+        each row."""
         product = exactly(rows) * state
         along = (product if beside is None else product + beside).tolist()
         supports = self.deviations.supports([row[1:] for row in along])

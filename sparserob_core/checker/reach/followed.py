@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 from typing import final
 
 import numpy as np
 
+from sparserob_core.checker.arithmetic.remembered import remembered
 from sparserob_core.checker.arithmetic.series import stacked
 from sparserob_core.checker.flow.still import modes_at
 from sparserob_core.checker.problem.disturbances import Disturbances
@@ -38,7 +39,6 @@ class FollowedRows:
     stated: OptimalControlProblem
     timing: Timing
     disturbances: Disturbances
-    _adjoints: dict[bytes, AdjointRow] = field(default_factory=dict, repr=False)
 
     @cached_property
     def running(self) -> RunningIntegrals | None:
@@ -86,10 +86,8 @@ class FollowedRows:
         return AdjointFlow.of(A, B, self.timing.grid[-1], self.timing.clock)
 
     def worst(self, c: Array, scene: Scene | None) -> Worst:
-        """Return the worst case of the row ``c'x``, ``c (d,)``, under the control of a ``scene``, or without a control.
-
-        One adjoint serves a row and its opposite.
-        """
+        """Return the worst case of the row ``c'x``, ``c (d,)``, under the control of a ``scene``, or without a
+        control."""
         problem = self.problem
         inputs = problem.system.controls + problem.system.drifts
         table = Enclosed(*np.zeros((2, inputs, len(self.timing.grid) - 1)))
@@ -120,10 +118,9 @@ class FollowedRows:
                 return Stopped(rows, [(*rows[0], 0.0)] if len(terms) == 1 else ())
         return self._remember_adjoint(c)
 
+    @remembered(key=lambda self, c: (c + 0.0).tobytes())  # -0 becomes 0, so that equal rows have equal bytes
     def _remember_adjoint(self, c: Array) -> AdjointRow:
         """Return the adjoint of a row ``c (d,)``, which is made once for the row and its opposite."""
-        adjoints, c = self._adjoints, c + 0.0  # turns -0 into 0, so that equal rows have equal bytes
-        if c.tobytes() not in adjoints:
-            opposite = adjoints.get((0.0 - c).tobytes())
-            adjoints[c.tobytes()] = AdjointRow.of(self.flow, c) if opposite is None else opposite.reversed()
-        return adjoints[c.tobytes()]
+        c, opposite = c + 0.0, 0.0 - c
+        is_first = c.tobytes() <= opposite.tobytes()
+        return AdjointRow.of(self.flow, c) if is_first else self._remember_adjoint(opposite).reversed()

@@ -54,17 +54,9 @@ class BoundedInput(ABC):
 
     @abstractmethod
     def over(self, c: Array, times: Sequence[float], within: tuple[Corners, Around] | None) -> Added:
-        """Return bounds of what the worst input adds to ``c'x`` at one or two times.
-
-        Parameters
-        ----------
-        c
-            The row, ``(d,)``.
-        times
-            One time, or two times without a mark between them.
-        within
-            The corners of a box of parameters, and the monomials on it; ``None`` for a known system.
-        """
+        """Return bounds of what the worst input adds to ``c'x``, ``c (d,)``, at one time, or at two without a mark
+        between them, over the corners ``within`` of a box of parameters with its monomials; ``None`` for a known
+        system."""
 
 
 class BoundedInputHere(BoundedInput):
@@ -98,14 +90,8 @@ class BoundedInputHere(BoundedInput):
 
 def pushes(law: VerifiedFlow, start: float, stop: float, columns: slice) -> Enclosed:
     """Return the kernel of an interval without marks: its length times some ``columns`` of ``Phi(stop, s) [B c E](s)``.
-
-    The kernel is a polynomial in ``u``, where ``(1 + u) / 2`` is the share of the interval that is left at ``s``.
-
-    Returns
-    -------
-    Enclosed
-        Coefficients ``(p + 1, M, d, m)`` of powers of ``u`` from -1 to 1; the remainder is in the radius of the first.
-    """
+    Its coefficients ``(p + 1, M, d, m)`` are those of powers of ``u`` from -1 to 1, where ``(1 + u) / 2`` is the share
+    of the interval that is left at ``s``; the remainder is in the radius of the first."""
     from flint import arb, arb_mat
 
     terms, remainder = law.kernel(start, stop)
@@ -121,23 +107,12 @@ def above_chord(
     law: VerifiedFlow, rows: Array | arb_mat, start: float, stop: float, begun: Array, size: Array, first: int
 ) -> Array:
     """Return upper bounds ``(r,)`` of how far sums of integrals of ``|c'Phi(t, s) B_j(s)|`` up to ``t`` lie above their
-    chords on ``[start, stop]``, at every parameter.
+    chords on a cell between two marks, at every parameter, for ``rows (r, d)``. ``begun (d,)`` bounds these sums at
+    ``start`` for every state, ``size (m,)`` the inputs, which enter by the columns from the ``first`` one on.
 
-    An integrand that started before is ``|c'Phi(t, start) y|``. It lies above its chord by no more than
-    ``c'Phi(t, start) y`` differs from its own chord: a term ``a s^n`` by at most ``(n - 1) n^(-n / (n - 1)) |a|``. What
-    starts within the cell has a second derivative of at least ``-|c'B'| - |c'A B| - int |c'(A' + A^2) Phi B| ds``.
-
-    Parameters
-    ----------
-    rows
-        The rows ``c``, ``(r, d)``.
-    start, stop
-        The ends of a cell that lies between two marks.
-    begun
-        The upper bound of these sums at ``start`` for every state in the place of ``c'x``, ``(d,)``.
-    size
-        The upper bound of the inputs, ``(m,)``, which enter by the columns of ``[B c E]`` from the ``first`` one on.
-    """
+    An integrand that started before is ``|c'Phi(t, start) y|``. It lies above its chord by no more than ``c'Phi(t,
+    start) y`` differs from its own chord: a term ``a s^n`` by at most ``(n - 1) n^(-n / (n - 1)) |a|``. What starts
+    within the cell has a second derivative of at least ``-|c'B'| - |c'A B| - int |c'(A' + A^2) Phi B| ds``."""
     lines, width = exactly(rows), (stop - start) * (1.0 + rounding(2))
     enclosure, d = Enclosed.of(lines), lines.ncols()
     row_bounds = np.abs(enclosure.mid) + enclosure.rad

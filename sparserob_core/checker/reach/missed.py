@@ -151,14 +151,9 @@ class BoundedInputAt(BoundedInputHere):
         return at_least - rounding_error * OUTWARD, at_most + rounding_error * OUTWARD
 
     def _bound_integrals(self, rows: Array, time: float, pieces: np.ndarray) -> tuple[Array, Array, np.ndarray]:
-        """Return bounds of the integrals of the support functions of all sides along ``c'Phi(t, s) B(s)`` for ``rows
-        (n, d)``, over the intervals between marks among ``pieces`` that begin before ``time``.
-
-        Returns
-        -------
-        tuple
-            Lower bounds ``(q, n, S)``, upper bounds ``(q, n, S)``, and the indices ``(q,)`` of these intervals.
-        """
+        """Return lower and upper bounds ``(q, n, S)`` of the integrals of the support functions of all sides along
+        ``c'Phi(t, s) B(s)`` for ``rows (n, d)``, over the intervals among ``pieces`` that begin before ``time``; and
+        their indices ``(q,)``."""
         begins, rows = np.array(self.marks[:-1]), self.input.reaching(rows)
         indices = pieces[begins[pieces] < time]
         if not indices.size:
@@ -256,17 +251,9 @@ class BoundedInputOver(BoundedInput):
         return Added(ends, (gap + fit_error + total + 2.0 * remainder + chord_error) * OUTWARD, over * OUTWARD, wide)
 
     def _bound_curvature(self, c: Array, times: Sequence[float], box: ParameterBox) -> tuple[Array, float, float]:
-        """Return bounds of what the curvature adds on a box of parameters.
-
-        Returns
-        -------
-        wide
-            How far the integrals may lie above the interpolation between corners, due to each parameter, ``(nu,)``.
-        remainder
-            The upper bound of what the remainder of the expansion adds to the integrals.
-        chord_error
-            How far the integrals may lie above their chord between the ``times``; 0 at a single time.
-        """
+        """Return bounds of what the curvature adds on a box: how far the integrals may lie above the interpolation
+        between corners, due to each parameter, ``(nu,)``; what the remainder of the expansion adds; and how far they
+        may lie above their chord between two ``times``."""
         flow = self.flows.holding(box)
         halves = np.array(flow.box.halves)
         shares = np.array(box.halves) / np.where(halves > 0.0, halves, 1.0) * (1.0 + rounding(4))

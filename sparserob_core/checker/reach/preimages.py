@@ -61,24 +61,11 @@ class Pushed:
 
     @staticmethod
     def of(modes: Sequence[tuple[arb_mat, arb_mat]], vectors: Sequence[Sequence[Fraction]]) -> Pushed:
-        """Return the reached states for a disturbance along ``vectors (q, mw)``, without rounding: the entries of the
-        systems must be floats.
+        """Return the reached states for a disturbance along ``vectors (q, mw)``, without rounding; `Unchecked` unless
+        the entries of all systems ``A (d, d)``, ``E (d, mw)`` are floats.
 
         The reached subspace is the smallest one that holds the columns of every ``E`` along the vectors and that no
-        ``A`` leaves. It is found within ``d`` steps.
-
-        Parameters
-        ----------
-        modes
-            The matrices ``A (d, d)`` and ``E (d, mw)`` of every system.
-        vectors
-            The vectors along which the disturbance deviates, ``(q, mw)``.
-
-        Raises
-        ------
-        Unchecked
-            If the numbers of a system are not exact.
-        """
+        ``A`` leaves. It is found within ``d`` steps."""
         from flint import fmpq, fmpq_mat
 
         if not all(x.is_exact() for mode in modes for matrix in mode for x in matrix.entries()):
@@ -161,16 +148,8 @@ class SeenDeviations:
 
     def inverse(self) -> arb_mat:
         """Return a matrix ``(c, r)`` that gives, for the innovations of any deviations, deviations with the same
-        innovations.
-
-        Of all such deviations they are the shortest, in units of powers of two that are near ``reach`` where it is
-        given.
-
-        Raises
-        ------
-        Unchecked
-            If balls do not show as many independent rows as there can be.
-        """
+        innovations, the shortest in units of powers of two near ``reach``. Raise `Unchecked` if balls do not show as
+        many independent rows as there can be."""
         from flint import ctx
         from scipy.linalg import qr
 

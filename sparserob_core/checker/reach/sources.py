@@ -93,15 +93,9 @@ class Sources:
         return [source if parameter is None else source.at(parameter) for source in sources if source is not None]
 
     def erring(self, c: Array, time: float, parameter: Sequence[float]) -> tuple[Array | None, arb]:
-        """Return lower bounds of what errors of execution add to ``c'x(t)`` at a parameter.
-
-        Returns
-        -------
-        sizes
-            The bounds for a command of size 1 on every piece, ``(K, m)``; ``None`` where there are no such errors.
-        given
-            The bound for the control that acts until the delay is over; 0 without a delay.
-        """
+        """Return lower bounds of what errors of execution add to ``c'x(t)`` at a parameter: for a command of size 1 on
+        every piece, ``(K, m)`` or ``None``, and for the control that acts until the delay is over, 0 without a
+        delay."""
         delivered = self.delivered_at(parameter)
         bounds, none = None if delivered is None else delivered.least(c, time), ball(0)
         if bounds is None or not self.problem.system.delay > 0.0:

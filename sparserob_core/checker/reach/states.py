@@ -164,27 +164,11 @@ class States:
     def seen(
         self, basis: Array, place: int, start: float, stop: float, order: int
     ) -> tuple[Enclosed, list[tuple[ConvexSet, Enclosed]]]:
-        """Return the states projected onto rows, on a part of an interval between marks, as polynomials.
+        """Return the states projected onto rows ``basis (b, d)`` on a part from ``start`` to ``stop`` of the interval
+        number ``place`` between marks, as polynomials of at most ``order = J`` terms in the share of the part.
 
-        Parameters
-        ----------
-        basis
-            The rows, ``(b, d)``.
-        place
-            The index of the interval between marks.
-        start, stop
-            The ends of the part; both may be the same.
-        order
-            The largest number of terms, ``J``, in the share of the part that has passed; at a single time there is one.
-
-        Returns
-        -------
-        Enclosed
-            The undisturbed state, ``(J, M, b)``.
-        list
-            For the disturbance and for the initial deviation, as far as there are any: the set, and the effect per unit
-            of every entry on every block, ``(blocks, J, M, w, b)``.
-        """
+        They are the undisturbed state, ``(J, M, b)``; and for the disturbance and the initial deviation, as far as
+        there are any, the set and the effect per unit of every entry on every block, ``(blocks, J, M, w, b)``."""
         flow, scene, d, m = self.flow, self.scene, self.flow.states, self.flow.driven
         begin, end, order = self.marks[place], self.marks[place + 1], 1 if start == stop else order
         segment, share = flow.segment(begin, end)
@@ -284,11 +268,8 @@ class Lines:
         return Lines(terms, np.abs(basis) @ segment.off * OUTWARD, np.abs(basis) @ segment.powers.sizes * OUTWARD)
 
     def shifted(self, first: float, width: float, order: int) -> Enclosed:
-        """Return the rows on a part of the segment, from the share ``first`` on and of this ``width``.
-
-        They are at most ``order`` terms in powers of the share of the part, ``(J, M, b, d + w)``. The remainder is in
-        the radius of the first.
-        """
+        """Return the rows on a part of the segment, from the share ``first`` on and of this ``width``: at most
+        ``order`` terms in powers of its share, ``(J, M, b, d + w)``, with the remainder in the radius of the first."""
         count = len(self.terms.mid)
         table = shifted(first, width, count)
         kept, size = table[:order], np.abs(self.terms.mid)

@@ -135,25 +135,9 @@ class VerifiedTube:
         return Enclosed.of(stacked(table))
 
     def cells(self, piece: int, start: float, stop: float, z: Array, sharp: bool = False) -> list[Polynomial]:
-        """Return polynomials near the largest ``c'x`` over all deviations, with their errors, for every direction
-        ``c = z_i'basis``.
-
-        Parameters
-        ----------
-        piece
-            The index of a piece of the grid.
-        start, stop
-            The ends of the cell, a part of this piece without marks.
-        z
-            The combinations of the basis, ``(k, b)``.
-        sharp
-            Whether to reduce the error due to disturbances that switch, where the set is round; this takes longer.
-
-        Returns
-        -------
-        list of Polynomial
-            One polynomial for every direction.
-        """
+        """Return polynomials near the largest ``c'x`` over all deviations, for every direction ``c = z_i'basis``, ``z
+        (k, b)``, on a cell of time, a part of a piece of the grid without marks. Where it is ``sharp``, the error due
+        to disturbances that switch is smaller, if the set is round; this takes longer."""
         states = self.rows.states
         interval = states.place(piece, start)
         state, effects = self.rows.on(interval, start, stop)
@@ -187,26 +171,13 @@ class VerifiedTube:
 def bound_supports(
     shape: Shape, monomials: Monomials, every: Array, errors: Array, z: Array, sharp: bool
 ) -> tuple[Array, Array, Array, Array]:
-    """Return polynomials that, with their errors, are upper bounds of the sum over pieces of a set's support function.
+    """Return polynomials that, with their errors, are upper bounds of the sum over pieces of a set's support function,
+    at combinations ``z (k, b)`` of arguments ``every (pieces, J + 1, M, mw, b)`` with ``errors``; smaller where
+    ``sharp``.
 
-    Parameters
-    ----------
-    shape, monomials
-        The set, and the monomials of the parameters.
-    every, errors
-        The arguments of the support function, ``(pieces, J + 1, M, mw, b)``, and their error bounds.
-    z
-        The combinations of the arguments, ``(k, b)``.
-    sharp
-        Whether to take a smaller bound where the set is round, which takes longer.
-
-    Returns
-    -------
-    tuple
-        The coefficients ``(k, J + 1, M)``; their errors ``(k,)``; how much the bounds may be above the true value
-        because the worst point of the set switches, ``(k,)``; and about how much of that is due to the size of the box
-        of parameters.
-    """
+    They are coefficients ``(k, J + 1, M)``; their errors ``(k,)``; how much they may be above the true value because
+    the worst point of the set switches, ``(k,)``; and about how much of that is due to the size of the box of
+    parameters."""
     pieces = every.shape[0]
     mid, w, argument_errors, error, kinks, share = _bound_linearly(shape, every, errors, z, pieces)
     k, mw = mid.shape[0], mid.shape[-1]
@@ -232,17 +203,12 @@ def bound_supports(
 def _bound_linearly(
     shape: Shape, every: Array, errors: Array, z: Array, count: int
 ) -> tuple[Array, Array, Array, Array, Array, Array]:
-    """Return linear upper bounds of the support function of each piece, by a point of the set that is best or nearly
-    so in the middle of the range of the arguments.
+    """Return linear upper bounds of the support function of each piece, by a point of the set that is best or nearly so
+    in the middle of the range of the arguments.
 
-    Returns
-    -------
-    tuple
-        The arguments ``(k, pieces, J + 1, M, mw)`` for the combinations ``z (k, b)``; the points ``(k, pieces, mw)``;
-        the error bounds of the arguments, ``(k, pieces, mw)``, where up to ``count`` pieces are added up; the errors of
-        the bounds, ``(k, pieces)``; their parts due to switching; and about which share of these is due to the box of
-        parameters.
-    """
+    They are the arguments ``(k, pieces, J + 1, M, mw)``; the points and the errors of the arguments, ``(k, pieces,
+    mw)``, where up to ``count`` pieces are added up; the errors of the bounds, ``(k, pieces)``; their parts due to
+    switching; and about which share of these is due to the box of parameters."""
     mid = np.einsum("ljkwb,ib->iljkw", every, z)
     rad = np.einsum("ljkwb,ib->iljkw", errors + rounding(z.shape[1]) * np.abs(every), np.abs(z)) * OUTWARD
     k, pieces, mw = mid.shape[0], mid.shape[1], mid.shape[-1]

@@ -173,11 +173,7 @@ def _evaluate_support(shape: Shape, about: Array, c: Array) -> tuple[Array, Arra
 
 def _bound_support(shape: Shape, about: Array, c: Array, spread: Array) -> Array:
     """Return bounds ``(k,)`` of the absolute value of the support function of the set minus the point at complex
-    directions.
-
-    The directions are those within ``spread (k, d)`` of ``c (k, d)``. A bound is ``inf`` where the function is not
-    shown to be analytic at all of them.
-    """
+    directions within ``spread (k, d)`` of ``c (k, d)``; ``inf`` where it is not shown to be analytic at all of them."""
     L, share, q = shape.norm_matrix()
     y, b = np.abs(c @ L), spread @ np.abs(L)
     unit = np.maximum((y + b).max(axis=1, keepdims=True), TINY)
@@ -198,12 +194,9 @@ def _bound_support(shape: Shape, about: Array, c: Array, spread: Array) -> Array
 
 
 def _bound_dominated_norm(y: Array, b: Array, q: float) -> Array:
-    """Return bounds of the ``q``-norm within ``b (k, d)`` of ``y (k, d)``, both nonnegative, where one entry dominates.
-
-    The entries are divided by the dominating one. Where the powers of all others add up to less than 1, the sum of all
-    is away from 0; elsewhere the bound is ``inf``. For a large ``q`` one entry dominates nearly everywhere, while a
-    power changes by its own size where its base changes by a share ``1 / q``.
-    """
+    """Return bounds of the ``q``-norm within ``b (k, d)`` of ``y (k, d)``, both nonnegative, where one entry dominates:
+    divided by it, the powers of all others add up to less than 1. For a large ``q`` that is so nearly everywhere, while
+    a power changes by its own size where its base changes by a share ``1 / q``."""
     lead = y.argmax(axis=1)[:, None]
     low, high = (np.take_along_axis(end, lead, axis=1) for end in (y - b, y + b))
     quotients = np.where(low > 0.0, (y + b) / np.where(low > 0.0, low, 1.0), 1.0)

@@ -297,15 +297,12 @@ def _compute_power(value: arb, exponent: arb) -> arb:
 
 
 def _bound_ellipsoid(centre: Array, S: Array, value: Array, spread: Array, power: int = 0) -> tuple[Array, Array]:
-    """Return linear upper bounds of the support function of an ellipsoid: a point, and an excess, as `Shape.bound`
-    does.
-
-    The ellipsoid has the matrix ``S``, enlarged by the factor ``2^power``. The excess is of second order in ``spread``:
-    in the norm of the set, ``|f| - f0'f / |f0| <= |f - f0|^2 / (2 (|f0| - |f - f0|))``.
+    """Return linear upper bounds of the support function of an ellipsoid with the matrix ``S``, enlarged by
+    ``2^power``, as `Shape.bound` does. In the norm of the set, ``|f| - f0'f / |f0| <= |f - f0|^2 / (2 (|f0| - |f -
+    f0|))``.
 
     Directions are scaled by powers of two, such that the largest support value of an entry is from 1/2 to 1. Otherwise
-    squares of numbers below 1e-162 would be 0, and the set a point.
-    """
+    squares of numbers below 1e-162 would be 0, and the set a point."""
     largest_support = (np.maximum(np.abs(value), spread) * np.sqrt(np.diag(S))).max(axis=1)
     shift = np.frexp(np.where(np.isfinite(largest_support), largest_support, 1.0))[1][:, None]
     value, spread = np.ldexp(value, -shift), np.ldexp(spread, -shift)

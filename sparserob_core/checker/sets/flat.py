@@ -46,11 +46,8 @@ class Flat(Shape):
         return self.listed
 
     def least(self, ups: Sequence[arb], downs: Sequence[arb], slope: Sequence[arb]) -> arb:
-        """Return a lower bound of ``min sum_i ups_i max(u_i, 0) + downs_i max(-u_i, 0) + slope_i u_i`` over the set.
-
-        The coordinate planes cut the set, or one that is larger by rounding, into parts on which the function is
-        linear. Its minimum is attained at a corner of a part.
-        """
+        """Return what `Shape.least` says. The coordinate planes cut the set, or one that is larger by rounding, into
+        parts on which the function is linear. Its minimum is attained at a corner of a part."""
         rows = tuple((*map(float, c), float(b) if b == float(b) else above(b)) for c, b in self.holding)
         return _find_least(
             [
@@ -260,12 +257,9 @@ class Segments(Flat):
 
     @cached_property
     def facets(self) -> list[Facet] | None:
-        """The facets, with normals in floats and limits drawn inwards; ``None`` where there are too many.
-
-        A facet is spanned by one segment fewer than the dimension of the span of all segments. Its normal is a float
-        vector of length 1 near the exact normal. Its limit is drawn inwards, such that a point within it, up to twice
-        as large as the set, cannot be outside the exact facet.
-        """
+        """The facets, ``None`` where there are too many. Each is spanned by one segment fewer than the dimension of the
+        span. Its normal is rounded to floats, and its limit drawn inwards, such that no point within it, up to twice as
+        large as the set, is outside the exact facet."""
         if self.source.halfspaces() is None:  # too many facets: a run treats the set as curved
             return None
         reach, facets = 2 * total(balls(self.radius)), []
@@ -401,10 +395,7 @@ def _compute_length(row: Sequence[Fraction]) -> float:
 
 
 def _compute_widths(rows: Sequence[list[Fraction]]) -> list[Fraction]:
-    """Return the largest absolute value of every column, 1 where all are 0.
-
-    The columns are coordinates in different units. A vector that is short relative to another coordinate is not thin.
-    """
+    """Return the largest absolute value of every column, 1 where all are 0: coordinates may be in different units."""
     return [max(map(abs, column)) or Fraction(1) for column in zip(*rows, strict=True)]
 
 
@@ -483,15 +474,8 @@ def _find_least(values: Sequence[arb]) -> arb:
 def _find_intersections(
     rows: tuple[tuple[float, ...], ...], planes: tuple[int, ...]
 ) -> tuple[tuple[Fraction, ...], ...]:
-    """Return the points of ``{x : H x <= h}`` where ``d`` of its facets and of the coordinate ``planes`` meet.
-
-    The rows are ``(*H_i, h_i)``, and the arithmetic is rational.
-
-    Raises
-    ------
-    Unchecked
-        Where the intersections are too many to be listed, or the polytope has no corners.
-    """
+    """Return the points of ``{x : H x <= h}``, rows ``(*H_i, h_i)``, where ``d`` of its facets and of the coordinate
+    ``planes`` meet, in rational arithmetic; `Unchecked` where they are too many, or none."""
     from flint import fmpq, fmpq_mat
 
     d = len(rows[0]) - 1

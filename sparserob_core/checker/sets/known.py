@@ -41,15 +41,8 @@ KINDS: Mapping[type[ConvexSet], Callable[[Any], Shape]] = MappingProxyType(
 
 
 def known(source: ConvexSet) -> Shape:
-    """Return the `Shape` of a set at the working precision.
-
-    No claim rests on what the set's own class computes, nor on a subclass of a known kind.
-
-    Raises
-    ------
-    Unchecked
-        For a kind of set whose data the checker cannot read.
-    """
+    """Return the `Shape` of a set at the working precision; `Unchecked` for a kind whose data the checker cannot read.
+    No claim rests on what the set's own class computes, nor on a subclass of a known kind."""
     from flint import ctx
 
     if type(source) not in KINDS:

@@ -119,14 +119,8 @@ class Truncated:
 
 @lru_cache(maxsize=16)
 def _tabulate_products(monomials: Monomials) -> tuple[Array, Array, Array, Array]:
-    """Return the pairs of monomials whose product is kept.
-
-    Returns
-    -------
-    tuple[Array, Array, Array, Array]
-        The first and the second monomial of each pair, the matrix from pairs to products, and the matrix from monomials
-        to degrees.
-    """
+    """Return the first and the second monomial of each pair whose product is kept, the matrix from pairs to products,
+    and the matrix from monomials to degrees."""
     products = np.array(monomials.products)
     gather, degrees = np.zeros((len(products), monomials.size)), np.zeros((monomials.size, monomials.degree + 1))
     gather[np.arange(len(products)), products[:, 2]] = 1.0
@@ -135,17 +129,11 @@ def _tabulate_products(monomials: Monomials) -> tuple[Array, Array, Array, Array
 
 
 def lengths(monomials: Monomials, parts: Array) -> tuple[Array, Array, Array]:
-    """Return polynomials that bound the lengths ``|g|`` of vectors of polynomials ``g (n, J + 1, M, r)`` from above.
+    """Return polynomials above the lengths ``|g|`` of vectors of polynomials ``g (n, J + 1, M, r)``: coefficients ``(n,
+    J + 1, M)``, their errors ``(n,)``, and how far they may be too large, infinite where a vector may come near 0.
 
-    With ``|g|^2 = s^2 (1 + e)`` the length is ``s sqrt(1 + e) <= s (1 + e/2 - e^2/8 + e^3/16)``, since the fourth
-    derivative of the root is negative. The bound exceeds the length by a term of fourth order in ``e``.
-
-    Returns
-    -------
-    tuple[Array, Array, Array]
-        Coefficients ``(n, J + 1, M)``, their errors ``(n,)``, and how far the bound may be above the length in
-        addition, ``(n,)``; infinite where a vector may come near 0.
-    """
+    With ``|g|^2 = s^2 (1 + e)`` it is ``s sqrt(1 + e) <= s (1 + e/2 - e^2/8 + e^3/16)``, since the fourth derivative of
+    the root is negative. The bound exceeds the length by a term of fourth order in ``e``."""
     none = np.zeros(len(parts))
     with np.errstate(over="ignore", invalid="ignore"):
         return _bound_lengths(monomials, parts, none)

@@ -58,13 +58,8 @@ class Shape(ABC):
         """Return True where a point, ``(d,)`` balls, is proven to be in the set."""
 
     def contains(self, point: Sequence[float] | Array) -> bool:
-        """Return True where an exact point is proven to be in the set.
-
-        Raises
-        ------
-        Unchecked
-            Where the rounding of its coordinates may have moved the point out of the set.
-        """
+        """Return True where an exact point is proven to be in the set; raise `Unchecked` where the rounding of its
+        coordinates may have moved it out of the set."""
         if self.holds(balls(point)):
             return True
         if self.member(point, WRITTEN) is not None:
@@ -72,18 +67,9 @@ class Shape(ABC):
         return False
 
     def member(self, point: Sequence[float] | Array, near: float = NEAR) -> list[arb] | None:
-        """Return the point of the set that an exact point stands for; ``None`` where none is near.
-
-        It is the point itself, or a nearby one of the set, since floats are seldom in a thin set. In a set without an
-        interior it lies in the span of the `segments`.
-
-        Parameters
-        ----------
-        point
-            The exact point ``(d,)``.
-        near
-            The largest distance, relative to the size of the set or of the point, whichever is larger.
-        """
+        """Return the point of the set that an exact point ``(d,)`` stands for: itself, or one within ``near`` of the
+        size of the set or of the point, since floats are seldom in a thin set; ``None`` where none is. In a set without
+        an interior it lies in the span of the `segments`."""
         if self.segments is None and self.holds(balls(point)):
             return balls(point)
         candidate = self.nearest(np.asarray(point, dtype=float))
@@ -101,30 +87,14 @@ class Shape(ABC):
     @property
     def segments(self) -> list[tuple[list[Fraction], Fraction]] | None:
         """The vectors ``v (d,)`` along which the points of a thin set differ, each with a number ``c``; ``None`` for
-        other sets.
-
-        A thin set has no interior, or one that is negligible relative to its length. Its width along any ``a`` is at
-        least ``c |a'v|``. The vectors span a part of the set, and the whole set is close to that part.
-        """
+        other sets. Its width along any ``a`` is at least ``c |a'v|``. The vectors span a part of the set, and the whole
+        set is close to it."""
         return None
 
     @abstractmethod
     def bound(self, value: Array, spread: Array) -> tuple[Array, Array]:
-        """Return linear upper bounds of the support function on ranges of directions.
-
-        Parameters
-        ----------
-        value
-            Middles ``(k, d)`` of the ranges.
-        spread
-            Half the widths ``(k, d)`` of the ranges.
-
-        Returns
-        -------
-        tuple[Array, Array]
-            Points ``w (k, d)`` and ``excess (k,)`` with ``h(f) <= w'f + excess`` for every ``f`` within ``spread`` of
-            ``value``. The bound is sharp where ``spread`` is 0.
-        """
+        """Return points ``w (k, d)`` and ``excess (k,)`` with ``h(f) <= w'f + excess`` for every ``f`` within ``spread
+        (k, d)`` of ``value (k, d)``. The bound is sharp where ``spread`` is 0."""
 
     @property
     def round(self) -> tuple[Array, Array] | None:
@@ -203,11 +173,8 @@ class Shape(ABC):
 
     @cached_property
     def units(self) -> list[float]:
-        """The own unit of every facet of a flat set: the smallest nonzero one of several sizes.
-
-        The sizes are the largest absolute value of ``c'x`` over the set, the width to the opposite facet, and others
-        that the kind of set names.
-        """
+        """The own unit of every facet of a flat set: the smallest nonzero one of the largest absolute value of ``c'x``
+        over the set, the width to the opposite facet, and others that the kind of set names."""
         assert self.facets is not None
         return [
             smallest([width, max(_estimate_support(self, c), _estimate_support(self, -c)), *self._list_sizes(b)])
@@ -233,11 +200,8 @@ class Shape(ABC):
         raise Unchecked(f"the checker does not know how far a {self.source.kind} reaches")
 
     def point(self, direction: Array) -> list[arb]:
-        """Return a point of the set far out in a direction, in exact numbers and proven to be in the set.
-
-        The point is the centre where none better is proven. Floats would not suffice: a rounded point is far outside a
-        thin set that is oblique to the axes.
-        """
+        """Return a point of the set far out in a direction, in exact numbers and proven to be in the set; the centre
+        where none better is. A rounded point would be far outside a thin set that is oblique to the axes."""
         from flint import arb, ctx
 
         middle, offset, spare = balls(self.centre), self.far(balls(direction)), arb(2) ** (SPARE - ctx.prec)
@@ -259,11 +223,8 @@ class Shape(ABC):
     # All of them
 
     def sides(self, about: Array) -> list[Side | CurvedSide]:
-        """Return sets whose sum is the set minus a point ``about (d,)``.
-
-        A box has one for every channel, a zonotope one for every segment and one for its centre, a product those of its
-        factors.
-        """
+        """Return sets whose sum is the set minus a point ``about (d,)``: for a box one for every channel, for a
+        zonotope one for every segment and one for its centre, for a product those of its factors."""
         curved = CurvedSide(self, about)
         _ = curved.far  # raises `Unchecked` for a set that the checker does not know
         return [curved]
@@ -273,11 +234,9 @@ class Shape(ABC):
         return self.support(balls(direction))
 
     def least(self, ups: Sequence[arb], downs: Sequence[arb], slope: Sequence[arb]) -> arb:
-        """Return a lower bound of ``min sum_i ups_i max(u_i, 0) + downs_i max(-u_i, 0) + slope_i u_i`` over the set.
-
-        ``ups`` and ``downs`` are not negative. A linear function with any slope between ``-down`` and ``up`` is a lower
-        bound of the first two terms of a component.
-        """
+        """Return a lower bound of ``min sum_i ups_i max(u_i, 0) + downs_i max(-u_i, 0) + slope_i u_i`` over the set,
+        ``ups`` and ``downs`` not negative. A linear function with any slope from ``-down`` to ``up`` is below the first
+        two terms."""
         tilt = [
             s + ball(float(np.clip(-float(s), -float(down.lower()), float(up.lower()))))
             for up, down, s in zip(ups, downs, slope, strict=True)
@@ -302,18 +261,9 @@ class Shape(ABC):
         return [above(self.support(balls(axis)).max(self.support(balls(-axis)))) for axis in axes]
 
     def excess(self, point: Sequence[arb], beyond: Callable[[Array], arb] | None = None) -> tuple[float, str]:
-        """Return an upper bound of the distance by which a point may lie outside the set, and where.
-
-        The distance is relative to the own unit of each facet, which is at least what double precision resolves. For a
-        curved set it is along the gauge. It is 0 where the point is proven inside.
-
-        Parameters
-        ----------
-        point
-            The point, ``(d,)`` balls.
-        beyond
-            For a flat set, a function of a normal: what is added to the value of the point along it.
-        """
+        """Return an upper bound of the distance by which a point, ``(d,)`` balls, may lie outside the set, and where:
+        relative to the own unit of each facet, at least what double precision resolves, or along the gauge. ``beyond``
+        says what is added to the value along a normal."""
         if self.facets is None:
             assert beyond is None
             gauge = self.gauge([x - m for x, m in zip(point, balls(self.centre), strict=True)])
@@ -358,15 +308,8 @@ def widths(flat: Sequence[Facet]) -> list[float]:
 
 
 def facet(flat: Sequence[Facet], direction: Array) -> tuple[int, Fraction]:
-    """Return the number of the facet whose normal a direction is, and the factor between the two.
-
-    The factor is exact. Of several parallel facets it is the tightest one.
-
-    Raises
-    ------
-    Broken
-        Where the direction is the normal of no facet.
-    """
+    """Return the number of the facet whose normal a direction is, of parallel ones the tightest, and the exact factor
+    between the two; raise `Broken` where there is none."""
     index, best = int(np.abs(direction).argmax()), None
     for number, (c, b) in enumerate(flat):
         if c[index] * direction[index] <= 0.0:

@@ -53,11 +53,8 @@ class Curved:
     least: Callable[[Array, float], float]
 
     def bounded(self, z: Array, inside: Sequence[arb]) -> Bounded:
-        """Return the constraint in one direction, with a point ``inside`` the set as its limit.
-
-        Its unit is the distance along the direction from the centre of the set to the point, so that an excess is
-        judged along the gauge.
-        """
+        """Return the constraint in one direction, with a point ``inside`` the set as its limit. Its unit is the
+        distance along the direction from the centre to the point, so that an excess is judged along the gauge."""
         c = self.balls(z)
         height, middle = total(a * x for a, x in zip(c, inside, strict=True)), along(self.shape.centre, c)
         unit = max(0.0, below(height - middle))
@@ -121,10 +118,7 @@ class Sides:
 
     def slopes(self, tops: Sequence[float]) -> Array:
         """Return the mean difference of bounds ``tops`` between the two ends of every coordinate of the directions,
-        ``(b,)``.
-
-        It is what the bound on the cell loses, since the limit in the middle is the true one.
-        """
+        ``(b,)``: what the bound on the cell loses."""
         assert self.low is not None and self.high is not None
         free, slopes = np.flatnonzero(self.high > self.low), np.zeros(self.low.size)
         corners = np.asarray(tops, dtype=float).reshape((2,) * free.size)

@@ -48,12 +48,9 @@ class Side:
         return Side(*(np.pad(table, ((0, 0), (before, after))) for table in (self.corners, self.rad)))
 
     def swept(self, plain: Array, off: Array, sizes: Array, ends: Array) -> tuple[Array, Array, Array, Array]:
-        """Return the integrals of the support function along polynomials, over ``u`` from -1 to ``ends (n,)``.
-
-        Given are coefficients ``plain (n, p + 1, mw)``, their error bounds ``off (n, mw)``, and the sums ``sizes (n,
-        mw)`` of their absolute values. Returned are values, how much more and how much less the true integrals may be,
-        and bounds of the absolute support values without their errors, ``(n,)`` each.
-        """
+        """Return the integrals of the support function along polynomials ``plain (n, p + 1, mw)`` with error bounds
+        ``off`` and sums of absolute values ``sizes``, over ``u`` from -1 to ``ends (n,)``: values, how much more and
+        how much less they may be, and bounds of the absolute support values without their errors, ``(n,)`` each."""
         P = np.einsum("npw,vw->npv", plain, self.corners)
         e = (off @ (np.abs(self.corners) + self.rad).T + sizes @ self.rad.T) * OUTWARD
         return *swept(P, e, ends), np.abs(P).sum(axis=1).max(axis=1)
@@ -76,23 +73,9 @@ def integrate(sides: Sequence[Side | CurvedSide], plain: Array, off: Array) -> t
 
 
 def swept(P: Array, e: Array, ends: Array) -> tuple[Array, Array, Array]:
-    """Return the integral of the largest of several polynomials, over ``u`` from -1 to ``ends (M,)``.
-
-    Parameters
-    ----------
-    P
-        The coefficients of ``v`` polynomials for each of ``M`` integrals, ``(M, p + 1, v)``.
-    e
-        The error bounds of the polynomials, ``(M, v)``. They allow for the rounding errors in the sum of two of their
-        values.
-    ends
-        The upper limits of the integrals, ``(M,)``.
-
-    Returns
-    -------
-    tuple
-        Values, and how much more and how much less the true integral may be, ``(M,)`` each.
-    """
+    """Return the integrals of the largest of ``v`` polynomials ``P (M, p + 1, v)``, over ``u`` from -1 to ``ends
+    (M,)``, and how much more and how much less they may be. Error bounds ``e (M, v)`` of the polynomials allow for
+    rounding in the sum of two of their values."""
     orders = np.arange(P.shape[1])
     owners, start, stop = np.arange(len(P)), -np.ones(len(P)), ends.copy()
     value, excess, deficit = np.zeros(len(P)), np.zeros(len(P)), np.zeros(len(P))

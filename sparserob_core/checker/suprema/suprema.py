@@ -216,10 +216,8 @@ def _read_signal(case: Case, entry: Mapping[str, Any]) -> tuple[Array, Array | N
 
 
 def _refine_grid(case: Case, changes: Array, signal: Array | None) -> tuple[Case, object]:
-    """Return the case whose grid has the ``changes`` of a signal, and the signal on the pieces of that grid.
-
-    A measurable signal that is constant between the changes is one of a dictionary with these pieces.
-    """
+    """Return the case whose grid has the ``changes`` of a signal, and the signal on the pieces of that grid. A
+    measurable signal that is constant between the changes is one of a dictionary with these pieces."""
     if signal is None:
         return case, None
     if case.measurable:
