@@ -14,6 +14,7 @@ from sparserob_core.checker.claims.case import Case
 from sparserob_core.checker.claims.claims import check
 from sparserob_core.checker.outcome import Clock, Finding
 from sparserob_core.checker.sets.known import known
+from sparserob_core.checker.sets.shape import excess
 from sparserob_core.control.problem.dictionary import Dictionary
 
 INFINITY = np.inf
@@ -145,16 +146,16 @@ def test_a_row_of_a_polytope_of_controls_means_the_same_at_any_factor(factor: fl
     shape = sr.Polytope(H, h)
     assert known(shape).units[4] == pytest.approx(0.5 * factor, rel=1e-12)
     for point, over in (([0.25, 0.25 + 1e-8], 2e-8), ([0.95, 0.95], 2.8), ([0.25, 0.2], 0.0)):
-        found, where = known(shape).excess([arb(x) for x in point])
+        found, where = excess(known(shape), [arb(x) for x in point])
         assert found == pytest.approx(over, rel=1e-6)
         assert where == ("row 5" if over else "")
 
 
 def test_every_component_of_a_control_is_judged_in_its_own_range() -> None:
     shape = box([-1e-9, 0.0, 5.0], [1e-9, 1e6, 5.0])
-    assert known(shape).excess([arb(1.5e-9), arb(3.0), arb(5.0)])[0] == pytest.approx(0.5, rel=1e-6)
-    assert known(shape).excess([arb(0.0), arb(1e6 + 1e-3), arb(5.0)]) == (pytest.approx(1e-9, rel=1e-3), "u2")
-    assert known(shape).excess([arb(0.0), arb(0.0), arb(5.0 + 1e-12)])[0] > 1e-13
+    assert excess(known(shape), [arb(1.5e-9), arb(3.0), arb(5.0)])[0] == pytest.approx(0.5, rel=1e-6)
+    assert excess(known(shape), [arb(0.0), arb(1e6 + 1e-3), arb(5.0)]) == (pytest.approx(1e-9, rel=1e-3), "u2")
+    assert excess(known(shape), [arb(0.0), arb(0.0), arb(5.0 + 1e-12)])[0] > 1e-13
 
 
 def test_states_in_units_of_a_millionth_are_judged_as_before() -> None:

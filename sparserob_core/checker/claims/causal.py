@@ -43,7 +43,7 @@ SHARE = 1.0 - 2.0**-40  # of a price is shared, so that rounding does not share 
 
 def causal_bound(case: Case, data: Mapping[str, Any], priced: bool) -> arb:
     """Return a ball whose lower end is the bound that the signals and multipliers of an entry ``causal`` prove for
-    every causal policy: of the cost where ``priced``, else of the weighted sum of the constraints, which no causal
+    every causal policy. Where ``priced`` it bounds the cost; else the weighted sum of the constraints, which no causal
     policy meets where that is positive."""
     _require_supported(case)
     signals, nominal_report = _read_signals(case, data), middle_of(case)

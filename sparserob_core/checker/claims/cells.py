@@ -189,8 +189,8 @@ def _tighten_bound(
 def _has_too_wide_directions(
     place: Place, sides: Sides, interval: Interval, failed: Sequence[tuple[Bounded, Polynomial]], worst: float
 ) -> bool:
-    """Return whether a cell fails, by at most ``worst``, because its directions differ too much: the one in the middle
-    does not fail, and the others exceed it by more than smaller cells of time and parameters could gain, twice the
+    """Return whether a cell fails, by at most ``worst``, because its directions differ too much. The one in the middle
+    does not fail, and the others exceed it by more than smaller cells of time and parameters could gain: twice the
     error."""
     middle = sides.centre
     if middle is None:
@@ -275,9 +275,8 @@ def _bound_by_halfspaces(place: Place, row: Bounded, poly: Polynomial) -> float:
 
 
 def _is_smaller_box_better(poly: Polynomial, top: float, interval: Interval) -> bool:
-    """Return whether a smaller box of parameters helps more than a shorter time: at a single time, where the box causes
-    the error, or where the polynomial changes more over the box than over the time and errors do not explain the
-    excess."""
+    """Return whether a smaller box of parameters helps more than a shorter time. It does at a single time, where the
+    box causes the error, or where the polynomial changes more over the box and errors do not explain the excess."""
     if interval[1] == interval[2] or poly.expansion + poly.turning > BLAME * poly.error:
         return True
     if top <= 2.0 * poly.error + poly.kinks:

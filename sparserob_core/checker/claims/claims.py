@@ -25,7 +25,7 @@ from sparserob_core.checker.problem.returning import single
 from sparserob_core.checker.reach.tube import Still
 from sparserob_core.checker.sets.known import known
 from sparserob_core.checker.sets.parameters import Parameters
-from sparserob_core.checker.sets.shape import Shape
+from sparserob_core.checker.sets.shape import Shape, excess
 from sparserob_core.checker.sets.sides import Curved, Sides
 from sparserob_core.control.policies.policy import WrittenPolicy
 from sparserob_core.control.problem.names import unit_of_row
@@ -197,7 +197,7 @@ def _verify_in_set(
                 continue
             responses = [_zero_nominal(summand) for summand in summands]
             deviation_support = lambda c, responses=responses: feedback.heights(responses, exactly(c[None]))[0]  # noqa: E731
-        over, where = shape.excess(point, deviation_support)
+        over, where = excess(shape, point, deviation_support)
         if over > TOLERANCE:
             where = name.format("the control" if where == "it" else where)
             at = _format_time(case, float(case.control.breakpoints[k]))

@@ -30,6 +30,7 @@ from sparserob_core.checker.reach.states import Scene, States
 from sparserob_core.checker.reach.tube import LoopTube, ProjectedStates, VerifiedTube
 from sparserob_core.checker.sets.known import known
 from sparserob_core.checker.sets.parameters import Corners, Parameters
+from sparserob_core.checker.sets.shape import basis_of, width
 from sparserob_core.checker.sets.sides import Bounded, Curved, Sides
 from sparserob_core.control.problem.names import joined, measured_in, unit_of_row
 from sparserob_core.control.sets.sets import Box
@@ -203,7 +204,7 @@ def _extract_facets(window: ConstraintWindow, units: WindowUnits) -> tuple[Array
     """Return the normals of a flat set's facets, on the state ``(b, d)`` and on the control ``(b, m)``, and its rows.
 
     Opposite facets share a normal. The rows are ``None`` for a curved set."""
-    facet_basis, facets = window.seen.basis, window.seen.facets
+    facet_basis, facets = basis_of(window.seen), window.seen.facets
     if facet_basis is None or facets is None:
         return np.zeros((0, 0)), np.zeros((0, 0)), None
     basis, z = facet_basis
@@ -337,7 +338,7 @@ def _is_uncertain(case: Case, state: int) -> bool:
 
 def _is_wide(bound: ConvexSet, channel: int) -> bool:
     """Return whether a set may be more than one point along an axis; False only where it provably is one."""
-    return not known(bound).width(channel) <= math.ulp(0.0)
+    return not width(known(bound), channel) <= math.ulp(0.0)
 
 
 def _is_at_rest(case: Case, state: int) -> bool:

@@ -23,7 +23,7 @@ from sparserob_core.checker.outcome import EQUALITY, TOLERANCE, Broken, Unchecke
 from sparserob_core.checker.reach.states import States
 from sparserob_core.checker.reach.tube import LoopTube, Polynomial, ProjectedStates, VerifiedTube
 from sparserob_core.checker.sets.known import known
-from sparserob_core.checker.sets.shape import along
+from sparserob_core.checker.sets.shape import along, basis_of
 from sparserob_core.sip.convex_set import Array
 
 if TYPE_CHECKING:
@@ -39,8 +39,8 @@ ROUNDED = 1e-11
 
 
 def reached(case: Case, time: float, parameter: Array, signal: object, deviation: object = None) -> list[arb]:
-    """Return the state ``(d,)`` at a time and a parameter ``(nu,)`` under the control of the case, a disturbance
-    ``signal (mw, pieces)`` on the common grid and a ``deviation (d,)`` of the initial state; neither is read where the
+    """Return the state ``(d,)`` at a time and a parameter ``(nu,)`` under the control of the case. The disturbance is a
+    ``signal (mw, pieces)`` on the common grid, the initial state has a ``deviation (d,)``; neither is read where the
     problem has none.
 
     Raise `Broken` where they are not shown to be admissible, and `Unchecked` where the disturbance is given on another
@@ -177,7 +177,7 @@ def exceeded(case: Case, said: Mapping[str, object], begun: Array | None = None)
         return [float(residual) for residual, _ in residuals], TOLERANCE * max(term_size for _, term_size in residuals)
     window, parameter = case.window(name), numbers(said.get("parameter", []), "parameter")
     asked(case, window, time, parameter)  # not `admissible`: rounding may take a parameter at the edge out of its set
-    facets, facet_basis = window.seen.facets, window.seen.basis
+    facets, facet_basis = window.seen.facets, basis_of(window.seen)
     if facets is None or facet_basis is None:
         raise Unchecked("the worst direction of a curved set is not told")
     pieces = _find_pieces(case, time, jumps=window.is_mixed)

@@ -17,6 +17,7 @@ from sparserob_core.checker.cost.duality import ConstraintRow
 from sparserob_core.checker.reach.closed_loop import VerifiedLoop
 from sparserob_core.checker.reach.preimages import Pushed, SeenDeviations
 from sparserob_core.checker.sets.known import known
+from sparserob_core.checker.sets.shape import width
 from sparserob_core.sip.convex_set import ConvexSet
 
 if TYPE_CHECKING:
@@ -47,7 +48,7 @@ class GainsBound:
         slopes = stacked([[ball(y) * row.slope[k][i] for y, row in rows] for k in range(K) for i in range(m)])
         innovations = stacked([[x for innovation in row.innovations for x in innovation] for _, row in rows])
         product = (slopes * innovations).tolist()
-        width = [known(self.control).width(i) for i in range(m)]
+        widths = [width(known(self.control), i) for i in range(m)]
         for k in range(K):
             clusters = self._cluster_breakpoints(k)
             for i in range(m):
@@ -61,7 +62,7 @@ class GainsBound:
                         sum((abs(next(shares)) / length for _, length in self._segments[block]), ball(0))
                         for block in blocks
                     ]
-                total = total + width[i] * largest(sizes)
+                total = total + widths[i] * largest(sizes)
         return total
 
     def _cluster_breakpoints(self, k: int) -> list[tuple[list[int], arb_mat, list[int]]]:

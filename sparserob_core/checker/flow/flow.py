@@ -243,9 +243,8 @@ class VerifiedFlow:
 
     def kernel(self, start: float, stop: float) -> tuple[list[Series], Array]:
         """Return the kernel ``h Phi(stop, s) [B c E](s)`` of inputs at any time ``s`` of an interval without marks, of
-        length ``h``: coefficients ``(d, w)`` in powers of the share of the interval that is left at ``s``, and the
-        error bound of this polynomial. The rows of ``Phi(stop, s)`` are the flow of the transposed system,
-        backwards."""
+        length ``h``. It has coefficients ``(d, w)`` in powers of the share of the interval that is left at ``s``, and
+        an error bound. The rows of ``Phi(stop, s)`` are the flow of the transposed system, backwards."""
         stretch = self.law.stretches[self._find_stretch(start, stop)]
         A, F = stretch.between(start, stop, backwards=True)
         Phi, Phi_error = self._solve_backwards(stretch, A, start, stop)
@@ -288,8 +287,8 @@ class VerifiedFlow:
 
     def sizes(self, start: float, stop: float) -> tuple[Array, Array, Array]:
         """Return upper bounds of the absolute values of ``[A B c E]`` and of its derivative in time, ``(d, d + w)``
-        each, on the stretch that contains an interval; and the units ``(d,)`` of the states, in which the law is small
-        there."""
+        each. The third value is the units ``(d,)`` of the states, in which the law is small on the stretch of the
+        interval."""
         stretch = self.law.stretches[self._find_stretch(start, stop)]
         return *stretch.sizes, stretch.units
 

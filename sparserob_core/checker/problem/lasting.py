@@ -71,8 +71,8 @@ class Lasting:
 
     def gathered(self, mid: Array, rad: Array) -> tuple[Array, Array]:
         """Return the coefficients ``(pieces, ..., mw, b)`` of the first pieces of the disturbance and their error
-        bounds, added up over the intervals on which a component has one value: at its first piece is the sum, at its
-        others 0."""
+        bounds, added up over the intervals on which a component has one value. The sum is at the first piece of each,
+        and 0 at the others."""
         mid, rad = mid.copy(), rad.copy()
         for columns, firsts in self.parts:
             starts = firsts[firsts < mid.shape[0]]

@@ -8,6 +8,7 @@ import numpy as np
 
 from sparserob_core.checker.outcome import Unchecked
 from sparserob_core.checker.sets.known import known
+from sparserob_core.checker.sets.shape import width
 from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.control.problem.terms.repeat import Return
 from sparserob_core.control.sets.sets import Box
@@ -42,4 +43,4 @@ def single(problem: OptimalControlProblem) -> list[int]:
     bound, d = problem.initial_set, problem.system.states
     if bound is None:
         return list(range(d))
-    return [i for i in range(d) if known(bound).width(i).is_zero()]
+    return [i for i in range(d) if width(known(bound), i).is_zero()]

@@ -90,8 +90,8 @@ class BoundedInputHere(BoundedInput):
 
 def pushes(law: VerifiedFlow, start: float, stop: float, columns: slice) -> Enclosed:
     """Return the kernel of an interval without marks: its length times some ``columns`` of ``Phi(stop, s) [B c E](s)``.
-    Its coefficients ``(p + 1, M, d, m)`` are those of powers of ``u`` from -1 to 1, where ``(1 + u) / 2`` is the share
-    of the interval that is left at ``s``; the remainder is in the radius of the first."""
+    Coefficients ``(p + 1, M, d, m)`` are those of powers of ``u`` from -1 to 1; the remainder is in the radius of the
+    first. ``(1 + u) / 2`` is the share of the interval that is left at ``s``."""
     from flint import arb, arb_mat
 
     terms, remainder = law.kernel(start, stop)

@@ -165,8 +165,8 @@ class MeasurableLoop(VerifiedLoop):
 
     @cached_property
     def deviations(self) -> MeasurableDeviations:
-        held, width = len(self.grid) - 1, self.system.disturbances
-        return MeasurableDeviations(self.shape, width, self.initial, held, flow=self.flow, grid=self.grid)
+        pieces, width = len(self.grid) - 1, self.system.disturbances
+        return MeasurableDeviations(self.shape, width, self.initial, pieces, flow=self.flow, grid=self.grid)
 
     @cached_property
     def seen(self) -> list[dict[int, arb_mat]]:

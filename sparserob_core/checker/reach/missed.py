@@ -251,9 +251,9 @@ class BoundedInputOver(BoundedInput):
         return Added(ends, (gap + fit_error + total + 2.0 * remainder + chord_error) * OUTWARD, over * OUTWARD, wide)
 
     def _bound_curvature(self, c: Array, times: Sequence[float], box: ParameterBox) -> tuple[Array, float, float]:
-        """Return bounds of what the curvature adds on a box: how far the integrals may lie above the interpolation
-        between corners, due to each parameter, ``(nu,)``; what the remainder of the expansion adds; and how far they
-        may lie above their chord between two ``times``."""
+        """Return bounds of what the curvature adds on a box. The first says how far the integrals may lie above the
+        interpolation between corners, due to each parameter, ``(nu,)``. The others are what the remainder of the
+        expansion adds, and how far they may lie above their chord between two ``times``."""
         flow = self.flows.holding(box)
         halves = np.array(flow.box.halves)
         shares = np.array(box.halves) / np.where(halves > 0.0, halves, 1.0) * (1.0 + rounding(4))

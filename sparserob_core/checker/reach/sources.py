@@ -47,9 +47,9 @@ class Sources:
         if bound is None or self.timing.answering:
             return None
         sides, system = sides_of(bound), self.problem.system
-        one, ends = stacked([[v] for v in balls(np.ones(len(sides)))]), np.array([0.0, self.timing.grid[-1]])
+        whole, ends = stacked([[v] for v in balls(np.ones(len(sides)))]), np.array([0.0, self.timing.grid[-1]])
         return self._build_bounded_input(
-            SizedInput(np.ones(len(sides)), ends, [one], sides, system.controls + system.drifts)
+            SizedInput(np.ones(len(sides)), ends, [whole], sides, system.controls + system.drifts)
         )
 
     def _build_bounded_input(self, entering: SizedInput) -> BoundedInput:
@@ -93,9 +93,9 @@ class Sources:
         return [source if parameter is None else source.at(parameter) for source in sources if source is not None]
 
     def erring(self, c: Array, time: float, parameter: Sequence[float]) -> tuple[Array | None, arb]:
-        """Return lower bounds of what errors of execution add to ``c'x(t)`` at a parameter: for a command of size 1 on
-        every piece, ``(K, m)`` or ``None``, and for the control that acts until the delay is over, 0 without a
-        delay."""
+        """Return lower bounds of what errors of execution add to ``c'x(t)`` at a parameter, for a command of size 1 on
+        every piece, ``(K, m)`` or ``None``. The second value is that for the control that acts until the delay is over,
+        or 0."""
         delivered = self.delivered_at(parameter)
         bounds, none = None if delivered is None else delivered.least(c, time), ball(0)
         if bounds is None or not self.problem.system.delay > 0.0:

@@ -268,8 +268,8 @@ class Lines:
         return Lines(terms, np.abs(basis) @ segment.off * OUTWARD, np.abs(basis) @ segment.powers.sizes * OUTWARD)
 
     def shifted(self, first: float, width: float, order: int) -> Enclosed:
-        """Return the rows on a part of the segment, from the share ``first`` on and of this ``width``: at most
-        ``order`` terms in powers of its share, ``(J, M, b, d + w)``, with the remainder in the radius of the first."""
+        """Return the rows on a part of the segment, from the share ``first`` on and of this ``width``. They are at most
+        ``order`` terms in powers of its share, ``(J, M, b, d + w)``; the remainder is in the radius of the first."""
         count = len(self.terms.mid)
         table = shifted(first, width, count)
         kept, size = table[:order], np.abs(self.terms.mid)

@@ -172,20 +172,20 @@ def bound_supports(
     shape: Shape, monomials: Monomials, every: Array, errors: Array, z: Array, sharp: bool
 ) -> tuple[Array, Array, Array, Array]:
     """Return polynomials that, with their errors, are upper bounds of the sum over pieces of a set's support function,
-    at combinations ``z (k, b)`` of arguments ``every (pieces, J + 1, M, mw, b)`` with ``errors``; smaller where
-    ``sharp``.
+    smaller where ``sharp``. The arguments are combinations ``z (k, b)`` of ``every (pieces, J + 1, M, mw, b)`` with
+    ``errors``.
 
-    They are coefficients ``(k, J + 1, M)``; their errors ``(k,)``; how much they may be above the true value because
-    the worst point of the set switches, ``(k,)``; and about how much of that is due to the size of the box of
+    They are coefficients ``(k, J + 1, M)`` and their errors ``(k,)``. The third value says how much they may be too
+    large because the worst point of the set switches, ``(k,)``, the last about how much of that is due to the box of
     parameters."""
     pieces = every.shape[0]
     mid, w, argument_errors, error, kinks, share = _bound_linearly(shape, every, errors, z, pieces)
     k, mw = mid.shape[0], mid.shape[-1]
-    if not sharp or shape.round is None:
+    if not sharp or shape.norm is None or shape.norm.q != 2.0:
         coefficients = np.einsum("ilw,iljkw->ijk", w, mid)
         return coefficients, error.sum(axis=1) * OUTWARD, kinks.sum(axis=1) * OUTWARD, (share * kinks).sum(axis=1)
     # for every piece, the better one of this linear bound and a polynomial above the length of L'f
-    m, L = shape.round
+    m, L = shape.centre, shape.norm.outer
     transformed = (mid @ L).reshape(-1, *mid.shape[2:4], L.shape[1])
     above, above_errors, over = (
         values.reshape(k, pieces, *values.shape[1:]) for values in lengths(monomials, transformed)
@@ -207,8 +207,8 @@ def _bound_linearly(
     in the middle of the range of the arguments.
 
     They are the arguments ``(k, pieces, J + 1, M, mw)``; the points and the errors of the arguments, ``(k, pieces,
-    mw)``, where up to ``count`` pieces are added up; the errors of the bounds, ``(k, pieces)``; their parts due to
-    switching; and about which share of these is due to the box of parameters."""
+    mw)``, where up to ``count`` pieces are added up. Then follow the errors of the bounds, ``(k, pieces)``, their parts
+    due to switching, and the share of these that is due to the box of parameters."""
     mid = np.einsum("ljkwb,ib->iljkw", every, z)
     rad = np.einsum("ljkwb,ib->iljkw", errors + rounding(z.shape[1]) * np.abs(every), np.abs(z)) * OUTWARD
     k, pieces, mw = mid.shape[0], mid.shape[1], mid.shape[-1]

@@ -12,16 +12,13 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
 from math import comb
-from typing import TYPE_CHECKING, final
+from typing import NamedTuple, final
 
 import numpy as np
 
 from sparserob_core.checker.outcome import Unchecked
 from sparserob_core.checker.sets.polynomials import HALF_ULP, OUTWARD, TINY, rounding
 from sparserob_core.sip.convex_set import Array
-
-if TYPE_CHECKING:
-    from sparserob_core.checker.sets.shape import Shape
 
 DISC = 3.0  # radius: with 2 the error of the rule is 1e-9, with 4 cells are halved once more
 NODES = 16  # of Gauss' rule: its relative error is then 3e-15
@@ -33,21 +30,34 @@ STEEP = 1e9  # the largest exponent: rounding changes such a power by some 1e-6 
 AT_ONCE = 20_000  # cells that are evaluated together: some 50 MB
 
 
+class Norm(NamedTuple):
+    """The norm ``|L'c|_q`` with a matrix ``L (d, d)``, which has the relative error ``share``."""
+
+    L: Array
+    share: float
+    q: float
+
+    @property
+    def outer(self) -> Array:
+        """A matrix that gives no smaller norms."""
+        return np.asarray(self.L * (np.nextafter(1.0 + self.share, np.inf) * OUTWARD))
+
+
 @final
 @dataclass(frozen=True, eq=False)
 class CurvedSide:
-    """A set relative to a point ``about (d,)``, with integrals of its support function along polynomials. Further
+    """A set with the support function ``c'offset + |L'c|_q``, with integrals of it along polynomials. Further
     coordinates ``before`` and ``after`` its own are 0."""
 
-    shape: Shape
-    about: Array
+    norm: Norm
+    offset: Array
     before: int = 0
     after: int = 0
 
     @property
     def dimension(self) -> int:
         """The number of coordinates, ``mw``."""
-        return self.before + self.shape.dimension + self.after
+        return self.before + self.offset.size + self.after
 
     def widened(self, before: int, after: int) -> CurvedSide:
         """Return the set with 0 in further coordinates before and after its own."""
@@ -56,8 +66,8 @@ class CurvedSide:
     @cached_property
     def _radii(self) -> Array:
         """The upper bounds ``(d,)`` of the distance from the point to the set's ends along its own coordinates."""
-        axes = np.vstack([np.eye(self.shape.dimension), -np.eye(self.shape.dimension)])
-        heights, errors = _evaluate_support(self.shape, self.about, axes)
+        axes = np.vstack([np.eye(self.offset.size), -np.eye(self.offset.size)])
+        heights, errors = _evaluate_support(self.norm, self.offset, axes)
         return np.asarray((heights + errors).reshape(2, -1).max(axis=0) * OUTWARD)
 
     @cached_property
@@ -68,7 +78,7 @@ class CurvedSide:
     def swept(self, plain: Array, off: Array, sizes: Array, ends: Array) -> tuple[Array, Array, Array, Array]:
         """Return the integrals of the support function along polynomials, as `Side.swept` does; ``sizes`` are not
         used."""
-        own = plain[:, :, self.before : self.before + self.shape.dimension]
+        own = plain[:, :, self.before : self.before + self.offset.size]
         outputs = [np.zeros(0)] * 3
         for first in range(0, len(plain), AT_ONCE):
             batch = slice(first, first + AT_ONCE)
@@ -90,8 +100,8 @@ class CurvedSide:
         orders, powers = np.arange(count), nodes[:, None] ** np.arange(count)
         for level in range(ROUNDS + 1):
             spread = np.einsum("n,mnw->mw", DISC ** orders[1:], np.abs(a[:, 1:])) * OUTWARD
-            bounds = _bound_support(self.shape, self.about, a[:, 0], spread)
-            heights, height_errors = _evaluate_support(self.shape, self.about, (powers @ a).reshape(-1, a.shape[2]))
+            bounds = _bound_support(self.norm, self.offset, a[:, 0], spread)
+            heights, height_errors = _evaluate_support(self.norm, self.offset, (powers @ a).reshape(-1, a.shape[2]))
             total = heights.reshape(len(a), -1) @ weights
             rounding_errors = (
                 height_errors.reshape(len(a), -1) @ weights
@@ -99,7 +109,7 @@ class CurvedSide:
             )
             rule_error = np.where(np.isfinite(bounds), LEFT * bounds, np.inf)
             change = 2.0 * np.abs(a[:, 1:]).sum(axis=1) @ radii
-            middle_heights, middle_errors = _evaluate_support(self.shape, self.about, a[:, 0])
+            middle_heights, middle_errors = _evaluate_support(self.norm, self.offset, a[:, 0])
             if not np.isfinite(rounding_errors).all():
                 raise Unchecked("a support function grows beyond what numbers can hold")
             use_middle = change < rule_error
@@ -159,28 +169,25 @@ def _rescale_polynomials(plain: Array, length: Array) -> Array:
     return polynomials
 
 
-def _evaluate_support(shape: Shape, about: Array, c: Array) -> tuple[Array, Array]:
-    """Return the support function of the set minus the point at exact directions ``(k, d)``, and error bounds, ``(k,)``
-    each."""
-    (L, share, q), size, offset = shape.norm_matrix(), np.abs(c), shape.centre - about
-    norm = _compute_norms(c @ L, q)
-    norm_error = _compute_norms(size @ np.abs(L), q) * rounding(2 * len(L) + 8) + norm * (
-        2.0 * share + rounding(64 * len(L))
-    )
-    norm_error = norm_error + (size @ np.abs(offset)) * rounding(len(L) + 2)
-    return norm + c @ offset, norm_error * OUTWARD
+def _evaluate_support(norm: Norm, offset: Array, c: Array) -> tuple[Array, Array]:
+    """Return the support function at exact directions ``(k, d)``, and error bounds, ``(k,)`` each."""
+    (L, share, q), size = norm, np.abs(c)
+    lengths = _compute_norms(c @ L, q)
+    errors = _compute_norms(size @ np.abs(L), q) * rounding(2 * len(L) + 8)
+    errors += lengths * (2.0 * share + rounding(64 * len(L))) + (size @ np.abs(offset)) * rounding(len(L) + 2)
+    return lengths + c @ offset, errors * OUTWARD
 
 
-def _bound_support(shape: Shape, about: Array, c: Array, spread: Array) -> Array:
-    """Return bounds ``(k,)`` of the absolute value of the support function of the set minus the point at complex
-    directions within ``spread (k, d)`` of ``c (k, d)``; ``inf`` where it is not shown to be analytic at all of them."""
-    L, share, q = shape.norm_matrix()
+def _bound_support(norm: Norm, offset: Array, c: Array, spread: Array) -> Array:
+    """Return bounds ``(k,)`` of the absolute support function at complex directions, within
+    ``spread (k, d)`` of ``c (k, d)``. A bound is ``inf`` where it is not shown to be analytic at all of them."""
+    L, share, q = norm
     y, b = np.abs(c @ L), spread @ np.abs(L)
     unit = np.maximum((y + b).max(axis=1, keepdims=True), TINY)
     y, b = y / unit, b / unit
     if q == 2.0:  # |sum (y + b)^2 - sum y^2| <= 2 |y| |b| + |b|^2
-        norm, change = np.linalg.norm(y, axis=1), np.linalg.norm(b, axis=1)
-        power_sum, change = norm**2, 2.0 * norm * change + change**2
+        length, change = np.linalg.norm(y, axis=1), np.linalg.norm(b, axis=1)
+        power_sum, change = length**2, 2.0 * length * change + change**2
         is_analytic = change < ROOM * power_sum
     else:  # the slope of z^q is at most q (y + b)^(q - 1) between
         power_sum, change = (y**q).sum(axis=1), (q * b * (y + b) ** (q - 1.0)).sum(axis=1)
@@ -189,8 +196,8 @@ def _bound_support(shape: Shape, about: Array, c: Array, spread: Array) -> Array
     if q != 2.0:
         is_smooth = ((y * ROOM > b) | (y + b == 0.0)).all(axis=1)
         norm_bound = np.where(is_smooth, np.minimum(norm_bound, _bound_dominated_norm(y, b, q)), np.inf)
-    offset = np.abs(shape.centre - about) * OUTWARD
-    return np.asarray((unit[:, 0] * norm_bound * (1.0 + 2.0 * share) + (np.abs(c) + spread) @ offset) * OUTWARD)
+    linear = (np.abs(c) + spread) @ (np.abs(offset) * OUTWARD)
+    return np.asarray((unit[:, 0] * norm_bound * (1.0 + 2.0 * share) + linear) * OUTWARD)
 
 
 def _bound_dominated_norm(y: Array, b: Array, q: float) -> Array:

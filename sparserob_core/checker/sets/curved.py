@@ -14,7 +14,7 @@ import numpy as np
 from sparserob_core.checker.arithmetic.balls import above, ball, balls, largest
 from sparserob_core.checker.arithmetic.series import exactly
 from sparserob_core.checker.outcome import Broken, Unchecked
-from sparserob_core.checker.sets.along import CurvedSide
+from sparserob_core.checker.sets.along import CurvedSide, Norm
 from sparserob_core.checker.sets.polynomials import HALF_ULP, OUTWARD, ROUNDING
 from sparserob_core.checker.sets.shape import NEAR, Shape, along, total
 from sparserob_core.checker.sets.summands import Side
@@ -66,16 +66,13 @@ class Ellipsoidal(Shape):
     def bound(self, value: Array, spread: Array) -> tuple[Array, Array]:
         return _bound_ellipsoid(self.centre, self.source.shape, value, spread)
 
-    @cached_property
-    def round(self) -> tuple[Array, Array]:
-        return self.centre, self.source.factor * np.nextafter(1.0 + self.missed, np.inf) * OUTWARD
-
     def chords(self, middle: Array) -> list[arb]:
         inverse = exactly(self.source.shape).inv()
         return [2 / inverse[b, b].sqrt() for b in range(self.dimension)]
 
-    def norm_matrix(self) -> tuple[Array, float, float]:
-        return self.source.factor, self.missed, 2.0
+    @cached_property
+    def norm(self) -> Norm:
+        return Norm(self.source.factor, self.missed, 2.0)
 
     @cached_property
     def missed(self) -> float:
@@ -166,15 +163,10 @@ class Ball(Shape):
     def chords(self, middle: Array) -> list[arb]:
         return [2 * ball(self.source.radius)] * self.dimension
 
-    def norm_matrix(self) -> tuple[Array, float, float]:
-        p = self.source.p
-        if p == 1.0:
-            return super().norm_matrix()
-        return self.source.radius * np.eye(self.dimension), HALF_ULP, p / (p - 1.0)
-
     @cached_property
-    def round(self) -> tuple[Array, Array] | None:
-        return (self.centre, self.source.radius * np.eye(self.dimension)) if self.source.p == 2.0 else None
+    def norm(self) -> Norm | None:
+        p = self.source.p
+        return None if p == 1.0 else Norm(self.source.radius * np.eye(self.dimension), HALF_ULP, p / (p - 1.0))
 
 
 @final

@@ -201,6 +201,7 @@ class Polyhedral(Cornered):
     """A polytope."""
 
     source: Polytope
+    has_limits_as_sizes = True
 
     @cached_property
     def facets(self) -> list[Facet]:
@@ -220,9 +221,6 @@ class Polyhedral(Cornered):
         number, factor = facet(self.listed, direction)
         multipliers: Array = float(factor) * np.eye(len(self.listed))[number]
         return multipliers
-
-    def _list_sizes(self, limit: arb) -> list[float]:
-        return [abs(float(limit))]
 
 
 @final

@@ -48,8 +48,8 @@ class Parameters:
 
     def bounds(self, box: Corners, slope: Array) -> list[tuple[Array, Array, float]]:
         """Return combinations of half-spaces of the set that balance the ``slope (nu,)`` of a bound on a box of
-        parameters, as far as they can: normals ``a (k, nu)``, limits ``s (k,)`` with ``a p <= s`` on the set, and
-        weights ``(k,) >= 0``."""
+        parameters. They are normals ``a (k, nu)``, limits ``s (k,)`` with ``a p <= s`` on the set, and weights ``(k,)
+        >= 0``."""
         if self.is_box or self.shape is None or not slope.any():
             return []
         combinations = [(slope[None], np.array([above(self.shape.support(balls(slope)))]), np.ones(1))]

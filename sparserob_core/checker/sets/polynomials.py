@@ -130,7 +130,8 @@ def _tabulate_products(monomials: Monomials) -> tuple[Array, Array, Array, Array
 
 def lengths(monomials: Monomials, parts: Array) -> tuple[Array, Array, Array]:
     """Return polynomials above the lengths ``|g|`` of vectors of polynomials ``g (n, J + 1, M, r)``: coefficients ``(n,
-    J + 1, M)``, their errors ``(n,)``, and how far they may be too large, infinite where a vector may come near 0.
+    J + 1, M)``, and their errors ``(n,)``. The third value says how far they may be too large, infinite where a vector
+    may come near 0.
 
     With ``|g|^2 = s^2 (1 + e)`` it is ``s sqrt(1 + e) <= s (1 + e/2 - e^2/8 + e^3/16)``, since the fourth derivative of
     the root is negative. The bound exceeds the length by a term of fourth order in ``e``."""

@@ -14,7 +14,7 @@ import numpy as np
 from sparserob_core.checker.arithmetic.balls import above, ball, balls, rational
 from sparserob_core.checker.arithmetic.balls import smallest as least_of
 from sparserob_core.checker.outcome import RESOLVED, Broken, Unchecked
-from sparserob_core.checker.sets.along import CurvedSide
+from sparserob_core.checker.sets.along import CurvedSide, Norm
 from sparserob_core.checker.sets.summands import Side
 from sparserob_core.sip.convex_set import Array, ConvexSet
 
@@ -44,6 +44,9 @@ class Shape(ABC):
 
     is_box = False
     """True where the boxes of a subdivision contain points of the set only."""
+
+    has_limits_as_sizes = False
+    """True where the limit of a facet is one of the sizes that its unit is chosen from."""
 
     def __init__(self, source: ConvexSet) -> None:
         self.source, self.dimension = source, source.dimension
@@ -97,12 +100,6 @@ class Shape(ABC):
         (k, d)`` of ``value (k, d)``. The bound is sharp where ``spread`` is 0."""
 
     @property
-    def round(self) -> tuple[Array, Array] | None:
-        """The ``m (d,)`` and ``L (d, r)`` of a round set with ``h(c) <= c'm + |L'c|``, where both sides differ by
-        rounding only; ``None`` for other sets."""
-        return None
-
-    @property
     def spanned(self) -> int:
         """The number of first coordinates that the set bounds, alone or in sums with others."""
         return self.dimension
@@ -110,11 +107,6 @@ class Shape(ABC):
     def lifted(self, directions: Array) -> Array:
         """Return directions ``(k, b)`` of the `spanned` coordinates as directions ``(k, d)`` of the set."""
         return directions
-
-    def width(self, channel: int) -> arb:
-        """Return the width of the set along an axis."""
-        axis = np.eye(self.dimension)[channel]
-        return self.support(balls(axis)) + self.support(balls(-axis))
 
     def chords(self, middle: Array) -> list[arb]:
         """Return the lengths of the chords along the axes through the ``middle`` of the set: its width along any ``a``
@@ -135,7 +127,7 @@ class Shape(ABC):
         ``c > 0``: the width of the set along any ``a`` is at least ``c |a'v|``. The vectors are along the axes, except
         for a set without an interior."""
         chords, axes = self.chords(middle), np.eye(self.dimension).tolist()
-        widths = [self.width(channel) for channel in range(self.dimension)]
+        widths = [width(self, channel) for channel in range(self.dimension)]
         if all(width.is_zero() or chord > NEAR * width for width, chord in zip(widths, chords, strict=True)):
             spans = zip(axes, chords, widths, strict=True)
             return [([*map(Fraction, axis)], chord) for axis, chord, width in spans if not width.is_zero()]
@@ -150,22 +142,6 @@ class Shape(ABC):
         """The facets of a flat set, ``None`` for a curved one."""
         return None
 
-    @cached_property
-    def basis(self) -> tuple[Array, Array] | None:
-        """The ``basis (b, d)`` and ``z (k, b)`` where ``z_i'basis`` is exactly the normal of facet ``i``; ``None`` for
-        a curved set. Opposite normals share a row of the basis."""
-        if self.facets is None:
-            return None
-        numbers: dict[bytes, int] = {}
-        normals, z = [c + 0.0 for c, _ in self.facets], np.zeros((len(self.facets), len(self.facets)))
-        for i, c in enumerate(normals):
-            opposite = numbers.get((-c + 0.0).tobytes())
-            z[i, numbers.setdefault(c.tobytes(), len(numbers)) if opposite is None else opposite] = (
-                1.0 if opposite is None else -1.0
-            )
-        vectors = [np.frombuffer(key) for key in numbers]
-        return np.array(vectors).reshape(len(vectors), self.dimension), z[:, : len(vectors)]
-
     def shares(self, direction: Array) -> Array:
         """Return numbers ``y (k,) >= 0`` such that the facets' normals times ``y`` add up to the direction, up to
         rounding."""
@@ -176,13 +152,11 @@ class Shape(ABC):
         """The own unit of every facet of a flat set: the smallest nonzero one of the largest absolute value of ``c'x``
         over the set, the width to the opposite facet, and others that the kind of set names."""
         assert self.facets is not None
-        return [
-            smallest([width, max(_estimate_support(self, c), _estimate_support(self, -c)), *self._list_sizes(b)])
-            for (c, b), width in zip(self.facets, widths(self.facets), strict=True)
-        ]
-
-    def _list_sizes(self, limit: arb) -> list[float]:
-        return []
+        units = []
+        for (c, b), across in zip(self.facets, widths(self.facets), strict=True):
+            sizes = [across, max(_estimate_support(self, c), _estimate_support(self, -c))]
+            units.append(smallest([*sizes, abs(float(b))] if self.has_limits_as_sizes else sizes))
+        return units
 
     # Curved sets
 
@@ -199,35 +173,22 @@ class Shape(ABC):
         """Return balls near the offset from the centre to the point of the set farthest out in a direction."""
         raise Unchecked(f"the checker does not know how far a {self.source.kind} reaches")
 
-    def point(self, direction: Array) -> list[arb]:
-        """Return a point of the set far out in a direction, in exact numbers and proven to be in the set; the centre
-        where none better is. A rounded point would be far outside a thin set that is oblique to the axes."""
-        from flint import arb, ctx
-
-        middle, offset, spare = balls(self.centre), self.far(balls(direction)), arb(2) ** (SPARE - ctx.prec)
-        while spare < 0.5:
-            point = [(m + (1 - spare) * v).mid() for m, v in zip(middle, offset, strict=True)]
-            if self.holds(point):
-                return point
-            spare = spare * 1024
-        return middle
-
-    def norm_matrix(self) -> tuple[Array, float, float]:
-        """Return ``L (d, d)``, the relative error of ``L``, and ``q`` with ``h(c) = c'm + |L'c|_q``, ``m`` the
-        centre."""
-        raise Unchecked(
-            "the checker knows measurable disturbances in boxes, polytopes, ellipsoids, balls, zonotopes, and products"
-            " of these; balls of the 1-norm in up to 10 dimensions"
-        )
+    @property
+    def norm(self) -> Norm | None:
+        """The norm ``|L'c|_q`` with ``h(c) = c'm + |L'c|_q``, ``m`` the centre; ``None`` for other sets."""
+        return None
 
     # All of them
 
     def sides(self, about: Array) -> list[Side | CurvedSide]:
         """Return sets whose sum is the set minus a point ``about (d,)``: for a box one for every channel, for a
         zonotope one for every segment and one for its centre, for a product those of its factors."""
-        curved = CurvedSide(self, about)
-        _ = curved.far  # raises `Unchecked` for a set that the checker does not know
-        return [curved]
+        if self.norm is None:
+            raise Unchecked(
+                "the checker knows measurable disturbances in boxes, polytopes, ellipsoids, balls, zonotopes, and"
+                " products of these; balls of the 1-norm in up to 10 dimensions"
+            )
+        return [CurvedSide(self.norm, self.centre - about)]
 
     def limit(self, direction: Array) -> arb:
         """Return the largest ``c'x`` over the set, or an upper bound of it."""
@@ -260,25 +221,62 @@ class Shape(ABC):
         axes = np.eye(self.dimension)
         return [above(self.support(balls(axis)).max(self.support(balls(-axis)))) for axis in axes]
 
-    def excess(self, point: Sequence[arb], beyond: Callable[[Array], arb] | None = None) -> tuple[float, str]:
-        """Return an upper bound of the distance by which a point, ``(d,)`` balls, may lie outside the set, and where:
-        relative to the own unit of each facet, at least what double precision resolves, or along the gauge. ``beyond``
-        says what is added to the value along a normal."""
-        if self.facets is None:
-            assert beyond is None
-            gauge = self.gauge([x - m for x, m in zip(point, balls(self.centre), strict=True)])
-            if not gauge.is_finite():
-                raise Unchecked("the size of a point cannot be bounded")
-            return max(0.0, float((gauge - 1).upper())), "it"
-        worst, where = 0.0, ""
-        for number, ((c, b), unit) in enumerate(zip(self.facets, self.units, strict=True)):
-            terms = [a * x for a, x in zip(balls(c), point, strict=True) if not a.is_zero()]
-            extra = total([] if beyond is None else [beyond(c)])
-            unit = max(unit, RESOLVED * float((abs(b) + abs(extra) + total(abs(t) for t in terms)).mid())) or 1.0
-            over = float((total(terms) + extra - b).upper()) / unit
-            if over > worst:
-                worst, where = over, _name_facet(c, number)
-        return worst, where
+
+def width(shape: Shape, channel: int) -> arb:
+    """Return the width of a set along an axis."""
+    axis = np.eye(shape.dimension)[channel]
+    return shape.support(balls(axis)) + shape.support(balls(-axis))
+
+
+def basis_of(shape: Shape) -> tuple[Array, Array] | None:
+    """Return the ``basis (b, d)`` and ``z (k, b)`` where ``z_i'basis`` is exactly the normal of facet ``i``; ``None``
+    for a curved set. Opposite normals share a row of the basis."""
+    if shape.facets is None:
+        return None
+    numbers: dict[bytes, int] = {}
+    normals, z = [c + 0.0 for c, _ in shape.facets], np.zeros((len(shape.facets), len(shape.facets)))
+    for i, c in enumerate(normals):
+        opposite = numbers.get((-c + 0.0).tobytes())
+        z[i, numbers.setdefault(c.tobytes(), len(numbers)) if opposite is None else opposite] = (
+            1.0 if opposite is None else -1.0
+        )
+    vectors = [np.frombuffer(key) for key in numbers]
+    return np.array(vectors).reshape(len(vectors), shape.dimension), z[:, : len(vectors)]
+
+
+def far_point(shape: Shape, direction: Array) -> list[arb]:
+    """Return a point of the set far out in a direction, in exact numbers and proven to be in the set; the centre
+    where none better is. A rounded point would be far outside a thin set that is oblique to the axes."""
+    from flint import arb, ctx
+
+    middle, offset, spare = balls(shape.centre), shape.far(balls(direction)), arb(2) ** (SPARE - ctx.prec)
+    while spare < 0.5:
+        point = [(m + (1 - spare) * v).mid() for m, v in zip(middle, offset, strict=True)]
+        if shape.holds(point):
+            return point
+        spare = spare * 1024
+    return middle
+
+
+def excess(shape: Shape, point: Sequence[arb], beyond: Callable[[Array], arb] | None = None) -> tuple[float, str]:
+    """Return an upper bound of the distance by which a point, ``(d,)`` balls, may lie outside the set, and where:
+    relative to the own unit of each facet, at least what double precision resolves, or along the gauge. ``beyond``
+    says what is added to the value along a normal."""
+    if shape.facets is None:
+        assert beyond is None
+        gauge = shape.gauge([x - m for x, m in zip(point, balls(shape.centre), strict=True)])
+        if not gauge.is_finite():
+            raise Unchecked("the size of a point cannot be bounded")
+        return max(0.0, float((gauge - 1).upper())), "it"
+    worst, where = 0.0, ""
+    for number, ((c, b), unit) in enumerate(zip(shape.facets, shape.units, strict=True)):
+        terms = [a * x for a, x in zip(balls(c), point, strict=True) if not a.is_zero()]
+        extra = total([] if beyond is None else [beyond(c)])
+        unit = max(unit, RESOLVED * float((abs(b) + abs(extra) + total(abs(t) for t in terms)).mid())) or 1.0
+        over = float((total(terms) + extra - b).upper()) / unit
+        if over > worst:
+            worst, where = over, _name_facet(c, number)
+    return worst, where
 
 
 def _estimate_support(shape: Shape, direction: Array) -> float:

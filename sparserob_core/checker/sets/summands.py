@@ -48,9 +48,9 @@ class Side:
         return Side(*(np.pad(table, ((0, 0), (before, after))) for table in (self.corners, self.rad)))
 
     def swept(self, plain: Array, off: Array, sizes: Array, ends: Array) -> tuple[Array, Array, Array, Array]:
-        """Return the integrals of the support function along polynomials ``plain (n, p + 1, mw)`` with error bounds
-        ``off`` and sums of absolute values ``sizes``, over ``u`` from -1 to ``ends (n,)``: values, how much more and
-        how much less they may be, and bounds of the absolute support values without their errors, ``(n,)`` each."""
+        """Return the integrals of the support function over ``u`` from -1 to ``ends (n,)``, along polynomials ``plain
+        (n, p + 1, mw)`` with error bounds ``off`` and sums of absolute values ``sizes``. They are values, how much more
+        and how much less they may be, and bounds of the absolute support values without their errors."""
         P = np.einsum("npw,vw->npv", plain, self.corners)
         e = (off @ (np.abs(self.corners) + self.rad).T + sizes @ self.rad.T) * OUTWARD
         return *swept(P, e, ends), np.abs(P).sum(axis=1).max(axis=1)
@@ -74,8 +74,8 @@ def integrate(sides: Sequence[Side | CurvedSide], plain: Array, off: Array) -> t
 
 def swept(P: Array, e: Array, ends: Array) -> tuple[Array, Array, Array]:
     """Return the integrals of the largest of ``v`` polynomials ``P (M, p + 1, v)``, over ``u`` from -1 to ``ends
-    (M,)``, and how much more and how much less they may be. Error bounds ``e (M, v)`` of the polynomials allow for
-    rounding in the sum of two of their values."""
+    (M,)``, and how much more and how much less they may be. Error bounds ``e (M, v)`` of the polynomials allow for the
+    rounding errors in the sum of two values."""
     orders = np.arange(P.shape[1])
     owners, start, stop = np.arange(len(P)), -np.ones(len(P)), ends.copy()
     value, excess, deficit = np.zeros(len(P)), np.zeros(len(P)), np.zeros(len(P))

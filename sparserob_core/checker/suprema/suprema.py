@@ -21,6 +21,7 @@ from sparserob_core.checker.claims.window import ConstraintWindow
 from sparserob_core.checker.outcome import FIGURES, TOLERANCE, Broken, Finding, Unchecked
 from sparserob_core.checker.sets.known import known
 from sparserob_core.checker.sets.polynomials import HALF_ULP, OUTWARD
+from sparserob_core.checker.sets.shape import basis_of
 from sparserob_core.checker.sets.sides import Bounded, Sides
 from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.problem.disturbances import columns_of
@@ -232,7 +233,7 @@ def _prove_row_on_cells(case: Case, asked: SupremumRow, limit: float) -> int:
     cells."""
     window = asked.window
     single_row = replace(window, shape=Polytope(asked.direction[None], np.array([limit])))
-    facet_basis = single_row.seen.basis
+    facet_basis = basis_of(single_row.seen)
     assert facet_basis is not None
     (basis, gains), z = np.split(facet_basis[0], [window.states], axis=1), facet_basis[1]
     unit = SHARE * abs(limit) or 1.0  # the excused excess is subtracted from the limit, of which it is a rounding error

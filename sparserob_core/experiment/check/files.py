@@ -11,6 +11,7 @@ import numpy as np
 from sparserob_core.checker.outcome import CANCELLED, Broken, Finding, Unchecked
 from sparserob_core.checker.outcome import FIGURES as AGREED
 from sparserob_core.checker.sets.known import known
+from sparserob_core.checker.sets.shape import excess
 from sparserob_core.errors import InputError
 from sparserob_core.experiment.directory.finished import ANSWERS, StoredRun
 from sparserob_core.experiment.directory.sparsity import sparsity
@@ -363,9 +364,9 @@ def _measure_excess(bound: ConvexSet, begun: Array, centre: Array) -> float:
     shape, deviation = known(bound), begun - centre
     rounded = np.finfo(float).eps * (np.abs(begun) + np.abs(centre))
     if shape.facets is not None:
-        return shape.excess(balls(deviation), lambda c: balls([-float(np.abs(c) @ rounded)])[0])[0]
+        return excess(shape, balls(deviation), lambda c: balls([-float(np.abs(c) @ rounded)])[0])[0]
     distance = np.maximum(np.abs(deviation - shape.centre) - rounded, 0.0)
-    return shape.excess(balls(shape.centre + np.copysign(distance, deviation - shape.centre)))[0]
+    return excess(shape, balls(shape.centre + np.copysign(distance, deviation - shape.centre)))[0]
 
 
 def _compare_worst_violation(case: Case, said: Mapping[str, Any]) -> list[str]:

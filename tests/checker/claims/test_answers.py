@@ -23,6 +23,7 @@ from sparserob_core.checker.claims.case import Case
 from sparserob_core.checker.cost.gains import reach
 from sparserob_core.checker.outcome import Broken, Unchecked
 from sparserob_core.checker.sets.known import known
+from sparserob_core.checker.sets.shape import width
 from sparserob_core.control.policies.affine import AffinePolicy
 from sparserob_core.control.problem.system import LinearSystem
 from sparserob_core.control.sets.sets import Box, Ellipsoid, Equality, NormBall, Polytope, Product
@@ -453,7 +454,7 @@ def test_how_far_and_how_wide_a_set_is_along_a_channel():
         (Box([-3.0, -5.0], [1.0, -2.0]), (4.0, 3.0), (3.0, 5.0)),
         (NormBall(p=2.0, radius=2.0, centre=[0.5, -1.0]), (4.0, 4.0), (2.5, 3.0)),
     ):
-        assert [float(known(shape).width(c).mid()) for c in (0, 1)] == pytest.approx(wide)
+        assert [float(width(known(shape), c).mid()) for c in (0, 1)] == pytest.approx(wide)
         assert [float(reach(shape, c).mid()) for c in (0, 1)] == pytest.approx(far)
 
 

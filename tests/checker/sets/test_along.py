@@ -10,9 +10,8 @@ from flint import arb, ctx
 
 from sparserob_core.checker.arithmetic.balls import balls
 from sparserob_core.checker.outcome import Unchecked
-from sparserob_core.checker.sets.along import LEFT, NODES, CurvedSide, _bound_support, _evaluate_support, rule
+from sparserob_core.checker.sets.along import LEFT, NODES, CurvedSide, Norm, _bound_support, _evaluate_support, rule
 from sparserob_core.checker.sets.known import known, middle, sides_of
-from sparserob_core.checker.sets.shape import Shape
 from sparserob_core.control.sets.sets import Box, ConvexSet, Cylinder, Ellipsoid, NormBall, Polytope, Zonotope, product
 
 SEGMENTS = np.array([[0.3, 0.04], [-0.03, 0.4]])
@@ -31,7 +30,9 @@ CURVED = ("ellipsoid", "long ellipsoid", "ball", "3-norm", "1.3-norm")
 
 
 def curve(bound: ConvexSet) -> CurvedSide:
-    return CurvedSide(known(bound), middle(bound))
+    (side,) = sides_of(bound)
+    assert isinstance(side, CurvedSide)
+    return side
 
 
 @pytest.mark.first(2)
@@ -42,10 +43,10 @@ def test_heights_are_those_of_the_set_in_balls(name: str, size: float) -> None:
     some = curve(bound)
     more = np.array([[1.0, -0.5, 2.0, 0.25][: bound.dimension]])
     values = size * np.vstack([rng.normal(size=(20, bound.dimension)), np.eye(bound.dimension), more])
-    heights, off = _evaluate_support(some.shape, some.about, values)
+    heights, off = _evaluate_support(some.norm, some.offset, values)
     with ctx.workprec(300):
         for c, height, wrong in zip(values, heights, off, strict=True):
-            moved = sum((a * b for a, b in zip(balls(c), balls(some.about), strict=True)), arb(0))
+            moved = sum((a * b for a, b in zip(balls(c), balls(middle(bound)), strict=True)), arb(0))
             assert abs(known(bound).support(balls(c)) - moved - arb(float(height))) < arb(float(wrong))
             assert wrong <= (1e-11 if "long" in name else 1e-13) * size
 
@@ -92,7 +93,7 @@ def test_heights_count_from_any_point_and_allow_for_what_the_factor_of_a_long_el
     values = np.array([[-1.99999999, 1.0], [-2.0, 1.0], [0.3, -0.2]])  # the first two along the shorter axis
     away = ((SETS["ball"], np.array([0.3, -0.2])), (SETS["ellipsoid"], np.ones(2)))
     for bound, about in ((long, np.zeros(2)), *away):
-        heights, off = _evaluate_support(known(bound), about, values)
+        heights, off = _evaluate_support(known(bound).norm, known(bound).centre - about, values)
         with ctx.workprec(300):
             for c, height, wrong in zip(values, heights, off, strict=True):
                 moved = sum((a * b for a, b in zip(balls(c), balls(about), strict=True)), arb(0))
@@ -114,7 +115,7 @@ def test_the_rule_of_gauss_is_the_one_whose_remainder_is_told() -> None:
 def test_where_a_root_or_an_absolute_value_may_be_0_nothing_is_analytic() -> None:
     def analytic(bound: ConvexSet, centre: list[float], spread: list[float]) -> bool:
         return bool(
-            np.isfinite(_bound_support(known(bound), np.zeros(len(centre)), np.array([centre]), np.array([spread]))[0])
+            np.isfinite(_bound_support(known(bound).norm, np.zeros(2), np.array([centre]), np.array([spread]))[0])
         )
 
     ball, third = NormBall(2.0, 1.0, dimension=2), NormBall(3.0, 1.0, dimension=2)
@@ -122,9 +123,9 @@ def test_where_a_root_or_an_absolute_value_may_be_0_nothing_is_analytic() -> Non
     assert not analytic(ball, [1.0, 0.0], [1.0, 0.0]) and analytic(ball, [1.0, 0.0], [0.2, 0.2])
     assert not analytic(third, [1.0, 0.1], [0.0, 0.1]) and analytic(third, [1.0, 0.0], [0.1, 0.0])
     with pytest.raises(Unchecked, match="1-norm in up to 10"):  # whose support function has no curvature to speak of
-        _ = CurvedSide(known(NormBall(1.0, 1.0, dimension=12)), [arb(0)] * 12).far
+        sides_of(NormBall(1.0, 1.0, dimension=12))
     with pytest.raises(Unchecked, match="boxes, polytopes, ellipsoids"):
-        _bound_support(known(Cylinder(ball, 3)), np.zeros(3), np.ones((1, 3)), np.zeros((1, 3)))
+        known(Cylinder(ball, 3)).sides(np.zeros(3))
 
 
 @pytest.mark.first(1)
@@ -133,10 +134,10 @@ def test_what_is_said_of_complex_directions_holds_of_those_that_are_real(name: s
     bound, rng = SETS[name], np.random.default_rng(2)
     some, centre = curve(bound), rng.normal(size=(200, bound.dimension))
     spread = np.abs(centre) * rng.uniform(0.0, 0.4, size=centre.shape)
-    most = _bound_support(some.shape, some.about, centre, spread)
+    most = _bound_support(some.norm, some.offset, centre, spread)
     assert np.isfinite(most).sum() > 10
     for sign in rng.uniform(-1.0, 1.0, size=(20, bound.dimension)):
-        inside, _ = _evaluate_support(some.shape, some.about, centre + sign * spread)
+        inside, _ = _evaluate_support(some.norm, some.offset, centre + sign * spread)
         assert (np.abs(inside) <= most).all()
 
 
@@ -147,7 +148,7 @@ def test_a_norm_is_no_larger_at_complex_directions_than_is_said(p: float) -> Non
     q = p / (p - 1.0)
     centre = np.sort(np.abs(rng.normal(size=(600, 2))), axis=1)
     spread = centre * rng.uniform(0.0, 1.0, size=(600, 1)) ** 3
-    most = _bound_support(some.shape, some.about, centre, spread)
+    most = _bound_support(some.norm, some.offset, centre, spread)
     finite = np.isfinite(most)
     assert finite.sum() > 200
     z, apart = centre[finite], spread[finite]
@@ -166,9 +167,9 @@ def test_balls_that_are_nearly_those_of_the_1_norm_take_few_cells(p: float, monk
     are the same."""
     cells = [0]
 
-    def most(shape: Shape, about: np.ndarray, c: np.ndarray, spread: np.ndarray) -> np.ndarray:
+    def most(norm: Norm, offset: np.ndarray, c: np.ndarray, spread: np.ndarray) -> np.ndarray:
         cells.append(len(c))
-        return _bound_support(shape, about, c, spread)
+        return _bound_support(norm, offset, c, spread)
 
     monkeypatch.setattr("sparserob_core.checker.sets.along._bound_support", most)
     zero, plain = np.zeros((1, 2)), np.array([[[0.45, 0.25], [-0.35, 0.55]]])
