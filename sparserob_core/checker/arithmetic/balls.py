@@ -57,10 +57,8 @@ def below(ball: arb) -> float:
 
 
 def difference(a: float, b: float) -> tuple[float, float]:
-    """Return ``a - b`` exactly, as the nearest float and the remainder (Knuth 1997, section 4.2.2, theorem B).
-
-    Two differences are equal where the pairs are equal.
-    """
+    """Return ``a - b`` exactly, as the nearest float and the remainder (Knuth 1997, section 4.2.2, theorem B). Two
+    differences are equal where the pairs are equal."""
     nearest = a - b
     negative_b = nearest - a
     return nearest, (a - (nearest - negative_b)) - (b + negative_b)

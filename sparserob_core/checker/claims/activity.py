@@ -66,9 +66,8 @@ def least(case: Case, rows: Rows, pieces: Sequence[Sequence[float]] | None) -> f
 
 
 def least_of_cost(case: Case, cost: arb) -> float:
-    """Return the share of time that every admissible control acts at least, where none costs less than ``cost``.
-
-    A vector of channels that is not 0 costs at most its highest weight times the largest length that it can have."""
+    """Return the share of time that every admissible control acts at least, where none costs less than ``cost``. A
+    vector of channels that is not 0 costs at most its highest weight times the largest length that it can have."""
     counts, highest = case.price.counts, case.price.highest
     factors = [
         ball(len(block)) * ball(counts[c]) / (ball(case.problem.cost.l1) * ball(highest[c]) * longest)
@@ -263,9 +262,8 @@ def _bound_piece_in_part(
 
 
 def _list_candidate_values(case: Case, part: Part, low: float, high: float) -> list[float]:
-    """Return the values among which the count of an entry plus any slope has its minimum.
-
-    The values are the ends of the range of the entry, and 0 in between; with an alphabet, the letters in the range."""
+    """Return the values among which the count of an entry plus any slope has its minimum. The values are the ends of
+    the range of the entry, and 0 in between; with an alphabet, the letters in the range."""
     if case.letters is not None:
         return [letter for letter in case.letters if part[0] <= letter <= part[1]]
     lower, upper = max(low, part[0]), min(high, part[1])

@@ -42,9 +42,8 @@ class VerifiedFeedback:
 
     @cached_property
     def gains(self) -> Array:
-        """The gains ``(K, K, m, p)``, 0 for a control that answers nothing.
-
-        Raises `Broken` where they answer what is not yet measured, or what the policy does not answer."""
+        """The gains ``(K, K, m, p)``, 0 for a control that answers nothing. Raises `Broken` where they answer what is
+        not yet measured, or what the policy does not answer."""
         case = self.case
         if not case.answering:
             return self._zero_gains
@@ -71,9 +70,8 @@ class VerifiedFeedback:
 
     @cached_property
     def observer(self) -> Array | None:
-        """The observer gains ``(K, d, p)`` that make innovations of the outputs; ``None`` without answered outputs.
-
-        Any gains that are written are valid."""
+        """The observer gains ``(K, d, p)`` that make innovations of the outputs; ``None`` without answered outputs. Any
+        gains that are written are valid."""
         case = self.case
         if case.problem.measurements is None or not case.answering:
             return None
@@ -86,9 +84,8 @@ class VerifiedFeedback:
         return self._close_loop(self.case.pieces, self.gains)
 
     def _close_loop(self, nominal: Sequence[arb_mat], gains: Array, changes: list[float] | None = None) -> VerifiedLoop:
-        """Return the closed loop; where ``changes`` are given, under disturbances that jump at these times only.
-
-        Raise `Unchecked` for the kinds of systems and disturbances that the checker does not know under feedback."""
+        """Return the closed loop; where ``changes`` are given, under disturbances that jump at these times only. Raise
+        `Unchecked` for the kinds of systems and disturbances that the checker does not know under feedback."""
         case = self.case
         system = case.problem.system
         if system.parameter_count:
@@ -153,9 +150,8 @@ class VerifiedFeedback:
         return self.loop.deviations.support(responses) if responses else ball(0.0)
 
     def heights(self, parts: Sequence[arb_mat], rows: arb_mat) -> list[arb]:
-        """Return the largest ``c'u`` over all deviations, ``(r,)``, for every row ``c`` of ``rows (r, m)``.
-
-        ``u`` is a sum of ``parts (m, 1 + Q)`` with independent deviations."""
+        """Return the largest ``c'u`` over all deviations, ``(r,)``, for every row ``c`` of ``rows (r, m)``. ``u`` is a
+        sum of ``parts (m, 1 + Q)`` with independent deviations."""
         support_values = [[row[0] + self.support(row[1:]) for row in (rows * part).tolist()] for part in parts]
         return [sum(values[1:], values[0]) for values in zip(*support_values, strict=True)]
 
@@ -169,9 +165,8 @@ class VerifiedFeedback:
         return np.asarray(np.where(np.isfinite(largest), largest, 0.0))
 
     def added(self, state: int) -> float:
-        """Return an upper bound of the size of the numbers that are added up to a state at the end.
-
-        The numbers are the state without control, the state with it, and what deviations add to both."""
+        """Return an upper bound of the size of the numbers that are added up to a state at the end. The numbers are the
+        state without control, the state with it, and what deviations add to both."""
         total = 0.0
         for loop in (self.loop_at_rest, self.loop):
             first, *responses = (float(abs(x).upper()) for x in loop.nodes[-1].tolist()[state])

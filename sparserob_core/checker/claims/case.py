@@ -191,9 +191,8 @@ class Case:
         return self.on_pieces(self.theta)
 
     def on_pieces(self, coefficients: Array) -> list[arb_mat]:
-        """Return the control ``(m, 1)`` on every piece of its dictionary, from its coefficients ``(m, N)``.
-
-        Equal values are one object."""
+        """Return the control ``(m, 1)`` on every piece of its dictionary, from its coefficients ``(m, N)``. Equal
+        values are one object."""
         from flint import arb, arb_mat
 
         if self.control.is_indicators:
@@ -291,7 +290,6 @@ def numbers(data: object, name: str) -> Array:
 
 def shaped(data: Mapping[str, Any], key: str, shape: tuple[int, ...], whose: str = "") -> Array:
     """Return finite numbers of one shape under a key of the certificate; raise `Broken` where they are something else.
-
     ``whose`` names their entry, before the key in messages."""
     array = numbers(data.get(key), f"{whose}{key}")
     if array.shape != shape:
@@ -311,9 +309,8 @@ def _is_numeric(data: object) -> bool:
 
 
 def written_policy(certificate: Mapping[str, Any], pieces: int) -> WrittenPolicy:
-    """Return the policy that a certificate describes: the cost that it is charged, and what each piece answers.
-
-    The answers are ranges of breakpoints for each of the ``pieces``. Raise `Broken` where there is no such policy."""
+    """Return the policy that a certificate describes: the cost that it is charged, and what each piece answers. The
+    answers are ranges of breakpoints for each of the ``pieces``. Raise `Broken` where there is no such policy."""
     data = certificate.get("policy")
     if not isinstance(data, Mapping):
         raise Broken("policy: expected a cost, and the breakpoints that every piece answers")

@@ -96,9 +96,8 @@ def causal_bound(case: Case, data: Mapping[str, Any], priced: bool) -> arb:
 
 
 def _read_shares(data: Mapping[str, Any], count: int) -> list[arb]:
-    """Return the weights of the efforts under the signals; their weighted sum is at most the largest effort.
-
-    Raise `Broken` unless no weight is negative and their sum is at most 1."""
+    """Return the weights of the efforts under the signals; their weighted sum is at most the largest effort. Raise
+    `Broken` unless no weight is negative and their sum is at most 1."""
     shares = numbers(data.get("shares", []), "causal: shares")
     if shares.shape != (count,) or not (shares >= 0.0).all():
         raise Broken(f"causal: expected shares of {count} signals, not below 0")
@@ -117,9 +116,8 @@ def _require_supported(case: Case) -> None:
 
 
 def _read_entry(case: Case, entry: object, signals: int, rows: Rows) -> tuple[float, int, Pushed]:
-    """Return the multiplier of an entry, the number of its signal, and its constraint.
-
-    With the constraint come the weights of the disturbance and of the initial state in it."""
+    """Return the multiplier of an entry, the number of its signal, and its constraint. With the constraint come the
+    weights of the disturbance and of the initial state in it."""
     if not isinstance(entry, Mapping):
         raise Broken("causal: expected a signal, a constraint, a time, a direction and a number each")
     name, time, y = str(entry.get("constraint")), number(entry, "time"), number(entry, "multiplier")
@@ -254,9 +252,8 @@ def _bound_piece(case: Case, k: int, groups: dict[bytes, list[arb]], counts: dic
 
 
 def _share_peak_price(case: Case, prices: list[arb], groups: dict[bytes, list[arb]]) -> dict[bytes, list[arb]]:
-    """Return the part of the price of a channel's peak that each group pays, as far as it can lower its slope.
-
-    The sum of the parts is at most the price, since ``max_g |u_g|`` is at least every mean of ``|u_g|``."""
+    """Return the part of the price of a channel's peak that each group pays, as far as it can lower its slope. The sum
+    of the parts is at most the price, since ``max_g |u_g|`` is at least every mean of ``|u_g|``."""
     shares = {key: [ball(0)] * len(prices) for key in groups}
     for i, price in enumerate(prices):
         axis = [ball(j == i) for j in range(len(prices))]

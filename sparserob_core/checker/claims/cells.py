@@ -148,9 +148,8 @@ class _OpenCells:
 
 
 def _examine(place: Place, sides: Sides, todo: Sequence[Interval], left: _OpenCells, shown: _LargestExcess) -> None:
-    """Bound the rows on every cell of time, and sort the cells whose bounds are too large into ``left``.
-
-    The bounds that suffice are recorded in ``shown``."""
+    """Bound the rows on every cell of time, and sort the cells whose bounds are too large into ``left``. The bounds
+    that suffice are recorded in ``shown``."""
     for interval, polynomials, tops in _bound_rows(place, sides.rows, todo):
         for i, row in enumerate(sides.rows):
             if not tops[i] <= 0.0:
@@ -215,9 +214,8 @@ def _refute(place: Place, interval: Interval, rows: Sequence[tuple[Bounded, Poly
 def _bound_rows(
     place: Place, rows: Sequence[Bounded], todo: Sequence[Interval], sharp: bool = False
 ) -> Iterator[tuple[Interval, list[Polynomial], list[float]]]:
-    """Yield every interval with its polynomials, one per row, and with proven upper bounds of their excess.
-
-    Each bound holds for the polynomial with its error, less the limit and the slack of its row."""
+    """Yield every interval with its polynomials, one per row, and with proven upper bounds of their excess. Each bound
+    holds for the polynomial with its error, less the limit and the slack of its row."""
     z, polynomials_by_interval = np.array([row.z for row in rows]), []
     for interval in todo:
         place.clock.check()
@@ -235,9 +233,8 @@ def _bound_rows(
 
 
 def _bound_polynomials(tube: Reached, flat: Sequence[tuple[Polynomial, float]]) -> Array:
-    """Return upper bounds ``(k,)`` of polynomials with their errors, each less the value that it is allowed to reach.
-
-    A bound is at most 0 where halving boxes shows that. No bound need be sharp, whatever its sign."""
+    """Return upper bounds ``(k,)`` of polynomials with their errors, each less the value that it is allowed to reach. A
+    bound is at most 0 where halving boxes shows that. No bound need be sharp, whatever its sign."""
     tops, monomials = np.empty(len(flat)), tube.flow.monomials
     for orders in {poly.coefficients.shape[0] for poly, _ in flat}:
         indices = [i for i, (poly, _) in enumerate(flat) if poly.coefficients.shape[0] == orders]
@@ -255,9 +252,8 @@ def _bound_polynomials(tube: Reached, flat: Sequence[tuple[Polynomial, float]]) 
 
 
 def _bound_by_halfspaces(place: Place, row: Bounded, poly: Polynomial) -> float:
-    """Return the upper bound that the half-spaces of the set of parameters give; infinite for a box.
-
-    Where ``a'p <= s`` on the set, ``v <= v + weight (s - a'p)`` holds there for every ``weight >= 0``."""
+    """Return the upper bound that the half-spaces of the set of parameters give; infinite for a box. Where ``a'p <= s``
+    on the set, ``v <= v + weight (s - a'p)`` holds there for every ``weight >= 0``."""
     tube, top = place.tube, np.inf
     centre, radius = np.array(tube.flow.centre), np.array(tube.flow.radius)
     if place.parameters.is_box:

@@ -47,9 +47,8 @@ ASIDE = ("fewest active", "causal")  # claims that the status does not rest on
 
 
 def check(case: Case, gap_tolerance: float | None) -> list[Finding]:
-    """Return one verdict per claim of the certificate; nothing that the file says is believed.
-
-    ``gap_tolerance`` is the relative gap up to which the config calls a control certified, or ``None``."""
+    """Return one verdict per claim of the certificate; nothing that the file says is believed. ``gap_tolerance`` is the
+    relative gap up to which the config calls a control certified, or ``None``."""
     from flint import ctx
 
     status = case.certificate.get("status")
@@ -85,9 +84,8 @@ def check(case: Case, gap_tolerance: float | None) -> list[Finding]:
 
 
 def derived_bound(case: Case) -> float:
-    """Return the lower bound of the cost that the certificate's multipliers prove, rounded down.
-
-    Raise `Broken` or `Unchecked` where the multipliers prove none."""
+    """Return the lower bound of the cost that the certificate's multipliers prove, rounded down. Raise `Broken` or
+    `Unchecked` where the multipliers prove none."""
     from flint import ctx
 
     with ctx.workprec(precision_of(case)):
@@ -124,9 +122,8 @@ def precision_of(case: Case) -> int:
 
 
 def judged(name: str, derive: Callable[[], str]) -> Finding:
-    """Return the verdict of a derivation that returns a sentence or raises.
-
-    Where floats overflow, the claim is not checked: a comparison with a NaN could pass."""
+    """Return the verdict of a derivation that returns a sentence or raises. Where floats overflow, the claim is not
+    checked: a comparison with a NaN could pass."""
     try:
         with np.errstate(over="raise", invalid="raise", divide="raise"):
             return Finding(name, "holds", derive())
@@ -141,9 +138,8 @@ def judged(name: str, derive: Callable[[], str]) -> Finding:
 
 
 def _qualify_finding(status: str, found: Finding) -> Finding:
-    """Return the verdict on a constraint, given the status of the control.
-
-    A control that is not proven, such as one at which a run was stopped, claims no constraint. So it fails none."""
+    """Return the verdict on a constraint, given the status of the control. A control that is not proven, such as one at
+    which a run was stopped, claims no constraint. So it fails none."""
     if found.verdict != "fails" or status in ("certified", "verified"):
         return found
     return Finding(found.name, "not checked", f"the certificate does not claim it: {found.text}")
@@ -213,9 +209,8 @@ def _verify_in_set(
 def _bound_curved_excess(
     case: Case, shape: Shape, places: Sequence[int], heights: Callable[[int, arb_mat], list[arb]]
 ) -> float:
-    """Show that what answers deviations is in a curved set on the given pieces, in every direction.
-
-    Return the largest excess that was not excluded, along the gauge of the set."""
+    """Show that what answers deviations is in a curved set on the given pieces, in every direction. Return the largest
+    excess that was not excluded, along the gauge of the set."""
     m, times = shape.dimension, case.control.breakpoints.tolist()
     curved = Curved(shape, np.diag(1.0 / np.array(shape.radius)), lambda c, width: 0.0)
     work = list[Work]()
@@ -315,9 +310,8 @@ def _format_cost_unit(case: Case) -> str:
 
 
 def _verify_active_time(case: Case) -> str:
-    """Show that the written time of action and the written cost ``J`` are those of the control.
-
-    Where there is an alphabet, its letters must be the only values of the control."""
+    """Show that the written time of action and the written cost ``J`` are those of the control. Where there is an
+    alphabet, its letters must be the only values of the control."""
     active_share, total = activity.acted(case), activity.largest(case)
     _require_agreement("cost", number(case.certificate, "cost"), ball(active_share * total), 0.0)
     derived = case.price.of(case.pieces)
@@ -337,9 +331,8 @@ def _verify_active_time(case: Case) -> str:
 
 
 def _require_agreement(name: str, written: float, derived: arb, scale: float) -> None:
-    """Raise `Broken` unless a written figure is within `FIGURES` times a size of the derived one.
-
-    The size is ``scale``, or the absolute value of the derived figure where that is larger."""
+    """Raise `Broken` unless a written figure is within `FIGURES` times a size of the derived one. The size is
+    ``scale``, or the absolute value of the derived figure where that is larger."""
     difference = abs(ball(written) - derived)
     if not difference <= ball(FIGURES) * ball(scale).max(abs(derived)):
         raise Broken(f"{name}: {written!r} is written, {float(derived)!r} is derived")
@@ -518,9 +511,8 @@ def relative_gap(case: Case, cost: float, lower: float) -> float:
 
 
 def added_up(case: Case) -> float:
-    """Return the size of the numbers that are added up to the claimed cost.
-
-    This size is the cost itself, except for quadratic costs, whose terms may cancel."""
+    """Return the size of the numbers that are added up to the claimed cost. This size is the cost itself, except for
+    quadratic costs, whose terms may cancel."""
     cost = number(case.certificate, "cost")
     if case.counts or not case.price.is_quadratic:
         return abs(cost)
@@ -547,9 +539,8 @@ def _verify_witness(case: Case) -> str:
 
 
 def _verify_violation(case: Case, over: arb, slack: float, data: Mapping[str, Any]) -> str:
-    """Show that an excess ``over`` is a violation, and agrees with the figure of the witness.
-
-    The two may differ by a millionth of the excess, plus ``slack``, enlarged where many steps are rounded."""
+    """Show that an excess ``over`` is a violation, and agrees with the figure of the witness. The two may differ by a
+    millionth of the excess, plus ``slack``, enlarged where many steps are rounded."""
     allowed = excused(case, data, slack)
     if not over > allowed:
         raise Broken(f"it leads to a violation of {float(over):.3g}, up to {allowed:.3g} is none")

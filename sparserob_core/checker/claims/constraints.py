@@ -202,7 +202,6 @@ def _find_cuts(case: Case) -> Array:
 
 def _extract_facets(window: ConstraintWindow, units: WindowUnits) -> tuple[Array, Array, Sides | None]:
     """Return the normals of a flat set's facets, on the state ``(b, d)`` and on the control ``(b, m)``, and its rows.
-
     Opposite facets share a normal. The rows are ``None`` for a curved set."""
     facet_basis, facets = basis_of(window.seen), window.seen.facets
     if facet_basis is None or facets is None:
@@ -227,7 +226,6 @@ def prove_on_cells(
     case: Case, window: ConstraintWindow, rows: tuple[Array, Array], work: Sequence[Work], cells: tuple[Array, Array]
 ) -> Proven:
     """Show with `prove` that a constraint is kept on the parts ``work`` of ``cells`` between lower and upper corners.
-
     The rows to bound are combinations of ``rows``, ``(b, d)`` on the state and ``(b, m)`` on the control."""
     added_terms = case.beside(window, *rows)
     return prove(tubes(case, *rows, *cells), parameters_of(case), work, case.clock, added_terms)
@@ -342,9 +340,8 @@ def _is_wide(bound: ConvexSet, channel: int) -> bool:
 
 
 def _is_at_rest(case: Case, state: int) -> bool:
-    """Return whether a state provably starts at 0 and nothing ever moves it, uncertainties aside.
-
-    Neither a linked state, nor a control of the decision, nor a drift, nor the middle of a disturbance may move it."""
+    """Return whether a state provably starts at 0 and nothing ever moves it, uncertainties aside. Neither a linked
+    state, nor a control of the decision, nor a drift, nor the middle of a disturbance may move it."""
     reaching, (is_nonzero, _) = _find_linked_states(case, state), case.flows.links
     m, initial_control = case.problem.system.controls, case.problem.initial_control
     commands = [

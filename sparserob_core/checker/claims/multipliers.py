@@ -163,9 +163,8 @@ def _derive_base_row(
 def _derive_row(
     case: Case, c: Array, time: float, parameter: Sequence[float], limit: arb, disturbed: bool
 ) -> ConstraintRow:
-    """Return the constraint ``c'x(t) <= limit`` for the worst deviations or without them.
-
-    By the adjoint of its row no transition matrix is computed; each would take a minute for hundreds of states."""
+    """Return the constraint ``c'x(t) <= limit`` for the worst deviations or without them. By the adjoint of its row no
+    transition matrix is computed; each would take a minute for hundreds of states."""
     if not case.followed.are_best:
         return case.duality.row(c, time, parameter, limit, disturbed)
     worst, problem, delay = case.followed.worst(c, None), case.problem, case.problem.system.delay
@@ -218,9 +217,8 @@ def _derive_effort_row(case: Case, shares: Array, named: NamedDeviations | None)
 
 
 def fixed_limit(case: Case, direction: Array, time: float) -> arb:
-    """Return the value of ``c'x(T)`` for a direction ``c (d,)`` of one fixed state or its opposite.
-
-    Raise `Broken` for any other direction or time."""
+    """Return the value of ``c'x(T)`` for a direction ``c (d,)`` of one fixed state or its opposite. Raise `Broken` for
+    any other direction or time."""
     values = dict(case.equalities)
     states = np.flatnonzero(direction).tolist()
     if len(states) != 1 or states[0] not in values or time != case.problem.horizon:
@@ -229,9 +227,8 @@ def fixed_limit(case: Case, direction: Array, time: float) -> arb:
 
 
 def piece_of(case: Case, window: ConstraintWindow, entry: Mapping[str, Any], time: float) -> int:
-    """Return the number of the control's piece that an entry names for a mixed constraint.
-
-    Raise `Broken` unless that piece holds the time and meets the window in positive length."""
+    """Return the number of the control's piece that an entry names for a mixed constraint. Raise `Broken` unless that
+    piece holds the time and meets the window in positive length."""
     piece = entry.get("piece")
     if type(piece) is not int:
         raise Broken(f"{window.name}: piece is {piece!r}, expected the number of a piece of the control")

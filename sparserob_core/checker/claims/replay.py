@@ -148,7 +148,6 @@ def _enclose_largest_value(
 
 def _project_onto_direction(direction: Array, named: NamedDeviations | None, rows: Sequence[list[arb]]) -> arb:
     """Return ``c'x`` for rows with a nominal value and responses, ``(1 + Q,)`` each, under the named deviations.
-
     Without named deviations it is the nominal value."""
     return along(direction, [row[0] for row in rows] if named is None else named.of(rows))
 
@@ -222,9 +221,8 @@ def _compute_excess_by_adjoints(
 
 
 def _find_pieces(case: Case, time: float, jumps: bool) -> list[tuple[int, int]]:
-    """Return the pairs of a piece of the grid and a piece of the control that a time is in.
-
-    Where the control ``jumps``, the pieces on both sides of the time count."""
+    """Return the pairs of a piece of the grid and a piece of the control that a time is in. Where the control
+    ``jumps``, the pieces on both sides of the time count."""
     sides: tuple[Literal["left", "right"], ...] = ("left", "right") if jumps else ("right",)
     ends = np.array(case.timing.grid), case.control.breakpoints
     places = ([int(np.clip(np.searchsorted(e, time, side=side) - 1, 0, e.size - 2)) for e in ends] for side in sides)
@@ -251,9 +249,8 @@ def _read_initial_deviation(case: Case, data: object) -> Array:
 
 
 def _read_disturbance(case: Case, signal: object) -> Array:
-    """Return the disturbance ``(mw, pieces)``, shown to be admissible.
-
-    Raise `Broken` where it leaves its set or jumps within one of its pieces, `Unchecked` where its grid is another."""
+    """Return the disturbance ``(mw, pieces)``, shown to be admissible. Raise `Broken` where it leaves its set or jumps
+    within one of its pieces, `Unchecked` where its grid is another."""
     changes, bound = case.disturbances.changes, case.problem.disturbance
     assert changes is not None and bound is not None
     w = numbers(signal, "disturbance")

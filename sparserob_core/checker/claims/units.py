@@ -102,9 +102,8 @@ class WindowUnits:
 
     @cached_property
     def resolved(self) -> Array:
-        """The unit ``(k,)`` of every facet of a flat set as far as double precision resolves it, large or small.
-
-        This unit says how closely figures must agree; no violation is excused by it."""
+        """The unit ``(k,)`` of every facet of a flat set as far as double precision resolves it, large or small. This
+        unit says how closely figures must agree; no violation is excused by it."""
         facets = known(self.shape).facets
         assert facets is not None
         heights = np.array([abs(float(b)) for _, b in facets])

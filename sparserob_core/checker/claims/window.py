@@ -84,15 +84,13 @@ class ConstraintWindow:
         return [ball(a) + v * (ball(start) - ball(t)) for a, v in zip(p, slope, strict=True)], slope
 
     def cuts(self, breakpoints: Sequence[float]) -> list[float]:
-        """Return the times at which the rows have a kink or a jump that the state does not have.
-
-        ``breakpoints (K + 1,)`` are those of the control, at which mixed constraints jump."""
+        """Return the times at which the rows have a kink or a jump that the state does not have. ``breakpoints (K +
+        1,)`` are those of the control, at which mixed constraints jump."""
         kinks = [] if self.reference is None else self.reference[:, 0].tolist()
         return kinks + (list(breakpoints) if self.is_mixed else [])
 
     def meets(self, breakpoints: Sequence[float], piece: int, time: float) -> None:
         """Raise `Broken` unless a piece of the control holds a time and meets the window in positive length.
-
         ``breakpoints (K + 1,)`` are those of the control."""
         if not 0 <= piece < len(breakpoints) - 1:
             raise Broken(f"{self.name}: the control has no piece {piece}")
@@ -158,9 +156,8 @@ class Beside:
 
     @remembered(lambda: DIRECTIONS_KEPT, lambda self, z: z.tobytes())
     def directions(self, z: Array) -> tuple[Array, Array]:
-        """Return ``c = z'basis`` as floats ``(k, d)``, with bounds ``(k, d)`` of their rounding errors.
-
-        The floats are exact where nothing is added up, and mostly elsewhere."""
+        """Return ``c = z'basis`` as floats ``(k, d)``, with bounds ``(k, d)`` of their rounding errors. The floats are
+        exact where nothing is added up, and mostly elsewhere."""
         exact = (exactly(z) * exactly(self.basis)).entries()
         floats = [float(x) for x in exact]
         errors = [x - ball(c) for x, c in zip(exact, floats, strict=True)]
@@ -197,9 +194,8 @@ class Beside:
 
 
 def _add_terms(poly: Polynomial, terms: Array, lost: float) -> Polynomial:
-    """Return the sum of a polynomial and another one with coefficients ``terms (J, M)`` of the first monomials.
-
-    All errors of these coefficients together are at most ``lost``."""
+    """Return the sum of a polynomial and another one with coefficients ``terms (J, M)`` of the first monomials. All
+    errors of these coefficients together are at most ``lost``."""
     missing = max(0, len(terms) - poly.coefficients.shape[0])
     coefficients = np.pad(poly.coefficients, ((0, missing), (0, 0)))
     changed = coefficients[: len(terms), : terms.shape[1]]

@@ -18,9 +18,8 @@ from sparserob_core.checker.arithmetic.monomials import Monomials
 from sparserob_core.checker.arithmetic.remembered import remembered
 from sparserob_core.checker.arithmetic.series import OUTWARD, Series, middles, products, zeros
 from sparserob_core.checker.flow.law import Law, ParameterBox, Stretch
-from sparserob_core.checker.flow.plant import Plant, called
+from sparserob_core.checker.flow.plant import Plant, called, held_about
 from sparserob_core.checker.flow.segment import LONGER, ROUGH, SHARP, VerifiedSegment, solve
-from sparserob_core.checker.flow.still import held_about
 from sparserob_core.checker.outcome import Unchecked
 from sparserob_core.sip.convex_set import Array
 

@@ -22,8 +22,7 @@ import numpy as np
 from sparserob_core.checker.arithmetic.balls import ball, balls
 from sparserob_core.checker.arithmetic.series import around, exactly, identity, stacked
 from sparserob_core.checker.flow.flow import VerifiedFlow
-from sparserob_core.checker.flow.plant import Plant
-from sparserob_core.checker.flow.still import modes_at
+from sparserob_core.checker.flow.plant import Plant, modes_at
 from sparserob_core.checker.reach.deviations import Deviations
 from sparserob_core.checker.reach.preimages import Pushed
 from sparserob_core.checker.sets.polynomials import OUTWARD, Enclosed, rounding

@@ -17,7 +17,7 @@ import numpy as np
 
 from sparserob_core.checker.arithmetic.remembered import remembered
 from sparserob_core.checker.arithmetic.series import stacked
-from sparserob_core.checker.flow.still import modes_at
+from sparserob_core.checker.flow.plant import modes_at
 from sparserob_core.checker.outcome import Clock
 from sparserob_core.checker.reach.adjoint import AdjointFlow, AdjointRow, SupportIntegrals, subtract_times
 from sparserob_core.checker.reach.kernels import BoundedInputHere

@@ -10,7 +10,7 @@ import numpy as np
 
 from sparserob_core.checker.arithmetic.remembered import remembered
 from sparserob_core.checker.arithmetic.series import stacked
-from sparserob_core.checker.flow.still import modes_at
+from sparserob_core.checker.flow.plant import modes_at
 from sparserob_core.checker.problem.disturbances import Disturbances
 from sparserob_core.checker.problem.integrals import RunningIntegrals, spelt
 from sparserob_core.checker.problem.timing import Timing

@@ -62,10 +62,8 @@ class Pushed:
     @staticmethod
     def of(modes: Sequence[tuple[arb_mat, arb_mat]], vectors: Sequence[Sequence[Fraction]]) -> Pushed:
         """Return the reached states for a disturbance along ``vectors (q, mw)``, without rounding; `Unchecked` unless
-        the entries of all systems ``A (d, d)``, ``E (d, mw)`` are floats.
-
-        The reached subspace is the smallest one that holds the columns of every ``E`` along the vectors and that no
-        ``A`` leaves. It is found within ``d`` steps."""
+        the entries of all systems ``A (d, d)``, ``E (d, mw)`` are floats. The reached subspace is the smallest one that
+        holds the columns of every ``E`` along the vectors and that no ``A`` leaves. It is found within ``d`` steps."""
         from flint import fmpq, fmpq_mat
 
         if not all(x.is_exact() for mode in modes for matrix in mode for x in matrix.entries()):

@@ -44,9 +44,8 @@ class Enclosed:
 
     @staticmethod
     def all(matrices: Sequence[arb_mat], shape: tuple[int, ...]) -> Enclosed:
-        """Return the entries of ball matrices in an array of that shape, one matrix after another, row by row.
-
-        An exact 0 has the radius 0, and no other number has it."""
+        """Return the entries of ball matrices in an array of that shape, one matrix after another, row by row. An exact
+        0 has the radius 0, and no other number has it."""
         entries = [x for matrix in matrices for x in matrix.entries()]
         mid = np.array([*map(float, entries)]).reshape(shape)
         rad = np.array([float(x.rad()) for x in entries]).reshape(shape)

@@ -1,4 +1,4 @@
-"""Guards checker/flow/units and checker/flow/still: units in which a system is small, and the flow of one that does not
+"""Guards checker/flow/units and checker/flow/plant: units in which a system is small, and the flow of one that does not
 change with time."""
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from flint import arb, arb_mat, ctx
 from scipy.linalg import expm
 
 from sparserob_core.checker.arithmetic.series import middles
-from sparserob_core.checker.flow.still import held_about, modes_at
+from sparserob_core.checker.flow.plant import held_about, modes_at
 from sparserob_core.checker.flow.units import balanced, scaled
 from sparserob_core.checker.outcome import Unchecked
 from sparserob_core.control.problem.expression import parse_matrix

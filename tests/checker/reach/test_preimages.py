@@ -10,8 +10,7 @@ from flint import arb, arb_mat, ctx
 
 import sparserob_core as sr
 from sparserob_core.checker.flow.flow import VerifiedFlow
-from sparserob_core.checker.flow.plant import Plant
-from sparserob_core.checker.flow.still import modes_at
+from sparserob_core.checker.flow.plant import Plant, modes_at
 from sparserob_core.checker.outcome import Unchecked
 from sparserob_core.checker.reach.closed_loop import VerifiedLoop
 from sparserob_core.checker.reach.preimages import Pushed, SeenDeviations
