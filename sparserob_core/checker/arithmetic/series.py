@@ -72,7 +72,7 @@ class Series:
     @cached_property
     def size(self) -> Array:
         """The upper bounds ``(rows, columns)`` of the absolute values of the entries; 0 where an entry is exactly 0."""
-        bounds = np.array([upper(x) for coefficient in self.parts for x in coefficient.entries()])
+        bounds = uppers([x for coefficient in self.parts for x in coefficient.entries()])
         return np.asarray(bounds.reshape(len(self.parts), *self.shape).sum(axis=0) * OUTWARD)
 
     @property
@@ -175,10 +175,13 @@ class Series:
         return Series(self.monomials, [coefficient.transpose() for coefficient in self.parts])
 
 
-def upper(x: arb) -> float:
-    """Return an upper bound of an absolute value, up to `OUTWARD`: 0 for an exact 0 alone, since floats underflow."""
-    size = float(x.abs_upper())
-    return 0.0 if size == 0.0 and x.is_zero() else size + TINY
+def uppers(entries: Sequence[arb]) -> Array:
+    """Return upper bounds of absolute values, up to `OUTWARD`: 0 for an exact 0 alone, since floats underflow."""
+    sizes = np.array([float(x.abs_upper()) for x in entries])
+    exact = [i for i in np.flatnonzero(sizes == 0.0).tolist() if entries[i].is_zero()]
+    sizes += TINY
+    sizes[exact] = 0.0
+    return sizes
 
 
 def sizes_of(series: Sequence[Series]) -> Array:

@@ -14,7 +14,7 @@ import numpy as np
 
 from sparserob_core.checker.arithmetic.models import Frame, Model
 from sparserob_core.checker.arithmetic.monomials import NONE, Monomials, monomials_of
-from sparserob_core.checker.arithmetic.series import OUTWARD, Series, stacked, upper
+from sparserob_core.checker.arithmetic.series import OUTWARD, Series, stacked, uppers
 from sparserob_core.checker.flow.plant import Plant, called
 from sparserob_core.checker.flow.segment import SHARP
 from sparserob_core.checker.flow.units import balanced, pace
@@ -126,8 +126,7 @@ class Stretch:
         for table in self.table:
             for i, row in enumerate(table):
                 for j, entry in enumerate(row):
-                    for n, c in enumerate(entry.coeffs()):
-                        size = upper(c)
+                    for n, size in enumerate(uppers(entry.coeffs()).tolist()):
                         sizes[:, i, j] += size, size * n / half
         return sizes[0] * OUTWARD**2, sizes[1] * OUTWARD**2
 

@@ -47,12 +47,12 @@ class Enclosed:
         """Return the entries of ball matrices in an array of that shape, one matrix after another, row by row. An exact
         0 has the radius 0, and no other number has it."""
         entries = [x for matrix in matrices for x in matrix.entries()]
-        mid = np.array([*map(float, entries)]).reshape(shape)
-        rad = np.array([float(x.rad()) for x in entries]).reshape(shape)
+        mid, rad = np.array([*map(float, entries)]), np.array([float(x.rad()) for x in entries])
         if not (np.isfinite(mid).all() and np.isfinite(rad).all()):
             raise Unchecked("the response grows beyond what numbers can hold")
-        inexact = np.array([not x.is_zero() for x in entries]).reshape(shape)
-        return Enclosed(mid, (rad + HALF_ULP * np.abs(mid)) * OUTWARD + TINY * inexact)
+        bounds = (rad + HALF_ULP * np.abs(mid)) * OUTWARD + TINY
+        bounds[[i for i in np.flatnonzero((mid == 0.0) & (rad == 0.0)).tolist() if entries[i].is_zero()]] = 0.0
+        return Enclosed(mid.reshape(shape), bounds.reshape(shape))
 
 
 def product(left: Enclosed, right: Enclosed) -> Enclosed:
