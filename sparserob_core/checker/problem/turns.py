@@ -1,7 +1,7 @@
-"""Switched systems, delays and parameters as one system whose entries depend on the time.
+"""Switched systems and systems with parameters as one system whose entries depend on the time.
 
-Errors of execution are propagated in the time, not in the age of a command; so are measurable disturbances of a system
-with parameters.
+Errors of execution are then propagated in the time, not in the age of a command; so are measurable disturbances of a
+system with parameters.
 """
 
 from __future__ import annotations
@@ -15,11 +15,9 @@ from sparserob_core.control.sets.sets import Box
 
 def in_turns(problem: OptimalControlProblem) -> OptimalControlProblem:
     """Return the problem with such a system where that is needed, else the problem itself: for errors of execution with
-    switches, a delay or parameters, and for measurable disturbances with a box of parameters."""
+    switches or parameters, and for measurable disturbances with a box of parameters."""
     system = problem.system
-    is_execution_case = problem.execution is not None and bool(
-        system.switches or system.delay or system.parameter_count
-    )
+    is_execution_case = problem.execution is not None and bool(system.switches or system.parameter_count)
     is_measurable_case = problem.measurable is not None and isinstance(system.parameters, Box)
     if system.varies or not (is_execution_case or is_measurable_case):
         return problem

@@ -72,14 +72,14 @@ class Sources:
         if self.timing.answering:
             raise Unchecked("the checker knows errors of execution without feedback")
         shares, breakpoints, pieces = np.asarray(shares, dtype=float), self.timing.control, self.pieces()
-        if self.is_still:
-            return FollowedExecution(self.problem, shares, breakpoints, pieces, self.timing.clock)
         if system.delay > 0.0:  # the control before 0 is the first piece; the last pieces act after the horizon
             begins = breakpoints[:-1] + system.delay
             breakpoints = np.array([0.0, *begins[begins < self.problem.horizon], self.problem.horizon])
             pieces = [stacked([[v] for v in balls(before(self.problem))]), *pieces][
                 : breakpoints.size - 1 if pieces else 0
             ]
+        if self.is_still:
+            return FollowedExecution(self.problem, shares, breakpoints, pieces, self.timing.clock)
         sides = channels(shares.size)
         return self._build_bounded_input(SizedInput(shares, breakpoints, pieces, sides, numb=self.problem.commanded))
 

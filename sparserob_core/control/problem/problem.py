@@ -377,10 +377,10 @@ class OptimalControlProblem(Term):
                 self.terminal_equalities
             ),
             "parameters in another set than a box": timed is None,
-            "measurable disturbances in a curved set where the system has pieces, a delay or parameters": any(
+            "measurable disturbances in a curved set where the system has pieces or parameters": any(
                 bound.halfspaces() is None for bound in filter(None, [self.measurable])
             )
-            and (bool(self.system.switches) or self.system.delay > 0.0 or self.system.parameter_count > 0),
+            and (bool(self.system.switches) or self.system.parameter_count > 0),
             "curved sets of states with parameters that the state does not depend on affinely": timed is not None
             and timed.powers is not None
             and any(bound.halfspaces() is None for bound in sets),

@@ -37,8 +37,9 @@ ALIKE = 1e-14
 class Execution:
     """Errors of execution: the delivered control may differ from the commanded one by ``shares (m,)`` of it.
 
-    ``breakpoints (K + 1,)`` are those of the command, and ``response`` is the response of a known system. ``felt (d,)``
-    is 0 for states that add up what is commanded, and do nothing else, and 1 for others.
+    ``breakpoints (K + 1,)`` are those of the command, and ``response`` is the response of a known system, on which
+    commands may act with a delay. ``felt (d,)`` is 0 for states that add up what is commanded, and do nothing else, and
+    1 for others.
     """
 
     response: Response
@@ -90,8 +91,27 @@ class Execution:
         return replace(self, shares=np.zeros(self.shares.size))
 
     def given(self, times: Array, directions: Array) -> Array:
-        """Return the contribution ``(k,)`` to ``c'x(t)`` of errors of commands before the first piece: 0."""
-        return np.zeros(times.size)
+        """Return the contribution ``(k,)`` to ``c'x(t)`` of errors of the control before the first piece, where
+        commands act late."""
+        if not self.late:
+            return np.zeros(times.size)
+        return self.added(np.zeros((self.shares.size, self.breakpoints.size - 1)), times, directions)
+
+    @property
+    def late(self) -> int:
+        """Number of inputs before the first piece of the command: 1 where commands act with a delay, else 0."""
+        return int(self.response.grid.before is not None)
+
+    def acts(self, control: Array) -> Array:
+        """Return the absolute value of all that acts, ``(m, late + K)``, for a command ``(m, K)``."""
+        size, before = np.abs(control), self.response.grid.before
+        return size if before is None or not self.late else np.column_stack([np.abs(before), size])
+
+    @cached_property
+    def begins(self) -> Array:
+        """Times ``(late + K + 1,)`` at which what acts changes."""
+        delay = self.response.system.delay
+        return np.append(0.0, self.breakpoints + delay) if self.late else self.breakpoints
 
     @property
     def size(self) -> int:
@@ -122,7 +142,7 @@ class Execution:
 
         The result ``(k, m K)`` is ordered channel by channel. It is not enclosed.
         """
-        ages = np.clip(times[:, None] - self.breakpoints, 0.0, None)
+        ages = np.clip(times[:, None] - self.begins[self.late :], 0.0, None)
         contributions = np.zeros((times.size, self.shares.size, self.breakpoints.size - 1))
         for j, integral in enumerate(self._integrate_responses(ages, directions)):
             contributions[:, j] = self.shares[j] * np.maximum(integral[:, :-1] - integral[:, 1:], 0.0)
@@ -137,7 +157,7 @@ class Execution:
         pieces, jumps = self.jumps(control)
         if not pieces.size:
             return np.zeros(times.size)
-        ages = np.clip(times[:, None] - self.breakpoints[pieces], 0.0, None)
+        ages = np.clip(times[:, None] - self.begins[pieces], 0.0, None)
         pairs = zip(self._integrate_responses(ages, directions), jumps, strict=True)
         return np.asarray(sum(integral @ change for integral, change in pairs))
 
@@ -147,15 +167,15 @@ class Execution:
     ) -> Float[Array, " k"]:
         """The derivative ``(k,)`` of `added` in the time, from the left where that jumps."""
         (A, B), (pieces, jumps) = self.matrices, self.jumps(control)
-        ages = times[:, None] - self.breakpoints[pieces]
+        ages = times[:, None] - self.begins[pieces]
         impulse_responses = _propagate_rows(A, directions, ages) @ B
         return np.asarray(np.einsum("kqm,mq,kq->k", np.abs(impulse_responses), jumps, ages > 0.0))
 
     @shaped
     def jumps(self, control: Float[Array, "m K"]) -> tuple[np.ndarray, Float[Array, "m q"]]:
-        """The pieces ``(q,)`` with which the size of the largest error changes, and by how much, ``(m, q)``: by parts,
-        ``sum_k r_k int_k = sum_k (r_k - r_{k-1}) int_{t_k}^t``, of which a sparse control needs few."""
-        jumps = np.diff(self.shares[:, None] * np.abs(control), axis=1, prepend=0.0)
+        """The entries ``(q,)`` of `acts` with which the size of the largest error changes, and by how much, ``(m, q)``:
+        by parts, ``sum_k r_k int_k = sum_k (r_k - r_{k-1}) int_{t_k}^t``, of which a sparse control needs few."""
+        jumps = np.diff(self.shares[:, None] * self.acts(control), axis=1, prepend=0.0)
         pieces = np.flatnonzero(jumps.any(axis=0))
         return pieces, jumps[:, pieces]
 
@@ -185,10 +205,11 @@ class Execution:
         """Return lower and upper bounds of `added`, ``(k, 2)``."""
         pieces, jumps = self.jumps(control)
         total, size = np.zeros((times.size, 2)), np.zeros(times.size)
-        ages = np.clip(times[:, None] - self.breakpoints[pieces], 0.0, None).ravel()
-        # a difference of times is rounded, and an integral grows with its length
+        ages = np.clip(times[:, None] - self.begins[pieces], 0.0, None).ravel()
+        # sums and differences of times are rounded, and an integral grows with its length
         last, rows = float(self.breakpoints[-1]), np.repeat(directions, pieces.size, axis=0)
-        age_bounds = np.nextafter(ages, 0.0), np.minimum(np.nextafter(ages, np.inf), last)
+        room = 2.0 * np.spacing(last)
+        age_bounds = np.maximum(ages - room, 0.0), np.minimum(ages + room, last)
         for support, change in zip(self._supports, jumps, strict=True):
             if support is None or not change.any():
                 continue
@@ -232,7 +253,7 @@ class ExecutionCellSupport(KnownCellSupport):
         if not pieces.size:
             return np.zeros((start.size, self.rows.shape[0]))
         comparison, lifted = self.lifted.comparison, self.lifted
-        ages = start[:, None] - self.execution.breakpoints[pieces]
+        ages = start[:, None] - self.execution.begins[pieces]
         is_active = ages + widths[:, None] > 0.0  # the others begin after the cell
         ages, width = np.where(is_active, np.maximum(ages, 0.0), 0.0).ravel(), np.repeat(widths, pieces.size)
         rows, drive = self.rows @ lifted.transform, lifted.B[0][:, : jumps.shape[0]]
@@ -260,7 +281,7 @@ class ExecutionCellSupport(KnownCellSupport):
     def reached(self) -> Array:
         """Norm bounds ``(L, q)`` of the effect of the errors on every block of the coordinates until the end of every
         piece."""
-        error_sizes = self.execution.shares * np.abs(self.control).max(axis=1)
+        error_sizes = self.execution.shares * self.execution.acts(self.control).max(axis=1)
         norms = block_norms(np.abs(self.lifted.B[0][:, : error_sizes.size]) @ error_sizes, self.lifted.starts)
         reach = self.lifted.comparison.over(self.lifted.grid.breakpoints[1:])
         return reach.integral.on(np.broadcast_to(norms, (self.lifted.grid.pieces, norms.size)))

@@ -138,12 +138,7 @@ class VaryingExecution(Execution):
     @property
     def late(self) -> int:
         """Number of inputs before the first piece of the command: 1 where commands act with a delay, else 0."""
-        return int(self.motion.grid.before is not None and not self.disturbing)
-
-    def acts(self, control: Array) -> Array:
-        """Return the absolute value of all that acts, ``(m, late + K)``, for a command ``(m, K)``."""
-        size, before = np.abs(control), self.motion.grid.before
-        return size if before is None or not self.late else np.column_stack([np.abs(before), size])
+        return 0 if self.disturbing else super().late
 
     @cached_property
     def kernel(self) -> Kernel:
@@ -156,13 +151,6 @@ class VaryingExecution(Execution):
         """`Execution.lengths`."""
         lengths = self._integrate_unit_errors(times, directions)[:, :, self.late :]
         return lengths.reshape(times.size, self.shares.size * (self.breakpoints.size - 1))
-
-    @shaped
-    def given(self, times: Float[Array, " k"], directions: Float[Array, "k d"]) -> Float[Array, " k"]:
-        """`Execution.given`, where commands act late."""
-        if not self.late:
-            return np.zeros(times.size)
-        return self.added(np.zeros((self.shares.size, self.breakpoints.size - 1)), times, directions)
 
     def _integrate_unit_errors(self, times: Array, directions: Array) -> Array:
         """Return the middle of the bounds of the contribution of errors for size 1 of each entry of `acts`,

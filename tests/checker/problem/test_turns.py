@@ -40,7 +40,8 @@ def test_laws_in_turns_are_those_of_the_systems_that_take_turns() -> None:
     ("plant", "more", "changed"),
     [
         (LinearSystem(-np.eye(1), np.eye(1)), {"execution": np.array([0.1])}, False),
-        (LinearSystem(-np.eye(1), np.eye(1), delay=0.25), {"execution": np.array([0.1])}, True),
+        (LinearSystem(-np.eye(1), np.eye(1), delay=0.25), {"execution": np.array([0.1])}, False),
+        (SwitchedSystem([(0.75, system("1")), (2.0, system("2"))]), {"execution": np.array([0.1])}, True),
         (LinearSystem(-np.eye(1), np.eye(1), delay=0.25), {}, False),
         (system("-p1"), {"execution": np.array([0.1])}, True),
         (system("-p1"), {}, False),

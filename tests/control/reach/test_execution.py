@@ -136,6 +136,33 @@ def test_a_constraint_is_the_same_in_any_units(units: float) -> None:
     )
 
 
+def test_a_late_command_adds_what_a_system_followed_in_time_says() -> None:
+    """And so does the control before it, which acts until the first piece does."""
+    delayed = sr.LinearSystem(A, B, delay=0.3)
+    late, in_time = (
+        model(system=system, initial_control=[0.4, -0.9]).functionals.execution
+        for system in (delayed, delayed.in_time(HORIZON))
+    )
+    assert late is not None and in_time is not None and type(late) is Execution is not type(in_time)
+    times = np.array([0.0, 0.1, 0.3, 0.5, 0.8, 1.23, 2.2, HORIZON])
+    at = times, np.tile([1.0, -0.4], (times.size, 1))
+    np.testing.assert_allclose(late.given(*at), in_time.given(*at), atol=1e-12)
+    assert late.given(*at)[1] > 1e-3 and late.given(*at)[-1] > 1e-3
+    np.testing.assert_allclose(late.lengths(*at), in_time.lengths(*at), atol=1e-12)
+    np.testing.assert_allclose(late.added(CONTROL, *at), in_time.added(CONTROL, *at), atol=1e-12)
+    bounds, truth = late.enclosed(CONTROL, *at), in_time.enclosed(CONTROL, *at)
+    assert (bounds[:, 0] <= truth[:, 1]).all() and (truth[:, 0] <= bounds[:, 1]).all()
+    h = 1e-6
+    about = [late.added(CONTROL, times[1:-1] + sign * h + 0.01, at[1][1:-1]) for sign in (1.0, -1.0)]
+    slopes = late.slope(CONTROL, times[1:-1] + 0.01, at[1][1:-1])
+    np.testing.assert_allclose(slopes, (about[0] - about[1]) / (2 * h), rtol=1e-5)
+
+
+def test_late_bounds_hold_on_every_cell_and_close() -> None:
+    one = constraint(model(system=sr.LinearSystem(A, B, delay=0.3), initial_control=[0.4, -0.9]))
+    assert_bounded_on_cells(one, np.concatenate([CONTROL.ravel(), np.abs(CONTROL).ravel()]), halvings=3, near=0.02)
+
+
 def test_the_sum_over_jumps_allows_for_its_rounding(execution: Execution) -> None:
     at = np.array([2.9]), np.array([[1.0, -0.4]])
     low, high = execution.enclosed(CONTROL, *at)[0]

@@ -1,5 +1,5 @@
-"""Switched systems, delays and parameters as one system that changes with time, where errors of execution or measurable
-disturbances need it."""
+"""Switched systems and systems with parameters as one system that changes with time, where errors of execution or
+measurable disturbances need it."""
 
 from __future__ import annotations
 
@@ -23,16 +23,16 @@ _CACHE: WeakKeyDictionary[OptimalControlProblem, OptimalControlProblem] = WeakKe
 def in_time(problem: OptimalControlProblem) -> OptimalControlProblem:
     """Return the same problem with a system that changes with time, where the method needs one.
 
-    This is the case for errors of execution with phases of the system, a delay or parameters, and for measurable
-    disturbances with parameters. The integrals over pieces of the command do not depend on its age alone. They are
-    integrals of such a system (`VaryingExecution`), and so are those of measurable disturbances, over all parameters
+    This is the case for errors of execution with phases of the system or parameters, and for measurable disturbances
+    with parameters. The integrals over pieces of the command do not depend on its age alone. They are integrals of such
+    a system (`VaryingExecution`), and so are those of measurable disturbances, over all parameters
     (`VaryingMeasurable`). Parameters of which the state is an affine function become states (`superposed`). Measurable
     disturbances with parameters that are not within reach stay as they are: nothing is proven for them.
     """
     system = problem.system
     if system.varies:
         return problem
-    plain = not (system.switches or system.delay or system.parameter_count)
+    plain = not (system.switches or system.parameter_count)
     if problem.execution is not None:
         return problem if plain else replace(problem, system=system.in_time(problem.horizon))
     if problem.measurable is None or not system.parameter_count:
