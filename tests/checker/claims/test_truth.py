@@ -73,10 +73,11 @@ def test_a_row_along_its_adjoint_is_the_one_that_exponentials_give(name: str, mo
     for time in (0.0, 0.25, 0.7, 1.25, 1.3, 2.0):
         for one in cases:
             row, limit = DIRECTIONS[2], arb(0.375)
-            found = multipliers._derive_adjoint_row(one, row, time, limit)
+            found = multipliers._derive_row(one, row, time, [], limit, disturbed=True)
             exact = one.duality.row(row, time, [], limit)
             strayed = one.sources.strayed
-            constant = exact.constant if strayed is None else exact.constant + arb(strayed.added(row, time)[1])
+            low, high = (0.0, 0.0) if strayed is None else strayed.added(row, time)
+            constant = exact.constant + arb((low + high) / 2.0, (high - low) / 2.0 * (1.0 + 1e-9))
             pairs = [(found.constant, constant)]
             pairs += [
                 (a, b)
@@ -192,8 +193,7 @@ def test_an_integral_that_begins_later_is_the_one_of_pieces_where_rows_are_follo
         monkeypatch.setattr(followed_rows, "FOLLOWED", followed)
         assert case.followed.are_best == (followed == 1)
         numbers = [x for state in (None, begun) for x in replay.exceeded(case, said, state)[0]]
-        derive = multipliers._derive_adjoint_row if followed == 1 else _by_duality
-        row = derive(case, c, window.start, arb(0.25))
+        row = multipliers._derive_row(case, c, window.start, [], arb(0.25), disturbed=True)
         found.append(numbers + [float(x.mid()) for part in ([row.constant], *row.slope) for x in part])
     assert found[1] == pytest.approx(found[0], abs=1e-12)
     assert len(set(np.round(found[0], 6))) > 6  # of other states, rows and pieces others
@@ -220,10 +220,6 @@ def test_measurable_disturbances_of_an_integral_are_those_of_pieces(
     assert found[1] == pytest.approx(found[0], abs=1e-9)
     with pytest.raises(Unchecked, match="one integral at a time"):
         case.followed.worst(np.array([0.0, 0.0, 1.0, 1.0]), case.scene).most(np.array([1.8]))
-
-
-def _by_duality(case: Any, c: np.ndarray, time: float, limit: Any) -> Any:
-    return case.duality.row(c, time, [], limit)
 
 
 def test_a_quadratic_cost_of_a_system_in_time_is_an_integral_by_hand() -> None:
