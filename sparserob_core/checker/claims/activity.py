@@ -23,7 +23,7 @@ from sparserob_core.control.sets.curved import NormBall
 if TYPE_CHECKING:
     from flint import arb
 
-ROUNDED = 1e-12  # of the terms that a value of the control is a sum of: so small a value counts as 0
+ROUNDED = 1e-12  # relative to the terms of a value of the control: a smaller value counts as 0
 EQUAL = 1e-12  # counts that differ by no more are equal
 NEARLY = 1e-6  # relative to one count: a bound that is above a whole number of counts by less is rounded down to it
 

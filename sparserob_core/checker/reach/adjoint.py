@@ -22,10 +22,10 @@ from sparserob_core.checker.arithmetic.series import Series, middles, stacked, z
 from sparserob_core.checker.flow.segment import VerifiedSegment, solve
 from sparserob_core.checker.flow.units import balanced
 from sparserob_core.checker.outcome import Clock, Unchecked
-from sparserob_core.checker.sets.along import CurvedSide
-from sparserob_core.checker.sets.known import known, middle, sides_of
+from sparserob_core.checker.sets.along import NormSummand
+from sparserob_core.checker.sets.known import known, middle, summands_of
 from sparserob_core.checker.sets.polynomials import HALF_ULP, OUTWARD, TINY, Enclosed, rounding
-from sparserob_core.checker.sets.summands import Side
+from sparserob_core.checker.sets.summands import Summand
 from sparserob_core.sip.convex_set import Array, ConvexSet
 
 if TYPE_CHECKING:
@@ -311,12 +311,12 @@ class AdjointRow:
 @final
 @dataclass(frozen=True, eq=False)
 class SupportIntegrals:
-    """The integrals, from 0 on, of the support functions of ``sides`` at some ``columns`` of ``l'F`` for one ``row``:
-    one integral for every side."""
+    """The integrals, from 0 on, of the support functions of ``summands`` at some ``columns`` of ``l'F`` for one
+    ``row``: one integral for every summand."""
 
     row: AdjointRow
     columns: slice
-    sides: Sequence[Side | CurvedSide]
+    summands: Sequence[Summand | NormSummand]
 
     @cached_property
     def _polynomials(self) -> tuple[Array, Array, Array]:
@@ -333,7 +333,7 @@ class SupportIntegrals:
         """The upper bounds of the absolute values of the support functions on every step and its neighbours,
         ``(N, S)``."""
         _, errors, size = self._polynomials
-        heights = (size + errors) @ np.array([side.far for side in self.sides]).T * OUTWARD
+        heights = (size + errors) @ np.array([summand.far for summand in self.summands]).T * OUTWARD
         padded = np.pad(heights, ((1, 1), (0, 0)), mode="edge")
         return np.asarray(np.maximum(heights, np.maximum(padded[:-2], padded[2:])))
 
@@ -342,8 +342,8 @@ class SupportIntegrals:
         they may be, ``(k, S)`` each."""
         P, errors, size = (values[steps] for values in self._polynomials)
         integrals = []
-        for side in self.sides:
-            value, excess, deficit, tops = side.swept(P, errors, size, 2.0 * shares - 1.0)
+        for summand in self.summands:
+            value, excess, deficit, tops = summand.swept(P, errors, size, 2.0 * shares - 1.0)
             rounded = rounding(4 * ORDER) * 2.0 * tops
             integrals.append((value, (excess + rounded) * OUTWARD, (deficit + rounded) * OUTWARD))
         value, excess, deficit = (
@@ -613,7 +613,7 @@ class Worst:
     def _disturbance_integrals(self) -> SupportIntegrals:
         """The integrals of the support functions of a measurable disturbance about the middle of its set."""
         assert self.pushed is not None
-        return SupportIntegrals(self._single_adjoint, self._disturbance_columns, sides_of(self.pushed))
+        return SupportIntegrals(self._single_adjoint, self._disturbance_columns, summands_of(self.pushed))
 
     def _evaluate_measurable(self, times: Array) -> tuple[Array, Array]:
         """Return what the worst measurable disturbance adds to the row at ``times (k,)``, and error bounds, ``(k,)``
@@ -625,7 +625,7 @@ class Worst:
         mid, mid_errors = linear.mid[:, self._disturbance_columns], (linear.rad + rounded)[:, self._disturbance_columns]
         top = (low + high) / 2.0 + mid @ self._disturbance_middle
         size = np.abs(mid) @ np.abs(self._disturbance_middle) + np.abs(low) + np.abs(high)
-        rounding_error = rounding(len(self._disturbance_integrals.sides) + self._disturbance_middle.size + 2) * size
+        rounding_error = rounding(len(self._disturbance_integrals.summands) + self._disturbance_middle.size + 2) * size
         return top, (high - low) / 2.0 + mid_errors @ np.abs(self._disturbance_middle) + rounding_error
 
     def _evaluate_stopped(self, stopped: Stopped, times: Array) -> tuple[Array, Array]:

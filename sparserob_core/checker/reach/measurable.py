@@ -21,10 +21,10 @@ from sparserob_core.checker.flow.flow import VerifiedFlow
 from sparserob_core.checker.reach.closed_loop import VerifiedLoop
 from sparserob_core.checker.reach.deviations import Deviations, of_block, rounded_radii
 from sparserob_core.checker.reach.kernels import above_chord, pushes
-from sparserob_core.checker.sets.along import CurvedSide
-from sparserob_core.checker.sets.known import middle, sides_of
+from sparserob_core.checker.sets.along import NormSummand
+from sparserob_core.checker.sets.known import middle, summands_of
 from sparserob_core.checker.sets.polynomials import OUTWARD, Enclosed, product, rounding
-from sparserob_core.checker.sets.summands import Side, integrate
+from sparserob_core.checker.sets.summands import Summand, integrate
 from sparserob_core.sip.convex_set import Array, ConvexSet
 
 if TYPE_CHECKING:
@@ -61,11 +61,11 @@ class VerifiedKernel:
         errors = (errors + np.einsum("nd,spdw->nsw", a.rad, np.abs(self.coefficients))) * OUTWARD
         return plain, errors
 
-    def most(self, a: Enclosed, sides: Sequence[Side | CurvedSide]) -> Enclosed:
+    def most(self, a: Enclosed, summands: Sequence[Summand | NormSummand]) -> Enclosed:
         """Return the integral of the support function of ``K(r)'a`` over all parts, for ``a (N, d)``, as middles and
-        radii ``(N,)``. The set is the sum of ``sides``."""
+        radii ``(N,)``. The set is the sum of ``summands``."""
         polynomials = (values.reshape(-1, *values.shape[2:]) for values in self.along(a))
-        ends = np.stack(integrate(sides, *polynomials)).reshape(2, len(a.mid), -1)
+        ends = np.stack(integrate(summands, *polynomials)).reshape(2, len(a.mid), -1)
         low, high = ends.sum(axis=2)
         rounded = rounding(ends.shape[2] + 4) * np.abs(ends).sum(axis=(0, 2))
         return Enclosed((low + high) / 2.0, ((high - low) / 2.0 + rounded) * OUTWARD)
@@ -89,10 +89,10 @@ class MeasurableDeviations(Deviations):
         return [] if self.initial is None else [(self.initial, middle(self.initial))]
 
     @cached_property
-    def sides(self) -> list[Side | CurvedSide]:
+    def summands(self) -> list[Summand | NormSummand]:
         """The sets whose sum is the set of the disturbances about its middle."""
         assert self.shape is not None
-        return sides_of(self.shape)
+        return summands_of(self.shape)
 
     def kernel(self, piece: int) -> VerifiedKernel:
         """Return the kernel of a piece of the grid."""
@@ -125,7 +125,7 @@ class MeasurableDeviations(Deviations):
         for piece in range(self.blocks):
             kernel = self.kernel(piece)
             if id(kernel) not in cached:
-                ends = kernel.most(exact, self.sides)
+                ends = kernel.most(exact, self.summands)
                 cached[id(kernel)] = kernel, (ends.mid + ends.rad).reshape(2, d).max(axis=0)
             radii.append(cached[id(kernel)][1])
         return rounded_radii(radii, self.sets)
@@ -147,7 +147,7 @@ class MeasurableDeviations(Deviations):
             used = np.flatnonzero((np.abs(rows.mid) + rows.rad).any(axis=1))
             if not used.size:
                 continue
-            integrals = kernel.most(Enclosed(rows.mid[used], rows.rad[used]), self.sides)
+            integrals = kernel.most(Enclosed(rows.mid[used], rows.rad[used]), self.summands)
             for index, m, r in zip(
                 (used // len(pieces)).tolist(), integrals.mid.tolist(), integrals.rad.tolist(), strict=True
             ):
@@ -222,7 +222,7 @@ class MeasurableLoop(VerifiedLoop):
     def under_way(self, piece: int, time: float, rows: Array | arb_mat) -> Enclosed:
         """Return the most that deviations of the disturbance on a piece add to ``rows (r, d)`` up to a time in this
         piece, ``(r,)``."""
-        return self.deviations.way(self.grid[piece], time).most(as_enclosed(rows), self.deviations.sides)
+        return self.deviations.way(self.grid[piece], time).most(as_enclosed(rows), self.deviations.summands)
 
     def bent(self, piece: int, start: float, stop: float, rows: Array | arb_mat) -> Array:
         """Return upper bounds ``(r,)`` of how far ``max c'x(t)`` lies above its chord on ``[start, stop]``. The
@@ -230,7 +230,7 @@ class MeasurableLoop(VerifiedLoop):
         axes = np.vstack([np.eye(self.system.states), -np.eye(self.system.states)])
         start_bounds, size = (
             np.zeros(len(axes)),
-            sum((side.far for side in self.deviations.sides), np.zeros(self.deviations.width)),
+            sum((summand.far for summand in self.deviations.summands), np.zeros(self.deviations.width)),
         )
         if start > self.grid[piece]:
             ends = self.under_way(piece, start, axes)

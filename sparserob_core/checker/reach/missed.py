@@ -24,10 +24,10 @@ from sparserob_core.checker.flow.law import ParameterBox
 from sparserob_core.checker.reach.kernels import Added, BoundedInput, BoundedInputHere, above_chord, pushes
 from sparserob_core.checker.reach.states import enclosed, ring
 from sparserob_core.checker.reach.tube import Around
-from sparserob_core.checker.sets.along import CurvedSide
+from sparserob_core.checker.sets.along import NormSummand
 from sparserob_core.checker.sets.parameters import Corners
 from sparserob_core.checker.sets.polynomials import OUTWARD, Enclosed, rounding
-from sparserob_core.checker.sets.summands import Side, integrate
+from sparserob_core.checker.sets.summands import Summand, integrate
 from sparserob_core.sip.convex_set import Array
 
 if TYPE_CHECKING:
@@ -50,8 +50,8 @@ class SizedInput:
     shares
         The shares, ``(S,)``.
     breakpoints, pieces
-        The breakpoints ``(K + 1,)`` of the command, and the sizes of its pieces, ``(S, 1)`` each.
-    sides
+        The breakpoints ``(K + 1,)`` of the command, and its values on the pieces, ``(S, 1)`` each.
+    summands
         The ``S`` sets whose sum enters by ``m`` columns, each times the size of its own share of the command.
     first
         The first of the columns of ``[B c E]`` by which the input enters.
@@ -62,7 +62,7 @@ class SizedInput:
     shares: Array
     breakpoints: Array
     pieces: Sequence[arb_mat]
-    sides: Sequence[Side | CurvedSide]
+    summands: Sequence[Summand | NormSummand]
     first: int = 0
     numb: Sequence[int] = ()
 
@@ -76,12 +76,12 @@ class SizedInput:
     @property
     def columns(self) -> slice:
         """The columns of ``[B c E]`` by which the input enters."""
-        return slice(self.first, self.first + self.sides[0].dimension)
+        return slice(self.first, self.first + self.summands[0].dimension)
 
     @cached_property
     def far(self) -> Array:
         """The upper bounds ``(S, m)`` of what enters by each of the `columns`, in absolute value, for a size of 1."""
-        return np.array([side.far for side in self.sides])
+        return np.array([summand.far for summand in self.summands])
 
     def piece_at(self, time: float) -> int:
         """Return the index of the piece of the command from a time on; before the first and after the last piece, that
@@ -151,7 +151,7 @@ class BoundedInputAt(BoundedInputHere):
         return at_least - rounding_error * OUTWARD, at_most + rounding_error * OUTWARD
 
     def _bound_integrals(self, rows: Array, time: float, pieces: np.ndarray) -> tuple[Array, Array, np.ndarray]:
-        """Return lower and upper bounds ``(q, n, S)`` of the integrals of the support functions of all sides along
+        """Return lower and upper bounds ``(q, n, S)`` of the integrals of the support functions of all summands along
         ``c'Phi(t, s) B(s)`` for ``rows (n, d)``, over the intervals among ``pieces`` that begin before ``time``; and
         their indices ``(q,)``."""
         begins, rows = np.array(self.marks[:-1]), self.input.reaching(rows)
@@ -181,7 +181,8 @@ class BoundedInputAt(BoundedInputHere):
         sizes = np.abs(K.mid).sum(axis=1)
         errors = np.einsum("qnd,qdm->qnm", np.abs(a), rounding(a.shape[2] + 1) * sizes + K.rad.sum(axis=1))
         errors = (errors + np.einsum("qnd,qdm->qnm", rad, sizes + K.rad.sum(axis=1))) * OUTWARD
-        ends = integrate(self.input.sides, plain.reshape(-1, order, plain.shape[3]), errors.reshape(-1, plain.shape[3]))
+        flat = plain.reshape(-1, order, plain.shape[3]), errors.reshape(-1, plain.shape[3])
+        ends = integrate(self.input.summands, *flat)
         low, high = (end.reshape(*plain.shape[:2], -1) for end in ends)
         return low, np.maximum(high, 0.0), indices
 

@@ -18,7 +18,7 @@ from sparserob_core.checker.problem.timing import Timing, before
 from sparserob_core.checker.reach.execution import FollowedExecution
 from sparserob_core.checker.reach.kernels import BoundedInput, BoundedInputHere
 from sparserob_core.checker.reach.missed import BoundedInputAt, BoundedInputOver, SizedInput
-from sparserob_core.checker.sets.known import sides_of
+from sparserob_core.checker.sets.known import summands_of
 from sparserob_core.checker.sets.summands import channels
 from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.sip.convex_set import Array
@@ -46,10 +46,10 @@ class Sources:
         bound = self.problem.measurable
         if bound is None or self.timing.answering:
             return None
-        sides, system = sides_of(bound), self.problem.system
-        whole, ends = stacked([[v] for v in balls(np.ones(len(sides)))]), np.array([0.0, self.timing.grid[-1]])
+        summands, system = summands_of(bound), self.problem.system
+        whole, ends = stacked([[v] for v in balls(np.ones(len(summands)))]), np.array([0.0, self.timing.grid[-1]])
         return self._build_bounded_input(
-            SizedInput(np.ones(len(sides)), ends, [whole], sides, system.controls + system.drifts)
+            SizedInput(np.ones(len(summands)), ends, [whole], summands, system.controls + system.drifts)
         )
 
     def _build_bounded_input(self, entering: SizedInput) -> BoundedInput:
@@ -64,8 +64,8 @@ class Sources:
 
     @cached_property
     def execution(self) -> BoundedInput | None:
-        """The errors of execution; ``None`` where the command is delivered exactly. They belong to no control where the
-        certificate has none."""
+        """The errors of execution; ``None`` where the command is delivered exactly. Without a
+        control in the certificate they have no pieces."""
         shares, system = self.problem.execution, self.problem.system
         if shares is None:
             return None
@@ -80,8 +80,8 @@ class Sources:
             ]
         if self.is_still:
             return FollowedExecution(self.problem, shares, breakpoints, pieces, self.timing.clock)
-        sides = channels(shares.size)
-        return self._build_bounded_input(SizedInput(shares, breakpoints, pieces, sides, numb=self.problem.commanded))
+        summands = channels(shares.size)
+        return self._build_bounded_input(SizedInput(shares, breakpoints, pieces, summands, numb=self.problem.commanded))
 
     def delivered_at(self, parameter: Sequence[float]) -> BoundedInputHere | None:
         """Return `execution` at one parameter."""

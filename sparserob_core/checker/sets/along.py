@@ -45,7 +45,7 @@ class Norm(NamedTuple):
 
 @final
 @dataclass(frozen=True, eq=False)
-class CurvedSide:
+class NormSummand:
     """A set with the support function ``c'offset + |L'c|_q``, with integrals of it along polynomials. Further
     coordinates ``before`` and ``after`` its own are 0."""
 
@@ -59,7 +59,7 @@ class CurvedSide:
         """The number of coordinates, ``mw``."""
         return self.before + self.offset.size + self.after
 
-    def widened(self, before: int, after: int) -> CurvedSide:
+    def widened(self, before: int, after: int) -> NormSummand:
         """Return the set with 0 in further coordinates before and after its own."""
         return replace(self, before=self.before + before, after=self.after + after)
 
@@ -76,7 +76,7 @@ class CurvedSide:
         return np.pad(self._radii, (self.before, self.after))
 
     def swept(self, plain: Array, off: Array, sizes: Array, ends: Array) -> tuple[Array, Array, Array, Array]:
-        """Return the integrals of the support function along polynomials, as `Side.swept` does; ``sizes`` are not
+        """Return the integrals of the support function along polynomials, as `Summand.swept` does; ``sizes`` are not
         used."""
         own = plain[:, :, self.before : self.before + self.offset.size]
         outputs = [np.zeros(0)] * 3

@@ -14,10 +14,10 @@ import numpy as np
 from sparserob_core.checker.arithmetic.balls import above, ball, balls, largest
 from sparserob_core.checker.arithmetic.series import exactly
 from sparserob_core.checker.outcome import Broken, Unchecked
-from sparserob_core.checker.sets.along import CurvedSide, Norm
+from sparserob_core.checker.sets.along import Norm, NormSummand
 from sparserob_core.checker.sets.polynomials import HALF_ULP, OUTWARD, ROUNDING
 from sparserob_core.checker.sets.shape import NEAR, Shape, along, total
-from sparserob_core.checker.sets.summands import Side
+from sparserob_core.checker.sets.summands import Summand
 from sparserob_core.control.sets.sets import Cylinder, Ellipsoid, NormBall, Product
 from sparserob_core.sip.convex_set import Array
 
@@ -265,11 +265,11 @@ class Joint(Shape):
             for vector, length in factor.spans(middle[columns])
         ]
 
-    def sides(self, about: Array) -> list[Side | CurvedSide]:
+    def summands(self, about: Array) -> list[Summand | NormSummand]:
         return [
-            side.widened(columns.start, self.dimension - columns.stop)
+            summand.widened(columns.start, self.dimension - columns.stop)
             for factor, columns in zip(self.parts, self.places, strict=True)
-            for side in factor.sides(about[columns])
+            for summand in factor.summands(about[columns])
         ]
 
     def bound(self, value: Array, spread: Array) -> tuple[Array, Array]:

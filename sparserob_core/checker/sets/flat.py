@@ -15,10 +15,10 @@ import numpy as np
 from sparserob_core.checker.arithmetic.balls import above, ball, balls, below, largest, rational, smallest, spanning
 from sparserob_core.checker.arithmetic.series import stacked
 from sparserob_core.checker.outcome import Broken, Unchecked
-from sparserob_core.checker.sets.along import CurvedSide
+from sparserob_core.checker.sets.along import NormSummand
 from sparserob_core.checker.sets.polynomials import HALF_ULP, OUTWARD, Enclosed, rounding
 from sparserob_core.checker.sets.shape import NEAR, Facet, Shape, along, dot, facet, total
-from sparserob_core.checker.sets.summands import Side
+from sparserob_core.checker.sets.summands import Summand
 from sparserob_core.control.sets.sets import Box, NormBall, Polytope, Zonotope
 from sparserob_core.sip.convex_set import Array
 
@@ -120,7 +120,7 @@ class Boxed(Flat):
     def shares(self, direction: Array) -> Array:
         return np.maximum(0.0, np.array([c for c, _ in self.listed]) @ direction)
 
-    def sides(self, about: Array) -> list[Side | CurvedSide]:
+    def summands(self, about: Array) -> list[Summand | NormSummand]:
         ends = enumerate(zip(self._upper_corner, self._lower_corner, balls(about), strict=True))
         axes = [[ball(i == j) for j in range(self.dimension)] for i in range(self.dimension)]
         return _round_corners([[[x * (end - m) for x in axes[i]] for end in (up, low)] for i, (up, low, m) in ends])
@@ -138,7 +138,7 @@ class Cornered(Flat):
         corners = ([rational(x) for x in corner] for corner in self.corners)
         return largest(total(x * c for x, c in zip(corner, direction, strict=True)) for corner in corners)
 
-    def sides(self, about: Array) -> list[Side | CurvedSide]:
+    def summands(self, about: Array) -> list[Summand | NormSummand]:
         middle = balls(about)
         return _round_corners(
             [[[rational(x) - m for x, m in zip(corner, middle, strict=True)] for corner in self.corners]]
@@ -334,7 +334,7 @@ class Segments(Flat):
         """The segments ``(q, d)`` whose sum the set is, exactly."""
         return [[Fraction(float(v)) for v in row] for row in self.source.generators if row.any()]
 
-    def sides(self, about: Array) -> list[Side | CurvedSide]:
+    def summands(self, about: Array) -> list[Summand | NormSummand]:
         ends = [[rational(x) for x in segment] for segment in self.generators]
         centre = [c - m for c, m in zip(balls(self.source.centre), balls(about), strict=True)]
         return _round_corners([[centre], *([end, [-x for x in end]] for end in ends)])
@@ -383,9 +383,9 @@ class Segments(Flat):
         return super().least(ups, downs, slope) if has_facets else Shape.least(self, ups, downs, slope)
 
 
-def _round_corners(sides: Sequence[Sequence[Sequence[arb]]]) -> list[Side | CurvedSide]:
+def _round_corners(summands: Sequence[Sequence[Sequence[arb]]]) -> list[Summand | NormSummand]:
     """Return sets from their corners in balls."""
-    return [Side(corners.mid, corners.rad) for corners in (Enclosed.of(stacked(rows)) for rows in sides)]
+    return [Summand(corners.mid, corners.rad) for corners in (Enclosed.of(stacked(rows)) for rows in summands)]
 
 
 def _compute_length(row: Sequence[Fraction]) -> float:

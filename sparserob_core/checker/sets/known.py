@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 
 from sparserob_core.checker.outcome import Unchecked
-from sparserob_core.checker.sets.along import CurvedSide
+from sparserob_core.checker.sets.along import NormSummand
 from sparserob_core.checker.sets.curved import Ball, Cylindrical, Ellipsoidal, Joint
 from sparserob_core.checker.sets.flat import Boxed, Octahedral, Polyhedral, Segments
 from sparserob_core.checker.sets.shape import Shape
-from sparserob_core.checker.sets.summands import Side
+from sparserob_core.checker.sets.summands import Summand
 from sparserob_core.control.sets.sets import Box, ConvexSet, Cylinder, Ellipsoid, NormBall, Polytope, Product, Zonotope
 from sparserob_core.sip.convex_set import Array
 
@@ -63,6 +63,6 @@ def middle(shape: ConvexSet) -> Array:
     return point
 
 
-def sides_of(shape: ConvexSet) -> list[Side | CurvedSide]:
-    """Return sets whose sum is a bounded set minus its `middle`, as `Shape.sides` does."""
-    return known(shape).sides(middle(shape))
+def summands_of(shape: ConvexSet) -> list[Summand | NormSummand]:
+    """Return sets whose sum is a bounded set minus its `middle`, as `Shape.summands` does."""
+    return known(shape).summands(middle(shape))

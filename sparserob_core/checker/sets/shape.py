@@ -14,8 +14,8 @@ import numpy as np
 from sparserob_core.checker.arithmetic.balls import above, ball, balls, rational
 from sparserob_core.checker.arithmetic.balls import smallest as least_of
 from sparserob_core.checker.outcome import RESOLVED, Broken, Unchecked
-from sparserob_core.checker.sets.along import CurvedSide, Norm
-from sparserob_core.checker.sets.summands import Side
+from sparserob_core.checker.sets.along import Norm, NormSummand
+from sparserob_core.checker.sets.summands import Summand
 from sparserob_core.sip.convex_set import Array, ConvexSet
 
 if TYPE_CHECKING:
@@ -180,7 +180,7 @@ class Shape(ABC):
 
     # All of them
 
-    def sides(self, about: Array) -> list[Side | CurvedSide]:
+    def summands(self, about: Array) -> list[Summand | NormSummand]:
         """Return sets whose sum is the set minus a point ``about (d,)``: for a box one for every channel, for a
         zonotope one for every segment and one for its centre, for a product those of its factors."""
         if self.norm is None:
@@ -188,7 +188,7 @@ class Shape(ABC):
                 "the checker knows measurable disturbances in boxes, polytopes, ellipsoids, balls, zonotopes, and"
                 " products of these; balls of the 1-norm in up to 10 dimensions"
             )
-        return [CurvedSide(self.norm, self.centre - about)]
+        return [NormSummand(self.norm, self.centre - about)]
 
     def limit(self, direction: Array) -> arb:
         """Return the largest ``c'x`` over the set, or an upper bound of it."""

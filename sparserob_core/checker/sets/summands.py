@@ -1,7 +1,7 @@
-"""The summands of a set that acts at any time, and integrals of their support functions along polynomials.
+"""Sets whose sum is the set of an input, and integrals of their support functions along polynomials.
 
-On every cell the corner that is best there stands for all corners, and the error bound says how much better another
-corner could be.
+On each interval one corner is integrated in place of all. The error bound says how much better another corner
+could be.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from typing import final
 
 import numpy as np
 
-from sparserob_core.checker.sets.along import CurvedSide
+from sparserob_core.checker.sets.along import NormSummand
 from sparserob_core.checker.sets.polynomials import OUTWARD, rounding
 from sparserob_core.sip.convex_set import Array
 
@@ -27,7 +27,7 @@ SECANTS = 12  # steps of the search for the point where two corners are equally 
 
 @final
 @dataclass(frozen=True, eq=False)
-class Side:
+class Summand:
     """A summand of the set of the deviations, by its ``corners (v, mw)`` with error bounds ``rad (v, mw)``."""
 
     corners: Array
@@ -43,9 +43,9 @@ class Side:
         """The upper bound of the absolute value of every coordinate on the set, ``(mw,)``."""
         return np.asarray((np.abs(self.corners) + self.rad).max(axis=0) * OUTWARD)
 
-    def widened(self, before: int, after: int) -> Side:
+    def widened(self, before: int, after: int) -> Summand:
         """Return the set with 0 in further coordinates before and after its own."""
-        return Side(*(np.pad(table, ((0, 0), (before, after))) for table in (self.corners, self.rad)))
+        return Summand(*(np.pad(table, ((0, 0), (before, after))) for table in (self.corners, self.rad)))
 
     def swept(self, plain: Array, off: Array, sizes: Array, ends: Array) -> tuple[Array, Array, Array, Array]:
         """Return the integrals of the support function over ``u`` from -1 to ``ends (n,)``, along polynomials ``plain
@@ -56,17 +56,17 @@ class Side:
         return *swept(P, e, ends), np.abs(P).sum(axis=1).max(axis=1)
 
 
-def channels(count: int) -> list[Side]:
+def channels(count: int) -> list[Summand]:
     """Return the segments from -1 to 1 along every axis, whose support functions are absolute values."""
-    return [Side(np.stack([axis, -axis]), np.zeros((2, count))) for axis in np.eye(count)]
+    return [Summand(np.stack([axis, -axis]), np.zeros((2, count))) for axis in np.eye(count)]
 
 
-def integrate(sides: Sequence[Side | CurvedSide], plain: Array, off: Array) -> tuple[Array, Array]:
+def integrate(summands: Sequence[Summand | NormSummand], plain: Array, off: Array) -> tuple[Array, Array]:
     """Return lower and upper bounds ``(n, S)`` of the means, over ``u`` from -1 to 1, of the support functions of
-    ``sides`` along polynomials ``plain (n, p + 1, mw)`` with error bounds ``off (n, mw)``."""
+    ``summands`` along polynomials ``plain (n, p + 1, mw)`` with error bounds ``off (n, mw)``."""
     (count, order, mw), sizes = plain.shape, np.abs(plain).sum(axis=1)
     errors = off + rounding(4 * order + 32 + mw) * sizes
-    integrals = [side.swept(plain, errors, sizes, np.ones(count))[:3] for side in sides]
+    integrals = [summand.swept(plain, errors, sizes, np.ones(count))[:3] for summand in summands]
     value, excess, deficit = (np.stack(columns, axis=1) / 2.0 for columns in zip(*integrals, strict=True))
     rounded = rounding(4) * (np.abs(value) + excess)
     return value - deficit - rounded, value + excess + rounded

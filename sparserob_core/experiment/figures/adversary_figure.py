@@ -74,8 +74,7 @@ def draw_adversary(arrays: Mapping[str, Array], data: FigureData) -> Figure:
 
 
 def _select_corner(states: Array, direction: Array, data: FigureData) -> Array:
-    """The states ``(d, T)`` of a worst case, at the corner of the parameters beside the time that its direction is
-    of."""
+    """Return the states ``(d, T)`` of a worst case, at the corner of the parameters that fits its direction."""
     return data.names.corners.stated(direction, states)
 
 

@@ -1,5 +1,5 @@
-"""Figures of a solved experiment: the nominal trajectory, the worst-case tube around it, and the constraints on
-them."""
+"""Data for the figures of a solved experiment: the nominal trajectory, the worst-case tube around it, and the
+constraints on them."""
 
 from __future__ import annotations
 
@@ -148,8 +148,8 @@ def _collect_data(
 
 
 def choose_states(experiment: Experiment, theta: Array) -> Sequence[int] | None:
-    """The states that figures show of a system of very many, whose tubes would take longer than the control: of all of
-    them the reach is told at a few times. ``None``: all."""
+    """Return the states that figures show, chosen by their ranges at a few times where there are very many;
+    ``None`` for all."""
     model = experiment.model
     if model is None or model.problem.system.states <= MOST_STATES:
         return None

@@ -124,7 +124,7 @@ def draw_horizons(found: Margin) -> Figure:
         )
     ax.set_ylabel(least_cost(found))
     ax.set_xlabel(plain(found.quantity).replace("horizon", "horizon $T$", 1))
-    ax.set_title(found.title, pad=8)
+    ax.set_title(plain(found.title), pad=8)
     figure.legend(
         *ax.get_legend_handles_labels(), loc="outside lower center", ncols=2, columnspacing=1.6, handlelength=1.6
     )

@@ -350,8 +350,8 @@ def _order_attempts(program: FiniteProgram) -> tuple[tuple[Form, float], ...]:
 def _sharpen(case: _Case, claim: Claim | None, answer: Recovered | None) -> FiniteSolution | None:
     """Return the first answer that is believed and sharp: more digits of the ``claim``, and a vertex, which comes first
     where the solver has an answer that lacks digits, and last where it goes somewhere and does not arrive. Where it
-    gave up, a proof that there is no answer comes before more digits. One that raises, or has nothing to say, is told
-    of."""
+    gave up, a proof that there is no answer comes before more digits. Failures are
+    reported."""
     solved = claim is not None and claim.status == "solved" and answer is not None
     believed = _solve_by_simplex(case) if solved else None
     if claim is not None and claim.status == "failed":

@@ -43,7 +43,7 @@ def irreducible(relaxed: RelaxedProgram, rows: Rows, solution: FiniteSolution) -
     solution : FiniteSolution
         Solution with the multipliers that prove it.
     shown : bool
-        Whether a decision was found for the rows without any one of them.
+        True where, for each row, a decision was found that meets all the others.
     """
     fixed = relaxed.program.finite.h.size
     plain = _find_evident_reason(relaxed, solution)

@@ -240,7 +240,7 @@ def infeasible_subsystem(
     amount : float
         Proven infeasibility, in multiples of the norms of the rows.
     shown : bool
-        Whether a decision was found for the rows without any one of them.
+        True where, for each row, a decision was found that meets all the others.
 
     Returns
     -------

@@ -1,7 +1,7 @@
 """Imposed rows that must hold for every deviation: indices are exchanged, deviations are all in the relaxed program.
 
-The relaxed program is the robust counterpart at the imposed indices (`inner.simplex`, or `inner.central` where that is
-quicker). The lower bound is that of cuts: every row with a multiplier, at the deviation that its multipliers determine
+The relaxed program is the robust counterpart at the imposed indices (`inner.simplex`, or `inner.central` for many
+gains). The lower bound is that of cuts: every row with a multiplier, at the deviation that its multipliers determine
 (weak duality over the bounds of the program). Nothing is dropped: a row has variables of its own, and the last basis,
 from which the next solution starts, contains them.
 """

@@ -82,7 +82,7 @@ def test_measurable_disturbances_in_time_stray_from_their_middle_by_half_their_w
     assert isinstance(held, Box)
     np.testing.assert_array_equal(held.lower, held.upper)
     np.testing.assert_allclose(held.lower, [0.1, 0.05], rtol=1e-15)
-    wide, point = strayed.input.sides
+    wide, point = strayed.input.summands
     assert not point.corners.any() and not point.rad.any()
     assert (wide.rad[:, 0] > 0.0).all() and (wide.rad[:, 0] < 1e-15).all() and not wide.corners[:, 1].any()
     for end, corner, off in zip((bound.upper[0], bound.lower[0]), wide.corners[:, 0], wide.rad[:, 0], strict=True):

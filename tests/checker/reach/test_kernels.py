@@ -10,7 +10,7 @@ import pytest
 from flint import arb_mat, ctx
 
 from sparserob_core.checker.reach.measurable import MeasurableLoop
-from sparserob_core.checker.sets.known import sides_of
+from sparserob_core.checker.sets.known import summands_of
 from sparserob_core.checker.sets.polynomials import Enclosed, product
 from sparserob_core.checker.sets.summands import _evaluate_polynomials, _find_crossings, channels, integrate, swept
 from sparserob_core.control.problem.system import LinearSystem
@@ -58,12 +58,12 @@ def test_many_parts_are_added_up_with_what_rounding_does_to_them():
 
 def test_segments_together_reach_as_far_as_all_of_them():
     generators = np.array([[0.5, -0.25], [0.25, 1.0], [-0.125, 0.5]])
-    sides = sides_of(Zonotope(np.array([3.0, -2.0]), generators))
-    far = sum(side.far for side in sides)
+    summands = summands_of(Zonotope(np.array([3.0, -2.0]), generators))
+    far = sum(summand.far for summand in summands)
     np.testing.assert_allclose(far, np.abs(generators).sum(axis=0), rtol=1e-11)
     assert (far >= np.abs(generators).sum(axis=0)).all()
     plain, zero = np.array([[[1.0, 0.5], [0.2, -0.3]]]), np.zeros((1, 2))
-    low, high = (end.sum() for end in integrate(sides, plain, zero))
+    low, high = (end.sum() for end in integrate(summands, plain, zero))
     u = np.linspace(-1.0, 1.0, 20_001)
     true = float(np.trapezoid(np.abs((plain[0, 0] + u[:, None] * plain[0, 1]) @ generators.T).sum(axis=1), u)) / 2.0
     assert abs(low - true) < 1e-7 and low < high < low + 1e-13
@@ -106,23 +106,23 @@ def kernel_of(A, E, length):
 def test_the_integral_of_an_exponential_is_the_closed_form(rate):
     """``|a| (2 e^{rate r}) c`` with ``|w| <= c``, up to any time."""
     with ctx.workprec(128):
-        sides, a = sides_of(Box([-0.5], [0.5])), Enclosed(np.array([[1.0], [-3.0]]), np.zeros((2, 1)))
+        summands, a = summands_of(Box([-0.5], [0.5])), Enclosed(np.array([[1.0], [-3.0]]), np.zeros((2, 1)))
         for length in (0.08, 0.2, 0.5, 0.8):
             kernel = kernel_of(rate, 2.0, length)
-            found = kernel.most(a, sides)
+            found = kernel.most(a, summands)
             height = length if rate == 0.0 else np.expm1(rate * length) / rate
             truth = np.array([1.0, 3.0]) * height
             assert (np.abs(found.mid - truth) <= found.rad + 1e-15).all()
             assert (found.rad <= 1e-11).all()
-        wide = kernel.most(Enclosed(a.mid, np.full((2, 1), 0.25)), sides)
+        wide = kernel.most(Enclosed(a.mid, np.full((2, 1), 0.25)), summands)
         assert (wide.mid + wide.rad >= np.array([1.25, 3.25]) * height * (1 - 1e-13)).all()
         assert (wide.rad <= 0.25 * height * 4.0).all()
 
 
-def test_sides_are_segments_of_a_box_and_corners_of_what_has_them():
-    box = sides_of(Box([-1.0, 2.0], [3.0, 5.0]))
-    assert [side.corners.tolist() for side in box] == [[[2.0, 0.0], [-2.0, 0.0]], [[0.0, 1.5], [0.0, -1.5]]]
-    (ball,) = sides_of(NormBall(1.0, 0.5, centre=[1.0, 2.0]))
+def test_summands_are_segments_of_a_box_and_corners_of_what_has_them():
+    box = summands_of(Box([-1.0, 2.0], [3.0, 5.0]))
+    assert [summand.corners.tolist() for summand in box] == [[[2.0, 0.0], [-2.0, 0.0]], [[0.0, 1.5], [0.0, -1.5]]]
+    (ball,) = summands_of(NormBall(1.0, 0.5, centre=[1.0, 2.0]))
     assert sorted(ball.corners.tolist()) == [[-0.5, 0.0], [0.0, -0.5], [0.0, 0.5], [0.5, 0.0]]
     assert (ball.rad < 1e-15).all()
     # in two channels the segments add up, the ball is the largest of its corners

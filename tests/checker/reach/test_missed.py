@@ -23,8 +23,8 @@ from sparserob_core.checker.flow.flow import VerifiedFlow
 from sparserob_core.checker.flow.plant import Plant
 from sparserob_core.checker.reach.execution import FollowedExecution
 from sparserob_core.checker.reach.missed import BoundedInputAt, SizedInput
-from sparserob_core.checker.sets.known import middle, sides_of
-from sparserob_core.checker.sets.summands import Side, channels
+from sparserob_core.checker.sets.known import middle, summands_of
+from sparserob_core.checker.sets.summands import Summand, channels
 from sparserob_core.control.problem.system import VaryingSystem
 from sparserob_core.sip.convex_set import Array
 
@@ -86,7 +86,7 @@ def test_what_is_large_is_not_enclosed_more_coarsely_than_rounding_does(side: sr
     with ctx.workprec(192):
         found = made(ROCKET)
         if side is not None:
-            form, one = sides_of(side), [stacked([[arb(1)]])] * 6
+            form, one = summands_of(side), [stacked([[arb(1)]])] * 6
             found = BoundedInputAt(VerifiedFlow(Plant.of(ROCKET, 3.0), 3.0), SizedInput(np.ones(1), POINTS, one, form))
         low, high = found.added(np.array([1.0, 0.0]), 3.0)
     assert 0.0 < high - low <= 3e-13 * high
@@ -182,8 +182,8 @@ def test_bounds_allow_for_what_is_rounded_and_for_the_size_of_the_control() -> N
 def entering(system: VaryingSystem, off: float = 0.0) -> BoundedInputAt:
     """A command of 1 through ``E`` that is missed by 0.25."""
     one, ends = [stacked([[arb(1)]])], np.array([0.0, 3.0])
-    side = Side(np.array([[1.0], [-1.0]]), np.full((2, 1), 4.0 * off))
-    entering = SizedInput(np.array([0.25]), ends, one, [side], system.controls)
+    summand = Summand(np.array([[1.0], [-1.0]]), np.full((2, 1), 4.0 * off))
+    entering = SizedInput(np.array([0.25]), ends, one, [summand], system.controls)
     return BoundedInputAt(VerifiedFlow(Plant.of(system, 3.0), 3.0), entering)
 
 
@@ -229,7 +229,7 @@ def test_a_thin_set_whose_middle_is_rounded_adds_no_less_than_nothing() -> None:
     still = sr.LinearSystem(np.zeros((2, 2)), np.array([[0.0], [1.0]]), np.eye(2))
     with ctx.workprec(192):
         one, ends = [stacked([[arb(1)]])], np.array([0.0, 1.0])
-        entering = SizedInput(np.ones(1), ends, one, sides_of(thin), 1)
+        entering = SizedInput(np.ones(1), ends, one, summands_of(thin), 1)
         found = BoundedInputAt(VerifiedFlow(Plant.of(still, 1.0), 1.0), entering)
         about = middle(thin)
         for c in (np.array([-1.0, 3.0]), np.array([1.0, -3.0])):

@@ -10,8 +10,8 @@ from flint import arb, ctx
 
 from sparserob_core.checker.arithmetic.balls import balls
 from sparserob_core.checker.outcome import Unchecked
-from sparserob_core.checker.sets.along import LEFT, NODES, CurvedSide, Norm, _bound_support, _evaluate_support, rule
-from sparserob_core.checker.sets.known import known, middle, sides_of
+from sparserob_core.checker.sets.along import LEFT, NODES, Norm, NormSummand, _bound_support, _evaluate_support, rule
+from sparserob_core.checker.sets.known import known, middle, summands_of
 from sparserob_core.control.sets.sets import Box, ConvexSet, Cylinder, Ellipsoid, NormBall, Polytope, Zonotope, product
 
 SEGMENTS = np.array([[0.3, 0.04], [-0.03, 0.4]])
@@ -29,10 +29,10 @@ SETS: dict[str, ConvexSet] = {
 CURVED = ("ellipsoid", "long ellipsoid", "ball", "3-norm", "1.3-norm")
 
 
-def curve(bound: ConvexSet) -> CurvedSide:
-    (side,) = sides_of(bound)
-    assert isinstance(side, CurvedSide)
-    return side
+def curve(bound: ConvexSet) -> NormSummand:
+    (summand,) = summands_of(bound)
+    assert isinstance(summand, NormSummand)
+    return summand
 
 
 @pytest.mark.first(2)
@@ -56,7 +56,7 @@ def test_heights_are_those_of_the_set_in_balls(name: str, size: float) -> None:
 @pytest.mark.parametrize("end", [1.0, -0.4])
 def test_integrals_hold_what_balls_of_many_digits_say_and_are_close(name: str, end: float) -> None:
     bound, rng = SETS[name], np.random.default_rng(3)
-    sides, about, count = sides_of(bound), middle(bound), 8
+    summands, about, count = summands_of(bound), middle(bound), 8
     plain = rng.normal(size=(5, count, bound.dimension)) * 0.4 ** np.arange(count)[:, None]
     plain[:3, 0] += 2.0 * np.sign(plain[:3, 0])  # the other two may go through 0
     plain[:3, 0, 0] += 3.0 * np.sign(plain[:3, 0, 0])  # one corner of the triangle is best
@@ -67,7 +67,8 @@ def test_integrals_hold_what_balls_of_many_digits_say_and_are_close(name: str, e
 
     def swept(off: np.ndarray) -> list[np.ndarray]:
         return [
-            np.sum(one, axis=0) for one in zip(*(side.swept(plain, off, sizes, ends) for side in sides), strict=True)
+            np.sum(one, axis=0)
+            for one in zip(*(summand.swept(plain, off, sizes, ends) for summand in summands), strict=True)
         ]
 
     value, more, less, tops = swept(zero + 1e-15 * sizes)
@@ -84,8 +85,8 @@ def test_integrals_hold_what_balls_of_many_digits_say_and_are_close(name: str, e
     assert -less[4] - 1e-15 <= exact - value[4] <= more[4] + 1e-15
     assert ((more + less) <= (1e-11 if "long" in name else 3e-13) * tops).all()
     moved = swept(zero + 1e-3)
-    assert (moved[1] >= more + 1e-3 * (end + 1.0) * sum(side.far.sum() for side in sides) * (1 - 1e-9)).all()
-    np.testing.assert_allclose(moved[0], value, rtol=0.0, atol=2e-3 * sum(side.far.sum() for side in sides))
+    assert (moved[1] >= more + 1e-3 * (end + 1.0) * sum(summand.far.sum() for summand in summands) * (1 - 1e-9)).all()
+    np.testing.assert_allclose(moved[0], value, rtol=0.0, atol=2e-3 * sum(summand.far.sum() for summand in summands))
 
 
 def test_heights_count_from_any_point_and_allow_for_what_the_factor_of_a_long_ellipsoid_misses() -> None:
@@ -123,9 +124,9 @@ def test_where_a_root_or_an_absolute_value_may_be_0_nothing_is_analytic() -> Non
     assert not analytic(ball, [1.0, 0.0], [1.0, 0.0]) and analytic(ball, [1.0, 0.0], [0.2, 0.2])
     assert not analytic(third, [1.0, 0.1], [0.0, 0.1]) and analytic(third, [1.0, 0.0], [0.1, 0.0])
     with pytest.raises(Unchecked, match="1-norm in up to 10"):  # whose support function has no curvature to speak of
-        sides_of(NormBall(1.0, 1.0, dimension=12))
+        summands_of(NormBall(1.0, 1.0, dimension=12))
     with pytest.raises(Unchecked, match="boxes, polytopes, ellipsoids"):
-        known(Cylinder(ball, 3)).sides(np.zeros(3))
+        known(Cylinder(ball, 3)).summands(np.zeros(3))
 
 
 @pytest.mark.first(1)
@@ -189,9 +190,9 @@ def test_balls_that_are_nearly_those_of_the_1_norm_take_few_cells(p: float, monk
     assert sum(cells) < 1500
 
 
-def test_sides_of_a_product_are_those_of_its_factors_in_their_own_columns() -> None:
+def test_summands_of_a_product_are_those_of_its_factors_in_their_own_columns() -> None:
     inner = product([NormBall(2.0, 0.5, dimension=2), Box([-1.0], [2.0])])
-    ball, box, last = sides_of(product([inner, Box([0.0], [4.0])]))
-    assert [side.dimension for side in (ball, box, last)] == [4, 4, 4]
-    np.testing.assert_allclose([side.far for side in (ball, box, last)],
+    ball, box, last = summands_of(product([inner, Box([0.0], [4.0])]))
+    assert [summand.dimension for summand in (ball, box, last)] == [4, 4, 4]
+    np.testing.assert_allclose([summand.far for summand in (ball, box, last)],
                                [[0.5, 0.5, 0, 0], [0, 0, 1.5, 0], [0, 0, 0, 2]], rtol=1e-11)  # fmt: skip

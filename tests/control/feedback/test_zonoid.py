@@ -9,7 +9,7 @@ from flint import ctx
 from scipy.linalg import expm
 
 import sparserob_core as sr
-from sparserob_core.checker.sets.known import sides_of
+from sparserob_core.checker.sets.known import summands_of
 from sparserob_core.checker.sets.polynomials import Enclosed
 from sparserob_core.control.feedback.zonoid import Arc, Pushes, Zonoid, _is_nonnegative, _solve_shares
 from sparserob_core.control.sets.sets import Box, Polytope
@@ -173,7 +173,7 @@ def test_the_support_function_is_that_of_the_checker_to_all_digits(name: str) ->
         )  # fmt: skip
         kernel = undriven(problem, [0.0, length]).deviations.kernel(0)
         rows = a @ found.into
-        truth = kernel.most(Enclosed(rows, np.zeros_like(rows)), sides_of(bound))
+        truth = kernel.most(Enclosed(rows, np.zeros_like(rows)), summands_of(bound))
     sizes = np.abs(found.support(a)).max()
     assert truth.rad.max() < 1e-10 * sizes
     assert found.support(a) == pytest.approx(truth.mid, rel=1e-10, abs=1e-11 * sizes)

@@ -50,7 +50,7 @@ Iterate = tuple[float, Array, Array, Array, Array, Array, Array, Array, Array]
 @dataclass(eq=False)
 class Interior:
     """Uncertain rows over one program and one box of deviations, to which rows are added; every solve begins where the
-    last one ended. ``answered``: how many answers there were."""
+    last one ended. ``answered`` counts the solves by method."""
 
     program: FiniteProgram
     spread: Spread

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from scipy.sparse import csr_array
 
 ALIKE = 1.2  # times the parts of a block that its group may have
-WORTH = 3500  # answering variables from which the simplex method takes longer
+WORTH = 3500  # answering variables from which this method is used; the simplex method is as fast up to 10 000
 LARGEST = 600  # variables of one block at most: beyond, a factorisation of it is no gain
 
 
