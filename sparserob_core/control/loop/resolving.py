@@ -272,7 +272,7 @@ class Resolving:
         tools: Tools,
     ) -> Solved:
         tools.deadline.check()
-        tuned, pieces = self._retune(plan, piece, state, innovations), self._model.control.pieces - piece
+        tuned, pieces = self._retune(plan, piece, state, innovations, tools), self._model.control.pieces - piece
         if not self._is_in_time(piece):
             return tuned
         start_time, full = clock.perf_counter(), Solved(None)
@@ -296,7 +296,7 @@ class Resolving:
         program begins ``gap`` later than the program in which these cuts were active."""
         return self._method.close(program, tools, prover_of(program, tools), shifted(cuts, gap, program))
 
-    def _retune(self, plan: Plan, piece: int, state: Array, innovations: Sequence[Array]) -> Solved:
+    def _retune(self, plan: Plan, piece: int, state: Array, innovations: Sequence[Array], tools: Tools) -> Solved:
         """Solve for the best nominal control with the same gains, where `Retuning` accepts the problem."""
         retuning = next((entry for entry in self._retunings if entry.model is plan.known), None)
         if retuning is None:
@@ -305,7 +305,7 @@ class Resolving:
             retuning = Retuning(plan.known, plan.decision)
             self._retunings = [*self._retunings[:1], retuning]  # that of the plan that loops begin with, and the last
         plan_piece = piece - plan.first
-        tracked = retuning.solve(plan_piece, state)
+        tracked = retuning.solve(plan_piece, state, tools.deadline.at_most(np.inf))
         if tracked is None:
             return Solved(None)
         decision = retuned(plan.known, plan.decision, plan_piece, plan.left(plan_piece, innovations), tracked.decision)
@@ -322,7 +322,7 @@ class Resolving:
         innovations: Sequence[Array],
         tools: Tools,
     ) -> Solved:
-        tracked = self._solve_by_tracking(plan, piece, state, innovations)
+        tracked = self._solve_by_tracking(plan, piece, state, innovations, tools)
         if tracked is not None:
             return tracked
         tools.deadline.check()
@@ -366,7 +366,9 @@ class Resolving:
             model, result, piece, decision, units.cost * result.cost, units.cost * result.lower_bound, known_cost
         )
 
-    def _solve_by_tracking(self, plan: Plan, piece: int, state: Array, innovations: Sequence[Array]) -> Solved | None:
+    def _solve_by_tracking(
+        self, plan: Plan, piece: int, state: Array, innovations: Sequence[Array], tools: Tools
+    ) -> Solved | None:
         """Return the answer of `Tracking` where it accepts the problem and closes the gap; otherwise ``None``."""
         if self._model.problem.control_step is not None:
             return None
@@ -377,7 +379,7 @@ class Resolving:
         if tracking is None:
             return None
         model, own, units = self._prepare_problem(piece, state)
-        tracked = tracking.solve(state / units.states)
+        tracked = tracking.solve(state / units.states, tools.deadline.at_most(np.inf))
         if tracked is None:
             return None
         if relative_gap(tracked.lower, tracked.cost, own.program.added(tracked.decision)) > self._method.tolerance:

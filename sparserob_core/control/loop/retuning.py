@@ -68,14 +68,14 @@ class Retuning:
             if self._trackers.setdefault(piece, self._prepare_tracker(piece, state)) is None:
                 return
 
-    def solve(self, piece: int, state: Array) -> Tracked | None:
+    def solve(self, piece: int, state: Array, seconds: float = np.inf) -> Tracked | None:
         """Return the nominal control ``(m K',)`` that remains from ``piece`` on, with the response of the gains to the
-        past, from a measured ``state (d,)``. ``None`` where no answer is proven, or where `Tracking` does not accept
-        the problem."""
+        past, from a measured ``state (d,)``. ``None`` where no answer is proven in the ``seconds`` of each round, or
+        where `Tracking` does not accept the problem."""
         if piece not in self._trackers:
             self._trackers[piece] = self._prepare_tracker(piece, state)
         tracking = self._trackers[piece]
-        return None if tracking is None else tracking.solve(state)
+        return None if tracking is None else tracking.solve(state, seconds)
 
     def _prepare_tracker(self, piece: int, state: Array) -> Tracking | None:
         model, grid = self.model, self.model.response.grid

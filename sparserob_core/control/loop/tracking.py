@@ -189,15 +189,15 @@ class Tracking:
         self._input_rows, self._state_rows = np.zeros((0, weights.size)), np.zeros((0, self.H.shape[1]))
         self._right_hand_sides = np.zeros(0)
 
-    def solve(self, state: Array) -> Tracked | None:
-        """Return the answer from an initial state; ``None`` where none was proven."""
+    def solve(self, state: Array, seconds: float = np.inf) -> Tracked | None:
+        """Return the answer from an initial state; ``None`` where none was proven, in the ``seconds`` of each round."""
         if len(self._row_instants) > KEPT:
             self._drop_idle_rows()
         nominal, (weights, low, high) = self._propagate_uncontrolled(state), self.limits
         for round_ in range(ROUNDS):
             h = self._right_hand_sides - self._state_rows @ state
             self._program.limit(np.arange(h.size), h - MARGIN)
-            solved, _, parts, y = self._program.solve()
+            solved, _, parts, y = self._program.solve(seconds)
             if not solved:
                 return None
             x = np.clip(parts[: low.size] - parts[low.size :], low, high)

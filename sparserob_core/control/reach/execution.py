@@ -109,9 +109,11 @@ class Execution:
 
     @cached_property
     def begins(self) -> Array:
-        """Times ``(late + K + 1,)`` at which what acts changes."""
-        delay = self.response.system.delay
-        return np.append(0.0, self.breakpoints + delay) if self.late else self.breakpoints
+        """Times ``(late + K + 1,)`` at which what acts changes, on the grid of the response; the horizon for pieces
+        that would act after it."""
+        grid = self.response.grid
+        first = np.searchsorted(grid.control_piece, np.arange(-self.late, self.breakpoints.size - 1))
+        return np.append(grid.breakpoints[first], grid.breakpoints[-1])
 
     @property
     def size(self) -> int:

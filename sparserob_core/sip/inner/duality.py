@@ -331,13 +331,14 @@ def _evaluate_bound(terms: Terms, program: FiniteProgram) -> float:
     s = minimisers(terms.weights, terms.curvature, slope, program.lower, program.upper)
     away = None if program.bounded else ~np.isfinite(s)
     if away is not None and away.any():
-        if (np.abs(slope[away]) - terms.weights[away] > 10 * terms.round_off * terms.noise[away]).any():
+        if (np.abs(slope[away]) - terms.weights[away] > 10 * ROUND_OFF * terms.noise[away]).any():
             return -np.inf
         s = np.where(away, np.clip(0.0, program.lower, program.upper), s)
     values = terms.weights * np.abs(s) + slope * s
-    if terms.curvature is not None:
-        values += 0.5 * terms.curvature * s * s
     size = terms.magnitude + float(np.abs(s) @ (terms.noise + terms.weights))
+    if terms.curvature is not None:
+        bent = 0.5 * terms.curvature * s * s
+        values, size = values + bent, size + float(bent.sum())
     return terms.constant + _add_pairwise(values) - terms.round_off * size
 
 

@@ -65,7 +65,8 @@ def irreducible(relaxed: RelaxedProgram, rows: Rows, solution: FiniteSolution) -
         solution, y = without, without.y[fixed:]
         rows, needed, positive = rows.take(keep), needed[keep], y > 0.0
         rows, needed, y = rows.take(positive), needed[positive], y[positive]
-    return rows, replace(solution, y=np.concatenate([solution.y[:fixed], y])), shown
+    alone = not (fixed or relaxed.program.finite.b.size)  # of a single row: bounds of the decision can always hold
+    return rows, replace(solution, y=np.concatenate([solution.y[:fixed], y])), shown and bool(needed.all() or alone)
 
 
 def _move_to_vertex(relaxed: RelaxedProgram, rows: Rows, solution: FiniteSolution) -> FiniteSolution:

@@ -158,6 +158,15 @@ def test_a_late_command_adds_what_a_system_followed_in_time_says() -> None:
     np.testing.assert_allclose(slopes, (about[0] - about[1]) / (2 * h), rtol=1e-5)
 
 
+def test_pieces_that_begin_beside_others_begin_with_them() -> None:
+    """A delay of a piece and 3e-12: the grid has one time for both, and so have the errors."""
+    late = model(system=sr.LinearSystem(A, B, delay=0.5 + 2.9e-12), initial_control=[0.4, -0.9]).functionals
+    assert late.execution is not None
+    grid = late.response.grid.breakpoints
+    assert np.isin(late.execution.begins, grid).all() and late.execution.begins[1] == 0.5
+    assert late.execution.begins.size == PIECES + 2 and late.execution.begins[-1] == HORIZON
+
+
 def test_late_bounds_hold_on_every_cell_and_close() -> None:
     one = constraint(model(system=sr.LinearSystem(A, B, delay=0.3), initial_control=[0.4, -0.9]))
     assert_bounded_on_cells(one, np.concatenate([CONTROL.ravel(), np.abs(CONTROL).ravel()]), halvings=3, near=0.02)

@@ -117,6 +117,28 @@ def test_a_bound_by_many_terms_allows_for_what_their_sum_loses(along: str) -> No
     assert bound >= -float(truth) - 1e-10
 
 
+def test_the_rounding_of_a_square_is_counted_where_nothing_else_is() -> None:
+    """``min p x^2 / 2`` over ``[l, 2]``, without a slope and a weight: the bound is a product of three floats."""
+    rng = np.random.default_rng(5)
+    for p, low in rng.uniform(0.1, 1.9, size=(100, 2)):
+        zero, none = np.zeros(1), np.zeros((0, 1))
+        P = csc_array([[p]])
+        program = FiniteProgram(zero, zero, np.array([low]), np.array([2.0]), none, zero[:0], none, zero[:0], P=P)
+        assert Fraction(dual_bound(program, zero[:0], zero[:0])) <= Fraction(p) * Fraction(low) ** 2 / 2
+
+
+@pytest.mark.parametrize("apart", [2e-12, 1.5e-11])
+def test_rows_that_have_no_entry_of_a_variable_do_not_excuse_its_slope(apart: float) -> None:
+    """``x1 - (1 - d) x2`` with ``x1 = x2`` has no least value, however many multipliers other rows have."""
+    n, rows = 3, 4000
+    G, A = np.zeros((rows, n)), np.array([[1.0, -1.0, 0.0]])
+    G[:, 2] = -1.0
+    low, high = np.array([-np.inf, -np.inf, 0.0]), np.array([np.inf, np.inf, 1.0])
+    q = np.array([1.0, -(1.0 - apart), 0.0])
+    program = FiniteProgram(q, np.zeros(n), low, high, G, np.zeros(rows), A, np.zeros(1))
+    assert dual_bound(program, np.full(rows, 1e-9), np.array([-1.0])) == -np.inf
+
+
 def test_what_refutes_is_the_dual_function_of_the_rows_alone_per_size_of_the_multipliers() -> None:
     rng = np.random.default_rng(2)
     for kind in ("plain", "open rows", "diagonal"):
