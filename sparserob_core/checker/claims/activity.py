@@ -30,7 +30,7 @@ NEARLY = 1e-6  # relative to one count: a bound that is above a whole number of 
 Rows = list[tuple[float, ConstraintRow]]
 
 
-def acted(case: Case) -> float:
+def active_share(case: Case) -> float:
     """Return the share of time, weighted over the channels, that the certificate's control acts."""
     is_active = np.abs(case.control.control(case.theta)) > ROUNDED * case.control.summands(case.theta)
     for block in case.price.blocks:  # the channels of one vector act together
@@ -39,7 +39,7 @@ def acted(case: Case) -> float:
     return float(counts[is_active].sum() / counts.sum())
 
 
-def shared(case: Case, rows: Rows, pieces: Any) -> tuple[Rows, Any]:
+def convert_multipliers(case: Case, rows: Rows, pieces: Any) -> tuple[Rows, Any]:
     """Return multipliers of the cost as multipliers of the count, with those of the pieces, ``(m, K)`` or ``None``. Any
     positive divisor is valid; best is the largest absolute value of a channel times the factor ``l1`` of the cost."""
     divisor = max(
@@ -50,7 +50,7 @@ def shared(case: Case, rows: Rows, pieces: Any) -> tuple[Rows, Any]:
     return [(y / divisor, row) for y, row in rows], piece_multipliers
 
 
-def least(case: Case, rows: Rows, pieces: Sequence[Sequence[float]] | None) -> float:
+def bound_by_multipliers(case: Case, rows: Rows, pieces: Sequence[Sequence[float]] | None) -> float:
     """Return the share of time, from 0 to 1, that every admissible control acts at least: a whole number of pieces
     where all count the same. ``rows`` are multipliers with their constraints, ``pieces (m, K)`` those of the control's
     pieces."""
@@ -65,7 +65,7 @@ def least(case: Case, rows: Rows, pieces: Sequence[Sequence[float]] | None) -> f
     return _bound_active_share(case, total)
 
 
-def least_of_cost(case: Case, cost: arb) -> float:
+def bound_by_cost(case: Case, cost: arb) -> float:
     """Return the share of time that every admissible control acts at least, where none costs less than ``cost``. A
     vector of channels that is not 0 costs at most its highest weight times the largest length that it can have."""
     counts, highest = case.price.counts, case.price.highest
@@ -157,7 +157,7 @@ def _sum_counts(case: Case) -> np.ndarray:
     return np.array([counts[block].sum(axis=0) for block in case.price.blocks])
 
 
-def largest(case: Case) -> float:
+def longest_time(case: Case) -> float:
     """Return the longest time that a control can act, weighted over its channels."""
     return float(_compute_counts(case).sum())
 
@@ -167,7 +167,7 @@ Part = tuple[float, float, bool]
 ANY: Part = (-np.inf, np.inf, False)
 
 
-def proven(case: Case, nodes: Sequence[Any], weighted: Callable[[Mapping[str, Any]], Rows]) -> float:
+def bound_by_tree(case: Case, nodes: Sequence[Any], weighted: Callable[[Mapping[str, Any]], Rows]) -> float:
     """Return a lower bound of the time that every control acts, by the leaves of a tree of parts of the controls, the
     root first; infinite where every leaf proves that its part holds no feasible control. ``weighted`` returns the
     multipliers of a leaf with their constraints. Raise `Broken` where the nodes are no tree whose leaves cover all

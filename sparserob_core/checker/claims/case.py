@@ -12,7 +12,7 @@ import numpy as np
 
 from sparserob_core.checker.arithmetic.balls import balls
 from sparserob_core.checker.arithmetic.series import stacked
-from sparserob_core.checker.claims.window import Beside, ConstraintWindow
+from sparserob_core.checker.claims.window import AddedTerms, ConstraintWindow
 from sparserob_core.checker.cost.duality import Duality
 from sparserob_core.checker.cost.price import Price
 from sparserob_core.checker.flow.flows import VerifiedFlows
@@ -238,13 +238,13 @@ class Case:
 
     def beside(
         self, window: ConstraintWindow, basis: Array, gains: Array, parameter: Sequence[float] | None = None
-    ) -> Beside | None:
+    ) -> AddedTerms | None:
         """Return the terms that are added to the state in the rows ``basis (b, d)`` on the state and ``gains (b, m)``
         on the control, ``None`` where there are none; at one ``parameter (nu,)``, or at all of them."""
         entering = self.sources.entering(parameter)
         if window.reference is None and not window.is_mixed and not entering:
             return None
-        return Beside(window, basis, gains, self.control.breakpoints.tolist(), self.pieces, entering)
+        return AddedTerms(window, basis, gains, self.control.breakpoints.tolist(), self.pieces, entering)
 
     @property
     def nominal_parameter(self) -> list[float]:

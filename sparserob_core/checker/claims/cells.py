@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, TypeAlias, final
 import numpy as np
 
 from sparserob_core.checker.arithmetic.bernstein import highest
-from sparserob_core.checker.claims.window import Beside
+from sparserob_core.checker.claims.window import AddedTerms
 from sparserob_core.checker.outcome import TOLERANCE, Broken, Clock, Unchecked
-from sparserob_core.checker.reach.tube import LoopTube, Polynomial, Still, VerifiedTube
+from sparserob_core.checker.reach.tube import LoopTube, Polynomial, TimelessTube, VerifiedTube
 from sparserob_core.checker.sets.parameters import Corners, Parameters
 from sparserob_core.checker.sets.polynomials import HALF_ULP, OUTWARD, ROUNDING
 from sparserob_core.checker.sets.sides import Bounded, Sides
@@ -27,7 +27,7 @@ TIMES = 4
 MOST_BOXES = 8_000  # pairs of a box of parameters and a cell of directions
 BLAME = 0.2  # share of the error, or of the slack, from which one of its causes is treated before the others
 
-Reached: TypeAlias = VerifiedTube | LoopTube | Still
+Reached: TypeAlias = VerifiedTube | LoopTube | TimelessTube
 Interval: TypeAlias = tuple[int, float, float]
 """The number of a piece of the grid, and the start and the end of a part of it, which may be the same time."""
 
@@ -54,10 +54,10 @@ def prove(
     parameters: Parameters,
     work: Sequence[Work],
     clock: Clock,
-    beside: Beside | None = None,
+    added_terms: AddedTerms | None = None,
 ) -> Proven:
     """Show that no row exceeds its limit by more than its slack on any cell of the ``work``; return upper bounds of the
-    excess. ``tubes`` returns the reachable states over a box of parameters, ``beside`` are the terms that are added to
+    excess. ``tubes`` returns the reachable states over a box of parameters, ``added_terms`` are those that are added to
     the state. A box that provably holds none of the ``parameters`` needs no proof.
 
     Raise `Broken` where a row certainly exceeds its limit, `Unchecked` where neither is shown with the cells and the
@@ -84,7 +84,9 @@ def prove(
                         f"neither shown nor refuted: after {cells} cells a violation of more than {TOLERANCE:.0e} of"
                         " its unit is not excluded"
                     )
-                _examine(Place(tubes(box), parameters, box, clock, beside), sides, intervals, open_cells, excess)
+                _examine(
+                    BoxOfStates(tubes(box), parameters, box, clock, added_terms), sides, intervals, open_cells, excess
+                )
                 intervals, open_cells.halves = open_cells.halves, []
             if open_cells.turned:
                 stack += [(half, open_cells.turned) for half in reversed(sides.halves(open_cells.slopes))]
@@ -97,21 +99,21 @@ def prove(
 
 @final
 @dataclass(frozen=True, eq=False)
-class Place:
+class BoxOfStates:
     """A box of parameters with the reachable states over it."""
 
     tube: Reached
     parameters: Parameters
     box: Corners
     clock: Clock
-    beside: Beside | None = None
+    added_terms: AddedTerms | None = None
 
     def cells(self, interval: Interval, z: Array, sharp: bool) -> list[Polynomial]:
-        """Return the polynomials of the rows ``z (k, b)`` on an interval, with the added terms of `beside`."""
+        """Return the polynomials of the rows ``z (k, b)`` on an interval, with the added terms of `added_terms`."""
         polynomials = self.tube.cells(*interval, z, sharp)
-        if self.beside is None:
+        if self.added_terms is None:
             return polynomials
-        return self.beside.added(polynomials, *interval[1:], z, within=(self.box, self.tube.flow))
+        return self.added_terms.added(polynomials, *interval[1:], z, within=(self.box, self.tube.flow))
 
 
 @final
@@ -147,7 +149,9 @@ class _OpenCells:
     wide: list[Interval] = field(default_factory=list)
 
 
-def _examine(place: Place, sides: Sides, todo: Sequence[Interval], left: _OpenCells, shown: _LargestExcess) -> None:
+def _examine(
+    place: BoxOfStates, sides: Sides, todo: Sequence[Interval], left: _OpenCells, shown: _LargestExcess
+) -> None:
     """Bound the rows on every cell of time, and sort the cells whose bounds are too large into ``left``. The bounds
     that suffice are recorded in ``shown``."""
     for interval, polynomials, tops in _bound_rows(place, sides.rows, todo):
@@ -174,7 +178,7 @@ def _examine(place: Place, sides: Sides, todo: Sequence[Interval], left: _OpenCe
 
 
 def _tighten_bound(
-    place: Place, row: Bounded, interval: Interval, poly: Polynomial, top: float
+    place: BoxOfStates, row: Bounded, interval: Interval, poly: Polynomial, top: float
 ) -> tuple[float, Polynomial]:
     """Return a tighter bound with its polynomial: sharper where switching disturbances cause the error, and by the
     half-spaces of the set of parameters."""
@@ -186,7 +190,7 @@ def _tighten_bound(
 
 
 def _has_too_wide_directions(
-    place: Place, sides: Sides, interval: Interval, failed: Sequence[tuple[Bounded, Polynomial]], worst: float
+    place: BoxOfStates, sides: Sides, interval: Interval, failed: Sequence[tuple[Bounded, Polynomial]], worst: float
 ) -> bool:
     """Return whether a cell fails, by at most ``worst``, because its directions differ too much. The one in the middle
     does not fail, and the others exceed it by more than smaller cells of time and parameters could gain: twice the
@@ -202,7 +206,7 @@ def _has_too_wide_directions(
     return sides.is_wide and top <= 0.0 and worst - top > 2.0 * (poly.expansion + poly.kinks)
 
 
-def _refute(place: Place, interval: Interval, rows: Sequence[tuple[Bounded, Polynomial]]) -> None:
+def _refute(place: BoxOfStates, interval: Interval, rows: Sequence[tuple[Bounded, Polynomial]]) -> None:
     """Raise `Broken` where a row certainly exceeds its limit by more than its slack, at the start of the interval and
     at the centre of the box, if that is proven to be a parameter."""
     for row, poly in rows:
@@ -212,7 +216,7 @@ def _refute(place: Place, interval: Interval, rows: Sequence[tuple[Bounded, Poly
 
 
 def _bound_rows(
-    place: Place, rows: Sequence[Bounded], todo: Sequence[Interval], sharp: bool = False
+    place: BoxOfStates, rows: Sequence[Bounded], todo: Sequence[Interval], sharp: bool = False
 ) -> Iterator[tuple[Interval, list[Polynomial], list[float]]]:
     """Yield every interval with its polynomials, one per row, and with proven upper bounds of their excess. Each bound
     holds for the polynomial with its error, less the limit and the slack of its row."""
@@ -251,7 +255,7 @@ def _bound_polynomials(tube: Reached, flat: Sequence[tuple[Polynomial, float]]) 
     return tops
 
 
-def _bound_by_halfspaces(place: Place, row: Bounded, poly: Polynomial) -> float:
+def _bound_by_halfspaces(place: BoxOfStates, row: Bounded, poly: Polynomial) -> float:
     """Return the upper bound that the half-spaces of the set of parameters give; infinite for a box. Where ``a'p <= s``
     on the set, ``v <= v + weight (s - a'p)`` holds there for every ``weight >= 0``."""
     tube, top = place.tube, np.inf

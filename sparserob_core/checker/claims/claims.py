@@ -22,7 +22,7 @@ from sparserob_core.checker.claims.window import ConstraintWindow
 from sparserob_core.checker.cost.duality import ConstraintRow, steps
 from sparserob_core.checker.outcome import CANCELLED, FIGURES, TOLERANCE, Broken, Finding, Unchecked
 from sparserob_core.checker.problem.returning import single
-from sparserob_core.checker.reach.tube import Still
+from sparserob_core.checker.reach.tube import TimelessTube
 from sparserob_core.checker.sets.known import known
 from sparserob_core.checker.sets.parameters import Parameters
 from sparserob_core.checker.sets.shape import Shape, excess
@@ -219,7 +219,7 @@ def _bound_curved_excess(
             low, high = -np.ones(m), np.ones(m)
             low[axis] = high[axis] = sign
             work.append((((), ()), Sides.cell(curved, low, high), [(k, times[k], times[k]) for k in places]))
-    still = Still(heights, curved.normals)
+    still = TimelessTube(heights, curved.normals)
     return max(0.0, prove(lambda _: still, Parameters(None), work, case.clock).share)
 
 
@@ -312,7 +312,7 @@ def _format_cost_unit(case: Case) -> str:
 def _verify_active_time(case: Case) -> str:
     """Show that the written time of action and the written cost ``J`` are those of the control. Where there is an
     alphabet, its letters must be the only values of the control."""
-    active_share, total = activity.acted(case), activity.largest(case)
+    active_share, total = activity.active_share(case), activity.longest_time(case)
     _require_agreement("cost", number(case.certificate, "cost"), ball(active_share * total), 0.0)
     derived = case.price.of(case.pieces)
     _require_agreement(
@@ -348,23 +348,23 @@ def _verify_fewest_active(case: Case, status: str) -> str:
     if (upper is not None) is not proven:
         raise Broken(f"upper is {upper!r} where the status is {status}")
     other_case = _replace_control(case, data)
-    active_share = activity.acted(other_case)
+    active_share = activity.active_share(other_case)
     if proven and abs(number(data, "upper") - active_share) > FIGURES:
         raise Broken(f"upper is {upper!r}, the control acts for a share of {active_share!r}")
     own_multipliers = data.get("multipliers")
     if case.counts and case.letters is None:
-        derived = _bound_by_tree(case) / activity.largest(case)
+        derived = _bound_by_tree(case) / activity.longest_time(case)
         if not 0.0 <= written <= min(derived, active_share if proven else np.inf) + FIGURES:
             raise Broken(f"lower is {written!r}, the leaves prove {derived!r}")
         return _describe_least_share(case, written)
     if own_multipliers is None and case.problem.cost.blocks and not case.problem.cost.is_quadratic:
-        derived = activity.least_of_cost(case, multiplied(case, priced=True))
+        derived = activity.bound_by_cost(case, multiplied(case, priced=True))
     else:
         rows, pieces = weighted(
             case, case.certificate.get("multipliers") if own_multipliers is None else own_multipliers
         )
-        rows, pieces = activity.shared(case, rows, pieces) if own_multipliers is None else (rows, pieces)
-        derived = activity.least(case, rows, pieces)
+        rows, pieces = activity.convert_multipliers(case, rows, pieces) if own_multipliers is None else (rows, pieces)
+        derived = activity.bound_by_multipliers(case, rows, pieces)
     if not 0.0 <= written <= derived + FIGURES or (proven and written > active_share + FIGURES):
         raise Broken(f"lower is {written!r}, the multipliers prove {derived!r}")
     least = _describe_least_share(case, written)
@@ -454,7 +454,7 @@ def _bound_by_tree(case: Case) -> float:
             constraints.append({**entry, "multiplier": pair[1]} if isinstance(entry, Mapping) else entry)
         return weighted(case, {"constraints": constraints, "equalities": leaf.get("equalities")})[0]
 
-    return activity.proven(case, listed(data, "nodes"), of_leaf)
+    return activity.bound_by_tree(case, listed(data, "nodes"), of_leaf)
 
 
 def _verify_infeasibility(case: Case) -> str:
@@ -527,7 +527,7 @@ def compared(case: Case) -> float:
 
 def largest_cost(case: Case) -> float:
     """Return the largest cost that a control may have; earlier versions made the gap relative to it."""
-    return activity.largest(case) if case.counts else case.price.largest
+    return activity.longest_time(case) if case.counts else case.price.largest
 
 
 def _verify_witness(case: Case) -> str:

@@ -101,7 +101,7 @@ class ConstraintWindow:
 
 @final
 @dataclass(frozen=True, eq=False)
-class Beside:
+class AddedTerms:
     """The terms ``g'u - c'r(t)`` that are added to ``c'x(t)`` in the rows of a window.
 
     The coefficients are ``c = z'basis`` and ``g = z'gains``, with ``basis (b, d)`` and ``gains (b, m)``.

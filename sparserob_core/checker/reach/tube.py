@@ -270,7 +270,7 @@ class LoopTube:
 
 @final
 @dataclass(frozen=True, eq=False)
-class Still:
+class TimelessTube:
     """The largest values of quantities with numbered places instead of times. ``heights`` gives them at a place for
     rows ``(r, d)``, which are combinations of the rows of ``basis (b, d)``."""
 

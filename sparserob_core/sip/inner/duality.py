@@ -337,8 +337,8 @@ def _evaluate_bound(terms: Terms, program: FiniteProgram) -> float:
     values = terms.weights * np.abs(s) + slope * s
     size = terms.magnitude + float(np.abs(s) @ (terms.noise + terms.weights))
     if terms.curvature is not None:
-        bent = 0.5 * terms.curvature * s * s
-        values, size = values + bent, size + float(bent.sum())
+        squares = 0.5 * terms.curvature * s * s
+        values, size = values + squares, size + float(squares.sum())
     return terms.constant + _add_pairwise(values) - terms.round_off * size
 
 

@@ -250,10 +250,10 @@ def test_the_leaves_of_a_tree_prove_how_long_a_control_acts():
     assert claims._bound_by_tree(case_of(certificate=once, **END)) == 2.0
     loose = {"terminal": [Box([-9.0], [0.2])], "counts": True}
     assert claims._bound_by_tree(case_of(certificate=once, **loose)) == 1.0
-    assert activity.largest(case_of()) == 2.0
+    assert activity.longest_time(case_of()) == 2.0
     weighted = case_of(certificate=once, weights=[3.0], **loose)
     assert claims._bound_by_tree(weighted) == 3.0
-    assert activity.largest(weighted) == 6.0
+    assert activity.longest_time(weighted) == 6.0
     written = {"lower_bound": 2.0, **tree(*TREE, constraints=ROWS)}
     assert "acts for less than 2" in claims._verify_lower_bound(case_of(certificate=written, **END))
     with pytest.raises(Broken):
@@ -318,27 +318,27 @@ def test_letters_are_divided_between_neighbours_only():
 
 
 def test_the_share_of_time_that_a_control_acts_is_that_of_what_is_not_dust():
-    assert activity.acted(case_of()) == 1.0
-    assert activity.acted(case_of(decision=((-0.75, 0.0),))) == 0.5
+    assert activity.active_share(case_of()) == 1.0
+    assert activity.active_share(case_of(decision=((-0.75, 0.0),))) == 0.5
     two = {"control": Box([-1.0] * 2, [1.0] * 2), "decision": ((-0.75, 0.0), (0.0, 0.0))}
-    assert activity.acted(case_of(**two)) == 0.25
-    assert activity.acted(case_of(**two, weights=[3.0, 1.0])) == 0.375
+    assert activity.active_share(case_of(**two)) == 0.25
+    assert activity.active_share(case_of(**two, weights=[3.0, 1.0])) == 0.375
     case = case_of(Box([-1.0], [2.0]), terminal=[Box([-9.0], [0.2])])
     rows = bounds.rows_of(case, entry())
-    assert activity.least(case, rows, None) == 0.5  # 0.8, rounded up to one piece of two
-    assert activity.least(case, [(0.5, rows[0][1])], None) == 0.5
-    assert activity.least(case, [], None) == 0.0
-    assert activity.least_of_cost(case, arb(0.8)) == 0.5  # at most 2 a piece
-    assert activity.least_of_cost(case, arb(2.1)) == 1.0
+    assert activity.bound_by_multipliers(case, rows, None) == 0.5  # 0.8, rounded up to one piece of two
+    assert activity.bound_by_multipliers(case, [(0.5, rows[0][1])], None) == 0.5
+    assert activity.bound_by_multipliers(case, [], None) == 0.0
+    assert activity.bound_by_cost(case, arb(0.8)) == 0.5  # at most 2 a piece
+    assert activity.bound_by_cost(case, arb(2.1)) == 1.0
     # where 0 is outside, a piece always counts
     always = case_of(Box([0.25], [1.0]), decision=((0.5, 0.5),))
-    assert activity.least(always, [], None) == 1.0
+    assert activity.bound_by_multipliers(always, [], None) == 1.0
     # beside another channel that need not act: half of all, and nothing for the values that it must have
     half = case_of(Box([0.25, -1.0], [1.0, 1.0]), decision=((0.5, 0.5), (0.0, 0.0)))
-    assert activity.least(half, [], None) == 0.5
+    assert activity.bound_by_multipliers(half, [], None) == 0.5
     below = case_of(Box([-1.0, -1.0], [-0.25, 1.0]), decision=((-0.5, -0.5), (0.0, 0.0)))
-    assert activity.least(below, [], None) == 0.5
-    scaled = activity.shared(case, rows, None)[0][0]
+    assert activity.bound_by_multipliers(below, [], None) == 0.5
+    scaled = activity.convert_multipliers(case, rows, None)[0][0]
     assert scaled[0] == pytest.approx(0.5)
 
 

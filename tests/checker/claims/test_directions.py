@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from flint import ctx
 
-from sparserob_core.checker.claims.window import Beside, ConstraintWindow
+from sparserob_core.checker.claims.window import AddedTerms, ConstraintWindow
 from sparserob_core.checker.reach.kernels import BoundedInputHere
 from sparserob_core.checker.reach.measurable import as_enclosed
 from sparserob_core.checker.reach.tube import LoopTube, Polynomial
@@ -42,9 +42,9 @@ def precision():
         yield
 
 
-def beside(basis: np.ndarray) -> Beside:
+def beside(basis: np.ndarray) -> AddedTerms:
     window = ConstraintWindow("path", Ellipsoid(np.zeros(3), np.eye(3)), 0.0, 1.0, 3)
-    return Beside(window, basis, np.zeros((len(basis), 0)), [0.0, 1.0], [], cast(Any, [Erring()]))
+    return AddedTerms(window, basis, np.zeros((len(basis), 0)), [0.0, 1.0], [], cast(Any, [Erring()]))
 
 
 def test_a_direction_is_the_nearest_float_and_off_by_what_is_left() -> None:

@@ -178,11 +178,11 @@ def test_a_tree_is_asked_for_where_time_counts_and_letters_are_kept_to() -> None
 def test_what_counts_alike_is_rounded_up_to_whole_pieces_and_what_does_not_is_a_share() -> None:
     """Two channels on two pieces of one length: four that count alike."""
     case = case_of(SETS["box"])
-    one = activity.largest(case) / 4.0
+    one = activity.longest_time(case) / 4.0
     for count, pieces in ((-1.0, 0), (0.3, 1), (1.0 + 1e-3, 2), (2.0, 2), (2.0 - 1e-9, 2), (3.9, 4), (4.7, 4)):
         assert activity._bound_active_share(case, arb(count * one)) == pieces / 4.0
     apart = case_of(SETS["box"], weights=[1.0, 3.0])
-    most = activity.largest(apart)
+    most = activity.longest_time(apart)
     for share in (-0.5, 0.0, 0.3, 0.9):
         found = activity._bound_active_share(apart, arb(share * most))
         assert max(0.0, share) - 1e-12 <= found <= max(0.0, share)

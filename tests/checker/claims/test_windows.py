@@ -23,7 +23,7 @@ from sparserob_core.checker.arithmetic.series import stacked
 from sparserob_core.checker.claims import claims, constraints, multipliers, replay
 from sparserob_core.checker.claims.case import Case, numbers
 from sparserob_core.checker.claims.causal import _share_peak_price, causal_bound
-from sparserob_core.checker.claims.cells import Place, _bound_by_halfspaces
+from sparserob_core.checker.claims.cells import BoxOfStates, _bound_by_halfspaces
 from sparserob_core.checker.claims.units import units_of
 from sparserob_core.checker.cost.price import _is_semidefinite
 from sparserob_core.checker.outcome import RESOLVED, Broken, Clock, Finding, Unchecked
@@ -297,7 +297,7 @@ def test_a_bound_with_the_set_of_parameters_is_above_every_parameter_in_it(seed)
     edge = middle + radius * np.stack([np.cos(angle), np.sin(angle)], axis=1)
     inside = edge[((edge >= low) & (edge <= high)).all(axis=1)]
     truth = offset + ((inside - flow.centre) @ slope).max() + 1e-3
-    place = Place(SimpleNamespace(flow=flow), parameters, box, Clock(9.0))
+    place = BoxOfStates(SimpleNamespace(flow=flow), parameters, box, Clock(9.0))
     for limit in (0.0, 0.7):
         row = Bounded(np.ones(1), limit, 1.0)
         found = _bound_by_halfspaces(place, row, poly)

@@ -19,7 +19,7 @@ from sparserob_core.checker.outcome import Broken, Clock
 from sparserob_core.checker.reach.closed_loop import VerifiedLoop
 from sparserob_core.checker.reach.measurable import MeasurableLoop
 from sparserob_core.checker.reach.preimages import Pushed
-from sparserob_core.checker.reach.tube import LoopTube, Still
+from sparserob_core.checker.reach.tube import LoopTube, TimelessTube
 from sparserob_core.checker.sets.known import known
 from sparserob_core.checker.sets.parameters import Parameters
 from sparserob_core.checker.sets.polynomials import Enclosed, rounding
@@ -198,8 +198,8 @@ def test_the_integral_of_a_kernel_is_that_of_the_support_function(name):
             for share in (1.0, 0.37):
                 pushed = loop.deviations
                 kernel = pushed.kernel(piece) if share == 1.0 else pushed.way(begin, begin + share * length)
-                found = kernel.most(Enclosed(a, np.zeros_like(a)), loop.deviations.sides)
-                wide = kernel.most(Enclosed(a, np.full_like(a, 1e-3)), loop.deviations.sides)
+                found = kernel.most(Enclosed(a, np.zeros_like(a)), loop.deviations.summands)
+                wide = kernel.most(Enclosed(a, np.full_like(a, 1e-3)), loop.deviations.summands)
                 parts = 120
                 ends = np.linspace(0.0, share * length, parts + 1)
                 r = ((ends[:-1] + ends[1:])[:, None] / 2 + np.diff(ends)[:, None] / 2 * nodes).ravel()
@@ -218,7 +218,7 @@ def test_the_integral_of_a_kernel_is_that_of_the_support_function(name):
                 assert (np.abs(found.mid - truth) <= found.rad + 2e-5).all()
                 assert (found.rad < 1e-11).all()
                 for offset in 1e-3 * rng.uniform(-1, 1, size=(3, *a.shape)):
-                    moved = kernel.most(Enclosed(a + offset, np.zeros_like(a)), loop.deviations.sides)
+                    moved = kernel.most(Enclosed(a + offset, np.zeros_like(a)), loop.deviations.summands)
                     assert (moved.mid + moved.rad <= wide.mid + wide.rad + 1e-12).all()
                     assert (moved.mid - moved.rad >= wide.mid - wide.rad - 1e-12).all()
                 assert (wide.rad < 0.1).all()
@@ -285,7 +285,7 @@ def test_an_excess_of_a_set_is_judged_in_the_unit_of_how_far_it_reaches():
 
 def test_what_has_no_times_is_as_far_out_as_at_its_place():
     with ctx.workprec(192):
-        still = Still(
+        still = TimelessTube(
             lambda place, rows: [x * (place + 1) for x in (rows * exactly(np.ones((2, 1)))).entries()], np.eye(2)
         )
         polynomials = still.cells(2, 0.0, 0.0, np.array([[1.0, 0.0], [1.0, -0.25]]))
