@@ -199,7 +199,7 @@ def test_the_worst_signals_of_a_plant_whose_matrices_do_not_commute_attain_what_
                 np.testing.assert_allclose(outward @ zonoid.reached(arc), state, atol=1e-9)
                 assert float(zonoid.support(a @ outward)) == pytest.approx(reached, abs=1e-9)
                 pushed = both.deviations
-                told = pushed.kernel(piece).most(Enclosed(a[None], np.zeros((1, 2))), pushed.sides)
+                told = pushed.kernel(piece).most(Enclosed(a[None], np.zeros((1, 2))), pushed.summands)
                 assert told.mid[0] == pytest.approx(reached, abs=1e-9) and told.rad[0] < 1e-12
                 time = 0.3 * low + 0.7 * high
                 ends, signal = pieces.signal(np.zeros(pieces.size), time, a, piece)
