@@ -17,8 +17,8 @@ from sparserob_core.checker.flow.segment import VerifiedSegment
 from sparserob_core.checker.outcome import Clock, Unchecked
 from sparserob_core.checker.reach import adjoint as module
 from sparserob_core.checker.reach.adjoint import DEAR, AdjointFlow, AdjointRow, SupportIntegrals, Worst
-from sparserob_core.checker.reach.measurable import Side
 from sparserob_core.checker.sets.polynomials import Enclosed
+from sparserob_core.checker.sets.summands import Summand
 from sparserob_core.control.sets.sets import Box, Polytope
 
 A = [[0.0, 1.0, 0.0], [-9.0, -0.4, 2.0], [0.3, 0.0, -1.5]]
@@ -357,7 +357,7 @@ def swept(mid: list[list[float]], rad: float, sides: list[list[float]], step: fl
     off[:, 0, 1] = rad
     row = SimpleNamespace(driven=Enclosed(table, off), count=len(mid), step=step)
     row.placed = lambda times: AdjointRow.placed(cast(AdjointRow, row), times)
-    every = [Side(np.array(side)[:, None], np.zeros((len(side), 1))) for side in sides]
+    every = [Summand(np.array(side)[:, None], np.zeros((len(side), 1))) for side in sides]
     return SupportIntegrals(cast(AdjointRow, row), slice(1, None), every)
 
 
@@ -437,7 +437,7 @@ def test_integrals_are_off_by_what_all_steps_are_and_by_what_their_sum_is_rounde
         return values, np.full(count, 0.1), np.full(count, 0.2), np.full(count, 3.0)
 
     known = swept([[1.0]] * 4, 0.0, [[1.0]])
-    known = replace(known, sides=[cast(Side, SimpleNamespace(swept=found, far=np.ones(1)))])
+    known = replace(known, summands=[cast(Summand, SimpleNamespace(swept=found, far=np.ones(1)))])
     with monkeypatch.context() as patched, ctx.workprec(128):
         told(patched, COARSE, half, outward)
         value, more, less = (part[:, 0] for part in known._end_integrals)
@@ -458,7 +458,7 @@ def test_a_measurable_worst_is_off_by_what_its_integrals_are(monkeypatch: pytest
     stub = SimpleNamespace(integrals=lambda times: (linear, np.array([[9.0, 0.05]])))
     row = replace(worst("measurable"), adjoint=cast(AdjointRow, stub))
     integrals = (np.array([[1.0, 2.0]]), np.array([[1.5, 2.25]]))
-    row.__dict__["_disturbance_integrals"] = SimpleNamespace(at=lambda times: integrals, sides=[None, None])
+    row.__dict__["_disturbance_integrals"] = SimpleNamespace(at=lambda times: integrals, summands=[None, None])
     about = 0.15  # the middle of the set
     with monkeypatch.context() as patched:
         told(patched, COARSE, 0.0, 1.0)
