@@ -64,8 +64,8 @@ class Sources:
 
     @cached_property
     def execution(self) -> BoundedInput | None:
-        """The errors of execution; ``None`` where the command is delivered exactly. Without a
-        control in the certificate they have no pieces."""
+        """The errors of execution; ``None`` where the command is delivered exactly. They have no pieces where the
+        certificate has no control."""
         shares, system = self.problem.execution, self.problem.system
         if shares is None:
             return None

@@ -23,8 +23,8 @@ from sparserob_core.sip.convex_set import Array
 DISC = 3.0  # radius: with 2 the error of the rule is 1e-9, with 4 cells are halved once more
 NODES = 16  # of Gauss' rule: its relative error is then 3e-15
 LEFT = 4.0 * DISC ** (-2.0 * NODES) / (1.0 - 1.0 / DISC) * OUTWARD
-ROUNDS = 60  # rounds in which cells are halved
-SETTLED = 2.0**-49  # relative to the support values: a cell with a smaller error is halved no more
+ROUNDS = 60  # rounds in which cells are cut
+SETTLED = 2.0**-49  # relative to the support values: a cell with a smaller error is cut no more
 ROOM = 0.999  # the largest relative change of a sum of squares or powers: it stays away from 0 despite rounding
 STEEP = 1e9  # the largest exponent: rounding changes such a power by some 1e-6 of itself, and `ROOM` leaves 1e-3
 AT_ONCE = 20_000  # cells that are evaluated together: some 50 MB

@@ -13,12 +13,10 @@ from typing import final
 
 import numpy as np
 
-from sparserob_core.checker.sets.along import NormSummand
+from sparserob_core.checker.sets.along import ROUNDS, SETTLED, NormSummand
 from sparserob_core.checker.sets.polynomials import OUTWARD, rounding
 from sparserob_core.sip.convex_set import Array
 
-SETTLED = 2.0**-49  # relative to the support values: how much another corner may add on a cell that is cut no further
-ROUNDS = 60  # in which cells are cut
 # Rounds that always cut where two corners are equally good. Later every second one halves the cell: where two corners
 # touch at an end, that point lies next to this end, and such cuts gain little.
 CROSSING = 8

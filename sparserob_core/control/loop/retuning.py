@@ -70,8 +70,8 @@ class Retuning:
 
     def solve(self, piece: int, state: Array, seconds: float = np.inf) -> Tracked | None:
         """Return the nominal control ``(m K',)`` that remains from ``piece`` on, with the response of the gains to the
-        past, from a measured ``state (d,)``. ``None`` where no answer is proven in the ``seconds`` of each round, or
-        where `Tracking` does not accept the problem."""
+        past, from a measured ``state (d,)``. ``None`` where no answer is proven within ``seconds``, or where `Tracking`
+        does not accept the problem."""
         if piece not in self._trackers:
             self._trackers[piece] = self._prepare_tracker(piece, state)
         tracking = self._trackers[piece]

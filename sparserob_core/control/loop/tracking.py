@@ -7,6 +7,7 @@ only the nominal state is new.
 
 from __future__ import annotations
 
+import time
 from bisect import bisect_left
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -190,14 +191,15 @@ class Tracking:
         self._right_hand_sides = np.zeros(0)
 
     def solve(self, state: Array, seconds: float = np.inf) -> Tracked | None:
-        """Return the answer from an initial state; ``None`` where none was proven, in the ``seconds`` of each round."""
+        """Return the answer from an initial state; ``None`` where none was proven within ``seconds``."""
+        until = time.monotonic() + seconds
         if len(self._row_instants) > KEPT:
             self._drop_idle_rows()
         nominal, (weights, low, high) = self._propagate_uncontrolled(state), self.limits
         for round_ in range(ROUNDS):
             h = self._right_hand_sides - self._state_rows @ state
             self._program.limit(np.arange(h.size), h - MARGIN)
-            solved, _, parts, y = self._program.solve(seconds)
+            solved, _, parts, y = self._program.solve(until - time.monotonic())
             if not solved:
                 return None
             x = np.clip(parts[: low.size] - parts[low.size :], low, high)

@@ -75,10 +75,13 @@ def remark(problem: OptimalControlProblem, feedback: bool = False) -> str:
     measurable disturbances, which the checker encloses."""
     kinds = sorted({convex.kind for convex in strangers(problem)})
     assumption = f"what sets of the kind {', '.join(kinds)} say of themselves is believed" if kinds else ""
-    if problem.measurable is None or not feedback:
-        return assumption
-    allowed = "the integrals over measurable disturbances are allowed a relative error of 1e-12, which sparserob check"
-    return "; ".join(filter(None, [assumption, f"{allowed} encloses"]))
+    integrals = (
+        "the integrals over measurable disturbances are allowed a relative error of 1e-12, which sparserob check"
+        " encloses"
+        if feedback and problem.measurable is not None
+        else ""
+    )
+    return "; ".join(filter(None, [assumption, integrals]))
 
 
 def growth(system: System, horizon: float) -> float:

@@ -350,12 +350,12 @@ def _order_attempts(program: FiniteProgram) -> tuple[tuple[Form, float], ...]:
 def _sharpen(case: _Case, claim: Claim | None, answer: Recovered | None) -> FiniteSolution | None:
     """Return the first answer that is believed and sharp: more digits of the ``claim``, and a vertex, which comes first
     where the solver has an answer that lacks digits, and last where it goes somewhere and does not arrive. Where it
-    gave up, a proof that there is no answer comes before more digits. Failures are
-    reported."""
-    solved = claim is not None and claim.status == "solved" and answer is not None
-    believed = _solve_by_simplex(case) if solved else None
+    gave up, a proof that there is no answer comes before more digits. Failures are reported."""
+    believed = None
     if claim is not None and claim.status == "failed":
         believed = _find_elastic_proof(case, None)
+    elif claim is not None and claim.status == "solved" and answer is not None:
+        believed = _solve_by_simplex(case)
     believed = believed or _refine_digits(case, claim)
     is_stalled = claim is not None and claim.status == "failed" and np.isfinite(claim.x).all() and claim.x.any()
     return _solve_by_simplex(case) if believed is None and is_stalled else believed
@@ -504,22 +504,27 @@ def _find_elastic_proof(case: _Case, known: FiniteSolution | None) -> FiniteSolu
     if case.elastic:
         return known
     case.elastic = True
-    relaxed = elastic_program(case.program)
-    corner = simplex(relaxed, TURNS * (relaxed.n + relaxed.h.size)) if HIGHS in case.solver.quick else None
-    if corner is not None and corner.status == "optimal":
-        vertex_answer = unrelaxed(case.program, (corner.x, corner.y, corner.mu, corner.z))
-        proof = _check_proof(case, vertex_answer, "the elastic program")
+    for by, answer in _list_elastic_answers(case, ("split", "epigraph") if known is None else ("split",)):
+        proof = _check_proof(case, unrelaxed(case.program, answer), "the elastic program")
         if proof is not None and (known is None or proof.infeasibility > known.infeasibility):
-            return replace(proof, by=HIGHS)
-    forms: tuple[Form, ...] = ("split", "epigraph")
-    for form in forms if known is None else forms[:1]:
-        claim, answer = _ask_solver(case, relaxed, form, 0.1 * case.tolerance)
-        proof = None if answer is None else _check_proof(case, unrelaxed(case.program, answer), "the elastic program")
-        if proof is not None and (known is None or proof.infeasibility > known.infeasibility):
-            return proof
-        if claim is not None and claim.status == "solved":
-            break
+            return replace(proof, by=by)
     return known
+
+
+def _list_elastic_answers(case: _Case, forms: tuple[Form, ...]) -> Iterator[tuple[str, Recovered]]:
+    """Yield answers to the elastic program, each with the name of the method that it is by: a vertex, where no solver
+    was named, and the solver's in each form until it calls one solved."""
+    relaxed = elastic_program(case.program)
+    if HIGHS in case.solver.quick:
+        corner = simplex(relaxed, TURNS * (relaxed.n + relaxed.h.size))
+        if corner.status == "optimal":
+            yield HIGHS, (corner.x, corner.y, corner.mu, corner.z)
+    for form in forms:
+        claim, answer = _ask_solver(case, relaxed, form, 0.1 * case.tolerance)
+        if answer is not None:
+            yield "", answer
+        if claim is not None and claim.status == "solved":
+            return
 
 
 def _check_proof(case: _Case, answer: Recovered | None, source: str) -> FiniteSolution | None:

@@ -3,6 +3,8 @@ the long way proves, and claims no more."""
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 
@@ -119,6 +121,15 @@ def test_from_where_nothing_is_feasible_it_says_nothing() -> None:
     tracking = Tracking(own)
     assert tracking.solve(np.array([-9.0, 1.0]) / units.states) is None
     assert tracking.solve(np.array([-1.0, 1.0]) / units.states) is not None
+
+
+def test_all_rounds_together_have_the_time_of_a_step(monkeypatch: pytest.MonkeyPatch) -> None:
+    own, units = spring()
+    tracking, asked = Tracking(own), list[float]()
+    solve = tracking._program.solve
+    monkeypatch.setattr(tracking._program, "solve", lambda seconds: asked.append(seconds) or solve(seconds))
+    assert tracking.solve(np.array([-1.0, 1.0]) / units.states, 60.0) is not None
+    assert len(asked) > 1 and asked[0] <= 60.0 and all(a > b > 0.0 for a, b in pairwise(asked))
 
 
 def test_many_states_do_not_let_it_grow() -> None:
