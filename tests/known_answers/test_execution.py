@@ -296,6 +296,6 @@ def test_the_push_counts_what_errors_do_in_the_rows_as_a_price(tmp_path: Path) -
     config = {"problem": STRAIGHT, "dictionaries": {"control": pieces(4)}, "observers": []}
     outcome = sr.run(config, out=tmp_path / "run", figures=False)
     view = sr.Inspection.read(tmp_path / "run")
-    push = sr.Switching(view.program, view.row).push(outcome.result.dual.cuts, outcome.result.dual.mu)
+    push = sr.Switching(view.program, view.row).evaluate(outcome.result.dual.cuts, outcome.result.dual.mu)
     # of a command 0.95 arrive for sure, at the multiplier 1 / 0.95: what pushes is 1 / 0.95, the price 1 + 0.05 / 0.95
     assert push is not None and push == pytest.approx(np.ones((1, 4)), abs=1e-6)

@@ -295,7 +295,7 @@ def test_the_signals_are_the_control_and_the_tube_of_the_figures(exchanged: sr.O
 def test_the_control_acts_just_where_the_push_of_the_active_constraints_leaves_the_band(exchanged: sr.Outcome) -> None:
     view = sr.Inspection.read(exchanged.directory)
     assert exchanged.control is not None
-    push = sr.Switching(view.program, view.row).push(exchanged.result.indices, None)
+    push = sr.Switching(view.program, view.row).evaluate(exchanged.result.indices, None)
     _acts_beyond(push, exchanged.control)
 
 
@@ -315,7 +315,7 @@ def test_of_policies_and_scenarios_too_the_push_says_why_the_control_switches(
     switching = sr.Switching(view.program, view.row)
     cuts = outcome.result.dual.cuts if outcome.program.spread is not None else outcome.result.indices
     assert outcome.result.decision is not None
-    _acts_beyond(switching.push(cuts, None), outcome.result.decision[: switching.pieces].reshape(1, -1))
+    _acts_beyond(switching.evaluate(cuts, None), outcome.result.decision[: switching.pieces].reshape(1, -1))
 
 
 def _acts_beyond(push: np.ndarray | None, control: np.ndarray) -> None:
@@ -407,8 +407,11 @@ def mapped(g: Any, anchor: np.ndarray, size: int = 8) -> Any:
 def test_the_map_is_over_the_times_of_the_two_indices_that_decide_most_the_earlier_one_across() -> None:
     anchor = np.array([[0.2, 0.5], [0.9, 0.5], [0.6, 0.4]])
     both = mapped(Plain(lambda s: s[0, 0] + 10 * s[2, 0], [2, 0, -1, -1], 2), anchor)
-    assert (both.first, both.second) == ((0, 0), (2, 0)) and both.names() == ("t of the earlier", "t of the later")
-    assert both.names("h") == ("t of the earlier, in h", "t of the later, in h")
+    assert (both.first, both.second) == ((0, 0), (2, 0)) and both.names() == (
+        "t of the earlier index",
+        "t of the later index",
+    )
+    assert both.names("h") == ("t of the earlier index, in h", "t of the later index, in h")
     mixed = mapped(Plain(lambda s: s[0, 0], [0], 2), anchor[:1])
     assert mixed.names("h") == ("t, in h", "p")  # a unit of time behind a time, and behind nothing else
     assert both.values[0, 0] == 0.0 and both.values[-1, 0] == 1.0 and both.values[0, -1] == 10.0

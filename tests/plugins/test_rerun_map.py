@@ -166,10 +166,8 @@ def test_beside_a_literal_tuple_it_is_said_how_far_below_the_map_it_is_and_what_
 
     landscape: Any = SimpleNamespace(value=0.632, level=1)
     aim = Aim(np.zeros((2, 1)), 0.1, 0.482, "")
-    here, own = _own(landscape, aim)
-    assert "g = 0.632 on the map, where the disturbances of these two indices are the worst" in here
-    assert "g is 0.482, 0.15 below the map" in own
-    assert _own(landscape, replace(aim, value=0.632)) == ["orange dot: the best tuple, g = 0.632"]
+    assert "g = 0.482, 0.15 below the map, which has the worst disturbances" in _own(landscape, aim)
+    assert _own(landscape, replace(aim, value=0.632)) == "orange dot: the best tuple, g = 0.632"
 
 
 class Kept:

@@ -24,12 +24,12 @@ from sparserob_rerun.exchange import rounds
 from sparserob_rerun.exchange.bounds import FEWEST, ONE, Bounds
 from sparserob_rerun.exchange.clash import draw_clash, extent
 from sparserob_rerun.exchange.rounds import Rounds, Worst, told_by_result
-from sparserob_rerun.physics import physics
+from sparserob_rerun.physics import phase, physics
 from sparserob_rerun.physics.pages import heading, pages
 from sparserob_rerun.physics.phase import moved
 from sparserob_rerun.physics.physics import Physics
 from sparserob_rerun.recording import words
-from sparserob_rerun.recording.layout import PHASE, Shown, layout
+from sparserob_rerun.recording.layout import Shown, layout
 from tests.support.places import CONFIGS
 
 SIX: dict[str, Any] = {
@@ -106,7 +106,7 @@ def test_every_control_and_state_is_on_one_page_and_those_with_walls_on_the_firs
     found = pages(six.problem)
     plots = [plot for page in found for plot in page.plots]
     assert sorted(plots) == sorted(
-        [(kind, k) for kind in ("control", "push") for k in range(3)] + [("state", k) for k in range(6)]
+        [(kind, k) for kind in ("control", "switching") for k in range(3)] + [("state", k) for k in range(6)]
     )
     assert {("state", 4), ("state", 5)} <= set(found[0].plots)
     for page in found[1:]:
@@ -435,9 +435,8 @@ def test_a_single_strip_has_the_width_of_the_screen_and_several_have_a_column() 
         shown = Shown(None, 1, False, False, clash=extent([_Strip] * strips), drawn=False)  # type: ignore[list-item]
         first = layout(shown).root_container.contents[0]
         assert isinstance(first, kind)
-    assert "push" not in words.page("T", "infeasible", 0.0, 1.0, []) and "push" in words.page(
-        "T", "certified", 0.0, 1.0, []
-    )
+    infeasible, certified = (words.page("T", status, 0.0, 1.0, []) for status in ("infeasible", "certified"))
+    assert "switching function" not in infeasible and "switching function" in certified
 
 
 class _Strip:
@@ -451,7 +450,7 @@ def test_the_lane_is_named_after_the_verdict_which_has_no_width_on_it() -> None:
 
     for searches in (True, False):
         live, over = (layout(Shown(None, 1, searches, True, verdict=one)).root_container for one in ("", "certified"))
-        assert "What is going on" in names(live) and "certified: what went on" in names(over)
+        assert "State" in names(live) and "State: certified" in names(over)
     assert "Decisions, the newest first" in names(live.contents[1])  # on the tab of the exchange too
 
 
@@ -586,8 +585,26 @@ def test_a_system_in_a_plane_is_drawn_there_with_the_arcs_on_which_its_control_a
     assert np.ptp(curve[:, 0]) / np.ptp(curve[:, 1]) == pytest.approx(np.ptp(data.path[:, 0]) / np.ptp(data.path[:, 1]))
     acts = (np.abs(result.control.values) > 1e-6).any(axis=0)
     assert len(drawing.strips["arcs"]) == int((np.diff([0, *acts.astype(int)]) > 0).sum()) > 0
-    left, right, top, bottom = PHASE
+    left, right, top, bottom = phase.extent(problem, True)
     for places in [*(points for layer in drawing.strips.values() for points, _, _ in layer)]:
         assert (places >= (left, top)).all() and (places <= (right, bottom)).all()
     said = [words for _, words, _ in drawing.labels]
     assert {"terminal set", "thick: the control acts", "dot: x(0)"} <= {*said} and "worst case" not in said
+
+
+@pytest.mark.parametrize("searches", [True, False])
+def test_a_phase_plane_with_its_words_is_as_wide_as_the_panel_that_it_has(small: sr.Outcome, searches: bool) -> None:
+    paper = Paper()
+    assert small.problem is not None
+    view = sr.Inspection.read(small.directory)
+    Physics(rr, paper, view, searches).draw(np.asarray(small.result.decision), small.result.indices, None)
+    left, right, top, bottom = phase.extent(small.problem, searches)
+    frame = np.concatenate(paper.strips("physics/phase/frame"))
+    assert np.ptp(frame[:, 0]) > (0.5 if searches else 0.4) * (right - left)
+    assert ((frame > (left, top)) & (frame < (right, bottom))).all()
+
+
+def test_the_tab_of_the_signals_has_no_panel_that_waits_for_another_timeline(small: sr.Outcome) -> None:
+    tabs = {tab.name: tab for tab in layout(Shown(small.problem, 2, False, False)).root_container.contents}
+    assert all(isinstance(panel, rrb.BarChartView) for panel in tabs["Signals"].contents)
+    assert isinstance(tabs["Timeline t"].contents[0], rrb.TextDocumentView)

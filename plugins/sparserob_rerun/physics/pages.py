@@ -11,7 +11,7 @@ import numpy as np
 if TYPE_CHECKING:
     import sparserob_core as sr
 
-Kind: TypeAlias = Literal["control", "push", "state"]
+Kind: TypeAlias = Literal["control", "switching", "state"]
 CONTROLS, STATES = 2, 4  # on the first screen
 PLOTS = 6  # on a further page
 
@@ -19,7 +19,8 @@ PLOTS = 6  # on a further page
 @final
 @dataclass(frozen=True)
 class Page:
-    """Page of plots above one another, each of a control, of what pushes it, or of a state; logged below ``path``."""
+    """Page of plots above one another, each of a control, of its switching function, or of a state; logged below
+    ``path``."""
 
     path: str
     plots: tuple[tuple[Kind, int], ...]
@@ -27,7 +28,7 @@ class Page:
     def name(self, names: sr.Names) -> str:
         """Return the names of the signals on the page, such as ``u3, x5, x6``."""
         name_of = {"control": names.control, "state": names.state}
-        return ", ".join(name_of[kind](index) for kind, index in self.plots if kind != "push")
+        return ", ".join(name_of[kind](index) for kind, index in self.plots if kind != "switching")
 
 
 def pages(problem: sr.OptimalControlProblem) -> list[Page]:
@@ -46,14 +47,12 @@ def heading(problem: sr.OptimalControlProblem, searches: bool = False) -> str:
     """Say what the first screen shows, in a search the best tuple, and where the other signals are."""
     further_pages = pages(problem)[1:]
     names = ", ".join(page.name(problem.names) for page in further_pages)
-    subject = "The best tuple so far: control and states" if searches else "Control and states"
-    return f"{subject} against the time of the system" + (
-        f"; {names} in the tab Further signals" if further_pages else ""
-    )
+    subject = "Best tuple so far: control and states" if searches else "Control and states"
+    return f"{subject} over time" + (f"; {names} in the tab Further signals" if further_pages else "")
 
 
 def _controls(which: Sequence[int]) -> list[tuple[Kind, int]]:
-    return [(kind, channel) for channel in which for kind in ("control", "push")]
+    return [(kind, channel) for channel in which for kind in ("control", "switching")]
 
 
 def _walled(problem: sr.OptimalControlProblem) -> set[int]:

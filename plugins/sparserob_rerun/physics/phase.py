@@ -17,6 +17,10 @@ if TYPE_CHECKING:
     from sparserob_rerun.drawing.palette import Colour, Floats
 
 SIDE = 420.0
+WIDER = {True: 260.0, False: 0.0}
+"""How much wider than high a plane of two states is, in the arrangement of a search and in the others: it fills its
+panel there. With ten times as much the words beside it are outside; with a tenth half of the panel is empty."""
+EXTENT = (-40.0, 790.0, -24.0, 530.0)  # left, right, top and bottom of the plane, where it is as wide as high
 FLAT, LENGTH = 0.4, 640.0  # a plane that is flatter is drawn that long, and what it shows is said below it
 SLICES = 36
 ROOM = 2.0  # the panel is half as large as the drawing
@@ -26,13 +30,13 @@ LINE, ENTRY = 36.0, 340.0  # of words beside a plot, from one to the next, and h
 COLUMNS, WIDE = 2, 400.0  # of words below one, which have the width of the panel
 
 
-def draw_phase(rr: Any, stream: Any, data: sr.FigureData, worst: Mapping[str, Any]) -> None:
+def draw_phase(rr: Any, stream: Any, data: sr.FigureData, worst: Mapping[str, Any], searches: bool) -> None:
     """Draw the nominal trajectory, the worst ones, slices of the tube and the terminal set below ``/physics/phase``;
-    nothing for a single state."""
+    nothing for a single state; with ``searches`` as wide as the panel of a search is."""
     if data.plane is not None:
         moved(data, worst).log(rr, stream, "physics/phase", layers=LAYERS)
     elif len(data.state) == 2:
-        _plane(data, worst).log(rr, stream, "physics/phase", layers=LAYERS)
+        _plane(data, worst, WIDER[searches]).log(rr, stream, "physics/phase", layers=LAYERS)
     elif len(data.state) > 2:
         _space(rr, stream, data, worst)
 
@@ -40,6 +44,12 @@ def draw_phase(rr: Any, stream: Any, data: sr.FigureData, worst: Mapping[str, An
 def pair_of(problem: sr.OptimalControlProblem) -> tuple[int, int] | None:
     """Return the two states that are drawn across and upwards; ``None`` where there are more, in space."""
     return problem.names.in_plane or ((0, 1) if problem.system.states == 2 else None)
+
+
+def extent(problem: sr.OptimalControlProblem, searches: bool) -> tuple[float, float, float, float]:
+    """Return left, right, top and bottom of the plane that is drawn."""
+    left, right, top, bottom = EXTENT
+    return left, right + WIDER[searches and problem.names.in_plane is None], top, bottom
 
 
 def moved(data: sr.FigureData, worst: Mapping[str, Any]) -> Drawing:
@@ -102,8 +112,8 @@ def _slices(data: sr.FigureData) -> Floats:
     return np.stack([data.tube_lower[:, indices].T, data.tube_upper[:, indices].T], axis=-1)
 
 
-def _plane(data: sr.FigureData, worst: Mapping[str, Any]) -> Drawing:
-    axes = Axes(60.0, 0.0, SIDE, SIDE, _limits(data, 0), _limits(data, 1))
+def _plane(data: sr.FigureData, worst: Mapping[str, Any], wider: float) -> Drawing:
+    axes = Axes(60.0, 0.0, SIDE + wider, SIDE, _limits(data, 0), _limits(data, 1))
     drawing, legend = Drawing(), [("dot: x(0)", ink.INK), ("worst-case boxes", ink.SKY)]
     drawing.frame(axes, "", data.names.state(0), room=ROOM)
     for box in _slices(data):

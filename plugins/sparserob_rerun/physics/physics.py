@@ -1,4 +1,5 @@
-"""Pictures of the control, of what pushes it, and of every state between its walls, against the time of the system."""
+"""Pictures of the control, of its switching function, and of every state between its walls, over the time of the
+system."""
 
 from __future__ import annotations
 
@@ -60,9 +61,9 @@ class Physics:
         deciding = [cut for cut in active if not self.view.program.family(cut.family).defines]
         data = self.view.picture(decision, deciding)
         worst = self.view.worst_cases(decision)
-        push = self.switching.push(active, mu)
-        if push is None and proven:
-            push = self.switching.push(proven, mu)
+        switching = self.switching.evaluate(active, mu)
+        if switching is None and proven:
+            switching = self.switching.evaluate(proven, mu)
         for number, page in enumerate(pages(self.problem)):
             drawing = Drawing()
             self.each = HEIGHT if number else height(len(page.plots), self.searches)
@@ -70,13 +71,13 @@ class Physics:
                 last = top == len(page.plots) - 1
                 if kind == "control":
                     self._control(drawing, self._axes(top, data, _control_limits(data, index)), data, index, last)
-                elif kind == "push":
-                    self._push(drawing, self._axes(top, data, (-2.0, 2.0)), data, push, index, last)
+                elif kind == "switching":
+                    self._switching(drawing, self._axes(top, data, (-2.0, 2.0)), data, switching, index, last)
                 else:
                     self._state(drawing, self._axes(top, data, _state_limits(data, index)), data, worst, index, last)
             self._marks(drawing, data, page.plots)
             drawing.log(self.rr, self.stream, page.path, layers=LAYERS)
-        draw_phase(self.rr, self.stream, data, worst)
+        draw_phase(self.rr, self.stream, data, worst, self.searches)
 
     def signals(self, decision: Floats) -> None:
         """Send the final control and states as series on a timeline of their own, ``t``: the time of the system in
@@ -145,27 +146,22 @@ class Physics:
         drawing.band("tube", axes, *_fill(edges, steps), ink.TUBE)
         drawing.line("curve", axes.at(np.repeat(edges, 2)[1:-1], np.repeat(steps, 2)), ink.SKY, 2.0)
 
-    def _push(
-        self, drawing: Drawing, axes: Axes, data: sr.FigureData, push: Floats | None, channel: int, last: bool
+    def _switching(
+        self, drawing: Drawing, axes: Axes, data: sr.FigureData, switching: Floats | None, channel: int, last: bool
     ) -> None:
         name = data.names.control(channel)
-        if push is None or not push.any():
-            drawing.frame(
-                axes,
-                f"why {name} switches: "
-                + ("no constraint pushes" if push is not None else "known once the run is over"),
-                _time(data),
-                ticks_below=last,
-            )
+        if switching is None or not switching.any():
+            reason = "no constraint is active" if switching is not None else "known once the run is over"
+            drawing.frame(axes, f"switching function of {name}: {reason}", _time(data), ticks_below=last)
             return
-        values = push[channel]
+        values = switching[channel]
         reach = max(1.5, float(np.abs(values).max()) * 1.15)
         axes = Axes(axes.left, axes.top, axes.width, axes.height, axes.x, (-reach, reach))
         drawing.frame(
             axes,
-            f"how the constraints push the nominal {name}; 1 is what its largest size costs"
+            f"switching function of the nominal {name}; 1 is what its largest size costs"
             if self.switching.peak
-            else f"why {name} switches: the push leaves the band",
+            else f"switching function: {name} acts outside the band",
             _time(data),
             ticks_below=last,
         )
@@ -201,8 +197,8 @@ class Physics:
         return Axes(LEFT, position * (self.each + GAP), WIDTH, self.each, ends, limits)
 
     def _marks(self, drawing: Drawing, data: sr.FigureData, plots: Sequence[tuple[str, int]]) -> None:
-        """Mark the times of the active constraints through the plots of the control and of what pushes it, and as dots
-        on the time axis. In the plot of a state, mark those of the constraints that bound it."""
+        """Mark the times of the active constraints through the plots of the control and of its switching function, and
+        as dots on the time axis. In the plot of a state, mark those of the constraints that bound it."""
         for position, (kind, index) in enumerate(plots):
             axes = self._axes(position, data, (0.0, 1.0))
             times = data.active.on(index) if kind == "state" else data.active.times

@@ -9,9 +9,8 @@ from zlib import crc32
 from sparserob_rerun.drawing import palette as ink
 from sparserob_rerun.drawing.canvas import view
 from sparserob_rerun.exchange import bounds, rounds
-from sparserob_rerun.physics import feedback, physics
+from sparserob_rerun.physics import feedback, phase, physics
 from sparserob_rerun.physics.pages import heading, pages
-from sparserob_rerun.physics.phase import pair_of
 from sparserob_rerun.search import views as search
 
 if TYPE_CHECKING:
@@ -21,7 +20,6 @@ if TYPE_CHECKING:
 WIDE = 2.0
 """Width over height of a drawing that has the whole width of the screen. With ten times as much a single strip fills
 half of its panel; with a tenth many strips are narrow and high above the words."""
-PHASE = (-40.0, 790.0, -24.0, 530.0)  # left, right, top and bottom of the phase plane
 
 
 @final
@@ -85,7 +83,7 @@ def layout(shown: Shown) -> Any:
         tabs = [_infeasible(rrb, shown, shown.clash), *(tabs if shown.drawn else [])]
     elif shown.problem is not None:
         tabs += [_feedback(rrb, shown.problem)] if shown.answers else []
-        tabs.append(_signals(rrb, shown.answers))
+        tabs += [_signals(rrb), _timeline(rrb, shown.answers)]
     tabs.append(_log(rrb, shown))
     return rrb.Blueprint(
         rrb.Tabs(*tabs, active_tab=0),
@@ -99,8 +97,9 @@ def layout(shown: Shown) -> Any:
 def _columns(rrb: Any, shown: Shown) -> tuple[list[Any], list[int]]:
     """Return the panels of the first screen in columns, and how wide these are."""
     words = [rrb.TextDocumentView(origin="/verdict", name="What is known")]
-    plane = [_phase(rrb, shown.problem)] if shown.problem is not None and shown.problem.system.states > 1 else []
-    map_words = [rrb.TextDocumentView(origin="/landscape/words", name="What the map shows")] if shown.landscape else []
+    problem = shown.problem
+    plane = [_phase(rrb, problem, shown.searches)] if problem is not None and problem.system.states > 1 else []
+    map_words = [rrb.TextDocumentView(origin="/landscape/words", name="The map")] if shown.landscape else []
     plots = [] if shown.problem is None else [_plots(shown.problem, shown.searches)]
     if shown.searches:  # the search is what is seen first: its map has more than half of the screen
         terrain = [_terrain(shown)] if shown.landscape else []
@@ -132,7 +131,7 @@ def _lane(rrb: Any, shown: Shown) -> Any:
 
     everything = rrb.TimeRangeBoundary.infinite()
     time_axis = rrb.TimeAxis(view_range=TimeRange(start=everything, end=everything))
-    name = f"{shown.verdict}: what went on" if shown.verdict else "What is going on"
+    name = f"State: {shown.verdict}" if shown.verdict else "State"
     return rrb.StateTimelineView(origin="/state", name=name, time_view=time_axis)
 
 
@@ -159,13 +158,13 @@ def _log(rrb: Any, shown: Shown) -> Any:
     )
 
 
-def _phase(rrb: Any, problem: sr.OptimalControlProblem) -> Any:
-    pair = pair_of(problem)
+def _phase(rrb: Any, problem: sr.OptimalControlProblem, searches: bool) -> Any:
+    pair = phase.pair_of(problem)
     if pair is not None:
         kind = "Phase plane" if problem.names.in_plane is None else "Plane"
         units = problem.names.state_units or [""] * problem.system.states
         across, up = (f"{problem.names.state(state)} in {units[state]}".removesuffix(" in ") for state in pair)
-        return view("/physics/phase", f"{kind}: {up} over {across}", PHASE)
+        return view("/physics/phase", f"{kind}: {up} over {across}", phase.extent(problem, searches))
     states = problem.system.states
     name = (
         "State space"
@@ -192,24 +191,28 @@ def _feedback(rrb: Any, problem: sr.OptimalControlProblem) -> Any:
     return rrb.Vertical(pictures, words, name="Feedback", row_shares=[3, 1])
 
 
-def _signals(rrb: Any, answers: bool) -> Any:
+def _signals(rrb: Any) -> Any:
+    """Return a tab of the last decision as bars, which are there on every timeline."""
+    legend = rrb.Corner2D.RightTop
+    controls = rrb.BarChartView(
+        origin="/signals/bars/controls", name="Controls of the last decision over t", plot_legend=legend
+    )
+    states = rrb.BarChartView(origin="/signals/bars/states", name="Nominal states over t", plot_legend=legend)
+    return rrb.Vertical(controls, states, name="Signals")
+
+
+def _timeline(rrb: Any, answers: bool) -> Any:
+    """Return a tab of the series over the time of the system, with a column that says on which timeline they are."""
     legend = rrb.Corner2D.RightTop
     effort = rrb.TimeSeriesView(origin="/signals/effort", name="Size of the controls under disturbances, over t",
                                 plot_legend=legend)  # fmt: skip
-    bars = [
-        rrb.BarChartView(
-            origin="/signals/bars/controls", name="Controls of the last decision over t", plot_legend=legend
-        ),
-        rrb.BarChartView(origin="/signals/bars/states", name="Nominal states over t", plot_legend=legend),
-    ]
-    series = rrb.Vertical(
-        rrb.TextDocumentView(origin="/howto", name="The same as series, with what is uncertain"),
-        rrb.TimeSeriesView(origin="/signals/control", name="Controls on the timeline t", plot_legend=legend),
-        rrb.TimeSeriesView(origin="/signals/states", name="States on the timeline t", plot_legend=legend),
+    series = [
+        rrb.TimeSeriesView(origin="/signals/control", name="Controls over t", plot_legend=legend),
+        rrb.TimeSeriesView(origin="/signals/states", name="States over t, with their tube", plot_legend=legend),
         *([effort] if answers else []),
-        row_shares=[1, 5, 5, *([5] if answers else [])],
-    )
-    return rrb.Horizontal(rrb.Vertical(*bars), series, column_shares=[3, 2], name="Signals")
+    ]
+    words = rrb.TextDocumentView(origin="/howto", name="How to see the series")
+    return rrb.Horizontal(words, rrb.Vertical(*series), column_shares=[1, 4], name="Timeline t")
 
 
 def _infeasible(rrb: Any, shown: Shown, clash: tuple[float, ...]) -> Any:
@@ -236,7 +239,7 @@ def _bounds(rrb: Any) -> Any:
 def _violation(rrb: Any, shown: Shown) -> Any:
     return view(
         "/violation/plots",
-        "Violation (up) along the indices (across): orange dots are new cuts",
+        "Violation over the indices; orange: new cuts",
         shown.violations,
     )
 

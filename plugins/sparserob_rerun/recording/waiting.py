@@ -7,10 +7,9 @@ from typing import Any, final
 from sparserob_rerun.drawing import palette as ink
 from sparserob_rerun.drawing.canvas import Drawing
 from sparserob_rerun.exchange import bounds, clash, rounds
-from sparserob_rerun.physics import physics
+from sparserob_rerun.physics import phase, physics
 from sparserob_rerun.physics.pages import pages
-from sparserob_rerun.physics.phase import pair_of
-from sparserob_rerun.recording.layout import PHASE, Shown
+from sparserob_rerun.recording.layout import Shown
 from sparserob_rerun.search import views
 
 CONTROL, LANDSCAPE = "control and states", "the landscape"
@@ -33,8 +32,9 @@ class Waiting:
                 plot_height = physics.HEIGHT if number else physics.height(count, shown.searches)
                 words = f"the control and the states are drawn when {event}"
                 self._write(CONTROL, page.path, physics.extent(count, plot_height), words)
-            if pair_of(shown.problem) is not None:
-                self._write(CONTROL, "physics/phase", PHASE, f"drawn when {event}")
+            if phase.pair_of(shown.problem) is not None:
+                plane = phase.extent(shown.problem, shown.searches)
+                self._write(CONTROL, "physics/phase", plane, f"drawn when {event}")
         if shown.landscape:
             tuples = "the first tuple is evaluated" if shown.searches else "the first constraints are active"
             self._write(LANDSCAPE, "landscape/map", views.EXTENT, f"the landscape of g is drawn when {tuples}")

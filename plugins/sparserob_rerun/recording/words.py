@@ -12,17 +12,17 @@ from sparserob_rerun.drawing.palette import Colour
 CUTS = 12  # cuts of one round that are listed one by one
 
 SIGNALS = (
-    "The controls and states of the final decision are series over the time of the system. Choose the timeline t at"
-    " the lower left, where now another one is chosen, and they appear."
+    "The controls and states of the final decision are series over the time t of the system. Choose the timeline t at"
+    " the lower left, in the place of the one that is chosen there, and they appear."
 )
 LEGEND = """
-**Reading the pictures.** Blue: the control and the states; the band: where disturbance and parameters can push them.
-Hatched red: forbidden. Yellow: the worst case. Pink: when a constraint is active, and how hard the active ones push the
-control: it acts where the push leaves the dashed band, and nowhere else.
+**Colours.** Blue: the control and the states; the band: how far disturbance and parameters can move them.
+Hatched red: forbidden. Yellow: the worst case. Pink: active constraints, and the switching function that follows from
+them: the control acts where it leaves the dashed band, and nowhere else.
 """
 
 CLASHES = """
-**Reading the picture.** Hatched red: forbidden. Blue: where the control can bring the quantity.
+**Colours.** Hatched red: forbidden. Blue: where the control can bring the quantity.
 White line: the best of it. Yellow: what the worst disturbance makes of the best.
 """
 
@@ -110,7 +110,7 @@ def page(title: str, status: str, lower: float, upper: float, more: list[str]) -
     else:
         bounds = "no bound yet" if status == "solving" else "no bound is known"
     is_bounded = math.isfinite(lower) and math.isfinite(upper) and status != "infeasible"
-    gap = f"; {(upper - lower) / max(abs(upper), 1e-12):.2g} of it apart" if is_bounded and upper > lower else ""
+    gap = f"; relative gap {(upper - lower) / max(abs(upper), 1e-12):.2g}" if is_bounded and upper > lower else ""
     return "\n\n".join(
         [f"**{status}**: {bounds}{gap}", *more, f"*{title}*", CLASHES if status == "infeasible" else LEGEND]
     )

@@ -21,8 +21,8 @@ WIDTH, HEIGHT = 600.0, 400.0
 BAR, STEPS = (640.0, 26.0), 64  # the left side of the colour bar and its width, and its numbers
 TRIED, LEG, LAST = 150, 400, 20  # points that stay visible, corners of the walk, and its last ones
 ABOUT = (
-    "**g of a tuple**: the least cost of a control that meets the constraints at its few indices. Its maximum over all"
-    " tuples is J\\*, the least cost of a control that meets all."
+    "**g of a tuple**: the least cost of a control that meets the constraints at its indices. J\\* is the largest g of"
+    " all tuples."
 )
 """Introduction for a person who has never seen the map."""
 LIFT = 0.015  # points stand this share of the height above the surface
@@ -70,8 +70,8 @@ class Terrain:
         has_two = landscape.first[0] != landscape.second[0]
         weight = [f"epsilon {landscape.epsilon:.3g}"] if landscape.epsilon > 0.0 else []
         phrase = ["over the two indices that decide most"] if has_two else []
-        basis = [", ".join([*phrase, *weight])]
-        self._say("map", [*_own(landscape, aim), *_said(landscape), *basis, aim.words])
+        basis = ", ".join([aim.words, *phrase, *weight])
+        self._say("map", [_own(landscape, aim), basis, *_said(landscape)])
         across, up, values = landscape.shown
         anchor = [landscape.axes[k][landscape.at[k]] for k in (0, 1)]
         self.stream.log(
@@ -359,16 +359,15 @@ def _said(landscape: sr.Landscape) -> list[str]:
     return [*lines, "brown: no control meets the constraints"] if has_infeasible else lines
 
 
-def _own(landscape: sr.Landscape, aim: Aim) -> list[str]:
-    """Describe the value at the anchor, and how far below it the value of the search is, whose disturbances need not be
-    the worst."""
-    deficit, sentence = landscape.value - aim.value, f"orange dot: the best tuple, g = {landscape.value:.6g}"
+def _own(landscape: sr.Landscape, aim: Aim) -> str:
+    """Describe the value of the best tuple, and how far it is below the map, where the disturbances are the worst."""
+    deficit = landscape.value - aim.value
     if not deficit > VISIBLE * max(1.0, abs(landscape.value)):
-        return [sentence]
-    return [
-        f"{sentence} on the map, where the disturbances of these two indices are the worst for them",
-        f"with its own disturbances g is {aim.value:.6g}, {deficit:.2g} below the map",
-    ]
+        return f"orange dot: the best tuple, g = {landscape.value:.6g}"
+    return (
+        f"orange dot: the best tuple, g = {aim.value:.6g}, {deficit:.2g} below the map, which has the worst"
+        " disturbances at these two indices"
+    )
 
 
 def _numbers_beside(limits: tuple[float, float]) -> list[tuple[float, str]]:

@@ -87,8 +87,8 @@ class FigureData:
     ``history`` the rounds of the method. ``tolerance`` is the relative gap that was asked for, ``cost_scale`` what is
     added up to the cost, ``cost_of`` what is added up to it, where that is not the L1 norm alone, ``cost_unit``
     what it is measured in, where that is known, ``counts`` whether cost means the time that the control acts, ``names``
-    what everything is called, ``plane`` where the system moves, if the problem says that it does so in one, ``push (m,
-    K)`` the switching function, how hard the constraints push the control, where that is known.
+    what everything is called, ``plane`` where the system moves, if the problem says that it does so in one,
+    ``switching (m, K)`` the switching function, the effect of the constraints on the control, where that is known.
 
     Under feedback the control is the nominal one, ``control_least``, ``control_most (m, K)`` are how far the
     disturbance moves it, ``gains (K, K, m, p)`` answer what is measured, ``outputs`` or (``None``) states, and
@@ -129,7 +129,7 @@ class FigureData:
     counts: bool = False
     names: Names = UNNAMED
     plane: Plane | None = None
-    push: Array | None = None
+    switching: Array | None = None
 
     def __post_init__(self) -> None:
         pieces, instants = self.breakpoints.size - 1, self.times.size

@@ -21,10 +21,8 @@ if TYPE_CHECKING:
     from sparserob_core.sip.convex_set import Array
 
 MOST_GAINS = 16  # pictures of gains in one figure
-FLAT = (
-    1.5  # prices, half the height of a picture of the push at least: at 15 the band is a line, at 1 it hides its edge
-)
-HEADROOM = 1.15  # of the largest push, above it: at 1 it is on the frame, at 10 the band is a line
+FLAT = 1.5  # half the least height of a switching function, in prices: at 15 the band is a line, at 1 it hides its edge
+HEADROOM = 1.15  # of the largest value, above it: at 1 it is on the frame, at 10 the band is a line
 IDLE = 1e-7  # of the control's bound: less than that is no action but rounding
 
 
@@ -32,7 +30,7 @@ def run_pictures(data: FigureData) -> dict[str, Callable[[], Figure]]:
     """The figures that there are of a decision, by name."""
     candidates: dict[str, tuple[bool, Callable[[FigureData], Figure]]] = {
         "control": (True, draw_control),
-        "switching": (data.push is not None and bool(data.push.any()), draw_switching),
+        "switching": (data.switching is not None and bool(data.switching.any()), draw_switching),
         "states": (True, draw_states),
         "plane": (data.plane is not None, draw_plane),
         "outputs": (data.outputs is not None, draw_outputs),
@@ -78,11 +76,12 @@ def draw_control(data: FigureData) -> Figure:
 def draw_switching(data: FigureData) -> Figure:
     """Draw the switching function of every channel, in units of the cost of acting there: the control acts where it
     leaves the band, and nowhere else."""
-    assert data.push is not None
-    figure, axes = panels(len(data.push), 1.9, extra=0.5)
+    assert data.switching is not None
+    figure, axes = panels(len(data.switching), 1.9, extra=0.5)
     ends, edge = data.breakpoints, np.ones(data.breakpoints.size - 1)
     for channel, ax in enumerate(axes):
-        push, reach = data.push[channel], max(FLAT, HEADROOM * float(np.abs(data.push[channel]).max()))
+        values = data.switching[channel]
+        reach = max(FLAT, HEADROOM * float(np.abs(values).max()))
         bound = max(abs(float(data.control_lower[channel])), abs(float(data.control_upper[channel])))
         size = np.abs(data.control[channel])
         acts = size > IDLE * (bound if np.isfinite(bound) else float(size.max()))
@@ -91,14 +90,12 @@ def draw_switching(data: FigureData) -> Figure:
         ax.axhspan(-1.0, 1.0, color=look.MIST, alpha=0.6, linewidth=0, zorder=0.5, label="not worth its price")
         for side in (1.0, -1.0):
             ax.stairs(side * edge, ends, baseline=None, color=look.GREY, linewidth=0.8, zorder=1)
-        ax.stairs(
-            push, ends, baseline=None, color=look.PURPLE, linewidth=1.5, zorder=3, label="push of the constraints"
-        )
+        ax.stairs(values, ends, baseline=None, color=look.PURPLE, linewidth=1.5, zorder=3, label="switching function")
         _draw_rug(ax, data.active.times)
         ax.set_ylim(-reach, reach)
-        ax.set_ylabel(f"push on {plain(data.names.control(channel))}")
+        ax.set_ylabel(f"switching of {plain(data.names.control(channel))}")
     draw_time_axis(axes[-1], data)
-    _set_title(axes[0], data.title, "1 is what it costs to act: the control acts where the push leaves the band")
+    _set_title(axes[0], data.title, "1 is what it costs to act: the control acts outside the band")
     draw_legend(figure, axes)
     return figure
 

@@ -45,9 +45,9 @@ class Switching:
             has_all_pieces = self.dense.shape == (self.pieces, self.pieces)
             self.known = bool(has_all_pieces and np.linalg.matrix_rank(self.dense) == self.pieces)
 
-    def push(self, cuts: Sequence[Cut], mu: Array | None) -> Array | None:
-        """The switching function ``(m, K)`` under these constraints with their multipliers, or ``None`` where it is not
-        known."""
+    def evaluate(self, cuts: Sequence[Cut], mu: Array | None) -> Array | None:
+        """Return the switching function ``(m, K)`` under these constraints with their multipliers; ``None`` where it is
+        not known."""
         program = self.program
         if not self.known or (program.A is not None and (mu is None or mu.size != len(np.atleast_2d(program.A)))):
             return None

@@ -179,7 +179,7 @@ def _prepare_decision_figures(
     decision = np.asarray(result.decision, dtype=float).ravel()
     active, states = active_of(experiment.model, result.indices), choose_states(experiment, decision)
     data = figure_data(experiment, decision, active, result.history, result.cost, DRAWS, result.status, states)
-    data = replace(data, push=switching(experiment, result))
+    data = replace(data, switching=switching(experiment, result))
     cases = worst(decision)
     return {**run_pictures(data), **({"adversary": partial(draw_adversary, cases, data)} if cases else {})}
 
@@ -255,8 +255,10 @@ def switching(experiment: Experiment, result: Result) -> Array | None:
         return None
     view, dual = Inspection(experiment.loaded, experiment), result.dual
     function = Switching(view.program, view.row)
-    values = function.push(dual.cuts, dual.mu) if len(dual.cuts) or dual.mu.size else None
-    return function.push([cut for cut in result.indices if cut.multiplier > 0.0], None) if values is None else values
+    values = function.evaluate(dual.cuts, dual.mu) if len(dual.cuts) or dual.mu.size else None
+    return (
+        function.evaluate([cut for cut in result.indices if cut.multiplier > 0.0], None) if values is None else values
+    )
 
 
 def _draw_landscape(experiment: Experiment, trace: SearchTrace, notify: Notify) -> Figure | None:

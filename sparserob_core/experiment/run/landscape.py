@@ -260,10 +260,10 @@ class Landscape:
         return np.asarray(np.where(finite, mixed, nearest))
 
     def names(self, unit: str = "") -> tuple[str, str]:
-        """Return the two coordinates in words, such as ``t of the earlier``.
+        """Return the two coordinates in words, such as ``t of the earlier index``.
 
         It is only ``t`` where a tuple has a single index. A time is followed by its ``unit``, where one is given: ``t
-        of the earlier, in s``.
+        of the earlier index, in s``.
         """
         (slot, c), (other_slot, k) = self.first, self.second
         in_unit = [f", in {unit}" if unit and self.g.kinds[axis] == "time" else "" for axis in (c, k)]
@@ -272,8 +272,11 @@ class Landscape:
         if c == k:
             labels = ("the earlier", "the later") if self.g.kinds[c] == "time" else ("the lower", "the upper")
         else:
-            labels = ("the one", "the one" if slot == other_slot else "the other")
-        return f"{self.g.names[c]} of {labels[0]}{in_unit[0]}", f"{self.g.names[k]} of {labels[1]}{in_unit[1]}"
+            labels = ("the deciding",) * 2 if slot == other_slot else ("one", "the other")
+        return (
+            f"{self.g.names[c]} of {labels[0]} index{in_unit[0]}",
+            f"{self.g.names[k]} of {labels[1]} index{in_unit[1]}",
+        )
 
 
 @final

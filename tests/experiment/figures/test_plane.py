@@ -152,7 +152,7 @@ def test_a_figure_shows_why_the_control_acts_where_it_acts() -> None:
     acts = np.abs(result.control.values) > 1e-6
     assert (np.abs(push[acts]) > 1.0 - 1e-6).all() and (np.abs(push[~acts]) < 1.0 + 1e-6).all()
     drawn = result.plot("switching").axes
-    assert len(drawn) == 2 and drawn[0].get_ylabel() == "push on u1"
+    assert len(drawn) == 2 and drawn[0].get_ylabel() == "switching of u1"
 
 
 @pytest.mark.parametrize(("side", "seen"), [(0.1, True), (0.6, False), (0.0, False)])
