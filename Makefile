@@ -36,7 +36,7 @@ help:
 	@echo "make live LITERAL=1  the same with tuples as the paper writes them, disturbances and all"
 	@echo "make paper       every experiment and figure of the paper, and docs/paper.md (a few minutes)"
 	@echo "make test        lint, types, import rules, tests: the first stage, about three minutes on two processors"
-	@echo "make test-changed  the tests of the first stage that the changes since main can affect (SINCE=REVISION)"
+	@echo "make test-changed  the tests that the changes since main can affect, what takes long too (SINCE=REVISION)"
 	@echo "make test-slow   the second stage: what takes long, and larger instances of what the first one tests"
 	@echo "make archive     seconds that the checks of archived runs take, and took the version that made them (MEMORY=1: their memory too)"
 	@echo "make mutants     300 small errors in what proves and checks (COUNT=20 SEED=1 for fewer): which do the tests notice? (hours)"
@@ -102,7 +102,7 @@ tests: $(INSTALLED)
 # SINCE=REVISION (main): what the modules that were changed since can affect, by the imports.
 test-changed: $(INSTALLED)
 	@chosen=$$($(BIN)/python -m tests.changed $(SINCE)) && \
-	if [ -n "$$chosen" ]; then $(BIN)/python -m pytest --numprocesses 2 --dist worksteal $$chosen; else echo "nothing was changed"; fi
+	if [ -n "$$chosen" ]; then $(BIN)/python -m pytest -m "(long or not slow) and not benchmark" --numprocesses 2 --dist worksteal $$chosen; else echo "nothing was changed"; fi
 
 test-slow: $(INSTALLED)
 	$(BIN)/python -m pytest -m slow --numprocesses 2 --dist worksteal -p no:cacheprovider

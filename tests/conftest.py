@@ -21,6 +21,7 @@ os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 
 from hypothesis import HealthCheck, settings
 
+from tests.stages import read_names
 from tests.support.drafts import drafts
 from tests.support.places import ROOT
 from tests.support.stub import command, config, process
@@ -47,9 +48,13 @@ def pytest_collection_finish() -> None:
 @pytest.hookimpl(tryfirst=True)  # before the tests of the other stage are left out
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Make every set of parameters after the first ``n`` of a test that is marked ``first(n)`` one of the second
-    stage."""
-    met = Counter[str]()
+    stage; the tests that take long, too, which are its first."""
+    met, long = Counter[str](), read_names()
+    items.sort(key=lambda item: item.nodeid.partition("[")[0] not in long)
     for item in items:
+        if item.nodeid.partition("[")[0] in long and item.get_closest_marker("slow") is None:
+            item.add_marker(pytest.mark.long)
+            item.add_marker(pytest.mark.slow)
         first = item.get_closest_marker("first")
         if first is not None and item.get_closest_marker("slow") is None:
             name = item.nodeid.partition("[")[0]

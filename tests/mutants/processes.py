@@ -23,6 +23,7 @@ import pytest
 
 from tests.mutants.sites import Mutant
 
+STAGE = "(long or not slow) and not benchmark"  # what is run: the first stage, and what takes long
 PATIENCE, AT_LEAST = 3.0, 30  # times the processor time of the unchanged tests, and seconds: only loops that never end
 FIRST_STAGE = 3000  # seconds of the processor: four times what all of the first stage takes
 MEMORY = 4 * 2**30  # bytes, which no test of a folder comes near: a mutant may make arrays without end
@@ -114,7 +115,7 @@ def _written(file: Path, data: bytes) -> None:
 
 
 def _pytest(arguments: list[str], plugins: list[Any]) -> int:
-    return int(pytest.main(["-q", "-p", "no:cacheprovider", "--tb=line", *arguments], plugins=plugins))
+    return int(pytest.main(["-q", "-m", STAGE, "-p", "no:cacheprovider", "--tb=line", *arguments], plugins=plugins))
 
 
 def _in_a_process(copy: Path, work: Callable[[], int], limit: int) -> int:

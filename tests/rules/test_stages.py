@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import ast
 from pathlib import Path
 from typing import Any
 
 import pytest
+
+from tests import stages
+from tests.support.places import ROOT
 
 
 class Item:
@@ -21,16 +25,45 @@ class Item:
         self.marks[mark.name] = mark.mark
 
 
-def test_the_first_sets_of_parameters_are_of_the_first_stage_and_the_others_of_the_second(
-    pytestconfig: pytest.Config,
-) -> None:
+@pytest.fixture
+def conftest(pytestconfig: pytest.Config) -> Any:
     file = str(Path(__file__).parents[1] / "conftest.py")
-    conftest: Any = next(
-        one for one in pytestconfig.pluginmanager.get_plugins() if getattr(one, "__file__", "") == file
-    )
+    return next(one for one in pytestconfig.pluginmanager.get_plugins() if getattr(one, "__file__", "") == file)
+
+
+def test_the_first_sets_of_parameters_are_of_the_first_stage_and_the_others_of_the_second(conftest: Any) -> None:
     two = pytest.mark.first(2)
     family = [Item("test[0]", two), Item("test[1]", two, pytest.mark.slow), *(Item(f"test[{k}]", two) for k in (2, 3))]
     others = [Item("test_other[3]", two), Item("test_alone"), Item("test_all[4]")]
     conftest.pytest_collection_modifyitems([*family[:3], *others, *family[3:]])
     assert ["slow" in one.marks for one in family] == [False, True, False, True]
     assert not any("slow" in one.marks for one in others)
+
+
+def test_what_takes_long_is_the_first_of_the_second_stage(conftest: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(conftest, "read_names", lambda: {"tests/test_some.py::test_long"})
+    items = [Item("test_quick"), Item("test_large", pytest.mark.slow), Item("test_long[1]"), Item("test_long[2]")]
+    conftest.pytest_collection_modifyitems(items)
+    assert [item.nodeid.split("::")[1] for item in items] == [
+        "test_long[1]", "test_long[2]", "test_quick", "test_large",
+    ]  # fmt: skip
+    assert ["slow" in item.marks for item in items] == [True, True, False, True]
+    assert ["long" in item.marks for item in items] == [True, True, False, False]
+
+
+def test_a_test_takes_long_where_its_sets_of_parameters_do_in_the_mean() -> None:
+    table = ["0.50s call     tests/test_a.py::test_one[x]", "0.20s call     tests/test_a.py::test_one[y]",
+             "9.00s setup    tests/test_a.py::test_two", "0.29s call     tests/test_a.py::test_two"]  # fmt: skip
+    assert stages.choose(table) == ["tests/test_a.py::test_one"]
+
+
+def test_every_test_that_takes_long_is_there() -> None:
+    """A test of another name would be one of the first stage again. Of a class the name of the class is looked for."""
+    defined = {
+        f"{file.relative_to(ROOT)}::{node.name}"
+        for file in {ROOT / name.partition("::")[0] for name in stages.read_names()}
+        if file.is_file()
+        for node in ast.walk(ast.parse(file.read_text(encoding="utf-8")))
+        if isinstance(node, ast.FunctionDef | ast.ClassDef)
+    }
+    assert [name for name in stages.read_names() if "::".join(name.split("::")[:2]) not in defined] == []
