@@ -21,7 +21,14 @@ import numpy as np
 
 import sparserob_core as sr
 from sparserob_core.errors import InputError, not_installed
-from sparserob_core.experiment.benchmark.landscapes import Formulation, Landscape, bbob, classic, landscape_of, standard
+from sparserob_core.experiment.benchmark.landscapes import (
+    BenchmarkFunction,
+    Formulation,
+    bbob,
+    classic,
+    landscape_of,
+    standard,
+)
 from sparserob_core.experiment.solve import component
 from sparserob_core.sip.maximiser import Maximiser
 from sparserob_core.sip.search.search import Rules, maximise
@@ -62,7 +69,7 @@ EACH = 50
 INSTANCES = 3
 """Of every function of BBOB, with the seeds 1, 2, ...; slow searches have the first."""
 MANY = 50_000  # coordinates in which a search has two seeds, as the slow ones have
-Search = Callable[[Landscape, int, int], float]
+Search = Callable[[BenchmarkFunction, int, int], float]
 
 
 @dataclass
@@ -80,7 +87,7 @@ def ours(name: str) -> Search:
     """A maximiser of this package with its defaults, as `sparserob_core.maximise` has them."""
     maximiser: Maximiser = component(sr.load_registry(), "maximiser", name, Maximiser)
 
-    def search(landscape: Landscape, budget: int, seed: int) -> float:
+    def search(landscape: BenchmarkFunction, budget: int, seed: int) -> float:
         target = (landscape if landscape.fresh is None else landscape.fresh()).target
         as_in_runs = target.gradient is not None or target.linear is not None
         rules = Rules(polish=None if as_in_runs else maximiser.polished)
@@ -98,7 +105,7 @@ def theirs(peer: str) -> Search:
 
     run = next(one.run for one in PEERS if one.name == peer)
 
-    def search(landscape: Landscape, budget: int, seed: int) -> float:
+    def search(landscape: BenchmarkFunction, budget: int, seed: int) -> float:
         values: list[float] = []
 
         def value(point: object) -> float:
@@ -133,7 +140,7 @@ def contenders(peers: Sequence[str], names: Sequence[str] = NAMES) -> Iterator[t
         yield from ((one.name, theirs(one.name)) for one in PEERS if one.name in peers and one.installed)
 
 
-def measured(name: str, search: Search, landscapes: Sequence[Landscape], budgets: Sequence[int]) -> Measured:
+def measured(name: str, search: Search, landscapes: Sequence[BenchmarkFunction], budgets: Sequence[int]) -> Measured:
     """All searches of one competitor."""
     found = Measured(name, 2 if name.strip("`") in SLOW else SEEDS)
     search(landscapes[0], 10, 0)  # everything is imported
@@ -148,13 +155,13 @@ def measured(name: str, search: Search, landscapes: Sequence[Landscape], budgets
     return found
 
 
-def share(row: Measured, landscape: Landscape, budget: int) -> float:
+def share(row: Measured, landscape: BenchmarkFunction, budget: int) -> float:
     """The share of the searches that solve a landscape: come within `ACCURACY`."""
     least = landscape.maximum - ACCURACY * (landscape.maximum - landscape.begin(0))
     return float(np.mean(np.array(row.values[landscape.name, budget]) >= least))
 
 
-def of_functions(landscapes: Sequence[Landscape], budgets: Sequence[int], peers: Sequence[str] = ()) -> str:
+def of_functions(landscapes: Sequence[BenchmarkFunction], budgets: Sequence[int], peers: Sequence[str] = ()) -> str:
     """One row for each search: how many functions are solved at each budget, which are not at the largest, and the time
     that it takes."""
     rows = [measured(name, search, landscapes, budgets) for name, search in contenders(peers)]
@@ -202,7 +209,7 @@ def of_g(cases: Sequence[tuple[int, Formulation, int]], budgets: Sequence[int], 
     return table(lines)
 
 
-def _of_experiment(experiment: int, formulation: Formulation, size: int) -> Landscape:
+def _of_experiment(experiment: int, formulation: Formulation, size: int) -> BenchmarkFunction:
     pieces = {"name": "piecewise_constant", "pieces": size}
     overrides = {"dictionaries.control": pieces} | ({} if experiment == 2 else {"dictionaries.disturbance": pieces})
     config = ROOT / "configs" / f"experiment{experiment}_repaired.yaml"

@@ -276,7 +276,7 @@ class ConvexSet(ABC):
     def scaled(self, factor: float) -> ConvexSet:
         """Return the set of ``m + factor (x - m)`` for all ``x`` in the set, with ``m`` its `middle` and ``factor >=
         0``."""
-        return Scaled(self, self.middle(), factor)
+        return ScaledSet(self, self.middle(), factor)
 
     @shaped
     def in_units(self, units: Float[Array, " d"]) -> ConvexSet:
@@ -1037,7 +1037,7 @@ def few_digits(matrix: Float[Array, "b d"]) -> Float[Array, "b d"]:
 
 
 @dataclass(frozen=True, eq=False)
-class Scaled(ConvexSet):
+class ScaledSet(ConvexSet):
     """The set ``{about + factor (x - about) : x in base}``: the default of `ConvexSet.scaled`.
 
     Parameters
@@ -1104,7 +1104,7 @@ class Scaled(ConvexSet):
 
     @shaped
     def in_units(self, units: Float[Array, " d"]) -> ConvexSet:
-        return Scaled(self.base.in_units(units), self.about / units, self.factor)
+        return ScaledSet(self.base.in_units(units), self.about / units, self.factor)
 
     @shaped
     def linearisation_excess(self, centre: Float[Array, "*k d"], spread: Float[Array, "*k J d"]) -> Float[Array, " *k"]:

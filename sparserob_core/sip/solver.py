@@ -471,7 +471,7 @@ class Named(Solver):
 
 
 @final
-class Asked(Solver):
+class AccountedSolver(Solver):
     """A solver with an account of its calls, and with the solvers that may answer before it or instead of it.
 
     Parameters
@@ -483,7 +483,7 @@ class Asked(Solver):
     quick : frozenset of str
         Methods that may answer before the solver is called: `CLOSED_FORM`, `DUAL_NEWTON` from the last solution,
         `HIGHS`.
-    instead : Asked, optional
+    instead : AccountedSolver, optional
         Solver that is called where no answer of this one passes the check.
     failures : Failures, optional
         Account of unanswered programs; a new one by default.
@@ -496,7 +496,7 @@ class Asked(Solver):
         solver: Solver,
         name: str = SOLVER,
         quick: frozenset[str] = SHORTCUTS,
-        instead: Asked | None = None,
+        instead: AccountedSolver | None = None,
         failures: Failures | None = None,
         cones: tuple[Solver, str] | None = None,
     ) -> None:
@@ -506,23 +506,25 @@ class Asked(Solver):
         self.deadline = Deadline()
 
     @staticmethod
-    def of(solver: Solver) -> Asked:
+    def of(solver: Solver) -> AccountedSolver:
         """Return a solver with the account that its kind needs.
 
         `Auto`, and a solver that nobody named, answers only what the quick methods do not. A `Named` solver answers
         everything. The dual Newton method always starts from the last solution.
         """
         match solver:
-            case Asked():
+            case AccountedSolver():
                 return solver
             case Named():
                 quick = frozenset({solver.name} & {DUAL_NEWTON})
-                return Asked(solver.solver, solver.name, quick, Asked.of(solver.instead), solver.failures)
+                return AccountedSolver(
+                    solver.solver, solver.name, quick, AccountedSolver.of(solver.instead), solver.failures
+                )
             case Auto():
-                return Asked(solver.general, solver.called, cones=solver.of_cones)
-        return Asked(solver)
+                return AccountedSolver(solver.general, solver.called, cones=solver.of_cones)
+        return AccountedSolver(solver)
 
-    def until(self, deadline: Deadline) -> Asked:
+    def until(self, deadline: Deadline) -> AccountedSolver:
         """Return this solver, after a ``deadline`` was set for it and for the solver called instead."""
         self.deadline = deadline
         if self.instead is not None:
@@ -572,7 +574,11 @@ def named(solver: Solver, name: str, instead: Solver) -> Solver:
     Solver
         The named solver; `Auto`, and a solver that is named already, are returned unchanged.
     """
-    return solver if isinstance(solver, Auto | Named | Asked) else Named(solver, whole_name(solver, name), instead)
+    return (
+        solver
+        if isinstance(solver, Auto | Named | AccountedSolver)
+        else Named(solver, whole_name(solver, name), instead)
+    )
 
 
 def whole_name(solver: object, name: str) -> str:

@@ -414,7 +414,7 @@ def misses(program: QuadraticProgram, claim: Claim) -> dict[str, float]:
     }
 
 
-class Counted(Solver):
+class CountedSolver(Solver):
     """Passes everything on to a solver, and counts the calls."""
 
     def __init__(self, solver: Solver) -> None:
@@ -556,7 +556,7 @@ class SolverContract(Contract[Solver], kind="solver"):
 
     def test_programs_that_need_a_solver_are_solved(self) -> None:
         for instance in coupled_instances():
-            counted = Counted(self.create())
+            counted = CountedSolver(self.create())
             solve_finite(instance.program, counted)
             demand(counted.calls, f"{instance.name}: solved without the solver", "this is a fault of the contract")
         self.solve_all(coupled_instances())

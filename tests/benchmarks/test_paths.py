@@ -11,7 +11,7 @@ from unittest.mock import patch
 import pytest
 
 import sparserob_core as sr
-from sparserob_core.control.response.response import Outputs, Propagator
+from sparserob_core.control.response.response import OutputResponse, Propagator
 from tests.benchmarks.test_plants import PUSHED, stated
 from tests.benchmarks.test_scale import chain
 from tests.benchmarks.test_small_problems import problem
@@ -33,13 +33,13 @@ def piece_by_piece() -> Iterator[None]:
 @contextmanager
 def outputs_from_states() -> Iterator[None]:
     """Outputs are made of the states at all breakpoints."""
-    at = Outputs.at
+    at = OutputResponse.at
 
-    def plain(outputs: Outputs, *given: object) -> object:
+    def plain(outputs: OutputResponse, *given: object) -> object:
         with patch(f"{RESPONSE}.FEWEST", NONE):
             return at(outputs, *given)  # type: ignore[arg-type]
 
-    with patch.object(Outputs, "at", plain):
+    with patch.object(OutputResponse, "at", plain):
         yield
 
 

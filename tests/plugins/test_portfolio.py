@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import sparserob_core as sr
-from sparserob_core.experiment.benchmark.landscapes import Landscape, classic
+from sparserob_core.experiment.benchmark.landscapes import BenchmarkFunction, classic
 from sparserob_core.experiment.config.load import load_config
 from sparserob_portfolio import Portfolio
 from tests.support.places import CONFIGS
@@ -123,7 +123,7 @@ def test_a_package_that_is_missing_costs_only_its_member(monkeypatch):
     ],
     ids=lambda one: one.name,
 )
-def test_what_some_searches_lose_it_finds(landscape: Landscape):
+def test_what_some_searches_lose_it_finds(landscape: BenchmarkFunction):
     found = [
         sr.maximise(landscape.target.function, landscape.target.domain, Portfolio(), budget=1000, seed=seed).best_value
         for seed in range(5)

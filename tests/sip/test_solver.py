@@ -13,7 +13,7 @@ from scipy.optimize import linprog
 import sparserob_core as sr
 from sparserob_core.sip.inner.simplex.counterpart import Growing
 from sparserob_core.sip.inner.solve import solve_finite
-from sparserob_core.sip.solver import Asked, Auto, Failures, Named, Unanswered
+from sparserob_core.sip.solver import AccountedSolver, Auto, Failures, Named, Unanswered
 from sparserob_core.testing.solvers import regularised, robust_terminal
 
 REGISTRY = sr.load_registry()
@@ -124,7 +124,7 @@ def test_the_solver_of_auto_is_asked_for_what_is_left_and_counts_under_its_name(
     assert first.by == "clarabel"
     assert solve_finite(program, AUTO, guess=first).by == "dual_newton"
     assert solve_finite(program, Named(PIQP, "mine", AUTO), guess=first).by == "mine"
-    assert Asked.of(AUTO).instead is None
+    assert AccountedSolver.of(AUTO).instead is None
 
 
 @pytest.mark.parametrize("inner", ["auto", {"name": "auto"}])
@@ -203,7 +203,7 @@ def test_a_growing_program_has_the_same_answer_by_whoever_is_asked(seed):
     table, inside = rng.normal(size=(r, n)) * 10.0 ** rng.integers(-2, 3, (r, 1)), rng.uniform(-1, 1, n)
     cost, middle = 50.0 * rng.normal(size=n), table @ inside
     low, high = middle - [0, 1, np.inf, 0.5, 0.1], middle + np.array([0, 0.2, 0.3, np.inf, 0.1])
-    asked = Asked.of(Named(PIQP, "mine", AUTO))
+    asked = AccountedSolver.of(Named(PIQP, "mine", AUTO))
     answers = []
     for who in (None, asked):
         growing = Growing(who)

@@ -10,7 +10,7 @@ from scipy.linalg import expm
 
 from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.problem.system import LinearSystem
-from sparserob_core.control.reach.functional import WorstCase
+from sparserob_core.control.reach.functional import WorstFunctionals
 from sparserob_core.control.response.disturbance import disturbance_model
 from sparserob_core.control.response.response import Response, merge_grids
 
@@ -37,7 +37,7 @@ def worst_case(system, control, disturbance=None, bound=None, kind="piecewise_co
     grid = merge_grids(control.breakpoints, disturbance.breakpoints)
     model = None if bound is None else disturbance_model(kind, bound, disturbance, grid)
     start = np.zeros(system.states) if initial_state is None else np.asarray(initial_state, dtype=float)
-    return WorstCase(Response(system, grid, start), control, model)
+    return WorstFunctionals(Response(system, grid, start), control, model)
 
 
 def held(breakpoints, values, time):

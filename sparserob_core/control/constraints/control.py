@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, final
 
 import numpy as np
 
-from sparserob_core.control.constraints.explanation import Source, TimedExplanation, of_gauge
+from sparserob_core.control.constraints.explanation import ConstraintSource, TimedExplanation, of_gauge
 from sparserob_core.control.constraints.local_maxima import climb
 from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.problem.problem import OptimalControlProblem
@@ -117,7 +117,7 @@ def before(problem: OptimalControlProblem) -> Array | None:
 
 
 @dataclass(frozen=True, eq=False)
-class ControlConstraint(Source):
+class ControlConstraint(ConstraintSource):
     """Constraint that the control at ``places`` stays in a curved set.
 
     The index is ``(t, z)`` with ``z`` in ``[-1, 1]^m`` a direction, not normalised.

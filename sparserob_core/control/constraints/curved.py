@@ -23,10 +23,10 @@ from sparserob_core.control.constraints.state import StateConstraint
 from sparserob_core.control.enclosures.cache import remember
 from sparserob_core.control.enclosures.taylor import Combination, combination
 from sparserob_core.control.reach.enclosure import Bounded, CellEnclosure, enclose, kept, over_legs
-from sparserob_core.control.reach.functional import Leg, WorstCase
+from sparserob_core.control.reach.functional import Leg, WorstFunctionals
 from sparserob_core.control.reach.sizes import nominal_sizes
 from sparserob_core.control.response.parameters import ParameterIndex
-from sparserob_core.control.response.reference import STILL, Moving, Reference
+from sparserob_core.control.response.reference import STILL, MovingReference, Reference
 from sparserob_core.control.sets.directions import across, faces, neighbours, on_surface, sampled, shares, unit
 from sparserob_core.shapes import Float, Int, shaped
 from sparserob_core.sip.convex_set import Array, Box, ConvexSet
@@ -52,7 +52,7 @@ class CurvedConstraint(StateConstraint):
     """
 
     name: str
-    functionals: WorstCase
+    functionals: WorstFunctionals
     set: ConvexSet
     start: float
     stop: float
@@ -304,7 +304,7 @@ class CurvedConstraint(StateConstraint):
             lengthening = np.concatenate([np.zeros(nu), self._compute_lengthening(H, shortest / self.unit)])
             control = self.functionals.control(x)
             cuts = self.parameters.cuts(low[:nu], high[:nu])
-            moving = Moving(self.reference, H) if self.reference.moves else None
+            moving = MovingReference(self.reference, H) if self.reference.moves else None
 
             def cell(leg: Leg) -> CellEnclosure:
                 supports = self.functionals.support_over(leg, H, joined)

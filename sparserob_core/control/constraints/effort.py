@@ -7,7 +7,7 @@ from typing import final
 
 import numpy as np
 
-from sparserob_core.control.constraints.explanation import Source, TimedExplanation
+from sparserob_core.control.constraints.explanation import ConstraintSource, TimedExplanation
 from sparserob_core.control.constraints.feedback import not_linear, told
 from sparserob_core.control.feedback.closed_loop import ROUND_OFF, ClosedLoop
 from sparserob_core.control.feedback.effort import Effort, largest_effort
@@ -19,7 +19,7 @@ from sparserob_core.sip.program import ConstraintFamily, Enclosure, Explanation,
 
 @final
 @dataclass(frozen=True, eq=False)
-class FeedbackEffort(Source):
+class FeedbackEffort(ConstraintSource):
     """``sum_k prices_k |u_k| <= c`` for every deviation, ``c`` the variable number ``bound``; ``prices (m K,)`` of the
     nominal control's entries.
 

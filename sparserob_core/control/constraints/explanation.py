@@ -15,7 +15,7 @@ import numpy as np
 from sparserob_core.brief import ENTRIES, brief
 from sparserob_core.control.problem.names import UNNAMED, Names, measured_in, unit_of_row
 from sparserob_core.control.problem.units import Units
-from sparserob_core.control.reach.functional import WorstCase
+from sparserob_core.control.reach.functional import WorstFunctionals
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.program import (
     Explanation,
@@ -29,7 +29,7 @@ from sparserob_core.sip.program import (
 SAME = 1e-12  # of the largest coefficient of a combination, one that is rounding
 
 
-class Source(ABC):
+class ConstraintSource(ABC):
     """A constraint on states or controls, of a control that answers or of one that does not, as the source of a family:
     the same constraint in other units has the same rows but for their factors."""
 
@@ -43,7 +43,7 @@ class Source(ABC):
         return 1.0
 
     @property
-    def of_state(self) -> Source | None:
+    def of_state(self) -> ConstraintSource | None:
         """Constraint on the state without feedback; ``None`` for a constraint on controls."""
         return None
 
@@ -320,7 +320,7 @@ def in_numbers(
 
 def explanation(
     name: str,
-    functionals: WorstCase,
+    functionals: WorstFunctionals,
     H: Array,
     h: Array,
     row: int,
@@ -335,7 +335,7 @@ def explanation(
     ----------
     name : str
         Name of the constraint.
-    functionals : WorstCase
+    functionals : WorstFunctionals
         Functionals of the system.
     H : ndarray, shape (r, d)
         Normals on the state.

@@ -9,7 +9,7 @@ from typing import Protocol, final
 import numpy as np
 
 from sparserob_core.control.constraints.control import Places
-from sparserob_core.control.constraints.explanation import Source, TimedExplanation, combination
+from sparserob_core.control.constraints.explanation import ConstraintSource, TimedExplanation, combination
 from sparserob_core.control.constraints.flat import FlatConstraint
 from sparserob_core.control.constraints.local_maxima import local_maxima
 from sparserob_core.control.feedback.closed_loop import ROUND_OFF, ClosedLoop, shared
@@ -73,7 +73,7 @@ class Uncertain(Protocol):
         index holds."""
 
 
-def indexed(constraint: Uncertain, index_set: Box, start: Array, source: Source) -> ConstraintFamily:
+def indexed(constraint: Uncertain, index_set: Box, start: Array, source: ConstraintSource) -> ConstraintFamily:
     """Return a constraint as a family; in its literal form, deviations are part of the index."""
     family = ConstraintFamily(
         name=constraint.name,
@@ -106,7 +106,7 @@ def indexed(constraint: Uncertain, index_set: Box, start: Array, source: Source)
 
 @final
 @dataclass(frozen=True, eq=False)
-class FeedbackConstraint(Source):
+class FeedbackConstraint(ConstraintSource):
     """``H (x(t) - r(t)) + G u(t) <= h`` for all times of a window and every disturbance, with the control that it
     causes; the index is ``(t,)``, or with the deviations of the disturbance ``(t, w)``. ``flat``: the same constraint
     without feedback, which has every row of a mixed constraint twice, for both values of a control that jumps."""
@@ -381,7 +381,7 @@ def rows_at(
 
 @final
 @dataclass(frozen=True, eq=False)
-class FeedbackControl(Source):
+class FeedbackControl(ConstraintSource):
     """Constraint ``H a <= h`` for every disturbance, on the value ``a`` of the control on every piece or on its change
     at every step.
 

@@ -17,7 +17,7 @@ import numpy as np
 
 from sparserob_core.control.constraints.control import Places
 from sparserob_core.control.constraints.curved import STEP, CurvedConstraint
-from sparserob_core.control.constraints.explanation import Source, TimedExplanation, of_gauge
+from sparserob_core.control.constraints.explanation import ConstraintSource, TimedExplanation, of_gauge
 from sparserob_core.control.constraints.feedback import STATES, FeedbackConstraint, acting, indexed, rows_at, told
 from sparserob_core.control.constraints.local_maxima import climb, highest_at, ridden, turns
 from sparserob_core.control.feedback.closed_loop import ROUND_OFF, ClosedLoop
@@ -84,7 +84,7 @@ class Turning(ABC):
 
     @property
     @abstractmethod
-    def source(self) -> Source:
+    def source(self) -> ConstraintSource:
         """Constraint that the family belongs to."""
 
     @property
@@ -257,7 +257,7 @@ class FeedbackCurved(Turning):
         return self.curved.unit
 
     @property
-    def source(self) -> Source:
+    def source(self) -> ConstraintSource:
         return self.curved
 
     @cached_property
@@ -292,7 +292,7 @@ class FeedbackCurved(Turning):
 
 @final
 @dataclass(frozen=True, eq=False)
-class FeedbackCurvedControl(Turning, Source):
+class FeedbackCurvedControl(Turning, ConstraintSource):
     """Constraint that the control at ``places``, on every piece or at every step, stays in a curved set for every
     disturbance."""
 
@@ -314,7 +314,7 @@ class FeedbackCurvedControl(Turning, Source):
         return self.convex
 
     @property
-    def source(self) -> Source:
+    def source(self) -> ConstraintSource:
         return self
 
     @property

@@ -24,12 +24,12 @@ from sparserob_core.control.constraints.state import StateConstraint
 from sparserob_core.control.enclosures.cache import remember
 from sparserob_core.control.problem.terms.windows import Flat
 from sparserob_core.control.reach.enclosure import Bounded, CellEnclosure, enclose, kept, over_legs
-from sparserob_core.control.reach.functional import LEGS_KEPT, Leg, WorstCase
+from sparserob_core.control.reach.functional import LEGS_KEPT, Leg, WorstFunctionals
 from sparserob_core.control.reach.sizes import stated_sizes
 from sparserob_core.control.reach.support import Supports
 from sparserob_core.control.response.parameters import ParameterIndex
-from sparserob_core.control.response.reference import STILL, Direct, Moving, Reference
-from sparserob_core.control.response.response import Outputs, Response, distinct_times
+from sparserob_core.control.response.reference import STILL, Direct, MovingReference, Reference
+from sparserob_core.control.response.response import OutputResponse, Response, distinct_times
 from sparserob_core.shapes import Float, Int, shaped
 from sparserob_core.sip.convex_set import Array, Box
 from sparserob_core.sip.program import Enclosure, Separation
@@ -64,7 +64,7 @@ class Samples:
     ``h`` is ``(r,)``.
     """
 
-    functionals: WorstCase
+    functionals: WorstFunctionals
     H: Array
     h: Array
     window: tuple[float, float]
@@ -145,11 +145,11 @@ class Samples:
         return self.h[None, :, None] - np.tile(sigma, (1, copies, 1))
 
     @cached_property
-    def outputs(self) -> Outputs:
+    def outputs(self) -> OutputResponse:
         """``H x`` at the sampled times and parameters, once for rows that are equal or opposite. The states themselves
         where there are fewer of them than rows."""
         rows = np.eye(self.H.shape[1]) if self._has_fewer_states else self.H[self._distinct_rows[0]]
-        return Outputs(self._response.propagator, rows, self.times, self.lattice[0])
+        return OutputResponse(self._response.propagator, rows, self.times, self.lattice[0])
 
     def along(self, response: Response, control: Array) -> Array:
         """Return ``H x (v, r, times)`` from the initial state of a response, under a control ``(m, K)``."""
@@ -197,7 +197,7 @@ class FlatConstraint(StateConstraint):
     """
 
     name: str
-    functionals: WorstCase
+    functionals: WorstFunctionals
     H: Array
     h: Array
     start: float
@@ -210,7 +210,7 @@ class FlatConstraint(StateConstraint):
     @staticmethod
     def of(
         name: str,
-        functionals: WorstCase,
+        functionals: WorstFunctionals,
         rows: Flat,
         window: tuple[float, float],
         parameters: ParameterIndex,
@@ -296,7 +296,7 @@ class FlatConstraint(StateConstraint):
     @shaped
     def moved(self, times: Float[Array, " k"]) -> Float[Array, "k r"]:
         """Return ``-H r(t)``."""
-        return Moving(self.reference, self.H).at(times)
+        return MovingReference(self.reference, self.H).at(times)
 
     @shaped
     def commanded(self, times: Float[Array, " k"]) -> Int[np.ndarray, "k r"]:
@@ -422,7 +422,7 @@ class FlatConstraint(StateConstraint):
             rows = self.samples.proven
             rhs, H = np.zeros((rows, legs[0].space.size)), self.H[:rows]
             rhs[:, 0] = self.h[:rows]
-            moving = Moving(self.reference, H) if self.reference.moves else None
+            moving = MovingReference(self.reference, H) if self.reference.moves else None
             direct = None if self.gains is None else Direct(self.gains[:rows], self.functionals.dictionary, control)
             supports = self.samples.support_over(legs, low, high)
             pairs = zip(supports, legs, strict=True)

@@ -7,10 +7,10 @@ from functools import cached_property
 
 import numpy as np
 
-from sparserob_core.control.constraints.explanation import SAME, Source, TimedExplanation
+from sparserob_core.control.constraints.explanation import SAME, ConstraintSource, TimedExplanation
 from sparserob_core.control.problem.names import unit_of_row
 from sparserob_core.control.problem.units import Units
-from sparserob_core.control.reach.functional import WorstCase
+from sparserob_core.control.reach.functional import WorstFunctionals
 from sparserob_core.control.reach.sizes import nominal_sizes
 from sparserob_core.control.response.parameters import ParameterIndex
 from sparserob_core.control.response.reference import STILL, Reference
@@ -24,17 +24,17 @@ from sparserob_core.sip.program import Enclosure, Separation
 NOTHING = 2.0**-140
 
 
-class StateConstraint(Source):
+class StateConstraint(ConstraintSource):
     """``c'(x(t) - r(t)) + g'u(t) <= h(c)`` for all ``t`` in ``[start, stop]``, parameters and disturbances, and for the
     normals ``c`` of a convex set, ``r`` its ``reference`` where it moves; ``g = 0`` but for mixed constraints. A
     terminal constraint is the window ``[T, T]``.
 
     An index is ``(t, p)``, followed by a direction ``z (b,)`` where the set is curved; at each there are ``r`` rows.
-    The disturbance is maximised in closed form (`WorstCase`), so the formulation is the reduced one.
+    The disturbance is maximised in closed form (`WorstFunctionals`), so the formulation is the reduced one.
     """
 
     name: str
-    functionals: WorstCase
+    functionals: WorstFunctionals
     start: float
     stop: float
     parameters: ParameterIndex

@@ -468,7 +468,7 @@ class Superposed:
 
     name: str
     entry: object
-    dependence: Dependence | Spread
+    dependence: Dependence | ExpandedSystem
 
     def __call__(self, p: Sequence[Value]) -> Table:
         """The matrix at a time ``(1,)``."""
@@ -477,7 +477,7 @@ class Superposed:
 
 @final
 @dataclass(frozen=True, eq=False)
-class Left:
+class TruncationBound:
     """Bounds of the entries of a law beyond a degree in the parameters, for all values of the parameters.
 
     ``sizes (s, d, d + n)`` are the bounds of ``[A B c E]`` between the times ``ends (s + 1,)``.
@@ -495,7 +495,7 @@ class Left:
 
 @final
 @dataclass(frozen=True, eq=False)
-class Spread:
+class ExpandedSystem:
     """The state of a system of ``d`` states as a polynomial in its parameters, ``x = sum_a delta^a x_a``, with a
     remainder of higher degrees.
 
@@ -509,14 +509,14 @@ class Spread:
     space: TaylorSpace
     centre: Array
     units: Array
-    left: Left | None = None
+    left: TruncationBound | None = None
 
     @property
     def states(self) -> int:
         """Number of all states: ``d`` for each monomial."""
         return self.d * self.space.size
 
-    def on_cell(self, low: Array, high: Array, ends: Array, law: Array) -> tuple[Spread, np.ndarray]:
+    def on_cell(self, low: Array, high: Array, ends: Array, law: Array) -> tuple[ExpandedSystem, np.ndarray]:
         """Return how the state depends on the parameters of a cell, and which coefficients of the law it keeps.
 
         Parameters
@@ -541,8 +541,8 @@ class Spread:
         truncated = law[:, self.space.degrees > space.degree].sum(axis=1)
         if self.left is not None:
             truncated = truncated + self.left.over(ends)
-        remainder = Left(ends, truncated * OUTWARD) if truncated.any() else None
-        return Spread(self.d, space, (low + high) / 2, (high - low) / 2, remainder), kept
+        remainder = TruncationBound(ends, truncated * OUTWARD) if truncated.any() else None
+        return ExpandedSystem(self.d, space, (low + high) / 2, (high - low) / 2, remainder), kept
 
     def shares(self, parameters: Array) -> Array:
         """``delta (k, nu)`` of parameters ``(k, nu)``."""

@@ -18,14 +18,14 @@ from sparserob_core.control.enclosures.cache import remember
 from sparserob_core.control.feedback.innovations import KNOWN, Answers, innovations_seen
 from sparserob_core.control.feedback.measurable import MeasurablePieces
 from sparserob_core.control.feedback.observer import Observer, innovations_of
-from sparserob_core.control.reach.functional import WorstCase
+from sparserob_core.control.reach.functional import WorstFunctionals
 from sparserob_core.control.reach.measurable import MISSED
 from sparserob_core.control.reach.varying_motion import VaryingMotion
 from sparserob_core.sip.convex_set import Array, ConvexSet
 from sparserob_core.sip.finite import Spread, UncertainRows, table_of
 
 if TYPE_CHECKING:
-    from sparserob_core.control.response.response import Steps, TimeGrid
+    from sparserob_core.control.response.response import PieceTransitions, TimeGrid
 
 TERMS = 8  # of the Taylor expansion that bounds a curvature
 ROUND_OFF = 2.0**-46  # of the numbers that are added up
@@ -42,7 +42,7 @@ class ClosedLoop:
 
     Parameters
     ----------
-    functionals : WorstCase
+    functionals : WorstFunctionals
         Functionals of the system.
     answers : Answers
         Variables of the gains.
@@ -61,7 +61,7 @@ class ClosedLoop:
         before those of the initial state; only the step across the seam depends on them.
     """
 
-    functionals: WorstCase
+    functionals: WorstFunctionals
     answers: Answers
     spread: Spread
     variables: int
@@ -123,7 +123,7 @@ class ClosedLoop:
         return np.arange(self.grid.pieces) if self.motion is None else self.motion.origin
 
     @cached_property
-    def steps(self) -> Steps:
+    def steps(self) -> PieceTransitions:
         """Matrices and transitions of the system."""
         return self.functionals.response.steps(KNOWN)
 

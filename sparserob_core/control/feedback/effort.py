@@ -48,11 +48,11 @@ class Effort:
 
 def largest_effort(a: Array, A: Array, spread: Spread, parts: int = PARTS) -> Effort:
     """Return ``max_w sum_k |a_k + A_k w|`` of ``a (n,)`` and ``A (n, Q)``, over the deviations of the ``spread``."""
-    return _Search(a, A, spread).run(parts)
+    return _SignSearch(a, A, spread).run(parts)
 
 
 @final
-class _Search:
+class _SignSearch:
     """Branch and bound over the signs of the control's entries. A part holds sign vectors by its ``slopes (n,)``: a
     sign where it is fixed, and the slope of the chord where it is open."""
 

@@ -18,8 +18,8 @@ import numpy as np
 
 from sparserob_core.control.enclosures.cache import remember
 from sparserob_core.control.enclosures.matrix_exponential import rounding
-from sparserob_core.control.feedback.zonoid import FAST, PARTS, Arc, Pushes, Zonoid, corners
-from sparserob_core.control.reach.functional import WorstCase
+from sparserob_core.control.feedback.zonoid import FAST, PARTS, Arc, KernelPolynomial, Zonoid, corners
+from sparserob_core.control.reach.functional import WorstFunctionals
 from sparserob_core.control.reach.measurable import MISSED
 from sparserob_core.control.reach.varying_execution import VaryingExecution, VaryingExecutionCellSupport
 from sparserob_core.control.reach.varying_measurable import VaryingMeasurable
@@ -39,7 +39,7 @@ class MeasurablePieces:
 
     Parameters
     ----------
-    functionals : WorstCase
+    functionals : WorstFunctionals
         Functionals of the system.
     zonoids : tuple of Zonoid
         Sets of effects, one for every piece, in the problem's own units.
@@ -51,13 +51,13 @@ class MeasurablePieces:
         Signals that were found for points of the zonoids, in any units.
     """
 
-    functionals: WorstCase
+    functionals: WorstFunctionals
     zonoids: tuple[Zonoid, ...]
     states: Array
     disturbances: Array
     composed: dict[tuple[int, bytes], Arc] = field(default_factory=dict, repr=False)
 
-    def in_units_of(self, functionals: WorstCase, states: Array, disturbances: Array) -> MeasurablePieces:
+    def in_units_of(self, functionals: WorstFunctionals, states: Array, disturbances: Array) -> MeasurablePieces:
         """Return the same effects for ``functionals`` of the same problem in other units.
 
         The own units of the zonoids are ``states (d,)`` and ``disturbances (mw,)`` in the units of ``functionals``.
@@ -178,9 +178,9 @@ class MeasurablePieces:
         response = self.functionals.response
         return response.flows(np.clip(times - response.grid.breakpoints[pieces + 1], 0.0, None))[0]
 
-    def pushes(self, piece: int, until: float) -> Pushes:
+    def pushes(self, piece: int, until: float) -> KernelPolynomial:
         """Return the kernel from a disturbance on ``piece`` to the state at the time ``until`` within the piece."""
-        return Pushes.of(*self._matrices, until - float(self.functionals.response.grid.breakpoints[piece]))
+        return KernelPolynomial.of(*self._matrices, until - float(self.functionals.response.grid.breakpoints[piece]))
 
     def weights(self, time: float, H: Array, pieces: np.ndarray) -> Array:
         """Return the contribution of every deviation to ``H x(time)`` without control, ``(r, Q)``.
@@ -347,7 +347,7 @@ class VaryingPieces(MeasurablePieces):
         ends = self.functionals.response.grid.breakpoints[pieces + 1]
         return np.asarray(self.motion.expansion.flow(ends, np.maximum(ends, times)).state)
 
-    def pushes(self, piece: int, until: float) -> Pushes:
+    def pushes(self, piece: int, until: float) -> KernelPolynomial:
         """Return the kernel as in `MeasurablePieces.pushes`, joined from the kernels between marks, each on parts in
         which the system does not change much."""
         motion, channels = self.motion, self.motion.expansion.channels[0]
@@ -360,7 +360,7 @@ class VaryingPieces(MeasurablePieces):
         lengths = np.diff(ends)
         paces = np.ceil(motion.paces[motion.place(ends[:-1])] * lengths / FAST)
         counts = np.clip(np.maximum(paces, np.ceil(PARTS * lengths / (until - start))), 1, None).astype(int)
-        return Pushes.joined(kernels[::-1], (until - ends)[::-1], counts[::-1].tolist())
+        return KernelPolynomial.joined(kernels[::-1], (until - ends)[::-1], counts[::-1].tolist())
 
 
 def _compute_leading_signs(H: Array) -> Array:
@@ -369,7 +369,7 @@ def _compute_leading_signs(H: Array) -> Array:
     return np.where(first < 0.0, -1.0, 1.0)
 
 
-def measurable_pieces(functionals: WorstCase) -> MeasurablePieces | None:
+def measurable_pieces(functionals: WorstFunctionals) -> MeasurablePieces | None:
     """Return the effects of measurable disturbances on the pieces of a grid, in the units of ``functionals``; ``None``
     where there is no measurable disturbance."""
     model, response = functionals.disturbance, functionals.response

@@ -65,7 +65,7 @@ class Arc:
 
 @final
 @dataclass(frozen=True, eq=False)
-class Pushes:
+class KernelPolynomial:
     """Kernel ``K (d, mw)`` from a disturbance at any time of a piece to the state at its end, as polynomials.
 
     Parameters
@@ -80,7 +80,7 @@ class Pushes:
     ends: Array
 
     @staticmethod
-    def of(A: Array, E: Array, length: float) -> Pushes:
+    def of(A: Array, E: Array, length: float) -> KernelPolynomial:
         """Return the kernel ``e^{A r} E`` for ``r`` from 0 to ``length``, on equal parts."""
         count = _choose_part_count(A, length)
         half, term = length / count / 2.0, E
@@ -89,10 +89,10 @@ class Pushes:
         for order in range(_choose_degree(float(np.linalg.norm(A, 2)) * half) + 1):
             terms.append(flows @ term)
             term = A @ term * (half / (order + 1))
-        return Pushes(np.stack(terms, axis=1), np.linspace(0.0, length, count + 1))
+        return KernelPolynomial(np.stack(terms, axis=1), np.linspace(0.0, length, count + 1))
 
     @staticmethod
-    def joined(kernels: Sequence[Array], ends: Array, counts: Sequence[int]) -> Pushes:
+    def joined(kernels: Sequence[Array], ends: Array, counts: Sequence[int]) -> KernelPolynomial:
         """Join the kernels of consecutive intervals, without terms of negligible size at the highest orders.
 
         Parameters
@@ -117,7 +117,7 @@ class Pushes:
         )
         sizes = np.abs(coefficients).max(axis=(0, 2, 3))
         significant = np.flatnonzero(sizes > REST * sizes.max(initial=0.0))
-        return Pushes(coefficients[:, : 1 + int(significant.max(initial=0))], np.concatenate(cuts))
+        return KernelPolynomial(coefficients[:, : 1 + int(significant.max(initial=0))], np.concatenate(cuts))
 
     @cached_property
     def halves(self) -> Array:
@@ -135,13 +135,13 @@ class Zonoid(ConvexSet):
     Times count backwards, from the end of the piece.
     """
 
-    pushes: Pushes
+    pushes: KernelPolynomial
     parts: tuple[Array, ...]
     into: Array
     outward: Array
 
     @staticmethod
-    def of(pushes: Pushes, bound: ConvexSet) -> Zonoid:
+    def of(pushes: KernelPolynomial, bound: ConvexSet) -> Zonoid:
         """Return the set of one piece, in the coordinates in which the ellipsoid of its second moments is a ball."""
         corner_sets, (d, mw) = tuple(corners(bound)), pushes.terms.shape[2:]
         nodes, weights = np.polynomial.legendre.leggauss(32)

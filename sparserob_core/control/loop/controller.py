@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from sparserob_core.brief import brief
 from sparserob_core.control.feedback.observer import Observer
-from sparserob_core.control.loop.resolving import Plan, Resolving
+from sparserob_core.control.loop.resolving import ProvenPlan, Resolving
 from sparserob_core.control.studies.measuring import Measuring
 from sparserob_core.errors import InputError
 from sparserob_core.sip.convex_set import Array
@@ -68,7 +68,7 @@ class Controller:
       a state that is not believed is told as ``None``.
     """
 
-    def __init__(self, plan: Plan, resolving: Resolving | None = None) -> None:
+    def __init__(self, plan: ProvenPlan, resolving: Resolving | None = None) -> None:
         self._first_plan, self._resolver = plan, resolving
         began = clock.perf_counter()
         if resolving is not None:
@@ -118,7 +118,7 @@ class Controller:
         return tuple(self._steps)
 
     @property
-    def plan(self) -> Plan:
+    def plan(self) -> ProvenPlan:
         """The plan that is applied: the first one, or the last that was solved anew."""
         return self._plan
 
@@ -202,7 +202,7 @@ class Controller:
         points = self._first_plan.model.control.breakpoints
         return float(period * points[-1] + points[piece])
 
-    def _apply_plan(self, plan: Plan) -> None:
+    def _apply_plan(self, plan: ProvenPlan) -> None:
         self._plan = plan
         self._last_disturbance: tuple[int, Array] | None = (
             None  # the last piece of the disturbance that was seen, and its value
@@ -211,7 +211,7 @@ class Controller:
         self._measuring = None if feedback is None else Measuring.of(plan.known, plan.decision)
         self._nominal_control = plan.known.pieces(plan.decision)
 
-    def _replace_plan(self, plan: Plan) -> None:
+    def _replace_plan(self, plan: ProvenPlan) -> None:
         """Apply a new plan from now on; one with the same gains goes on answering what was seen so far."""
         if self._measuring is None or plan.known is not self._plan.known:
             self._apply_plan(plan)

@@ -39,7 +39,7 @@ HALVINGS = 50  # of the way to a curved edge of the controls; a tenth ends 3 % b
 
 @final
 @dataclass(frozen=True, eq=False)
-class Plan:
+class ProvenPlan:
     """Proven decision ``(n,)`` of a transcribed problem, whose time 0 is the beginning of piece ``first`` of the
     control that the plan is for.
 
@@ -184,7 +184,7 @@ class Solved:
     """Result of a re-solve: a ``plan``, or ``None`` where none is proven, its ``cost`` and the ``lower`` bound of the
     cost. ``cheaper`` is true where the plan costs less than the remainder of the last plan."""
 
-    plan: Plan | None
+    plan: ProvenPlan | None
     cost: float = np.nan
     lower: float = np.nan
     cheaper: bool = False
@@ -215,7 +215,7 @@ class Resolving:
         self._next_control: Array | None = None  # with what the next period begins, of a plan that repeats
         self._transcription_seconds = 0.0  # what it takes to write a whole program down, however few pieces are left
 
-    def prepare(self, plan: Plan) -> None:
+    def prepare(self, plan: ProvenPlan) -> None:
         """Compute everything that steps with a time limit should not wait for, for the plan that loops begin with;
         nothing without a limit."""
         self._next_control = plan.known.pieces(plan.decision)[:, 0]
@@ -242,7 +242,7 @@ class Resolving:
         return self._seconds is None or needed <= self._seconds
 
     def answer(
-        self, plan: Plan, piece: int, state: Array, before: Array | None, innovations: Sequence[Array]
+        self, plan: ProvenPlan, piece: int, state: Array, before: Array | None, innovations: Sequence[Array]
     ) -> Solved:
         """Return the best plan for the remaining horizon from piece ``piece`` of the whole control on, compared with
         the remainder of ``plan`` after the ``innovations`` so far. The ``state (d,)`` is measured, ``before (m,)`` is
@@ -264,7 +264,7 @@ class Resolving:
 
     def _solve_feedback(
         self,
-        plan: Plan,
+        plan: ProvenPlan,
         piece: int,
         state: Array,
         before: Array | None,
@@ -296,7 +296,7 @@ class Resolving:
         program begins ``gap`` later than the program in which these cuts were active."""
         return self._method.close(program, tools, prover_of(program, tools), shifted(cuts, gap, program))
 
-    def _retune(self, plan: Plan, piece: int, state: Array, innovations: Sequence[Array], tools: Tools) -> Solved:
+    def _retune(self, plan: ProvenPlan, piece: int, state: Array, innovations: Sequence[Array], tools: Tools) -> Solved:
         """Solve for the best nominal control with the same gains, where `Retuning` accepts the problem."""
         retuning = next((entry for entry in self._retunings if entry.model is plan.known), None)
         if retuning is None:
@@ -315,7 +315,7 @@ class Resolving:
 
     def _solve_open_loop(
         self,
-        plan: Plan,
+        plan: ProvenPlan,
         piece: int,
         state: Array,
         before: Array | None,
@@ -339,7 +339,7 @@ class Resolving:
 
     def _solve_by_exchange(
         self,
-        plan: Plan,
+        plan: ProvenPlan,
         piece: int,
         state: Array,
         before: Array | None,
@@ -367,7 +367,7 @@ class Resolving:
         )
 
     def _solve_by_tracking(
-        self, plan: Plan, piece: int, state: Array, innovations: Sequence[Array], tools: Tools
+        self, plan: ProvenPlan, piece: int, state: Array, innovations: Sequence[Array], tools: Tools
     ) -> Solved | None:
         """Return the answer of `Tracking` where it accepts the problem and closes the gap; otherwise ``None``."""
         if self._model.problem.control_step is not None:
@@ -388,7 +388,7 @@ class Resolving:
         known_cost = float(own.program.cost(plan.left(piece - plan.first, innovations).ravel() / control_units))
         decision, cost = tracked.decision * control_units, units.cost * tracked.cost
         return Solved(
-            Plan(model, decision, piece, state=state.copy()),
+            ProvenPlan(model, decision, piece, state=state.copy()),
             cost,
             units.cost * tracked.lower,
             is_cheaper(tracked.cost, known_cost),
@@ -433,7 +433,7 @@ class Resolving:
     ) -> Solved:
         if result.status not in PROVEN or decision is None:
             return Solved(None)
-        return Solved(Plan(model, decision, piece, result.indices), cost, lower, is_cheaper(cost, known))
+        return Solved(ProvenPlan(model, decision, piece, result.indices), cost, lower, is_cheaper(cost, known))
 
 
 def is_cheaper(cost: float, known: float) -> bool:

@@ -12,7 +12,7 @@ from typing import TypeAlias, final
 import numpy as np
 
 from sparserob_core.brief import noun
-from sparserob_core.control.enclosures.dependence import Dependence, Spread, Superposed, dependence
+from sparserob_core.control.enclosures.dependence import Dependence, ExpandedSystem, Superposed, dependence
 from sparserob_core.control.problem.expression import parse_column, parse_definitions, parse_matrix
 from sparserob_core.control.problem.phase import PARTS, TIME, Matrix, Phase, PhaseInUnits, and_time, boxed
 from sparserob_core.control.term import SAME_TIME, over
@@ -323,7 +323,7 @@ class System:
         sides = ((centre, box.upper), (box.lower, centre))
         return centre, np.max([[_subtract_upwards(a, b) for a, b in zip(*ends, strict=True)] for ends in sides], axis=0)
 
-    def superposed(self, depends: Dependence | Spread) -> System:
+    def superposed(self, depends: Dependence | ExpandedSystem) -> System:
         """Return the known system of the coefficients of the state, where the state is expanded in the parameters.
 
         Parameters

@@ -28,7 +28,7 @@ from sparserob_core.control.enclosures.polynomial import (
 from sparserob_core.control.enclosures.taylor import Combination, TaylorSpace
 from sparserob_core.control.enclosures.valid_inequalities import Cuts
 from sparserob_core.control.reach.support import Supports
-from sparserob_core.control.response.reference import Direct, Moving
+from sparserob_core.control.response.reference import Direct, MovingReference
 from sparserob_core.control.response.response import TimeGrid
 from sparserob_core.errors import NotEnclosable
 from sparserob_core.sip.convex_set import Array
@@ -46,7 +46,7 @@ TINIEST = float(np.finfo(float).tiny)  # instead of nothing to divide by
 FEW_CELLS = 64  # of which only neighbours are asked whether they share an end
 
 
-class Motion(Protocol):
+class EnclosedMotion(Protocol):
     """A system over a cell of parameters, as bounds over cells of time see it: the Taylor models of a state in
     coordinates ``z`` with ``x = T z``, ``transform`` ``T (d, d)``, whose blocks begin at ``starts (q,)``, on a
     ``grid`` between whose breakpoints nothing jumps."""
@@ -130,7 +130,7 @@ class CellEnclosure:
     every cell of times.
     """
 
-    lifted: Motion
+    lifted: EnclosedMotion
     sigma: Supports | None
     H: Array
     rhs: Array
@@ -139,7 +139,7 @@ class CellEnclosure:
     looseness: Array | float = 0.0
     lengthening: Array | float = 0.0
     cuts: Cuts | None = None
-    moving: Moving | None = None
+    moving: MovingReference | None = None
     direct: Direct | None = None
 
     def bounds(self, start: Array, stop: Array) -> tuple[Array, Array, Array]:
@@ -328,7 +328,7 @@ class LegsEnclosure:
         return bounds, bend, spread
 
 
-AnyMotion = TypeVar("AnyMotion", bound=Motion)
+AnyMotion = TypeVar("AnyMotion", bound=EnclosedMotion)
 Bounded: TypeAlias = CellEnclosure | LegsEnclosure
 
 

@@ -50,7 +50,7 @@ NEAR = 250_000
 
 
 @dataclass(frozen=True, eq=False)
-class Parts:
+class Contributions:
     """Contributions to the largest ``c'x(t)`` at one index, without the contribution of the control.
 
     ``free`` is the contribution of the centre of the initial states and of inputs that are not decided. ``sigma`` is
@@ -68,7 +68,7 @@ class Parts:
 
 
 @dataclass(frozen=True, eq=False)
-class WorstCase:
+class WorstFunctionals:
     """The functionals ``c'x(t)`` of one system under its worst disturbance, from the worst initial state.
 
     The initial states are that of the response plus ``initial``, a set of deviations. The worst of them adds the
@@ -89,7 +89,7 @@ class WorstCase:
     execution: Execution | None = None
 
     @shaped
-    def from_state(self, initial_state: Float[Array, " d"]) -> WorstCase:
+    def from_state(self, initial_state: Float[Array, " d"]) -> WorstFunctionals:
         """The functionals from another initial state ``(d,)``; what does not depend on it is shared."""
         return replace(self, response=self.response.from_state(initial_state), shared=self.measurable)
 
@@ -131,7 +131,7 @@ class WorstCase:
         before the first decided one acts; 0 elsewhere."""
         return self.response.grid.inputs(np.zeros((self.channels, self.dictionary.pieces)))
 
-    def central(self) -> WorstCase:
+    def central(self) -> WorstFunctionals:
         """The functionals along the nominal trajectory: the disturbance and the initial state at the `nominal_point` of
         their sets; the parameters stay in the index."""
         response, model = self.response, self.disturbance
@@ -142,13 +142,13 @@ class WorstCase:
             self, response=response, disturbance=disturbance, shared=None, initial=None, execution=self._exact_execution
         )
 
-    def nominal(self) -> WorstCase:
+    def nominal(self) -> WorstFunctionals:
         """Return the functionals of the system at an interior point of its parameters, from the centre of the initial
         states, under one admissible disturbance: 0 where it is admissible."""
         return self._nominal_case
 
     @cached_property
-    def _nominal_case(self) -> WorstCase:
+    def _nominal_case(self) -> WorstFunctionals:
         system, model = self.response.system, self.disturbance
         if model is not None:
             zero = np.zeros(model.channels)
@@ -158,7 +158,7 @@ class WorstCase:
             response = response.at(system.parameters.interior_point())
         if system.varies:
             return replace(self, response=response, disturbance=model, initial=None, shared=None, execution=exact)
-        return WorstCase(response, self.dictionary, model, names=self.names, execution=exact)
+        return WorstFunctionals(response, self.dictionary, model, names=self.names, execution=exact)
 
     @property
     def _exact_execution(self) -> Execution | None:
@@ -166,7 +166,7 @@ class WorstCase:
         ``None`` where there is no execution."""
         return None if self.execution is None else self.execution.none()
 
-    def coarser(self, pieces: int) -> WorstCase:
+    def coarser(self, pieces: int) -> WorstFunctionals:
         """Return the same functionals on about ``pieces`` equal pieces over the whole horizon, or unchanged.
 
         The grid changes only for a known system on many equal pieces, on each of which every input may act: the effect
@@ -484,11 +484,11 @@ class WorstCase:
         return result
 
     @shaped
-    def parts(self, time: float, direction: Float[Array, " d"], parameter: Float[Array, " nu"]) -> Parts:
+    def parts(self, time: float, direction: Float[Array, " d"], parameter: Float[Array, " nu"]) -> Contributions:
         """Return the contributions to the largest ``c'x(t)`` at one index, without the contribution of the control."""
         index = (np.array([time]), direction[None], parameter[None])
         weights = self.response.weights(*index)
-        return Parts(
+        return Contributions(
             float(weights.free[0] @ self.response.initial_state + self.given(weights.control)[0]),
             float(self._evaluate_support(weights, *index)[0]),
             float(self._evaluate_initial_support(weights.free)[0]),

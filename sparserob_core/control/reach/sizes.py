@@ -15,7 +15,7 @@ from sparserob_core.control.problem.cost import nominal_point
 from sparserob_core.sip.convex_set import Array
 
 if TYPE_CHECKING:
-    from sparserob_core.control.reach.functional import WorstCase
+    from sparserob_core.control.reach.functional import WorstFunctionals
 
 PARALLEL = 1e-14  # of the largest entry: rows that differ by less are opposite ones
 # Breakpoints at which the nominal trajectory is looked at. A tenth of them may miss most of a swing, and a proof then
@@ -51,12 +51,12 @@ def stated_sizes(H: Array, h: Array) -> Array:
     return np.maximum(np.abs(h), np.where(np.isfinite(width), width, 0.0))
 
 
-def nominal_sizes(functionals: WorstCase, x: Array, H: Array, G: Array | None = None) -> Array:
+def nominal_sizes(functionals: WorstFunctionals, x: Array, H: Array, G: Array | None = None) -> Array:
     """Return the largest ``|H x(t) + G u(t)|`` along the nominal trajectory of a decision.
 
     Parameters
     ----------
-    functionals : WorstCase
+    functionals : WorstFunctionals
         The functionals of the state.
     x : Array
         The decision ``(n,)``.

@@ -7,7 +7,7 @@ entry by entry by its own derivative. The error of the computed states is the pr
 products of transitions that propagate it are at most the computed ones, and a little more.
 
 For a system with parameters whose state is not affine in them, the motion is that of all coefficients of an expansion
-in the parameters. With ``x = sum_a delta^a x_a + R`` (`Spread`), the remainder beyond the degree ``D`` obeys
+in the parameters. With ``x = sum_a delta^a x_a + R`` (`ExpandedSystem`), the remainder beyond the degree ``D`` obeys
 ``R' = A(t, p) R`` plus the products of coefficients of ``A`` and of the state whose degrees add up to more than ``D``.
 So the remainder is at most the norm of the transitions times the integral of ``sum_j n_j sum_(b > D - j) a_b``, with
 ``a_b`` and ``n_j`` the norms of all coefficients of ``A`` and of the state of a degree. The transitions are such an
@@ -27,7 +27,7 @@ import numpy as np
 
 from sparserob_core.control.enclosures.cache import remember
 from sparserob_core.control.enclosures.comparison import product
-from sparserob_core.control.enclosures.dependence import Spread
+from sparserob_core.control.enclosures.dependence import ExpandedSystem
 from sparserob_core.control.enclosures.matrix_exponential import rounding
 from sparserob_core.control.enclosures.taylor import Combination, TaylorSpace
 from sparserob_core.control.reach.disturbance_support import over_faces, summed
@@ -622,7 +622,7 @@ class Truncation:
     """
 
     motion: VaryingMotion
-    spread: Spread
+    spread: ExpandedSystem
     known: float | None = None
 
     @cached_property
@@ -820,7 +820,7 @@ class SpreadMotion:
         return self.truncation.motion
 
     @property
-    def spread(self) -> Spread:
+    def spread(self) -> ExpandedSystem:
         """The parametric expansion of the state."""
         return self.truncation.spread
 

@@ -74,7 +74,7 @@ STILL = Reference()  # of a set that stays where it is
 
 @final
 @dataclass(frozen=True, eq=False)
-class Moving:
+class MovingReference:
     """Change ``-H r(t)`` of functionals ``H x(t)``, ``H (r, d)``, by the reference of a moving set, on cells of time
     between its kinks."""
 

@@ -21,7 +21,7 @@ from sparserob_core.control.enclosures.flows import FEW_STATES, Exponentials, Le
 from sparserob_core.control.enclosures.matrix_exponential import EPSILON, transitions
 from sparserob_core.control.problem.system import System
 from sparserob_core.control.response.varying.expansion import Expansion
-from sparserob_core.control.response.varying.spread import Parts, law_of
+from sparserob_core.control.response.varying.spread import ParameterParts, law_of
 from sparserob_core.shapes import Float, Int, shaped
 from sparserob_core.sip.convex_set import Array
 
@@ -219,7 +219,7 @@ def _merge_breakpoints(points: Array, others: Array) -> Array:
 
 
 @dataclass(frozen=True, eq=False)
-class Steps:
+class PieceTransitions:
     """Matrices at ``v`` parameters, and transitions over whole pieces of ``q`` distinct modes and lengths.
 
     ``A (v, J, d, d)`` has one matrix for every mode; ``B`` and ``E`` hold those of all modes side by side. ``Phi = e^{A
@@ -387,13 +387,13 @@ class Propagator:
     grid: TimeGrid
     propagate: Exponentials | None = None
     given: Expansion | None = None
-    _steps: dict[bytes, Steps] = field(default_factory=dict, repr=False)
+    _steps: dict[bytes, PieceTransitions] = field(default_factory=dict, repr=False)
     _flows: dict[bytes, tuple[Array, Array]] = field(default_factory=dict, repr=False)
     _exponentials: dict[int, Leaps] = field(default_factory=dict, repr=False)
 
     @cached_property
     def which(self) -> np.ndarray:
-        """Index of every piece among the distinct modes and lengths, in the order of `Steps`, ``(L,)``."""
+        """Index of every piece among the distinct modes and lengths, in the order of `PieceTransitions`, ``(L,)``."""
         lengths = self.grid.lengths / self.grid.breakpoints[-1]
         if self.grid.mode is None and np.ptp(lengths) <= ALIKE:  # rounded, some might go up and others down
             return np.zeros(lengths.size, dtype=int)
@@ -411,20 +411,20 @@ class Propagator:
 
     @cached_property
     def _modes(self) -> np.ndarray:
-        """Mode ``(q,)`` of every entry of `Steps`."""
+        """Mode ``(q,)`` of every entry of `PieceTransitions`."""
         modes = np.zeros(self.lengths.size, dtype=int)
         if self.grid.mode is not None:
             modes[self.which] = self.grid.mode
         return modes
 
     @cached_property
-    def laws(self) -> Parts | None:
+    def laws(self) -> ParameterParts | None:
         """Law of a system that changes with time as a function of its parameters, on parts of their box. ``None`` where
         the state is an affine function of the parameters, or where there are none."""
         return None if self.system.powers is None else law_of(self.system)
 
     @property
-    def law(self) -> Expansion | Parts:
+    def law(self) -> Expansion | ParameterParts:
         """Law of a system that changes with time, known or with parameters."""
         law = self.expansion if self.laws is None else self.laws
         assert law is not None
@@ -432,7 +432,7 @@ class Propagator:
 
     def on_cell(self, low: Array, high: Array) -> Propagator:
         """Return the propagator of all coefficients of the state on a cell ``[low, high]`` of parameters
-        (`Parts.on_cell`)."""
+        (`ParameterParts.on_cell`)."""
         assert self.laws is not None
         return Propagator(self.system, self.grid, given=self.laws.on_cell(low, high))
 
@@ -442,7 +442,7 @@ class Propagator:
         return Propagator(self.system, self.grid, given=self.laws.at_point(parameter))
 
     @shaped
-    def steps(self, parameters: Float[Array, "v nu"]) -> Steps:
+    def steps(self, parameters: Float[Array, "v nu"]) -> PieceTransitions:
         """Return the matrices and the transitions over whole pieces at parameters ``(v, nu)``; remembered for the last
         few calls."""
         # no parameters: any number of rows has the same bytes
@@ -456,7 +456,7 @@ class Propagator:
                 *(np.concatenate([matrices[index] for matrices in by_mode], axis=2) for index in (1, 2)),
             )
             Phi, Gamma = self._compute_transitions(A, self._modes, self.lengths)
-            remember(self._steps, key, Steps(A, B, E, Phi, Gamma, self._modes), STEPS_KEPT)
+            remember(self._steps, key, PieceTransitions(A, B, E, Phi, Gamma, self._modes), STEPS_KEPT)
         return self._steps[key]
 
     def _compute_transitions(self, A: Array, modes: np.ndarray, durations: Array) -> tuple[Array, Array]:
@@ -536,10 +536,10 @@ class Propagator:
         parts; 0 for another system."""
         return max((expansion.slack for expansion in self.law.expansions), default=0.0) if self.system.varies else 0.0
 
-    def _compute_varying_steps(self, parameters: Array) -> Steps:
-        """Return the `Steps` of a system that changes with time, whose pieces are modes. ``Gamma`` is the length of a
-        piece. ``B`` and ``E`` of a mode are the response of the state to an input on the piece, divided by its
-        length."""
+    def _compute_varying_steps(self, parameters: Array) -> PieceTransitions:
+        """Return the `PieceTransitions` of a system that changes with time, whose pieces are modes. ``Gamma`` is the
+        length of a piece. ``B`` and ``E`` of a mode are the response of the state to an input on the piece, divided by
+        its length."""
         points = parameters if self.laws is not None else parameters[:1]
         count, pieces, breaks, lengths = len(points), self.grid.pieces, self.grid.breakpoints, self.grid.lengths
         state, input_response = self.law.over(breaks[:-1], breaks[1:], points)
@@ -548,7 +548,7 @@ class Propagator:
         Gamma = np.broadcast_to(np.eye(d) * lengths[:, None, None], (count, pieces, d, d))
         rates = (input_response / lengths[:, None, None]).swapaxes(1, 2)
         B, E = (np.ascontiguousarray(columns).reshape(count, d, -1) for columns in (rates[..., :m], rates[..., m:]))
-        return Steps(A, B, E, state, Gamma, self._modes)
+        return PieceTransitions(A, B, E, state, Gamma, self._modes)
 
     def _compute_varying_adjoint(
         self, times: Array, directions: Array, parameters: Array
@@ -615,10 +615,10 @@ class Propagator:
 
     def _compute_weights_by_piece(
         self, times: Array, directions: Array, parameters: Array, drives: bool
-    ) -> tuple[Array, Array, Steps, np.ndarray]:
+    ) -> tuple[Array, Array, PieceTransitions, np.ndarray]:
         """Return the weights of functionals on the initial state, ``(k, d)``, and on every input on every piece, ``(k,
-        L, m + mw)``; with ``drives`` instead on the forcing of every piece, ``(k, L, d)``. The `Steps` at the distinct
-        parameters, and the index of each parameter among them, are returned too."""
+        L, m + mw)``; with ``drives`` instead on the forcing of every piece, ``(k, L, d)``. Return the
+        `PieceTransitions` at the distinct parameters, and the index of each parameter among them, too."""
         unique, indices = unique_rows(parameters)
         steps, pieces = self.steps(unique), self.grid.locate(times)
         order = np.argsort(-pieces, kind="stable")
@@ -659,7 +659,7 @@ class Propagator:
         return Stretches.of(self.which, steps.Gamma[0] @ steps.inputs[0, self._modes], steps.Phi[0])
 
     def _propagate_within_pieces(
-        self, steps: Steps, which: np.ndarray, pieces: np.ndarray, rows: Array, within: Array
+        self, steps: PieceTransitions, which: np.ndarray, pieces: np.ndarray, rows: Array, within: Array
     ) -> tuple[Array, Array]:
         """Return ``c'e^{A r}`` and ``c'Gamma(r)``, ``(k, d)`` each, of ``rows (k, d)`` over parts ``within (k,)`` of
         their pieces. No matrix is made for a time where no parameter is uncertain."""
@@ -719,7 +719,9 @@ class Propagator:
         steps = self.steps(np.zeros((1, 0)))
         return Impulses(self, np.concatenate([steps.B[0], steps.E[0]], axis=1))
 
-    def _propagate_within_equal_pieces(self, steps: Steps, rows: Array, within: Array) -> tuple[Array, Array]:
+    def _propagate_within_equal_pieces(
+        self, steps: PieceTransitions, rows: Array, within: Array
+    ) -> tuple[Array, Array]:
         """Return ``c'e^{A r}`` and ``c'Gamma(r)`` of ``rows (k, d)`` over parts ``within (k,)`` of equal pieces of a
         known system, ``(k, d)`` each."""
         length, tolerance = float(self.lengths[0]), STEP * float(self.grid.breakpoints[-1])
@@ -761,7 +763,7 @@ class Propagator:
         """True where all pieces of the grid are equally long and of one mode."""
         return bool(self.lengths.size == 1) and not self.grid.varying
 
-    def block(self, steps: Steps) -> int:
+    def block(self, steps: PieceTransitions) -> int:
         """Return the number of equal pieces, a power of two, that are taken together where the states of many pieces
         are asked for; 1 for none. The system moves little over a block, so that the response to the inputs of a block
         alone is not much larger than the states."""
@@ -807,7 +809,7 @@ class Propagator:
         """Transitions over 1, 2, 4, ... pieces, ``(q, d, d)``; for a known system and equal pieces."""
         return self.flows(2.0 ** np.arange(self.grid.pieces.bit_length()) * self.lengths[0])[0]
 
-    def leaps_of(self, steps: Steps, count: int) -> list[Array]:
+    def leaps_of(self, steps: PieceTransitions, count: int) -> list[Array]:
         """Return the transposed transitions ``(v, d, d)`` over 1, 2, 4, ... equal pieces, ``count`` of them."""
         if self.system.parameters is None and steps.A.shape[:2] == (1, 1):
             return [leap.T[None] for leap in self.leaps[:count]]
@@ -834,7 +836,7 @@ class Propagator:
 
 
 @dataclass(frozen=True, eq=False)
-class Outputs:
+class OutputResponse:
     """Outputs ``H x(t)`` at many ``times (T,)``, for rows ``H (r, d)``, at parameters ``points (v, nu)``, under any
     control.
 
@@ -1009,7 +1011,7 @@ class Response:
         return self if system is self.system else Response(system, self.grid, self.initial_state)
 
     @shaped
-    def steps(self, parameters: Float[Array, "v nu"]) -> Steps:
+    def steps(self, parameters: Float[Array, "v nu"]) -> PieceTransitions:
         """Return the matrices and the transitions over whole pieces at parameters ``(v, nu)`` (`Propagator.steps`)."""
         return self.propagator.steps(parameters)
 
@@ -1105,7 +1107,7 @@ class Response:
     def _node_cache(self) -> dict[bytes, Array]:
         return {}
 
-    def _propagate_in_blocks(self, path: Array, steps: Steps, block: int) -> Array:
+    def _propagate_in_blocks(self, path: Array, steps: PieceTransitions, block: int) -> Array:
         """Solve ``x_{k+1} = Phi x_k + f_k`` in blocks, from a ``path (v, L+1, d)`` that holds ``x_0, f_0, f_1, ...``;
         return the path of the states.
 

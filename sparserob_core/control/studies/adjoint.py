@@ -178,7 +178,7 @@ def tidy(times: Array, horizon: float) -> Array:
 
 
 @dataclass(frozen=True, eq=False)
-class Pushes:
+class AdjointDisturbances:
     """Disturbances ``w(t)`` in a set ``bound``.
 
     They are constant between the times ``changes (M + 1,)`` or, without these, measurable. They enter by the columns
@@ -206,7 +206,7 @@ class WorstRow:
         Ends of the pieces.
     drives : ndarray, shape (q', L)
         Known values of the first inputs on the pieces.
-    pushes : Pushes or None
+    pushes : AdjointDisturbances or None
         Disturbances, which are the other inputs.
     beside : tuple of ndarray, optional
         Breakpoints of the control, and ``g'u`` on the pieces between them.
@@ -219,7 +219,7 @@ class WorstRow:
     begun: ConvexSet | None
     grid: Array
     drives: Array
-    pushes: Pushes | None
+    pushes: AdjointDisturbances | None
     beside: tuple[Array, Array] | None = None
     moving: tuple[Array, Array] | None = None
 

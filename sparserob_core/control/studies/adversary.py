@@ -14,7 +14,7 @@ import numpy as np
 from sparserob_core.brief import brief
 from sparserob_core.control.constraints.state import StateConstraint
 from sparserob_core.control.enclosures.flows import Leaps
-from sparserob_core.control.reach.functional import WorstCase
+from sparserob_core.control.reach.functional import WorstFunctionals
 from sparserob_core.control.reach.varying_motion import VaryingMotion
 from sparserob_core.control.response.response import Response
 from sparserob_core.control.transcription.record import Feedback, Transcription
@@ -139,7 +139,9 @@ def _find_in_closed_loop(constraint: StateConstraint, decision: Array, loop: Clo
     )
 
 
-def worst_signal(functionals: WorstCase, time: float, direction: Array, parameter: Array) -> tuple[Array, Array | None]:
+def worst_signal(
+    functionals: WorstFunctionals, time: float, direction: Array, parameter: Array
+) -> tuple[Array, Array | None]:
     """``breakpoints (L + 1,)`` and a disturbance ``(mw, L)`` that maximises ``direction'x(time)``; ``None`` without
     disturbances.
 
@@ -175,7 +177,7 @@ def worst_signal(functionals: WorstCase, time: float, direction: Array, paramete
 
 
 def pushed_by(
-    functionals: WorstCase, time: float, direction: Array, parameter: Array, signal: tuple[Array, Array]
+    functionals: WorstFunctionals, time: float, direction: Array, parameter: Array, signal: tuple[Array, Array]
 ) -> float:
     """Return the contribution of a disturbance to ``direction'x(time)``.
 

@@ -85,7 +85,7 @@ class CausalBound:
 
 
 @final
-class Limits:
+class CausalLimits:
     """Limits at which a search ends.
 
     Parameters
@@ -107,11 +107,13 @@ class Limits:
         self.ended: Ended = "settled"
 
     @staticmethod
-    def of(charge: Charge, results: Sequence[Result], columns: int, passed: Callable[[], bool]) -> Limits:
+    def of(charge: Charge, results: Sequence[Result], columns: int, passed: Callable[[], bool]) -> CausalLimits:
         """Return limits that are proportional to the work for the policy's own ``results``, with ``columns`` of their
         programs."""
         programs = sum(result.counts.get("relaxed_programs", 0) for result in results)
-        return Limits(charge.causal_signals, WORK + programs * (EACH + PER * columns), charge.causal_seconds, passed)
+        return CausalLimits(
+            charge.causal_signals, WORK + programs * (EACH + PER * columns), charge.causal_seconds, passed
+        )
 
     @property
     def seconds(self) -> float:
@@ -186,7 +188,7 @@ class CausalSearch:
         own = [at for name, at, _ in active if name == one.name and one.start <= at <= one.stop]
         return np.unique([one.start, one.stop, *own, *inside[(inside > one.start) & (inside < one.stop)]])
 
-    def tree(self, limits: Limits, highest: float | None = None) -> Tree:
+    def tree(self, limits: CausalLimits, highest: float | None = None) -> Tree:
         """A tree of the nominal signal and those that the policy's bound rests on, of which a control knows all that
         the disturbance does until the last measurement that is known: outputs tell no more."""
         points, measured, s = self.model.control.breakpoints, self.model.problem.measurements, self.sampled
@@ -198,7 +200,9 @@ class CausalSearch:
             OfDisturbances(N, self.spread, width, known_counts, block_counts), signals, limits, highest
         )
 
-    def hiding(self, limits: Limits, beside: tuple[Tree, Grown] | None, highest: float | None = None) -> Tree | None:
+    def hiding(
+        self, limits: CausalLimits, beside: tuple[Tree, Grown] | None, highest: float | None = None
+    ) -> Tree | None:
         """A tree of signals that a noise hides, with those that have a multiplier in one ``beside`` it; ``None`` where
         nothing is hidden. Noise and initial states stay what they are under all factors up to the ``highest``."""
         points, measured, s = self.model.control.breakpoints, self.model.problem.measurements, self.sampled
@@ -212,7 +216,9 @@ class CausalSearch:
         signals = [beside[0].signals[index] for index in np.unique(beside[1].signals)] if beside is not None else []
         return self._build_tree(knowledge, signals, limits, highest)
 
-    def _build_tree(self, knowledge: Knowledge, known: list[Array], limits: Limits, highest: float | None) -> Tree:
+    def _build_tree(
+        self, knowledge: Knowledge, known: list[Array], limits: CausalLimits, highest: float | None
+    ) -> Tree:
         problem, feedback = self.model.problem, self.model.answering
         limits.again()
         prices = problem.prices(self.model.control.breakpoints)
@@ -225,7 +231,7 @@ class CausalSearch:
         limits.begin(tree)
         return tree
 
-    def least_cost(self, cost: float, limits: Limits, hides: bool = True) -> tuple[Tree, Grown, bool] | None:
+    def least_cost(self, cost: float, limits: CausalLimits, hides: bool = True) -> tuple[Tree, Grown, bool] | None:
         """The tree that was found, its multipliers, and whether they prove that no causal policy exists; ``cost``: of
         the policy, an upper bound of what the tree can prove, infinite where none is known. First as if no noise hid
         anything, and then, where it ``hides``, with what that took to prove."""
@@ -238,7 +244,7 @@ class CausalSearch:
             return better
         return best
 
-    def _search_least_cost(self, tree: Tree, cost: float, limits: Limits) -> tuple[Tree, Grown, bool] | None:
+    def _search_least_cost(self, tree: Tree, cost: float, limits: CausalLimits) -> tuple[Tree, Grown, bool] | None:
         best, idle = tree.least(), 0
         while best is not None and idle < len(ANSWERED) and not limits.over(tree, idle):
             aim = cost if np.isfinite(cost) else np.inf
@@ -261,7 +267,7 @@ class CausalSearch:
         multipliers = tree.relaxed()
         return multipliers if multipliers is not None and multipliers.value > NONE else None
 
-    def largest_factor(self, highest: float, limits: Limits) -> tuple[Tree, Grown] | None:
+    def largest_factor(self, highest: float, limits: CausalLimits) -> tuple[Tree, Grown] | None:
         """The largest factor of all deviations for which the tree is feasible, with its multipliers. Of outputs with a
         noise first as if it hid nothing, and then below the factor that was found, for which it hides its share."""
         best = self._search_largest_factor(self.tree(limits, highest), limits)
@@ -276,7 +282,7 @@ class CausalSearch:
                 break
         return best
 
-    def _search_largest_factor(self, tree: Tree, limits: Limits) -> tuple[Tree, Grown] | None:
+    def _search_largest_factor(self, tree: Tree, limits: CausalLimits) -> tuple[Tree, Grown] | None:
         best, idle = tree.least(), 0
         while best is not None and idle < len(ANSWERED) and not limits.over(tree, idle):
             if not self._grow(tree, best, limits.room(tree), idle):

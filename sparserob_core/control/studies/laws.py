@@ -13,7 +13,7 @@ import numpy as np
 from sparserob_core.control.constraints.state import StateConstraint
 from sparserob_core.control.enclosures.dependence import Dependence
 from sparserob_core.control.problem.problem import OptimalControlProblem
-from sparserob_core.control.reach.functional import WorstCase
+from sparserob_core.control.reach.functional import WorstFunctionals
 from sparserob_core.control.response.disturbance import DisturbanceModel
 from sparserob_core.control.response.parameters import ParameterIndex
 from sparserob_core.control.studies.simulate import worst_errors
@@ -36,7 +36,7 @@ class Uncertainty:
 
     Parameters
     ----------
-    functionals : WorstCase
+    functionals : WorstFunctionals
         Functionals of the system.
     parameters : ParameterIndex
         Set of the parameters.
@@ -47,7 +47,7 @@ class Uncertainty:
         known to matter.
     """
 
-    functionals: WorstCase
+    functionals: WorstFunctionals
     parameters: ParameterIndex
     constraints: Sequence[StateConstraint]
     worst: tuple[Array, Array, Array]

@@ -18,7 +18,7 @@ THIN = 1e-12  # of the box, a distance that is rounding
 
 @final
 @dataclass(frozen=True, eq=False)
-class Support:
+class SupportBound:
     """Support of a planar set in one direction: an upper bound, and the best point that was found.
 
     Parameters
@@ -39,7 +39,9 @@ class Support:
     proven: bool = False
 
 
-def sandwich(ask: Callable[[Array], Support], known: Sequence[Support], count: int, gap: float) -> list[Support]:
+def sandwich(
+    ask: Callable[[Array], SupportBound], known: Sequence[SupportBound], count: int, gap: float
+) -> list[SupportBound]:
     """Supports of a planar set in up to ``count`` directions, in the order of their angles, fewer when the polygons
     differ by a share of at most ``gap`` in area.
 
@@ -62,14 +64,14 @@ def sandwich(ask: Callable[[Array], Support], known: Sequence[Support], count: i
     return supports
 
 
-def inner_polygon(supports: Sequence[Support]) -> Array:
+def inner_polygon(supports: Sequence[SupportBound]) -> Array:
     """The convex hull of the proven points, its vertices ``(k, 2)`` anticlockwise; one or two points where it has no
     interior."""
     points = [s.point for s in supports if s.proven and s.point is not None]
     return convex_hull(np.array(points).reshape(-1, 2))
 
 
-def outer_polygon(supports: Sequence[Support]) -> Array:
+def outer_polygon(supports: Sequence[SupportBound]) -> Array:
     """The intersection of the half-planes, its vertices ``(k, 2)`` anticlockwise; the four axis directions must be
     among them."""
     axes = [min(s.bound for s in supports if float(s.direction @ axis) > 1.0 - PARALLEL) for axis in AXES]
@@ -103,11 +105,11 @@ def inside(polygon: Array, points: Array) -> np.ndarray:
     return np.asarray((edges[:, 0] * offsets[..., 1] - edges[:, 1] * offsets[..., 0] >= 0.0).all(axis=1))
 
 
-def _compute_angle(support: Support) -> float:
+def _compute_angle(support: SupportBound) -> float:
     return float(np.arctan2(support.direction[1], support.direction[0]))
 
 
-def _measure_wedge(one: Support, other: Support) -> tuple[float, Array | None]:
+def _measure_wedge(one: SupportBound, other: SupportBound) -> tuple[float, Array | None]:
     """The area in which the boundary between two neighbouring directions is still to be found, and the direction that
     would cut it."""
     if one.point is None or other.point is None:
@@ -132,7 +134,7 @@ def _measure_wedge(one: Support, other: Support) -> tuple[float, Array | None]:
     return (area, normal) if within else (0.0, None)
 
 
-def _compute_bisector(one: Support, other: Support) -> Array:
+def _compute_bisector(one: SupportBound, other: SupportBound) -> Array:
     middle = one.direction + other.direction
     return np.asarray(middle / np.linalg.norm(middle))
 

@@ -50,7 +50,7 @@ def finer(grid: TimeGrid, times: Array) -> TimeGrid:
     return grid.refined(times)
 
 
-class Motion(Protocol):
+class PieceMotion(Protocol):
     """Motion of a system on a piece with constant inputs, in internal coordinates of the system."""
 
     def enter(self, states: Array) -> Array:
@@ -100,7 +100,7 @@ def walk(
         yield states
 
 
-def _choose_motion(response: Response, parameters: Array) -> Motion:
+def _choose_motion(response: Response, parameters: Array) -> PieceMotion:
     """Return the motion that takes the least work; ``parameters (n, nu)`` are those of the trajectories."""
     grid, system = response.grid, response.system
     if grid.varying:

@@ -15,9 +15,9 @@ from sparserob_core.control.problem.names import measured_in
 from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.control.problem.terms.repeat import Return
 from sparserob_core.control.problem.terms.windows import MixedConstraint, PathConstraint
-from sparserob_core.control.reach.functional import WorstCase
+from sparserob_core.control.reach.functional import WorstFunctionals
 from sparserob_core.control.sets.sets import Polytope
-from sparserob_core.control.studies.adjoint import Adjoint, Pushes, WorstRow, tidy, within
+from sparserob_core.control.studies.adjoint import Adjoint, AdjointDisturbances, WorstRow, tidy, within
 from sparserob_core.control.studies.adversary import pushed_by, worst_signal
 from sparserob_core.control.transcription.grid import grid_of
 from sparserob_core.control.transcription.transcribe import prepare, windows_of
@@ -211,7 +211,7 @@ def followed(
         grid.inputs(pieces),
         None
         if problem.disturbance is None
-        else Pushes(problem.disturbance, slice(B.shape[1], inputs.shape[1]), changes),
+        else AdjointDisturbances(problem.disturbance, slice(B.shape[1], inputs.shape[1]), changes),
         (control.breakpoints, gains @ pieces) if gains.size else None,
         reference,
     )
@@ -349,7 +349,7 @@ def _bound_by_program(
     )
 
 
-def _sum_magnitudes(functionals: WorstCase, theta: Array, state: Array, times: Array, parameter: Array) -> float:
+def _sum_magnitudes(functionals: WorstFunctionals, theta: Array, state: Array, times: Array, parameter: Array) -> float:
     """The largest sum of the sizes of what makes a row ``state (d,)`` beside the disturbance, at ``times (k,)`` and
     ``parameter (1, nu)``: so much is rounded where the row itself is near 0."""
     at = times, np.tile(state, (times.size, 1)), np.repeat(parameter, times.size, axis=0)

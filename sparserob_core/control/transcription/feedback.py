@@ -30,7 +30,7 @@ from sparserob_core.control.reach.sizes import widths
 from sparserob_core.control.transcription.own_units import added_up, constraint_sides, extent, fixed, units_of_steps
 from sparserob_core.control.transcription.program import EQUALS, ranges, transcribed
 from sparserob_core.control.transcription.provable import hindrance
-from sparserob_core.control.transcription.record import Acting, Feedback, Part, Posed, Transcription
+from sparserob_core.control.transcription.record import Acting, Feedback, Posed, ProgramPart, Transcription
 from sparserob_core.control.transcription.telling import Telling
 from sparserob_core.errors import InputError
 from sparserob_core.shapes import read_only
@@ -74,7 +74,7 @@ class Seen:
 
 @final
 @dataclass(frozen=True, eq=False)
-class Answering(Acting):
+class FeedbackModel(Acting):
     """Control that answers measurements by a ``policy``. ``mask (K, K)`` says which piece answers which measurement,
     and ``charge`` says which cost the policy is chosen by. The constraints and terminal equalities hold for every
     deviation, whether it is measured or not."""
@@ -92,7 +92,7 @@ class Answering(Acting):
         """Policy by which the control answers measurements."""
         return self.policy
 
-    def in_own(self, theirs: Posed, own: Posed, units: Units) -> Answering:
+    def in_own(self, theirs: Posed, own: Posed, units: Units) -> FeedbackModel:
         """Return this control with its measurements in the problem's ``own`` units."""
         measurements = self.first[1] if own is self.first[0] else _build_measurements(self.mask, theirs, own, units)[0]
         return replace(self, seen=measurements)
@@ -139,7 +139,7 @@ class Answering(Acting):
         charged = {"nominal": peaks[:0], "peak": peaks, "worst": np.full(1, units.cost)}[self.charge.cost]
         return np.concatenate([units.controls[answers.channel] / deviations[answers.entry], charged])
 
-    def part(self, posed: Posed) -> Part:
+    def part(self, posed: Posed) -> ProgramPart:
         """Return the families that hold for every deviation, the gains with their bounds, and the variables that bound
         the charge."""
         functionals, problem, pieces = posed.functionals, posed.problem, posed.control.pieces
@@ -198,7 +198,7 @@ class Answering(Acting):
             lower, upper = np.append(lower, 0.0), np.append(upper, 2.0 * largest)
         elif charge.among == "peak" and problem.cost.is_linear:
             among = (transcribed(posed, peak).program, first)
-        return Part(
+        return ProgramPart(
             families=[replace(family, hindrance=lambda low, high: hindrance(system, horizon)) for family in families],
             lower=lower,
             upper=upper,
@@ -214,7 +214,7 @@ class Answering(Acting):
         )
 
 
-def answering(policy: Policy, mask: np.ndarray, posed: Posed, own: Posed, units: Units) -> Answering:
+def answering(policy: Policy, mask: np.ndarray, posed: Posed, own: Posed, units: Units) -> FeedbackModel:
     """Return the control that acts by a policy in the user's units, from its measurements in the problem's ``own``
     units."""
     scaled, outputs = _build_measurements(mask, posed, own, units)
@@ -227,7 +227,7 @@ def answering(policy: Policy, mask: np.ndarray, posed: Posed, own: Posed, units:
         fixed=_split_equalities(*fixed(posed.problem)),
         still=scaled.still,
     )
-    return Answering(policy, mask, policy.charge, measurements, (own, scaled))
+    return FeedbackModel(policy, mask, policy.charge, measurements, (own, scaled))
 
 
 def _build_measurements(mask: np.ndarray, theirs: Posed, own: Posed, units: Units) -> tuple[Seen, Array]:

@@ -25,14 +25,14 @@ class Quadratics(TypedDict, total=False):
     largest: float
 
 
-class Objective(Quadratics):
+class CostFields(Quadratics):
     """Fields of a program that hold the whole cost."""
 
     weights: Array
     blocks: Array | None
 
 
-def objective(problem: OptimalControlProblem, dictionary: Dictionary, images: int, variables: int) -> Objective:
+def objective(problem: OptimalControlProblem, dictionary: Dictionary, images: int, variables: int) -> CostFields:
     """Return the cost of a program with so many ``images`` and ``variables``. The images begin with the values of the
     control on its pieces, ``(m K,)``, and the variables with its coefficients, ``(m N,)``; all other entries cost
     nothing."""

@@ -9,10 +9,10 @@ import numpy as np
 from sparserob_core.control.constraints.state import StateConstraint
 from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.control.problem.units import Units, power_of_two
-from sparserob_core.control.reach.functional import WorstCase
+from sparserob_core.control.reach.functional import WorstFunctionals
 from sparserob_core.control.reach.sizes import widths
 from sparserob_core.control.response.parameters import ParameterIndex
-from sparserob_core.control.response.reference import Moving
+from sparserob_core.control.response.reference import MovingReference
 from sparserob_core.control.sets.directions import sampled
 from sparserob_core.sip.convex_set import Array, ConvexSet
 
@@ -68,7 +68,7 @@ def rough_units(problem: OptimalControlProblem) -> Units:
     )
 
 
-def own_units(problem: OptimalControlProblem, rough: Units, functionals: WorstCase, control: ConvexSet) -> Units:
+def own_units(problem: OptimalControlProblem, rough: Units, functionals: WorstFunctionals, control: ConvexSet) -> Units:
     """Return the units of a problem, from the largest distance of its states from 0. ``functionals`` and the set of the
     ``control`` are those of the problem in rough units."""
     axes, parameters = np.eye(problem.system.states), ParameterIndex(functionals.response.system.parameters)
@@ -115,7 +115,7 @@ def row_units(constraint: StateConstraint, control: ConvexSet) -> Array:
     times = window_times(functionals, constraint.start, constraint.stop)
     reference = constraint.reference
     if sides is not None:
-        offsets = Moving(reference, sides[0]).at(times) if reference.moves else None
+        offsets = MovingReference(reference, sides[0]).at(times) if reference.moves else None
         reach_and_sums = reaches(
             functionals, constraint.parameters, control, sides[0], times, offsets, constraint.gains
         )
@@ -194,7 +194,7 @@ def units_of_steps(step: ConvexSet, H: Array, h: Array, control: ConvexSet) -> A
 
 
 def reaches(
-    functionals: WorstCase,
+    functionals: WorstFunctionals,
     parameters: ParameterIndex,
     control: ConvexSet,
     H: Array,
@@ -210,7 +210,7 @@ def reaches(
 
     Parameters
     ----------
-    functionals : WorstCase
+    functionals : WorstFunctionals
         The worst-case functionals of the problem.
     parameters : ParameterIndex
         The set of the parameters.
@@ -269,7 +269,7 @@ def reaches(
     return reach, sums.max(axis=(0, 1))
 
 
-def _estimate_uncontrolled_reach(functionals: WorstCase, parameters: ParameterIndex) -> float:
+def _estimate_uncontrolled_reach(functionals: WorstFunctionals, parameters: ParameterIndex) -> float:
     """Estimate the largest distance of any state from 0 over the whole horizon, in own units, due to the initial state,
     drift, disturbance and one coupling. Amplification by an instability is left out, and so is the control, which need
     not act."""
@@ -299,7 +299,7 @@ def fixed(problem: OptimalControlProblem) -> tuple[Array, Array]:
     return np.eye(problem.system.states)[states], values
 
 
-def added_up(problem: OptimalControlProblem, functionals: WorstCase) -> Array:
+def added_up(problem: OptimalControlProblem, functionals: WorstFunctionals) -> Array:
     """Return the largest sums ``(e,)`` of absolute numbers from which the fixed states are computed."""
     H, no_parameters = fixed(problem)[0], ParameterIndex(None)
     if not H.size:
@@ -325,7 +325,7 @@ def extent(convex: ConvexSet) -> Array:
     return convex.reach(np.eye(convex.dimension))
 
 
-def window_times(functionals: WorstCase, start: float, stop: float) -> Array:
+def window_times(functionals: WorstFunctionals, start: float, stop: float) -> Array:
     """Return the ends of a window and some breakpoints between them."""
     breaks = functionals.response.grid.breakpoints
     inside = breaks[(breaks > start) & (breaks < stop)]

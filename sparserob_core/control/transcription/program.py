@@ -17,7 +17,7 @@ from sparserob_core.control.enclosures.taylor import TaylorSpace
 from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.control.problem.units import Units, power_of_two, ratios
-from sparserob_core.control.reach.functional import WorstCase
+from sparserob_core.control.reach.functional import WorstFunctionals
 from sparserob_core.control.reach.sizes import nominal_sizes
 from sparserob_core.control.response.disturbance import DisturbanceModel
 from sparserob_core.control.response.parameters import ParameterIndex
@@ -31,7 +31,7 @@ from sparserob_core.control.transcription.own_units import (
     units_of_steps,
 )
 from sparserob_core.control.transcription.provable import hindrance
-from sparserob_core.control.transcription.record import Acting, Part, Posed, RowUnits, Transcription
+from sparserob_core.control.transcription.record import Acting, Posed, ProgramPart, RowUnits, Transcription
 from sparserob_core.control.transcription.steps import Steps, paired
 from sparserob_core.control.transcription.telling import Telling
 from sparserob_core.errors import InputError, NotEnclosable
@@ -48,7 +48,7 @@ IDLE = 1e-15  # of the numbers that are added up, an entry of a row that is roun
 
 @final
 @dataclass(frozen=True, eq=False)
-class OpenLoop(Acting):
+class OpenLoopModel(Acting):
     """Open-loop control, which answers no measurement: its families have rows of the decision."""
 
     formulation: Formulation = "reduced"
@@ -57,11 +57,11 @@ class OpenLoop(Acting):
     def answers_by(self) -> None:
         """``None``: no policy answers measurements."""
 
-    def in_own(self, theirs: Posed, own: Posed, units: Units) -> OpenLoop:
+    def in_own(self, theirs: Posed, own: Posed, units: Units) -> OpenLoopModel:
         """Return this control, which is the same in all units since it uses no measurements."""
         return self
 
-    def part(self, posed: Posed) -> Part:
+    def part(self, posed: Posed) -> ProgramPart:
         """Return the families of the constraints, and of the sets of controls without flat sides."""
         problem, control, functionals = posed.problem, posed.control, posed.functionals
         families = [family_of(constraint) for constraint in posed.constraints]
@@ -71,7 +71,7 @@ class OpenLoop(Acting):
                 families.append(ControlConstraint.of(name, convex, places, control, extra).family())
         if self.formulation == "literal":
             families = [family.literal or family for family in families]
-        return Part(families=families, activity=np.outer(problem.counts, control.lengths).ravel())
+        return ProgramPart(families=families, activity=np.outer(problem.counts, control.lengths).ravel())
 
     def from_state(self, model: Transcription, begun: Posed) -> Transcription:
         """Return the program of the same problem from another initial state. Everything that does not depend on this
@@ -91,7 +91,7 @@ class OpenLoop(Acting):
             b=b if b.size else None,
             errors=final_errors(begun) if b.size else None,
         )
-        return begun.became(OpenLoop(), program)
+        return begun.became(OpenLoopModel(), program)
 
     def free(self, model: Transcription) -> Transcription:
         """Return the program as it is: only the control itself has a cost."""
@@ -265,7 +265,7 @@ def _build_image(
 
 
 def _append_sizes(
-    S: csc_array | None, lower: Array, upper: Array, functionals: WorstCase
+    S: csc_array | None, lower: Array, upper: Array, functionals: WorstFunctionals
 ) -> tuple[csc_array, Array, Array]:
     """Return the images of `_build_image` for a decision that continues with a bound ``a`` of the size of every value
     ``s`` of the control. Further images hold ``0 <= a - s`` and ``0 <= a + s``. Both are at most twice the largest
@@ -307,7 +307,7 @@ def _build_scaled_equalities(posed: Posed) -> tuple[Array, Array]:
 
 
 def _build_equalities(
-    problem: OptimalControlProblem, functionals: WorstCase, parameters: ParameterIndex
+    problem: OptimalControlProblem, functionals: WorstFunctionals, parameters: ParameterIndex
 ) -> tuple[Array, Array]:
     """Return the terminal equalities as rows of the decision. Raise `InputError` where the uncertainty reaches a fixed
     state, since no control could then satisfy the equality."""

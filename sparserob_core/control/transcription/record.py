@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING, final
 import numpy as np
 
 from sparserob_core.brief import noun
-from sparserob_core.control.constraints.explanation import Source, TimedExplanation, in_numbers
+from sparserob_core.control.constraints.explanation import ConstraintSource, TimedExplanation, in_numbers
 from sparserob_core.control.constraints.state import StateConstraint
 from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.problem.problem import OptimalControlProblem
-from sparserob_core.control.reach.functional import WorstCase
+from sparserob_core.control.reach.functional import WorstFunctionals
 from sparserob_core.control.response.parameters import ParameterIndex
 from sparserob_core.control.response.response import Response
 from sparserob_core.sip.convex_set import Array, ConvexSet
@@ -72,7 +72,7 @@ class Posed:
     held: OptimalControlProblem
     control: Dictionary
     disturbance: Dictionary
-    functionals: WorstCase
+    functionals: WorstFunctionals
     parameters: ParameterIndex
     constraints: tuple[StateConstraint, ...]
     rows: RowUnits | None = None
@@ -90,7 +90,7 @@ class Posed:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Part:
+class ProgramPart:
     """Part of a program that depends on how its control acts: the ``families``, and further entries of the decision
     after the nominal ones, with their bounds ``lower`` and ``upper (k,)``.
 
@@ -127,7 +127,7 @@ class Acting(ABC):
         """Return this law in the problem's ``own`` units."""
 
     @abstractmethod
-    def part(self, posed: Posed) -> Part:
+    def part(self, posed: Posed) -> ProgramPart:
         """Return the part of the program of a posed problem, in these units, that depends on this law."""
 
     @abstractmethod
@@ -235,5 +235,5 @@ class Transcription(Posed):
     def constraint(self, family: ConstraintFamily) -> StateConstraint | None:
         """Return the constraint on the state from which a family was made, in any formulation, also for an equality
         that must hold for every deviation; ``None`` for a constraint on the control."""
-        source = family.source.of_state if isinstance(family.source, Source) else None
+        source = family.source.of_state if isinstance(family.source, ConstraintSource) else None
         return source if isinstance(source, StateConstraint) else None

@@ -7,7 +7,7 @@ from typing import final
 
 import numpy as np
 
-from sparserob_core.control.constraints.explanation import Source
+from sparserob_core.control.constraints.explanation import ConstraintSource
 from sparserob_core.control.problem.units import Units, ratios
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.program import ConstraintFamily, Explanation
@@ -30,7 +30,7 @@ class Telling:
     def family(self, own: ConstraintFamily, theirs: ConstraintFamily) -> ConstraintFamily:
         """Return a family in own units, in all its forms, with the explanations of the user's family."""
         source, user = own.source, theirs.source
-        assert isinstance(source, Source) and isinstance(user, Source)
+        assert isinstance(source, ConstraintSource) and isinstance(user, ConstraintSource)
         (normals, _), (own_normals, coordinates) = user.normals_in(self.units), source.normals_in(self.units)
         rows, begins = ratios(normals, own_normals, coordinates), source.index_units(self.units)
 

@@ -16,7 +16,7 @@ from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.control.problem.representable import require_representable
 from sparserob_core.control.problem.terms.windows import MixedConstraint, PathConstraint
 from sparserob_core.control.problem.units import Units, ratios
-from sparserob_core.control.reach.functional import WorstCase
+from sparserob_core.control.reach.functional import WorstFunctionals
 from sparserob_core.control.response.disturbance import DisturbanceModel, disturbance_model
 from sparserob_core.control.response.parameters import ParameterIndex
 from sparserob_core.control.response.reference import Reference
@@ -28,7 +28,13 @@ from sparserob_core.control.transcription.own_units import (
     row_units,
     shortfall,
 )
-from sparserob_core.control.transcription.program import OpenLoop, held_nominally, held_units, transcribed, way_back
+from sparserob_core.control.transcription.program import (
+    OpenLoopModel,
+    held_nominally,
+    held_units,
+    transcribed,
+    way_back,
+)
 from sparserob_core.control.transcription.record import Acting, Posed, Transcription
 from sparserob_core.control.transcription.steps import refuse_without_steps
 from sparserob_core.control.transcription.terms.accumulated import accumulated
@@ -127,7 +133,7 @@ def prepare(
         nominal_problem = held_nominally(problem)
     posed = _pose_problem(problem, nominal_problem, control, disturbance)
     own = cache(lambda: _scale_to_own_units(posed))
-    acting: Acting = OpenLoop(formulation)
+    acting: Acting = OpenLoopModel(formulation)
     if policy is not None and mask.any():
         acting = feedback.answering(policy, mask, posed, *own())
     model = transcribed(posed, acting)
@@ -155,7 +161,7 @@ def _merge_disturbance_grids(
 
 def _build_functionals(
     problem: OptimalControlProblem, control: Dictionary, disturbance: Dictionary
-) -> tuple[WorstCase, ParameterIndex]:
+) -> tuple[WorstFunctionals, ParameterIndex]:
     system, grid = problem.system.forced, grid_of(problem, control.breakpoints, disturbance.breakpoints)
     model: DisturbanceModel | None = None
     if problem.disturbance is not None:
@@ -171,7 +177,9 @@ def _build_functionals(
         felt[list(problem.commanded)] = 0.0
         arguments = response, control.breakpoints, shares, felt
         execution = followed(VaryingExecution(*arguments)) if system.varies else Execution(*arguments)
-    functionals = WorstCase(response, control, model, names=problem.names, initial=initial_set, execution=execution)
+    functionals = WorstFunctionals(
+        response, control, model, names=problem.names, initial=initial_set, execution=execution
+    )
     return functionals, ParameterIndex(problem.system.parameters)
 
 
@@ -309,7 +317,7 @@ def from_state(model: Transcription, initial_state: Array) -> Transcription:
 
 
 def _build_state_constraints(
-    problem: OptimalControlProblem, functionals: WorstCase, parameters: ParameterIndex
+    problem: OptimalControlProblem, functionals: WorstFunctionals, parameters: ParameterIndex
 ) -> tuple[StateConstraint, ...]:
     """Return the path and terminal constraints in the form that the program uses; equalities are not among them."""
     constraints: list[StateConstraint] = []

@@ -12,7 +12,7 @@ import numpy as np
 from sparserob_core.arguments import share, whole
 from sparserob_core.errors import InputError
 from sparserob_core.experiment.benchmark.files import write
-from sparserob_core.experiment.benchmark.landscapes import SUITES, Landscape, landscapes
+from sparserob_core.experiment.benchmark.landscapes import SUITES, BenchmarkFunction, landscapes
 from sparserob_core.experiment.benchmark.searches import Benchmark, Search
 from sparserob_core.experiment.comparison.profiles import Instance, Profiles
 from sparserob_core.experiment.config.examples import shipped
@@ -81,7 +81,7 @@ def benchmark(
 
 
 def _build_benchmark(
-    every: Sequence[Landscape],
+    every: Sequence[BenchmarkFunction],
     names: Sequence[str],
     searches: Sequence[Search],
     budget: int,
@@ -119,7 +119,9 @@ def _build_benchmark(
     return Benchmark(profiles, searches, targets, budget)
 
 
-def _run_search(landscape: Landscape, name: str, maximiser: Maximiser, budget: int, seed: int, rules: Rules) -> Search:
+def _run_search(
+    landscape: BenchmarkFunction, name: str, maximiser: Maximiser, budget: int, seed: int, rules: Rules
+) -> Search:
     fresh = (landscape if landscape.fresh is None else landscape.fresh()).target
     inside = 0.0
 

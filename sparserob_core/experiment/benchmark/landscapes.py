@@ -27,7 +27,7 @@ SAMPLE = 1000  # uniform points whose median is where a search is said to begin
 
 @final
 @dataclass(frozen=True, eq=False)
-class Landscape:
+class BenchmarkFunction:
     """Function to be maximised, with its ``maximum``, and its number and instance in IOHprofiler.
 
     ``fresh`` makes the landscape anew, where the function remembers earlier evaluations.
@@ -39,7 +39,7 @@ class Landscape:
     number: int
     suite: str
     instance: int = 1
-    fresh: Callable[[], Landscape] | None = None
+    fresh: Callable[[], BenchmarkFunction] | None = None
 
     def begin(self, seed: int) -> float:
         """The median of the function at uniform points: what a search begins with."""
@@ -51,7 +51,7 @@ class Landscape:
         return float(np.median(values[np.isfinite(values)], axis=0)) if np.isfinite(values).any() else -np.inf
 
 
-def landscapes(suites: Sequence[str], configs: Sequence[Path], instance: int = 1) -> Iterator[Landscape]:
+def landscapes(suites: Sequence[str], configs: Sequence[Path], instance: int = 1) -> Iterator[BenchmarkFunction]:
     """The landscapes of the suites; ``configs`` for the suite ``g``. Raises `InputError` for an unknown suite, one that
     needs a package that is missing, and a config without a certified value."""
     for suite in suites:
@@ -68,7 +68,7 @@ def landscapes(suites: Sequence[str], configs: Sequence[Path], instance: int = 1
             yield landscape_of(config, 301 + number)
 
 
-def standard() -> Iterator[Landscape]:
+def standard() -> Iterator[BenchmarkFunction]:
     """Six functions with their maxima off the centre of the box, where a method that begins there would meet them by
     luck."""
     shift = np.array([0.7123, -1.3391, 1.0417])
@@ -80,7 +80,7 @@ def standard() -> Iterator[Landscape]:
     yield _make_landscape("rosenbrock", functions.rosenbrock, _make_cube(2.048, 5), 106)
 
 
-def classic() -> Iterator[Landscape]:
+def classic() -> Iterator[BenchmarkFunction]:
     """Twelve functions more, in two to twenty coordinates: each of them defeats some searches that are good
     elsewhere."""
     shift = np.random.default_rng(0).uniform(-0.6, 0.6, 20)
@@ -110,11 +110,11 @@ def _make_landscape(
     number: int,
     maximum: float = 0.0,
     suite: str = "standard",
-) -> Landscape:
-    return Landscape(name, Target(function, box), maximum, number, suite)
+) -> BenchmarkFunction:
+    return BenchmarkFunction(name, Target(function, box), maximum, number, suite)
 
 
-def bbob(instance: int = 1, dimensions: Sequence[int] = BBOB_DIMENSIONS) -> Iterator[Landscape]:
+def bbob(instance: int = 1, dimensions: Sequence[int] = BBOB_DIMENSIONS) -> Iterator[BenchmarkFunction]:
     """The 24 functions of BBOB (Hansen, Finck, Ros and Auger 2009), negated, in so many dimensions, by ioh."""
     if find_spec("ioh") is None:
         raise InputError(f"suite: bbob needs a package: {not_installed('ioh')}")
@@ -131,7 +131,7 @@ def bbob(instance: int = 1, dimensions: Sequence[int] = BBOB_DIMENSIONS) -> Iter
 
             name = f"{problem.meta_data.name} {dimension}D"
             target = Target(negated, _make_cube(5.0, dimension))
-            yield Landscape(name, target, -float(problem.optimum.y), number, "bbob", instance)
+            yield BenchmarkFunction(name, target, -float(problem.optimum.y), number, "bbob", instance)
 
 
 def landscape_of(
@@ -140,7 +140,7 @@ def landscape_of(
     formulation: Formulation = "reduced",
     indices: int = INDICES,
     overrides: Mapping[str, Any] | None = None,
-) -> Landscape:
+) -> BenchmarkFunction:
     """``g`` at tuples of so many indices of a config, at a small weight of the regulariser, in the units in which the
     methods search; its maximum is the value that the exchange certifies at that weight. ``overrides``: what is another
     in the config.
@@ -164,11 +164,11 @@ def landscape_of(
         raise InputError(f"{config}: expected a config whose value is certified, got {result.status}: {result.message}")
     program = imposed_program(sought, formulation)
 
-    def made() -> Landscape:
+    def made() -> BenchmarkFunction:
         g = TupleValue(program, RelaxedProgram(program, tools.solver, tools.regulariser), indices)
         g.epsilon = EPSILON
         target = Target(g, g.domain, g.gradient, g.block, g.linear, g.acting)
-        return Landscape(f"g of {config.stem}", target, float(result.value), number, "g", fresh=made)
+        return BenchmarkFunction(f"g of {config.stem}", target, float(result.value), number, "g", fresh=made)
 
     return made()
 

@@ -9,7 +9,7 @@ from typing import Any, final
 import numpy as np
 
 from sparserob_core.brief import brief
-from sparserob_core.experiment.benchmark.landscapes import Landscape
+from sparserob_core.experiment.benchmark.landscapes import BenchmarkFunction
 from sparserob_core.experiment.comparison.curve import spent_until
 from sparserob_core.experiment.comparison.profiles import Profiles
 from sparserob_core.sip.convex_set import Array
@@ -21,7 +21,7 @@ class Search:
     """Search of one contender on one landscape: the best value after every evaluation, the maximiser's own CPU time,
     and the best point."""
 
-    landscape: Landscape
+    landscape: BenchmarkFunction
     contender: str
     seed: int
     best: Array

@@ -11,7 +11,7 @@ from typing import Any
 from sparserob_core.encodings import name_of, path_of
 from sparserob_core.errors import ConfigError, Path
 from sparserob_core.experiment.config.matrices.files import resolve
-from sparserob_core.experiment.config.reading.reader import Source, read_source
+from sparserob_core.experiment.config.reading.reader import ConfigSource, read_source
 from sparserob_core.experiment.config.run_config import SLOTS, RunConfig
 from sparserob_core.experiment.plugins.messages import Complaint, models_in, shown
 
@@ -24,7 +24,7 @@ SECTIONS = {(name,) for name, field in RunConfig.model_fields.items() if [*model
 """The sections whose keys are taken one by one, as those of components with the same name are."""
 
 
-def extended(source: Source) -> Source:
+def extended(source: ConfigSource) -> ConfigSource:
     """Return a config together with the keys of the config that it extends, and so on along the chain.
 
     Keys of sections, and of components of the same name, are taken one by one. Any other value, a list, a set or a
@@ -33,7 +33,7 @@ def extended(source: Source) -> Source:
     return _extend_source(source, ())
 
 
-def movable(source: Source) -> tuple[dict[str, Any], list[Complaint]]:
+def movable(source: ConfigSource) -> tuple[dict[str, Any], list[Complaint]]:
     """Return the data of a config in a form that holds in any folder, and the faults that were found.
 
     Files of plugins have their absolute names, and the numbers of matrices replace their files.
@@ -46,7 +46,7 @@ def movable(source: Source) -> tuple[dict[str, Any], list[Complaint]]:
     return data, faults
 
 
-def _extend_source(source: Source, above: tuple[File, ...]) -> Source:
+def _extend_source(source: ConfigSource, above: tuple[File, ...]) -> ConfigSource:
     if EXTENDS not in source.data:
         return source
     stated = source.data[EXTENDS]
@@ -69,7 +69,7 @@ def _extend_source(source: Source, above: tuple[File, ...]) -> Source:
     return replace(source, data=_merge_values(data, own, ()), base=base, own=own)
 
 
-def _make_error(source: Source, said: str) -> ConfigError:
+def _make_error(source: ConfigSource, said: str) -> ConfigError:
     return ConfigError(f"{source.where((EXTENDS,))}: {EXTENDS}: {said}")
 
 

@@ -15,7 +15,7 @@ from sparserob_core.errors import ConfigError, InputError, Path, PluginError, Un
 from sparserob_core.experiment.config.extending import extended
 from sparserob_core.experiment.config.matrices.files import resolve
 from sparserob_core.experiment.config.reading.overrides import Override, apply_override, parse_overrides
-from sparserob_core.experiment.config.reading.reader import Source, read_source, read_value
+from sparserob_core.experiment.config.reading.reader import ConfigSource, read_source, read_value
 from sparserob_core.experiment.config.run_config import SLOTS, MaximiserEntry, RunConfig
 from sparserob_core.experiment.plugins.components import Registry
 from sparserob_core.experiment.plugins.messages import NOT_PLAIN, NOT_TEXT, Complaint, complaints, malformed, models_in
@@ -31,7 +31,7 @@ class Loaded:
 
     config: RunConfig
     registry: Registry
-    source: Source
+    source: ConfigSource
     overrides: tuple[Override, ...] = ()
 
     def place(self, path: Path) -> str | None:
@@ -54,7 +54,7 @@ class Loaded:
 
 
 def load_config(
-    config: str | File | Mapping[str, Any] | Source,
+    config: str | File | Mapping[str, Any] | ConfigSource,
     overrides: Mapping[str, object] | Iterable[str] | None = None,
     known: Registry | None = None,
 ) -> Loaded:
@@ -106,7 +106,7 @@ def load_config(
     return Loaded(resolved, registry, source, changes)
 
 
-def _find_folder(path: Path, source: Source, changes: tuple[Override, ...]) -> File:
+def _find_folder(path: Path, source: ConfigSource, changes: tuple[Override, ...]) -> File:
     """Return the folder that a file is relative to: that of the config, or the working directory for an override."""
     changed = _find_override(source, changes, Complaint(path, "")) is not None
     return File.cwd() if changed else source.folder
@@ -129,7 +129,7 @@ def _expand_entry(entry: object, default: str | None) -> object:
     return entry
 
 
-def _build_registry(data: dict[str, Any], source: Source, changes: tuple[Override, ...]) -> Registry:
+def _build_registry(data: dict[str, Any], source: ConfigSource, changes: tuple[Override, ...]) -> Registry:
     files = data.get("plugins") or []
     if not isinstance(files, list) or not all(isinstance(file, str) for file in files):
         return load_registry()
@@ -203,7 +203,7 @@ def _get_value(data: Any, path: Path) -> Any:
     return data
 
 
-def _make_error(source: Source, changes: tuple[Override, ...], wrong: list[Complaint]) -> ConfigError:
+def _make_error(source: ConfigSource, changes: tuple[Override, ...], wrong: list[Complaint]) -> ConfigError:
     inside = {complaint: source.position(complaint.path) for complaint in wrong}
     ordered = sorted(
         wrong, key=lambda complaint: (_find_override(source, changes, complaint) is not None, inside[complaint])
@@ -211,7 +211,7 @@ def _make_error(source: Source, changes: tuple[Override, ...], wrong: list[Compl
     return ConfigError("\n".join(dict.fromkeys(_format_line(source, changes, complaint) for complaint in ordered)))
 
 
-def _format_line(source: Source, changes: tuple[Override, ...], complaint: Complaint) -> str:
+def _format_line(source: ConfigSource, changes: tuple[Override, ...], complaint: Complaint) -> str:
     change = _find_override(source, changes, complaint)
     if change is None:
         return f"{source.where(complaint.path)}: {complaint}"
@@ -220,7 +220,7 @@ def _format_line(source: Source, changes: tuple[Override, ...], complaint: Compl
     return f"override {change.text}: {complaint}{hint}"
 
 
-def _find_override(source: Source, changes: tuple[Override, ...], complaint: Complaint) -> Override | None:
+def _find_override(source: ConfigSource, changes: tuple[Override, ...], complaint: Complaint) -> Override | None:
     """Return the override that gave a key: it set the key, or one below a key that was not written before."""
     path = [str(step) for step in complaint.path]
     for change in reversed(changes):

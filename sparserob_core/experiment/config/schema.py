@@ -11,7 +11,7 @@ from pydantic_core import core_schema
 from sparserob_core.experiment.config.extending import EXTENDS, MEANING
 from sparserob_core.experiment.config.run_config import SLOTS, MaximiserEntry, RunConfig
 from sparserob_core.experiment.config.set_options import shorthand
-from sparserob_core.experiment.plugins.components import Part, Registry
+from sparserob_core.experiment.plugins.components import ComponentOption, Registry
 from sparserob_core.experiment.plugins.components import parts as components
 from sparserob_core.experiment.plugins.records import Plugin
 from sparserob_core.options import meanings
@@ -63,14 +63,16 @@ def config_schema(registry: Registry) -> dict[str, Any]:
     for path, slot in SLOTS.items():
         holder = schema if len(path) == 1 else definitions["Dictionaries"]
         previous = holder["properties"][path[-1]]
-        choice = _describe_choice(registry, Part(slot.kind), slot.name, definitions)
+        choice = _describe_choice(registry, ComponentOption(slot.kind), slot.name, definitions)
         if any(option.get("type") == "null" for option in previous.get("anyOf", [])):
             choice["anyOf"].append({"type": "null"})
         holder["properties"][path[-1]] = {
             **{key: previous[key] for key in ("default", "description") if key in previous},
             **choice,
         }
-    schema["properties"]["observers"]["items"] = _describe_choice(registry, Part("observer"), None, definitions)
+    schema["properties"]["observers"]["items"] = _describe_choice(
+        registry, ComponentOption("observer"), None, definitions
+    )
     for unused in ("Entry", "MaximiserEntry"):
         definitions.pop(unused, None)
     _add_kinds(registry, definitions)
@@ -104,7 +106,7 @@ def _list_alternatives(field: dict[str, Any]) -> list[dict[str, Any]]:
 
 
 def _describe_choice(
-    registry: Registry, which: Part, default: str | None, parts: dict[str, Any], but: str | None = None
+    registry: Registry, which: ComponentOption, default: str | None, parts: dict[str, Any], but: str | None = None
 ) -> dict[str, Any]:
     """Return the schema of a component of a kind, by name or with its options.
 

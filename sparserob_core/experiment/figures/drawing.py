@@ -23,7 +23,7 @@ from sparserob_core.experiment.figures.active import Active, stored_active
 from sparserob_core.experiment.figures.figure_data import (
     MOST_STATES,
     FigureData,
-    Outputs,
+    MeasuredOutputs,
     Wall,
     plain,
     telling,
@@ -199,7 +199,7 @@ def _collect_feedback_data(
     }
 
 
-def _compute_outputs(model: Transcription, decision: Array, times: Array) -> Outputs | None:
+def _compute_outputs(model: Transcription, decision: Array, times: Array) -> MeasuredOutputs | None:
     """The outputs that a policy measures with their noise; ``None`` where it measures states."""
     measured, loop, points = model.problem.measurements, model.answering.loop, model.control.breakpoints
     if measured is None:
@@ -208,7 +208,7 @@ def _compute_outputs(model: Transcription, decision: Array, times: Array) -> Out
     instants = points[:-1][measured.known(points).any(axis=0)]
     lower, upper = -supports(model, decision, times, -C), supports(model, decision, times, C)
     noise = [measured.noises.support(side * np.eye(len(C))) for side in (-1, 1)]
-    return Outputs(
+    return MeasuredOutputs(
         C=C,
         nominal=C @ loop.states(decision, times)[:, :, 0].T,
         lower=lower,

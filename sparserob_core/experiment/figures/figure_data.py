@@ -57,7 +57,7 @@ class Wall:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Outputs:
+class MeasuredOutputs:
     """Measured outputs ``y = C x`` with ``C (p, d)``: ``nominal (p, T)`` and the worst cases ``lower``,
     ``upper (p, T)``.
 
@@ -121,7 +121,7 @@ class FigureData:
     control_least: Array | None = None
     control_most: Array | None = None
     gains: Array | None = None
-    outputs: Outputs | None = None
+    outputs: MeasuredOutputs | None = None
     effort: Array | None = None
     draws: int = 0
     answers: Array | None = None

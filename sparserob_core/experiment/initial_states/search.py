@@ -14,7 +14,7 @@ import numpy as np
 from sparserob_core.control.studies.initial_states import InitialPlane
 from sparserob_core.control.studies.polygon_approximation import (
     AXES,
-    Support,
+    SupportBound,
     inner_polygon,
     inside,
     outer_polygon,
@@ -59,9 +59,9 @@ class InitialStatesSearch:
     controls: dict[bytes, Array] = field(default_factory=dict)
     gains: dict[bytes, Array] = field(default_factory=dict)
     remarks: list[str] = field(default_factory=list)
-    asked: list[Support] = field(default_factory=list)
+    asked: list[SupportBound] = field(default_factory=list)
     interrupted: str = ""
-    frame: tuple[InitialPlane, list[Support]] | None = None
+    frame: tuple[InitialPlane, list[SupportBound]] | None = None
     programs: int = 0
     directions: int = 0
     started: float = field(default_factory=time.perf_counter)
@@ -127,7 +127,7 @@ class InitialStatesSearch:
             message=f"between two polygons, both proven{self._restriction}, that differ by {share:.2%} of the area",
         )
 
-    def _add_polygons(self, bare: InitialStates, supports: Sequence[Support], inner: Array) -> InitialStates:
+    def _add_polygons(self, bare: InitialStates, supports: Sequence[SupportBound], inner: Array) -> InitialStates:
         """The polygons and half-planes in the units of the model's states."""
         plane, scaled = self.plane, np.array([s.direction for s in supports]) / self.plane.radius
         norms = np.linalg.norm(scaled, axis=1)
@@ -171,7 +171,7 @@ class InitialStatesSearch:
         """Go on with what is known."""
         self.interrupted = str(pressed) or "interrupted from the keyboard"
 
-    def _fit_frame(self) -> list[Support] | Result:
+    def _fit_frame(self) -> list[SupportBound] | Result:
         """Fit the box of coordinates to the set; returns the supports along the axes, or the result that proves the set
         empty."""
         limit, least = self.plane.radius, self.least
@@ -207,7 +207,7 @@ class InitialStatesSearch:
                 " path or terminal sets that bound it, or a size of the plane to look at, such as 10"
             )
 
-    def _explore_direction(self, direction: Array) -> Support:
+    def _explore_direction(self, direction: Array) -> SupportBound:
         support = self._make_support(direction, self._solve_direction(direction))
         self.asked.append(support)
         self._report_progress("direction", len(self.asked) + len(AXES), self.directions)
@@ -231,7 +231,7 @@ class InitialStatesSearch:
         self.cuts[tuple(direction.tolist())] = result.indices or tuple(start_cuts.values())
         return result
 
-    def _make_support(self, direction: Array, result: Result) -> Support:
+    def _make_support(self, direction: Array, result: Result) -> SupportBound:
         bound, proven = float(np.abs(direction).sum()), result.status in PROVEN
         # it is not: another direction has a point
         bound = bound if result.status == "infeasible" else min(-result.lower_bound, bound)
@@ -245,7 +245,7 @@ class InitialStatesSearch:
             self.remarks.append(
                 f"in the direction {np.round(direction, 4).tolist()} no point is proven: {result.message}"
             )
-        return Support(direction, bound, point, proven)
+        return SupportBound(direction, bound, point, proven)
 
     def _compute_costs(self, inner: Array, values: int) -> tuple[Array, list[Result]]:
         """Costs on a lattice within the inner polygon, and beside its vertices."""

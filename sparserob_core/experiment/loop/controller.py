@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from sparserob_core.control.loop.controller import Controller
-from sparserob_core.control.loop.resolving import PROVEN, Plan, Resolving
+from sparserob_core.control.loop.resolving import PROVEN, ProvenPlan, Resolving
 from sparserob_core.errors import InputError
 from sparserob_core.experiment.assemble import ControlExperiment, assemble, build, counting, tools_of
 from sparserob_core.experiment.config.load import load_config
@@ -83,7 +83,7 @@ def resolving(experiment: ControlExperiment, seconds: float | None) -> Resolving
     return Resolving(experiment.transcription, tools_of(experiment.loaded), tolerance, seconds)
 
 
-def _find_plan(config: object, plugins: Iterable[str | Path]) -> tuple[Plan, ControlExperiment]:
+def _find_plan(config: object, plugins: Iterable[str | Path]) -> tuple[ProvenPlan, ControlExperiment]:
     if isinstance(config, Outcome | SolvedProblem):
         result = config.result if isinstance(config, Outcome) else config
         return _make_plan(
@@ -108,7 +108,7 @@ def _find_plan(config: object, plugins: Iterable[str | Path]) -> tuple[Plan, Con
 
 def _make_plan(
     experiment: ControlExperiment, status: str, message: str, decision: Array | None, cuts: Iterable[Cut] = ()
-) -> tuple[Plan, ControlExperiment]:
+) -> tuple[ProvenPlan, ControlExperiment]:
     if status not in PROVEN or decision is None:
         raise InputError(f"there is no proven control to apply; the status is '{status}': {message}")
-    return Plan(experiment.transcription, np.asarray(decision, dtype=float).ravel(), 0, tuple(cuts)), experiment
+    return ProvenPlan(experiment.transcription, np.asarray(decision, dtype=float).ravel(), 0, tuple(cuts)), experiment

@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from sparserob_core.control.studies.causal import Ended, Limits
+from sparserob_core.control.studies.causal import CausalLimits, Ended
 from sparserob_core.control.transcription.record import Transcription
 from sparserob_core.experiment.margin.scaling import Scaling
 from sparserob_core.experiment.run.conclusion.causal import active, proven, searched
@@ -61,7 +61,7 @@ def causal_upper(
     constraints = [] if result is None else active(model, result)
     constraints += [constraint for entry in infeasible for constraint in active(model, entry)]
     search = searched(model, None if result is None else result.decision, constraints)
-    limits = Limits.of(charge, list(results.values()), model.program.n, lambda: tools.deadline.passed)
+    limits = CausalLimits.of(charge, list(results.values()), model.program.n, lambda: tools.deadline.passed)
     solved_tree = search.largest_factor(scaling.highest / base, limits)
     if solved_tree is None:
         return np.nan, limits.ended

@@ -16,7 +16,7 @@ from sparserob_core.control.studies.horizons import Horizons, Multiplier, at_hor
 from sparserob_core.control.transcription.own_units import fixed
 from sparserob_core.control.transcription.record import Transcription
 from sparserob_core.errors import InputError
-from sparserob_core.experiment.margin.points import Point, Points
+from sparserob_core.experiment.margin.points import MarginPoint, Points
 from sparserob_core.experiment.margin.search import FEASIBLE, Answer, Margin
 from sparserob_core.sip.events import Notify, ignore
 from sparserob_core.sip.method import Tools
@@ -47,7 +47,7 @@ class HorizonSearch:
     tools: Tools
     width: float
     told: Points
-    points: dict[float, Point] = field(default_factory=dict)
+    points: dict[float, MarginPoint] = field(default_factory=dict)
     covered: list[tuple[float, float]] = field(default_factory=list)
     _farkas_multipliers: dict[float, list[Multiplier]] = field(default_factory=dict)
 
@@ -97,7 +97,7 @@ class HorizonSearch:
             cost_unit=self.problem.cost_unit,
         )
 
-    def _conclude(self, best: Point | None, low: float, stuck: str) -> tuple[Answer, str]:
+    def _conclude(self, best: MarginPoint | None, low: float, stuck: str) -> tuple[Answer, str]:
         longest = self.problem.horizon
         cells = f"{len(self.covered)} cell{'s' if len(self.covered) != 1 else ''}"
         if best is None and low >= longest:
@@ -207,11 +207,11 @@ class HorizonSearch:
         multipliers = [self._find_multipliers(end) for end in (high, low)]
         return any(self._horizons.amount(rows, low, high) > 0.0 for rows in multipliers if rows)
 
-    def _run_horizon(self, horizon: float) -> Point:
+    def _run_horizon(self, horizon: float) -> MarginPoint:
         """Return the run at a horizon, which is made only once."""
         if horizon not in self.points:
             model, result = self._solve_horizon(self.problem, horizon, self.told.begin(horizon))
-            self.points[horizon] = Point(
+            self.points[horizon] = MarginPoint(
                 horizon, horizon, result.status, result.message, result.lower_bound, result.upper_bound
             )
             self.told.end(self.points[horizon])

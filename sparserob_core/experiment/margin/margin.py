@@ -20,7 +20,7 @@ from sparserob_core.experiment.directory.artefacts import RunDirectory, finite
 from sparserob_core.experiment.directory.study import open_study
 from sparserob_core.experiment.margin.causal import causal_upper
 from sparserob_core.experiment.margin.horizon import HORIZON, HorizonSearch, horizon_search
-from sparserob_core.experiment.margin.points import Point, Points
+from sparserob_core.experiment.margin.points import MarginPoint, Points
 from sparserob_core.experiment.margin.scaling import scaling
 from sparserob_core.experiment.margin.search import Margin, MarginSearch
 from sparserob_core.experiment.run.events import Broadcast, Observer, SweepFinished, SweepStarted
@@ -31,7 +31,7 @@ from sparserob_core.sip.methods.exchange import Exchange
 from sparserob_core.sip.relaxed.parametric import ParametricProgram
 from sparserob_core.sip.result import Result
 
-__all__ = ["Margin", "Point", "margin", "margin_rows", "summary_of_margin"]
+__all__ = ["Margin", "MarginPoint", "margin", "margin_rows", "summary_of_margin"]
 
 
 def margin(

@@ -18,7 +18,7 @@ from sparserob_core.sip.result import Status, relative_gap
 
 @final
 @dataclass(frozen=True)
-class Point:
+class MarginPoint:
     """An ordinary run at one factor: its status, and the bounds of the cost, which are infinite where it is
     infeasible."""
 
@@ -64,7 +64,7 @@ class Points:
 
         return Bounds(moved).receive
 
-    def end(self, point: Point) -> None:
+    def end(self, point: MarginPoint) -> None:
         """Report the answer of the run that began last."""
         position, proven = self.count - 1, np.isfinite(point.upper_bound)
         gap = relative_gap(point.lower_bound, point.upper_bound)

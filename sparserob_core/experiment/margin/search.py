@@ -16,7 +16,7 @@ from sparserob_core.control.loop.resolving import shifted
 from sparserob_core.control.studies.causal import Ended
 from sparserob_core.errors import InputError
 from sparserob_core.experiment.margin.critical import Critical, critical_factor
-from sparserob_core.experiment.margin.points import Point, Points
+from sparserob_core.experiment.margin.points import MarginPoint, Points
 from sparserob_core.experiment.margin.scaling import Scaling, Sense
 from sparserob_core.sip.evidence import Cut
 from sparserob_core.sip.method import Tools
@@ -43,7 +43,7 @@ STEPS = (
 FARTHER = (*STEPS, 256.0, 1024.0, 4096.0)
 
 
-Sides: TypeAlias = tuple[Answer, str, Point | None, Point | None]
+Sides: TypeAlias = tuple[Answer, str, MarginPoint | None, MarginPoint | None]
 """An answer, its message, and the runs that prove the feasible and the infeasible side."""
 
 
@@ -110,9 +110,9 @@ class Margin:
     lower: float
     upper: float
     amounts: tuple[float, float]
-    feasible: Point | None = None
-    infeasible: Point | None = None
-    curve: tuple[Point, ...] = ()
+    feasible: MarginPoint | None = None
+    infeasible: MarginPoint | None = None
+    curve: tuple[MarginPoint, ...] = ()
     remarks: tuple[str, ...] = ()
     seconds: float = 0.0
     directory: Path | None = None
@@ -164,7 +164,7 @@ class MarginSearch:
     tools: Tools
     width: float
     told: Points
-    points: list[Point] = field(default_factory=list)
+    points: list[MarginPoint] = field(default_factory=list)
     seen: dict[float, str] = field(default_factory=dict)
     results: dict[float, Result] = field(default_factory=dict)
     cuts: Sequence[Cut] = ()
@@ -172,7 +172,7 @@ class MarginSearch:
 
     def margin(self, count: int) -> Margin:
         """Return the margin, with a curve of ``count`` points."""
-        started, curve = time.perf_counter(), tuple[Point, ...]()
+        started, curve = time.perf_counter(), tuple[MarginPoint, ...]()
         sides: Sides | None = None
         try:
             self.told.say(f"looking for the {self.scaling.sense} factor of {self.scaling.of}")
@@ -229,7 +229,7 @@ class MarginSearch:
         arguments = self.programs, self.joined, self.scaling, self.tools, self.width
         return critical_factor(*arguments, self.told.notify, self.seen)
 
-    def _collect_known(self, said: str, sides: Sides | None) -> tuple[Sides, tuple[Point, ...]]:
+    def _collect_known(self, said: str, sides: Sides | None) -> tuple[Sides, tuple[MarginPoint, ...]]:
         """Return the sides that an interrupted search knows, and every proven run on the feasible side as a curve.
 
         They are both sides where these were proven before. Otherwise they are the nearest two runs of which each proves
@@ -292,7 +292,7 @@ class MarginSearch:
         at = f"even at {best_factor:g} " if self.scaling.nested else ""
         return "infeasible", f"{at}nothing is feasible: {point.message}", None, point
 
-    def _find_proven_run(self, factor: float, outward: float, wanted: tuple[Status, ...]) -> Point | None:
+    def _find_proven_run(self, factor: float, outward: float, wanted: tuple[Status, ...]) -> MarginPoint | None:
         """Return the run nearest to the critical factor whose status is one of those ``wanted`` on that side."""
         width = self.width * (max(1.0, abs(factor)) if self.scaling.affine else 1.0)
         candidates = [float(np.clip(factor + outward * step * width, 0.0, self.scaling.highest)) for step in FARTHER]
@@ -322,7 +322,7 @@ class MarginSearch:
         """Return the result of a program in its own units, whose run begins with the constraints ``begun``."""
         return self.method.close(program, tools, prover_of(program, tools), shifted(begun, 0.0, program))
 
-    def run(self, factor: float, begun: Sequence[Cut] = ()) -> Point:
+    def run(self, factor: float, begun: Sequence[Cut] = ()) -> MarginPoint:
         """Run the problem at a factor, unless that was done before.
 
         Parameters
@@ -344,18 +344,18 @@ class MarginSearch:
         try:
             result = answered_in_own_units(partial(self._solve_from_cuts, begun), self.programs.program(factor), tools)
         except InputError as error:
-            point = Point(factor, amount, "failed", str(error), -np.inf, np.inf)
+            point = MarginPoint(factor, amount, "failed", str(error), -np.inf, np.inf)
             self.told.end(point)
             return point
         self.results[factor] = result
-        point = Point(factor, amount, result.status, result.message, result.lower_bound, result.upper_bound)
+        point = MarginPoint(factor, amount, result.status, result.message, result.lower_bound, result.upper_bound)
         self.points.append(point)
         self.told.end(point)
         if result.stopped:
             self.tools.deadline.check()
         return point
 
-    def _trace_curve(self, feasible: Point, status: Answer, count: int) -> tuple[Point, ...]:
+    def _trace_curve(self, feasible: MarginPoint, status: Answer, count: int) -> tuple[MarginPoint, ...]:
         """Return runs from the feasible side of the critical factor to no uncertainty, or to a set twice as large."""
         if count == 0:
             return ()

@@ -31,7 +31,7 @@ class Failure:
 
 
 @dataclass(frozen=True)
-class Part:
+class ComponentOption:
     """An option that is a component itself: its ``kind``, and the class ``of`` which it must be."""
 
     kind: str
@@ -49,11 +49,11 @@ def _describe_duplicate(first: Plugin, second: Plugin) -> str:
 
 
 @cache
-def parts(model: type[Options]) -> dict[str, Part]:
+def parts(model: type[Options]) -> dict[str, ComponentOption]:
     """Return the options that are components themselves, by name, as `sparserob_core.options.part` marks them."""
     extras = {key: field.json_schema_extra for key, field in model.model_fields.items()}
     return {
-        key: Part(str(extra["component"]), _import_class(str(extra["of"])) if "of" in extra else None)
+        key: ComponentOption(str(extra["component"]), _import_class(str(extra["of"])) if "of" in extra else None)
         for key, extra in extras.items()
         if isinstance(extra, dict) and "component" in extra
     }
@@ -179,7 +179,7 @@ class Registry:
             return None, [*complaints(error, model, options), *wrong]
         return (None if wrong else checked), wrong
 
-    def _spell_out(self, part: Part, entry: str | Mapping[str, Any]) -> tuple[object, list[Complaint]]:
+    def _spell_out(self, part: ComponentOption, entry: str | Mapping[str, Any]) -> tuple[object, list[Complaint]]:
         """Return a component within another one's options as a mapping with its name and all its options, and the
         errors."""
         name, options = (
@@ -227,7 +227,7 @@ class Registry:
         }
         return self.get(kind, name).create(checked.model_copy(update=inner))
 
-    def _build_part(self, part: Part, entry: Mapping[str, Any]) -> object:
+    def _build_part(self, part: ComponentOption, entry: Mapping[str, Any]) -> object:
         """Return a component within another one's options, wrapped in the check of its kind."""
         record = self.get(part.kind, entry["name"], part.of)
         built = self.build(part.kind, entry["name"], {key: entry[key] for key in entry if key != "name"})

@@ -13,13 +13,13 @@ from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.errors import InputError
 from sparserob_core.experiment.assemble import Experiment
 from sparserob_core.experiment.config.load import Loaded
-from sparserob_core.experiment.config.reading.reader import Source
+from sparserob_core.experiment.config.reading.reader import ConfigSource
 from sparserob_core.experiment.config.stated.source import source_of
 from sparserob_core.experiment.directory.finished import read_config
 from sparserob_core.experiment.run.outcome import Outcome, SolvedProblem
 
 GivenRun: TypeAlias = str | Path | Outcome | SolvedProblem
-GivenConfig: TypeAlias = str | Path | Mapping[str, Any] | Source | OptimalControlProblem | Outcome | SolvedProblem
+GivenConfig: TypeAlias = str | Path | Mapping[str, Any] | ConfigSource | OptimalControlProblem | Outcome | SolvedProblem
 
 
 def as_run(run: object) -> tuple[Path, Experiment | None]:
@@ -53,7 +53,7 @@ def as_run(run: object) -> tuple[Path, Experiment | None]:
     )
 
 
-def as_config(config: object) -> str | Path | Mapping[str, Any] | Source:
+def as_config(config: object) -> str | Path | Mapping[str, Any] | ConfigSource:
     """Return the config of anything that describes an experiment, in a form that `load_config` reads.
 
     Parameters
@@ -83,7 +83,7 @@ def as_config(config: object) -> str | Path | Mapping[str, Any] | Source:
     if isinstance(config, str | Path):
         path = Path(config)
         return _make_source(read_config(path), files=False) if (path / "config.yaml").is_file() else config
-    if isinstance(config, Mapping | Source):
+    if isinstance(config, Mapping | ConfigSource):
         return config
     raise InputError(
         "config: expected a config, an OptimalControlProblem, the directory of a run, or what sr.run, or sr.solve for a"
@@ -91,6 +91,6 @@ def as_config(config: object) -> str | Path | Mapping[str, Any] | Source:
     )
 
 
-def _make_source(loaded: Loaded, files: bool = True) -> Source:
+def _make_source(loaded: Loaded, files: bool = True) -> ConfigSource:
     plain = loaded.config.plain()
-    return Source(loaded.source.name, loaded.source.folder, plain if files else {**plain, "plugins": []})
+    return ConfigSource(loaded.source.name, loaded.source.folder, plain if files else {**plain, "plugins": []})

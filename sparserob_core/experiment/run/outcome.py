@@ -22,7 +22,7 @@ from sparserob_core.control.transcription.record import Transcription
 from sparserob_core.errors import InputError
 from sparserob_core.experiment.assemble import ControlExperiment, Experiment, assemble, tools_of
 from sparserob_core.experiment.config.load import Loaded, load_config
-from sparserob_core.experiment.config.reading.reader import Source, require_readable, write_yaml
+from sparserob_core.experiment.config.reading.reader import ConfigSource, require_readable, write_yaml
 from sparserob_core.experiment.config.stated.source import component_keys, dictionary_keys, source_of
 from sparserob_core.experiment.directory.provenance import git_revision, provenance
 from sparserob_core.experiment.directory.study import open_directory
@@ -54,7 +54,7 @@ COMPONENTS = ("method", "maximiser", "solver", "regulariser", "policy")
 
 @final
 @dataclass(frozen=True, eq=False)
-class Asked:
+class SolveArguments:
     """The arguments of `solve` for a problem.
 
     ``choices`` are the components, by name, by mapping or as objects. ``rest`` holds the other keys of a config.
@@ -65,7 +65,7 @@ class Asked:
     dictionaries: Mapping[str, Any]
     rest: Mapping[str, Any]
 
-    def source(self) -> Source:
+    def source(self) -> ConfigSource:
         """Return the config with the same meaning; raises `InputError` where there is none."""
         registry, keys = load_registry(), dict(self.rest)
         for kind, choice in self.choices.items():
@@ -87,7 +87,7 @@ class SolvedProblem(ControlResult):
 
     Parameters
     ----------
-    origin : Source or Asked
+    origin : ConfigSource or Asked
         The config of the result, or the arguments of `solve`, which become a config when one is needed.
 
     Notes
@@ -95,7 +95,7 @@ class SolvedProblem(ControlResult):
     The other fields are those of `ControlResult`.
     """
 
-    origin: Source | Asked = field(repr=False)
+    origin: ConfigSource | SolveArguments = field(repr=False)
 
     @staticmethod
     def run(result: Result, experiment: ControlExperiment, causal: CausalBound | None = None) -> SolvedProblem:
@@ -116,14 +116,14 @@ class SolvedProblem(ControlResult):
             The result.
         """
         loaded = experiment.loaded
-        stated = Source(loaded.source.name, loaded.source.folder, loaded.config.plain())
+        stated = ConfigSource(loaded.source.name, loaded.source.folder, loaded.config.plain())
         solved = SolvedProblem.asked(result, experiment.transcription, stated, causal)
         solved.__dict__["experiment"] = experiment
         return solved
 
     @staticmethod
     def asked(
-        result: Result, model: Transcription, origin: Source | Asked, causal: CausalBound | None = None
+        result: Result, model: Transcription, origin: ConfigSource | SolveArguments, causal: CausalBound | None = None
     ) -> SolvedProblem:
         """Return the result of a problem that was transcribed.
 
@@ -133,7 +133,7 @@ class SolvedProblem(ControlResult):
             The result.
         model : Transcription
             The problem on its dictionaries.
-        origin : Source or Asked
+        origin : ConfigSource or Asked
             The config of the result, or the arguments of `solve`.
         causal : CausalBound, optional
             The bound for every causal policy.
@@ -291,8 +291,8 @@ def concluded(experiment: Experiment, result: Result, tools: Tools, notify: Noti
     return conclusion
 
 
-def _get_source(origin: Source | Asked) -> Source:
-    return origin.source() if isinstance(origin, Asked) else origin
+def _get_source(origin: ConfigSource | SolveArguments) -> ConfigSource:
+    return origin.source() if isinstance(origin, SolveArguments) else origin
 
 
 def _rebuild_result(
@@ -303,7 +303,7 @@ def _rebuild_result(
     form: Any,
     policy: Policy | None,
     causal: CausalBound | None,
-    origin: Source | Asked,
+    origin: ConfigSource | SolveArguments,
 ) -> SolvedProblem:
     """Return a result that was pickled; its program is built anew."""
     from sparserob_core.control.transcription.transcribe import prepare
@@ -403,7 +403,7 @@ class Outcome:
         of = self.result
         plain, causal = (of.plain, of.causal) if isinstance(of, ControlResult) else (of, None)
         loaded = self.experiment.loaded
-        stated = Source(loaded.source.name, loaded.source.folder, loaded.config.plain())
+        stated = ConfigSource(loaded.source.name, loaded.source.folder, loaded.config.plain())
         kept = (self.directory, self.control, self.summary, self.remarks, self.interrupted)
         return _rebuild_outcome, (stated, plain, *kept, causal)
 
@@ -440,7 +440,7 @@ class Outcome:
 
 
 def _rebuild_outcome(
-    stated: Source,
+    stated: ConfigSource,
     result: Result,
     directory: Path,
     control: Array | None,

@@ -177,11 +177,11 @@ def solve(
         return remarked_program(model, result)
     from sparserob_core.control.transcription.provable import remarked
     from sparserob_core.experiment.run.conclusion.final_states import with_final_states
-    from sparserob_core.experiment.run.outcome import Asked, SolvedProblem
+    from sparserob_core.experiment.run.outcome import SolveArguments, SolvedProblem
 
     result = with_final_states(model, result, getattr(chosen, "tolerance", None))
     result = remarked(model.problem, result, model.feedback is not None)
-    arguments = Asked(
+    arguments = SolveArguments(
         problem=model.stated,
         choices={
             "method": _add_tolerance(registry, method, tolerance),

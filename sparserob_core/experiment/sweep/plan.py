@@ -19,7 +19,7 @@ from sparserob_core.experiment.config.extending import extended, movable
 from sparserob_core.experiment.config.load import Loaded, load_config
 from sparserob_core.experiment.config.plain import BESIDE, difference, identity, value_text
 from sparserob_core.experiment.config.reading.overrides import parse_overrides
-from sparserob_core.experiment.config.reading.reader import Source, read_source, read_value, write_yaml
+from sparserob_core.experiment.config.reading.reader import ConfigSource, read_source, read_value, write_yaml
 from sparserob_core.experiment.plugins.messages import nearest, shown
 from sparserob_core.experiment.run.events import StudyProgress
 from sparserob_core.experiment.sweep.axes import FIXED, MOST, Axis, parse_axes, require_whole
@@ -59,7 +59,7 @@ class Plan:
 
     Parameters
     ----------
-    base : Source
+    base : ConfigSource
         The base config.
     changes : tuple of Axis
         The changes of the base, in their order. One with several values is an axis; one with a single value holds for
@@ -73,7 +73,7 @@ class Plan:
         The study's own file, where it has one.
     """
 
-    base: Source
+    base: ConfigSource
     changes: tuple[Axis, ...]
     points: Arrangement = "grid"
     number: int | None = None
@@ -201,7 +201,7 @@ class Plan:
 
 
 def make_plan(
-    config: str | Path | Mapping[str, Any] | Source,
+    config: str | Path | Mapping[str, Any] | ConfigSource,
     axes: Mapping[str, object] | Sequence[str] | None = None,
     overrides: Mapping[str, object] | Iterable[str] | None = None,
     *,
@@ -278,7 +278,7 @@ def read_plan(file: Path) -> Plan:
     return make_plan(file)
 
 
-def _parse_plan(source: Source) -> Plan:
+def _parse_plan(source: ConfigSource) -> Plan:
     """Return the study in a file, with its keys checked."""
     data = source.data
     for key in data:
@@ -305,7 +305,7 @@ def _parse_plan(source: Source) -> Plan:
     return Plan(_resolve_base(below), tuple(changes), points, number, seed, source.name)
 
 
-def _parse_arrangement(source: Source) -> tuple[Arrangement, int | None, int | None]:
+def _parse_arrangement(source: ConfigSource) -> tuple[Arrangement, int | None, int | None]:
     """Return how the points of a study's file are chosen, how many are drawn, and with which seed."""
     points = source.data.get("points", "grid")
     if points not in ARRANGEMENTS:
@@ -322,11 +322,11 @@ def _parse_arrangement(source: Source) -> tuple[Arrangement, int | None, int | N
     return points, numbers[0], numbers[1]
 
 
-def _make_error(source: Source, key: str, said: str) -> ConfigError:
+def _make_error(source: ConfigSource, key: str, said: str) -> ConfigError:
     return ConfigError(f"{source.where((key,))}: {key}: {said}")
 
 
-def _resolve_base(source: Source) -> Source:
+def _resolve_base(source: ConfigSource) -> ConfigSource:
     """Return the base of a study in a form that holds in any folder.
 
     Files of plugins have their absolute names, the numbers of matrices replace their files, and its own name is the

@@ -54,7 +54,7 @@ class Task:
 
 @final
 @dataclass(frozen=True)
-class Answer:
+class PointAnswer:
     """The result of a task: the contents of ``result.json``, or the reason why there are none (``failure``).
 
     ``interrupted`` says that a key or a signal came while it ended.
@@ -94,7 +94,7 @@ class Bounds(Observer):
             self.tell(number, lower, upper)
 
 
-def run_point(task: Task, observers: Iterable[Observer] = ()) -> Answer:
+def run_point(task: Task, observers: Iterable[Observer] = ()) -> PointAnswer:
     """Run a point of a study.
 
     The directory has its final name only when it is complete. A process that dies therefore loses only the points on
@@ -123,7 +123,7 @@ def run_point(task: Task, observers: Iterable[Observer] = ()) -> Answer:
         if outcome.interrupted and outcome.result.stopped:
             raise KeyboardInterrupt(outcome.result.stopped)
         keep(partial, ends)
-        return Answer(finite(outcome.summary), interrupted=outcome.interrupted)
+        return PointAnswer(finite(outcome.summary), interrupted=outcome.interrupted)
     except OutOfTime as error:
         return _keep_failure(partial, ends, str(error))
     except KeyboardInterrupt:
@@ -170,10 +170,10 @@ def keep(partial: Path, ends: Path) -> None:
                 raise
 
 
-def _keep_failure(partial: Path, ends: Path, said: str) -> Answer:
+def _keep_failure(partial: Path, ends: Path, said: str) -> PointAnswer:
     """Keep the directory of a run that ended in an error, and return an answer with the reason."""
     if (partial / "result.json").is_file():
         keep(partial, ends)
     else:
         shutil.rmtree(partial, ignore_errors=True)
-    return Answer(failure=said)
+    return PointAnswer(failure=said)

@@ -36,7 +36,7 @@ from sparserob_core.experiment.run.events import (
 from sparserob_core.experiment.run.given import GivenConfig, as_config
 from sparserob_core.experiment.sweep.axes import Axis
 from sparserob_core.experiment.sweep.plan import FILE, Arrangement, Plan, Point, make_plan, read_plan
-from sparserob_core.experiment.sweep.point import Answer, Bounds, Task, run_point
+from sparserob_core.experiment.sweep.point import Bounds, PointAnswer, Task, run_point
 from sparserob_core.experiment.sweep.study import RUNS, Study
 from sparserob_core.experiment.sweep.table import COLUMNS, TABLE, Row, columns_of, columns_text, row_of, table_text
 from sparserob_core.sip.events import Notify, ignore
@@ -339,7 +339,7 @@ class _SweepCall:
         self.by_hash = {point.hash: point for point in reversed(points)}  # the first of equal configs names the run
         self.names = {point.hash: run_name(plan.axes, point) for point in self.by_hash.values()}
         self.copies = Counter(point.hash for point in points)
-        self.answers: dict[str, Answer] = {}
+        self.answers: dict[str, PointAnswer] = {}
         self.pending: set[str] = set()
         self.done = self.failed = self.new = 0
         self.began = time.monotonic()
@@ -417,7 +417,7 @@ class _SweepCall:
             name = names_by_digest.get(digest[:DIGITS])
             summary = None if name is None else _read_result(self.directory / RUNS / name, digest)
             if name is not None and summary is not None:
-                self.names[digest], self.answers[digest] = name, Answer(summary)
+                self.names[digest], self.answers[digest] = name, PointAnswer(summary)
 
     def _run_points(self, factory: ExecutorFactory, waiting: list[str]) -> None:
         """Run points until each has an answer.
@@ -430,7 +430,7 @@ class _SweepCall:
             if suspects:
                 digest = suspects.pop(0)
                 if self._run_batch(factory, [digest]):
-                    self._record_answer(digest, Answer(failure="the process that ran it died, twice"))
+                    self._record_answer(digest, PointAnswer(failure="the process that ran it died, twice"))
                 continue
             unanswered, before = self._run_batch(factory, waiting), len(waiting)
             suspects = [digest for digest in unanswered if self._get_partial_path(digest).exists()]
@@ -443,8 +443,8 @@ class _SweepCall:
         """Run a batch on a new executor; returns the points that have no answer since a worker died."""
         unanswered: list[str] = []
         with _open_workers(factory) as executor:
-            ended: SimpleQueue[Future[Answer]] = SimpleQueue()
-            open_ones: dict[Future[Answer], str] = {}
+            ended: SimpleQueue[Future[PointAnswer]] = SimpleQueue()
+            open_ones: dict[Future[PointAnswer], str] = {}
             for digest in batch:
                 shutil.rmtree(self._get_partial_path(digest), ignore_errors=True)
                 try:
@@ -478,7 +478,9 @@ class _SweepCall:
 
         return [Bounds(tell)]
 
-    def _collect_answer(self, future: Future[Answer], open_ones: dict[Future[Answer], str], lost: list[str]) -> None:
+    def _collect_answer(
+        self, future: Future[PointAnswer], open_ones: dict[Future[PointAnswer], str], lost: list[str]
+    ) -> None:
         digest = open_ones.pop(future)
         try:
             answer = future.result()
@@ -486,13 +488,13 @@ class _SweepCall:
             lost.append(digest)
             return
         except Exception as error:  # noqa: BLE001  what the executor could not send or fetch is this point's failure
-            answer = Answer(failure=named(error))
+            answer = PointAnswer(failure=named(error))
         self._record_answer(digest, answer, open_ones)
         if answer.interrupted:
             raise KeyboardInterrupt
 
     def _record_answer(
-        self, digest: str, answer: Answer, open_ones: Mapping[Future[Answer], str] | None = None
+        self, digest: str, answer: PointAnswer, open_ones: Mapping[Future[PointAnswer], str] | None = None
     ) -> None:
         """Keep an answer, and report it."""
         self.answers[digest] = answer
@@ -545,7 +547,7 @@ class _SweepCall:
             if all(not owner[0] or owner == (os.getpid(), platform.node()) or is_dead(*owner) for owner in owners):
                 shutil.rmtree(path, ignore_errors=True)
 
-    def _report_progress(self, digest: str, open_ones: Mapping[Future[Answer], str] | None = None) -> None:
+    def _report_progress(self, digest: str, open_ones: Mapping[Future[PointAnswer], str] | None = None) -> None:
         running = [
             point_hash
             for future, point_hash in (open_ones or {}).items()

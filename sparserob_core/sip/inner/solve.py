@@ -41,7 +41,7 @@ from sparserob_core.sip.inner.more_digits import refined
 from sparserob_core.sip.inner.norms import around, bent, near, of_the_rest, towards
 from sparserob_core.sip.inner.standard_form import Form, Recovered, has_cones, standard_form
 from sparserob_core.sip.inner.vertex import many, sifted, simplex
-from sparserob_core.sip.solver import Asked, Claim, QuadraticProgram, Solver
+from sparserob_core.sip.solver import AccountedSolver, Claim, QuadraticProgram, Solver
 
 # The accuracy that a solver is asked for, in multiples of the tolerance, in each form, until it is believed.
 ATTEMPTS: tuple[tuple[Form, float], ...] = (("split", 0.1), ("epigraph", 0.1), ("split", 1e-3), ("split", 10.0))
@@ -81,7 +81,7 @@ class _Case:
     """
 
     program: FiniteProgram
-    solver: Asked
+    solver: AccountedSolver
     tolerance: float
     small: float
     attempts: list[str] = field(default_factory=list)
@@ -147,11 +147,11 @@ def solve_finite(
     whatever the solver says. ``guess``: a solution of a program with the same numbers of rows; a separable program is
     then first tried by Newton's method. ``small``: a gap that is above ``10 tolerance`` times the value, and times this
     share of what is added up to it, is worth more digits; whether they are found or not, what is believed stays
-    ``optimal``. ``solver``: what may answer before it, and who does where it does not, `Asked` says. Raises
+    ``optimal``. ``solver``: what may answer before it, and who does where it does not, `AccountedSolver` says. Raises
     `InputError` when the program's shapes or numbers are at fault; a hard program is ``failed``, never an exception.
     """
     program.validate()
-    counted = Asked.of(solver)
+    counted = AccountedSolver.of(solver)
     case = _Case(program, counted, tolerance, small)
     solution = _solve_case(case, guess)
     if counted.instead is not None and solution.status == "failed":

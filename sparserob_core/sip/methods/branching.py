@@ -32,7 +32,7 @@ INWARDS = 1e-9  # of a bound, so that whoever derives it with another rounding d
 
 
 @dataclass(frozen=True, eq=False)
-class Part:
+class BranchNode:
     """Subset of the decisions, a node of the tree: one change of the bounds of an image in the part ``above`` it.
 
     Either the image has the bounds ``lower`` and ``upper``, or it counts (``on``). All images that count together with
@@ -59,14 +59,14 @@ class Branching:
     rows: Rows
     letters: Array | None = None
     alphabet: Sequence[float] = ()
-    parts: list[Part] = field(default_factory=list)
+    parts: list[BranchNode] = field(default_factory=list)
     nodes: list[Leaf | Branch] = field(default_factory=list)
     _heap: list[tuple[float, int]] = field(default_factory=list)
 
     def __post_init__(self) -> None:
         base = self.program.finite
         self.prices, self._vector_numbers = prices_of(self.program), vectors(self.program)
-        root = Part(-1, 0, float(base.lower[0]), float(base.upper[0]), False)
+        root = BranchNode(-1, 0, float(base.lower[0]), float(base.upper[0]), False)
         self.parts, self.nodes = [root], [Leaf(NO_BOUND)]
         self._heap = [(self._update_bound(0), 0)]
 
@@ -106,7 +106,7 @@ class Branching:
         below, above = float(low[image]), float(high[image])
         if self.letters is None:
             letters_at_cut = None
-            children = [Part(number, image, 0.0, 0.0, False), Part(number, image, below, above, True)]
+            children = [BranchNode(number, image, 0.0, 0.0, False), BranchNode(number, image, below, above, True)]
         else:
             allowed = self.letters[image]
             indices = np.flatnonzero((allowed >= below) & (allowed <= above))
@@ -114,8 +114,8 @@ class Branching:
             lower_index, upper_index = int(indices[cut - 1]), int(indices[cut])
             letters_at_cut = (float(self.alphabet[lower_index]), float(self.alphabet[upper_index]))
             children = [
-                Part(number, image, below, float(allowed[lower_index]), False),
-                Part(number, image, float(allowed[upper_index]), above, False),
+                BranchNode(number, image, below, float(allowed[lower_index]), False),
+                BranchNode(number, image, float(allowed[upper_index]), above, False),
             ]
         # measured before anything is changed: whoever is interrupted leaves a tree that covers every decision
         bounded_children, first = [self._bound_part(child, Leaf(NO_BOUND)) for child in children], len(self.nodes)
@@ -134,7 +134,7 @@ class Branching:
         self.parts[number], self.nodes[number] = self._bound_part(self.parts[number], leaf)
         return self.parts[number].bound
 
-    def _bound_part(self, part: Part, leaf: Leaf) -> tuple[Part, Leaf]:
+    def _bound_part(self, part: BranchNode, leaf: Leaf) -> tuple[BranchNode, Leaf]:
         """A part and its leaf, bounded with all rows; with what was known of it where that is better."""
         finite, certain = self._build_finite(part)
         corner = self._solve_part(finite)
@@ -177,7 +177,7 @@ class Branching:
         of = replace(finite, q=finite.q / unit, weights=finite.weights / unit)
         return self.relaxed.dual(self.rows, y / unit, mu / unit, z / unit, bound / unit, priced=priced, of=of)
 
-    def _find_bounds(self, part: Part) -> tuple[Array, Array, np.ndarray]:
+    def _find_bounds(self, part: BranchNode) -> tuple[Array, Array, np.ndarray]:
         """The bounds of all images in one part, and which count there whatever their value."""
         base = self.program.finite
         lower, upper, is_on = base.lower.copy(), base.upper.copy(), np.zeros(base.lower.size, dtype=bool)
@@ -196,7 +196,7 @@ class Branching:
             part = self.parts[part.above]
         return lower, upper, is_on
 
-    def _build_finite(self, part: Part) -> tuple[FiniteProgram, float]:
+    def _build_finite(self, part: BranchNode) -> tuple[FiniteProgram, float]:
         lower, upper, is_on = self._find_bounds(part)
         base = replace(self.relaxed.finite(self.rows.G, self.rows.h, 0.0), lower=lower, upper=upper)
         finite, _, certain = convex_below(base, self.prices, is_on)

@@ -27,7 +27,7 @@ from sparserob_core.sip.result import Result
 from sparserob_core.sip.separation.separation import separate
 from sparserob_core.sip.working.ledger import (
     ALLOWED,
-    Answer,
+    CheckedAnswer,
     Found,
     Ledger,
     Prover,
@@ -94,7 +94,7 @@ class Rounds:
     ledger: Ledger
     working: Working
     prover: Prover
-    kept: tuple[Answer, Found] | None = None
+    kept: tuple[CheckedAnswer, Found] | None = None
 
     def step(self, number: int) -> Result | None:
         """Perform one round; return its result where it is the last round, and ``None`` otherwise."""
@@ -152,7 +152,7 @@ class Rounds:
             ledger.judged(answer, worst_of(separations), proofs, self._explain_ending(answer, last)), answer
         )
 
-    def _explain_ending(self, answer: Answer, last: bool) -> str:
+    def _explain_ending(self, answer: CheckedAnswer, last: bool) -> str:
         """Return the reason why there is no further round, where the rules of the exchange are not the reason."""
         if self.ledger.tools.deadline.passed:
             return self.ledger.tools.deadline.reason
@@ -162,7 +162,7 @@ class Rounds:
             return ""
         return f"the decision is optimal for the regularised problem, epsilon = {answer.epsilon:g}"
 
-    def _choose_result(self, result: Result, answer: Answer) -> Result:
+    def _choose_result(self, result: Result, answer: CheckedAnswer) -> Result:
         """The result, or that of a decision that is proven, or of the last one that seemed feasible, with an open gap,
         where only that is proven."""
         result = or_proven(self.ledger, result)

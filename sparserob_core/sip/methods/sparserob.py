@@ -36,7 +36,7 @@ from sparserob_core.sip.result import Result, SearchTrace
 from sparserob_core.sip.rules import InnerStop, Metropolis, OptimisersSettle, OuterStep, OuterStop, Schedule, Selection
 from sparserob_core.sip.search.search import Rules, Target, maximise
 from sparserob_core.sip.separation.separation import separate
-from sparserob_core.sip.working.ledger import Answer, Found, Ledger, prover_of
+from sparserob_core.sip.working.ledger import CheckedAnswer, Found, Ledger, prover_of
 from sparserob_core.sip.working.plain import PlainRows
 from sparserob_core.sip.working.securing import back_off
 
@@ -137,7 +137,7 @@ class _OuterIteration:
         # Maximise: g(epsilon; .) over tuples, from the best so far, until SC2; walks accept by SlCr.
         self.point = _search_tuples(method, g, ledger, self.parts, self.point, epsilon, j)
         value, x = g.at(self.point), g.solution.x
-        answer = Answer(g.solution, g.rows(), epsilon, value)
+        answer = CheckedAnswer(g.solution, g.rows(), epsilon, value)
         self.steps.append(OuterStep(j, epsilon, value, program.cost(x), ledger.lower, x))
         if np.isfinite(value):
             separations = separate(program, x, tools, number=number)
@@ -166,7 +166,7 @@ class _OuterIteration:
         return _choose_result(ledger, result, answer)
 
 
-def _choose_result(ledger: Ledger, result: Result, answer: Answer) -> Result:
+def _choose_result(ledger: Ledger, result: Result, answer: CheckedAnswer) -> Result:
     """The result of the last ``answer``, or that of the decision that is proven in its place, with what that one is."""
     if result.status not in ("refuted", "undecided") or ledger.proven is None:
         return result
@@ -178,7 +178,7 @@ def _choose_result(ledger: Ledger, result: Result, answer: Answer) -> Result:
     return ledger.judged(proven_answer, worst_of(separations), proofs, ledger.tools.deadline.reason or ending)
 
 
-def _prove_answer(ledger: Ledger, answer: Answer, found: Found, tools: Tools) -> None:
+def _prove_answer(ledger: Ledger, answer: CheckedAnswer, found: Found, tools: Tools) -> None:
     """Keep an answer, and prove it or one that is backed off by the little that it misses the constraints by."""
     ledger.keep(answer, found)
     idle = np.zeros(answer.rows.h.size, dtype=int)
@@ -235,7 +235,7 @@ def _save_interrupted(g: TupleValue, ledger: Ledger, point: Array, value: float,
     in which nothing is told and another interrupt ends it."""
     ledger.relaxed.deadline = Deadline()  # one last program
     if np.isfinite(value) and np.isfinite(g.at(point)):
-        answer = Answer(g.solution, g.rows(), epsilon, value)
+        answer = CheckedAnswer(g.solution, g.rows(), epsilon, value)
         grace = Deadline(max(LAST, ledger.tools.deadline.at_most(MOMENT)))
         ledger.keep(answer)
         tools, ledger.relaxed.deadline = replace(ledger.tools, deadline=grace, notify=ignore), grace

@@ -88,7 +88,7 @@ class SparsestMethod(Method, Options):
             return _report_infeasible(program, plain, ())
         if plain is not None and plain.decision is None:
             return plain
-        state = _Search(self, program, bounded, tools, letters, plain)
+        state = _SparsestSearch(self, program, bounded, tools, letters, plain)
         root = state.root()
         return drive(tools.deadline, state.step, state.stopped) if root is None else root
 
@@ -122,7 +122,7 @@ class SparsestMethod(Method, Options):
 
 
 @dataclass(eq=False)
-class _Search:
+class _SparsestSearch:
     """State of the search while its two bounds close: the rows found so far, the best decision with its result, and the
     tree."""
 

@@ -25,7 +25,7 @@ from sparserob_core.sip.inner.solve import solve_finite
 from sparserob_core.sip.limits.deadline import Deadline
 from sparserob_core.sip.program import SemiInfiniteProgram
 from sparserob_core.sip.result import SMALL_COST
-from sparserob_core.sip.solver import ROUNDING, Asked, Solver
+from sparserob_core.sip.solver import ROUNDING, AccountedSolver, Solver
 
 if TYPE_CHECKING:
     from scipy.sparse import csc_array
@@ -144,7 +144,7 @@ def _select_most_violated(excess: Float[Array, " r"], kinds: Int[np.ndarray, " r
 
 def require_separable(program: SemiInfiniteProgram, solver: Solver, regulariser: Regulariser | None) -> None:
     """Raise `InputError` where the solver is `DualNewton`, and the relaxed programs are not for it."""
-    counted = Asked.of(solver)
+    counted = AccountedSolver.of(solver)
     if not isinstance(counted.solver, DualNewton):
         return
     if program.spread is not None:
@@ -193,7 +193,7 @@ class RelaxedProgram:
     _plain_program: tuple[Rows, FiniteProgram] | None = None
 
     def __post_init__(self) -> None:
-        self.counted = Asked.of(self.solver)
+        self.counted = AccountedSolver.of(self.solver)
         if self.counted.instead is not None:
             self.solved_by[self.counted.name] += 0
         if self.regulariser is not None:

@@ -15,7 +15,7 @@ from sparserob_core.sip.maximiser import Maximiser, Objective
 WORST = 1e20  # loss where the function has no value; it is finite, since some optimisers compute with it
 
 
-class Asked(Protocol):
+class AskTellOptimiser(Protocol):
     """An optimiser that minimises by ``asked = ask()`` and ``tell(asked, loss)``, as those of cma, nevergrad and
     optuna."""
 
@@ -32,7 +32,9 @@ class FromAskTell(Maximiser):
 
     scaled: ClassVar[bool] = True
 
-    def __init__(self, create: Callable[[int, int, np.random.Generator], Asked], read: Callable[[Any], Any]) -> None:
+    def __init__(
+        self, create: Callable[[int, int, np.random.Generator], AskTellOptimiser], read: Callable[[Any], Any]
+    ) -> None:
         self.create, self.read = create, read
 
     def search(self, objective: Objective, rng: np.random.Generator) -> float:
@@ -74,7 +76,7 @@ class FromMinimiser(Maximiser):
 
 
 def from_ask_tell(
-    create: Callable[[int, int, np.random.Generator], Asked], read: Callable[[Any], Any] = np.asarray
+    create: Callable[[int, int, np.random.Generator], AskTellOptimiser], read: Callable[[Any], Any] = np.asarray
 ) -> Maximiser:
     """Return a maximiser made from an optimiser with ``ask`` and ``tell``, which minimises over the unit box.
 

@@ -150,7 +150,7 @@ class Handed(ABC):
 
 
 @final
-class Moving(Handed):
+class MovingObjective(Handed):
     """The objective in the coordinates that can move; each of the others keeps its only value.
 
     The ``domain`` has ``lower < upper`` everywhere, so that no maximiser receives a degenerate box. The ``block`` is
@@ -213,7 +213,7 @@ class Moving(Handed):
 
 
 @final
-class Scaled(Handed):
+class ScaledObjective(Handed):
     """The objective in units in which the box and the values are of size 1.
 
     Every side of the box has a length of about 1. The first value that is neither 0 nor infinite has a size of about 1.

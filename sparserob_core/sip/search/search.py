@@ -16,7 +16,7 @@ from sparserob_core.sip.events import Notify, Phase, ignore
 from sparserob_core.sip.maximiser import EvaluationError, LinearBlocks, Maximiser, Objective, Report, SearchEnded, Trace
 from sparserob_core.sip.rules import Metropolis, Progress
 from sparserob_core.sip.search.block_ascent import block_ascent
-from sparserob_core.sip.search.handed import Apart, Moving, Scaled
+from sparserob_core.sip.search.handed import Apart, MovingObjective, ScaledObjective
 from sparserob_core.sip.search.notifier import Notifier, Standing
 
 Function: TypeAlias = Callable[[Array], object]
@@ -541,7 +541,7 @@ def maximise(
     moves = np.flatnonzero(target.domain.lower < target.domain.upper)
     reserved = int(rules.share(maximiser, target) * budget) if budget == int(budget) else 0
     objective = CountedObjective(target, budget - reserved, rules, notify, name)
-    shown = objective if moves.size in (0, target.domain.dimension) else Moving(objective, moves, name)
+    shown = objective if moves.size in (0, target.domain.dimension) else MovingObjective(objective, moves, name)
     bound, stopped, interrupted = np.inf, "the maximiser found nothing left to gain", False
     try:
         try:
@@ -567,7 +567,7 @@ def maximise(
 
             if not block_ascent(shown):  # no local method that knows less of the blocks improves its result
                 points, values = objective.seen()
-                scaled = Scaled(shown, values)
+                scaled = ScaledObjective(shown, values)
                 polish(scaled, *scaled.seen(points[:, moves], values))
     except SearchEnded:
         pass
@@ -613,7 +613,7 @@ def ask(maximiser: Maximiser, objective: Objective, rng: np.random.Generator) ->
     name = name_of(maximiser)
     if maximiser.apart and objective.acting is not None:  # a tuple of indices
         objective = Apart(objective)
-    scaled = Scaled(objective, objective.known()[1]) if maximiser.scaled else None
+    scaled = ScaledObjective(objective, objective.known()[1]) if maximiser.scaled else None
     try:
         claimed: object = maximiser.search(objective if scaled is None else scaled, rng)
     except (SearchEnded, SparseRobError, KeyboardInterrupt):

@@ -43,22 +43,27 @@ def separate(
     round ``number``; `search_worst`), the harder the less is found: as long as nothing of any family is violated by
     more than ``threshold``. Raises `OutOfTime` when the deadline of the tools has passed."""
 
-    def search(family: ConstraintFamily) -> _Search:
+    def search(family: ConstraintFamily) -> _ViolationSearch:
         notify = forwarded(
             tools.notify, EvaluationsFinished, lambda event: replace(event, family=family.name, round=number)
         )
-        return _Search(family, x, replace(tools, notify=notify), threshold)
+        return _ViolationSearch(family, x, replace(tools, notify=notify), threshold)
 
-    answers: dict[str, Separation | _Search] = {}
+    answers: dict[str, Separation | _ViolationSearch] = {}
     for family in program.families:
         tools.deadline.check()
         answers[family.name] = search(family) if family.worst is None else family.separated(x)
-    searched = [answer for answer in answers.values() if isinstance(answer, _Search)]
+    searched = [answer for answer in answers.values() if isinstance(answer, _ViolationSearch)]
     highest = max((float(answer.violations.max(initial=-np.inf)) for answer in answers.values()), default=-np.inf)
     _search_harder(searched, highest)
     separations = ((family, answers[family.name]) for family in program.families)
     return [
-        (family, replace(answer.result() if isinstance(answer, _Search) else answer, formulation=family.formulation))
+        (
+            family,
+            replace(
+                answer.result() if isinstance(answer, _ViolationSearch) else answer, formulation=family.formulation
+            ),
+        )
         for family, answer in separations
     ]
 
@@ -77,22 +82,22 @@ def search_worst(family: ConstraintFamily, x: Array, tools: Tools, threshold: fl
     A search proves nothing: ``bound`` is ``inf`` unless the maximiser proved one, or the index set is a single point.
     Raises `InputError` when a row is not a number or the index set is unbounded, and `OutOfTime` past the deadline.
     """
-    search = _Search(family, x, tools, threshold)
+    search = _ViolationSearch(family, x, tools, threshold)
     _search_harder([search], search.highest)
     return search.result()
 
 
-def _search_harder(searches: Sequence[_Search], highest: float) -> None:
+def _search_harder(searches: Sequence[_ViolationSearch], highest: float) -> None:
     """Search on, by finer grids and then by the maximiser, until one of the searches has found a violation, which is
     ``highest`` so far."""
-    for step in (_Search.look_closer, _Search.ask):
+    for step in (_ViolationSearch.look_closer, _ViolationSearch.ask):
         for search in searches:
             if highest <= search.threshold:
                 step(search)
                 highest = max(highest, search.highest)
 
 
-class _Search:
+class _ViolationSearch:
     """The search for the largest violations of a family: what is ``found``, by the grid of every round to begin with,
     and the last ``survey``."""
 

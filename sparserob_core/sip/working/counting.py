@@ -26,7 +26,7 @@ ROUNDED = 1e-12  # of the terms of which an entry is a sum: an entry of this siz
 
 @final
 @dataclass(frozen=True, eq=False)
-class Counted:
+class CountBound:
     """Convex program whose optimal value bounds the count from below.
 
     Parameters
@@ -44,13 +44,13 @@ class Counted:
     tilt: Array
 
 
-def counted_below(program: SemiInfiniteProgram) -> Counted:
+def counted_below(program: SemiInfiniteProgram) -> CountBound:
     """Return the convex program whose cost plus ``certain`` is at most the count at every feasible decision."""
     prices = prices_of(program)
     finite, tilt, certain = convex_below(program.finite, prices / program.cost_unit)
     cost = finite.weights, finite.q
     cheaper = replace(program, weights=cost[0], q=cost[1], P=None, constant=0.0, blocks=None, largest=None, twin=None)
-    return Counted(cheaper, certain * program.cost_unit, tilt)
+    return CountBound(cheaper, certain * program.cost_unit, tilt)
 
 
 def convex_below(

@@ -63,7 +63,7 @@ def prover_of(program: SemiInfiniteProgram, tools: Tools) -> Prover:
 
 
 @dataclass(frozen=True, eq=False)
-class Answer:
+class CheckedAnswer:
     """Answer to a relaxed program.
 
     Parameters
@@ -116,7 +116,7 @@ class Ledger:
         Multipliers of the best lower bound.
     history : list of RoundFinished
         All rounds.
-    best : Answer, optional
+    best : CheckedAnswer, optional
         The last answer that no search refuted, or else the last answer.
     proven : tuple, optional
         The cheapest answer at which every family is proven, with its separations and proofs.
@@ -129,8 +129,8 @@ class Ledger:
     started: float = field(default_factory=time.perf_counter)
     dual: Dual = NO_BOUND
     history: list[RoundFinished] = field(default_factory=list)
-    best: Answer | None = None
-    proven: tuple[Answer, Found, Sequence[Proof]] | None = None
+    best: CheckedAnswer | None = None
+    proven: tuple[CheckedAnswer, Found, Sequence[Proof]] | None = None
     _separations: Found = ()
     _has_suggested: bool = False
 
@@ -159,14 +159,14 @@ class Ledger:
         rounded = np.finfo(float).eps * self.program.finite.magnitude(x)
         return relative_gap(self.lower, self.program.cost(x) + rounded, self.program.added(x))
 
-    def tell(self, number: int, answer: Answer, found: Found, upper: float, kept: int) -> None:
+    def tell(self, number: int, answer: CheckedAnswer, found: Found, upper: float, kept: int) -> None:
         """Record a round, and send its event.
 
         Parameters
         ----------
         number : int
             Number of the round.
-        answer : Answer
+        answer : CheckedAnswer
             Answer to the relaxed program.
         found : Found
             Most violated constraints of each family at the answer.
@@ -206,16 +206,16 @@ class Ledger:
             self._has_suggested = bool(np.isfinite(upper))
         self.tools.notify(event)
 
-    def keep(self, answer: Answer, found: Found = ()) -> None:
+    def keep(self, answer: CheckedAnswer, found: Found = ()) -> None:
         """Keep the answer that is returned if the method is stopped now, with its most violated constraints."""
         self.best, self._separations = answer, found
 
-    def prove(self, answer: Answer, found: Found, proofs: Sequence[Proof]) -> bool:
+    def prove(self, answer: CheckedAnswer, found: Found, proofs: Sequence[Proof]) -> bool:
         """Keep an answer if these proofs show that it is feasible and it is the cheapest so far.
 
         Parameters
         ----------
-        answer : Answer
+        answer : CheckedAnswer
             The answer.
         found : Found
             Most violated constraints of each family at the answer.
@@ -239,17 +239,19 @@ class Ledger:
             self.proven = answer, found, proofs
         return True
 
-    def cheaper(self, answer: Answer) -> bool:
+    def cheaper(self, answer: CheckedAnswer) -> bool:
         """Return whether the answer costs less than the cheapest proven answer, or no answer is proven."""
         cost = self.program.cost(answer.solution.x)
         return self.proven is None or cost < self.program.cost(self.proven[0].solution.x)
 
-    def judged(self, answer: Answer, worst: WorstConstraint, proofs: Sequence[Proof], ending: str = "") -> Result:
+    def judged(
+        self, answer: CheckedAnswer, worst: WorstConstraint, proofs: Sequence[Proof], ending: str = ""
+    ) -> Result:
         """Return the result with the decision of an answer, and the status that proofs, gap and bounds allow.
 
         Parameters
         ----------
-        answer : Answer
+        answer : CheckedAnswer
             The answer.
         worst : WorstConstraint
             The most violated constraint that was found.
@@ -337,7 +339,7 @@ class Ledger:
         proofs = as_bad_as_found(proven, self._separations)
         return self.judged(self.best, worst_of(self._separations), proofs, reason)
 
-    def without(self, answer: Answer) -> Result:
+    def without(self, answer: CheckedAnswer) -> Result:
         """Return the result where the relaxed program has no usable answer.
 
         The status is ``infeasible`` with its reasons where that is proven, and ``failed`` otherwise.
@@ -364,7 +366,9 @@ class Ledger:
         answer, separations, proofs = self.proven
         return self.judged(answer, worst_of(separations), proofs, failed.message)
 
-    def result(self, status: Status, message: str, answer: Answer, worst: WorstConstraint | None = None) -> Result:
+    def result(
+        self, status: Status, message: str, answer: CheckedAnswer, worst: WorstConstraint | None = None
+    ) -> Result:
         """Return a result with this answer, whose bounds are claimed as far as the status allows.
 
         Parameters
@@ -373,7 +377,7 @@ class Ledger:
             The status.
         message : str
             The reason for the status.
-        answer : Answer
+        answer : CheckedAnswer
             The answer.
         worst : WorstConstraint, optional
             The most violated constraint.

@@ -22,7 +22,7 @@ from sparserob_core.sip.relaxed.relaxed import Rows, rows_at
 from sparserob_core.sip.result import Result
 from sparserob_core.sip.separation.separation import separate
 from sparserob_core.sip.working.counting import count, met, tidied
-from sparserob_core.sip.working.ledger import ALLOWED, Answer, Found, Ledger, Prover, Violated, above
+from sparserob_core.sip.working.ledger import ALLOWED, CheckedAnswer, Found, Ledger, Prover, Violated, above
 from sparserob_core.sip.working.working import Missed, Working, fits
 
 # Number of rounds without a multiplier after which a row is dropped. With 1, rows are dropped and imposed in turn; with
@@ -100,7 +100,7 @@ class PlainRows(Working):
         """Number of imposed rows."""
         return int(self.rows.h.size)
 
-    def relax(self, ledger: Ledger, prover: Prover, last: bool) -> Answer | Result:
+    def relax(self, ledger: Ledger, prover: Prover, last: bool) -> CheckedAnswer | Result:
         """Return the optimum under the imposed rows, or the final result where there is none.
 
         Without enough rows the cost may fall without bound. Then rows that prevent this are imposed, where there are
@@ -123,7 +123,7 @@ class PlainRows(Working):
             answer = self._solve_regularised(ledger)
         return answer if usable(answer.solution) else ledger.without(answer)
 
-    def _solve_regularised(self, ledger: Ledger) -> Answer:
+    def _solve_regularised(self, ledger: Ledger) -> CheckedAnswer:
         """Return the optimum of the relaxed program with decreasing weights of the regulariser.
 
         The weight decreases while the cost still changes and the gap is open, by several steps of the continuation at
@@ -144,7 +144,7 @@ class PlainRows(Working):
             has_converged = abs(cost_after - cost_before) <= regu.tolerance * max(1.0, abs(ledger.lower))
             if has_converged and self.exact and ledger.open(solution.x):
                 self._solve_unregularised(ledger)
-        return Answer(solution, self.rows, self.epsilon, solution.value)
+        return CheckedAnswer(solution, self.rows, self.epsilon, solution.value)
 
     def _solve(self, ledger: Ledger, epsilon: float) -> FiniteSolution:
         """Return the solution of the relaxed program with a given weight; its multipliers improve the lower bound."""
@@ -154,7 +154,7 @@ class PlainRows(Working):
         if usable(solution):
             self.guess = solution
             ledger.improve(ledger.relaxed.lower_bound(self.rows, solution))
-            self.pay(ledger, Answer(solution, self.rows, epsilon, solution.value))
+            self.pay(ledger, CheckedAnswer(solution, self.rows, epsilon, solution.value))
         return solution
 
     def _solve_unregularised(self, ledger: Ledger) -> FiniteSolution:
@@ -165,7 +165,7 @@ class PlainRows(Working):
             ledger.improve(ledger.relaxed.lower_bound(self.rows, plain))
         return plain
 
-    def sharpen(self, ledger: Ledger, answer: Answer) -> bool:
+    def sharpen(self, ledger: Ledger, answer: CheckedAnswer) -> bool:
         """Improve the lower bound by the unregularised program, and continue without the regulariser.
 
         This step is the last one, for a regulariser that is not exact at its smallest weight. False is returned where
@@ -180,7 +180,7 @@ class PlainRows(Working):
         self.epsilon, self.guess = 0.0, plain if self.program.n >= MANY else None
         return True
 
-    def exchange(self, answer: Answer, violated: Violated, number: int) -> int:
+    def exchange(self, answer: CheckedAnswer, violated: Violated, number: int) -> int:
         """Impose violated rows, and drop rows that were idle for some rounds; return the number of new rows."""
         fresh = self._find_new_rows(violated)
         if not fresh.h.size:
@@ -219,7 +219,7 @@ class PlainRows(Working):
                 fresh = fresh.joined(rows_at(self.program, family, indices[is_new], rows[is_new]))
         return fresh
 
-    def priced(self, answer: Answer) -> float:
+    def priced(self, answer: CheckedAnswer) -> float:
         """Return the increase of an answer's cost when all rows are moved by 1 along their normals, to first order."""
         return float(answer.multipliers @ answer.rows.norms)
 
@@ -239,26 +239,26 @@ class PlainRows(Working):
         row = rows_at(self.program, missed.family, missed.at, missed.row)
         return missed.violation / max(float(np.linalg.norm(row.G)), np.finfo(float).tiny)
 
-    def tightened(self, ledger: Ledger, answer: Answer, margin: float) -> Answer | None:
+    def tightened(self, ledger: Ledger, answer: CheckedAnswer, margin: float) -> CheckedAnswer | None:
         """Return the optimum of the imposed rows tightened by ``margin``; ``None`` where there is none."""
         guess = _pad_multipliers(answer.solution, self.rows.h.size - answer.rows.h.size)
         solution = ledger.relaxed.solve(self.rows, self.epsilon, margin, guess)
         if not usable(solution):
             return None
         ledger.improve(ledger.relaxed.lower_bound(self.rows, solution))
-        return Answer(solution, self.rows, self.epsilon, solution.value)
+        return CheckedAnswer(solution, self.rows, self.epsilon, solution.value)
 
-    def candidate(self, answer: Answer) -> Answer | None:
+    def candidate(self, answer: CheckedAnswer) -> CheckedAnswer | None:
         """Return ``None``: no decision other than the answer is known."""
         return None
 
-    def proven(self, ledger: Ledger, answer: Answer, x: Array) -> Dual:
+    def proven(self, ledger: Ledger, answer: CheckedAnswer, x: Array) -> Dual:
         """Return the lower bound by the multipliers of an answer, with tangents of the cost at ``x (n,)``."""
         return ledger.relaxed.lower_bound(answer.rows, replace(answer.solution, x=x))
 
     def choose(
-        self, ledger: Ledger, answer: Answer, found: Found, number: int, prover: Prover
-    ) -> tuple[Answer, Found, Violated]:
+        self, ledger: Ledger, answer: CheckedAnswer, found: Found, number: int, prover: Prover
+    ) -> tuple[CheckedAnswer, Found, Violated]:
         """Return an answer in which fewer entries count, where there is one.
 
         The new answer is the old one without the small entries that solvers leave, or a vertex of the relaxed program
@@ -269,7 +269,9 @@ class PlainRows(Working):
             self._solve_unregularised(ledger)
         return answer, found, violated
 
-    def _sparsify(self, ledger: Ledger, answer: Answer, found: Found, number: int) -> tuple[Answer, Found, Violated]:
+    def _sparsify(
+        self, ledger: Ledger, answer: CheckedAnswer, found: Found, number: int
+    ) -> tuple[CheckedAnswer, Found, Violated]:
         """Return an answer with a smaller count, its violations, and the constraints that a rejected candidate
         violates."""
         program, x = self.program, answer.solution.x

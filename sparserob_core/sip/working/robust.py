@@ -26,8 +26,8 @@ from sparserob_core.sip.proof.verdict import NAMED, explained
 from sparserob_core.sip.relaxed.relaxed import Rows
 from sparserob_core.sip.result import Result
 from sparserob_core.sip.separation.separation import separate
-from sparserob_core.sip.solver import Asked
-from sparserob_core.sip.working.ledger import ALLOWED, Answer, Found, Ledger, Prover, Violated, above, unproven
+from sparserob_core.sip.solver import AccountedSolver
+from sparserob_core.sip.working.ledger import ALLOWED, CheckedAnswer, Found, Ledger, Prover, Violated, above, unproven
 from sparserob_core.sip.working.plain import Close
 from sparserob_core.sip.working.securing import GLANCE, SPARED
 from sparserob_core.sip.working.working import Missed, Working, size_of
@@ -72,7 +72,7 @@ class RobustRows(Working):
         Price of a margin of 1 in the last round.
     calls : Counter of str
         Numbers of answers by their origin.
-    asked : Asked, optional
+    asked : AccountedSolver, optional
         Solver of the counterparts, where the user named one.
     guided : bool
         Whether the guide was used.
@@ -88,7 +88,7 @@ class RobustRows(Working):
     accuracy: float = COARSE
     price: float = 0.0
     calls: Counter[str] = field(default_factory=Counter)
-    asked: Asked | None = None
+    asked: AccountedSolver | None = None
     guided: bool = False
 
     @staticmethod
@@ -152,7 +152,7 @@ class RobustRows(Working):
         self.calls += self.counterpart.answered - before
         return answer
 
-    def relax(self, ledger: Ledger, prover: Prover, last: bool) -> Answer | Result:
+    def relax(self, ledger: Ledger, prover: Prover, last: bool) -> CheckedAnswer | Result:
         """Return the optimum under the imposed rows, or the final result where there is none.
 
         Where tightened rows are infeasible, the margin is reduced; in the end infeasibility is proven. For a program
@@ -230,7 +230,7 @@ class RobustRows(Working):
                         self.best = candidate
         return violated
 
-    def candidate(self, answer: Answer) -> Answer | None:
+    def candidate(self, answer: CheckedAnswer) -> CheckedAnswer | None:
         """Return the best decision known, for a program with a guide."""
         return self._replace_decision(answer, self.best) if self.best.size else None
 
@@ -239,7 +239,7 @@ class RobustRows(Working):
         """Number of imposed rows."""
         return len(self.cuts)
 
-    def exchange(self, answer: Answer, violated: Violated, number: int) -> int:
+    def exchange(self, answer: CheckedAnswer, violated: Violated, number: int) -> int:
         """Impose violated rows; return the number of changes.
 
         The worst deviations of imposed rows are added too. Where all of them are known, the next solution is more
@@ -254,7 +254,7 @@ class RobustRows(Working):
         worst = max(float(self.program.family(name).violations(x, at).max(initial=0.0)) for at, _, name in violated)
         return changes + self._raise_accuracy(answer, worst, bool(changes)) + self.counterpart.sharpen(x)
 
-    def sharpen(self, ledger: Ledger, answer: Answer) -> bool:
+    def sharpen(self, ledger: Ledger, answer: CheckedAnswer) -> bool:
         """Add constraints that the guide does not contain, more accuracy, or the worst deviations; return false where
         none remain."""
         x, undefined = answer.solution.x, 0
@@ -262,7 +262,7 @@ class RobustRows(Working):
             undefined = self.impose(self._find_undefined(x, True))
         return bool(undefined + self._raise_accuracy(answer, 0.0, bool(undefined)) + self.counterpart.sharpen(x))
 
-    def _raise_accuracy(self, answer: Answer, violation: float, added: bool) -> bool:
+    def _raise_accuracy(self, answer: CheckedAnswer, violation: float, added: bool) -> bool:
         """Return whether the next round can be more accurate; it is where new constraints change little."""
         if not self.counterpart.approximate or self.accuracy <= FINEST * self.tolerance:
             return False
@@ -293,7 +293,7 @@ class RobustRows(Working):
         """Return whether an index is imposed."""
         return (missed.family, missed.at[0].tobytes()) in self.known
 
-    def priced(self, answer: Answer) -> float:
+    def priced(self, answer: CheckedAnswer) -> float:
         """Return the sum of the multipliers: the price of a margin of 1."""
         return float(answer.multipliers.sum())
 
@@ -311,7 +311,7 @@ class RobustRows(Working):
         """Return the violation, since margins are in the rows' own units."""
         return missed.violation
 
-    def tightened(self, ledger: Ledger, answer: Answer, margin: float) -> Answer | None:
+    def tightened(self, ledger: Ledger, answer: CheckedAnswer, margin: float) -> CheckedAnswer | None:
         """Return the optimum of the imposed rows tightened by ``margin``, accurate to a tenth of what the first margin
         may cost, or as accurate as the rounds."""
         accuracy = min(self.accuracy, SHARPER * SPARED) * size_of(self.program, answer)
@@ -319,13 +319,13 @@ class RobustRows(Working):
         self._record_calls(ledger)
         return self._form_answer(ledger, solution) if solution.solved else None
 
-    def _form_answer(self, ledger: Ledger, found: RobustAnswer) -> Answer:
+    def _form_answer(self, ledger: Ledger, found: RobustAnswer) -> CheckedAnswer:
         """Return the decision of a solved counterpart; the bound of its multipliers improves the lower bound."""
         self.raw = np.clip(found.x, self.program.finite.lower, self.program.finite.upper)
         dual, none = self.dual(found, priced=True), np.zeros(0)
         ledger.improve(dual)
         solution = FiniteSolution("optimal", self.raw, np.inf, dual.bound, found.y, found.mu, none, np.inf, np.inf)
-        return self._replace_decision(Answer(solution, self._imposed_rows, 0.0, np.inf), self._settle(self.raw))
+        return self._replace_decision(CheckedAnswer(solution, self._imposed_rows, 0.0, np.inf), self._settle(self.raw))
 
     def _settle(self, x: Array) -> Array:
         """Return a decision within its bounds, with the variables that families define at their values."""
@@ -335,7 +335,7 @@ class RobustRows(Working):
             settled = np.clip(settled, self.program.finite.lower, self.program.finite.upper)
         return settled
 
-    def _replace_decision(self, answer: Answer, x: Array) -> Answer:
+    def _replace_decision(self, answer: CheckedAnswer, x: Array) -> CheckedAnswer:
         """Return an answer with another decision."""
         value, bound = self.program.cost(x), answer.solution.lower_bound
         residual = self.program.finite.residual(x)
@@ -411,7 +411,7 @@ class RobustRows(Working):
             return self._report_infeasible(ledger, elastic, dual)
         x = np.zeros(self.program.n)
         solution = FiniteSolution("failed", x, np.nan, -np.inf, none, none, none, np.inf, np.inf, said)
-        answer = Answer(solution, self._imposed_rows, 0.0, np.nan)
+        answer = CheckedAnswer(solution, self._imposed_rows, 0.0, np.nan)
         return ledger.result("failed", f"the relaxed program was not solved: {said}", answer)
 
     def _report_infeasible(self, ledger: Ledger, answer: RobustAnswer, dual: Dual) -> Result:
@@ -432,7 +432,7 @@ class RobustRows(Working):
         )
         ledger.dual = dual
         reason, worst = _describe_infeasibility(self.program, dual)
-        final_answer = Answer(solution, self._imposed_rows, 0.0, np.inf)
+        final_answer = CheckedAnswer(solution, self._imposed_rows, 0.0, np.inf)
         return replace(ledger.result("infeasible", reason.sentence(), final_answer, worst), infeasible=reason)
 
     def _record_calls(self, ledger: Ledger) -> None:
@@ -442,13 +442,13 @@ class RobustRows(Working):
             ledger.relaxed.counted.calls = ledger.relaxed.solves
         ledger.relaxed.solved_by.update(self.calls - ledger.relaxed.solved_by)
 
-    def proven(self, ledger: Ledger, answer: Answer, x: Array) -> Dual:
+    def proven(self, ledger: Ledger, answer: CheckedAnswer, x: Array) -> Dual:
         """Return the lower bound by the bounds of the decision alone."""
         return self.at_rest
 
     def choose(
-        self, ledger: Ledger, answer: Answer, found: Found, number: int, prover: Prover
-    ) -> tuple[Answer, Found, Violated]:
+        self, ledger: Ledger, answer: CheckedAnswer, found: Found, number: int, prover: Prover
+    ) -> tuple[CheckedAnswer, Found, Violated]:
         """Return the best decision by the second objective of the program (``among``), once this decision has been
         proven.
 
@@ -469,7 +469,7 @@ class RobustRows(Working):
         return self._replace_decision(answer, decision), separations, ()
 
     def _optimise_second(
-        self, ledger: Ledger, answer: Answer, second: SemiInfiniteProgram, shared: int
+        self, ledger: Ledger, answer: CheckedAnswer, second: SemiInfiniteProgram, shared: int
     ) -> Array | None:
         """Return the optimum of the ``second`` program under the active rows and one more row of the cost.
 

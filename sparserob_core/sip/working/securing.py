@@ -17,7 +17,7 @@ from sparserob_core.sip.program import SemiInfiniteProgram
 from sparserob_core.sip.proof.verdict import worst_of
 from sparserob_core.sip.result import Result
 from sparserob_core.sip.separation.separation import separate
-from sparserob_core.sip.working.ledger import ALLOWED, Answer, Found, Ledger, Prover, Violated, above, witnesses
+from sparserob_core.sip.working.ledger import ALLOWED, CheckedAnswer, Found, Ledger, Prover, Violated, above, witnesses
 from sparserob_core.sip.working.working import Missed, Working, left_open
 
 # Number of cells of a short proof. With a tenth, ordinary problems with parameters need a tightened decision although a
@@ -57,7 +57,7 @@ PAID = 2.0  # ratio of a margin to what is left open: half of it is for what the
 
 
 def proofs_of(
-    working: Working, ledger: Ledger, prover: Prover, answer: Answer, found: Found
+    working: Working, ledger: Ledger, prover: Prover, answer: CheckedAnswer, found: Found
 ) -> tuple[Sequence[Proof], bool]:
     """Return what is proven of an answer, and whether constraints were imposed for that.
 
@@ -72,7 +72,7 @@ def proofs_of(
         Accounts of the method.
     prover : Prover
         Prover of the families.
-    answer : Answer
+    answer : CheckedAnswer
         Answer to the relaxed program.
     found : Found
         Most violated constraints of each family at the answer.
@@ -99,7 +99,9 @@ def proofs_of(
     return proofs, imposed
 
 
-def secure_in_time(working: Working, ledger: Ledger, prover: Prover, answer: Answer, found: Found, number: int) -> bool:
+def secure_in_time(
+    working: Working, ledger: Ledger, prover: Prover, answer: CheckedAnswer, found: Found, number: int
+) -> bool:
     """Prove a tightened decision when it is due, even if the decision of this round is violated.
 
     The decision is due as soon as its margin costs little. With a limit, the decision is also due at certain shares of
@@ -114,7 +116,7 @@ def secure_in_time(working: Working, ledger: Ledger, prover: Prover, answer: Ans
         Accounts of the method.
     prover : Prover
         Prover of the families.
-    answer : Answer
+    answer : CheckedAnswer
         Answer to the relaxed program.
     found : Found
         Most violated constraints of each family at the answer.
@@ -155,7 +157,7 @@ def secure_in_time(working: Working, ledger: Ledger, prover: Prover, answer: Ans
     return _secure(working, ledger, prover, answer, violations, violated)
 
 
-def back_off(working: Working, ledger: Ledger, prover: Prover, answer: Answer, found: Found) -> None:
+def back_off(working: Working, ledger: Ledger, prover: Prover, answer: CheckedAnswer, found: Found) -> None:
     """Prove the answer of a search, or a tightened decision near it.
 
     The tightened decision is tried where the answer violates the constraints so little that the margin costs no more
@@ -171,7 +173,7 @@ def back_off(working: Working, ledger: Ledger, prover: Prover, answer: Answer, f
         Accounts of the method.
     prover : Prover
         Prover of the families.
-    answer : Answer
+    answer : CheckedAnswer
         Answer of the search.
     found : Found
         Most violated constraints of each family at the answer.
@@ -208,7 +210,7 @@ def _secure(
     working: Working,
     ledger: Ledger,
     prover: Prover,
-    answer: Answer,
+    answer: CheckedAnswer,
     missed: Sequence[Missed],
     violated: Violated,
     spared: float = SPARED,
@@ -230,7 +232,7 @@ def _secure(
         Accounts of the method.
     prover : Prover
         Prover of the families.
-    answer : Answer
+    answer : CheckedAnswer
         Answer to the relaxed program.
     missed : sequence of Missed
         Largest violations at the answer, found or not excluded.
@@ -245,7 +247,7 @@ def _secure(
         Whether constraints were imposed.
     """
     program, margin, imposed = ledger.program, working.margin, 0
-    kept: tuple[Answer, Found] | None = None  # a short proof left cells open, and no search finds a violation
+    kept: tuple[CheckedAnswer, Found] | None = None  # a short proof left cells open, and no search finds a violation
     cells, dear_margin = GLANCE, _compute_dear_margin(abs(program.cost(answer.solution.x)), working.priced(answer))
     for _ in range(SECURED):
         cost, price = abs(program.cost(answer.solution.x)), working.priced(answer)
@@ -287,7 +289,9 @@ def _compute_dear_margin(cost: float, price: float) -> float:
     return float(DEAR * cost / max(price, max(cost, 1.0) * np.finfo(float).tiny))
 
 
-def _solve_tightened(working: Working, ledger: Ledger, answer: Answer, margin: float, more: float) -> Answer | None:
+def _solve_tightened(
+    working: Working, ledger: Ledger, answer: CheckedAnswer, margin: float, more: float
+) -> CheckedAnswer | None:
     """Return the optimum of the imposed rows tightened by ``margin + more``, or by ``margin`` where that is infeasible.
 
     ``None`` where both are infeasible, or where the margin overflows.
@@ -309,7 +313,7 @@ def _separate_violations(ledger: Ledger, x: Array) -> tuple[Found, Sequence[Miss
     return separations, [Missed.most(*pair) for pair in violated_pairs], [above(*pair) for pair in violated_pairs]
 
 
-def _is_near(working: Working, program: SemiInfiniteProgram, answer: Answer, missed: Sequence[Missed]) -> bool:
+def _is_near(working: Working, program: SemiInfiniteProgram, answer: CheckedAnswer, missed: Sequence[Missed]) -> bool:
     """Return whether a margin that covers what an answer ``missed`` costs no more than the first margin of `_secure`.
 
     A round may take longer than all rounds before it, so the method does not wait for a better answer then.

@@ -18,7 +18,7 @@ from sparserob_core.sip.evidence import Dual, Proof
 from sparserob_core.sip.program import EQUALITY, ConstraintFamily, SemiInfiniteProgram, Separation
 from sparserob_core.sip.result import SMALL_COST, Result
 from sparserob_core.sip.separation.separation import separate
-from sparserob_core.sip.working.ledger import ALLOWED, Answer, Found, Ledger, Prover, Violated, above
+from sparserob_core.sip.working.ledger import ALLOWED, CheckedAnswer, Found, Ledger, Prover, Violated, above
 
 # The least positive margin, and the largest, in units of the decision's bounds where those are below 1. The least is
 # the rounding of rows: five times as much costs most of the tolerated gap where multipliers are a million; less has no
@@ -102,7 +102,7 @@ class Working(ABC):
         """Number of imposed rows."""
 
     @abstractmethod
-    def relax(self, ledger: Ledger, prover: Prover, last: bool) -> Answer | Result:
+    def relax(self, ledger: Ledger, prover: Prover, last: bool) -> CheckedAnswer | Result:
         """Return the optimum under the imposed constraints, or the final result where there is no optimum.
 
         The multipliers of the optimum improve the lower bound.
@@ -123,12 +123,12 @@ class Working(ABC):
         """
 
     @abstractmethod
-    def exchange(self, answer: Answer, violated: Violated, number: int) -> int:
+    def exchange(self, answer: CheckedAnswer, violated: Violated, number: int) -> int:
         """Impose constraints that are violated at an answer, and drop idle ones.
 
         Parameters
         ----------
-        answer : Answer
+        answer : CheckedAnswer
             Answer to the relaxed program.
         violated : Violated
             Constraints that are violated at it.
@@ -150,14 +150,14 @@ class Working(ABC):
         """Return whether a constraint is imposed."""
 
     @abstractmethod
-    def sharpen(self, ledger: Ledger, answer: Answer) -> bool:
+    def sharpen(self, ledger: Ledger, answer: CheckedAnswer) -> bool:
         """Solve the imposed constraints more accurately, where nothing is violated and the gap is open.
 
         Parameters
         ----------
         ledger : Ledger
             Accounts of the method.
-        answer : Answer
+        answer : CheckedAnswer
             Answer to the relaxed program.
 
         Returns
@@ -167,14 +167,14 @@ class Working(ABC):
         """
 
     @abstractmethod
-    def proven(self, ledger: Ledger, answer: Answer, x: Array) -> Dual:
+    def proven(self, ledger: Ledger, answer: CheckedAnswer, x: Array) -> Dual:
         """Return the lower bound by the multipliers of an answer, or by none.
 
         Parameters
         ----------
         ledger : Ledger
             Accounts of the method.
-        answer : Answer
+        answer : CheckedAnswer
             Answer with multipliers.
         x : ndarray, shape (n,)
             Decision at which terms of the cost are replaced by tangents.
@@ -187,15 +187,15 @@ class Working(ABC):
 
     @abstractmethod
     def choose(
-        self, ledger: Ledger, answer: Answer, found: Found, number: int, prover: Prover
-    ) -> tuple[Answer, Found, Violated]:
+        self, ledger: Ledger, answer: CheckedAnswer, found: Found, number: int, prover: Prover
+    ) -> tuple[CheckedAnswer, Found, Violated]:
         """Return the preferred one of the decisions that cost equally little.
 
         Parameters
         ----------
         ledger : Ledger
             Accounts of the method.
-        answer : Answer
+        answer : CheckedAnswer
             Answer to the relaxed program.
         found : Found
             Most violated constraints of each family at the answer.
@@ -206,7 +206,7 @@ class Working(ABC):
 
         Returns
         -------
-        answer : Answer
+        answer : CheckedAnswer
             The preferred answer, or the same one.
         found : Found
             Most violated constraints at it.
@@ -215,14 +215,14 @@ class Working(ABC):
         """
 
     @abstractmethod
-    def tightened(self, ledger: Ledger, answer: Answer, margin: float) -> Answer | None:
+    def tightened(self, ledger: Ledger, answer: CheckedAnswer, margin: float) -> CheckedAnswer | None:
         """Return the optimum of the imposed rows tightened by a margin.
 
         Parameters
         ----------
         ledger : Ledger
             Accounts of the method.
-        answer : Answer
+        answer : CheckedAnswer
             Optimum with a smaller margin.
         margin : float
             The margin.
@@ -234,7 +234,7 @@ class Working(ABC):
         """
 
     @abstractmethod
-    def priced(self, answer: Answer) -> float:
+    def priced(self, answer: CheckedAnswer) -> float:
         """Return the increase of an answer's cost when all rows are tightened by 1, to first order."""
 
     @property
@@ -252,10 +252,10 @@ class Working(ABC):
         """Return the margin that removes a violation."""
 
     @abstractmethod
-    def candidate(self, answer: Answer) -> Answer | None:
+    def candidate(self, answer: CheckedAnswer) -> CheckedAnswer | None:
         """Return a decision that may be proven before the gap is closed, where one is known."""
 
-    def rested(self, ledger: Ledger, answer: Answer, found: Found, number: int) -> tuple[Answer, Found]:
+    def rested(self, ledger: Ledger, answer: CheckedAnswer, found: Found, number: int) -> tuple[CheckedAnswer, Found]:
         """Return the answer with every costly entry at 0, where that closes the gap and violates nothing.
 
         Solvers leave small entries where the optimum of a cost is 0, and the relative gap stays open there.
@@ -264,7 +264,7 @@ class Working(ABC):
         ----------
         ledger : Ledger
             Accounts of the method.
-        answer : Answer
+        answer : CheckedAnswer
             Answer to the relaxed program.
         found : Found
             Most violated constraints of each family at the answer.
@@ -273,7 +273,7 @@ class Working(ABC):
 
         Returns
         -------
-        answer : Answer
+        answer : CheckedAnswer
             The new answer, or the same one.
         found : Found
             Most violated constraints at it.
@@ -303,7 +303,7 @@ class Working(ABC):
         self.margin, self.slater = self.most, self.most > 0.0
         return True
 
-    def pay(self, ledger: Ledger, answer: Answer) -> None:
+    def pay(self, ledger: Ledger, answer: CheckedAnswer) -> None:
         """Tighten the rows by as much as a tenth of the tolerated gap pays for.
 
         Up to four tenths are paid where many rows are active at once. Near a constraint that is active for a long time,
@@ -336,7 +336,7 @@ class Working(ABC):
         self.margin = max(self.margin, self.floor)
         return True
 
-    def allow_for(self, ledger: Ledger, answer: Answer, proofs: Sequence[Proof]) -> bool:
+    def allow_for(self, ledger: Ledger, answer: CheckedAnswer, proofs: Sequence[Proof]) -> bool:
         """Increase the margin by what a proof leaves open, where nothing is violated.
 
         A proof has to allow for rounding.
@@ -345,7 +345,7 @@ class Working(ABC):
         ----------
         ledger : Ledger
             Accounts of the method.
-        answer : Answer
+        answer : CheckedAnswer
             Answer to the relaxed program.
         proofs : sequence of Proof
             Proofs at the answer.
@@ -367,7 +367,7 @@ class Working(ABC):
         self.allowed += 1
         return True
 
-    def _is_affordable(self, ledger: Ledger, answer: Answer, margin: float) -> bool:
+    def _is_affordable(self, ledger: Ledger, answer: CheckedAnswer, margin: float) -> bool:
         """Return whether the tolerated gap pays for a margin above the largest, where no such margin left nothing
         feasible.
 
@@ -401,7 +401,7 @@ def fits(ledger: Ledger, x: Array) -> bool:
     return not ledger.open(x) and base.missed(x) <= EQUALITY and base.residual(x) <= ALLOWED
 
 
-def size_of(program: SemiInfiniteProgram, answer: Answer) -> float:
+def size_of(program: SemiInfiniteProgram, answer: CheckedAnswer) -> float:
     """Return the size to which a gap at an answer is relative."""
     x = answer.solution.x
     return max(SMALL_COST * program.added(x), abs(program.cost(x)))

@@ -20,7 +20,7 @@ from sparserob_core.checker.reach.measurable import MeasurableLoop
 from sparserob_core.checker.sets.polynomials import Enclosed
 from sparserob_core.control.feedback.closed_loop import ClosedLoop
 from sparserob_core.control.feedback.measurable import VaryingPieces
-from sparserob_core.control.feedback.zonoid import Pushes
+from sparserob_core.control.feedback.zonoid import KernelPolynomial
 from sparserob_core.control.problem.system import VaryingSystem
 from sparserob_core.control.transcription.transcribe import prepare
 from tests.support.closed_loops import CHANGING, Changing, exponentials
@@ -87,7 +87,7 @@ def test_what_it_is_at_least_and_at_most_is_as_near_as_rounding(name: str) -> No
 def test_pushes_on_parts_of_an_interval_are_the_polynomials_of_the_whole() -> None:
     rng = np.random.default_rng(0)
     kernels, ends = [rng.normal(size=(5, 2, 1)), rng.normal(size=(3, 2, 1))], np.array([0.0, 0.5, 2.0])
-    found = Pushes.joined(kernels, ends, [3, 2])
+    found = KernelPolynomial.joined(kernels, ends, [3, 2])
     assert found.ends == pytest.approx([0.0, 0.5 / 3, 1.0 / 3, 0.5, 1.25, 2.0])
     assert found.halves == pytest.approx(np.diff(found.ends) / 2)
     for part, (low, high) in enumerate(pairwise(found.ends.tolist())):
@@ -97,7 +97,9 @@ def test_pushes_on_parts_of_an_interval_are_the_polynomials_of_the_whole() -> No
             share = (low + (1.0 + u) / 2 * (high - low) - begin) / length
             truth = sum(one * share**k for k, one in enumerate(kernels[which])) / length
             assert np.tensordot(u ** np.arange(found.terms.shape[1]), found.terms[part], 1) == pytest.approx(truth)
-    none = Pushes.joined([np.concatenate([kernels[0], 1e-18 * np.ones((4, 2, 1))])], np.array([0.0, 1.0]), [1])
+    none = KernelPolynomial.joined(
+        [np.concatenate([kernels[0], 1e-18 * np.ones((4, 2, 1))])], np.array([0.0, 1.0]), [1]
+    )
     assert none.terms.shape[1] == 5
 
 

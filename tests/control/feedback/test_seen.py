@@ -15,7 +15,7 @@ from scipy.linalg import expm
 import sparserob_core as sr
 from sparserob_core.control.feedback.observer import Observer
 from sparserob_core.control.feedback.tree import Sampled
-from sparserob_core.control.feedback.zonoid import Pushes, Zonoid
+from sparserob_core.control.feedback.zonoid import KernelPolynomial, Zonoid
 from sparserob_core.control.sets.sets import Box, Polytope
 from sparserob_core.control.transcription.transcribe import prepare
 from tests.support.closed_loops import LOOPS
@@ -134,7 +134,7 @@ def test_an_observer_predicts_with_the_least_error():
 
 def test_a_set_of_what_a_disturbance_does_has_chords_to_its_boundary():
     A, E = np.array([[0.0, 1.0], [-2.0, -0.3]]), np.array([[0.3, 0.0], [1.0, -0.5]])
-    made = Zonoid.of(Pushes.of(A, E, 0.7), Box([-0.1, -0.2], [0.1, 0.2]))
+    made = Zonoid.of(KernelPolynomial.of(A, E, 0.7), Box([-0.1, -0.2], [0.1, 0.2]))
     zero, axes = np.zeros((2, 2)), np.eye(2)
     assert not made.middle().any() and not made.interior_point().any() and made.is_symmetric
     low, high = made.chord(zero, axes)
@@ -152,7 +152,7 @@ def test_the_coordinates_of_what_a_disturbance_does_have_second_moments_alike():
     A, E = np.array([[0.0, 1.0], [-2.0, -0.3]]), np.array([[0.3, 0.0], [1.0, -0.5]])
     signs = np.array([[1.0, 1.0], [1.0, -1.0], [-1.0, 1.0], [-1.0, -1.0]])
     bound = Polytope(signs / [0.4, 0.2], np.ones(4))
-    found, lengths = Zonoid.of(Pushes.of(A, E, 0.7), bound), (np.arange(100) + 0.5) * 0.7 / 100
+    found, lengths = Zonoid.of(KernelPolynomial.of(A, E, 0.7), bound), (np.arange(100) + 0.5) * 0.7 / 100
     steps = np.array([expm(A * s) for s in lengths]) @ (E * [0.4, 0.2])
     moments = np.einsum("sij,skj->ik", steps, steps) * 0.7 / len(steps)
     assert found.into @ moments @ found.into.T == pytest.approx(np.eye(2), abs=1e-3)

@@ -11,7 +11,7 @@ from scipy.linalg import expm
 import sparserob_core as sr
 from sparserob_core.checker.sets.known import summands_of
 from sparserob_core.checker.sets.polynomials import Enclosed
-from sparserob_core.control.feedback.zonoid import Arc, Pushes, Zonoid, _is_nonnegative, _solve_shares
+from sparserob_core.control.feedback.zonoid import Arc, KernelPolynomial, Zonoid, _is_nonnegative, _solve_shares
 from sparserob_core.control.sets.sets import Box, Polytope
 from sparserob_core.sip.convex_set import Array, ConvexSet
 from tests.support.undriven import undriven
@@ -44,7 +44,7 @@ def effect(A: Array, E: Array, length: float, ends: Array, values: Array) -> Arr
 
 def test_the_support_of_a_force_on_a_double_integrator_is_in_closed_form() -> None:
     """``int_0^l |a_1 r + a_2| dr`` with a root at ``-a_2 / a_1`` where that is within the piece."""
-    length, found = 0.8, Zonoid.of(Pushes.of(DOUBLE, FORCE, 0.8), Box([-1.0], [1.0]))
+    length, found = 0.8, Zonoid.of(KernelPolynomial.of(DOUBLE, FORCE, 0.8), Box([-1.0], [1.0]))
     rng = np.random.default_rng(0)
     for a in rng.normal(size=(50, 2)):
         root = float(np.clip(-a[1] / a[0], 0.0, length))
@@ -56,7 +56,7 @@ def test_the_support_of_a_force_on_a_double_integrator_is_in_closed_form() -> No
 @pytest.mark.parametrize("name", CASES)
 def test_the_support_function_is_the_integral_of_that_of_the_disturbance(name: str) -> None:
     A, E, length, bound = CASES[name]
-    found, count = Zonoid.of(Pushes.of(A, E, length), bound), 20_000
+    found, count = Zonoid.of(KernelPolynomial.of(A, E, length), bound), 20_000
     step, K = expm(A * length / count), [expm(A * length / count / 2) @ E]
     for _ in range(count - 1):
         K.append(step @ K[-1])
@@ -70,7 +70,7 @@ def test_the_support_function_is_the_integral_of_that_of_the_disturbance(name: s
 @pytest.mark.parametrize("name", CASES)
 def test_the_signal_of_a_direction_attains_the_support_function_and_no_sampled_signal_exceeds_it(name: str) -> None:
     A, E, length, bound = CASES[name]
-    found, rng = Zonoid.of(Pushes.of(A, E, length), bound), np.random.default_rng(2)
+    found, rng = Zonoid.of(KernelPolynomial.of(A, E, length), bound), np.random.default_rng(2)
     for a in rng.normal(size=(3, found.dimension)):
         best = found.best(a)
         assert (bound.violation(best.values + bound.middle()) <= 1e-12).all()
@@ -88,7 +88,7 @@ def test_the_signal_of_a_direction_attains_the_support_function_and_no_sampled_s
 )
 def test_every_point_of_the_set_has_an_admissible_signal(name: str) -> None:
     A, E, length, bound = CASES[name]
-    found, rng = Zonoid.of(Pushes.of(A, E, length), bound), np.random.default_rng(3)
+    found, rng = Zonoid.of(KernelPolynomial.of(A, E, length), bound), np.random.default_rng(3)
     extreme = found.support_point(rng.normal(size=(6, found.dimension)))
     points = np.vstack([rng.dirichlet(np.ones(6), 3) @ extreme, np.zeros((1, found.dimension)), extreme[:1]])
     for point, made in zip(points, found.signals(points), strict=True):
@@ -102,7 +102,7 @@ def test_every_point_of_the_set_has_an_admissible_signal(name: str) -> None:
 def test_a_signal_leads_where_an_exponential_says(name: str) -> None:
     """Signals that jump anywhere, at ends of parts too, not those of the best corners alone."""
     A, E, length, bound = CASES[name]
-    found, rng = Zonoid.of(Pushes.of(A, E, length), bound), np.random.default_rng(6)
+    found, rng = Zonoid.of(KernelPolynomial.of(A, E, length), bound), np.random.default_rng(6)
     of_parts = 1.0 - found.pushes.ends[1:-1] / length
     for ends in (np.ones(1), np.append(np.sort(rng.uniform(size=7)), 1.0), np.append(of_parts[::-1], 1.0)):
         values = rng.normal(size=(ends.size, E.shape[1]))
@@ -119,7 +119,7 @@ def test_a_signal_does_not_miss_its_point_where_columns_are_the_same_but_for_rou
     """Towards a corner of a round set three of four columns are one point to 1e-9, and a share of theirs is negative:
     without it a signal missed 3e-8."""
     A, E, length, bound = CASES[name]
-    found, rng = Zonoid.of(Pushes.of(A, E, length), bound), np.random.default_rng(seed)
+    found, rng = Zonoid.of(KernelPolynomial.of(A, E, length), bound), np.random.default_rng(seed)
     points = found.support_point(rng.normal(size=(8, 4))) * rng.uniform(size=(8, 1))
     reached = np.array([found.reached(one) for one in found.signals(points)])
     assert np.abs(reached - points).max() <= 1e-13
@@ -137,9 +137,9 @@ def test_shares_of_columns_that_are_one_point_are_taken_over_by_one_of_them() ->
 
 
 def test_a_direction_that_nothing_pushes_is_no_coordinate() -> None:
-    found = Zonoid.of(Pushes.of(-np.eye(2), np.ones((2, 1)), 1.0), Box([-0.2], [0.2]))
+    found = Zonoid.of(KernelPolynomial.of(-np.eye(2), np.ones((2, 1)), 1.0), Box([-0.2], [0.2]))
     assert found.dimension == 1
-    assert Zonoid.of(Pushes.of(SPRING, np.eye(2), 1.0), Box([0.5, 0.0], [0.5, 0.0])).dimension == 0
+    assert Zonoid.of(KernelPolynomial.of(SPRING, np.eye(2), 1.0), Box([0.5, 0.0], [0.5, 0.0])).dimension == 0
 
 
 def test_a_chord_less_a_parabola_is_the_whole_truth_of_convex_quadratics() -> None:
@@ -163,7 +163,7 @@ def test_a_chord_less_a_parabola_is_the_whole_truth_of_convex_quadratics() -> No
 def test_the_support_function_is_that_of_the_checker_to_all_digits(name: str) -> None:
     """Whose enclosure is another algorithm, in balls: no quadrature is as good."""
     A, E, length, bound = CASES[name]
-    found = Zonoid.of(Pushes.of(A, E, length), bound)
+    found = Zonoid.of(KernelPolynomial.of(A, E, length), bound)
     a = np.random.default_rng(4).normal(size=(40, found.dimension))
     with ctx.workprec(96):
         system = sr.LinearSystem(A, np.zeros((len(A), 1)), E)

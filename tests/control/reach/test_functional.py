@@ -12,9 +12,9 @@ from scipy.linalg import expm
 
 from sparserob_core.control.problem.cost import nominal_point
 from sparserob_core.control.problem.system import LinearSystem, SwitchedSystem, VaryingSystem
-from sparserob_core.control.reach.functional import WorstCase
+from sparserob_core.control.reach.functional import WorstFunctionals
 from sparserob_core.control.response.disturbance import disturbance_model
-from sparserob_core.control.response.response import Outputs, Response, TimeGrid, merge_grids
+from sparserob_core.control.response.response import OutputResponse, Response, TimeGrid, merge_grids
 from sparserob_core.control.sets.sets import Box, Ellipsoid, NormBall, Product
 from sparserob_core.errors import InputError
 from tests.support.plants import indicators, random_system, simulated, uniform, walsh
@@ -40,7 +40,7 @@ MODELS = {
 BEGUN = Ellipsoid([0.02, 0.0], [[0.01, 0.002], [0.002, 0.03]])
 
 
-def functionals(name: str, begun: bool = False, delay: float = 0.0, seed: int = 1) -> WorstCase:
+def functionals(name: str, begun: bool = False, delay: float = 0.0, seed: int = 1) -> WorstFunctionals:
     rng = np.random.default_rng(seed)
     chosen = MODELS[name]
     noise = GRID if chosen is None else chosen[2]
@@ -49,7 +49,7 @@ def functionals(name: str, begun: bool = False, delay: float = 0.0, seed: int = 
     system = random_system(rng)
     system = LinearSystem(system.phases[0].A, rng.normal(size=(2, 1)), rng.normal(size=(2, 2)), delay=delay)
     response = Response(system, grid, np.array([0.7, -0.4]))
-    return WorstCase(response, GRID, model, initial=BEGUN if begun else None)
+    return WorstFunctionals(response, GRID, model, initial=BEGUN if begun else None)
 
 
 def indices(seed: int, count: int = 5) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -191,7 +191,7 @@ def test_rows_and_flows_at_times_are_exponentials(turns: bool) -> None:
     assert grid.commanded(np.array([0.0, 1.2, HORIZON])).tolist() == [0, 0, 1, 1, 1, 1]
     control, times = np.random.default_rng(10).normal(size=(1, 6)), np.array([0.0, 0.3, 1.0, 1.7, HORIZON])
     H = np.array([[1.0, 0.0], [0.5, -2.0]])
-    found = Outputs(response.propagator, H, times, np.zeros((1, 0))).at(response, control)[0]
+    found = OutputResponse(response.propagator, H, times, np.zeros((1, 0))).at(response, control)[0]
     for time, values in zip(times, found.T, strict=True):
         state = simulated(
             A, [(B, GRID.breakpoints, control)], [0.7, -0.4], min(time, 1.0) if turns else time, GRID.breakpoints
@@ -227,7 +227,7 @@ def test_outputs_of_a_system_in_time_are_those_of_an_integrator() -> None:
         run = solve_ivp(rate, (begin, end), state, t_eval=[*inside, end], args=(u,), rtol=1e-11, atol=1e-12)
         states.update(zip(inside, run.y.T, strict=False))
         state = states[end] = run.y[:, -1]
-    found = Outputs(response.propagator, H, times, np.zeros((1, 0))).at(response, control)[0]
+    found = OutputResponse(response.propagator, H, times, np.zeros((1, 0))).at(response, control)[0]
     assert pytest.approx(np.array([H @ states[time] for time in times]), abs=1e-8) == found.T
 
 

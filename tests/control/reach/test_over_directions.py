@@ -13,7 +13,7 @@ from sparserob_core.control.enclosures.comparison import block_norms
 from sparserob_core.control.enclosures.taylor import TaylorSpace, combination
 from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.control.problem.system import LinearSystem, VaryingSystem
-from sparserob_core.control.reach.functional import WorstCase
+from sparserob_core.control.reach.functional import WorstFunctionals
 from sparserob_core.control.reach.support import DirectionsCellSupport, Supports, between_corners
 from sparserob_core.control.sets.sets import Box, Ellipsoid
 from sparserob_core.control.transcription.transcribe import prepare
@@ -46,7 +46,7 @@ def made(kind: str, rows: np.ndarray) -> tuple[Supports, Any]:
         disturbance_class="piecewise_constant" if bound is None else "measurable",
         execution=[0.1, 0.2] if bound is None else None,
     )  # fmt: skip
-    functionals: WorstCase = prepare(problem, uniform(3, HORIZON), uniform(3, HORIZON)).functionals
+    functionals: WorstFunctionals = prepare(problem, uniform(3, HORIZON), uniform(3, HORIZON)).functionals
     (leg,) = functionals.legs(np.zeros(0), np.zeros(0))
     joined = combination(leg.space, len(rows) - 1)
     if bound is not None:

@@ -13,10 +13,10 @@ from scipy.integrate import solve_ivp
 
 import sparserob_core as sr
 from sparserob_core.control.enclosures import dependence
-from sparserob_core.control.enclosures.dependence import Spread
+from sparserob_core.control.enclosures.dependence import ExpandedSystem
 from sparserob_core.control.enclosures.taylor import TaylorSpace
 from sparserob_core.control.reach.varying_motion import SpreadMotion, Truncation, VaryingMotion
-from sparserob_core.control.response.response import Outputs, Propagator, Response, merge_grids
+from sparserob_core.control.response.response import OutputResponse, Propagator, Response, merge_grids
 from sparserob_core.control.response.varying import spread as expansions
 from sparserob_core.control.response.varying.discs import cauchy
 from sparserob_core.control.response.varying.expansion import Expansion
@@ -35,7 +35,7 @@ def decay(t: np.ndarray, p: np.ndarray) -> np.ndarray:
 @pytest.mark.slow
 @pytest.mark.parametrize("degree", [2, 3, 5])
 def test_what_is_beyond_a_degree_is_bounded_and_not_by_far_more_than_it_is(degree: int) -> None:
-    spread = Spread(1, TaylorSpace(1, degree), *SYSTEM.deviations)
+    spread = ExpandedSystem(1, TaylorSpace(1, degree), *SYSTEM.deviations)
     breaks = np.linspace(0.0, 3.0, 7)
     every = Propagator(SYSTEM.superposed(spread), merge_grids(breaks, breaks, varying=True))
     motion = VaryingMotion(every, np.eye(spread.states)[0])
@@ -109,7 +109,7 @@ def test_growth_within_a_piece_is_no_floor_under_the_coefficients_of_a_small_cel
         assert (grown[:, 1:] <= 2.0 * width**orders + 1e-15).all()
 
 
-PARTS = expansions.Parts((np.array([0.0, 1.0, 3.0]), np.array([-1.0, 0.0])), ((None, None),) * 2)  # type: ignore[arg-type]
+PARTS = expansions.ParameterParts((np.array([0.0, 1.0, 3.0]), np.array([-1.0, 0.0])), ((None, None),) * 2)  # type: ignore[arg-type]
 
 
 def test_every_parameter_and_every_cell_within_one_has_its_part() -> None:
@@ -147,7 +147,7 @@ def relaxed(t: np.ndarray, p: np.ndarray) -> np.ndarray:
 def test_what_power_series_leave_of_entries_is_in_what_is_beyond(name: str, degree: int) -> None:
     system = RELAXING if name == "relaxing" else FILLING
     left = cauchy(system).left(degree)
-    spread = Spread(1, TaylorSpace(1, degree), *system.deviations, left=left)
+    spread = ExpandedSystem(1, TaylorSpace(1, degree), *system.deviations, left=left)
     breaks = np.linspace(0.0, 2.0, 5)
     every = Propagator(system.superposed(spread), merge_grids(breaks, breaks, varying=True))
     motion = VaryingMotion(every, np.eye(spread.states)[0])
@@ -201,7 +201,7 @@ def test_rows_and_outputs_at_any_time_and_parameter_are_those_of_an_integrator(
     weights = response.weights(times, c, points)
     rows = weights.free @ response.initial_state
     rows += weights.control[..., 0] @ control[0] + weights.disturbance[..., 0] @ disturbance
-    outputs = Outputs(response.propagator, c, times, points).at(response, control)
+    outputs = OutputResponse(response.propagator, c, times, points).at(response, control)
     for k, (p, q) in enumerate(points.tolist()):
 
         def rate(t: float, x: np.ndarray, u: float, w: float, p: float = p, q: float = q) -> np.ndarray:
@@ -226,7 +226,7 @@ def test_rows_and_outputs_at_any_time_and_parameter_are_those_of_an_integrator(
 
 @pytest.mark.parametrize("off", [0.0, 3e-7])
 def test_norms_of_coefficients_hold_what_transitions_are_off_by(off: float, monkeypatch: pytest.MonkeyPatch) -> None:
-    spread = Spread(1, TaylorSpace(1, 6), *SYSTEM.deviations)
+    spread = ExpandedSystem(1, TaylorSpace(1, 6), *SYSTEM.deviations)
     breaks = np.linspace(0.0, 3.0, 7)
     every = Propagator(SYSTEM.superposed(spread), merge_grids(breaks, breaks, varying=True))
     truncation = Truncation(VaryingMotion(every, np.eye(spread.states)[0]), spread)

@@ -18,7 +18,7 @@ from sparserob_core.control.constraints.sensitivity import Sensitivity
 from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.problem.system import VaryingSystem
 from sparserob_core.control.reach import varying_motion
-from sparserob_core.control.reach.functional import WorstCase
+from sparserob_core.control.reach.functional import WorstFunctionals
 from sparserob_core.control.reach.varying_motion import VaryingMotion
 from sparserob_core.control.response.disturbance import disturbance_model
 from sparserob_core.control.response.parameters import ParameterIndex
@@ -45,13 +45,15 @@ GRIDS = {"uniform": uniform(6, HORIZON), "uneven": indicators([0.0, 0.4, 0.5, 1.
 NOISES = {"own": None, "others": uniform(5, HORIZON), "walsh": walsh(4, HORIZON, 2)}
 
 
-def functionals(plant: str, dictionary: Dictionary, noise: Dictionary | None, bound: str, begun: str) -> WorstCase:
+def functionals(
+    plant: str, dictionary: Dictionary, noise: Dictionary | None, bound: str, begun: str
+) -> WorstFunctionals:
     system = PLANTS[plant].forced
     noise, w, x0 = dictionary if noise is None else noise, SETS[bound], SETS[begun]
     constants = system.controls - 1
     grid = merge_grids(dictionary.breakpoints, noise.breakpoints, constants=constants, varying=True)
     model = None if w is None else disturbance_model("piecewise_constant", w, noise, grid)
-    return WorstCase(Response(system, grid, np.array([1.0, -0.5])), dictionary, model, initial=x0)
+    return WorstFunctionals(Response(system, grid, np.array([1.0, -0.5])), dictionary, model, initial=x0)
 
 
 def sampled(constraint: FlatConstraint | CurvedConstraint, x: Array, low: Array, high: Array, count: int) -> Array:
@@ -119,7 +121,7 @@ def test_bounds_hold_what_coarse_transitions_are_off_by(name, part, monkeypatch)
         x, sharp = 0.0 * x, replace(sharp, response=sharp.response.from_state(np.zeros(2)))
     H = np.array([[1.0, 0.3], [-1.0, -0.3], [-0.2, 1.0], [0.2, -1.0]])
 
-    def path(worst: WorstCase) -> FlatConstraint:
+    def path(worst: WorstFunctionals) -> FlatConstraint:
         return FlatConstraint("path", worst, H, np.zeros(4), 0.0, HORIZON, ParameterIndex(None))
 
     times = np.linspace(0.0, HORIZON, 301)[:, None]
@@ -169,7 +171,7 @@ def test_what_bends_within_a_cell_is_counted(part, start, width):
     grid = merge_grids(whole.breakpoints, whole.breakpoints, constants=system.controls - 1, varying=True)
     noise = disturbance_model("piecewise_constant", Box([-1.0], [1.0]), whole, grid) if part == "disturbance" else None
     begun = Box([-1.0, 0.0], [1.0, 0.0]) if part == "initial" else None
-    worst = WorstCase(Response(system, grid, np.zeros(2)), whole, noise, initial=begun)
+    worst = WorstFunctionals(Response(system, grid, np.zeros(2)), whole, noise, initial=begun)
     constraint = FlatConstraint("path", worst, np.eye(2)[:1], np.zeros(1), 0.0, HORIZON, ParameterIndex(None))
     times, x = np.array([[start], [start + width]]), np.zeros(worst.variables)
     inside = sampled(constraint, x, times[:1], times[1:], 9)
@@ -194,7 +196,7 @@ def test_what_every_step_is_off_by_is_carried_on(monkeypatch):
     grid = merge_grids(many.breakpoints, many.breakpoints, varying=True)
     for begun in (None, Box([-1.0], [1.0])):
         start = np.array([1.0 if begun is None else 0.0])
-        worst = WorstCase(Response(system, grid, start), many, None, initial=begun)
+        worst = WorstFunctionals(Response(system, grid, start), many, None, initial=begun)
         sides = np.array([[-1.0], [1.0]]), np.zeros(2)
         path = FlatConstraint("path", worst, *sides, 0.0, HORIZON, ParameterIndex(None))
         legs = path.functionals.legs(np.zeros(0), np.zeros(0))

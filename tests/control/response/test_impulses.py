@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sparserob_core.control.problem.system import LinearSystem
-from sparserob_core.control.response.response import Outputs, Propagator, Response, merge_grids
+from sparserob_core.control.response.response import OutputResponse, Propagator, Response, merge_grids
 from sparserob_core.sip.convex_set import Box
 from tests.support.plants import random_system, uniform, worst_case
 
@@ -122,7 +122,7 @@ def test_outputs_in_blocks_are_rows_times_the_inputs(kind, pieces):
     chosen = [np.sort(rng.choice(ends[pieces // 3 :], 8, replace=False)), np.sort(rng.uniform(1.0, 4.0, 9)), ends[-1:]]
     control = rng.uniform(-1, 1, size=(2, pieces))
     for times in chosen:
-        found = Outputs(response.propagator, H, times, NONE).at(response, control)[0]
+        found = OutputResponse(response.propagator, H, times, NONE).at(response, control)[0]
         every = response.weights(np.repeat(times, 2), np.tile(H, (times.size, 1)), np.zeros((2 * times.size, 0)))
         value = every.free @ response.initial_state + np.einsum("klm,ml->k", every.control, control)
         size = np.abs(every.free).sum(axis=1) + np.abs(every.control).sum(axis=(1, 2)) + 1.0
@@ -138,7 +138,7 @@ def test_outputs_are_the_same_in_blocks_and_from_all_states(pieces):
     found = []
     for fewest in (64, 10**9):
         with patch(f"{HOME}.FEWEST", fewest):
-            found.append(Outputs(response.propagator, H, times, NONE).at(response, control))
+            found.append(OutputResponse(response.propagator, H, times, NONE).at(response, control))
     assert found[0].shape == (1, 4, times.size)
     assert np.allclose(*found, rtol=1e-10, atol=1e-11)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sparserob_core.control.response.reference import Direct, Moving, Reference
+from sparserob_core.control.response.reference import Direct, MovingReference, Reference
 from tests.support.plants import indicators
 
 ROWS = [[0.5, 0.0, 1.0], [1.0, 2.0, 1.0], [2.0, 0.0, -3.0]]
@@ -31,7 +31,9 @@ def test_a_reference_is_linear_between_its_points_and_stands_still_beyond() -> N
 
 def test_what_moves_is_taken_off_a_row() -> None:
     H = np.array([[1.0, -1.0], [0.0, 2.0], [-3.0, 0.5]])
-    made = Moving(Reference(*(part for part in (np.array([0.0, 2.0]), np.array([[1.0, 2.0], [3.0, -2.0]])))), H)
+    made = MovingReference(
+        Reference(*(part for part in (np.array([0.0, 2.0]), np.array([[1.0, 2.0], [3.0, -2.0]])))), H
+    )
     assert made.at(np.array([0.0, 1.0])) == pytest.approx(-np.array([[-1.0, 4.0, -2.0], [2.0, 0.0, -6.0]]))
     assert made.size.tolist() == [3.0 + 2.0, 4.0, 9.0 + 1.0]
 

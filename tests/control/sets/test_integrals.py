@@ -11,7 +11,7 @@ import pytest
 
 from sparserob_core.control.sets.integrals import _halve_polynomials, curved_integral, enclosed
 from sparserob_core.control.sets.sets import Box, ConvexSet, Ellipsoid, NormBall, Polytope, Zonotope, product
-from sparserob_core.sip.convex_set import Scaled
+from sparserob_core.sip.convex_set import ScaledSet
 from tests.control.sets.test_sets import ByItsSupport
 
 SEGMENTS = np.array([[0.3, 0.04], [-0.03, 0.4]])
@@ -24,7 +24,7 @@ SETS: dict[str, ConvexSet] = {
     "product": product([NormBall(2.0, 0.5, dimension=2), Box([-1.0], [2.0])]),
     "with segments": product([NormBall(2.0, 0.5, [0.1, 0.0]), Zonotope(np.array([0.2, 0.1]), SEGMENTS)]),
     "with a triangle": product([Polytope([[-1, 0], [0, -1], [1, 1]], [0.4, -0.1, 1.0]), NormBall(2.0, 0.5, [1, 0])]),
-    "scaled": Scaled(NormBall(2.0, 0.7, [0.1, 0.0]), np.array([0.2, 0.1]), 0.5),
+    "scaled": ScaledSet(NormBall(2.0, 0.7, [0.1, 0.0]), np.array([0.2, 0.1]), 0.5),
     "in units": NormBall(3.0, 0.7, dimension=2).in_units(np.array([1e3, 0.25])),
 }
 FINE, SHARES = np.polynomial.legendre.leggauss(40)
@@ -102,7 +102,7 @@ def test_where_a_root_or_an_absolute_value_may_be_0_nothing_is_continued() -> No
     segments = Zonotope(np.zeros(2), np.array([[1.0, 0.0], [1.0, 1.0]]))
     assert analytic(segments, [1.0, 0.5], [0.2, 0.2]) and not analytic(segments, [1.0, -0.5], [0.3, 0.3])
     assert enclosed(product([ball, segments])) and not enclosed(ByItsSupport(ball))
-    assert not enclosed(Scaled(ByItsSupport(ball), np.zeros(2), 0.5))
+    assert not enclosed(ScaledSet(ByItsSupport(ball), np.zeros(2), 0.5))
 
 
 def test_of_a_ball_that_is_a_point_nothing_moves() -> None:

@@ -12,12 +12,12 @@ from scipy.optimize import linprog
 
 import sparserob_core as sr
 from sparserob_core.control.studies.answer import ControlResult
-from sparserob_core.control.studies.causal import CausalBound, CausalSearch, Limits
+from sparserob_core.control.studies.causal import CausalBound, CausalLimits, CausalSearch
 from sparserob_core.experiment.run.conclusion.causal import active, proven
 from sparserob_core.sip.convex_set import Array
 
 T, RATE = 3.0, 0.4
-FREELY = Limits(60, np.inf, np.inf, lambda: False)
+FREELY = CausalLimits(60, np.inf, np.inf, lambda: False)
 
 
 def scalar(w: float, radius: float, x0: float, rate: float = RATE) -> sr.OptimalControlProblem:

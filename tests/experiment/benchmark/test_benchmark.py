@@ -10,7 +10,14 @@ import numpy as np
 import pytest
 
 import sparserob_core as sr
-from sparserob_core.experiment.benchmark.landscapes import Landscape, bbob, classic, landscape_of, landscapes, standard
+from sparserob_core.experiment.benchmark.landscapes import (
+    BenchmarkFunction,
+    bbob,
+    classic,
+    landscape_of,
+    landscapes,
+    standard,
+)
 from sparserob_core.experiment.benchmark.searches import Benchmark, Search
 from sparserob_core.experiment.comparison.profiles import Instance, Profiles
 from sparserob_core.sip.search.search import Target, maximise
@@ -61,7 +68,7 @@ def test_bbob_functions_have_their_maximum_where_ioh_says():
 
 def searched(bests, budget=10, target=1.0):
     """A benchmark of one contender on one landscape, with these running best values."""
-    landscape = Landscape("hill", Target(lambda x: x[:, 0], sr.Box([0.0], [1.0])), 1.0, 1, "standard")
+    landscape = BenchmarkFunction("hill", Target(lambda x: x[:, 0], sr.Box([0.0], [1.0])), 1.0, 1, "standard")
     searches = [Search(landscape, "a", seed, np.array(best), 0.001, np.zeros(1)) for seed, best in enumerate(bests)]
     times = [[np.array([one.needed(target) for one in searches])]]
     profiles = Profiles("", "evaluations", 1e-3, ["a"], [Instance("hill", 1.0, True, 2.0)], [[0, 1]], times, [0])

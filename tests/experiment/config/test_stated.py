@@ -14,7 +14,7 @@ from sparserob_core.control.problem.cost import Quadratic
 from sparserob_core.control.problem.phase import Phase
 from sparserob_core.experiment.assemble import problem_of
 from sparserob_core.experiment.config.load import load_config
-from sparserob_core.experiment.config.reading.reader import Source, require_readable, write_yaml
+from sparserob_core.experiment.config.reading.reader import ConfigSource, require_readable, write_yaml
 from sparserob_core.experiment.config.stated.problem import WRITTEN, WRITTEN_OF_SYSTEM
 from sparserob_core.experiment.config.stated.source import component_keys, dictionary_keys, source_of
 from sparserob_core.experiment.plugins.registry import load_registry
@@ -130,7 +130,7 @@ def same(one: object, other: object) -> bool:
 def test_a_problem_is_read_back_from_its_config_as_it_was(name: str) -> None:
     given = PROBLEMS[name]()
     text = write_yaml(source_of(given).data)
-    again = problem_of(load_config(Source("problem", source_of(given).folder, read(text))))
+    again = problem_of(load_config(ConfigSource("problem", source_of(given).folder, read(text))))
     assert isinstance(again, sr.OptimalControlProblem)
     told = replace(again, title=given.title)
     if given.initial_control is not None and given.control_step is None and not given.system.delay:

@@ -16,7 +16,7 @@ import sparserob_core as sr
 from sparserob_core.control.studies.initial_states import InitialPlane
 from sparserob_core.control.studies.polygon_approximation import (
     AXES,
-    Support,
+    SupportBound,
     convex_hull,
     inner_polygon,
     outer_polygon,
@@ -100,11 +100,11 @@ def test_a_plane_shares_its_work_and_agrees_with_the_problem_transcribed_afresh(
                 np.testing.assert_allclose(proven, known.enclosure(x, lower, upper).bounds, atol=1e-9)
 
 
-def ellipse(direction: np.ndarray) -> Support:
+def ellipse(direction: np.ndarray) -> SupportBound:
     """That of half-axes 3 and 1: its support function and the point that attains it."""
     shape = np.array([9.0, 1.0])
     bound = float(np.sqrt(shape @ direction**2))
-    return Support(direction, bound, shape * direction / bound, True)
+    return SupportBound(direction, bound, shape * direction / bound, True)
 
 
 def test_the_polygons_of_a_sandwich_enclose_and_converge_quadratically() -> None:
@@ -121,9 +121,9 @@ def test_the_polygons_of_a_sandwich_enclose_and_converge_quadratically() -> None
 def test_a_sandwich_of_a_polygon_ends_when_it_is_exact() -> None:
     corners = np.array([[0.0, 0.0], [2.0, 0.5], [1.0, 2.0]])
 
-    def triangle(direction: np.ndarray) -> Support:
+    def triangle(direction: np.ndarray) -> SupportBound:
         best = corners[int((corners @ direction).argmax())]
-        return Support(direction, float(best @ direction), best, True)
+        return SupportBound(direction, float(best @ direction), best, True)
 
     supports = sandwich(triangle, [triangle(axis) for axis in AXES], 100, 1e-9)
     assert len(supports) <= 9
@@ -132,7 +132,7 @@ def test_a_sandwich_of_a_polygon_ends_when_it_is_exact() -> None:
 
 
 def test_points_that_are_not_proven_are_not_in_the_inner_polygon() -> None:
-    supports = [Support(axis, 1.0, axis, number != 0) for number, axis in enumerate(AXES)]
+    supports = [SupportBound(axis, 1.0, axis, number != 0) for number, axis in enumerate(AXES)]
     assert polygon_area(inner_polygon(supports)) == pytest.approx(1.0)
     assert polygon_area(outer_polygon(supports)) == pytest.approx(4.0)
 

@@ -12,7 +12,7 @@ from sparserob_core.experiment.plugins.registry import load_registry
 from sparserob_core.sip.finite import Blocks, FiniteProgram, FiniteSolution
 from sparserob_core.sip.inner.solve import solve_finite
 from sparserob_core.sip.inner.standard_form import has_cones, standard_form
-from sparserob_core.sip.solver import Asked, Claim, QuadraticProgram, Solver
+from sparserob_core.sip.solver import AccountedSolver, Claim, QuadraticProgram, Solver
 
 REGISTRY = load_registry()
 
@@ -119,12 +119,12 @@ def test_a_claim_that_leaves_a_cone_or_whose_multiplier_does_is_no_solution() ->
 
 def test_who_answers_cones() -> None:
     build = REGISTRY.build
-    assert Asked.of(build("solver", "piqp")).cones is None
-    asked = Asked.of(build("solver", "clarabel")).cones
+    assert AccountedSolver.of(build("solver", "piqp")).cones is None
+    asked = AccountedSolver.of(build("solver", "clarabel")).cones
     assert asked is not None
-    auto = Asked.of(build("solver", "auto")).cones
+    auto = AccountedSolver.of(build("solver", "auto")).cones
     assert auto is not None
     assert auto[1] == "clarabel"
-    assert Asked.of(build("solver", "auto", {"cones": {"name": "piqp"}})).cones is None
+    assert AccountedSolver.of(build("solver", "auto", {"cones": {"name": "piqp"}})).cones is None
     with pytest.raises(ValueError, match=r"cones: .*expected a solver that answers by itself"):
         build("solver", "auto", {"cones": {"name": "auto"}})

@@ -14,7 +14,7 @@ from sparserob_core.sip.method import Tools
 from sparserob_core.sip.methods.exchange import Exchange
 from sparserob_core.sip.program import Separation
 from sparserob_core.sip.relaxed.relaxed import RelaxedProgram
-from sparserob_core.sip.working.ledger import Answer, Ledger
+from sparserob_core.sip.working.ledger import CheckedAnswer, Ledger
 from sparserob_core.sip.working.plain import PlainRows
 from sparserob_core.sip.working.robust import RobustRows
 from sparserob_core.sip.working.working import ALLOWANCES, LARGEST_MARGIN, SMALLEST_MARGIN, Working
@@ -53,9 +53,9 @@ def begun(kind: str) -> tuple[Working, Ledger]:
     return working, ledger
 
 
-def answer(working: Working, ledger: Ledger) -> Answer:
+def answer(working: Working, ledger: Ledger) -> CheckedAnswer:
     found = working.relax(ledger, lambda x, cells=0: (), False)
-    assert isinstance(found, Answer)
+    assert isinstance(found, CheckedAnswer)
     return found
 
 

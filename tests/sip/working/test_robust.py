@@ -13,7 +13,7 @@ from sparserob_core.sip.methods.exchange import Exchange
 from sparserob_core.sip.program import Separation
 from sparserob_core.sip.relaxed.relaxed import RelaxedProgram
 from sparserob_core.sip.working import robust
-from sparserob_core.sip.working.ledger import Answer, Ledger
+from sparserob_core.sip.working.ledger import CheckedAnswer, Ledger
 from sparserob_core.sip.working.robust import RobustRows
 from sparserob_piqp import Piqp
 
@@ -51,7 +51,7 @@ def test_a_decision_that_violates_a_row_that_is_imposed_is_not_preferred(
     working = RobustRows.start(case, ledger, Exchange().close)
     working.impose([(AT, np.zeros(1, dtype=int), "above")])
     answer = working.relax(ledger, lambda x, cells=0: (), False)
-    assert isinstance(answer, Answer) and case.among is not None
+    assert isinstance(answer, CheckedAnswer) and case.among is not None
     preferred = working._optimise_second(ledger, answer, *case.among)
     if rounds == 1:
         assert preferred is None

@@ -16,7 +16,7 @@ from typing import final
 
 import numpy as np
 
-from sparserob_core.control.enclosures.dependence import AnyNumber, Left, Split
+from sparserob_core.control.enclosures.dependence import AnyNumber, Split, TruncationBound
 from sparserob_core.control.enclosures.elementary import KEPLER_CIRCLES, eccentric_anomaly
 from sparserob_core.control.enclosures.matrix_exponential import EPSILON
 from sparserob_core.control.problem.expression import ExpressionMatrix
@@ -212,11 +212,11 @@ class Cauchy:
     far: Array
     sizes: Array
 
-    def left(self, degree: int) -> Left:
+    def left(self, degree: int) -> TruncationBound:
         """Return bounds of the terms beyond a degree, of entries that are no polynomials of this degree."""
         sizes = _bound_remainder(self.far, degree)
         sizes[:, ~beyond(self.system, degree)] = 0.0
-        return Left(self.ends, sizes)
+        return TruncationBound(self.ends, sizes)
 
     def share(self, degree: int, units: Array) -> float:
         """Return an estimate of the effect of `left` on states in ``units (d,)``: of ``A`` over the horizon, of inputs

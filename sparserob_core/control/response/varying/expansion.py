@@ -18,7 +18,7 @@ from weakref import WeakKeyDictionary, ref
 
 import numpy as np
 
-from sparserob_core.control.enclosures.dependence import Spread, Superposed
+from sparserob_core.control.enclosures.dependence import ExpandedSystem, Superposed
 from sparserob_core.control.enclosures.matrix_exponential import EPSILON, rounding
 from sparserob_core.control.enclosures.taylor import TaylorSpace
 from sparserob_core.control.problem.phase import Phase, PhaseInUnits
@@ -109,7 +109,7 @@ class Expansion:
     ratios: Array
     channels: tuple[int, int]
     turns: tuple[int, ...] = ()
-    spread: Spread | None = None
+    spread: ExpandedSystem | None = None
 
     @staticmethod
     def of(system: System) -> Expansion:
@@ -499,12 +499,12 @@ class Expansion:
         """Return estimates of ``A`` between times, in the form of `Parts.averages`."""
         return np.asarray(self.average(breaks))[None]
 
-    def on_cell(self, law: Spread, low: Array, high: Array) -> Expansion:
+    def on_cell(self, law: ExpandedSystem, low: Array, high: Array) -> Expansion:
         """Return the expansion of the state on a cell of parameters, on the same segments, from that of the law.
 
         Parameters
         ----------
-        law : Spread
+        law : ExpandedSystem
             The parametric expansion of the law, in the part of the parameters that this expansion is of.
         low, high : Array
             Ends ``(nu,)`` of the cell, which lies in that part.
@@ -513,7 +513,7 @@ class Expansion:
         -------
         Expansion
             The system of all coefficients of the state, as polynomials that are from -1 to 1 on the cell. The terms of
-            the law beyond their degree are in the `Spread.left` of its ``spread``.
+            the law beyond their degree are in the `ExpandedSystem.left` of its ``spread``.
         """
         d, recentring, (coefficients, remainders) = law.d, law.recentred(low, high), self._reshape_law(law)
         sizes = np.abs(coefficients).sum(axis=1)
@@ -547,7 +547,7 @@ class Expansion:
             spread,
         )
 
-    def at_point(self, law: Spread, parameter: Array) -> Expansion:
+    def at_point(self, law: ExpandedSystem, parameter: Array) -> Expansion:
         """Return the expansion of the known system at a ``parameter (nu,)``, from that of the law, whose parametric
         expansion is ``law``. The truncation error of the series in the parameters is not in its remainder."""
         powers = law.space.monomials(law.shares(parameter[None]))[0]
@@ -562,12 +562,12 @@ class Expansion:
         units, ones = self.units[: law.d], np.ones((len(point_remainder), law.d))
         return Expansion(self.ends, point_coefficients, point_remainder, units, ones, self.channels, self.turns)
 
-    def largest_inputs(self, law: Spread) -> Array:
+    def largest_inputs(self, law: ExpandedSystem) -> Array:
         """Return upper bounds ``(s, d, m + mw)`` of ``[B E]`` over all parameters and all times of every segment."""
         coefficients, remainders = self._reshape_law(law)
         return np.asarray((np.abs(coefficients).sum(axis=(1, 2)) + remainders.sum(axis=1))[..., law.d :])
 
-    def _reshape_law(self, law: Spread) -> tuple[Array, Array]:
+    def _reshape_law(self, law: ExpandedSystem) -> tuple[Array, Array]:
         """Return the coefficients of the law in time and parameters, ``(s, p + 1, M, d, d + m + mw)``, and the
         remainders of those of every monomial in the parameters, ``(s, M, d, d + m + mw)``."""
         remainders = np.concatenate([self.remainder[..., : law.d], self.remainder[..., self.units.size :]], axis=2)
@@ -782,12 +782,12 @@ def _bound_tail(sizes: Array, shares: Array, summed: int | None = None) -> tuple
     return terms, tail
 
 
-def _find_parametric_expansion(system: System) -> Spread | None:
+def _find_parametric_expansion(system: System) -> ExpandedSystem | None:
     """Return the parametric expansion whose coefficients are the states of a system; ``None`` where the states are no
     such coefficients."""
     entry = system.phases[0].entry("A")
     depends = entry.dependence if isinstance(entry, Superposed) else None
-    return depends if isinstance(depends, Spread) else None
+    return depends if isinstance(depends, ExpandedSystem) else None
 
 
 def _find_coupled_states(A: Array) -> list[np.ndarray]:

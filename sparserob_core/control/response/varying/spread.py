@@ -13,7 +13,7 @@ from weakref import WeakKeyDictionary, ref
 
 import numpy as np
 
-from sparserob_core.control.enclosures.dependence import Left, Split, Spread
+from sparserob_core.control.enclosures.dependence import ExpandedSystem, Split, TruncationBound
 from sparserob_core.control.enclosures.taylor import taylor_space
 from sparserob_core.control.problem.phase import Phase, PhaseInUnits
 from sparserob_core.control.problem.system import System
@@ -32,12 +32,12 @@ LOOKS = 17  # times at which coefficients are looked at; nothing is proven with 
 DEGREE = 4  # of the coefficients that are looked at then
 MOST_PARTS = 64  # of the box: each is proven alone
 FAR = 700.0  # largest exponent by which parameters may move the state: its exponential is still a float
-_CACHE: WeakKeyDictionary[Phase, dict[tuple[object, ...], Parts]] = WeakKeyDictionary()
+_CACHE: WeakKeyDictionary[Phase, dict[tuple[object, ...], ParameterParts]] = WeakKeyDictionary()
 
 
 @final
 @dataclass(frozen=True, eq=False)
-class Parts:
+class ParameterParts:
     """Box of parameters in parts, with the parametric expansion of the law on each.
 
     ``edges``: the ends of the parts of every parameter. The parts are all their products, those of the last parameter
@@ -46,7 +46,7 @@ class Parts:
     """
 
     edges: tuple[Array, ...]
-    every: tuple[tuple[Spread, System], ...]
+    every: tuple[tuple[ExpandedSystem, System], ...]
 
     def of(self, parameters: Array) -> np.ndarray:
         """Return the part that contains each of ``parameters (k, nu)``, ``(k,)``; at an edge, one of the parts that it
@@ -193,7 +193,7 @@ def _join_tables(found: Sequence[tuple[np.ndarray, Sequence[Array]]]) -> list[Ar
     return [np.concatenate(blocks)[order] for blocks in zip(*(tables for _, tables in found), strict=True)]
 
 
-def law_of(system: System) -> Parts:
+def law_of(system: System) -> ParameterParts:
     """Return the parametric expansion of the law of a system, on parts of the box of parameters.
 
     Entries that are polynomials need one part and have no truncation error. Other entries are power series, and the
@@ -212,30 +212,32 @@ def law_of(system: System) -> Parts:
     return kept[key]
 
 
-def _expand_law(system: System) -> Parts:
+def _expand_law(system: System) -> ParameterParts:
     """Return the law (`law_of`) of a system in the units of the user."""
     edges, series_bounds, degree = _choose_parts(system)
     laws = []
     for part_system, series_bound in zip(_restrict_to_parts(system, edges), series_bounds, strict=True):
         centre, units = part_system.deviations
         truncation = None if series_bound is None else series_bound.left(degree)
-        spread = Spread(system.states, taylor_space(centre.size, degree), centre, units, truncation)
+        spread = ExpandedSystem(system.states, taylor_space(centre.size, degree), centre, units, truncation)
         laws.append((spread, part_system.superposed(spread)))
-    return Parts(edges, tuple(laws))
+    return ParameterParts(edges, tuple(laws))
 
 
-def _convert_units(system: System) -> Parts:
+def _convert_units(system: System) -> ParameterParts:
     """Return the law (`law_of`) of a system in its own units, which are powers of two: the same polynomials, in these
     units."""
     law = system.phases[0]
     assert isinstance(law, PhaseInUnits)
     time, units = law.clock, law.units[1:]
-    user_law, laws = law_of(system.stated), list[tuple[Spread, System]]()
+    user_law, laws = law_of(system.stated), list[tuple[ExpandedSystem, System]]()
     factors = {name: law.factors[name] * np.ones(law._shape(name)) for name in NAMES if law.entry(name) is not None}
     for spread, part_system in user_law.every:
         size, truncation = spread.space.size, spread.left
         if truncation is not None:
-            truncation = Left(truncation.ends / time, truncation.sizes * np.abs(np.hstack(list(factors.values()))))
+            truncation = TruncationBound(
+                truncation.ends / time, truncation.sizes * np.abs(np.hstack(list(factors.values())))
+            )
         tiled = [np.tile(factors[name], (size, size if name == "A" else 1)) for name in ("A", "B", "E")]
         drift = np.tile(factors["c"], (size, 1)) if "c" in factors else 1.0
         scaled = part_system.in_units(tiled[0], tiled[1], tiled[2], np.zeros(0), drift, time)
@@ -243,7 +245,7 @@ def _convert_units(system: System) -> Parts:
             (replace(spread, centre=spread.centre / units, units=spread.units / units, left=truncation), scaled)
         )
     edges = tuple(ends / unit for ends, unit in zip(user_law.edges, units, strict=True))
-    return Parts(edges, tuple(laws))
+    return ParameterParts(edges, tuple(laws))
 
 
 def _restrict_to_parts(system: System, edges: tuple[Array, ...]) -> list[System]:

@@ -24,12 +24,12 @@ if TYPE_CHECKING:
 LARGEST = 4_000_000
 MOST_VALUES = 200_000  # values of a config; an alias counts as all values that it stands for
 
-__all__ = ["Source", "read_source", "read_value", "require_readable", "write_yaml"]
+__all__ = ["ConfigSource", "read_source", "read_value", "require_readable", "write_yaml"]
 
 
 @final
 @dataclass(frozen=True, eq=False)
-class Source:
+class ConfigSource:
     """A config as it was given.
 
     Parameters
@@ -42,7 +42,7 @@ class Source:
         The keys and values. Those of a config that extends another one include those of its ``base``.
     text : str, default ""
         The text of the file, which has the place of each key.
-    base : Source, optional
+    base : ConfigSource, optional
         The config that it extends.
     own : mapping
         The keys and values that it has without its ``base``.
@@ -52,7 +52,7 @@ class Source:
     folder: File
     data: dict[str, Any]
     text: str = ""
-    base: Source | None = None
+    base: ConfigSource | None = None
     own: Mapping[str, Any] = field(default_factory=dict)
 
     @cached_property
@@ -65,7 +65,7 @@ class Source:
         except (YAMLError, ValueError):
             return None
 
-    def writer(self, path: Path) -> Source:
+    def writer(self, path: Path) -> ConfigSource:
         """Return the config of the chain that gives the value at ``path``; this config, where none does."""
         if self.base is None or _is_decided(self.own, path) or not _is_decided(self.base.data, path):
             return self
@@ -87,15 +87,15 @@ class Source:
         return position
 
 
-def read_source(config: str | File | Mapping[str, Any] | Source) -> Source:
-    """Read a config from a ``.yaml``, ``.json`` or ``.toml`` file, or take it from a mapping or a `Source`.
+def read_source(config: str | File | Mapping[str, Any] | ConfigSource) -> ConfigSource:
+    """Read a config from a ``.yaml``, ``.json`` or ``.toml`` file, or take it from a mapping or a `ConfigSource`.
 
     Raises `ConfigError` where there is no such file, where it cannot be read, and where it does not hold a mapping.
     """
-    if isinstance(config, Source):
+    if isinstance(config, ConfigSource):
         return config
     if isinstance(config, Mapping):
-        return Source("config", File.cwd(), _to_plain(config))
+        return ConfigSource("config", File.cwd(), _to_plain(config))
     file = File(config)
     text = _read_text(file)
     data = _parse_text(file, text)
@@ -110,7 +110,7 @@ def read_source(config: str | File | Mapping[str, Any] | Source) -> Source:
         raise ConfigError(
             f"{file}: expected at most {MOST_VALUES} values, aliases counted as what they stand for, got more"
         )
-    return Source(str(file), file.resolve().parent, data, "" if file.suffix == ".toml" else text)
+    return ConfigSource(str(file), file.resolve().parent, data, "" if file.suffix == ".toml" else text)
 
 
 def require_readable(data: Mapping[str, Any], text: str) -> None:

@@ -35,14 +35,14 @@ def with_causal(result: ControlResult, tools: Tools) -> ControlResult:
     model = result.model
     if model.feedback is None or result.status == "failed" or result.stopped or tools.deadline.passed:
         return result
-    from sparserob_core.control.studies.causal import CausalBound, Limits
+    from sparserob_core.control.studies.causal import CausalBound, CausalLimits
 
     charge = model.feedback.charge
     if not charge.causal_signals or not model.problem.cost.is_linear:
         return result
     try:
         search = searched(model, result.decision, active(model, result))
-        limits = Limits.of(charge, [result], model.program.n, lambda: tools.deadline.passed)
+        limits = CausalLimits.of(charge, [result], model.program.n, lambda: tools.deadline.passed)
         cost = result.cost if result.status in ("certified", "verified") else np.inf
         for hides in (True, False):  # of an unstable plant, balls may be too wide to show what a noise hides
             solved_tree = search.least_cost(cost, limits, hides)

@@ -28,7 +28,7 @@ from sparserob_core.sip.inner.duality import Terms, without_norms
 from sparserob_core.sip.inner.simplex.interruptible import run
 from sparserob_core.sip.inner.simplex.silence import silent
 from sparserob_core.sip.inner.simplex.tangents import Tangents
-from sparserob_core.sip.solver import Asked, QuadraticProgram
+from sparserob_core.sip.solver import AccountedSolver, QuadraticProgram
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_array
@@ -121,7 +121,7 @@ class Counterpart:
     scales: bool = False
     highest: float = 0.0
     ceiling: tuple[Array, float] | None = None
-    asked: Asked | None = None
+    asked: AccountedSolver | None = None
     answered: Counter[str] = field(default_factory=Counter)
     blocks: list[UncertainRows] = field(default_factory=list)
     _imposed_rows: list[tuple[np.ndarray, Array, list[_Part]]] = field(default_factory=list, repr=False)
@@ -407,7 +407,7 @@ class Growing:
     """A sparse linear program that grows, solved by HiGHS from where it was, unless somebody else is ``asked``; ``by``:
     whose the last answer was."""
 
-    def __init__(self, asked: Asked | None = None) -> None:
+    def __init__(self, asked: AccountedSolver | None = None) -> None:
         import highspy
 
         self.asked, self.by = asked, HIGHS
@@ -510,7 +510,7 @@ class Growing:
         solution = self.highs.getSolution()
         return True, message, np.array(solution.col_value), -np.array(solution.row_dual)
 
-    def _ask_solver(self, asked: Asked) -> tuple[bool, str, Array, Array] | str:
+    def _ask_solver(self, asked: AccountedSolver) -> tuple[bool, str, Array, Array] | str:
         """Return the answer of who is asked, from nothing, where it holds; in words why it does not."""
         import highspy
         from scipy.sparse import csc_array, csr_array, diags_array, vstack
