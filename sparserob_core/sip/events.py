@@ -70,7 +70,7 @@ def forwarded(notify: Notify, kind: type[T], complete: Callable[[T], Event]) -> 
     return lambda event: notify(complete(event) if isinstance(event, kind) else event)
 
 
-def beside(notify: Notify, stage: str) -> Notify:
+def forward_progress(notify: Notify, stage: str) -> Notify:
     """Return a listener for an auxiliary program, which passes on the progress of its rounds and proofs only.
 
     Parameters

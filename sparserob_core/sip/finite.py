@@ -306,7 +306,7 @@ class FiniteProgram:
         worst = 0.0
         if self.G.shape[0]:
             worst = scaled_violation(self.G @ x - self.h, self.G, self.h, size)
-        worst = max(worst, self.missed(x))
+        worst = max(worst, self.equality_residual(x))
         image = self.image(x)
         outside = np.maximum(self.lower - image, image - self.upper)
         if outside.max(initial=0.0) == 0.0:
@@ -314,7 +314,7 @@ class FiniteProgram:
         return max(worst, float((outside / np.maximum(1.0, np.abs(image))).max()))
 
     @shaped
-    def missed(self, x: Float[Array, " n"]) -> float:
+    def equality_residual(self, x: Float[Array, " n"]) -> float:
         """Return the largest residual ``|A x - b|``, each divided by its scale (`scaled_violation`); 0 without
         equalities."""
         return scaled_violation(np.abs(self.excess(x)), self.A, self.b, np.abs(x)) if self.b.size else 0.0

@@ -416,18 +416,18 @@ class Failures:
         self.name = ""
         return self
 
-    def resume(self, calls: int, missed: Iterable[Unanswered]) -> None:
+    def resume(self, calls: int, unanswered: Iterable[Unanswered]) -> None:
         """Continue from an account that was stored before and has been logged then.
 
         Parameters
         ----------
         calls : int
             Number of calls in the stored account.
-        missed : iterable of Unanswered
+        unanswered : iterable of Unanswered
             Programs of the stored account.
         """
         self.calls += calls
-        for entry in missed:
+        for entry in unanswered:
             self._logged_kinds.add((entry.kind, entry.by))
             self.add(entry.kind, entry.reason, entry.by, entry.count)
 

@@ -15,7 +15,7 @@ from sparserob_core.sip.evidence import Proof
 from sparserob_core.sip.limits.deadline import Deadline
 from sparserob_core.sip.methods import exchange, sparsest
 from sparserob_core.sip.proof.branch_and_bound import CELLS
-from sparserob_core.sip.working import securing
+from sparserob_core.sip.working import tightening
 from sparserob_core.sip.working.ledger import prover_of
 from sparserob_core.sip.working.plain import PlainRows
 from sparserob_core.sip.working.robust import RobustRows
@@ -314,7 +314,7 @@ def test_where_nothing_is_as_far_away_as_large_cells_ask_for_smaller_ones_prove(
 
         def prover(x: Any, cells: int = CELLS) -> Any:
             open_ = Proof("path", "undecided", 1e3, index=np.array([2.0]), row=0, cells=1, formulation="reduced")
-            return proving(x, cells) if cells > securing.GLANCE else [open_]
+            return proving(x, cells) if cells > tightening.GLANCE else [open_]
 
         return prover
 

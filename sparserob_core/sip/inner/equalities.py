@@ -25,7 +25,7 @@ def onto_equalities(program: FiniteProgram, x: Float[Array, " n"]) -> Float[Arra
     bounds where it is: the cost has its kinks there, and an entry of 0 is to stay 0. What is missed is summed in
     extended precision.
     """
-    share = program.missed(x)
+    share = program.equality_residual(x)
     if not ROUNDED < share <= NEARLY:
         return x
     is_still = _find_active_images(program, x)
@@ -40,7 +40,7 @@ def onto_equalities(program: FiniteProgram, x: Float[Array, " n"]) -> Float[Arra
         trial = x.copy()
         trial[free] += np.linalg.lstsq(rows / size[:, None], residual / size, rcond=RANK)[0]
         trial = within_bounds(program, trial)
-        trial_share = program.missed(trial)
+        trial_share = program.equality_residual(trial)
         if not trial_share < share:
             break
         x, share = trial, trial_share

@@ -94,9 +94,9 @@ def _orthogonalise_rows(G: Array) -> Array:
     return np.asarray(solve_triangular(L, np.eye(count)[order], lower=True))
 
 
-def _choose_factor(before: float, missed: float) -> float:
+def _choose_factor(before: float, residual: float) -> float:
     """Return the power of two that makes what is missed of size 1, at most `GROWTH` times the one before."""
-    wanted = LARGEST if missed < 1.0 / LARGEST else float(np.exp2(np.floor(-np.log2(missed))))
+    wanted = LARGEST if residual < 1.0 / LARGEST else float(np.exp2(np.floor(-np.log2(residual))))
     return float(min(max(wanted, before), GROWTH * before, LARGEST))
 
 

@@ -37,7 +37,7 @@ from sparserob_core.sip.working.ledger import (
     witnesses,
 )
 from sparserob_core.sip.working.plain import PlainRows
-from sparserob_core.sip.working.securing import or_proven, proofs_of, secure_in_time
+from sparserob_core.sip.working.tightening import or_proven, proofs_of, tighten_in_time
 from sparserob_core.sip.working.working import Working
 
 
@@ -115,7 +115,7 @@ class Rounds:
         self.kept = (answer, separations) if feasible else self.kept
 
         # Secure: where time runs out, prove a decision that keeps away from the constraints while there is some.
-        imposed = secure_in_time(working, ledger, prover, answer, separations, number)
+        imposed = tighten_in_time(working, ledger, prover, answer, separations, number)
 
         # Exchange: impose them, drop what has been idle; of what is violated though imposed, solve a crude answer more
         # closely, and tighten else.

@@ -17,7 +17,7 @@ from pydantic import Field
 from sparserob_core.errors import InputError
 from sparserob_core.options import Options
 from sparserob_core.sip.convex_set import Array
-from sparserob_core.sip.events import beside
+from sparserob_core.sip.events import forward_progress
 from sparserob_core.sip.evidence import Cut
 from sparserob_core.sip.method import GAP_TOLERANCE, Method, Tools
 from sparserob_core.sip.methods.exchange import Exchange
@@ -66,7 +66,8 @@ class Reweighted(Method, Options):
             if tools.deadline.passed:
                 break
             labelled_tools = replace(
-                plain_tools, notify=beside(tools.notify, f"weighted program {number} of at most {self.passes}")
+                plain_tools,
+                notify=forward_progress(tools.notify, f"weighted program {number} of at most {self.passes}"),
             )
             heavier_program = replace(
                 program, weights=program.finite.weights * self._compute_weights(program, x), twin=None
@@ -129,7 +130,7 @@ def on_support(
     is_off = ~is_acting & (prices > 0.0)
     lower, upper = np.where(is_off, 0.0, base.lower), np.where(is_off, 0.0, base.upper)
     narrow = replace(program, lower=lower, upper=upper, twin=None)
-    quiet_tools = replace(tools, notify=beside(tools.notify, "least cost on the entries that were found"))
+    quiet_tools = replace(tools, notify=forward_progress(tools.notify, "least cost on the entries that were found"))
     return exchange.close(narrow, quiet_tools, prover_of(program, quiet_tools), imposed_cuts(known))
 
 

@@ -38,7 +38,7 @@ from sparserob_core.sip.search.search import Rules, Target, maximise
 from sparserob_core.sip.separation.separation import separate
 from sparserob_core.sip.working.ledger import CheckedAnswer, Found, Ledger, prover_of
 from sparserob_core.sip.working.plain import PlainRows
-from sparserob_core.sip.working.securing import back_off
+from sparserob_core.sip.working.tightening import back_off
 
 # Of a limit, what a search leaves to the proof of what it has found. With a tenth of it a limit of
 # some seconds leaves nothing proven; ten times as much is no search.

@@ -19,7 +19,7 @@ from pydantic import Field, field_validator
 from sparserob_core.errors import InputError
 from sparserob_core.options import Options
 from sparserob_core.sip.convex_set import Array
-from sparserob_core.sip.events import RoundFinished, StageProgress, beside, forwarded, ignore
+from sparserob_core.sip.events import RoundFinished, StageProgress, forward_progress, forwarded, ignore
 from sparserob_core.sip.evidence import Cut, Leaf, Sparsest
 from sparserob_core.sip.method import GAP_TOLERANCE, Method, Tools
 from sparserob_core.sip.methods.branching import Branching, proposed
@@ -34,7 +34,7 @@ from sparserob_core.sip.result import Result, relative_gap
 from sparserob_core.sip.separation.separation import separate
 from sparserob_core.sip.working.counting import DUST, completed, count, count_of, counted_below, counting, prices_of
 from sparserob_core.sip.working.ledger import unproven
-from sparserob_core.sip.working.securing import PAID
+from sparserob_core.sip.working.tightening import PAID
 
 PROVEN = ("certified", "verified")
 PROPOSALS = 40  # of the mixed-integer solver
@@ -117,7 +117,7 @@ class SparsestMethod(Method, Options):
         """An optimum of the program's own cost, to compare with; none with an alphabet."""
         if self.alphabet is not None:
             return None
-        tools = replace(tools, notify=beside(tools.notify, "least cost, to compare with"))
+        tools = replace(tools, notify=forward_progress(tools.notify, "least cost, to compare with"))
         return Exchange(tolerance=self.tolerance, rounds=self.rounds).solve(program, tools)
 
 
@@ -135,13 +135,13 @@ class _SparsestSearch:
     best: Result | None = None
     least: float = np.inf
     ending: str = ""
-    told: RoundFinished | None = None
+    reported: RoundFinished | None = None
     rounds: list[RoundFinished] = field(default_factory=list)
     tree: Branching | None = None
     tried: set[bytes] = field(default_factory=set)
     spent: list[Result] = field(default_factory=list)
     """What was solved on the way: the convex program, and one for every set of entries that was tried."""
-    missed: float = 0.0
+    violation: float = 0.0
     """By how much the last decision of letters missed constraints that were not yet imposed, in their norms."""
     margin: float = 0.0
     """By which the rows of the next proposal are tightened, in their norms."""
@@ -173,8 +173,8 @@ class _SparsestSearch:
         below = counted_below(self.bounded)
 
         def heard(event: RoundFinished) -> RoundFinished:
-            self.told = replace(event, upper_bound=np.inf, gap=np.inf)
-            return self.told
+            self.reported = replace(event, upper_bound=np.inf, gap=np.inf)
+            return self.reported
 
         tools = replace(self.tools, notify=forwarded(self.tools.notify, RoundFinished, heard), regulariser=None)
         method = Exchange(tolerance=self.method.tolerance, rounds=self.method.rounds)
@@ -250,9 +250,9 @@ class _SparsestSearch:
             is_new = self._impose_cuts(fresh)
             G, h = self.rows.G[row_count:], self.rows.h[row_count:]
             norms = np.maximum(np.linalg.norm(G, axis=1), np.finfo(float).tiny)
-            self.missed = float(((G @ x - h) / norms).max(initial=0.0))
+            self.violation = float(((G @ x - h) / norms).max(initial=0.0))
             return is_new
-        if program.finite.residual(x) > TOLERANCE or program.finite.missed(x) > TOLERANCE:
+        if program.finite.residual(x) > TOLERANCE or program.finite.equality_residual(x) > TOLERANCE:
             return False
         proofs = prove(program, x, tools.notify, deadline=tools.deadline)
         if any(proof.verdict != "proven" for proof in proofs):
@@ -278,23 +278,23 @@ class _SparsestSearch:
 
     def tell(self) -> None:
         """Tell of better bounds, as a round like the last."""
-        if self.told is None:
+        if self.reported is None:
             return
         unit = self.program.cost_unit
         decision = None if self.best is None else self.best.decision
-        self.told = replace(
-            self.told,
-            round=self.told.round + 1,
+        self.reported = replace(
+            self.reported,
+            round=self.reported.round + 1,
             lower_bound=self.lower / unit,
             upper_bound=self.least / unit,
             cost=self.least / unit,
-            decision=self.told.decision if decision is None else decision,
+            decision=self.reported.decision if decision is None else decision,
             gap=relative_gap(self.lower, self.least),
             proven=self.least / unit,
             relaxed_programs=self.relaxed.solves + sum(result.counts["relaxed_programs"] for result in self.spent),
         )
-        self.rounds.append(self.told)
-        self.tools.notify(self.told)
+        self.rounds.append(self.reported)
+        self.tools.notify(self.reported)
 
     def step(self, number: int) -> Result | None:
         """Make one proposal, or, where no more are made, one division of a part of the tree.
@@ -339,7 +339,7 @@ class _SparsestSearch:
             return True
         if x is None or not self.look(x):
             return False
-        self.margin = PAID * self.missed if self.roomy else 0.0
+        self.margin = PAID * self.violation if self.roomy else 0.0
         return True
 
     def _explain_failure(self) -> str:

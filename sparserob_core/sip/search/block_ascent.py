@@ -85,7 +85,7 @@ class IdleBlocks:
         moves = (self.upper > self.lower)[0]
         self.others = np.flatnonzero(moves if linear is None else moves & ~linear.coordinates.reshape(shape)[0])
         self.faces = linear is None  # half of the distributed blocks go there: no uniform point is near a vertex
-        self.beside, self.spread = 0, 0  # blocks placed so far near acting blocks, and over the box
+        self.near_count, self.spread_count = 0, 0  # blocks placed so far near acting blocks, and over the box
         self.shares = _compute_shares(self.others.size)
 
     def neighbours(self, acts: np.ndarray) -> float:
@@ -117,7 +117,7 @@ class IdleBlocks:
         near_blocks = idle[: (idle.size + 1) // 2] if acting.size else idle[:0]
         spread_blocks = idle[near_blocks.size :]
         if near_blocks.size:
-            number = self.beside + np.arange(near_blocks.size)
+            number = self.near_count + np.arange(near_blocks.size)
             turn, owner = np.divmod(number, acting.size)
             pair, axis = np.divmod(turn, self.others.size)
             octave = 1.0 + (OCTAVES - 1.0) * np.mod(pair * GOLDEN, 1.0)
@@ -125,13 +125,13 @@ class IdleBlocks:
             blocks[near_blocks, axes] += (
                 np.where(pair % 2, 1.0, -1.0) * (upper - lower)[near_blocks, axes] * 2.0**-octave
             )
-        number = self.spread + np.arange(spread_blocks.size)
+        number = self.spread_count + np.arange(spread_blocks.size)
         grid = np.ix_(spread_blocks, self.others)
         shares = np.mod(0.5 + np.outer(number, self.shares), 1.0)
         if self.faces:
             shares[::2] = np.clip(2.0 * shares[::2] - 0.5, 0.0, 1.0)
         blocks[grid] = lower[grid] + shares * (upper - lower)[grid]
-        self.beside, self.spread = self.beside + near_blocks.size, self.spread + spread_blocks.size
+        self.near_count, self.spread_count = self.near_count + near_blocks.size, self.spread_count + spread_blocks.size
         return np.clip(blocks, lower, upper).ravel()
 
 

@@ -119,21 +119,21 @@ class _Evaluations:
             self.points, self.values = np.vstack([self.points, point]), np.append(self.values, value)
 
 
-def _ascend(seen: _Evaluations) -> None:
+def _ascend(evaluations: _Evaluations) -> None:
     """Run L-BFGS-B from every start; a value of ``-inf`` is replaced by the lowest finite value."""
-    lowest = float(seen.values.min())
+    lowest = float(evaluations.values.min())
 
     def descent(scaled: Array) -> tuple[float, Array]:
-        value, gradient = seen.with_gradient(scaled / LONGEST)
+        value, gradient = evaluations.with_gradient(scaled / LONGEST)
         return -max(value, lowest), -gradient / LONGEST
 
-    for start in seen.starts():
-        if not seen.objective.remaining:
+    for start in evaluations.starts():
+        if not evaluations.objective.remaining:
             return
-        _minimise(descent, start, seen.objective.remaining)
+        _minimise(descent, start, evaluations.objective.remaining)
 
 
-def _ascend_with_idle_blocks(seen: _Evaluations, acting: Callable[[], np.ndarray]) -> None:
+def _ascend_with_idle_blocks(evaluations: _Evaluations, acting: Callable[[], np.ndarray]) -> None:
     """Run L-BFGS-B in the acting blocks from the best point, while every evaluation moves the idle blocks
     (`IdleBlocks`).
 
@@ -141,16 +141,16 @@ def _ascend_with_idle_blocks(seen: _Evaluations, acting: Callable[[], np.ndarray
     ``g`` is below its maximum, some index is violated, so that an idle block near that index acts. The block then joins
     the ascent. Nothing is done where every block acts.
     """
-    if not seen.objective.remaining:
+    if not evaluations.objective.remaining:
         return
-    idle = IdleBlocks(Box(np.zeros(seen.dimension), np.ones(seen.dimension)), seen.objective.block)
-    best = seen.top
-    value, _ = seen.with_gradient(best)
+    idle = IdleBlocks(Box(np.zeros(evaluations.dimension), np.ones(evaluations.dimension)), evaluations.objective.block)
+    best = evaluations.top
+    value, _ = evaluations.with_gradient(best)
     acts = acting()
-    while seen.objective.remaining and acts.any() and not acts.all():
-        ascent = _BlockLoss(seen, acting, idle, _AscentPoint(best, value, acts))
+    while evaluations.objective.remaining and acts.any() and not acts.all():
+        ascent = _BlockLoss(evaluations, acting, idle, _AscentPoint(best, value, acts))
         with suppress(_NewBlockError):
-            _minimise(ascent, best[ascent.free], seen.objective.remaining)
+            _minimise(ascent, best[ascent.free], evaluations.objective.remaining)
         best, value, acts = ascent.best.point, ascent.best.value, ascent.best.acts
 
 
@@ -182,17 +182,17 @@ class _BlockLoss:
     point."""
 
     def __init__(
-        self, seen: _Evaluations, acting: Callable[[], np.ndarray], idle: IdleBlocks, start: _AscentPoint
+        self, evaluations: _Evaluations, acting: Callable[[], np.ndarray], idle: IdleBlocks, start: _AscentPoint
     ) -> None:
-        self.seen, self.acting, self.idle, self.start, self.best = seen, acting, idle, start, start
-        self.free = np.repeat(start.acts, seen.objective.block)
-        self.lowest = float(seen.values.min())
+        self.evaluations, self.acting, self.idle, self.start, self.best = evaluations, acting, idle, start, start
+        self.free = np.repeat(start.acts, evaluations.objective.block)
+        self.lowest = float(evaluations.values.min())
 
     def __call__(self, scaled: Array) -> tuple[float, Array]:
         point = self.start.point.copy()
         point[self.free] = scaled / LONGEST
         point = self.idle.placed(point, self.start.acts)
-        value, gradient = self.seen.with_gradient(point)
+        value, gradient = self.evaluations.with_gradient(point)
         if value > self.best.value:
             self.best = _AscentPoint(point, value, self.acting())
             if (self.best.acts & ~self.start.acts).any():
@@ -214,79 +214,79 @@ def _minimise(loss: Callable[[Array], tuple[float, Array]], start: Array, most: 
     )
 
 
-def _climb(seen: _Evaluations) -> None:
+def _climb(evaluations: _Evaluations) -> None:
     """Climb by the trust region from every start, and cross each result with the best point.
 
     After the first start, the maxima of a separable function fitted to the values are crossed likewise. Where the
     function is separable or nearly so, they are near the highest hill, however many hills there are.
     """
-    _climb_and_cross(seen, seen.top)
-    for guess in separable_maxima(seen.points, seen.values):
-        if seen.objective.remaining >= AFFORDED * seen.dimension and _cross(seen, guess):
-            _climb_and_cross(seen, seen.top)
-    for start in seen.starts()[1:]:
-        _climb_and_cross(seen, start)
+    _climb_and_cross(evaluations, evaluations.top)
+    for guess in separable_maxima(evaluations.points, evaluations.values):
+        if evaluations.objective.remaining >= AFFORDED * evaluations.dimension and _cross(evaluations, guess):
+            _climb_and_cross(evaluations, evaluations.top)
+    for start in evaluations.starts()[1:]:
+        _climb_and_cross(evaluations, start)
 
 
-def _climb_and_cross(seen: _Evaluations, start: Array) -> None:
+def _climb_and_cross(evaluations: _Evaluations, start: Array) -> None:
     """Climb from a start, then cross the result with the best point as long as that improves it."""
-    end_point = _climb_from(seen, start)
-    while _cross(seen, end_point):
-        end_point = _climb_from(seen, seen.top)
+    end_point = _climb_from(evaluations, start)
+    while _cross(evaluations, end_point):
+        end_point = _climb_from(evaluations, evaluations.top)
 
 
-def _climb_from(seen: _Evaluations, start: Array) -> Array:
+def _climb_from(evaluations: _Evaluations, start: Array) -> Array:
     """Return the end ``(d,)`` of an ascent, which stops once it can no longer exceed the best value."""
-    points, values = seen.below(start)
-    region, progress, window = TrustRegion(2 * APART), [float(values.max())], 2 * seen.dimension + 4
-    while seen.objective.remaining:
+    points, values = evaluations.below(start)
+    region, progress, window = TrustRegion(2 * APART), [float(values.max())], 2 * evaluations.dimension + 4
+    while evaluations.objective.remaining:
         point = region.propose(points, values)
         if point is None:
             break
-        value = seen.evaluate(point)
+        value = evaluations.evaluate(point)
         region.tell(value)
         points, values = np.vstack([points, point]), np.append(values, value)
         progress.append(max(progress[-1], value))
-        missing = float(seen.values.max()) - progress[-1]
+        missing = float(evaluations.values.max()) - progress[-1]
         if len(progress) > window and missing > 4.0 * (progress[-1] - progress[-1 - window]):
             break
     return np.asarray(points[values.argmax()])
 
 
-def _cross(seen: _Evaluations, other: Array) -> bool:
+def _cross(evaluations: _Evaluations, other: Array) -> bool:
     """Return whether blocks of another local maximum, each tried alone, improve the best point.
 
     Local maxima of a nearly separable function may exchange blocks.
     """
     has_improved = False
-    for block in np.unique(seen.blocks):
-        best = seen.top
-        trial = np.where(seen.blocks == block, other, best)
-        if not seen.objective.remaining or np.abs(trial - best).max() < APART:
+    for block in np.unique(evaluations.blocks):
+        best = evaluations.top
+        trial = np.where(evaluations.blocks == block, other, best)
+        if not evaluations.objective.remaining or np.abs(trial - best).max() < APART:
             continue
-        before = float(seen.values.max())
-        has_improved = seen.evaluate(trial) > before or has_improved
+        before = float(evaluations.values.max())
+        has_improved = evaluations.evaluate(trial) > before or has_improved
     return has_improved
 
 
-def _search_by_compass(seen: _Evaluations) -> None:
+def _search_by_compass(evaluations: _Evaluations) -> None:
     """Run a compass search (Hooke and Jeeves 1961).
 
     The search moves one coordinate at a time up or down, by a step of its own that doubles or halves.
     """
-    best, value = seen.top.copy(), float(seen.values.max())
-    steps = np.full(seen.dimension, 0.1)
-    stride = _choose_stride(seen.dimension)
+    best, value = evaluations.top.copy(), float(evaluations.values.max())
+    steps = np.full(evaluations.dimension, 0.1)
+    stride = _choose_stride(evaluations.dimension)
     coordinate = 0
-    while seen.objective.remaining and steps.max() > 1e-12:
-        coordinate = (coordinate + stride) % seen.dimension
+    while evaluations.objective.remaining and steps.max() > 1e-12:
+        coordinate = (coordinate + stride) % evaluations.dimension
         is_better = False
         for direction in (steps[coordinate], -steps[coordinate]):
             trial = best.copy()
             trial[coordinate] = min(max(trial[coordinate] + direction, 0.0), 1.0)
-            if is_better or trial[coordinate] == best[coordinate] or not seen.objective.remaining:
+            if is_better or trial[coordinate] == best[coordinate] or not evaluations.objective.remaining:
                 continue
-            trial_value = seen.evaluate(trial)
+            trial_value = evaluations.evaluate(trial)
             if trial_value > value:
                 best, value, is_better = trial, trial_value, True
         steps[coordinate] = min(0.5, abs(steps[coordinate]) * 2.0) if is_better else 0.5 * steps[coordinate]

@@ -293,7 +293,7 @@ class Ledger:
         With ``strictly``, the limit is that of a claim; otherwise it is that of a decision worth returning.
         """
         finite = self.program.finite
-        yield "its equalities", finite.missed(x), EQUALITY if strictly else CRUDE
+        yield "its equalities", finite.equality_residual(x), EQUALITY if strictly else CRUDE
         yield "its bounds or rows", finite.residual(x), TOLERANCE if strictly else CRUDE
         yield "its bounds", _find_largest_violation(self.program, x) if strictly else 0.0, TOLERANCE
 
@@ -401,7 +401,9 @@ class Ledger:
             lower_bound=min(lower, cost) if proven else lower,
             upper_bound=cost if proven else np.inf,
             cost_scale=self.program.added(answer.solution.x) if decided else 0.0,
-            missed=self.program.finite.missed(answer.solution.x) if decided and self.program.finite.b.size else None,
+            missed=self.program.finite.equality_residual(answer.solution.x)
+            if decided and self.program.finite.b.size
+            else None,
             worst=worst,
             indices=cuts,
             counts=self._count_work(len(cuts)),

@@ -29,8 +29,8 @@ from sparserob_core.sip.separation.separation import separate
 from sparserob_core.sip.solver import AccountedSolver
 from sparserob_core.sip.working.ledger import ALLOWED, CheckedAnswer, Found, Ledger, Prover, Violated, above, unproven
 from sparserob_core.sip.working.plain import Close
-from sparserob_core.sip.working.securing import GLANCE, SPARED
-from sparserob_core.sip.working.working import Missed, Working, size_of
+from sparserob_core.sip.working.tightening import GLANCE, SPARED
+from sparserob_core.sip.working.working import ViolatedRow, Working, size_of
 
 ROUNDING = 2.0**-46  # rounding error of a bound, relative to the numbers that are added up in it
 SHARES = (0.1, 0.5, 1.0)  # points from the best decision known to the relaxed optimum at which rows are sought
@@ -289,9 +289,9 @@ class RobustRows(Working):
             count += 1
         return count
 
-    def knows(self, missed: Missed) -> bool:
+    def knows(self, row: ViolatedRow) -> bool:
         """Return whether an index is imposed."""
-        return (missed.family, missed.at[0].tobytes()) in self.known
+        return (row.family, row.at[0].tobytes()) in self.known
 
     def priced(self, answer: CheckedAnswer) -> float:
         """Return the sum of the multipliers: the price of a margin of 1."""
@@ -307,9 +307,9 @@ class RobustRows(Working):
         """1: margins are in the rows' own units."""
         return 1.0
 
-    def distance(self, missed: Missed) -> float:
+    def distance(self, row: ViolatedRow) -> float:
         """Return the violation, since margins are in the rows' own units."""
-        return missed.violation
+        return row.violation
 
     def tightened(self, ledger: Ledger, answer: CheckedAnswer, margin: float) -> CheckedAnswer | None:
         """Return the optimum of the imposed rows tightened by ``margin``, accurate to a tenth of what the first margin

@@ -39,7 +39,7 @@ AFFORDED = 0.5
 MANY_ACTIVE = 32
 
 
-class Missed(NamedTuple):
+class ViolatedRow(NamedTuple):
     """Largest violation of a family that was found, or that is not excluded.
 
     Parameters
@@ -60,10 +60,10 @@ class Missed(NamedTuple):
     row: np.ndarray
 
     @staticmethod
-    def most(family: ConstraintFamily, separation: Separation) -> Missed:
+    def largest(family: ConstraintFamily, separation: Separation) -> ViolatedRow:
         """Return the largest violation of a family that its separation has found."""
         largest = float(separation.violations.max(initial=0.0))
-        return Missed(largest, family.name, separation.indices[:1], separation.rows[:1])
+        return ViolatedRow(largest, family.name, separation.indices[:1], separation.rows[:1])
 
 
 @dataclass(eq=False)
@@ -78,23 +78,23 @@ class Working(ABC):
         Margin by which rows are tightened.
     floor : float
         Lower bound of the margin.
-    most : float
+    ceiling : float
         Upper bound of the margin.
     slater : bool
         Whether there is a Slater point for the margin.
     allowed : int
         Number of times that the margin was raised to allow for rounding.
-    secured : int
+    tightenings : int
         Number of times that a proven decision was due, by its price or by the share of a limit that has passed.
     """
 
     program: SemiInfiniteProgram
     margin: float = 0.0
     floor: float = 0.0
-    most: float = LARGEST_MARGIN
+    ceiling: float = LARGEST_MARGIN
     slater: bool = True
     allowed: int = 0
-    secured: int = 0
+    tightenings: int = 0
 
     @property
     @abstractmethod
@@ -146,7 +146,7 @@ class Working(ABC):
         """Impose constraints that no answer contains yet; return the number of new constraints."""
 
     @abstractmethod
-    def knows(self, missed: Missed) -> bool:
+    def knows(self, row: ViolatedRow) -> bool:
         """Return whether a constraint is imposed."""
 
     @abstractmethod
@@ -248,7 +248,7 @@ class Working(ABC):
         """Unit of margins."""
 
     @abstractmethod
-    def distance(self, missed: Missed) -> float:
+    def distance(self, row: ViolatedRow) -> float:
         """Return the margin that removes a violation."""
 
     @abstractmethod
@@ -299,8 +299,8 @@ class Working(ABC):
         """
         if self.margin <= 0.0:
             return False
-        self.most = THINNER * self.margin if THINNER * self.margin >= SMALLEST_MARGIN else 0.0
-        self.margin, self.slater = self.most, self.most > 0.0
+        self.ceiling = THINNER * self.margin if THINNER * self.margin >= SMALLEST_MARGIN else 0.0
+        self.margin, self.slater = self.ceiling, self.ceiling > 0.0
         return True
 
     def pay(self, ledger: Ledger, answer: CheckedAnswer) -> None:
@@ -316,7 +316,7 @@ class Working(ABC):
         price = max(self.priced(answer), np.finfo(float).tiny)
         margin = float(np.clip(budget / price, SMALLEST_MARGIN * self.unit, LARGEST_MARGIN * self.unit))
         if self.margin == 0.0 or margin < 0.5 * self.margin:
-            self.margin = min(max(margin, self.floor), self.most)
+            self.margin = min(max(margin, self.floor), self.ceiling)
 
     def tighten(self, found: Found) -> bool:
         """Tighten the rows where imposed rows are violated because of the solver's accuracy.
@@ -327,12 +327,12 @@ class Working(ABC):
         violated = [
             violation
             for pair in found
-            if (violation := Missed.most(*pair)).violation > ALLOWED and self.knows(violation)
+            if (violation := ViolatedRow.largest(*pair)).violation > ALLOWED and self.knows(violation)
         ]
-        if not violated or not self.slater or self.floor >= self.most:
+        if not violated or not self.slater or self.floor >= self.ceiling:
             return False
         distance = max(self.distance(violation) for violation in violated)
-        self.floor = float(np.clip(2.0 * max(distance, self.margin), SMALLEST_MARGIN, self.most))
+        self.floor = float(np.clip(2.0 * max(distance, self.margin), SMALLEST_MARGIN, self.ceiling))
         self.margin = max(self.margin, self.floor)
         return True
 
@@ -360,10 +360,10 @@ class Working(ABC):
             return False
         distances = [self.distance(violation) for violation in left_open(self.program, proofs)]
         floor = self.margin + 1.25 * max(distances, default=np.inf)
-        if (floor > self.most and not self._is_affordable(ledger, answer, floor)) or self.allowed >= ALLOWANCES:
+        if (floor > self.ceiling and not self._is_affordable(ledger, answer, floor)) or self.allowed >= ALLOWANCES:
             return False
         self.floor = self.margin = floor
-        self.most = max(self.most, floor)
+        self.ceiling = max(self.ceiling, floor)
         self.allowed += 1
         return True
 
@@ -374,7 +374,7 @@ class Working(ABC):
         A margin without a price from multipliers is refused, for its cost is unknown.
         """
         price = self.priced(answer)
-        return self.most >= LARGEST_MARGIN and 0.0 < price * margin <= AFFORDED * ledger.tolerance * size_of(
+        return self.ceiling >= LARGEST_MARGIN and 0.0 < price * margin <= AFFORDED * ledger.tolerance * size_of(
             self.program, answer
         )
 
@@ -398,7 +398,7 @@ def at_rest(program: SemiInfiniteProgram, x: Array) -> Array:
 def fits(ledger: Ledger, x: Array) -> bool:
     """Return whether a decision closes the gap and satisfies all constraints that are no family."""
     base = ledger.program.finite
-    return not ledger.open(x) and base.missed(x) <= EQUALITY and base.residual(x) <= ALLOWED
+    return not ledger.open(x) and base.equality_residual(x) <= EQUALITY and base.residual(x) <= ALLOWED
 
 
 def size_of(program: SemiInfiniteProgram, answer: CheckedAnswer) -> float:
@@ -407,7 +407,7 @@ def size_of(program: SemiInfiniteProgram, answer: CheckedAnswer) -> float:
     return max(SMALL_COST * program.added(x), abs(program.cost(x)))
 
 
-def left_open(program: SemiInfiniteProgram, proofs: Sequence[Proof]) -> list[Missed]:
+def left_open(program: SemiInfiniteProgram, proofs: Sequence[Proof]) -> list[ViolatedRow]:
     """Return the violations that proofs could not exclude, each with the index of the largest violation found.
 
     Parameters
@@ -419,12 +419,12 @@ def left_open(program: SemiInfiniteProgram, proofs: Sequence[Proof]) -> list[Mis
 
     Returns
     -------
-    list of Missed
+    list of ViolatedRow
         The violations. The list is empty where a proof excludes nothing at all, or is about another formulation than
         the imposed rows, since no margin would help then.
     """
     violations = [
-        Missed(
+        ViolatedRow(
             proof.violation if proof.verdict == "refuted" else proof.bound,
             proof.family,
             proof.index[None],

@@ -32,7 +32,7 @@ def near(rng: np.random.Generator, image: bool) -> tuple[FiniteProgram, np.ndarr
 def test_a_point_that_is_near_meets_its_equalities_and_keeps_its_zeros_and_its_bounds(image, seed):
     program, x = near(np.random.default_rng(seed), image)
     moved = onto_equalities(program, x)
-    assert program.missed(x) > 1e-12 > 2.0**-50 >= program.missed(moved)
+    assert program.equality_residual(x) > 1e-12 > 2.0**-50 >= program.equality_residual(moved)
     assert np.abs(moved - x).max() < 1e-8
     before, after = program.image(x), program.image(moved)
     rest = 0.0 if not image else 1e-14

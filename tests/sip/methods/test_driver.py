@@ -1,5 +1,5 @@
-"""Guards sip/methods/driver: every run passes the same functions of driver, exchange, ledger and securing, whatever is
-imposed; a driver ends with the first result, or with what is known."""
+"""Guards sip/methods/driver: every run passes the same functions of driver, exchange, ledger and tightening, whatever
+is imposed; a driver ends with the first result, or with what is known."""
 
 from __future__ import annotations
 
@@ -20,11 +20,13 @@ from sparserob_core.sip.methods import driver, exchange
 from sparserob_core.sip.methods.driver import drive
 from sparserob_core.sip.methods.exchange import Exchange
 from sparserob_core.sip.result import Result
-from sparserob_core.sip.working import ledger, securing, working
+from sparserob_core.sip.working import ledger, tightening, working
 from tests.support.entered import CORE, entered
 from tests.support.problems import spring
 
-SHARED = [str(Path(str(module.__file__)).relative_to(CORE)) for module in (driver, exchange, ledger, securing, working)]
+SHARED = [
+    str(Path(str(module.__file__)).relative_to(CORE)) for module in (driver, exchange, ledger, tightening, working)
+]
 RESULT = Result(status="undecided", message="", counts={}, seconds=0.0)
 
 
@@ -41,11 +43,11 @@ def test_a_run_with_feedback_and_one_without_pass_the_same_functions_of_the_driv
     assert [program.spread is None for program, _ in cases] == [True, False]
     results, passed = zip(*[entered(partial(Exchange().solve, *each), *SHARED) for each in cases], strict=True)
     assert [result.status for result in results] == ["certified", "certified"]
-    # what secures a decision is asked for that by the course of a run, which is not the same
-    met = [{one for one in each if not one.startswith("sip.working.securing._")} for each in passed]
+    # what tightens a decision is asked for that by the course of a run, which is not the same
+    met = [{one for one in each if not one.startswith("sip.working.tightening._")} for each in passed]
     assert met[0] == met[1]
     steps = {f"sip.methods.exchange.Rounds.{name}" for name in ("step", "_explain_ending", "_choose_result")}
-    assert steps | {"sip.methods.driver.drive", "sip.working.securing.proofs_of"} <= passed[0]
+    assert steps | {"sip.methods.driver.drive", "sip.working.tightening.proofs_of"} <= passed[0]
     assert {"sip.working.working.Working.pay", "sip.working.ledger.Ledger.tell"} <= passed[0]
 
 

@@ -118,7 +118,7 @@ def test_more_than_the_largest_margin_is_allowed_for_where_the_tolerated_gap_pay
     working.margin, ledger.tolerance = LARGEST_MARGIN, 1e-4
     assert not working.allow_for(ledger, exact, [undecided(2.1e-5)])
     assert working.allow_for(ledger, exact, [undecided(1.8e-5)])
-    assert working.margin == working.floor == working.most == pytest.approx(LARGEST_MARGIN + 1.25 * 1.8e-5)
+    assert working.margin == working.floor == working.ceiling == pytest.approx(LARGEST_MARGIN + 1.25 * 1.8e-5)
     tightened = answer(working, ledger)
     assert tightened.solution.x == pytest.approx([0.5 + working.margin], abs=1e-11)
     assert ledger.gap(tightened.solution.x) <= ledger.tolerance
@@ -141,7 +141,7 @@ def test_a_margin_that_leaves_nothing_becomes_less_until_there_is_none(kind: str
         tried.append(working.margin)
     assert tried == pytest.approx([1e-9, 1e-12, 1e-15, 0.0], rel=1e-9, abs=0.0)
     assert min(margin for margin in tried if margin) >= SMALLEST_MARGIN * (1.0 - 1e-9)
-    assert not working.slater and working.most == 0.0
+    assert not working.slater and working.ceiling == 0.0
     assert not working.tighten([(working.program.families[0], violated(1e-7))])
 
 

@@ -1,4 +1,4 @@
-"""Guards sip/working/securing: what a decision that keeps away from the constraints is solved from."""
+"""Guards sip/working/tightening: what a decision that keeps away from the constraints is solved from."""
 
 from __future__ import annotations
 
@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 import sparserob_core as sr
-from sparserob_core.sip.working.securing import DEAR, _compute_dear_margin
+from sparserob_core.sip.working.tightening import DEAR, _compute_dear_margin
 
 
 @pytest.mark.parametrize("pieces", [50, 250])
-def test_a_round_in_which_a_decision_is_secured_begins_with_what_is_known(pieces):
+def test_a_round_in_which_a_decision_is_tightened_begins_with_what_is_known(pieces):
     system = sr.LinearSystem(A=[[0, 1], [-2, -0.5]], B=[[0], [1]])
     problem = sr.OptimalControlProblem(
         system=system,

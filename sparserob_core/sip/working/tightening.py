@@ -18,7 +18,7 @@ from sparserob_core.sip.proof.verdict import worst_of
 from sparserob_core.sip.result import Result
 from sparserob_core.sip.separation.separation import separate
 from sparserob_core.sip.working.ledger import ALLOWED, CheckedAnswer, Found, Ledger, Prover, Violated, above, witnesses
-from sparserob_core.sip.working.working import Missed, Working, left_open
+from sparserob_core.sip.working.working import ViolatedRow, Working, left_open
 
 # Number of cells of a short proof. With a tenth, ordinary problems with parameters need a tightened decision although a
 # proof is quick; with ten times as many, a first upper bound along a constraint takes ten times longer.
@@ -37,7 +37,7 @@ PATIENT = 8
 # Largest number of rounds of tightening. Each imposes violated constraints, or has at least twice the margin of the one
 # before. With a third of them, a constraint that is active on a hundred pieces is not yet imposed; ten times as many
 # are a search of their own.
-SECURED = 10
+TIGHTENED = 10
 # Share of the cost that the first margin may cost. With a tenth of it, a proof along an active constraint takes three
 # times as many cells; with ten times as much, the upper bound is of no use.
 SPARED = 1e-3
@@ -90,8 +90,8 @@ def proofs_of(
         return proofs, False
     violations, imposed = left_open(ledger.program, proofs), False
     is_violated = any(above(*pair)[1].size for pair in found)  # then the rounds are used up, and no more may follow
-    if violations and not is_violated and not _is_secured(ledger):
-        imposed = _secure(working, ledger, prover, answer, violations, witnesses(ledger.program, proofs))
+    if violations and not is_violated and not _has_tightened(ledger):
+        imposed = _tighten(working, ledger, prover, answer, violations, witnesses(ledger.program, proofs))
     # Without cells, another proof would be the same one.
     if any(proof.cells for proof in proofs) and not any(proof.verdict == "refuted" for proof in proofs):
         proofs = prover(x)
@@ -99,7 +99,7 @@ def proofs_of(
     return proofs, imposed
 
 
-def secure_in_time(
+def tighten_in_time(
     working: Working, ledger: Ledger, prover: Prover, answer: CheckedAnswer, found: Found, number: int
 ) -> bool:
     """Prove a tightened decision when it is due, even if the decision of this round is violated.
@@ -135,26 +135,26 @@ def secure_in_time(
     if candidate is not None and ledger.cheaper(candidate):
         x = candidate.solution.x
         ledger.prove(candidate, separate(ledger.program, x, ledger.tools, ALLOWED), prover(x, GLANCE))
-    violations, violated = [Missed.most(*pair) for pair in found], [above(*pair) for pair in found]
-    is_near = working.secured == 0
+    violations, violated = [ViolatedRow.largest(*pair) for pair in found], [above(*pair) for pair in found]
+    is_near = working.tightenings == 0
     if deadline.left is None:  # with nothing left to impose, the proof of this decision follows at once
         is_near = is_near and (ledger.open(answer.solution.x) or any(rows.size for _, rows, _ in violated))
     is_near = is_near and _is_near(working, ledger.program, answer, violations)
     if deadline.left is None:
-        working.secured += is_near
+        working.tightenings += is_near
         is_due = is_near or (number >= PATIENT and number & (number - 1) == 0)
     else:
-        is_due = is_near or (working.secured < len(DUE) and deadline.used >= DUE[working.secured])
-        working.secured += is_due
+        is_due = is_near or (working.tightenings < len(DUE) and deadline.used >= DUE[working.tightenings])
+        working.tightenings += is_due
         longest = max(np.diff(round_times, prepend=0.0), default=0.0)
         is_due = is_due or (ledger.proven is None and deadline.left <= RESERVED * longest)
-    if not is_due or _is_secured(ledger):
+    if not is_due or _has_tightened(ledger):
         return False
     if not any(rows.size for _, rows, _ in violated):  # the answer may be proven as it is, which takes less time
         ledger.prove(answer, found, prover(answer.solution.x, GLANCE // 4))
         if ledger.proven is not None:
             return False
-    return _secure(working, ledger, prover, answer, violations, violated)
+    return _tighten(working, ledger, prover, answer, violations, violated)
 
 
 def back_off(working: Working, ledger: Ledger, prover: Prover, answer: CheckedAnswer, found: Found) -> None:
@@ -179,7 +179,7 @@ def back_off(working: Working, ledger: Ledger, prover: Prover, answer: CheckedAn
         Most violated constraints of each family at the answer.
     """
     x, program = answer.solution.x, ledger.program
-    violations = [Missed.most(*pair) for pair in found if not pair[0].defines]
+    violations = [ViolatedRow.largest(*pair) for pair in found if not pair[0].defines]
     violated: Violated = [above(*pair) for pair in found]
     if not ledger.cheaper(answer) or not _is_near(working, program, answer, violations):
         return
@@ -191,7 +191,7 @@ def back_off(working: Working, ledger: Ledger, prover: Prover, answer: CheckedAn
         if not violations or not _is_near(working, program, answer, violations):
             return
     trial_ledger = replace(ledger)
-    _secure(working, trial_ledger, prover, answer, violations, violated, ledger.tolerance)
+    _tighten(working, trial_ledger, prover, answer, violations, violated, ledger.tolerance)
     if trial_ledger.proven is not None and trial_ledger.proven is not ledger.proven:
         proven_answer, separations, proofs = trial_ledger.proven
         ledger.prove(replace(proven_answer, value=answer.value), separations, proofs)
@@ -206,19 +206,19 @@ def or_proven(ledger: Ledger, result: Result) -> Result:
     return ledger.judged(proven_answer, worst_of(separations), proofs, reason)
 
 
-def _secure(
+def _tighten(
     working: Working,
     ledger: Ledger,
     prover: Prover,
     answer: CheckedAnswer,
-    missed: Sequence[Missed],
+    violations: Sequence[ViolatedRow],
     violated: Violated,
     spared: float = SPARED,
 ) -> bool:
     """Prove a tightened decision, so that there is an upper bound while the proof of a better one continues.
 
     The decision is the optimum of the imposed and the ``violated`` rows. The first margin is what the share ``spared``
-    of the cost pays for, plus twice what the answer ``missed``. Later margins add twice what the proof leaves open. An
+    of the cost pays for, plus twice its largest violation. Later margins add twice what the proof leaves open. An
     addition is temporary where new constraints were imposed for it, and is omitted where it makes the program
     infeasible. Where even the first margin makes it infeasible, a hundredth of ``spared`` is tried. Where only the
     margin that large cells require makes it infeasible, smaller cells are used, with a margin that costs `DEAR` of the
@@ -234,7 +234,7 @@ def _secure(
         Prover of the families.
     answer : CheckedAnswer
         Answer to the relaxed program.
-    missed : sequence of Missed
+    violations : sequence of ViolatedRow
         Largest violations at the answer, found or not excluded.
     violated : Violated
         Constraints to impose.
@@ -249,11 +249,11 @@ def _secure(
     program, margin, imposed = ledger.program, working.margin, 0
     kept: tuple[CheckedAnswer, Found] | None = None  # a short proof left cells open, and no search finds a violation
     cells, dear_margin = GLANCE, _compute_dear_margin(abs(program.cost(answer.solution.x)), working.priced(answer))
-    for _ in range(SECURED):
+    for _ in range(TIGHTENED):
         cost, price = abs(program.cost(answer.solution.x)), working.priced(answer)
         fresh = working.impose(violated)
         imposed += fresh
-        addition = PAID * max((working.distance(violation) for violation in missed), default=0.0)
+        addition = PAID * max((working.distance(violation) for violation in violations), default=0.0)
         margin = max(margin, working.margin + (spared * cost / price if price > 0.0 else 0.0))
         margin += 0.0 if fresh else addition
         addition = addition if fresh and addition * price < DEAR * cost else 0.0
@@ -261,21 +261,26 @@ def _secure(
         if tighter is None and kept is not None:  # no margin as large cells require: smaller cells, a margin that costs
             if dear_margin * price <= PAID * spared * cost:
                 break
-            cells, margin, missed, dear_margin = CLOSER * GLANCE, working.margin + dear_margin, (), NEARER * dear_margin
+            cells, margin, violations, dear_margin = (
+                CLOSER * GLANCE,
+                working.margin + dear_margin,
+                (),
+                NEARER * dear_margin,
+            )
             continue
         if tighter is None:  # no such margin, for example where two constraints are close to each other
-            margin, spared, missed = working.margin, THINNER * spared, ()
+            margin, spared, violations = working.margin, THINNER * spared, ()
             if price > 0.0 and spared >= ledger.tolerance:
                 continue
             break
         answer = tighter
         x = tighter.solution.x
-        separations, missed, violated = _separate_violations(ledger, x)
-        if missed:
+        separations, violations, violated = _separate_violations(ledger, x)
+        if violations:
             continue
         proofs = prover(x, cells)
-        missed, violated = left_open(program, proofs), witnesses(program, proofs)
-        if ledger.prove(tighter, separations, proofs) or not missed:
+        violations, violated = left_open(program, proofs), witnesses(program, proofs)
+        if ledger.prove(tighter, separations, proofs) or not violations:
             return imposed > 0
         if cells == GLANCE:
             kept = None if any(rows.size for _, rows, _ in violated) else (tighter, separations)
@@ -304,27 +309,33 @@ def _solve_tightened(
     return None
 
 
-def _separate_violations(ledger: Ledger, x: Array) -> tuple[Found, Sequence[Missed], Violated]:
+def _separate_violations(ledger: Ledger, x: Array) -> tuple[Found, Sequence[ViolatedRow], Violated]:
     """Return the separations at ``x (n,)``, the largest violations among them, and the constraints to impose."""
     separations = separate(ledger.program, x, ledger.tools, ALLOWED, max(1, len(ledger.history)))
     violated_pairs = [
         pair for pair in separations if not pair[0].defines and pair[1].violations.max(initial=0.0) > ALLOWED
     ]
-    return separations, [Missed.most(*pair) for pair in violated_pairs], [above(*pair) for pair in violated_pairs]
+    return (
+        separations,
+        [ViolatedRow.largest(*pair) for pair in violated_pairs],
+        [above(*pair) for pair in violated_pairs],
+    )
 
 
-def _is_near(working: Working, program: SemiInfiniteProgram, answer: CheckedAnswer, missed: Sequence[Missed]) -> bool:
-    """Return whether a margin that covers what an answer ``missed`` costs no more than the first margin of `_secure`.
+def _is_near(
+    working: Working, program: SemiInfiniteProgram, answer: CheckedAnswer, violations: Sequence[ViolatedRow]
+) -> bool:
+    """Return whether a margin that covers the violations of an answer costs no more than the first one of `_tighten`.
 
     A round may take longer than all rounds before it, so the method does not wait for a better answer then.
     """
-    distance = max((working.distance(violation) for violation in missed if violation.violation > 0.0), default=0.0)
+    distance = max((working.distance(violation) for violation in violations if violation.violation > 0.0), default=0.0)
     price = working.priced(answer)
     if distance > 0.0 and not price > 0.0:  # no row has a multiplier, so the price of a margin is unknown
         return False
     return PAID * distance * price <= SPARED * abs(program.cost(answer.solution.x))
 
 
-def _is_secured(ledger: Ledger) -> bool:
+def _has_tightened(ledger: Ledger) -> bool:
     """Return whether a decision is proven that costs little more than a tightened decision must."""
     return ledger.proven is not None and ledger.gap(ledger.proven[0].solution.x) <= PAID * SPARED
