@@ -186,8 +186,8 @@ def _bound_signal_loss(model: Transcription, result: Result) -> tuple[float, flo
         )
         loss += float(residual @ (np.abs(rows.d[number]) + abs(rows.C[number]) @ magnitudes)[:size])
     arguments = finite, blocks, np.concatenate(multipliers), np.vstack(deviations), result.dual.mu
-    bound, sums = robust_bound(*arguments, priced=False)
-    return loss, bound - SHARE * sums
+    bound = robust_bound(*arguments, priced=False)
+    return loss, bound.value - max(SHARE, bound.rounding) * bound.size
 
 
 def added_up(model: Transcription, times: Array, directions: Array, parameters: Array) -> Array:

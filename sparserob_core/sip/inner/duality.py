@@ -22,7 +22,7 @@ from sparserob_core.sip.inner.equalities import onto_equalities
 from sparserob_core.sip.inner.extended import extended_bound
 from sparserob_core.sip.inner.image import onto_stationary, within_bounds
 
-# Least allowance for the error of a sum, relative to the sum of the absolute values (see `_bound_rounding`). With a
+# Least allowance for the error of a sum, relative to the sum of the absolute values (see `bound_rounding`). With a
 # tenth of it, slopes of 0 are refused for what a projection leaves; ten times as much costs digits of bounds.
 ROUND_OFF = 1e-14
 EPSILON = float(np.finfo(float).eps)
@@ -248,12 +248,12 @@ def _compute_terms(
         at = np.zeros(program.n) if at is None else at
         gradient = np.asarray(program.P @ at)
         sizes = np.asarray(abs(program.P) @ np.abs(at))  # what may cancel in the slope and in the square, and rounds
-        constant -= 0.5 * _add_pairwise(at * gradient)
+        constant -= 0.5 * add_pairwise(at * gradient)
         magnitude += 0.5 * float(np.abs(at) @ sizes)
         slope, noise = slope + gradient, noise + sizes
     if program.P is None:
         curvature = None
-    round_off = _bound_rounding(_count_terms(program, y))
+    round_off = bound_rounding(_count_terms(program, y))
     if program.S is None:
         return Terms(constant, slope, noise, program.weights, curvature, magnitude, image, round_off)
     start = np.zeros(program.weights.size) if z is None else z
@@ -262,7 +262,7 @@ def _compute_terms(
     return Terms(constant, -z, noise, program.weights, None, magnitude, image, round_off)
 
 
-def _bound_rounding(count: int) -> float:
+def bound_rounding(count: int) -> float:
     """Return the allowance for the rounding of a sum of ``count`` terms, relative to the sum of their absolute values.
 
     A chain of ``n`` roundings errs by at most ``n u / (1 - n u)`` (Higham 2002, section 3.1). Twice ``n u`` is allowed,
@@ -275,14 +275,14 @@ def _count_terms(program: FiniteProgram, y: Array) -> int:
     """Return the largest number of terms that are added up one after the other in a bound by multipliers ``y (r,)``.
 
     A slope has a term for each positive multiplier and each equality, and what ``P``, or the image, adds to it. The
-    number of entries counts by its logarithm only (`_add_pairwise`).
+    number of entries counts by its logarithm only (`add_pairwise`).
     """
     longest = sum(int(np.diff(term.indptr).max(initial=0)) for term in (program.P, program.S) if term is not None)
     pairs = max(program.n, program.weights.size).bit_length()
     return int(np.count_nonzero(y)) + program.b.size + longest + pairs
 
 
-def _add_pairwise(values: Array) -> float:
+def add_pairwise(values: Array) -> float:
     """Return the sum of ``values (k,)``, to which each value adds the rounding of at most ``log2 k + 1`` additions."""
     while values.size > 1:
         half = values.size // 2
@@ -302,7 +302,7 @@ def without_norms(terms: Terms, program: FiniteProgram) -> Terms:
     if blocks is None or not np.isfinite(terms.slope).all():
         return terms
     entries, of = blocks.entries, blocks.of
-    weights = terms.weights[blocks.first] * (1.0 - _bound_rounding(blocks.table.shape[1]))
+    weights = terms.weights[blocks.first] * (1.0 - bound_rounding(blocks.table.shape[1]))
     number, norms = np.maximum(blocks.number, 0), blocks.norms(terms.slope)
     offers = [-terms.slope * np.minimum(1.0, weights / np.where(norms > 0.0, norms, 1.0))[number]]
     if terms.at is not None:
@@ -339,7 +339,7 @@ def _evaluate_bound(terms: Terms, program: FiniteProgram) -> float:
     if terms.curvature is not None:
         squares = 0.5 * terms.curvature * s * s
         values, size = values + squares, size + float(squares.sum())
-    return terms.constant + _add_pairwise(values) - terms.round_off * size
+    return terms.constant + add_pairwise(values) - terms.round_off * size
 
 
 def _find_overshoot(terms: Terms, program: FiniteProgram, bound: float) -> Bool[np.ndarray, " k"] | None:

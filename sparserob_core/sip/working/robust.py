@@ -32,7 +32,6 @@ from sparserob_core.sip.working.plain import Close
 from sparserob_core.sip.working.tightening import GLANCE, SPARED
 from sparserob_core.sip.working.working import ViolatedRow, Working, size_of
 
-ROUNDING = 2.0**-46  # rounding error of a bound, relative to the numbers that are added up in it
 SHARES = (0.1, 0.5, 1.0)  # points from the best decision known to the relaxed optimum at which rows are sought
 ENDED = 0.05  # seconds after the deadline when it has passed for certain
 CUTS = 4  # largest number of rows at each of these points
@@ -369,13 +368,14 @@ class RobustRows(Working):
         elif decision is None and (self.program.P is not None or self.program.finite.blocks is not None):
             decision = np.zeros(self.program.n)
         named = self.counterpart.spread.named(answer.deviations)
-        bound, size = robust_bound(self.program.finite, blocks, answer.y, named, answer.mu, priced, decision)
+        bound = robust_bound(self.program.finite, blocks, answer.y, named, answer.mu, priced, decision)
         cuts = tuple(
             replace(cut, index=np.concatenate([cut.index, w]), multiplier=float(y), formulation="literal")
             for cut, y, w in zip(self.cuts, answer.y, named, strict=True)
             if y > 0.0
         )
-        return Dual(bound - (ROUNDING + self.counterpart.spread.lost) * size, cuts, answer.mu, at=decision)
+        share = bound.rounding + self.counterpart.spread.lost
+        return Dual(bound.value - share * bound.size, cuts, answer.mu, at=decision)
 
     @property
     def at_rest(self) -> Dual:

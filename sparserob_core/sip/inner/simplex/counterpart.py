@@ -17,14 +17,14 @@ from __future__ import annotations
 import time
 from collections import Counter
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, final
+from typing import TYPE_CHECKING, Any, NamedTuple, final
 
 import numpy as np
 
 from sparserob_core.errors import PluginError, named
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.finite import HIGHS, FiniteProgram, Spread, UncertainRows, entries_of, gathered
-from sparserob_core.sip.inner.duality import Terms, without_norms
+from sparserob_core.sip.inner.duality import Terms, add_pairwise, bound_rounding, without_norms
 from sparserob_core.sip.inner.simplex.interruptible import run
 from sparserob_core.sip.inner.simplex.silence import silent
 from sparserob_core.sip.inner.simplex.tangents import Tangents
@@ -583,6 +583,24 @@ def _split_signs(row: np.ndarray, column: np.ndarray, value: Array, n: int) -> t
     return np.concatenate([row, row]), np.concatenate([column, column + n]), np.concatenate([value, -value])
 
 
+class RobustBound(NamedTuple):
+    """Lower bound of a robust program by weak duality, but for the rounding of its evaluation.
+
+    Parameters
+    ----------
+    value : float
+        The bound, as it was computed.
+    size : float
+        Sum of the absolute numbers that were added up in it.
+    rounding : float
+        Bound of the rounding error, as a share of the ``size``.
+    """
+
+    value: float
+    size: float
+    rounding: float
+
+
 def robust_bound(
     program: FiniteProgram,
     blocks: list[UncertainRows],
@@ -591,12 +609,11 @@ def robust_bound(
     mu: Array,
     priced: bool,
     at: Array | None = None,
-) -> tuple[float, float]:
-    """Return a lower bound of the cost by weak duality, but for rounding, from multipliers ``y (r,) >= 0`` of rows at
+) -> RobustBound:
+    """Return a lower bound of the cost by weak duality from multipliers ``y (r,) >= 0`` of rows at
     ``deviations (r, Q)`` and ``mu (e,)``. It is the minimum over the bounds of the program alone. Quadratic terms are
     replaced by their tangent ``at (n,)``, of 0 unless given. Not ``priced``: of the weighted sum of the rows, which is
-    positive only where nothing is feasible. The second number is the sum of the absolute numbers that were added up, a
-    share of which the caller subtracts for rounding."""
+    positive only where nothing is feasible."""
     cost = program.tangent(np.zeros(program.n) if at is None else at)
     slope, constant = (cost.q.copy() if priced else np.zeros(program.n)), -float(mu @ program.b)
     constant, size = constant + cost.constant * priced, abs(constant) + abs(cost.constant) * priced
@@ -612,9 +629,9 @@ def robust_bound(
         weight = np.zeros(block.d.shape)
         np.add.at(weight, block.part[used], (multipliers[used] * block.factor[used])[:, None] * w[used])
         terms += [weighted(multipliers, block.g), weighted(weight.ravel(), block.stacked)]
-        constant += float(weight.ravel() @ block.d.ravel())
+        constant += add_pairwise((weight * block.d).ravel())
         size += float(np.abs(weight).ravel() @ np.abs(block.d).ravel())
-        constant -= float(multipliers @ block.h)
+        constant -= add_pairwise(multipliers * block.h)
         size += float(multipliers @ np.abs(block.h))
     column, value = (np.concatenate(arrays) for arrays in zip(*terms, strict=True))
     slope = slope + np.bincount(column, value, program.n)
@@ -627,5 +644,9 @@ def robust_bound(
     with np.errstate(invalid="ignore"):
         least = (weights * np.abs(ends) + np.where(slope == 0.0, 0.0, slope * ends)).min(axis=0)
         magnitudes = np.where(noise > 0.0, noise * np.abs(ends[:2]).max(axis=0), 0.0)
-    bound = constant + float(least.sum())
-    return (bound, size + float(magnitudes.sum())) if np.isfinite(bound) else (-np.inf, size)
+    bound, size = constant + add_pairwise(least), size + float(magnitudes.sum())
+    # a slope has a term for each entry of its column; other sums are by pairs, but for those over the blocks
+    longest = int(np.bincount(column, minlength=1).max()) + program.b.size + len(blocks)
+    longest += 0 if program.P is None else int(np.diff(program.P.indptr).max(initial=0))
+    rounding = bound_rounding(longest + max(program.n, max((block.d.size for block in blocks), default=1)).bit_length())
+    return RobustBound(bound, size, rounding) if np.isfinite(bound) else RobustBound(-np.inf, size, rounding)

@@ -66,7 +66,7 @@ def answering(name: int, piece: int) -> UncertainRows:
 
 
 def bound(x: Interior | Counterpart, y: Array, deviations: Array) -> float:
-    return robust_bound(program(), x.blocks, y, deviations, np.zeros(0), priced=True)[0]
+    return robust_bound(program(), x.blocks, y, deviations, np.zeros(0), priced=True).value
 
 
 def test_multipliers_leave_no_slope_in_what_answers_however_far_that_may_go() -> None:
@@ -77,7 +77,7 @@ def test_multipliers_leave_no_slope_in_what_answers_however_far_that_may_go() ->
         central.add(block)
     found = central.solve(0.0, 1e-9)
     assert found.solved
-    lower = robust_bound(far, central.blocks, found.y, found.deviations, np.zeros(0), priced=True)[0]
+    lower = robust_bound(far, central.blocks, found.y, found.deviations, np.zeros(0), priced=True).value
     cost = float(far.weights @ np.abs(found.x))
     assert cost - 1e-7 <= lower <= cost + 1e-9  # 5e-4 where what rounding leaves stays
 
@@ -119,7 +119,7 @@ def test_what_no_decision_meets_is_refuted_by_multipliers_at_deviations_in_the_s
     found = central.solve(0.0, 1e-9)
     assert not found.solved
     y = found.y / found.y.sum()
-    assert robust_bound(program(), central.blocks, y, found.deviations, np.zeros(0), priced=False)[0] > 1e-3
+    assert robust_bound(program(), central.blocks, y, found.deviations, np.zeros(0), priced=False).value > 1e-3
 
 
 def test_a_solve_that_is_out_of_time_says_how_far_it_has_come() -> None:

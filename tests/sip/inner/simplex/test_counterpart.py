@@ -4,6 +4,7 @@ every corner of the deviations, and its multipliers prove what the Lagrangian is
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from fractions import Fraction
 from itertools import product
 
 import numpy as np
@@ -134,7 +135,7 @@ def test_the_optimum_is_that_of_what_is_written_out_and_its_multipliers_prove_it
         assert max(float(block.excess(answer.x, spread).max()) for block in blocks) <= 1e-8 - margin
         assert (answer.y >= 0.0).all()
         assert all(spread.holds(w) for w in answer.deviations)
-        proven, size = robust_bound(base, blocks, answer.y, answer.deviations, answer.mu, priced=True)
+        proven, size, _ = robust_bound(base, blocks, answer.y, answer.deviations, answer.mu, priced=True)
         lost = margin * answer.y.sum()  # rows that were tightened are priced as they are
         assert truth.value - lost - 1e-7 <= proven <= truth.value + 1e-9
         assert size >= abs(proven) - 1e-12
@@ -187,7 +188,7 @@ def test_what_nothing_meets_is_relaxed_as_little_as_possible_and_its_multipliers
     assert truth.extra > 0.1
     assert answer.slack == pytest.approx(truth.extra, abs=1e-8)
     assert answer.y.sum() == pytest.approx(1.0, abs=1e-9)
-    proven = robust_bound(base, blocks, answer.y, answer.deviations, answer.mu, priced=False)[0]
+    proven = robust_bound(base, blocks, answer.y, answer.deviations, answer.mu, priced=False).value
     assert truth.extra - 1e-7 <= proven <= truth.extra + 1e-9
 
 
@@ -224,7 +225,7 @@ def test_costs_that_are_not_linear_are_met_by_their_tangents_and_proven(seed: in
     assert answer.solved
     assert answer.at is not None
     cost = base.objective(answer.x)
-    proven, _ = robust_bound(base, blocks, answer.y, answer.deviations, answer.mu, True, answer.at)
+    proven = robust_bound(base, blocks, answer.y, answer.deviations, answer.mu, True, answer.at).value
     assert cost - 1e-8 * (1.0 + abs(cost)) <= proven <= cost + 1e-9
     G, h, moved = written_out(blocks[0], BOX)
     for step in 0.1 * rng.standard_normal((300, N)):
@@ -269,7 +270,7 @@ def test_large_programs_are_begun_from_inside_and_end_at_the_same_optimum(
     assert ways[0]
     assert any(ways[1:]) == (patient == 0.0)
     assert base.objective(again.x) == pytest.approx(base.objective(steps.x), abs=1e-9)
-    proven, _ = robust_bound(base, blocks, again.y, again.deviations, again.mu, True, again.at)
+    proven = robust_bound(base, blocks, again.y, again.deviations, again.mu, True, again.at).value
     assert proven == pytest.approx(base.objective(again.x), abs=1e-8)
 
 
@@ -285,7 +286,7 @@ def test_squares_that_are_to_be_0_are_answered_though_no_tangent_is_sharp_enough
     answer = counterpart.solve()
     assert answer.solved
     assert base.objective(answer.x) <= 1e-10
-    proven, _ = robust_bound(base, [block], answer.y, answer.deviations, answer.mu, True, answer.at)
+    proven = robust_bound(base, [block], answer.y, answer.deviations, answer.mu, True, answer.at).value
     assert -1e-9 <= proven <= 0.0
 
 
@@ -327,7 +328,7 @@ def test_what_multipliers_prove_is_the_least_of_the_lagrangian(seed: int, priced
                 terms += [y[first] * one for one in said]
                 first += 1
         least, largest = min(least, sum(terms)), max(largest, sum(abs(term) for term in terms))
-    proven, size = robust_bound(base, blocks, y, w, mu, priced)
+    proven, size, _ = robust_bound(base, blocks, y, w, mu, priced)
     assert proven == pytest.approx(least, abs=1e-12 * largest)
     assert size >= 0.3 * largest  # all that is added up, so that its rounding is
 
@@ -337,7 +338,7 @@ def test_a_variable_without_an_end_that_a_slope_draws_there_has_no_bound() -> No
     base, block = program(rng), rows(rng, "several")
     free = replace(base, upper=np.full(N, np.inf), weights=np.zeros(N))
     y, w = np.ones(3), np.zeros((3, Q))
-    assert robust_bound(free, [block], y, w, np.zeros(1), priced=True)[0] == -np.inf
+    assert robust_bound(free, [block], y, w, np.zeros(1), priced=True).value == -np.inf
 
 
 @pytest.mark.parametrize("scales", [False, True])
@@ -358,7 +359,7 @@ def test_exact_rows_hold_at_every_deviation(scales: bool) -> None:
     assert answer.x[2:] == pytest.approx(factor * np.array([-0.3, 0.2]), abs=1e-9)
     assert answer.x[:2].sum() == pytest.approx(0.7, abs=1e-9)
     if not scales:
-        proven = robust_bound(base, [both], answer.y, answer.deviations, answer.mu, priced=True)[0]
+        proven = robust_bound(base, [both], answer.y, answer.deviations, answer.mu, priced=True).value
         assert proven == pytest.approx(base.objective(answer.x), abs=1e-8)
         assert (answer.y >= 0.0).all()
         assert all(BOX.holds(one) for one in answer.deviations)
@@ -374,3 +375,17 @@ def test_entries_in_any_order_are_the_sparse_table_that_scipy_makes_of_them(seed
         mine, known = getattr(table, name), getattr(theirs, name)
         assert mine == pytest.approx(known, abs=1e-15)
     assert [one.tolist() for one in entries_of(table)[:2]] == [one.tolist() for one in theirs.tocoo().coords]
+
+
+@pytest.mark.parametrize("count", [10, 100_000])
+def test_the_rounding_of_a_bound_is_counted_for_as_many_rows_as_there_are(count: int) -> None:
+    """One variable with a slope of as many terms as rows, each rounded downwards; many of them exceed a fixed 2^-46."""
+    y, g = np.ones(count), np.full(count, 1.0 + 0.4 * 2.0**-36)
+    none = np.zeros((0, 1))
+    base = FiniteProgram(np.zeros(1), np.zeros(1), -np.ones(1), np.ones(1), none, np.zeros(0), none, np.zeros(0))
+    part = np.zeros(count, dtype=int)
+    block = UncertainRows(csr_array(g[:, None]), y * 0.0, part, np.zeros(count), (csr_array((Q, 1)),), np.zeros((1, Q)))
+    found = robust_bound(base, [block], y, np.zeros((count, Q)), np.zeros(0), priced=True)
+    truth = -count * Fraction(y[0]) * Fraction(g[0])
+    assert Fraction(found.value - found.rounding * found.size) <= truth
+    assert (Fraction(found.value - 2.0**-46 * found.size) > truth) == (count == 100_000)
