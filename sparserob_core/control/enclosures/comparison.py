@@ -24,7 +24,9 @@ KEPT = 64
 # neighbouring durations share a bound if they differ by at most this share of them and `NOTHING` of the longest
 EQUAL = 1e-9
 NOTHING = 1e-12
-MOST = 10_000_000  # numbers in the matrices of one kind, beyond which durations that differ by `NEAR` share one too
+STORAGE_LIMIT = (
+    10_000_000  # numbers in the matrices of one kind, beyond which durations that differ by `NEAR` share one too
+)
 NEAR = 1e-2
 # Multiplications that exponentials of cells, and of slack, may take, beyond which those whose widths differ by `WIDE`
 # share one: with ten times as many, a look at a plant of 350 states, at cells of hundreds of widths, takes half a
@@ -82,7 +84,7 @@ class NormBounds:
         own."""
         if self.matrices.shape[0] == 1:
             return product(norms, self.matrices[0].T)
-        if self.which.size < FEW * self.matrices.shape[0] and self.matrices[0].size * self.which.size <= MOST:
+        if self.which.size < FEW * self.matrices.shape[0] and self.matrices[0].size * self.which.size <= STORAGE_LIMIT:
             return np.asarray(product(self.matrices[self.which], norms[..., None])[..., 0])
         bounds = np.empty((*norms.shape[:-1], self.matrices.shape[1]))
         for number, indices in enumerate(self._duration_indices):
@@ -169,7 +171,7 @@ class ComparisonSystem:
             shortest, longest, groups = alike(widths, self.sizes.size, rough=cells)
         key = shortest.tobytes() + longest.tobytes()
         if key not in self._cached_bounds:
-            capacity = MOST // max(1, shortest.size * self.sizes.size)
+            capacity = STORAGE_LIMIT // max(1, shortest.size * self.sizes.size)
             remember(self._cached_bounds, key, self._compute_bounds(shortest, longest), max(1, min(KEPT, capacity)))
         return Reach(*(NormBounds(bounds, groups) for bounds in self._cached_bounds[key]))
 
@@ -233,7 +235,7 @@ def alike(
     nothing, share = NOTHING * distinct.max(initial=0.0), EQUAL
     group = np.cumsum(np.diff(distinct, prepend=distinct[:1]) > share * distinct + nothing)
     count = int(group[-1]) + 1 if group.size else 0
-    ratio = WIDE if rough and count * numbers**1.5 > WORK else NEAR if count * numbers > MOST else 0.0
+    ratio = WIDE if rough and count * numbers**1.5 > WORK else NEAR if count * numbers > STORAGE_LIMIT else 0.0
     if ratio:  # in steps of a ratio, where there are very many
         steps = np.floor(np.log(np.maximum(distinct, nothing) / nothing) / np.log1p(ratio))
         group = np.unique(steps, return_inverse=True)[1]

@@ -32,7 +32,7 @@ WELL_CONDITIONED = 1e3
 POORLY_CONDITIONED, MANY = 1e5, 50
 SEPARATED = (1e-6, 1e-4, 1e-2, 0.1, 0.5)  # of the largest eigenvalue: closer ones are tried in one group
 SWEEPS = 16  # of balancing
-FAR = 6.0  # bits by which two ways to balance may differ before the one that is not step by step is taken
+BALANCE_TOLERANCE = 6.0  # bits by which two ways to balance may differ before the one that is not step by step is taken
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,19 +51,19 @@ class Decoupling:
     starts: np.ndarray
     groups: np.ndarray
 
-    def normal_form(self, moved: Array) -> Array:
-        """Return ``D (d, d)``, which ``T^-1 A T`` would be without rounding, from the computed product ``moved (d,
-        d)``.
+    def normal_form(self, transformed: Array) -> Array:
+        """Return ``D (d, d)``, which ``T^-1 A T`` would be without rounding, from the computed product ``transformed
+        (d, d)``.
 
         Entries outside the groups and below the diagonal blocks are 0, and 2 by 2 blocks are ``[[a, b], [-b, a]]``.
-        Without a transform ``D`` is ``moved`` itself.
+        Without a transform ``D`` is ``transformed`` itself.
         """
         if self.is_identity:
-            return moved.copy()
+            return transformed.copy()
         d = self.transform.shape[0]
         block = np.searchsorted(self.starts, np.arange(d), side="right")
         group = np.searchsorted(self.groups, np.arange(d), side="right")
-        D = np.where((group[:, None] == group) & (block[:, None] <= block), moved, 0.0)
+        D = np.where((group[:, None] == group) & (block[:, None] <= block), transformed, 0.0)
         for i in np.flatnonzero(np.diff(np.append(self.starts, d)) == 2):
             at = self.starts[i]
             rate, rotation = (D[at, at] + D[at + 1, at + 1]) / 2, (D[at, at + 1] - D[at + 1, at]) / 2
@@ -85,12 +85,12 @@ class Decoupling:
         transformed = self.inverse @ A.astype(np.longdouble) @ self.transform
         return self._round_to_double(transformed, np.abs(A) @ np.abs(self.transform))
 
-    def _round_to_double(self, moved: LongArray, sizes: Array) -> tuple[Array, Array]:
-        """Return ``moved`` in double precision, and a bound of its distance from the truth; ``sizes`` bounds the moduli
-        of the factor of the inverse."""
-        products = _bound_long_rounding(2 * moved.shape[-2]) * (np.abs(self.inverse) @ sizes)
-        result = moved.astype(float)
-        bound = products + self.defect @ (np.abs(moved) + products) + np.abs(moved - result)
+    def _round_to_double(self, transformed: LongArray, sizes: Array) -> tuple[Array, Array]:
+        """Return ``transformed`` in double precision, and a bound of its distance from the truth; ``sizes`` bounds the
+        moduli of the factor of the inverse."""
+        products = _bound_long_rounding(2 * transformed.shape[-2]) * (np.abs(self.inverse) @ sizes)
+        result = transformed.astype(float)
+        bound = products + self.defect @ (np.abs(transformed) + products) + np.abs(transformed - result)
         return result, 1.001 * bound.astype(float)
 
     @cached_property
@@ -260,7 +260,7 @@ def balance(A: Array) -> Array:
     their diagonal (Osborne 1960)."""
     scale, start = _sweep_scales(A, np.ones(A.shape[0])), _fit_scales(A)
     # where many states are in a row, each next to its like, the sweeps stop early
-    return scale if np.ptp(np.log2(scale / start)) <= FAR else _sweep_scales(A, start)
+    return scale if np.ptp(np.log2(scale / start)) <= BALANCE_TOLERANCE else _sweep_scales(A, start)
 
 
 def _sweep_scales(A: Array, scale: Array) -> Array:

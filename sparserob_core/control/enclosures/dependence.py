@@ -26,10 +26,10 @@ Value: TypeAlias = Any
 """A float, or anything else with arithmetic, such as a `TaylorModel`."""
 Table: TypeAlias = "np.ndarray"
 Exponents: TypeAlias = tuple[int, ...]
-MOST_POWERS = 8
+LARGEST_DEGREE = 8
 """The degree in all parameters together up to which an entry counts as a polynomial in them. With twice the degree an
 expansion of all terms is too large; beyond it an entry is a power series, of which only the terms that matter count."""
-MOST_ON_CELL, NUMBERS_ON_CELL = 6, 80
+LARGEST_CELL_DEGREE, NUMBERS_ON_CELL = 6, 80
 """The degree on a cell of parameters, and the coefficients times states, at most: with twice as many a cell takes three
 times as long, with half as many there are three times as many cells."""
 Part: TypeAlias = "dict[Exponents, Value]"
@@ -68,7 +68,7 @@ class Dependent:
 
     value: Value
     others: Mapping[Exponents, Value]
-    degree: int = MOST_POWERS
+    degree: int = LARGEST_DEGREE
     beyond: bool = False
 
     @property
@@ -334,7 +334,7 @@ class Split:
     nu: int
 
     @staticmethod
-    def of(entry: object, time: Value, centre: Array, units: Array, degree: int = MOST_POWERS) -> Split:
+    def of(entry: object, time: Value, centre: Array, units: Array, degree: int = LARGEST_DEGREE) -> Split:
         """Return the expansion of an entry of a law in its parameters.
 
         Parameters
@@ -420,41 +420,41 @@ def _mark_nonzeros(table: Table) -> np.ndarray:
 @final
 @dataclass(frozen=True, eq=False)
 class Dependence:
-    """Affine dependence of the state on parameters: ``reached (nu, d)`` is the mask of the states ``y_j`` that
+    """Affine dependence of the state on parameters: ``affected (nu, d)`` is the mask of the states ``y_j`` that
     parameter ``j`` reaches.
 
     The parameters are measured from their ``centre (nu,)`` in ``units (nu,)``.
     """
 
-    reached: np.ndarray
+    affected: np.ndarray
     centre: Array
     units: Array
 
     @property
     def states(self) -> int:
         """Number of all states: those of the system, and those that parameters reach."""
-        return int(self.reached.shape[1] + self.reached.sum())
+        return int(self.affected.shape[1] + self.affected.sum())
 
     def rows(self, shares: Array) -> Array:
         """Return ``x`` as rows on all states, ``(d, states)``, where the parameters deviate from their centre by these
         ``shares (nu,)`` of their units."""
-        nu, d = self.reached.shape
+        nu, d = self.affected.shape
         axes = np.eye(d)
-        return np.hstack([axes, *(shares[j] * axes[:, self.reached[j]] for j in range(nu))])
+        return np.hstack([axes, *(shares[j] * axes[:, self.affected[j]] for j in range(nu))])
 
     def matrix(self, name: str, entry: object, time: Value) -> Table:
         """``A``, or one of ``B``, ``E``, ``c``, of the system of all states at a time."""
-        tables, (nu, d) = Split.of(entry, time, self.centre, self.units).whole, self.reached.shape
+        tables, (nu, d) = Split.of(entry, time, self.centre, self.units).whole, self.affected.shape
         if name != "A":
-            return np.concatenate([tables[0], *(tables[1 + j][self.reached[j]] for j in range(nu))])
+            return np.concatenate([tables[0], *(tables[1 + j][self.affected[j]] for j in range(nu))])
         below = []
         for j in range(nu):
-            is_reached = self.reached[j]
-            row = [tables[1 + j][is_reached]]
+            is_affected = self.affected[j]
+            row = [tables[1 + j][is_affected]]
             for i in range(nu):
-                own = tables[0][np.ix_(is_reached, is_reached)]
+                own = tables[0][np.ix_(is_affected, is_affected)]
                 row.append(
-                    own if i == j else np.zeros((int(is_reached.sum()), int(self.reached[i].sum())), dtype=object)
+                    own if i == j else np.zeros((int(is_affected.sum()), int(self.affected[i].sum())), dtype=object)
                 )
             below.append(np.concatenate(row, axis=1))
         first = np.concatenate([tables[0], np.zeros((d, self.states - d), dtype=object)], axis=1)
@@ -499,17 +499,16 @@ class ExpandedSystem:
     """The state of a system of ``d`` states as a polynomial in its parameters, ``x = sum_a delta^a x_a``, with a
     remainder of higher degrees.
 
-    The ``x_a`` are the blocks of a larger state, in the order of the monomials of the ``space``. They obey
-    ``x_a' = sum_b A_b x_(a-b) + B_a u + E_a w + c_a``, about the ``centre (nu,)`` of the parameters and in
-    ``units (nu,)``. ``left`` bounds the terms beyond the degree of the space, of entries that are no polynomials of
-    that degree.
+    The ``x_a`` are the blocks of a larger state, in the order of the monomials of the ``space``. They obey ``x_a' =
+    sum_b A_b x_(a-b) + B_a u + E_a w + c_a``, about the ``centre (nu,)`` of the parameters and in ``units (nu,)``.
+    ``remainder`` bounds the terms beyond the degree of the space, of entries that are no polynomials of that degree.
     """
 
     d: int
     space: TaylorSpace
     centre: Array
     units: Array
-    left: TruncationBound | None = None
+    remainder: TruncationBound | None = None
 
     @property
     def states(self) -> int:
@@ -530,17 +529,19 @@ class ExpandedSystem:
 
         Returns
         -------
-        Spread, np.ndarray
+        ExpandedSystem, np.ndarray
             The polynomials on the cell; and the indices of the monomials of this space that are at most of their
-            degree. The terms beyond this degree are bounded by their `left`.
+            degree. The terms beyond this degree are bounded by their `remainder`.
         """
         nu = self.space.nu
-        degrees = [degree for degree in range(1, MOST_ON_CELL + 1) if self.d * comb(nu + degree, nu) <= NUMBERS_ON_CELL]
+        degrees = [
+            degree for degree in range(1, LARGEST_CELL_DEGREE + 1) if self.d * comb(nu + degree, nu) <= NUMBERS_ON_CELL
+        ]
         space = taylor_space(nu, max([1, *degrees]))
         kept = np.flatnonzero(self.space.degrees <= space.degree)
         truncated = law[:, self.space.degrees > space.degree].sum(axis=1)
-        if self.left is not None:
-            truncated = truncated + self.left.over(ends)
+        if self.remainder is not None:
+            truncated = truncated + self.remainder.over(ends)
         remainder = TruncationBound(ends, truncated * OUTWARD) if truncated.any() else None
         return ExpandedSystem(self.d, space, (low + high) / 2, (high - low) / 2, remainder), kept
 
@@ -621,14 +622,14 @@ def dependence(laws: Sequence[Sequence[object]], centre: Array, units: Array) ->
         return powers
     d, nu = split_laws[0][0].there.shape[1], centre.size
     coupling = np.any([A.there[0] for A, _ in split_laws], axis=0)
-    is_reached = np.zeros((nu, d), dtype=bool)
+    is_affected = np.zeros((nu, d), dtype=bool)
     for j in range(nu):
-        is_reached[j] = np.any(
+        is_affected[j] = np.any(
             [split.there[1 + j].any(axis=1) for A, inputs in split_laws for split in (A, *inputs)], axis=0
         )
         for _ in range(d):
-            is_reached[j] = is_reached[j] | coupling[:, is_reached[j]].any(axis=1)
+            is_affected[j] = is_affected[j] | coupling[:, is_affected[j]].any(axis=1)
     for A, _ in split_laws:
-        if (A.there[1:].any(axis=0) & is_reached.any(axis=0)).any():  # columns of states that a parameter reaches
+        if (A.there[1:].any(axis=0) & is_affected.any(axis=0)).any():  # columns of states that a parameter reaches
             return powers
-    return Dependence(is_reached, centre, units)
+    return Dependence(is_affected, centre, units)

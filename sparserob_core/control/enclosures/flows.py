@@ -46,7 +46,7 @@ def products(A: Array):  # type: ignore[no-untyped-def]  # an array, or one of s
 
 
 @dataclass(frozen=True, eq=False)
-class Leaps:
+class DoublingExponentials:
     """``c'e^{A r}`` and ``c'int_0^r e^{A s} ds``: by transitions over a short time and its doubles, and the exponential
     series over the rest of ``r``.
 
@@ -206,7 +206,7 @@ def _compute_norm(A: Array) -> float:
 @dataclass(frozen=True, eq=False)
 class Flows:
     """``e^{D r}`` of the normal form ``D (d, d)`` of a decoupling: by scalar exponentials for groups of one block, by
-    `Leaps` for the others."""
+    `DoublingExponentials` for the others."""
 
     decoupling: Decoupling
     D: Array
@@ -221,10 +221,10 @@ class Flows:
         return real, self.D[real, real], turning, self.D[turning, turning] + 1j * self.D[turning, turning + 1]
 
     @cached_property
-    def _groups(self) -> list[tuple[slice, Leaps, Leaps]]:
-        """The groups of several blocks, each with its `Leaps` on rows and on columns."""
+    def _groups(self) -> list[tuple[slice, DoublingExponentials, DoublingExponentials]]:
+        """The groups of several blocks, each with its `DoublingExponentials` on rows and on columns."""
         pairs = [(block, self.D[block, block]) for block, single in self.decoupling.parts if not single]
-        return [(block, Leaps(D), Leaps(np.ascontiguousarray(D.T))) for block, D in pairs]
+        return [(block, DoublingExponentials(D), DoublingExponentials(np.ascontiguousarray(D.T))) for block, D in pairs]
 
     @shaped
     def rows(

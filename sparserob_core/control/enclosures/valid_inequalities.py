@@ -30,15 +30,15 @@ class Cuts:
     """Functions of ``delta in [-1, 1]^nu`` that are at least 0 wherever a cell ``centre + radius delta`` holds
     parameters of a set.
 
-    Half-spaces ``slack - slopes delta`` with ``slopes (q, nu)`` and ``slack (q,)``, all of them crossing the cell;
-    ``(1 - |base + image delta|^2) / 2`` for a ``ball`` ``(base (nu,), image (nu, nu))``. ``bent (nu,)`` estimates how
+    Half-spaces ``slack - slopes delta`` with ``slopes (q, nu)`` and ``slack (q,)``, all of them crossing the cell; ``(1
+    - |base + image delta|^2) / 2`` for a ``ball`` ``(base (nu,), image (nu, nu))``. ``curvature (nu,)`` estimates how
     far the set curves away from its half-spaces over the cell, along every coordinate; it only guides the halving.
     """
 
     slopes: Array
     slack: Array
     ball: tuple[Array, Array] | None
-    bent: Array
+    curvature: Array
 
     def lowered(self, space: TaylorSpace, polynomials: Array, rest: Array | float) -> tuple[Array, Array]:
         """Return polynomials that are above ``polynomials (k, r, M)`` where the parameters are, and measures
@@ -51,7 +51,7 @@ class Cuts:
         bounds = [polynomial_bound(space, total + addition) for addition in additions]
         spreads = [spread for _, spread in bounds]
         if self.slack.size:
-            spreads[1][..., : self.bent.size] += multipliers.sum(axis=-1, keepdims=True) * self.bent
+            spreads[1][..., : self.curvature.size] += multipliers.sum(axis=-1, keepdims=True) * self.curvature
             spreads[2] = spreads[1]  # that products bend downwards is no reason to halve
         best = np.array([heights for heights, _ in bounds]).argmin(axis=0)[None, ..., None]
         lowered = polynomials + np.take_along_axis(np.array(additions), best, axis=0)[0]
@@ -60,7 +60,7 @@ class Cuts:
     def _build_additions(self, space: TaylorSpace, total: Array) -> tuple[list[Array], Array]:
         """The polynomials that are tried: none, those of the half-spaces, of their products, of the ball; and the
         multipliers ``(k, r, q)``."""
-        count = self.bent.size
+        count = self.curvature.size
         gradient, hessian = (
             array.reshape(*total.shape[:2], *array.shape[1:])
             for array in quadratic_part(space, total.reshape(-1, space.size))
@@ -109,12 +109,12 @@ class Cuts:
         assert self.ball is not None
         base, _ = self.ball
         inverse = self._inverse_image
-        bend = inverse.T @ hessian @ inverse
-        slope = gradient @ inverse - bend @ base
+        curvature = inverse.T @ hessian @ inverse
+        slope = gradient @ inverse - curvature @ base
         length = np.linalg.norm(base)
         towards = base / length if length > 0 else base
-        local = np.maximum((slope + bend @ towards) @ towards, 0.0)
-        values, vectors = np.linalg.eigh(bend)
+        local = np.maximum((slope + curvature @ towards) @ towards, 0.0)
+        values, vectors = np.linalg.eigh(curvature)
         along = np.abs(np.einsum("...ij,...i->...j", vectors, slope))
         low = np.maximum(values[..., -1], 0.0)
         _, high = bisect(

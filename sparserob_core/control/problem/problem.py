@@ -336,7 +336,7 @@ class OptimalControlProblem(Term):
         for i, end in enumerate(self.terminal):
             if not isinstance(end, Equality):
                 continue
-            for parameter, state in np.argwhere(system.dependence.reached).tolist():
+            for parameter, state in np.argwhere(system.dependence.affected).tolist():
                 if state in end.fixed:
                     returns = self.repeat and widths(self.initial_set, system.states)[state] == 0.0
                     raise InputError(

@@ -619,11 +619,11 @@ class WorstFunctionals:
         polynomials.
         """
         laws, bounds = self.response.propagator.laws, np.zeros(self.response.initial_state.size)
-        if laws is None or all(spread.left is None for spread, _ in laws.every):
+        if laws is None or all(spread.remainder is None for spread, _ in laws.every):
             return bounds
         initial_sizes, inputs = self._bound_initial_and_inputs(far)
         for part_index, (spread, _) in enumerate(laws.every):
-            if spread.left is not None:
+            if spread.remainder is not None:
                 growth = self._bound_growth(*laws.ends(part_index), HALVINGS)
                 error_bounds = laws.left_out(part_index, initial_sizes, inputs, growth)
                 bounds = np.maximum(bounds, error_bounds)

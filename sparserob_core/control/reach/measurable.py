@@ -16,7 +16,7 @@ import numpy as np
 
 from sparserob_core.control.enclosures.cache import remember
 from sparserob_core.control.enclosures.comparison import block_norms, product
-from sparserob_core.control.enclosures.flows import Leaps, products
+from sparserob_core.control.enclosures.flows import DoublingExponentials, products
 from sparserob_core.control.enclosures.matrix_exponential import rounding
 from sparserob_core.control.enclosures.taylor import Combination
 from sparserob_core.control.reach.disturbance_support import Carried, carried
@@ -74,14 +74,14 @@ class _BalancedMatrix:
     A: Array
     units: Array
     speed: float
-    leaps: Leaps
+    exponentials: DoublingExponentials
 
     @staticmethod
     def of(A: Array) -> _BalancedMatrix:
         from scipy.linalg import matrix_balance
 
         balanced, (units, _) = matrix_balance(A, permute=False, separate=True)
-        return _BalancedMatrix(balanced, units, float(np.linalg.norm(balanced, 2)), Leaps(balanced))
+        return _BalancedMatrix(balanced, units, float(np.linalg.norm(balanced, 2)), DoublingExponentials(balanced))
 
     @cached_property
     def fastest(self) -> float:
@@ -361,7 +361,7 @@ class MeasurableSupport:
         A, units, speed, E = balanced.A, balanced.units, balanced.speed, E / balanced.units[:, None]
         lengths, radius, count = np.tile(np.diff(starts), len(directions)), self.bound.radius_bound, len(directions)
         matrix, absolute_matrix = balanced.products
-        row = balanced.leaps.orbits(directions * units, starts[:-1])[0].swapaxes(0, 1).reshape(-1, A.shape[0])
+        row = balanced.exponentials.orbits(directions * units, starts[:-1])[0].swapaxes(0, 1).reshape(-1, A.shape[0])
         terms, sizes, size = [row @ E], np.abs(row) @ np.abs(E), np.abs(row)
         for order in range(1, ORDER + 1):
             step = (lengths / order)[:, None]
@@ -382,7 +382,7 @@ class MeasurableSupport:
 def _propagate_rows(A: Array, rows: Array, durations: Array) -> Array:
     """``c'e^{A r} (k, q, d)`` of ``rows (k, d)`` over ``durations (k, q)`` of their own."""
     repeated = np.repeat(rows, durations.shape[1], axis=0)
-    return Leaps(A).rows(repeated, durations.ravel())[0].reshape(*durations.shape, -1)
+    return DoublingExponentials(A).rows(repeated, durations.ravel())[0].reshape(*durations.shape, -1)
 
 
 @dataclass(frozen=True, eq=False)

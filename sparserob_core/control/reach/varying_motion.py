@@ -678,9 +678,9 @@ class Truncation:
         """Bounds of the remainder of the entries of the law on every piece: the norm of that of ``A``, ``(K,)``, and
         the rate at which that of ``[B E]`` drives states per unit of each input, ``(K, m + mw)``."""
         d, K = self.spread.d, self.motion.grid.pieces
-        if self.spread.left is None:
+        if self.spread.remainder is None:
             return np.zeros(K), np.zeros((K, self.motion.most.shape[2] - self.motion.states))
-        sizes = self.spread.left.over(self.motion.grid.breakpoints) / self.units[:, None]
+        sizes = self.spread.remainder.over(self.motion.grid.breakpoints) / self.units[:, None]
         return (sizes[:, :, :d] * self.units).sum(axis=2).max(axis=1) * OUTWARD, sizes[:, :, d:].max(axis=1) * OUTWARD
 
     @cached_property

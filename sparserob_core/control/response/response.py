@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 
 from sparserob_core.control.enclosures.cache import remember
-from sparserob_core.control.enclosures.flows import FEW_STATES, Exponentials, Leaps
+from sparserob_core.control.enclosures.flows import FEW_STATES, DoublingExponentials, Exponentials
 from sparserob_core.control.enclosures.matrix_exponential import EPSILON, transitions
 from sparserob_core.control.problem.system import System
 from sparserob_core.control.response.varying.expansion import Expansion
@@ -389,7 +389,7 @@ class Propagator:
     given: Expansion | None = None
     _steps: dict[bytes, PieceTransitions] = field(default_factory=dict, repr=False)
     _flows: dict[bytes, tuple[Array, Array]] = field(default_factory=dict, repr=False)
-    _exponentials: dict[int, Leaps] = field(default_factory=dict, repr=False)
+    _exponentials: dict[int, DoublingExponentials] = field(default_factory=dict, repr=False)
 
     @cached_property
     def which(self) -> np.ndarray:
@@ -478,10 +478,10 @@ class Propagator:
         """Return the exponentials of a mode of a known system."""
         return self.own(mode) if self.propagate is None else self.propagate
 
-    def own(self, mode: int = 0) -> Leaps:
+    def own(self, mode: int = 0) -> DoublingExponentials:
         """Return the exponentials of the matrix of a mode, without any structure of the matrix."""
         if mode not in self._exponentials:
-            self._exponentials[mode] = Leaps(self.system.modes[mode].matrices(np.zeros((1, 0)))[0][0])
+            self._exponentials[mode] = DoublingExponentials(self.system.modes[mode].matrices(np.zeros((1, 0)))[0][0])
         return self._exponentials[mode]
 
     def _compute_varying_weights(self, times: Array, directions: Array, parameters: Array) -> Weights:
@@ -740,7 +740,9 @@ class Propagator:
         of equal pieces are computed together first, whole pieces after."""
         (k, r), d = (times.size, directions.shape[0]), directions.shape[1]
         if not self.aged(parameter.size):
-            exponentials = Leaps(self.steps(parameter[None]).A[0, 0]) if self._has_dependence else self.own()
+            exponentials = (
+                DoublingExponentials(self.steps(parameter[None]).A[0, 0]) if self._has_dependence else self.own()
+            )
             return exponentials.orbits(directions, times)[0]
         pieces = self.grid.locate(times)
         within, indices = self.grid.distinct(np.maximum(times - self.grid.breakpoints[pieces], 0.0))
@@ -882,7 +884,7 @@ class OutputResponse:
         products = np.empty((2, 1, durations.size, *self.H.shape))
         for mode in np.unique(modes):
             is_mode = modes == mode
-            exponentials = Leaps(steps.A[0, mode]) if self.points.shape[1] else self.propagator.own(mode)
+            exponentials = DoublingExponentials(steps.A[0, mode]) if self.points.shape[1] else self.propagator.own(mode)
             products[0, 0, is_mode], products[1, 0, is_mode] = exponentials.orbits(self.H, durations[is_mode])
         return products[0], products[1]
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from sparserob_core.brief import brief
 from sparserob_core.control.constraints.state import StateConstraint
-from sparserob_core.control.enclosures.flows import Leaps
+from sparserob_core.control.enclosures.flows import DoublingExponentials
 from sparserob_core.control.reach.functional import WorstFunctionals
 from sparserob_core.control.reach.varying_motion import VaryingMotion
 from sparserob_core.control.response.response import Response
@@ -200,7 +200,7 @@ class _SwitchedAdjoint:
         End of each phase, or the time of the functional where that is earlier.
     rows : ndarray, shape (J, d)
         Adjoint at these ends.
-    leaps : list of Leaps
+    exponentials : list of DoublingExponentials
         Powers of the transition matrix of each phase.
     E : list of ndarray
         Matrix of the disturbance in each phase.
@@ -208,42 +208,45 @@ class _SwitchedAdjoint:
 
     ends: Array
     rows: Array
-    leaps: list[Leaps]
+    exponentials: list[DoublingExponentials]
     E: list[Array]
 
     @staticmethod
     def of(response: Response, parameter: Array, time: float, direction: Array) -> _SwitchedAdjoint:
         """Compute the adjoint of a functional at a ``time`` with a ``direction (d,)``."""
         matrices = [[matrix[0] for matrix in mode.matrices(parameter[None])] for mode in response.system.modes]
-        leaps, begins = [Leaps(A) for A, _, _ in matrices], np.array([0.0, *response.system.switches])
+        exponentials, begins = (
+            [DoublingExponentials(A) for A, _, _ in matrices],
+            np.array([0.0, *response.system.switches]),
+        )
         ends = np.minimum(np.append(begins[1:], response.grid.breakpoints[-1]), time)
         rows = np.tile(direction, (ends.size, 1))
         for mode in range(ends.size - 1, 0, -1):
-            rows[mode - 1] = leaps[mode].rows(rows[[mode]], ends[[mode]] - ends[[mode - 1]])[0][0]
-        return _SwitchedAdjoint(ends, rows, leaps, [E for _, _, E in matrices])
+            rows[mode - 1] = exponentials[mode].rows(rows[[mode]], ends[[mode]] - ends[[mode - 1]])[0][0]
+        return _SwitchedAdjoint(ends, rows, exponentials, [E for _, _, E in matrices])
 
     def at(self, times: Array, inside: Array) -> Array:
         """Return ``E' Phi(time, s)' direction`` at ``times (k,)``, in the phases that hold the times ``inside (k,)``:
         ``(k, mw)``."""
-        return self._evaluate_by_phase(times, inside, lambda leaps, rows, indices: rows)
+        return self._evaluate_by_phase(times, inside, lambda exponentials, rows, indices: rows)
 
     def gains(self, starts: Array, ends: Array) -> Array:
         """Return the integrals of ``E' Phi(time, s)' direction`` from ``starts (k,)`` to ``ends (k,)``, each within one
         phase: ``(k, mw)``."""
 
-        def integrated(leaps: Leaps, rows: Array, which: np.ndarray) -> Array:
-            return leaps.rows(rows, (ends - starts)[which])[1]
+        def integrated(exponentials: DoublingExponentials, rows: Array, which: np.ndarray) -> Array:
+            return exponentials.rows(rows, (ends - starts)[which])[1]
 
         return self._evaluate_by_phase(ends, (starts + ends) / 2, integrated)
 
     def _evaluate_by_phase(
-        self, times: Array, inside: Array, made: Callable[[Leaps, Array, np.ndarray], Array]
+        self, times: Array, inside: Array, made: Callable[[DoublingExponentials, Array, np.ndarray], Array]
     ) -> Array:
         values, modes = np.zeros((times.size, self.E[0].shape[1])), np.searchsorted(self.ends[:-1], inside)
         for mode in np.unique(modes):
             indices = np.flatnonzero(modes == mode)
-            rows = self.leaps[mode].orbits(self.rows[[mode]], self.ends[mode] - times[indices])[0][:, 0]
-            values[indices] = made(self.leaps[mode], rows, indices) @ self.E[mode]
+            rows = self.exponentials[mode].orbits(self.rows[[mode]], self.ends[mode] - times[indices])[0][:, 0]
+            values[indices] = made(self.exponentials[mode], rows, indices) @ self.E[mode]
         return values
 
 

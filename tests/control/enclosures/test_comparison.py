@@ -120,7 +120,7 @@ def exact_between(M, lengths):
 @pytest.mark.parametrize("name", sorted(METZLER))
 def test_very_many_durations_share_bounds_in_steps_that_hold_for_each(name, monkeypatch):
     lengths = np.random.default_rng(0).uniform(1e-3, 1.0, 400)
-    monkeypatch.setattr(comparison, "MOST", 900)
+    monkeypatch.setattr(comparison, "STORAGE_LIMIT", 900)
     system = made(name)
     found = system.over(lengths)
     assert found.flow.matrices.shape[0] < 400
@@ -136,7 +136,7 @@ def test_very_many_durations_share_bounds_in_steps_that_hold_for_each(name, monk
 def test_no_duration_is_outside_of_its_group(durations, most):
     values = np.array(durations)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(comparison, "MOST", most)
+        patch.setattr(comparison, "STORAGE_LIMIT", most)
         shortest, longest, which = alike(values, 1)
     assert (shortest >= 0.0).all()
     assert ((shortest[which] <= values) & (values <= longest[which])).all()

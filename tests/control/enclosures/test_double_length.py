@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from sparserob_core.control.enclosures.double_length import flows, product
-from sparserob_core.control.enclosures.flows import Leaps
+from sparserob_core.control.enclosures.flows import DoublingExponentials
 
 Exact = list[list[Fraction]]
 
@@ -75,14 +75,14 @@ def test_the_exponential_of_a_small_matrix_has_twice_the_digits_and_its_integral
 def test_long_exponentials_are_rounded_once() -> None:
     """Squares of floats would be off by a rounding for every doubling of the time, twice as much each time: 1e-14."""
     A = np.random.default_rng(3).normal(size=(5, 5))
-    leaps, doublings = Leaps(A), 7
-    flow, driven = exponential(scaled(exact(leaps._scaled_matrix), Fraction(leaps.step)))
-    driven = scaled(driven, Fraction(leaps.step))
+    exponentials, doublings = DoublingExponentials(A), 7
+    flow, driven = exponential(scaled(exact(exponentials._scaled_matrix), Fraction(exponentials.step)))
+    driven = scaled(driven, Fraction(exponentials.step))
     for _ in range(doublings):
         driven, flow = added(driven, times(flow, driven)), times(flow, flow)
         digits = 2**300  # of fractions that would else double their length each time
         flow, driven = ([[Fraction(round(x * digits), digits) for x in row] for row in part] for part in (flow, driven))
-    known = leaps._compute_transitions(doublings + 1)[-1]
+    known = exponentials._compute_transitions(doublings + 1)[-1]
     assert off(flow, known[0]) <= 2e-16
     assert off(driven, known[1]) <= 2e-15
 

@@ -10,7 +10,7 @@ import pytest
 from scipy.linalg import expm
 
 from sparserob_core.control.enclosures.decoupling import decoupled, identity
-from sparserob_core.control.enclosures.flows import Flows, Leaps
+from sparserob_core.control.enclosures.flows import DoublingExponentials, Flows
 from sparserob_core.control.enclosures.matrix_exponential import exponential_rounding
 
 RNG = np.random.default_rng(5)
@@ -23,7 +23,7 @@ DURATIONS = np.array([0.0, 1e-9, 0.013, 0.5, 1.0, 3.75, 17.3])
 @pytest.mark.parametrize("A", [TURNING, DEFECTIVE, STILL, np.zeros((2, 2))])
 def test_leaps_are_the_exponential_and_its_integral_on_rows(A: np.ndarray) -> None:
     rows, d = RNG.normal(size=(DURATIONS.size, A.shape[0])), A.shape[0]
-    flown, driven = Leaps(A).rows(rows, DURATIONS)
+    flown, driven = DoublingExponentials(A).rows(rows, DURATIONS)
     size = np.abs(A).sum(axis=0).max() * DURATIONS
     for k, duration in enumerate(DURATIONS):
         both = expm(np.block([[A, np.eye(d)], [np.zeros((d, 2 * d))]]) * duration)
@@ -36,12 +36,12 @@ def test_leaps_are_the_exponential_and_its_integral_on_rows(A: np.ndarray) -> No
 
 @pytest.mark.parametrize("A", [TURNING, DEFECTIVE, np.kron(np.eye(3), TURNING)])
 def test_orbits_are_every_row_over_every_duration(A: np.ndarray) -> None:
-    rows, leaps = RNG.normal(size=(2, A.shape[0])), Leaps(A)
+    rows, exponentials = RNG.normal(size=(2, A.shape[0])), DoublingExponentials(A)
     durations = np.concatenate([DURATIONS[::-1], DURATIONS[:2], [-1e-18]])
-    each = leaps.rows(np.tile(rows, (durations.size, 1)), np.repeat(durations, 2))
-    for found, known in zip(leaps.orbits(rows, durations), each, strict=True):
+    each = exponentials.rows(np.tile(rows, (durations.size, 1)), np.repeat(durations, 2))
+    for found, known in zip(exponentials.orbits(rows, durations), each, strict=True):
         assert found.reshape(known.shape) == pytest.approx(known, rel=1e-12, abs=1e-12 * np.abs(known).max())
-    assert leaps.orbits(rows, np.zeros(0))[0].shape == (0, *rows.shape)
+    assert exponentials.orbits(rows, np.zeros(0))[0].shape == (0, *rows.shape)
 
 
 @pytest.mark.parametrize("A", [TURNING, DEFECTIVE, STILL])
@@ -65,10 +65,14 @@ def test_nothing_is_as_large_as_a_matrix_for_every_duration() -> None:
     rates = np.linspace(0.1, 3.0, d // 2)
     A = np.block([[np.zeros((d // 2, d // 2)), np.eye(d // 2)], [-np.diag(rates**2), -0.1 * np.eye(d // 2)]])
     basis, durations = decoupled(A), np.linspace(0.0, 5.0, k)
-    flows, leaps, rows = Flows(basis, basis.normal_form(basis.matrix(A)[0])), Leaps(A), np.ones((k, 1, d))
+    flows, exponentials, rows = (
+        Flows(basis, basis.normal_form(basis.matrix(A)[0])),
+        DoublingExponentials(A),
+        np.ones((k, 1, d)),
+    )
     tracemalloc.start()
     flows.rows(rows, durations)
-    leaps.rows(rows[:, 0], durations)
+    exponentials.rows(rows[:, 0], durations)
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert peak <= 12 * rows.nbytes  # and 60 times the rows are 58 MB

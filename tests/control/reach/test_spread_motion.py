@@ -146,8 +146,8 @@ def relaxed(t: np.ndarray, p: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize("name", ["relaxing", "filling"])
 def test_what_power_series_leave_of_entries_is_in_what_is_beyond(name: str, degree: int) -> None:
     system = RELAXING if name == "relaxing" else FILLING
-    left = cauchy(system).left(degree)
-    spread = ExpandedSystem(1, TaylorSpace(1, degree), *system.deviations, left=left)
+    left = cauchy(system).bound_remainder(degree)
+    spread = ExpandedSystem(1, TaylorSpace(1, degree), *system.deviations, remainder=left)
     breaks = np.linspace(0.0, 2.0, 5)
     every = Propagator(system.superposed(spread), merge_grids(breaks, breaks, varying=True))
     motion = VaryingMotion(every, np.eye(spread.states)[0])
@@ -162,7 +162,7 @@ def test_what_power_series_leave_of_entries_is_in_what_is_beyond(name: str, degr
     assert lost[-1] <= 1e4 * off.max()
     rest = 1.0 / (1.0 + points)  # the series of 1 / (1 + p) in shares of a quarter
     rest = rest - sum((-0.25) ** n / 1.05 ** (n + 1) * ((points - 0.05) / 0.25) ** n for n in range(degree + 1))
-    without = Truncation(motion, replace(spread, left=None)).lost(np.abs(states[:-1]), inputs)[:, 0]
+    without = Truncation(motion, replace(spread, remainder=None)).lost(np.abs(states[:-1]), inputs)[:, 0]
     entering = np.exp(-2.0 / 0.8) if name == "relaxing" else 2.0  # the least that multiplies what is beyond
     assert (lost - without)[-1] >= 2.0 * np.abs(rest).max() * entering
     others = np.tile([0.0, 1.0], (marks.size - 1, 1))
@@ -188,7 +188,7 @@ PUSHED = sr.VaryingSystem.of(
 def test_rows_and_outputs_at_any_time_and_parameter_are_those_of_an_integrator(
     most: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(expansions, "LEFT", (1e-8,))
+    monkeypatch.setattr(expansions, "TRUNCATION_TOLERANCES", (1e-8,))
     monkeypatch.setattr(expansions, "NUMBERS", most)  # fewer numbers are several parts
     breaks, rng = np.linspace(0.0, 3.0, 3), np.random.default_rng(4)
     system = PUSHED.in_phases([replace(phase) for phase in PUSHED.phases])
@@ -285,7 +285,7 @@ def test_the_law_on_a_cell_is_that_of_its_parameters_but_for_what_it_says(pushed
     for t, *shares in rng.uniform([0.0, -1.0, -1.0], [3.0, 1.0, 1.0], (40, 3)).tolist():
         p, q = (LOW + HIGH) / 2 + (HIGH - LOW) / 2 * np.array(shares)
         law, left = seen_at(expansion, t, expansion.spread.space.monomials(np.array([shares]))[0])
-        beyond = 0.0 if expansion.spread.left is None else expansion.spread.left.over(np.array([t, t]))[0]
+        beyond = 0.0 if expansion.spread.remainder is None else expansion.spread.remainder.over(np.array([t, t]))[0]
         off = np.abs(law - entries(t, float(p), float(q)))
         assert (off <= left + beyond).all()
         assert off.max() < 1e-9
@@ -299,9 +299,9 @@ def test_what_a_cell_leaves_of_its_law_is_counted_and_nothing_else(
     assert expansion is not None
     assert expansion.spread is not None
     assert expansion.spread.space.degree == 1
-    assert expansion.spread.left is not None
+    assert expansion.spread.remainder is not None
     r, s = (HIGH - LOW) / 2
-    left = expansion.spread.left.over(np.array([0.0, 0.3]))[0]
+    left = expansion.spread.remainder.over(np.array([0.0, 0.3]))[0]
     assert r**2 <= left[1, 2] <= 1.3 * r**2  # of 1 + p^2 cos t
     assert s**2 / 4.05**3 <= left[1, 1] <= 1.3 * s**2 / 3.9**3  # of -1 / (4 + q)
     assert left[0].max() < 1e-15
@@ -382,7 +382,7 @@ DRIVEN = sr.VaryingSystem.of([["-1/(1 + p) + 0*t"]], [["1"]], 2.0, [[1]], parame
 def test_what_a_law_leaves_out_of_its_series_is_in_no_state_more_than_is_said(
     law: sr.System, begun: float, closed: Callable[..., np.ndarray], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(expansions, "LEFT", (1e-2,))  # so much that the degree is low
+    monkeypatch.setattr(expansions, "TRUNCATION_TOLERANCES", (1e-2,))  # so much that the degree is low
     system = law.in_phases([replace(phase) for phase in law.phases])
     problem = sr.OptimalControlProblem(
         system=system, horizon=2.0, initial_state=[begun], control=sr.Box([-2.0], [2.0]), path=[sr.Box([-9.0], [9.0])]
@@ -402,14 +402,14 @@ def test_what_a_law_leaves_out_of_its_series_is_in_no_state_more_than_is_said(
     cell = functionals.response.propagator.on_cell(np.array([-0.1]), np.array([0.2])).expansion
     assert cell is not None
     assert cell.spread is not None
-    assert cell.spread.left is not None
+    assert cell.spread.remainder is not None
     for p in (-0.1, 0.05, 0.2):  # what the law leaves out is in what is beyond a cell
         powers = cell.spread.space.monomials(np.array([[(p - 0.05) / 0.15]]))[0]
         found = (
             powers @ cell.coefficients[0, 0, :, 0] if law is not FILLING else powers @ cell.coefficients[0, 0, :, -2]
         )
         true = -1.0 / (1.0 + p) if law is not FILLING else 1.0 / (1.0 + p)
-        entry = cell.spread.left.sizes[0, 0, 0 if law is not FILLING else 1]
+        entry = cell.spread.remainder.sizes[0, 0, 0 if law is not FILLING else 1]
         assert abs(found - true) <= entry + 1e-14
     (polynomial,) = prepare(replace(problem, system=SYSTEM, horizon=3.0), pieces_of(3.0), pieces_of(3.0)).constraints
     assert not polynomial.functionals.beyond(np.array([2.0])).any()
@@ -420,7 +420,7 @@ def pieces_of(horizon: float) -> sr.Dictionary:
 
 
 def test_growth_is_asked_of_the_part_that_a_cell_is_in(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(expansions, "LEFT", (1e-3,))
+    monkeypatch.setattr(expansions, "TRUNCATION_TOLERANCES", (1e-3,))
     monkeypatch.setattr(expansions, "NUMBERS", 14)
     law = [["0", "exp(3*p)"], ["-1", "-0.1*t"]]
     system = sr.VaryingSystem.of(law, [[0], [1]], 1.0, parameters=sr.Box([-1.0], [1.0]), names=["p"])
@@ -489,7 +489,7 @@ def test_what_a_law_leaves_out_in_time_is_no_less_on_a_cell_than_at_its_corners(
     assert cell.spread is not None
     first = np.concatenate([cell.remainder[..., :2], cell.remainder[..., cell.units.size :]], axis=2)
     on_cell = first.reshape(len(first), cell.spread.space.size, 2, -1).sum(axis=1)
-    left = 0.0 if cell.spread.left is None else cell.spread.left.over(cell.ends)
+    left = 0.0 if cell.spread.remainder is None else cell.spread.remainder.over(cell.ends)
     assert (on_cell + left >= corner.remainder * (1.0 - 1e-9)).all()
     assert (on_cell <= 1.01 * corner.remainder).all()
 

@@ -212,16 +212,16 @@ class Cauchy:
     far: Array
     sizes: Array
 
-    def left(self, degree: int) -> TruncationBound:
+    def bound_remainder(self, degree: int) -> TruncationBound:
         """Return bounds of the terms beyond a degree, of entries that are no polynomials of this degree."""
         sizes = _bound_remainder(self.far, degree)
         sizes[:, ~beyond(self.system, degree)] = 0.0
         return TruncationBound(self.ends, sizes)
 
     def share(self, degree: int, units: Array) -> float:
-        """Return an estimate of the effect of `left` on states in ``units (d,)``: of ``A`` over the horizon, of inputs
-        relative to their own effect."""
-        d, sizes = units.size, self.left(degree).sizes / units[:, None]
+        """Return an estimate of the effect of `bound_remainder` on states in ``units (d,)``: of ``A`` over the horizon,
+        of inputs relative to their own effect."""
+        d, sizes = units.size, self.bound_remainder(degree).sizes / units[:, None]
         A = (sizes[:, :, :d] * units).sum(axis=2).max(axis=1) @ np.diff(self.ends)
         inputs, input_sizes = sizes[:, :, d:].max(axis=(0, 1)), (self.sizes[:, d:] / units[:, None]).max(axis=0)
         return float(A + (inputs / np.where(input_sizes > 0.0, input_sizes, 1.0)).max(initial=0.0))

@@ -23,7 +23,7 @@ from sparserob_core.control.sets.sets import Box
 from sparserob_core.errors import InputError, NotEnclosable
 from sparserob_core.sip.convex_set import Array
 
-LEFT = (1e-14, 1e-12, 1e-10)
+TRUNCATION_TOLERANCES = (1e-14, 1e-12, 1e-10)
 """Shares of the state, of which the first is taken that the estimated truncation error of the law reaches. A proof
 needs 1e-8."""
 NUMBERS = 400  # coefficients times states of a law; twice as many are matrices of 5 MB on each of its segments
@@ -170,7 +170,7 @@ class ParameterParts:
             Upper bound of the growth of states between two times, in the units of the part.
         """
         spread, law = self.every[part][0], self.expansions[part]
-        truncation, d = spread.left, spread.d
+        truncation, d = spread.remainder, spread.d
         assert truncation is not None
         units, forcing = law.units[:d], law.largest_inputs(spread) @ inputs / law.units[:d]
         state = growth * (float((begun / units).max()) + float(np.diff(law.ends) @ forcing.max(axis=1)))
@@ -218,7 +218,7 @@ def _expand_law(system: System) -> ParameterParts:
     laws = []
     for part_system, series_bound in zip(_restrict_to_parts(system, edges), series_bounds, strict=True):
         centre, units = part_system.deviations
-        truncation = None if series_bound is None else series_bound.left(degree)
+        truncation = None if series_bound is None else series_bound.bound_remainder(degree)
         spread = ExpandedSystem(system.states, taylor_space(centre.size, degree), centre, units, truncation)
         laws.append((spread, part_system.superposed(spread)))
     return ParameterParts(edges, tuple(laws))
@@ -233,7 +233,7 @@ def _convert_units(system: System) -> ParameterParts:
     user_law, laws = law_of(system.stated), list[tuple[ExpandedSystem, System]]()
     factors = {name: law.factors[name] * np.ones(law._shape(name)) for name in NAMES if law.entry(name) is not None}
     for spread, part_system in user_law.every:
-        size, truncation = spread.space.size, spread.left
+        size, truncation = spread.space.size, spread.remainder
         if truncation is not None:
             truncation = TruncationBound(
                 truncation.ends / time, truncation.sizes * np.abs(np.hstack(list(factors.values())))
@@ -242,7 +242,7 @@ def _convert_units(system: System) -> ParameterParts:
         drift = np.tile(factors["c"], (size, 1)) if "c" in factors else 1.0
         scaled = part_system.in_units(tiled[0], tiled[1], tiled[2], np.zeros(0), drift, time)
         laws.append(
-            (replace(spread, centre=spread.centre / units, units=spread.units / units, left=truncation), scaled)
+            (replace(spread, centre=spread.centre / units, units=spread.units / units, remainder=truncation), scaled)
         )
     edges = tuple(ends / unit for ends, unit in zip(user_law.edges, units, strict=True))
     return ParameterParts(edges, tuple(laws))
@@ -276,7 +276,7 @@ def _choose_parts(system: System) -> tuple[tuple[Array, ...], list[Cauchy | None
     degrees = [n for n in range(lowest, MOST_TERMS + 1) if d * comb(nu + n, nu) <= NUMBERS]
     while degrees and counts.prod() <= MOST_PARTS:
         edges, series_bounds = _bound_parts(system, counts)
-        for tolerance, degree in product(LEFT, degrees):
+        for tolerance, degree in product(TRUNCATION_TOLERANCES, degrees):
             if all(_estimate_truncation(series_bound, degree, scale) <= tolerance for series_bound in series_bounds):
                 return edges, series_bounds, degree
         candidates = [counts * (1 + direction) for direction in np.eye(nu, dtype=int)]

@@ -65,7 +65,7 @@ def within_reach(problem: OptimalControlProblem) -> OptimalControlProblem | str:
 def corners_of_box(depends: Dependence) -> list[Array]:
     """Return the corners of the box of parameters as shares of their deviation from its middle; only parameters that
     reach a state vary. Raise `InputError` where there are more than `CORNERS`."""
-    moves = depends.reached.any(axis=1) & (depends.units > 0.0)
+    moves = depends.affected.any(axis=1) & (depends.units > 0.0)
     count = 2 ** int(moves.sum())
     if count > CORNERS:
         expected = f"a box with at most {CORNERS} corners beside the time t"

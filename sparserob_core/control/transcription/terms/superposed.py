@@ -65,10 +65,10 @@ def corners_of(problem: OptimalControlProblem) -> Corners:
     system, rows = in_time(problem).system, at_corners(problem)
     if rows is None or system.dependence is None:
         return Corners()
-    box, is_reached = system.box, system.dependence.reached
+    box, is_affected = system.box, system.dependence.affected
     ends = [
         sorted({low, high}) if any(row) else [low]
-        for low, high, row in zip(box.lower.tolist(), box.upper.tolist(), is_reached, strict=True)
+        for low, high, row in zip(box.lower.tolist(), box.upper.tolist(), is_affected, strict=True)
     ]
     return Corners(rows, np.array(list(every_choice(*ends))), system.names)
 
@@ -78,8 +78,8 @@ def _extend_names(names: Names, system: System, depends: Dependence) -> Names:
     the parameter."""
     contributions = [
         (i, name)
-        for name, is_reached in zip(system.names, depends.reached, strict=True)
-        for i in np.flatnonzero(is_reached).tolist()
+        for name, is_affected in zip(system.names, depends.affected, strict=True)
+        for i in np.flatnonzero(is_affected).tolist()
     ]
     units = [names.state_units[i] for i, _ in contributions] if names.state_units else []
     return replace(

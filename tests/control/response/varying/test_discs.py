@@ -78,7 +78,7 @@ def test_what_is_beyond_a_degree_is_bounded_and_not_by_far_more_than_it_is(text:
     system = sr.VaryingSystem.of([[text]], [["1"]], 2.0, [[1]], parameters=box, names=["p"])
     known, (centre, units), entry = cauchy(system), system.deviations, system.phases[0].entry("A")
     for degree in (1, 4, 7):
-        left = known.left(degree)
+        left = known.bound_remainder(degree)
         assert (left.sizes[:, :, 1:] == 0.0).all()
         share = 0.0
         for number in range(0, left.ends.size - 1, 5):
