@@ -223,7 +223,7 @@ def test_errors_at_one_parameter_and_over_cells_are_those_of_the_plant_there() -
         most.append(max(excess))
         excess.clear()
     assert most[0] < 1e-3 and most[2] < 1e-11  # at a corner no more is left than rounding
-    seen = execution.seen(np.tile(rows, (4, 1)), np.tile([0.03, 0.01], (8, 1)))
+    seen = execution.extend_directions(np.tile(rows, (4, 1)), np.tile([0.03, 0.01], (8, 1)))
     found = execution.added(control, np.repeat(times, 2), seen).reshape(4, 2)
     assert found == pytest.approx(plain(np.array([0.03, 0.01])), rel=1e-11)
 

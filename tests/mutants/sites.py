@@ -34,6 +34,7 @@ OUTWARD = re.compile(r"^_?(OUTWARD|ROUNDING|HALF_ULP|ULP|EPS|ROUNDED|ROUNDOFF|AB
 TOLERANCES = re.compile(r"tolerance", re.IGNORECASE)
 REST = re.compile(
     r"^_?(tails?|rests?|remainders?|lost|errors?|excess|rad|radius|radii|slack|bends?|bent|off|left_out|kinks|spare|"
+    r"truncation_errors?|rounding_errors?|state_errors|error_bounds|chord_errors?|curvatures?|"
     r"dropped|spread|loss|blur|wrong|dips|expansion|pushed)$"
 )
 UNSEEN = {"axis", "axes", "maxsize", "ndmin", "repeat"}

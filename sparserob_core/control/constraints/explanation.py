@@ -367,7 +367,10 @@ def explanation(
     free, limit = sign * contributions.free + 0.0, sign * float(h[row]) + 0.0  # no negative zeros
     names = [
         name
-        for name, distance in (("disturbance", sigma - contributions.begun), ("initial state", contributions.begun))
+        for name, distance in (
+            ("disturbance", sigma - contributions.initial_support),
+            ("initial state", contributions.initial_support),
+        )
         if distance > SAME * sigma
     ]
     cause = " and ".join(names) or "disturbance"

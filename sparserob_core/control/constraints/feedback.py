@@ -15,7 +15,7 @@ from sparserob_core.control.constraints.local_maxima import local_maxima
 from sparserob_core.control.feedback.closed_loop import ROUND_OFF, ClosedLoop, shared
 from sparserob_core.control.problem.names import unit_of_row
 from sparserob_core.control.problem.units import Units
-from sparserob_core.control.reach.sizes import stated_sizes
+from sparserob_core.control.reach.sizes import row_sizes
 from sparserob_core.errors import InputError
 from sparserob_core.sip.convex_set import Array, Box
 from sparserob_core.sip.finite import UncertainRows
@@ -401,7 +401,7 @@ class FeedbackControl(ConstraintSource):
         return self.H, units.controls
 
     def scale(self, x: Array) -> float:
-        sizes = stated_sizes(self.H, self.h)
+        sizes = row_sizes(self.H, self.h)
         return float(sizes[sizes > 0.0].min(initial=1.0))
 
     def family(self) -> ConstraintFamily:

@@ -25,7 +25,7 @@ from sparserob_core.control.enclosures.cache import remember
 from sparserob_core.control.problem.terms.windows import Flat
 from sparserob_core.control.reach.enclosure import Bounded, CellEnclosure, enclose, kept, over_legs
 from sparserob_core.control.reach.functional import LEGS_KEPT, Leg, WorstFunctionals
-from sparserob_core.control.reach.sizes import stated_sizes
+from sparserob_core.control.reach.sizes import row_sizes
 from sparserob_core.control.reach.support import Supports
 from sparserob_core.control.response.parameters import ParameterIndex
 from sparserob_core.control.response.reference import STILL, Direct, MovingReference, Reference
@@ -374,7 +374,7 @@ class FlatConstraint(StateConstraint):
     @shaped
     def sized_rows(self) -> tuple[Float[Array, "q d"], Float[Array, " q"]]:
         normals = self.H if self.gains is None else np.hstack([self.H, self.gains])
-        return self.H, stated_sizes(normals, self.h)
+        return self.H, row_sizes(normals, self.h)
 
     def nominal(self) -> FlatConstraint:
         return replace(self, functionals=self.functionals.nominal(), parameters=ParameterIndex(None), shared=None)
@@ -475,7 +475,7 @@ class FlatConstraint(StateConstraint):
         rows, copies = self.H[: self.samples.proven], self.h.size // max(1, self.samples.proven)
         (points, _), k, r = self.lattice, self.times.size, rows.shape[0]
         v = len(points)
-        along = execution.seen(np.tile(rows, (v * k, 1)), np.repeat(points, k * r, axis=0))
+        along = execution.extend_directions(np.tile(rows, (v * k, 1)), np.repeat(points, k * r, axis=0))
         contributions = execution.sampled(self.functionals.control(x), np.tile(np.repeat(self.times, r), v), along)
         return np.tile(contributions.reshape(v, k, r).swapaxes(1, 2), (1, copies, 1))
 

@@ -104,7 +104,7 @@ class ScenarioConstraint:
         if functionals.execution is None:
             return np.zeros((samples, r, times))
         rows, at = np.tile(self.H, (samples * times, 1)), np.tile(np.repeat(self._times, r), samples)
-        along = functionals.execution.seen(rows, np.repeat(parameters, times * r, axis=0))
+        along = functionals.execution.extend_directions(rows, np.repeat(parameters, times * r, axis=0))
         contributions = functionals.execution.added(functionals.control(x), at, along)
         return np.asarray(contributions.reshape(samples, times, r).swapaxes(1, 2))
 

@@ -168,16 +168,16 @@ class Sensitivity:
         execution = self.constraint.functionals.execution
         if execution is not None:
             control = self.constraint.functionals.control(x)
-            along = execution.seen(at.direction, parameters)
+            along = execution.extend_directions(at.direction, parameters)
             in_time = in_time + execution.slope(control, times[:, 0], along)[:, None]
             states = states + self._differentiate_in_shares(
-                at, lambda c, of: execution.added(control, times[of, 0], execution.seen(c, parameters[of]))
+                at, lambda c, of: execution.added(control, times[of, 0], execution.extend_directions(c, parameters[of]))
             )
             if self._nu:
                 box = self.constraint.parameters.box
 
                 def added(p: Array, of: np.ndarray) -> Array:
-                    return execution.added(control, times[of, 0], execution.seen(at.direction[of], p))
+                    return execution.added(control, times[of, 0], execution.extend_directions(at.direction[of], p))
 
                 in_parameters = in_parameters + differences(added, parameters, box.lower, box.upper)
         reference = self.constraint.reference

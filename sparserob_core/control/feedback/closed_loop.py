@@ -19,7 +19,7 @@ from sparserob_core.control.feedback.innovations import KNOWN, Answers, innovati
 from sparserob_core.control.feedback.measurable import MeasurablePieces
 from sparserob_core.control.feedback.observer import Observer, innovations_of
 from sparserob_core.control.reach.functional import WorstFunctionals
-from sparserob_core.control.reach.measurable import MISSED
+from sparserob_core.control.reach.measurable import SUPPORT_ERROR
 from sparserob_core.control.reach.varying_motion import VaryingMotion
 from sparserob_core.sip.convex_set import Array, ConvexSet
 from sparserob_core.sip.finite import Spread, UncertainRows, table_of
@@ -360,7 +360,7 @@ class ClosedLoop:
             origins = self.origin[pieces]
             inside = (self.measurable.within(end, H, origins) for end in (lower, upper))
             heights = [height + contribution for height, contribution in zip(heights, inside, strict=True)]
-            error_bounds += self.measurable.allowance(lower, upper, H, origins) + MISSED * (sizes @ radii)
+            error_bounds += self.measurable.allowance(lower, upper, H, origins) + SUPPORT_ERROR * (sizes @ radii)
         bounds = np.maximum(*heights) + chord_distances + error_bounds
         return np.where(np.isnan(bounds), np.inf, bounds), chord_distances
 
@@ -372,7 +372,7 @@ class ClosedLoop:
         ``states (k, d, 1 + Q)``."""
         drives, radii = self.path(x)[1][pieces], np.concatenate([[1.0], self.spread.radii])
         if self.motion is not None:
-            return self.motion.bent(H, start, width, pieces, states, drives, radii)
+            return self.motion.bound_chord_errors(H, start, width, pieces, states, drives, radii)
         modes = self.grid.modes[pieces]
         A = self.steps.A[0, modes]  # (1, d, d) of one system, (k, d, d) of several
         h, rates = width[:, None, None], A @ states + drives
@@ -400,7 +400,7 @@ class ClosedLoop:
         if self.measurable is not None:
             contributions, driving_sizes = self.measurable.reached
             state_sizes, input_sizes = state_sizes + contributions, np.concatenate([input_sizes, driving_sizes], axis=2)
-        return motion.left_out(state_sizes, input_sizes)
+        return motion.bound_state_errors(state_sizes, input_sizes)
 
     def worst(self, x: Array, time: float, direction: Array) -> Array:
         """Return a deviation ``(Q,)`` that attains the worst case of ``c'x(t)``."""

@@ -20,7 +20,7 @@ from sparserob_core.control.enclosures.cache import remember
 from sparserob_core.control.enclosures.matrix_exponential import rounding
 from sparserob_core.control.feedback.zonoid import FAST, PARTS, Arc, KernelPolynomial, Zonoid, corners
 from sparserob_core.control.reach.functional import WorstFunctionals
-from sparserob_core.control.reach.measurable import MISSED
+from sparserob_core.control.reach.measurable import SUPPORT_ERROR
 from sparserob_core.control.reach.varying_execution import VaryingExecution, VaryingExecutionCellSupport
 from sparserob_core.control.reach.varying_measurable import VaryingMeasurable
 from sparserob_core.control.reach.varying_motion import OUTWARD, VaryingMotion
@@ -145,8 +145,8 @@ class MeasurablePieces:
     def allowance(self, lower: Array, upper: Array, H: Array, pieces: np.ndarray) -> Array:
         """Bound the excess of `within` over its chord on cells ``[lower, upper] (k,)`` of ``pieces (k,)``: ``(k, r)``.
 
-        The bound uses that the integrand is Lipschitz. It includes the relative error `MISSED` that is allowed for
-        `within`.
+        The bound uses that the integrand is Lipschitz. It includes the relative error `SUPPORT_ERROR` that is allowed
+        for `within`.
         """
         response, (A, E) = self.functionals.response, self._matrices
         offsets = np.clip(lower - response.grid.breakpoints[pieces], 0.0, None)
@@ -159,7 +159,7 @@ class MeasurablePieces:
         input_bound = float(np.linalg.norm(np.abs(E) @ self._radii))
         with np.errstate(over="ignore", invalid="ignore"):
             slope += factor * np.exp(np.linalg.norm(A, 2) * h) * np.linalg.norm(row, axis=2) * input_bound
-        return np.asarray(h**2 / 8.0 * slope + MISSED * np.abs(self.within(upper, H, pieces)))
+        return np.asarray(h**2 / 8.0 * slope + SUPPORT_ERROR * np.abs(self.within(upper, H, pieces)))
 
     @property
     def reached(self) -> tuple[Array, Array]:
@@ -341,7 +341,7 @@ class VaryingPieces(MeasurablePieces):
         state_bounds = np.maximum(ends, 0.0).reshape(len(ends), 2, -1).max(axis=1)
         kernel, flow, columns = errors.kernel, motion.flow, errors.columns
         input_sizes = flow.sizes[..., columns] + kernel.sizes[..., columns] * (kernel.error / flow.error)[:, None, None]
-        return state_bounds * OUTWARD, input_sizes * errors.far * OUTWARD
+        return state_bounds * OUTWARD, input_sizes * errors.error_radii * OUTWARD
 
     def carried(self, pieces: np.ndarray, times: Array) -> Array:
         ends = self.functionals.response.grid.breakpoints[pieces + 1]

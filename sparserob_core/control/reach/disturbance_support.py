@@ -78,23 +78,23 @@ class DisturbanceSupport:
         pieces = np.minimum(np.maximum(grid.breakpoints.searchsorted(start, side="right") - 1, 0), grid.pieces - 1)
         flow = comparison.over(start - grid.breakpoints[pieces], cells=True).flow
         reach = comparison.over(widths, cells=True)
-        lasting_sizes = flow.on(np.broadcast_to(self._drive, (start.size, self._drive.size)))
-        ended_sizes = flow.on(self._effect_bounds[pieces])
+        current_sizes = flow.on(np.broadcast_to(self._drive, (start.size, self._drive.size)))
+        ended_sizes = flow.on(self._breakpoint_bounds[pieces])
         square = (widths**2 / 8)[:, None]
         exact = square * (
             sizes
             + product(curvature_norms, reach.departure.on(ended_sizes).T).T
-            + product(slope_norms, reach.peak.on(lasting_sizes).T).T
+            + product(slope_norms, reach.peak.on(current_sizes).T).T
         )
         ended = np.minimum(
             square * product(reach.peak.on(ended_sizes), squared.T),
             2.0 * product(reach.integral.on(ended_sizes), comparison.sizes.T),
         )
-        lasting = np.minimum(
-            square * product(reach.peak.on(lasting_sizes), comparison.sizes.T),
-            2.0 * reach.integral.on(lasting_sizes),
+        current = np.minimum(
+            square * product(reach.peak.on(current_sizes), comparison.sizes.T),
+            2.0 * reach.integral.on(current_sizes),
         )
-        by_mode = product(norms, (ended + lasting).T).T
+        by_mode = product(norms, (ended + current).T).T
         return np.asarray(np.minimum(exact, by_mode))
 
     @cached_property
@@ -128,16 +128,17 @@ class DisturbanceSupport:
         if earlier_effect is None:
             return np.asarray(within)
         earlier_errors = (
-            remainder @ (earlier_effect.reached + earlier_effect.left_out) + sizes.sum(axis=2) @ earlier_effect.left_out
+            remainder @ (earlier_effect.effect_bounds + earlier_effect.remainder)
+            + sizes.sum(axis=2) @ earlier_effect.remainder
         )
         earlier_errors = earlier_errors + np.einsum("rlaj,aj->rl", sizes, lifted.spilt(earlier_effect.sizes))
         return np.asarray(within + np.maximum.reduceat(earlier_errors[:, lifted.span], lifted.ends[:-1], axis=1))
 
     @property
-    def reached(self) -> Array:
+    def effect_bounds(self) -> Array:
         """Norm bounds ``(L, q)`` of the effect of any disturbance on every block of the coordinates until the end of
         every piece."""
-        return self._effect_bounds[1:]
+        return self._breakpoint_bounds[1:]
 
     @property
     def _space(self) -> TaylorSpace:
@@ -207,12 +208,12 @@ class DisturbanceSupport:
         """The sums of `_sum_over_blocks` at such times ``within (q,)`` of the pieces ``0, ..., count``,
         ``(q, r, count + 1, j)``, since what a block receives depends on its age."""
         propagated_rows, gains = self.lifted.flown(np.broadcast_to(start, (within.size, *start.shape)), within)
-        lasting_weights = self._weigh_disturbance(gains)[..., None, :]
+        current_weights = self._weigh_disturbance(gains)[..., None, :]
         ended_weights = self._impulses.of(propagated_rows, count)
         ended_weights = ended_weights.reshape(
-            *ended_weights.shape[:-1], lasting_weights.shape[2], lasting_weights.shape[4]
+            *ended_weights.shape[:-1], current_weights.shape[2], current_weights.shape[4]
         ).swapaxes(-2, -3)
-        return np.asarray(np.concatenate([of_blocks(lasting_weights), of_blocks(ended_weights)], axis=2).cumsum(axis=2))
+        return np.asarray(np.concatenate([of_blocks(current_weights), of_blocks(ended_weights)], axis=2).cumsum(axis=2))
 
     @cached_property
     def _impulses(self) -> Impulses:
@@ -270,13 +271,13 @@ class DisturbanceSupport:
         return all_weights
 
     @property
-    def _earlier_effect(self) -> Carried | None:
+    def _earlier_effect(self) -> PropagatedEffect | None:
         past = self.lifted.past
         if past is None:
             return None
-        earlier_effect = past.carried.get(id(self.disturbance))
-        if not isinstance(earlier_effect, Carried):
-            earlier_effect = past.carried[id(self.disturbance)] = _propagate_effect(past, self.disturbance)
+        earlier_effect = past.effects.get(id(self.disturbance))
+        if not isinstance(earlier_effect, PropagatedEffect):
+            earlier_effect = past.effects[id(self.disturbance)] = _propagate_disturbance(past, self.disturbance)
         return earlier_effect
 
     def _weigh_disturbance(self, gains: Array) -> Array:
@@ -296,7 +297,7 @@ class DisturbanceSupport:
     @cached_property
     def before(self) -> Array:
         """Norm bounds ``(q,)`` of the effect of any disturbance before time 0 on every block of the coordinates."""
-        return np.zeros(self.lifted.starts.size) if self._earlier_effect is None else self._earlier_effect.reached
+        return np.zeros(self.lifted.starts.size) if self._earlier_effect is None else self._earlier_effect.effect_bounds
 
     @cached_property
     def _lifted_rows(self) -> Array:
@@ -312,7 +313,7 @@ class DisturbanceSupport:
         return np.asarray(self.disturbance.radius * (norms + np.linalg.norm(self.lifted.slack_W, axis=1)))
 
     @cached_property
-    def _effect_bounds(self) -> Array:
+    def _breakpoint_bounds(self) -> Array:
         """Norm bounds ``(L+1, q)`` of the effect of any disturbance until each breakpoint on every block: in the
         comparison system ``int_0^t e^{M s} |W| ds``, plus the growth of `before`."""
         grid = self.lifted.grid
@@ -322,23 +323,25 @@ class DisturbanceSupport:
 
 
 @dataclass(frozen=True, eq=False)
-class Carried:
+class PropagatedEffect:
     """The effect of a part of the uncertainty on the state before a phase of a switched system begins.
 
     ``effect (M, d, ...)`` are Taylor coefficients of the effect per unit, in the coordinates of the phase. The bounds
-    hold block by block for all admissible values: ``sizes (M, q)`` of the norms of the coefficients, ``reached (q,)``
-    of the whole effect, and ``left_out (q,)`` of the remainder of the coefficients. ``of`` is the part of the
+    hold block by block for all admissible values: ``sizes (M, q)`` of the norms of the coefficients, ``effect_bounds
+    (q,)`` of the whole effect, and ``remainder (q,)`` of the remainder of the coefficients. ``of`` is the part of the
     uncertainty.
     """
 
     of: object
     effect: Array
     sizes: Array
-    reached: Array
-    left_out: Array
+    effect_bounds: Array
+    remainder: Array
 
 
-def carried(past: Past, of: object, old: Array, entries: Array, reached: Array, neglected: Array) -> Carried:
+def propagate_effect(
+    past: Past, of: object, old: Array, entries: Array, effect_bounds: Array, neglected: Array
+) -> PropagatedEffect:
     """Return the effect of a part of the uncertainty at the beginning of a phase, from bounds at the end of the phase
     before.
 
@@ -352,7 +355,7 @@ def carried(past: Past, of: object, old: Array, entries: Array, reached: Array, 
         Effect ``(d, M, ...)`` per unit, in the coordinates of the phase before.
     entries : Array
         Bounds ``(d, M)`` of the coefficients of the effect.
-    reached : Array
+    effect_bounds : Array
         Norm bounds ``(q',)`` of the whole effect, block by block.
     neglected : Array
         Bounds ``(d,)`` of the remainder of every coordinate.
@@ -365,19 +368,26 @@ def carried(past: Past, of: object, old: Array, entries: Array, reached: Array, 
     effect = np.moveaxis(np.tensordot(past.turn, old, axes=1), 1, 0)
     terms = rounding(2 * past.turn.shape[0] + old[0].size)
     sizes = (1.0 + terms) * block_norms((np.abs(past.turn) @ entries).T, past.starts)
-    bounds = product(past.blocks, reached[:, None])[:, 0]
+    bounds = product(past.blocks, effect_bounds[:, None])[:, 0]
     error_bounds = block_norms(np.abs(past.turn) @ neglected, past.starts) * (1.0 + terms)
-    return Carried(of, effect, sizes, bounds, error_bounds + past.rounded(entries.sum(axis=1)) + terms * bounds)
+    return PropagatedEffect(
+        of, effect, sizes, bounds, error_bounds + past.rounded(entries.sum(axis=1)) + terms * bounds
+    )
 
 
-def _propagate_effect(past: Past, disturbance: DisturbanceModel) -> Carried:
+def _propagate_disturbance(past: Past, disturbance: DisturbanceModel) -> PropagatedEffect:
     lifted, d = past.lifted, past.turn.shape[0]
     earlier_support, rows = DisturbanceSupport(lifted, disturbance, np.eye(d)), np.eye(d, lifted.row_matrix.shape[0])
     first = lifted.first + lifted.grid.pieces
     effect = earlier_support.on_pieces(lifted.grid.breakpoints[-1:], rows)[0, :, :first]  # (d, L, M, mw)
     entries = disturbance.radius * np.linalg.norm(effect, axis=3).sum(axis=1)
-    return carried(
-        past, disturbance, effect.swapaxes(1, 2), entries, earlier_support.reached[-1], earlier_support.neglected[:, -1]
+    return propagate_effect(
+        past,
+        disturbance,
+        effect.swapaxes(1, 2),
+        entries,
+        earlier_support.effect_bounds[-1],
+        earlier_support.neglected[:, -1],
     )
 
 

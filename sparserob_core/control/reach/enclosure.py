@@ -82,9 +82,9 @@ class EnclosedMotion(Protocol):
     def nodes(self, control: Array) -> Array:
         """Taylor coefficients ``(L+1, M, d)`` of the state at the breakpoints, under ``control (m, K)``."""
 
-    def moved(self, within: Array, pieces: np.ndarray, begun: Array, inputs: Array) -> Array:
+    def propagate(self, within: Array, pieces: np.ndarray, start_states: Array, inputs: Array) -> Array:
         """The coefficients ``(k, M, d)`` at times ``within (k,)`` the ``pieces (k,)``, from those at their beginning,
-        ``begun (k, M, d)``, under ``inputs (k, m)``."""
+        ``start_states (k, M, d)``, under ``inputs (k, m)``."""
 
     def deviation(
         self, rows: Array, start: Array, width: Array, pieces: np.ndarray, states: Array, inputs: Array
@@ -165,15 +165,15 @@ class CellEnclosure:
         ends, end_indices = _merge_ends(start, stop, pieces, self.lifted.grid.breakpoints)
         bounds, spreads = self._bound_at(*ends)
         start_bounds, stop_bounds = bounds[end_indices[: start.size]], bounds[end_indices[start.size :]]
-        bend = self._bound_chord_error(start, stop, pieces)
+        chord_error = self._bound_chord_error(start, stop, pieces)
         neglected = self._remainder_bounds[:, pieces].T
         if self.combination is not None:  # the parts of one constraint, each with a factor of at most 1
-            bend, neglected = bend.sum(axis=1, keepdims=True), neglected.sum(axis=1, keepdims=True)
+            chord_error, neglected = chord_error.sum(axis=1, keepdims=True), neglected.sum(axis=1, keepdims=True)
         if self.direct is not None:
             elapsed = self.lifted.grid.elapsed
             direct_terms = self.direct.on(start + elapsed, stop + elapsed)
             start_bounds, stop_bounds = start_bounds + direct_terms, stop_bounds + direct_terms
-        total = np.maximum(start_bounds, stop_bounds) + bend + neglected
+        total = np.maximum(start_bounds, stop_bounds) + chord_error + neglected
         worst = total.argmax(axis=1)
         pick = (np.arange(worst.size), worst)
         spread = (
@@ -182,8 +182,8 @@ class CellEnclosure:
         )
         # A short cell that bends beyond all measure has models that are good for narrower parameters only.
         short = self.lifted.norm * (stop - start) < 1.0
-        wild = short & ~(bend[pick] <= WILD * (1.0 + np.abs(start_bounds[pick]) + np.abs(stop_bounds[pick])))
-        gain = np.where(wild, 0.0, bend[pick]) if spread.shape[1] else bend[pick]
+        wild = short & ~(chord_error[pick] <= WILD * (1.0 + np.abs(start_bounds[pick]) + np.abs(stop_bounds[pick])))
+        gain = np.where(wild, 0.0, chord_error[pick]) if spread.shape[1] else chord_error[pick]
         return total[pick], gain, spread
 
     def _bound_at(self, times: Array, pieces: np.ndarray) -> tuple[Array, Array]:
@@ -260,7 +260,7 @@ class CellEnclosure:
         if not within.any():
             return start
         pieces = np.minimum(pieces, self.lifted.grid.pieces - 1)  # beyond the last there is no time to be driven in
-        return self.lifted.moved(within, pieces, start, self._inputs[pieces])
+        return self.lifted.propagate(within, pieces, start, self._inputs[pieces])
 
     def _bound_chord_error(self, start: Array, stop: Array, pieces: np.ndarray) -> Array:
         """Return bounds ``(k, r)`` of the height of the rows above their chords on the cells: of the state, summed over
@@ -300,7 +300,7 @@ class CellEnclosure:
         terms = rounding(2 * lifted.states + self.rhs.shape[1])
         total = lifted.along(self.control, self._row_norms, terms * widest)
         if self.sigma is not None:
-            total = total + self.sigma.neglected + terms * product(widest, self.sigma.reached.T)
+            total = total + self.sigma.neglected + terms * product(widest, self.sigma.effect_bounds.T)
         sides = np.abs(self.rhs).sum(axis=1, keepdims=True)  # of every row, or of the one that a combination makes
         for term in (self.moving, self.direct):
             sides = sides if term is None else sides + term.size[:, None]
@@ -324,8 +324,8 @@ class LegsEnclosure:
             times = np.maximum(start[members] - begin, 0.0), np.maximum(stop[members] - begin, 0.0)
             leg_bounds.append((members, self.legs[number].bounds(*times)))
         order = np.argsort(np.concatenate([members for members, _ in leg_bounds]))
-        bounds, bend, spread = (np.concatenate([triple[i] for _, triple in leg_bounds])[order] for i in range(3))
-        return bounds, bend, spread
+        bounds, chord_error, spread = (np.concatenate([triple[i] for _, triple in leg_bounds])[order] for i in range(3))
+        return bounds, chord_error, spread
 
 
 AnyMotion = TypeVar("AnyMotion", bound=EnclosedMotion)
@@ -389,8 +389,8 @@ def enclose(
     """
     bounds, split = np.full(lower.shape[0], -np.inf), np.zeros(lower.shape[0], dtype=int)
     if lower.shape[1] == 1:
-        bounds, bend, _ = cell_over(lower[0, 1:], upper[0, 1:]).bounds(lower[:, 0], upper[:, 0])
-        return Enclosure(bounds, split, bend)
+        bounds, chord_error, _ = cell_over(lower[0, 1:], upper[0, 1:]).bounds(lower[:, 0], upper[:, 0])
+        return Enclosure(bounds, split, chord_error)
     for members in _group_by_key(np.hstack([lower[:, 1:], upper[:, 1:]]), touched):
         low, high = lower[members[0], 1:], upper[members[0], 1:]
         try:
@@ -402,9 +402,9 @@ def enclose(
             widest = int(np.argmax((high - low)[:nu])) if error.along is None else error.along
             bounds[members], split[members] = np.inf, 1 + widest
             continue
-        bounds[members], bend, spread = cell.bounds(lower[members, 0], upper[members, 0])
+        bounds[members], chord_error, spread = cell.bounds(lower[members, 0], upper[members, 0])
         coordinates = np.concatenate([np.arange(1 + nu), 1 + nu + np.flatnonzero(high[nu:] > low[nu:])])
-        split[members] = coordinates[where_to_halve(bend, spread, bounds[members])]
+        split[members] = coordinates[where_to_halve(chord_error, spread, bounds[members])]
     return Enclosure(bounds, split)
 
 
@@ -418,7 +418,7 @@ def _group_by_key(keys: Array, touched: np.ndarray) -> list[np.ndarray]:
     return np.split(touched_rows[order], np.flatnonzero(np.diff(key_indices.reshape(-1)[order])) + 1)
 
 
-def where_to_halve(bend: Array, spread: Array, bounds: Array) -> np.ndarray:
+def where_to_halve(chord_error: Array, spread: Array, bounds: Array) -> np.ndarray:
     """Return the coordinate to halve of every cell, ``(k,)``: 0 for the times where they matter most, else one other
     coordinate.
 
@@ -426,7 +426,7 @@ def where_to_halve(bend: Array, spread: Array, bounds: Array) -> np.ndarray:
 
     Parameters
     ----------
-    bend : Array
+    chord_error : Array
         Gain ``(k,)`` from halving the times of a cell.
     spread : Array
         Gain ``(k, j)`` from halving each other coordinate.
@@ -434,7 +434,7 @@ def where_to_halve(bend: Array, spread: Array, bounds: Array) -> np.ndarray:
         Upper bounds ``(k,)`` of the violation; where some are positive, only their cells decide on the coordinate.
     """
     if not spread.shape[1]:
-        return np.zeros(bend.size, dtype=int)
+        return np.zeros(chord_error.size, dtype=int)
     open_ = bounds > 0
     total = spread[open_].sum(axis=0) if open_.any() else spread.sum(axis=0)
-    return np.where(bend > TIME_FIRST * spread.max(axis=1), 0, 1 + int(total.argmax()))
+    return np.where(chord_error > TIME_FIRST * spread.max(axis=1), 0, 1 + int(total.argmax()))

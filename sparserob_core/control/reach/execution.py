@@ -38,16 +38,16 @@ class Execution:
     """Errors of execution: the delivered control may differ from the commanded one by ``shares (m,)`` of it.
 
     ``breakpoints (K + 1,)`` are those of the command, and ``response`` is the response of a known system, on which
-    commands may act with a delay. ``felt (d,)`` is 0 for states that add up what is commanded, and do nothing else, and
-    1 for others.
+    commands may act with a delay. ``error_mask (d,)`` is 0 for states that add up what is commanded, and do nothing
+    else, and 1 for others.
     """
 
     response: Response
     breakpoints: Array
     shares: Array
-    felt: Array
+    error_mask: Array
 
-    def seen(self, directions: Array, parameters: Array) -> Array:
+    def extend_directions(self, directions: Array, parameters: Array) -> Array:
         """Return directions ``(k, d)`` at parameters ``(k, nu)`` as directions on the states along which errors are
         followed."""
         return directions
@@ -124,7 +124,7 @@ class Execution:
     def matrices(self) -> tuple[Array, Array]:
         """``A (d, d)``, ``B (d, m)``."""
         A, B, _ = self.response.system.modes[0].matrices(np.zeros((1, 0)))
-        return A[0], self.felt[:, None] * B[0][:, : self.shares.size]
+        return A[0], self.error_mask[:, None] * B[0][:, : self.shares.size]
 
     @cached_property
     def _supports(self) -> list[MeasurableSupport | None]:
@@ -280,7 +280,7 @@ class ExecutionCellSupport(KnownCellSupport):
         return np.zeros((self.rows.shape[0], self.lifted.grid.pieces))
 
     @property
-    def reached(self) -> Array:
+    def effect_bounds(self) -> Array:
         """Norm bounds ``(L, q)`` of the effect of the errors on every block of the coordinates until the end of every
         piece."""
         error_sizes = self.execution.shares * self.execution.acts(self.control).max(axis=1)

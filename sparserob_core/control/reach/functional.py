@@ -54,15 +54,15 @@ class Contributions:
     """Contributions to the largest ``c'x(t)`` at one index, without the contribution of the control.
 
     ``free`` is the contribution of the centre of the initial states and of inputs that are not decided. ``sigma`` is
-    the support value of the worst disturbance and the worst initial state together, and ``begun`` the part of it that
-    comes from the initial state. ``disturbance (mw, L)`` is a worst one of the disturbances that are constant on the
-    pieces of the merged grid. ``deviation (d,)`` is a worst deviation from the centre. Each is ``None`` where there is
-    none.
+    the support value of the worst disturbance and the worst initial state together, and ``initial_support`` the part of
+    it that comes from the initial state. ``disturbance (mw, L)`` is a worst one of the disturbances that are constant
+    on the pieces of the merged grid. ``deviation (d,)`` is a worst deviation from the centre. Each is ``None`` where
+    there is none.
     """
 
     free: float
     sigma: float
-    begun: float
+    initial_support: float
     disturbance: Array | None
     deviation: Array | None
 
@@ -215,7 +215,7 @@ class WorstFunctionals:
         execution are the worst ones.
         """
 
-        def pushed(part: slice, known: Weights) -> Array:
+        def compute_effect(part: slice, known: Weights) -> Array:
             free = known.free
             initial_effect = (
                 self._evaluate_initial_support(free) if deviations is None else (free * deviations[part]).sum(axis=1)
@@ -226,7 +226,7 @@ class WorstFunctionals:
                 else initial_effect + np.einsum("kli,kil->k", known.disturbance, disturbances[part])
             )
 
-        return self._build_rows(times, directions, parameters, pushed)
+        return self._build_rows(times, directions, parameters, compute_effect)
 
     @shaped
     def _build_rows(
@@ -234,19 +234,21 @@ class WorstFunctionals:
         times: Float[Array, " k"],
         directions: Float[Array, "k d"],
         parameters: Float[Array, "k nu"],
-        pushed: Callable[[slice, Weights], Array | float],
+        compute_effect: Callable[[slice, Weights], Array | float],
     ) -> tuple[Float[Array, "k n"], Float[Array, " k"]]:
-        """Rows and offsets; ``pushed(part, weights)`` is what the uncertainty adds to the offsets of a part of the
-        indices."""
+        """Rows and offsets; ``compute_effect(part, weights)`` is what the uncertainty adds to the offsets of a part of
+        the indices."""
         G, offset = np.empty((times.size, self.variables)), np.empty(times.size)
         for chunk in self._divide_into_chunks(parameters):
             weights = self.response.weights(times[chunk], directions[chunk], parameters[chunk])
             G[chunk, : self.coefficients] = self.on_decision(weights.control)
             if self.execution is not None:
-                error_directions = self.execution.seen(directions[chunk], parameters[chunk])
+                error_directions = self.execution.extend_directions(directions[chunk], parameters[chunk])
                 G[chunk, self.coefficients :] = self.execution.lengths(times[chunk], error_directions)
             offset[chunk] = (
-                weights.free @ self.response.initial_state + self.given(weights.control) + pushed(chunk, weights)
+                weights.free @ self.response.initial_state
+                + self.given(weights.control)
+                + compute_effect(chunk, weights)
             )
             if self.execution is not None:
                 offset[chunk] += self.execution.given(times[chunk], error_directions)
@@ -284,7 +286,7 @@ class WorstFunctionals:
                     "klm,ml->k", np.abs(weights.control[..., : self.channels]), self._bound_execution_errors(control)
                 )
             elif self.execution is not None:
-                error_directions = self.execution.seen(directions[chunk], parameters[chunk])
+                error_directions = self.execution.extend_directions(directions[chunk], parameters[chunk])
                 result[chunk] += self.execution.added(self.control(theta), times[chunk], error_directions)
         return result
 
@@ -317,7 +319,7 @@ class WorstFunctionals:
                 values[chunk] += self._evaluate_initial_support(free.reshape(-1, free.shape[2])).reshape(free.shape[:2])
                 if by_block is not None:
                     on_blocks = chunk_directions @ blocks[indices].reshape(*blocks[indices].shape[:2], -1)
-                    values[chunk] += by_block.pushed(on_blocks.reshape(*free.shape[:2], *blocks.shape[2:]))
+                    values[chunk] += by_block.support_from_blocks(on_blocks.reshape(*free.shape[:2], *blocks.shape[2:]))
                 if error_weights.shape[2]:
                     values[chunk] += np.abs(chunk_directions @ error_weights[indices]).sum(axis=2)
             if measurable is not None:
@@ -381,7 +383,7 @@ class WorstFunctionals:
             for inner_chunk in _divide_range(k, max(1, NEAR // (r * blocks[0, 0].size))):
                 active_blocks = blocks[inner_chunk][:, :, blocks[inner_chunk].any(axis=(0, 1, 3))]
                 projected = directions @ active_blocks.reshape(active_blocks.shape[0], d, active_blocks[0, 0].size)
-                sigma[chunk][inner_chunk] += model.pushed(
+                sigma[chunk][inner_chunk] += model.support_from_blocks(
                     projected.reshape(active_blocks.shape[0], r, *active_blocks.shape[2:])
                 )
         return sigma
@@ -611,27 +613,27 @@ class WorstFunctionals:
                 end[error.along] = (low[error.along] + high[error.along]) / 2
             return max(self._bound_growth(low, ends[1], halvings - 1), self._bound_growth(ends[0], high, halvings - 1))
 
-    def beyond(self, far: Array) -> Array:
+    def beyond(self, control_bound: Array) -> Array:
         """Return bounds ``(d,)`` of the truncation error of the state at any time and parameter, from the series of the
         law in the parameters.
 
-        ``far (m,)`` bounds the absolute value of the control. The error is 0 where the entries of the law are
+        ``control_bound (m,)`` bounds the absolute value of the control. The error is 0 where the entries of the law are
         polynomials.
         """
         laws, bounds = self.response.propagator.laws, np.zeros(self.response.initial_state.size)
         if laws is None or all(spread.remainder is None for spread, _ in laws.every):
             return bounds
-        initial_sizes, inputs = self._bound_initial_and_inputs(far)
+        initial_sizes, inputs = self._bound_initial_and_inputs(control_bound)
         for part_index, (spread, _) in enumerate(laws.every):
             if spread.remainder is not None:
                 growth = self._bound_growth(*laws.ends(part_index), HALVINGS)
-                error_bounds = laws.left_out(part_index, initial_sizes, inputs, growth)
+                error_bounds = laws.bound_truncation_error(part_index, initial_sizes, inputs, growth)
                 bounds = np.maximum(bounds, error_bounds)
         return bounds
 
-    def _bound_initial_and_inputs(self, far: Array) -> tuple[Array, Array]:
+    def _bound_initial_and_inputs(self, control_bound: Array) -> tuple[Array, Array]:
         """Return bounds of the initial state, ``(d,)``, and of all inputs, ``(m + constants + mw,)``, for a control of
-        at most ``far (m,)``."""
+        at most ``control_bound (m,)``."""
         initial_sizes, model = np.abs(self.response.initial_state), self.disturbance
         if self.initial is not None:
             initial_sizes = initial_sizes + self.initial.reach(np.eye(initial_sizes.size))
@@ -639,10 +641,10 @@ class WorstFunctionals:
         if model is not None:
             disturbance_sizes = model.bound.reach(np.eye(model.channels))
         input_sizes = np.abs(self.known).max(axis=1)
-        delivered = np.maximum(far, input_sizes[: far.size])
+        delivered = np.maximum(control_bound, input_sizes[: control_bound.size])
         if self.execution is not None:  # the series truncates the effect of errors as that of commands
             delivered = (1.0 + self.execution.shares) * delivered
-        return initial_sizes, np.concatenate([delivered, input_sizes[far.size :], disturbance_sizes])
+        return initial_sizes, np.concatenate([delivered, input_sizes[control_bound.size :], disturbance_sizes])
 
     @cached_property
     def _frozen_systems(self) -> dict[bytes, LiftedSystem]:

@@ -19,7 +19,7 @@ from sparserob_core.control.enclosures.comparison import block_norms, product
 from sparserob_core.control.enclosures.flows import DoublingExponentials, products
 from sparserob_core.control.enclosures.matrix_exponential import rounding
 from sparserob_core.control.enclosures.taylor import Combination
-from sparserob_core.control.reach.disturbance_support import Carried, carried
+from sparserob_core.control.reach.disturbance_support import PropagatedEffect, propagate_effect
 from sparserob_core.control.reach.support import InitialSupport, KnownCellSupport, Support, over_directions
 from sparserob_core.control.reach.varying_motion import (
     SpreadMotion,
@@ -32,12 +32,12 @@ from sparserob_core.shapes import Float, shaped
 from sparserob_core.sip.convex_set import Array, Box, ConvexSet
 
 ACCURACY = 1e-14  # of an integral over one interval, relative to the largest integrand times the horizon
-MISSED = 1e-12  # of a support value under feedback, the error that the run's proof allows for; `check` encloses it
+SUPPORT_ERROR = 1e-12  # of a support value under feedback, allowed for by the proof of a run; `check` encloses it
 ORDER = 12  # of the expansion that encloses a row; what is left of it on a short interval is 1e-14 of the row
 SHORT = 0.5  # time times speed that such an interval takes: twice as much leaves 1e-10, half as much doubles the work
 TINY = float(np.finfo(float).tiny)
 TABLES_KEPT = 4096  # directions and parameters whose integrals are remembered
-MOST_SHORT = 4096  # intervals that one is cut into before any is halved
+MOST_INTERVALS = 4096  # intervals that one is cut into before any is halved
 # numbers of polynomials, or of remembered lengths, that are made at once, or of kernels that are remembered (32 MB)
 AT_ONCE = 4_000_000
 KEPT = 8  # tables of lengths at sampled times, one for each constraint
@@ -52,14 +52,14 @@ class _IntegralTable:
     """Integrals along one direction, between the times ``starts (n + 1,)``.
 
     ``sums (n + 1, 2)`` are lower and upper bounds of the integrals up to each time. For the interval after each time
-    there are polynomials with ``terms (n, ORDER + 1, mw)`` and error bounds ``lost (n,)``. ``accuracy`` is the goal for
-    the error of an integral, and ``late`` the error from the rounding of a time.
+    there are polynomials with ``terms (n, ORDER + 1, mw)`` and error bounds ``error_bounds (n,)``. ``accuracy`` is the
+    goal for the error of an integral, and ``late`` the error from the rounding of a time.
     """
 
     starts: Array
     sums: Array
     terms: Array
-    lost: Array
+    error_bounds: Array
     accuracy: float
     late: float
 
@@ -266,7 +266,7 @@ class MeasurableSupport:
         within = np.clip(times - starts[intervals], 0.0, None)
         before, terms, errors = (
             np.array([getattr(tables[i], name)[j] for i, j in zip(table_indices, intervals, strict=True)])
-            for name in ("sums", "terms", "lost")
+            for name in ("sums", "terms", "error_bounds")
         )
         accuracy, late = np.array([(table.accuracy, table.late) for table in tables])[table_indices].T
         shares = within / np.diff(starts)[intervals]
@@ -331,7 +331,7 @@ class MeasurableSupport:
     def _divide_intervals(self, A: Array, ages: Array) -> Array:
         """The ends ``(n + 1,)`` of short intervals, as many between all neighbours of ``ages (L + 1,)``."""
         pieces = np.diff(ages)
-        count = int(np.clip(np.ceil(self._balance_matrix(A).fastest * pieces.max() / SHORT), 1, MOST_SHORT))
+        count = int(np.clip(np.ceil(self._balance_matrix(A).fastest * pieces.max() / SHORT), 1, MOST_INTERVALS))
         return np.append((ages[:-1, None] + np.outer(pieces, np.arange(count) / count)).ravel(), ages[-1])
 
     def _balance_matrix(self, A: Array) -> _BalancedMatrix:
@@ -446,12 +446,12 @@ class MeasurableCellSupport(KnownCellSupport):
         return np.asarray(errors[:, lifted.ends[1:] - 1])
 
     @cached_property
-    def reached(self) -> Array:
+    def effect_bounds(self) -> Array:
         """Norm bounds ``(L, q)`` of the effect of any disturbance on every block of the coordinates until the end of
         every piece."""
         reach = self.lifted.comparison.over(self.lifted.grid.breakpoints[1:])
         bounds = reach.integral.on(np.broadcast_to(self._drive, (self.lifted.grid.pieces, self._drive.size)))
-        return bounds if self._earlier_support is None else bounds + self._earlier_support.reached
+        return bounds if self._earlier_support is None else bounds + self._earlier_support.effect_bounds
 
     @cached_property
     def _earlier_support(self) -> InitialSupport | None:
@@ -460,19 +460,26 @@ class MeasurableCellSupport(KnownCellSupport):
         past = self.lifted.past
         if past is None:
             return None
-        earlier_effect = past.carried.get(id(self.support))
-        if not isinstance(earlier_effect, Carried):
+        earlier_effect = past.effects.get(id(self.support))
+        if not isinstance(earlier_effect, PropagatedEffect):
             axes = np.eye(past.lifted.states)
             earlier_support = MeasurableCellSupport(self.support, self.rows, past.lifted)
-            left_out = earlier_support._bound_rounding(axes)[:, -1]
+            rounding_errors = earlier_support._bound_rounding(axes)[:, -1]
             if earlier_support._earlier_support is not None:
-                left_out = left_out + replace(earlier_support._earlier_support, rows=axes).neglected[:, -1]
-            radii = np.repeat(earlier_support.reached[-1], np.diff(past.lifted.starts, append=past.lifted.states))
+                rounding_errors = (
+                    rounding_errors + replace(earlier_support._earlier_support, rows=axes).neglected[:, -1]
+                )
+            radii = np.repeat(earlier_support.effect_bounds[-1], np.diff(past.lifted.starts, append=past.lifted.states))
             box = Box(-radii, radii)
-            earlier_effect = carried(
-                past, (self.support, box), axes[:, None], radii[:, None], earlier_support.reached[-1], left_out
+            earlier_effect = propagate_effect(
+                past,
+                (self.support, box),
+                axes[:, None],
+                radii[:, None],
+                earlier_support.effect_bounds[-1],
+                rounding_errors,
             )
-            past.carried.update({id(self.support): earlier_effect, id(box): earlier_effect})
+            past.effects.update({id(self.support): earlier_effect, id(box): earlier_effect})
         assert isinstance(earlier_effect.of, tuple)
         _, box = earlier_effect.of
         return InitialSupport(self.lifted, box, self.rows @ self.lifted.transform)

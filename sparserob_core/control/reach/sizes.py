@@ -45,7 +45,7 @@ def widths(H: Array, h: Array) -> Array:
     return width
 
 
-def stated_sizes(H: Array, h: Array) -> Array:
+def row_sizes(H: Array, h: Array) -> Array:
     """Return the sizes ``(r,)`` that the rows ``H x <= h`` have by themselves: bound or width, the larger one."""
     width = widths(H, h)
     return np.maximum(np.abs(h), np.where(np.isfinite(width), width, 0.0))

@@ -18,7 +18,7 @@ from sparserob_core.control.enclosures.comparison import block_norms, product
 from sparserob_core.control.enclosures.matrix_exponential import rounding
 from sparserob_core.control.enclosures.polynomial import distinct_patterns
 from sparserob_core.control.enclosures.taylor import Combination, TaylorSpace
-from sparserob_core.control.reach.disturbance_support import Carried, carried, over_faces, summed
+from sparserob_core.control.reach.disturbance_support import PropagatedEffect, over_faces, propagate_effect, summed
 from sparserob_core.control.reach.varying_motion import OUTWARD, VaryingMotion
 from sparserob_core.control.response.lifted import KNOWN, LiftedSystem
 from sparserob_core.shapes import Float, shaped
@@ -43,7 +43,7 @@ class Support(Protocol):
         """Bounds ``(r, L)`` of the remainder of the Taylor models on every piece."""
 
     @property
-    def reached(self) -> Array:
+    def effect_bounds(self) -> Array:
         """Norm bounds ``(L, q)`` of the effect on the state on every piece, block by block."""
 
 
@@ -72,9 +72,9 @@ class Supports:
         return np.asarray(sum(support.neglected for support in self.parts))
 
     @cached_property
-    def reached(self) -> Array:
-        """`Support.reached` of all parts."""
-        return np.asarray(sum(support.reached for support in self.parts))
+    def effect_bounds(self) -> Array:
+        """`Support.effect_bounds` of all parts."""
+        return np.asarray(sum(support.effect_bounds for support in self.parts))
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,7 +118,7 @@ class InitialSupport:
         comparison, starts = lifted.comparison, lifted.starts
         pieces = np.clip(np.searchsorted(grid.breakpoints, start, side="right") - 1, 0, grid.pieces - 1)
         flow = comparison.over(start - grid.breakpoints[pieces], cells=True).flow
-        ended_sizes, reach = flow.on(self._effect_bounds[pieces]), comparison.over(widths, cells=True)
+        ended_sizes, reach = flow.on(self._breakpoint_bounds[pieces]), comparison.over(widths, cells=True)
         curvature_rows = self._propagate_rows(start) @ lifted.row_matrix @ lifted.row_matrix
         sizes = self._bound_coefficients(self._weigh_deviation(curvature_rows)).sum(axis=2)
         square = (widths**2 / 8)[:, None]
@@ -146,10 +146,10 @@ class InitialSupport:
         return np.asarray(np.maximum.reduceat(remainders[:, lifted.span], lifted.ends[:-1], axis=1))
 
     @cached_property
-    def reached(self) -> Array:
+    def effect_bounds(self) -> Array:
         """Norm bounds ``(L, q)`` of the effect of any deviation on every block of the coordinates on every piece."""
         peak = self.lifted.comparison.over(self.lifted.grid.lengths).peak
-        return peak.on(self._effect_bounds[:-1])
+        return peak.on(self._breakpoint_bounds[:-1])
 
     @property
     def _space(self) -> TaylorSpace:
@@ -179,24 +179,24 @@ class InitialSupport:
         return weights
 
     @property
-    def _earlier_effect(self) -> Carried | None:
+    def _earlier_effect(self) -> PropagatedEffect | None:
         """The effect of a deviation on the state before a later phase begins, ``effect (M, d, d)``; ``None`` in the
         first phase."""
         past = self.lifted.past
         if past is None:
             return None
-        earlier_effect = past.carried.get(id(self.set))
-        if not isinstance(earlier_effect, Carried):
+        earlier_effect = past.effects.get(id(self.set))
+        if not isinstance(earlier_effect, PropagatedEffect):
             d = past.turn.shape[0]
             earlier_support = InitialSupport(past.lifted, self.set, np.eye(d))
             radii = self.set.reach(np.eye(self.set.dimension))
             effect = earlier_support.blocks(past.lifted.grid.breakpoints[-1:])[0]  # (d, M, d)
-            earlier_effect = past.carried[id(self.set)] = carried(
+            earlier_effect = past.effects[id(self.set)] = propagate_effect(
                 past,
                 self.set,
                 effect,
                 np.abs(effect) @ radii,
-                earlier_support._effect_bounds[-1],
+                earlier_support._breakpoint_bounds[-1],
                 earlier_support.neglected[:, -1],
             )
         return earlier_effect
@@ -222,7 +222,7 @@ class InitialSupport:
     def _norm_bounds(self) -> Array:
         """Norm bounds ``(q,)`` of every block of the coordinates of any deviation, at the beginning of this phase."""
         if self._earlier_effect is not None:
-            return self._earlier_effect.reached
+            return self._earlier_effect.effect_bounds
         radii = self.set.reach(np.eye(self.set.dimension))
         return (
             block_norms(np.abs(self.lifted.decoupling.inverse).astype(float) @ radii, self.lifted.starts)
@@ -234,7 +234,7 @@ class InitialSupport:
         """Norm bounds ``(q,)`` of the rounding error of every block of a deviation, from the coordinates; in a later
         phase, of the remainder of the Taylor models at its beginning."""
         if self._earlier_effect is not None:
-            return self._earlier_effect.left_out
+            return self._earlier_effect.remainder
         decoupling = self.lifted.decoupling
         radii = self.set.reach(np.eye(self.set.dimension))
         if decoupling.is_identity:
@@ -245,7 +245,7 @@ class InitialSupport:
         return block_norms(1.001 * errors, self.lifted.starts)
 
     @cached_property
-    def _effect_bounds(self) -> Array:
+    def _breakpoint_bounds(self) -> Array:
         """Norm bounds ``(L + 1, q)`` of the effect of any deviation on every block at the breakpoints."""
         grid = self.lifted.grid
         flow = self.lifted.comparison.over(grid.lengths).flow
@@ -340,12 +340,12 @@ class DirectionsCellSupport:
     def neglected(self) -> Array:
         """Bounds ``(r, L)`` of `Support.neglected` of every row, with the rounding of the corners."""
         sizes = block_norms(np.abs(self.rows) @ np.abs(self.leg.transform), self.leg.starts)
-        return np.asarray(self._row_support.neglected + rounding(len(self.rows)) * product(sizes, self.reached.T))
+        return np.asarray(self._row_support.neglected + rounding(len(self.rows)) * product(sizes, self.effect_bounds.T))
 
     @cached_property
-    def reached(self) -> Array:
-        """`Support.reached`."""
-        return self._row_support.reached
+    def effect_bounds(self) -> Array:
+        """`Support.effect_bounds`."""
+        return self._row_support.effect_bounds
 
     @cached_property
     def _row_support(self) -> Support:

@@ -70,8 +70,8 @@ class VaryingExecution(Execution):
     def following(self, propagator: Propagator, initial_state: Array) -> VaryingExecution:
         """Return the errors along states ``(d,)`` or their coefficients ``(M d,)``, that a propagator moves."""
         response = Response(propagator.system, propagator.grid, initial_state, shared=propagator)
-        felt = np.tile(self.felt, initial_state.size // self.felt.size)
-        return replace(self, response=response, felt=felt, _lengths={}, _transitions={}, _cell_supports={})
+        error_mask = np.tile(self.error_mask, initial_state.size // self.error_mask.size)
+        return replace(self, response=response, error_mask=error_mask, _lengths={}, _transitions={}, _cell_supports={})
 
     def over(
         self,
@@ -106,10 +106,10 @@ class VaryingExecution(Execution):
     def columns(self) -> np.ndarray:
         """The columns of ``[B E]`` through which errors enter."""
         first = self.motion.expansion.channels[0] if self.disturbing else 0
-        return first + (np.arange(self.far.size) if self.through is None else self.through)
+        return first + (np.arange(self.error_radii.size) if self.through is None else self.through)
 
     @cached_property
-    def far(self) -> Array:
+    def error_radii(self) -> Array:
         """Bounds ``(m,)`` of the absolute value of the error through each column, where the command is 1."""
         if self.bound is None:
             return self.shares
@@ -121,7 +121,7 @@ class VaryingExecution(Execution):
         """The errors of the box around the set, where there is one."""
         if self.bound is None:
             return self
-        return replace(self, shares=self.far, bound=None, _lengths={}, _cell_supports={})
+        return replace(self, shares=self.error_radii, bound=None, _lengths={}, _cell_supports={})
 
     @cached_property
     def acting(self) -> np.ndarray:
@@ -211,7 +211,7 @@ class VaryingExecution(Execution):
         pieces = np.flatnonzero(is_active[:, acting].any(axis=0))
         if not pieces.size or not times.size:
             return contributions
-        directions = directions * self.felt
+        directions = directions * self.error_mask
         chunk_size = max(1, AT_ONCE // (pieces.size * self.kernel.terms[0].size + acting.size * directions.shape[1]))
         for begin in range(0, times.size, chunk_size):
             chunk = slice(begin, begin + chunk_size)
@@ -296,7 +296,7 @@ class VaryingExecution(Execution):
 
     def _bound_joint_inputs(self, bound: ConvexSet, kernel: Kernel, which: np.ndarray, rows: Array) -> Array:
         """Return `_bound_intervals` for a set of inputs through all columns together, ``(q, 1, 2)``."""
-        columns, radii = self.columns, self.far
+        columns, radii = self.columns, self.error_radii
         sizes = np.einsum("qd,qdm->qm", np.abs(rows), np.abs(kernel.terms[..., columns]).sum(axis=1)[which]) @ radii
         units = np.abs(rows) * self.motion.expansion.units
         errors = np.einsum("qd,qdm->qm", units, kernel.sizes[which][..., columns]) @ radii * kernel.error[which]
@@ -313,7 +313,7 @@ class UncertainExecution(Execution):
     """`Execution` of a system that changes with time and has parameters.
 
     ``known`` is the execution of a known system; an execution is made from it for each parameter and on each cell.
-    Directions are followed by their parameters (`seen`).
+    Directions are followed by their parameters (`extend_directions`).
     """
 
     known: VaryingExecution
@@ -336,7 +336,7 @@ class UncertainExecution(Execution):
             else replace(self, shares=around.shares, known=around, _point_executions={}, _cell_executions={})
         )
 
-    def seen(self, directions: Array, parameters: Array) -> Array:
+    def extend_directions(self, directions: Array, parameters: Array) -> Array:
         """Return directions ``(k, d)`` with the parameters ``(k, nu)`` as further columns, ``(k, d + nu)``."""
         return np.hstack([directions, parameters])
 
@@ -370,7 +370,7 @@ class UncertainExecution(Execution):
         self, directions: Array, found: Array, of: Callable[[VaryingExecution, np.ndarray, Array], Array]
     ) -> Array:
         """Fill ``found (k, ...)`` with the values of a function ``of`` the errors at every parameter, and return it."""
-        d = self.felt.size
+        d = self.error_mask.size
         unique, parameter_indices = unique_rows(directions[:, d:])
         for number, parameter in enumerate(unique):
             indices = np.flatnonzero(parameter_indices == number)
@@ -424,7 +424,7 @@ def followed(errors: VaryingExecution) -> VaryingExecution | UncertainExecution:
     """Return the errors of a system that changes with time: where it has parameters, at each of them and on cells."""
     if errors.response.propagator.laws is None:
         return errors
-    return UncertainExecution(errors.response, errors.breakpoints, errors.shares, errors.felt, errors)
+    return UncertainExecution(errors.response, errors.breakpoints, errors.shares, errors.error_mask, errors)
 
 
 @final
@@ -459,7 +459,7 @@ class VaryingExecutionCellSupport(KnownCellSupport):
         used_columns = np.append(np.arange(d), d + columns)
         law, slope = law[:, :, used_columns], slope[:, :, used_columns]
         law_bounds, second, third = (
-            bounds[pieces][:, :, used_columns] for bounds in (motion.most, motion.second, motion.third)
+            bounds[pieces][:, :, used_columns] for bounds in (motion.law_bounds, motion.second, motion.third)
         )
         start_sizes, input_sizes = self._bound_effects(start), self.sizing[pieces]
         state_curvature = np.abs(self.rows @ (slope[:, :, :d] + law[:, :, :d] @ law[:, :, :d]))
@@ -482,26 +482,26 @@ class VaryingExecutionCellSupport(KnownCellSupport):
     @cached_property
     def neglected(self) -> Array:
         """Bounds ``(r, K)`` of the error of the functionals on every piece, from the error of the transitions."""
-        return product(np.abs(self.rows), self.missed.T)
+        return product(np.abs(self.rows), self.state_errors.T)
 
     @cached_property
-    def missed(self) -> Array:
+    def state_errors(self) -> Array:
         """Bounds ``(K, d)`` of the error of the states on every piece, from the error of the transitions."""
         forcing = self.motion.flow.sizes[..., self.execution.columns] * self.sizing[:, None]
-        return self.motion.left_out(self.at_marks[:-1], forcing)
+        return self.motion.bound_state_errors(self.at_marks[:-1], forcing)
 
     @cached_property
-    def reached(self) -> Array:
+    def effect_bounds(self) -> Array:
         """Bounds ``(K, d)`` of the effect of the errors of execution on every state on every piece."""
         motion, lengths = self.motion, self.motion.grid.lengths
         columns = motion.states + self.execution.columns
-        rates = np.einsum("kim,km->ki", motion.most[:, :, columns], self.sizing)
+        rates = np.einsum("kim,km->ki", motion.law_bounds[:, :, columns], self.sizing)
         return motion.grown(motion.every, lengths, self.at_marks[:-1] + lengths[:, None] * rates)
 
     @cached_property
     def sizing(self) -> Array:
         """Bounds ``(K, m)`` of the errors of execution on every piece between marks."""
-        size = self.execution.far[:, None] * self.execution.acts(self.control)
+        size = self.execution.error_radii[:, None] * self.execution.acts(self.control)
         return np.asarray(size[:, self.execution.acting].T * OUTWARD)
 
     @cached_property
@@ -586,15 +586,16 @@ class SpreadExecutionSupport:
         """Bounds ``(r, K)`` of the error of the functionals on every piece, from the error of the transitions and from
         the terms beyond the degree."""
         support, motion, rows = self.every, self.motion, np.abs(self.rows)
-        inputs = np.zeros((len(support.sizing), support.motion.most.shape[2] - support.motion.states))
+        inputs = np.zeros((len(support.sizing), support.motion.law_bounds.shape[2] - support.motion.states))
         inputs[:, support.execution.columns] = support.sizing
-        truncation = motion.truncation.lost(support.at_marks[:-1] + support.missed, inputs)
-        return np.asarray((motion.sizes(rows) @ support.missed.T + rows @ truncation.T) * OUTWARD)
+        truncation = motion.truncation.bound_error(support.at_marks[:-1] + support.state_errors, inputs)
+        return np.asarray((motion.sizes(rows) @ support.state_errors.T + rows @ truncation.T) * OUTWARD)
 
     @cached_property
-    def reached(self) -> Array:
-        """Bounds ``(K, d)`` of `Support.reached`, times ``1 + M``, as the sums over ``M`` coefficients round more."""
-        return np.asarray((1.0 + self.motion.space.size) * self.motion.folded(self.every.reached))
+    def effect_bounds(self) -> Array:
+        """Bounds ``(K, d)`` of `Support.effect_bounds`, times ``1 + M``, as the sums over ``M`` coefficients round
+        more."""
+        return np.asarray((1.0 + self.motion.space.size) * self.motion.folded(self.every.effect_bounds))
 
     @cached_property
     def _curvature_bounds(self) -> Array:
@@ -603,14 +604,14 @@ class SpreadExecutionSupport:
         support, d = self.every, self.every.motion.states
         second = support.motion.second
         input_matrix = second[:, :, d + support.execution.columns]
-        curvatures = np.einsum("kij,kj->ki", second[:, :, :d], support.reached) + np.einsum(
+        curvatures = np.einsum("kij,kj->ki", second[:, :, :d], support.effect_bounds) + np.einsum(
             "kim,km->ki", input_matrix, support.sizing
         )
         return np.asarray(curvatures * OUTWARD)
 
     def _bound_effects(self, times: Array) -> Array:
         """Return bounds ``(k, r, M)`` of the effect of the errors of execution along every coefficient on the cell."""
-        bounds = self.every.reached[self._locate_pieces(times)].reshape(times.size, self.motion.space.size, -1)
+        bounds = self.every.effect_bounds[self._locate_pieces(times)].reshape(times.size, self.motion.space.size, -1)
         sizes = np.einsum("rd,kad->kra", np.abs(self.rows), bounds)
         return np.asarray(sizes * OUTWARD)
 

@@ -46,7 +46,7 @@ class VaryingMeasurable:
     ) -> Float[Array, " k"]:
         """Return ``sigma (k,)`` at ``times (k,)``, ``directions (k, d)``, ``parameters (k, nu)``; it is not
         enclosed."""
-        error_directions = self.errors.seen(directions, parameters)
+        error_directions = self.errors.extend_directions(directions, parameters)
         values = np.array(self.errors.sampled(self.command, times, error_directions))
         resting = self.resting
         if resting is None:
@@ -83,8 +83,10 @@ class VaryingMeasurable:
             )
         else:
             bound, through = _drop_zero_coordinates(self.bound)
-        ends, felt = self.response.grid.breakpoints[[0, -1]], np.ones(self.response.system.states)
-        execution = VaryingExecution(self.response, ends, shares, felt, disturbing=True, bound=bound, through=through)
+        ends, error_mask = self.response.grid.breakpoints[[0, -1]], np.ones(self.response.system.states)
+        execution = VaryingExecution(
+            self.response, ends, shares, error_mask, disturbing=True, bound=bound, through=through
+        )
         return followed(execution)
 
     @property
@@ -115,7 +117,7 @@ class VaryingMeasurable:
 
     def integrated_sizes(self, times: Array, directions: Array, parameters: Array) -> Array:
         """Return the sum ``(k,)`` of the integrals of absolute values that enter ``sigma`` at each time."""
-        error_directions = self.errors.seen(directions, parameters)
+        error_directions = self.errors.extend_directions(directions, parameters)
         return np.asarray(self.errors.around.lengths(times, error_directions).sum(axis=1))
 
 

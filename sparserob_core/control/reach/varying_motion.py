@@ -38,7 +38,7 @@ from sparserob_core.errors import NotEnclosable
 from sparserob_core.sip.convex_set import Array, ConvexSet
 
 KNOWN = TaylorSpace(0, 0)
-GROWN, MOST_GROWN = 8, 32
+FEWEST_TERMS, MOST_TERMS = 8, 32
 """Terms of an exponential of bounds, at least and at most. With half of them third derivatives count twice."""
 TAIL = 2.0**-60
 """Share of a norm that the terms beyond may be. They are bounded in the norm of all coefficients of a cell. With a
@@ -53,8 +53,8 @@ RATIOS = (1.0, 2.0, 4.0, 8.0, 16.0)
 error bound of a coefficient of high degree would be that of the constant one. Then the truncation error could never
 fall below rounding times the growth."""
 PATHS_KEPT = 4  # controls whose states are remembered
-WAYS_KEPT = 4  # sets of times whose flows are remembered: those of cells, and of their beginnings, of two constraints
-STRETCHES = 256  # of pieces, whose carries count at their largest; a tenth mixes parts of an orbit, ten times are 1 GB
+FLOWS_KEPT = 4  # sets of times whose flows are remembered: those of cells, and of their beginnings, of two constraints
+STRETCHES = 256  # of pieces, whose bounds count at their largest; a tenth mixes parts of an orbit, ten times are 1 GB
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,7 +114,7 @@ class VaryingMotion:
 
     @property
     def terms(self) -> int:
-        """Number of terms that are added up in an entry of `bends` times a state."""
+        """Number of terms that are added up in an entry of `compute_curvature_matrices` times a state."""
         return 2 * int(self.expansion.coefficients.shape[1]) + 4 * self.states
 
     @cached_property
@@ -152,10 +152,10 @@ class VaryingMotion:
     def _paths(self) -> dict[bytes, Array]:
         return {}
 
-    def moved(self, within: Array, pieces: np.ndarray, begun: Array, inputs: Array) -> Array:
-        """`Motion.moved`."""
+    def propagate(self, within: Array, pieces: np.ndarray, start_states: Array, inputs: Array) -> Array:
+        """`Motion.propagate`."""
         flow = self.over(within, pieces)
-        states = np.einsum("kij,kj->ki", flow.state, begun[:, 0]) + np.einsum("kim,km->ki", flow.control, inputs)
+        states = np.einsum("kij,kj->ki", flow.state, start_states[:, 0]) + np.einsum("kim,km->ki", flow.control, inputs)
         return np.asarray(states[:, None])
 
     def over(self, within: Array, pieces: np.ndarray) -> Flow:
@@ -167,7 +167,7 @@ class VaryingMotion:
         key = within.tobytes() + pieces.tobytes()
         if key not in self._flows:
             start = self.grid.breakpoints[pieces]
-            remember(self._flows, key, self.expansion.flow(start, start + within), WAYS_KEPT)
+            remember(self._flows, key, self.expansion.flow(start, start + within), FLOWS_KEPT)
         return self._flows[key]
 
     @cached_property
@@ -178,9 +178,11 @@ class VaryingMotion:
         self, rows: Array, start: Array, width: Array, pieces: np.ndarray, states: Array, inputs: Array
     ) -> Array:
         """`Motion.deviation`."""
-        return self.bent(rows, start, width, pieces, states[:, 0, :, None], inputs[:, :, None], np.ones(1))
+        return self.bound_chord_errors(
+            rows, start, width, pieces, states[:, 0, :, None], inputs[:, :, None], np.ones(1)
+        )
 
-    def bent(
+    def bound_chord_errors(
         self,
         rows: Array,
         start: Array,
@@ -213,10 +215,10 @@ class VaryingMotion:
             The bounds ``(k, r)``.
         """
         d, last = self.states, self.states + inputs.shape[1]
-        matrices = self.bends(start, pieces)[:, :, :last]
+        matrices = self.compute_curvature_matrices(start, pieces)[:, :, :last]
         curvatures = matrices[:, :, :d] @ states + matrices[:, :, d:] @ inputs
         start_sizes, input_sizes = np.abs(states) @ sizes, np.abs(inputs) @ sizes
-        law_bounds, third = self.most[pieces], self.third[pieces]
+        law_bounds, third = self.law_bounds[pieces], self.third[pieces]
         driven_sizes = start_sizes + width[:, None] * np.einsum("kim,km->ki", law_bounds[:, :, d:last], input_sizes)
         change = np.einsum("kij,kj->ki", third[:, :, :d], self.grown(pieces, width, driven_sizes))
         change = change + np.einsum("kim,km->ki", third[:, :, d:last], input_sizes)
@@ -231,8 +233,8 @@ class VaryingMotion:
         return np.asarray(product(rows, error_bounds.T) + product(others, sizes.T))
 
     def under(self, control: Array) -> tuple[Array, Array]:
-        """Return bounds of the error of the states under a control on every piece, as `left_out` counts it, and bounds
-        of the states, ``(K, d)`` each.
+        """Return bounds of the error of the states under a control on every piece, as `bound_state_errors` counts it,
+        and bounds of the states, ``(K, d)`` each.
 
         The result is remembered, since it is the same for all rows.
         """
@@ -240,8 +242,8 @@ class VaryingMotion:
         if key not in self._control_bounds:
             input_sizes, start_sizes = np.abs(self.grid.inputs(control)), np.abs(self.nodes(control)[:-1, 0])
             m = input_sizes.shape[0]
-            error_bounds = self.left_out(start_sizes, self.flow.sizes[:, :, :m] * input_sizes.T[:, None])
-            forcing = np.einsum("kim,mk->ki", self.most[:, :, self._slice_inputs(m)], input_sizes)
+            error_bounds = self.bound_state_errors(start_sizes, self.flow.sizes[:, :, :m] * input_sizes.T[:, None])
+            forcing = np.einsum("kim,mk->ki", self.law_bounds[:, :, self._slice_inputs(m)], input_sizes)
             driven_sizes = start_sizes + self.grid.lengths[:, None] * forcing
             bounds = error_bounds, self.grown(self.every, self.grid.lengths, driven_sizes)
             remember(self._control_bounds, key, bounds, PATHS_KEPT)
@@ -251,7 +253,7 @@ class VaryingMotion:
     def _control_bounds(self) -> dict[bytes, tuple[Array, Array]]:
         return {}
 
-    def left_out(self, sizes: Array, pushed: Array) -> Array:
+    def bound_state_errors(self, sizes: Array, forcing: Array) -> Array:
         """Return bounds of the error of states on every piece, entry by entry, ``(K, d)``.
 
         The error counts twice, since both a chord and the state itself are looked at. Its effect on the second and on
@@ -261,7 +263,7 @@ class VaryingMotion:
         ----------
         sizes : Array
             Bounds ``(K, d)`` of the states at the beginning of every piece.
-        pushed : Array
+        forcing : Array
             Bounds ``(K, d, ...)`` of the inputs to the states that are coupled with each state, in the norm of their
             units.
 
@@ -271,7 +273,7 @@ class VaryingMotion:
             Bounds ``(K, d)``.
         """
         state_errors, lengths, d = (
-            self._propagate_step_errors(sizes, pushed.sum(axis=2)),
+            self._propagate_step_errors(sizes, forcing.sum(axis=2)),
             self.grid.lengths[:, None],
             self.states,
         )
@@ -279,7 +281,7 @@ class VaryingMotion:
         third = np.einsum("kij,kj->ki", self.third[:, :, :d], self.grown(self.every, lengths[:, 0], state_errors))
         return np.asarray((2.0 * state_errors + lengths**2 / 8 * (second + lengths * third)) * OUTWARD)
 
-    def _propagate_step_errors(self, sizes: Array, pushed: Array) -> Array:
+    def _propagate_step_errors(self, sizes: Array, forcing: Array) -> Array:
         """Return bounds ``(K, d)`` of the propagated error of all steps, on every piece.
 
         Every step has an error in proportion to the states at its beginning, and to their inputs, of all states that
@@ -289,14 +291,14 @@ class VaryingMotion:
         units, step_errors = self._step_errors
         start_norms = self.expansion.over_parts((sizes / units)[:, :, None])[:, :, 0]
         # not 0, which times no bound is no number
-        local_errors = np.maximum(step_errors[:, None] * (start_norms + pushed), TINY)
+        local_errors = np.maximum(step_errors[:, None] * (start_norms + forcing), TINY)
         stretch, first = self._stretches
         sums_within, stretch_totals = np.empty_like(local_errors), np.add.reduceat(local_errors, first, axis=0)
         for begin, end in zip(first, [*first[1:], len(local_errors)], strict=True):
             sums_within[begin:end] = np.cumsum(local_errors[begin:end], axis=0)
         propagated, is_earlier = np.zeros_like(local_errors), np.arange(first.size) < stretch[:-1, None]
-        propagated[1:] = np.einsum("kb,kbi,bi->ki", is_earlier, self.carries[1:-1], stretch_totals)
-        propagated[1:] += self.carries[np.arange(1, len(local_errors)), stretch[:-1]] * sums_within[:-1]
+        propagated[1:] = np.einsum("kb,kbi,bi->ki", is_earlier, self.transition_bounds[1:-1], stretch_totals)
+        propagated[1:] += self.transition_bounds[np.arange(1, len(local_errors)), stretch[:-1]] * sums_within[:-1]
         return np.asarray((self.grown(self.every, self.grid.lengths, propagated) + units * local_errors) * OUTWARD)
 
     @cached_property
@@ -322,7 +324,7 @@ class VaryingMotion:
         return stretch, np.unique(stretch, return_index=True)[1]
 
     @cached_property
-    def carries(self) -> Array:
+    def transition_bounds(self) -> Array:
         """Bounds ``(K + 1, stretches, d)`` of the effect on every mark of a step with error 1 in an earlier stretch,
         state by state.
 
@@ -365,7 +367,7 @@ class VaryingMotion:
 
         The bounds are from the exponential of the largest entries of ``A`` on the piece.
         """
-        matrix_bounds, pace = self.most[pieces][:, :, : self.states], self.paces[pieces] * width
+        matrix_bounds, pace = self.law_bounds[pieces][:, :, : self.states], self.paces[pieces] * width
         units = self.expansion.units * self.expansion.ratios[self._segments[pieces]]
         total, term, count = sizes.astype(float), sizes.astype(float), _count_terms(float(pace.max(initial=0.0)))
         for n in range(1, count):
@@ -380,7 +382,7 @@ class VaryingMotion:
         """The mark at or before each time."""
         return np.maximum(np.searchsorted(self.grid.breakpoints, times, side="right") - 1, 0)
 
-    def bends(self, times: Array, pieces: np.ndarray) -> Array:
+    def compute_curvature_matrices(self, times: Array, pieces: np.ndarray) -> Array:
         """``[Q R]`` at times on pieces, ``(k, d, d + m + mw)``."""
         law, slope = self.law(times, pieces)
         return np.asarray(slope + law[:, :, : self.states] @ law)
@@ -435,7 +437,7 @@ class VaryingMotion:
         return law_bounds * OUTWARD, second * OUTWARD, third * OUTWARD, pace * OUTWARD
 
     @cached_property
-    def most(self) -> Array:
+    def law_bounds(self) -> Array:
         """Bounds ``(K, d, d + m + mw)`` of the absolute values of ``[A F]`` on every piece."""
         return np.asarray(self._segment_bounds[0][self._segments])
 
@@ -478,9 +480,9 @@ class VaryingMotion:
 
 
 def _count_terms(pace: float) -> int:
-    """Return the number of terms of ``e^pace`` whose tail is at most `TAIL`, within `GROWN` and `MOST_GROWN`."""
-    count, pace = GROWN, min(pace, float(MOST_GROWN))
-    while count < MOST_GROWN and pace**count > TAIL * factorial(count):
+    """Return the number of terms of ``e^pace`` whose tail is at most `TAIL`, within `FEWEST_TERMS` and `MOST_TERMS`."""
+    count, pace = FEWEST_TERMS, min(pace, float(MOST_TERMS))
+    while count < MOST_TERMS and pace**count > TAIL * factorial(count):
         count += 2
     return count
 
@@ -492,7 +494,7 @@ class VaryingSupport:
 
     ``effect (K + 1, d, P, w)`` is the effect of its ``P`` components on the state until every mark. ``blocks`` takes
     weights ``(..., P, w)`` on the components to weights ``(..., nb, q)`` on the blocks, each of which is in ``set``.
-    ``far (w,)`` bounds the entries of a component. ``lasts``: the components act one after another, each on its piece
+    ``radii (w,)`` bounds the entries of a component. ``lasts``: the components act one after another, each on its piece
     of the propagator's grid, through ``E``.
     """
 
@@ -500,7 +502,7 @@ class VaryingSupport:
     set: ConvexSet
     effect: Array
     blocks: Callable[[Array], Array]
-    far: Array
+    radii: Array
     lasts: bool
     rows: Array
     combination: Combination | None = None
@@ -543,18 +545,18 @@ class VaryingSupport:
         """`Support.deviation`: as `VaryingMotion.deviation`, for every block."""
         motion, d = self.motion, self.motion.states
         pieces = np.minimum(motion.place(start), motion.origin.size - 1)
-        matrices = motion.bends(start, pieces)
+        matrices = motion.compute_curvature_matrices(start, pieces)
         curvatures = self.weights(start, self.rows @ matrices[:, :, :d])
         third = motion.third[pieces]
-        change = np.einsum("kij,kj->ki", third[:, :, :d], self.reached[pieces])
+        change = np.einsum("kij,kj->ki", third[:, :, :d], self.effect_bounds[pieces])
         if self.lasts:
-            columns = slice(matrices.shape[2] - self.far.size, None)
+            columns = slice(matrices.shape[2] - self.radii.size, None)
             curvatures[np.arange(start.size), :, motion.origin[pieces]] += self.rows @ matrices[:, :, columns]
-            change = change + third[:, :, columns] @ self.far
+            change = change + third[:, :, columns] @ self.radii
         exact = self.set.reach(self.blocks(curvatures)).sum(axis=2)
         change = widths[:, None] * change
         change = change + rounding(motion.terms + curvatures[0, 0].size) * np.einsum(
-            "kij,kj->ki", motion.second[pieces][:, :, :d], self.reached[pieces]
+            "kij,kj->ki", motion.second[pieces][:, :, :d], self.effect_bounds[pieces]
         )
         row_curvature = exact + change @ np.abs(self.rows).T
         return np.asarray((widths**2 / 8)[:, None] * row_curvature * OUTWARD)
@@ -566,23 +568,23 @@ class VaryingSupport:
         motion, sizes = self.motion, self.sizes
         forcing = np.zeros((sizes.shape[0] - 1, 1, 1))
         if self.lasts:
-            forcing = motion.flow.sizes[..., -self.far.size :] * self.far
-        total = motion.left_out(sizes[:-1], forcing) + rounding(self.effect[0, 0].size) * self.reached
+            forcing = motion.flow.sizes[..., -self.radii.size :] * self.radii
+        total = motion.bound_state_errors(sizes[:-1], forcing) + rounding(self.effect[0, 0].size) * self.effect_bounds
         return product(np.abs(self.rows), total.T)
 
     @cached_property
-    def reached(self) -> Array:
+    def effect_bounds(self) -> Array:
         """Bounds ``(K, d)`` of the effect of this part of the uncertainty on every state on every piece."""
         motion, sizes = self.motion, self.sizes[:-1]
         lengths = motion.grid.lengths
         if self.lasts:
-            sizes = sizes + lengths[:, None] * (motion.most[:, :, -self.far.size :] @ self.far)
+            sizes = sizes + lengths[:, None] * (motion.law_bounds[:, :, -self.radii.size :] @ self.radii)
         return motion.grown(motion.every, lengths, sizes)
 
     @cached_property
     def sizes(self) -> Array:
         """Bounds ``(K + 1, d)`` of the effect of this part of the uncertainty on every state at the marks."""
-        return np.asarray(np.einsum("kdpw,w->kd", np.abs(self.effect), self.far) * OUTWARD)
+        return np.asarray(np.einsum("kdpw,w->kd", np.abs(self.effect), self.radii) * OUTWARD)
 
     @property
     def _space(self) -> TaylorSpace:
@@ -643,21 +645,21 @@ class Truncation:
         """Return bounds ``(K, D + 1)`` of the rates at which inputs of at most ``inputs (K, m + mw)`` drive the
         coefficients of every degree."""
         d = self.motion.states
-        rates = np.einsum("kin,kn->ki", self.motion.most[:, :, d:], inputs)
+        rates = np.einsum("kin,kn->ki", self.motion.law_bounds[:, :, d:], inputs)
         return self.norms(rates)
 
     @cached_property
     def _coefficient_norms(self) -> Array:
         """Bounds ``(K, M)`` of the norms of the coefficients of ``A`` on every piece."""
         d, space = self.spread.d, self.spread.space
-        first = self.motion.most[:, :, :d].reshape(-1, space.size, d, d) / self.units[:, None] * self.units
+        first = self.motion.law_bounds[:, :, :d].reshape(-1, space.size, d, d) / self.units[:, None] * self.units
         return np.asarray(first.sum(axis=3).max(axis=2))
 
     @property
     def influence(self) -> Array:
         """Size of the change of the law with every parameter, over the horizon, ``(nu,)``."""
         d, space, lengths = self.motion.states, self.spread.space, self.motion.grid.lengths
-        inputs = self.motion.most[:, :, d:].reshape(lengths.size, space.size, self.spread.d, -1)
+        inputs = self.motion.law_bounds[:, :, d:].reshape(lengths.size, space.size, self.spread.d, -1)
         input_norms = (inputs / self.units[:, None]).max(axis=(2, 3), initial=0.0)
         return np.asarray(lengths @ (self._coefficient_norms + input_norms) @ space.exponents)
 
@@ -679,7 +681,7 @@ class Truncation:
         the rate at which that of ``[B E]`` drives states per unit of each input, ``(K, m + mw)``."""
         d, K = self.spread.d, self.motion.grid.pieces
         if self.spread.remainder is None:
-            return np.zeros(K), np.zeros((K, self.motion.most.shape[2] - self.motion.states))
+            return np.zeros(K), np.zeros((K, self.motion.law_bounds.shape[2] - self.motion.states))
         sizes = self.spread.remainder.over(self.motion.grid.breakpoints) / self.units[:, None]
         return (sizes[:, :, :d] * self.units).sum(axis=2).max(axis=1) * OUTWARD, sizes[:, :, d:].max(axis=1) * OUTWARD
 
@@ -707,14 +709,14 @@ class Truncation:
         above = np.concatenate([np.zeros((sums.shape[0], 1)), sums[:, :-1]], axis=1)
         return np.asarray((above + self._law_remainders[0][:, None]) * OUTWARD)
 
-    def _integrate_truncation(self, begun: Array, driven: Array, off: Array) -> Array:
+    def _integrate_truncation(self, start_norms: Array, driven: Array, off: Array) -> Array:
         """Return bounds ``(K,)`` of the integral of the terms beyond the degree over every piece.
 
-        ``begun (K, D + 1)`` bounds the norms of the states at the beginning of the piece, ``driven (K, D + 1)`` the
-        rates of their inputs, and ``off (K,)`` the rate from the remainder of the entries ``[B E]``.
+        ``start_norms (K, D + 1)`` bounds the norms of the states at the beginning of the piece, ``driven (K, D + 1)``
+        the rates of their inputs, and ``off (K,)`` the rate from the remainder of the entries ``[B E]``.
         """
         lengths = self.motion.grid.lengths[:, None]
-        state_norms = np.einsum("kij,kj->ki", self._growth_bounds, begun + lengths * driven)
+        state_norms = np.einsum("kij,kj->ki", self._growth_bounds, start_norms + lengths * driven)
         return np.asarray(((state_norms * self._truncation_factors).sum(axis=1) + off) * lengths[:, 0] * OUTWARD)
 
     @cached_property
@@ -723,8 +725,8 @@ class Truncation:
         to each one.
 
         The bounds are those of the computed effect of the constant coefficient on all coefficients, plus the error of
-        the steps, propagated as in `VaryingMotion.carries`. The error is bounded in each of several norms, in which a
-        degree ``j`` counts ``ratio^j``, so that the error of that degree is the bound divided by ``ratio^j``.
+        the steps, propagated as in `VaryingMotion.transition_bounds`. The error is bounded in each of several norms, in
+        which a degree ``j`` counts ``ratio^j``, so that the error of that degree is the bound divided by ``ratio^j``.
         """
         motion, space, d = self.motion, self.spread.space, self.spread.d
         marks = motion.grid.breakpoints
@@ -753,7 +755,7 @@ class Truncation:
         largest = float(self._transition_norms.sum(axis=1).max())
         return piece_growth * piece_growth * largest / (1.0 - share) * OUTWARD if share < 0.5 else np.inf
 
-    def lost(self, sizes: Array, inputs: Array) -> Array:
+    def bound_error(self, sizes: Array, inputs: Array) -> Array:
         """Return bounds ``(K, d)`` of the truncation error of states, state by state.
 
         Parameters
@@ -777,10 +779,10 @@ class Truncation:
         key = control.tobytes()
         if key not in self._control_bounds:
             motion, inputs = self.motion, np.abs(self.motion.grid.inputs(control)).T
-            all_inputs = np.zeros((len(inputs), motion.most.shape[2] - motion.states))
+            all_inputs = np.zeros((len(inputs), motion.law_bounds.shape[2] - motion.states))
             all_inputs[:, : inputs.shape[1]] = inputs
             start_sizes = np.abs(motion.nodes(control)[:-1, 0]) + motion.under(control)[0]
-            remember(self._control_bounds, key, self.lost(start_sizes, all_inputs), PATHS_KEPT)
+            remember(self._control_bounds, key, self.bound_error(start_sizes, all_inputs), PATHS_KEPT)
         return self._control_bounds[key]
 
     @cached_property
@@ -863,10 +865,10 @@ class SpreadMotion:
         """`Motion.nodes`."""
         return self._separate_coefficients(self.motion.nodes(control)[:, 0])
 
-    def moved(self, within: Array, pieces: np.ndarray, begun: Array, inputs: Array) -> Array:
-        """`Motion.moved`."""
+    def propagate(self, within: Array, pieces: np.ndarray, start_states: Array, inputs: Array) -> Array:
+        """`Motion.propagate`."""
         return self._separate_coefficients(
-            self.motion.moved(within, pieces, begun.reshape(len(begun), 1, -1), inputs)[:, 0]
+            self.motion.propagate(within, pieces, start_states.reshape(len(start_states), 1, -1), inputs)[:, 0]
         )
 
     def deviation(
@@ -955,20 +957,23 @@ class SpreadSupport:
         """Bounds ``(r, K)`` of `Support.neglected`, with the truncation error beyond the degree."""
         motion, start_sizes = self.motion, self.every.sizes[:-1]
         inputs, forcing = (
-            np.zeros((len(start_sizes), motion.motion.most.shape[2] - motion.motion.states)),
+            np.zeros((len(start_sizes), motion.motion.law_bounds.shape[2] - motion.motion.states)),
             np.zeros((len(start_sizes), 1, 1)),
         )
         if self.every.lasts:
-            inputs[:, -self.every.far.size :] = self.every.far
-            forcing = motion.motion.flow.sizes[..., -self.every.far.size :] * self.every.far
-        truncation = motion.truncation.lost(start_sizes + motion.motion.left_out(start_sizes, forcing), inputs)
+            inputs[:, -self.every.radii.size :] = self.every.radii
+            forcing = motion.motion.flow.sizes[..., -self.every.radii.size :] * self.every.radii
+        truncation = motion.truncation.bound_error(
+            start_sizes + motion.motion.bound_state_errors(start_sizes, forcing), inputs
+        )
         remainders = self.every.neglected.reshape(len(self.rows), self.motion.space.size, -1).sum(axis=1)
         return np.asarray((remainders + np.abs(self.rows) @ truncation.T) * OUTWARD)
 
     @cached_property
-    def reached(self) -> Array:
-        """Bounds ``(K, d)`` of `Support.reached`, times ``1 + M``, as the sums over ``M`` coefficients round more."""
-        return (1.0 + self.motion.space.size) * self.motion.folded(self.every.reached)
+    def effect_bounds(self) -> Array:
+        """Bounds ``(K, d)`` of `Support.effect_bounds`, times ``1 + M``, as the sums over ``M`` coefficients round
+        more."""
+        return (1.0 + self.motion.space.size) * self.motion.folded(self.every.effect_bounds)
 
     @property
     def _space(self) -> TaylorSpace:

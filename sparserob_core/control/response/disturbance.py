@@ -33,8 +33,8 @@ class DisturbanceModel:
     (N, L)`` on the grid pieces: one block of ``mw N`` coefficients, channel-major, or one block of ``N`` coefficients
     for each channel, times its ``scale (mw,)``.
 
-    ``lasting``: components whose value is held over several blocks, and for each of their own pieces the number of its
-    first block, ``(g,)``. The weights on all of these blocks are added to the first, which has their value.
+    ``held_components``: components whose value is held over several blocks, and for each of their own pieces the number
+    of its first block, ``(g,)``. The weights on all of these blocks are added to the first, which has their value.
     ``classes``: the classes of the parts of ``bound``, for a disturbance of ``several`` classes. The blocks are then
     those of disturbances that are all constant on pieces, which are admissible.
     """
@@ -47,7 +47,7 @@ class DisturbanceModel:
     functions: Array | None = None
     scale: Array | None = None
     classes: Classes = ()
-    lasting: tuple[tuple[slice, np.ndarray], ...] = ()
+    held_components: tuple[tuple[slice, np.ndarray], ...] = ()
 
     @cached_property
     def on_blocks(self) -> DisturbanceModel | None:
@@ -88,7 +88,7 @@ class DisturbanceModel:
     @property
     def by_piece(self) -> bool:
         """True where each block is one piece of the grid, and no component is held over several of them."""
-        return self.starts is not None and self.starts.size == self.grid.pieces and not self.lasting
+        return self.starts is not None and self.starts.size == self.grid.pieces and not self.held_components
 
     @shaped
     def blocks(self, weights: Float[Array, "*k L mw"]) -> Float[Array, "*k nb q"]:
@@ -107,10 +107,10 @@ class DisturbanceModel:
     def _gather_weights(self, blocks: Array) -> Array:
         """Return the weights on every block, ``(..., nb, mw)``. Weights on components that are held over several blocks
         are added to the first of these."""
-        if not self.lasting:
+        if not self.held_components:
             return blocks
         gathered = blocks.copy()
-        for columns, first in self.lasting:
+        for columns, first in self.held_components:
             gathered[..., columns] = 0.0
             gathered[..., first, columns] = np.add.reduceat(blocks[..., columns], first, axis=-2)
         return gathered
@@ -119,10 +119,10 @@ class DisturbanceModel:
     def support(self, weights: Float[Array, "*k L mw"]) -> Float[Array, " *k"]:
         """Return the support value ``sigma (...,)``: the largest value of the functional over the admissible
         disturbances."""
-        return self.pushed(self.blocks(weights))
+        return self.support_from_blocks(self.blocks(weights))
 
     @shaped
-    def pushed(self, blocks: Float[Array, "*k nb q"]) -> Float[Array, " *k"]:
+    def support_from_blocks(self, blocks: Float[Array, "*k nb q"]) -> Float[Array, " *k"]:
         """Return the support value of a functional with weights on every block, ``(..., nb, q)``."""
         if self._radii is None:
             answer: Array = self.set.support(blocks).sum(axis=-1)
@@ -158,7 +158,7 @@ class DisturbanceModel:
         if self.starts is not None:
             block_of_piece = np.searchsorted(self.starts, np.arange(self.grid.pieces), side="right") - 1
             values = points[..., block_of_piece, :]
-            for columns, first in self.lasting:
+            for columns, first in self.held_components:
                 first_blocks = first[np.searchsorted(first, block_of_piece, side="right") - 1]
                 values[..., columns] = points[..., first_blocks, columns]
             return np.swapaxes(values, -1, -2)
@@ -208,8 +208,8 @@ def disturbance_model(
         plain = DisturbanceModel("piecewise_constant", bound, bound, grid, starts=starts)
         if breakpoints is None:
             return plain
-        lasting = _find_held_components(bound, breakpoints, _compute_middles(grid)[starts])
-        return replace(plain, set=product(bound.factors), lasting=lasting)
+        held_components = _find_held_components(bound, breakpoints, _compute_middles(grid)[starts])
+        return replace(plain, set=product(bound.factors), held_components=held_components)
     flat = bound.halfspaces()
     if flat is None:
         raise InputError(
@@ -226,7 +226,8 @@ def disturbance_model(
 def _find_held_components(
     bound: ConvexSet, breakpoints: Breakpoints, middles: Array
 ) -> tuple[tuple[slice, np.ndarray], ...]:
-    """Return the field ``lasting`` of a `DisturbanceModel` for blocks that contain these ``middles``, one time each."""
+    """Return the field ``held_components`` of a `DisturbanceModel` for blocks that contain these ``middles``, one time
+    each."""
     held_components, column = list[tuple[slice, np.ndarray]](), 0
     for factor, times in zip(bound.factors, breakpoints, strict=True):
         columns = slice(column, column + factor.dimension)

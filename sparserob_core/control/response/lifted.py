@@ -68,14 +68,14 @@ class Past:
 
     ``lifted``: the lifted system of the phase before. ``turn (d, d)``: the matrix from its coordinates to the new ones,
     with an error of at most ``slip (d, d)`` entry by entry. ``starts (q,)``: the indices at which the blocks of the new
-    coordinates begin. ``carried``: remembered effects of the disturbance on the state.
+    coordinates begin. ``effects``: remembered effects of the disturbance on the state.
     """
 
     lifted: LiftedSystem
     turn: Array
     slip: Array
     starts: np.ndarray
-    carried: dict[int, object] = field(default_factory=dict, repr=False)
+    effects: dict[int, object] = field(default_factory=dict, repr=False)
 
     @cached_property
     def blocks(self) -> Array:
@@ -258,11 +258,11 @@ class LiftedSystem:
         path = self._compute_path(control)
         return path if self.fine is self.grid else path[self.ends]
 
-    def moved(self, within: Array, pieces: np.ndarray, begun: Array, inputs: Array) -> Array:
+    def propagate(self, within: Array, pieces: np.ndarray, start_states: Array, inputs: Array) -> Array:
         """Return the coefficients ``(k, M, d)`` at times ``within (k,)`` the ``pieces (k,)``, from those at their
-        beginning, ``begun (k, M, d)``, under ``inputs (k, m)``. Short steps use the exponential series, long ones
-        matrix exponentials."""
-        start = begun.reshape(within.size, -1)
+        beginning, ``start_states (k, M, d)``, under ``inputs (k, m)``. Short steps use the exponential series, long
+        ones matrix exponentials."""
+        start = start_states.reshape(within.size, -1)
         size = self.norm * float(within.max(initial=0.0))
         if size < LONG_STEP:
             coefficients = self._propagate_by_series(
@@ -357,8 +357,8 @@ class LiftedSystem:
         ``rows (r, q)`` are the weights of the remainder of the Taylor models of the state, rounding included, and
         ``others (r, q)`` those of the models themselves, summed over their coefficients.
         """
-        left_out, sizes, _ = self._get_remainder_bounds(control)
-        answer: Array = product(rows, left_out.T) + product(others, sizes.T)
+        remainders, sizes, _ = self._get_remainder_bounds(control)
+        answer: Array = product(rows, remainders.T) + product(others, sizes.T)
         return answer[:, self.span] if self.spans.size < self.fine.pieces else answer
 
     def _get_remainder_bounds(self, control: Array) -> tuple[Array, Array, Array]:
@@ -395,8 +395,8 @@ class LiftedSystem:
         residual = self._bound_residual(sizes, rows=False) + drive
         neglected, bounds, _ = self._bound_error(begin, forcing_norms, residual, slack, rows=False)
         first = self.ends[:-1]
-        left_out: Array = np.maximum.reduceat(neglected[0], first, axis=0)
-        return left_out, np.maximum.reduceat(sizes[0].sum(axis=1), first, axis=0), bounds[0, -1]
+        remainders: Array = np.maximum.reduceat(neglected[0], first, axis=0)
+        return remainders, np.maximum.reduceat(sizes[0].sum(axis=1), first, axis=0), bounds[0, -1]
 
     def _sum_jumps(self, control: Array, size: Array) -> Array:
         """Return norm bounds ``(S, q)`` of the sum of the jumps of the forcing of each block within each span."""
@@ -448,7 +448,7 @@ class LiftedSystem:
             neglected, _, size_bounds = self._bound_error(begin, zeros, zeros[None], start, rows=True, by_age=by_age)
             if by_age:
                 propagator = self.backward.propagator
-                neglected = neglected + propagator.lateness[0] / float(propagator.lengths[0]) * size_bounds
+                neglected = neglected + propagator.duration_errors[0] / float(propagator.lengths[0]) * size_bounds
             return size_bounds[:, :, None], neglected
         sizes = self._bound_sizes(nodes, np.zeros(1), rows=True)
         return sizes, self._bound_error(begin, zeros, self._bound_residual(sizes, rows=True), start, rows=True)[0]
@@ -568,7 +568,7 @@ class LiftedSystem:
             )
             end_rounding, inner_rounding = (
                 relative + delay * speed
-                for delay in (self._backward_fine if rows else self.forward).propagator.lateness
+                for delay in (self._backward_fine if rows else self.forward).propagator.duration_errors
             )
             # the state at the end of a piece is the one that the next begins with
             inner_rounding = np.maximum(end_rounding, inner_rounding)
@@ -600,7 +600,7 @@ class LiftedSystem:
         """
         longest, count = np.maximum.reduceat(self.fine.lengths, self.spans), int(self._piece_counts.max())
         propagator = (self._backward_fine if rows else self.forward).propagator
-        piece_delay, inner_delay = propagator.lateness
+        piece_delay, inner_delay = propagator.duration_errors
         if by_age:  # a row and a column go through one transition for every bit of the age
             share = (self.fine.pieces.bit_length() + 4) * self._bound_transition_rounding(self.fine.breakpoints[-1:])
             delay = 2.0 * propagator.drift + inner_delay
@@ -613,7 +613,7 @@ class LiftedSystem:
             delay = 2.0 * propagator.drift + inner_delay
         if rows:  # the ends of the spans are computed by transitions of their own
             share = share + 2.0 * self._bound_transition_rounding(self._span_durations)
-            delay = delay + 2.0 * self._backward_spans.propagator.lateness[0]
+            delay = delay + 2.0 * self._backward_spans.propagator.duration_errors[0]
         sizes = self.comparison.sizes.T if rows else self.comparison.sizes
         first_order = product(peak.matrices, share.max() * np.eye(sizes.shape[0]) + delay * sizes)
         is_small = (product(first_order, peak.matrices) <= 0.5 * peak.matrices).all()
@@ -645,10 +645,10 @@ class LiftedSystem:
         terms = terms * int(np.bincount(self.space.products[2]).max()) + max(self.B.shape[2], self.W.shape[2])
         return np.asarray(relative + rounding(terms))
 
-    def _bound_speed(self, reached: Array, driven: Array, rows: bool) -> Array:
-        """Return an upper bound of the speed of a quantity of the sizes ``reached (r, S, q)`` under the forcing
+    def _bound_speed(self, sizes: Array, driven: Array, rows: bool) -> Array:
+        """Return an upper bound of the speed of a quantity of ``sizes (r, S, q)`` under the forcing
         ``driven``."""
-        return np.asarray(product(reached, self.comparison.sizes if rows else self.comparison.sizes.T) + driven)
+        return np.asarray(product(sizes, self.comparison.sizes if rows else self.comparison.sizes.T) + driven)
 
     def spilt(self, coefficients: Array) -> Array:
         """Return, for every monomial, a sum of norms ``(M, ...)``: of those ``coefficients (M, ...)`` of a factor whose

@@ -240,7 +240,7 @@ class PieceTransitions:
         return np.concatenate(list(by_mode), axis=-1)
 
     @cached_property
-    def pushed(self) -> Array:
+    def input_transitions(self) -> Array:
         """Matrices ``[Gamma (B, E), Phi] (v, q, d, m + mw + d)``, with which one product gives the weights of a row on
         the inputs and its transition."""
         return np.concatenate([self.Gamma @ self.inputs[:, self.modes], self.Phi], axis=-1)
@@ -288,11 +288,11 @@ class Impulses:
         first = self.propagator.steps(np.zeros((1, 0))).Gamma[0, 0] @ self.columns
         steps = np.empty((d, min(self.reach, self.propagator.grid.pieces) * c))
         steps[:, :c], filled = first, c
-        for leap in self.propagator.leaps:
+        for transition in self.propagator.transition_powers:
             if filled >= steps.shape[1]:
                 break
             batch = min(filled, steps.shape[1] - filled)
-            steps[:, filled : filled + batch] = leap @ steps[:, :batch]
+            steps[:, filled : filled + batch] = transition @ steps[:, :batch]
             filled += batch
         return steps
 
@@ -305,11 +305,11 @@ class Impulses:
         flat = rows.reshape(-1, rows.shape[-1])
         giants = np.empty((flat.shape[0], -(-count // self.reach), flat.shape[1]))
         giants[:, 0], filled = flat, 1
-        for leap in self.propagator.leaps[self.reach.bit_length() - 1 :]:
+        for transition in self.propagator.transition_powers[self.reach.bit_length() - 1 :]:
             if filled >= giants.shape[1]:
                 break
             batch = min(filled, giants.shape[1] - filled)
-            giants[:, filled : filled + batch] = giants[:, :batch] @ leap
+            giants[:, filled : filled + batch] = giants[:, :batch] @ transition
             filled += batch
         weights = (giants.reshape(-1, flat.shape[1]) @ self.steps).reshape(flat.shape[0], -1, c)
         return np.asarray(weights[:, :count].reshape(*leading_shape, count, c))
@@ -505,7 +505,7 @@ class Propagator:
         weights = np.zeros((times.size, self.grid.pieces, input_response.shape[2]))
         weights[np.arange(times.size), at] = (rows[:, None] @ input_response)[:, 0]
         rows = (rows[:, None] @ state)[:, 0]
-        self._propagate_by_recursion(steps.pushed, indices[order], at, rows, weights)
+        self._propagate_by_recursion(steps.input_transitions, indices[order], at, rows, weights)
         inverse_order = np.empty_like(order)
         inverse_order[order] = np.arange(order.size)
         channels = self.system.controls
@@ -629,7 +629,9 @@ class Propagator:
         weights = np.zeros((times.size, self.grid.pieces, last_weights.shape[1]))
         weights[np.arange(times.size), at] = last_weights
         if drives or self._has_dependence:
-            self._propagate_by_recursion(steps.driven if drives else steps.pushed, indices[order], at, rows, weights)
+            self._propagate_by_recursion(
+                steps.driven if drives else steps.input_transitions, indices[order], at, rows, weights
+            )
         else:
             self._stretches.on(at, rows, weights)
         inverse_order = np.empty_like(order)
@@ -752,12 +754,12 @@ class Propagator:
     def _propagate_whole_pieces(self, rows: Array, pieces: np.ndarray) -> Array:
         """Return ``rows (k, d)`` propagated over ``pieces (k,)`` whole pieces, ``(k, d)``."""
         free, common_pieces = rows.copy(), int(pieces[0]) if pieces.size and (pieces == pieces[0]).all() else None
-        for level, leap in enumerate(self.leaps[: int(pieces.max(initial=0)).bit_length()]):
+        for level, transition in enumerate(self.transition_powers[: int(pieces.max(initial=0)).bit_length()]):
             if common_pieces is None:
                 active = (pieces >> level & 1).nonzero()[0]
-                free[active] = free[active] @ leap
+                free[active] = free[active] @ transition
             elif common_pieces >> level & 1:
-                free = free @ leap
+                free = free @ transition
         return free
 
     @property
@@ -807,14 +809,14 @@ class Propagator:
         return flow, integral
 
     @cached_property
-    def leaps(self) -> Array:
+    def transition_powers(self) -> Array:
         """Transitions over 1, 2, 4, ... pieces, ``(q, d, d)``; for a known system and equal pieces."""
         return self.flows(2.0 ** np.arange(self.grid.pieces.bit_length()) * self.lengths[0])[0]
 
-    def leaps_of(self, steps: PieceTransitions, count: int) -> list[Array]:
+    def compute_transition_powers(self, steps: PieceTransitions, count: int) -> list[Array]:
         """Return the transposed transitions ``(v, d, d)`` over 1, 2, 4, ... equal pieces, ``count`` of them."""
         if self.system.parameters is None and steps.A.shape[:2] == (1, 1):
-            return [leap.T[None] for leap in self.leaps[:count]]
+            return [transition.T[None] for transition in self.transition_powers[:count]]
         durations = 2.0 ** np.arange(count) * self.lengths[0]
         flows = self._compute_transitions(steps.A, np.zeros(count, dtype=int), durations)[0]
         return [np.swapaxes(flows[:, level], 1, 2) for level in range(count)]
@@ -830,7 +832,7 @@ class Propagator:
         return self._state_impulses.of(np.eye(self.system.states), self.grid.pieces)
 
     @cached_property
-    def lateness(self) -> tuple[float, float]:
+    def duration_errors(self) -> tuple[float, float]:
         """Upper bounds of the errors of durations. The first is that of pieces, where nearly equal ones are taken as
         equal. The second is that of times within a piece, which are rounded (`TimeGrid.distinct`)."""
         length_error, elapsed = np.abs(self.grid.lengths - self.lengths[self.which]).max(), self.grid.elapsed
@@ -1077,7 +1079,7 @@ class Response:
         path[:, 0] = self.initial_state if deviations is None else self.initial_state + deviations
         shared, lengths = steps.Phi.shape[0] == 1, self.which.tolist()
 
-        def moved(matrices: Array, vectors: Array) -> Array:
+        def multiply(matrices: Array, vectors: Array) -> Array:
             return np.asarray(vectors @ matrices[0].T if shared else (matrices @ vectors[..., None])[..., 0])
 
         if self.uniform:
@@ -1087,14 +1089,14 @@ class Response:
                 return self._propagate_in_blocks(path, steps, block)
         else:
             for piece, length in enumerate(lengths):
-                path[:, piece + 1] = moved(steps.Gamma[:, length], drive[:, piece])
+                path[:, piece + 1] = multiply(steps.Gamma[:, length], drive[:, piece])
         if shared and self.uniform:
             Phi = steps.Phi[0, 0].T
             for piece in range(self.grid.pieces):
                 path[:, piece + 1] += path[:, piece] @ Phi
             return path
         for piece, length in enumerate(lengths):
-            path[:, piece + 1] += moved(steps.Phi[:, length], path[:, piece])
+            path[:, piece + 1] += multiply(steps.Phi[:, length], path[:, piece])
         return path
 
     def nodes(self, control: Array, parameters: Array) -> Array:
@@ -1118,7 +1120,7 @@ class Response:
         1990). No state goes through more products than `Propagator.products`, and rounding errors do not grow with the
         pieces of a block.
         """
-        leaps = self.propagator.leaps_of(steps, block.bit_length())
+        powers = self.propagator.compute_transition_powers(steps, block.bit_length())
         processed, v, d = 0, path.shape[0], path.shape[2]
         sizes = [block] + [block >> shift for shift in range(1, block.bit_length())]  # the last block may be shorter
         for size in sizes:
@@ -1129,25 +1131,25 @@ class Response:
             for level in range(levels):
                 step = 2**level
                 inside[:, :, 2 * step - 1 :: 2 * step] += _apply_transition(
-                    inside[:, :, step - 1 :: 2 * step], leaps[level]
+                    inside[:, :, step - 1 :: 2 * step], powers[level]
                 )
             starts = np.empty((v, count, 1, d))
             starts[:, 0, 0] = path[:, processed]
             for number in range(count):
-                inside[:, number, -1:] += starts[:, number] @ leaps[levels]
+                inside[:, number, -1:] += starts[:, number] @ powers[levels]
                 if number + 1 < count:
                     starts[:, number + 1] = inside[:, number, -1:]
             for level in range(levels - 1, -1, -1):
                 step = 2**level
                 before = np.concatenate([starts, inside[:, :, 2 * step - 1 :: 2 * step][:, :, :-1]], axis=2)
-                inside[:, :, step - 1 :: 2 * step] += _apply_transition(before, leaps[level])
+                inside[:, :, step - 1 :: 2 * step] += _apply_transition(before, powers[level])
             processed += count * size
         return path
 
 
-def _apply_transition(states: Array, leap: Array) -> Array:
+def _apply_transition(states: Array, transition: Array) -> Array:
     """Return ``(v, count, k, d)`` states, as rows, times the transposed transitions ``(v, d, d)``."""
-    return np.asarray(states.reshape(states.shape[0], -1, states.shape[3]) @ leap).reshape(states.shape)
+    return np.asarray(states.reshape(states.shape[0], -1, states.shape[3]) @ transition).reshape(states.shape)
 
 
 @shaped

@@ -323,7 +323,7 @@ def _bound_by_program(
     if disturbance is not None and problem.disturbance is not None:
         disturbance = within(problem.disturbance, disturbance.T).T
         if functionals.measurable is not None:  # whose worst signal is found to rounding, or less
-            support = float(functionals.offsets(*at)[0]) - functionals.parts(*of_state).begun
+            support = float(functionals.offsets(*at)[0]) - functionals.parts(*of_state).initial_support
             shortfall = max(0.0, support - pushed_by(functionals, *of_state, (changes, disturbance)))
     edges, middles = _divide_window(row)
     low = np.full(middles.size, -np.inf)

@@ -25,7 +25,7 @@ from sparserob_core.control.policies.policy import Charge, Policy
 from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.control.problem.units import Units, power_of_two
-from sparserob_core.control.reach.measurable import MISSED
+from sparserob_core.control.reach.measurable import SUPPORT_ERROR
 from sparserob_core.control.reach.sizes import widths
 from sparserob_core.control.transcription.own_units import added_up, constraint_sides, extent, fixed, units_of_steps
 from sparserob_core.control.transcription.program import EQUALS, ranges, transcribed
@@ -354,7 +354,7 @@ def _collect_deviations(posed: Posed, acting: MeasurablePieces | None, still: np
     problem, disturbance, periods = posed.problem, posed.functionals.disturbance, 1 + _has_next_initial_state(posed)
     if acting is not None:
         sets = (*acting.sets, *deviations_of(None, 0, problem.initial_set, periods=periods).sets)
-        return Spread(sets, MISSED, still)
+        return Spread(sets, SUPPORT_ERROR, still)
     blocks = 0 if disturbance is None else disturbance.block_count
     noise = None if problem.measurements is None else problem.measurements.noise
     spread = deviations_of(problem.disturbance, blocks, problem.initial_set, noise, posed.control.pieces, periods)

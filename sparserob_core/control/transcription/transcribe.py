@@ -173,9 +173,9 @@ def _build_functionals(
         from sparserob_core.control.reach.execution import Execution
         from sparserob_core.control.reach.varying_execution import VaryingExecution, followed
 
-        shares, felt = np.asarray(problem.execution), np.ones(problem.system.states)
-        felt[list(problem.commanded)] = 0.0
-        arguments = response, control.breakpoints, shares, felt
+        shares, error_mask = np.asarray(problem.execution), np.ones(problem.system.states)
+        error_mask[list(problem.commanded)] = 0.0
+        arguments = response, control.breakpoints, shares, error_mask
         execution = followed(VaryingExecution(*arguments)) if system.varies else Execution(*arguments)
     functionals = WorstFunctionals(
         response, control, model, names=problem.names, initial=initial_set, execution=execution

@@ -128,7 +128,10 @@ def test_what_an_expansion_leaves_out_of_what_a_piece_does_is_in_the_bounds(monk
         off = np.ptp(pieces.enclosed(times, H, every), axis=2) / 2.0
         assert off.max() > 1e-7 and (pieces.allowance(times, times, H, every) >= off).all()
         assert loop.motion is not None
-        left, under_way = loop._bound_transition_errors(none, loop.motion), loop.motion.left_out(*pieces.reached)
+        left, under_way = (
+            loop._bound_transition_errors(none, loop.motion),
+            loop.motion.bound_state_errors(*pieces.reached),
+        )
         assert under_way[0].min() > 1e-12 and (left >= under_way * (1.0 - 1e-12)).all()
 
 
@@ -138,7 +141,7 @@ def test_what_transitions_are_counted_by_is_what_the_piece_under_way_has_made_of
     """At marks within a piece, either way; nothing where a piece begins. What drives them counts with what kernels are
     off by, in the measure of what flows are."""
     case, _, pieces = made(name)
-    marks, far = pieces.motion.grid.breakpoints, pieces.errors.far
+    marks, far = pieces.motion.grid.breakpoints, pieces.errors.error_radii
     begun, driven = pieces.reached
     for k, (mark, piece) in enumerate(zip(marks[:-1].tolist(), pieces.motion.origin.tolist(), strict=True)):
         start = float(case.grid[piece])

@@ -186,7 +186,7 @@ def test_no_error_brings_a_state_further_than_is_said() -> None:
     support = ExecutionCellSupport(functionals.execution, full, H, leg)
     ends = leg.grid.breakpoints[1:]
     made = functionals.execution.added(full, np.repeat(ends, 2), np.tile(H, (ends.size, 1))).reshape(-1, 2)
-    assert (made <= support.reached @ block_norms(H @ leg.transform, leg.starts).T * (1 + 1e-12)).all()
+    assert (made <= support.effect_bounds @ block_norms(H @ leg.transform, leg.starts).T * (1 + 1e-12)).all()
 
 
 def test_ages_and_their_sum_are_rounded_outwards(execution: Execution) -> None:

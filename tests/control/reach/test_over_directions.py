@@ -125,7 +125,7 @@ def test_what_is_left_out_counts_for_every_row_with_what_rounding_makes_of_corne
     rows = np.vstack([np.ones(D), 0.3 * np.eye(D)[:2]])
     part = over_directions_of(made("a box", rows)[0])
     alone, leg = part.made(rows), part.leg
-    size = block_norms(np.abs(rows) @ np.abs(leg.transform), leg.starts) @ part.reached.T
+    size = block_norms(np.abs(rows) @ np.abs(leg.transform), leg.starts) @ part.effect_bounds.T
     assert (part.neglected - alone.neglected >= 1e-16 * size).all()
     assert (part.neglected - alone.neglected <= 1e-14 * size).all()
 

@@ -7,7 +7,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import sparserob_core as sr
-from sparserob_core.control.reach.sizes import nominal_sizes, stated_sizes, widths
+from sparserob_core.control.reach.sizes import nominal_sizes, row_sizes, widths
 from sparserob_core.control.transcription.transcribe import prepare
 from sparserob_core.sip.program import TOLERANCE
 
@@ -20,7 +20,7 @@ def test_the_width_is_that_to_the_opposite_row_in_the_rows_own_numbers() -> None
 
 
 def test_the_size_of_a_row_is_its_bound_or_its_width() -> None:
-    assert stated_sizes(H, h) == pytest.approx([1.2, 2.4, 0.0, 3.0])
+    assert row_sizes(H, h) == pytest.approx([1.2, 2.4, 0.0, 3.0])
 
 
 def prepared(disturbance: sr.ConvexSet | None = None, **more: object):

@@ -43,7 +43,7 @@ def test_what_is_beyond_a_degree_is_bounded_and_not_by_far_more_than_it_is(degre
     states = motion.nodes(np.zeros((1, 6)))[:, 0]
     seen = spread.space.monomials(spread.shares(points[:, None])) @ states.T
     off = np.abs(seen - decay(marks[None], points[:, None])).max(axis=0)
-    lost = Truncation(motion, spread).lost(np.abs(states[:-1]), np.zeros((marks.size - 1, 2)))[:, 0]
+    lost = Truncation(motion, spread).bound_error(np.abs(states[:-1]), np.zeros((marks.size - 1, 2)))[:, 0]
     assert (off[1:] <= lost * (1.0 + 1e-9) + 1e-14).all()
     assert lost[-1] <= 1e3 * off.max()
 
@@ -157,12 +157,12 @@ def test_what_power_series_leave_of_entries_is_in_what_is_beyond(name: str, degr
     t, p = marks[None], points[:, None]
     off = np.abs(seen - (relaxed(t, p) if name == "relaxing" else 1.0 - 2.0 * t / (1.0 + p))).max(axis=0)
     truncation, inputs = Truncation(motion, spread), np.tile([2.0, 0.0], (marks.size - 1, 1))
-    lost = truncation.lost(np.abs(states[:-1]), inputs)[:, 0]
+    lost = truncation.bound_error(np.abs(states[:-1]), inputs)[:, 0]
     assert (off[1:] <= lost * (1.0 + 1e-9) + 1e-14).all()
     assert lost[-1] <= 1e4 * off.max()
     rest = 1.0 / (1.0 + points)  # the series of 1 / (1 + p) in shares of a quarter
     rest = rest - sum((-0.25) ** n / 1.05 ** (n + 1) * ((points - 0.05) / 0.25) ** n for n in range(degree + 1))
-    without = Truncation(motion, replace(spread, remainder=None)).lost(np.abs(states[:-1]), inputs)[:, 0]
+    without = Truncation(motion, replace(spread, remainder=None)).bound_error(np.abs(states[:-1]), inputs)[:, 0]
     entering = np.exp(-2.0 / 0.8) if name == "relaxing" else 2.0  # the least that multiplies what is beyond
     assert (lost - without)[-1] >= 2.0 * np.abs(rest).max() * entering
     others = np.tile([0.0, 1.0], (marks.size - 1, 1))
@@ -170,7 +170,7 @@ def test_what_power_series_leave_of_entries_is_in_what_is_beyond(name: str, degr
         exact = [float(np.exp(0.05 + 0.25 * e)) for e in np.linspace(-1.0, 1.0, 31)]
         series = sum(np.exp(0.05) * (0.25 * np.linspace(-1.0, 1.0, 31)) ** n / factorial(n) for n in range(degree + 1))
         true = 2.0 * float(np.abs(exact - series).max())
-        assert true <= truncation.lost(0.0 * np.abs(states[:-1]), others)[-1, 0] <= 1e2 * true
+        assert true <= truncation.bound_error(0.0 * np.abs(states[:-1]), others)[-1, 0] <= 1e2 * true
 
 
 PUSHED = sr.VaryingSystem.of(
@@ -476,7 +476,7 @@ def test_what_steps_are_off_by_is_carried_to_all_coefficients(pushed: Propagator
         transition = np.eye(motion.states)
         for piece in range(mark - 1, -1, -1):  # from the end of the piece
             stretch = motion._stretches[0][piece]
-            assert (motion.carries[mark, stretch] >= np.abs(transition) @ units * (1.0 - 1e-12)).all()
+            assert (motion.transition_bounds[mark, stretch] >= np.abs(transition) @ units * (1.0 - 1e-12)).all()
             transition = transition @ steps[piece]
 
 

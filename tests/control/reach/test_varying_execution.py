@@ -226,7 +226,7 @@ def test_no_error_brings_a_state_further_than_is_said() -> None:
     for share in (0.3, 1.0):
         times = marks[:-1] + share * np.diff(marks)
         made = found.added(full, np.repeat(times, 2), np.tile(np.eye(2), (times.size, 1))).reshape(-1, 2)
-        assert (made <= support.reached * (1 + 1e-12)).all()
+        assert (made <= support.effect_bounds * (1 + 1e-12)).all()
 
 
 @pytest.mark.slow

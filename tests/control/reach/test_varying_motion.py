@@ -270,10 +270,10 @@ def test_transitions_count_in_the_units_of_what_they_begin_with(monkeypatch):
             norms.append((np.abs(product) * ends[k + 1] / ends[j + 1, :, None]).sum(axis=1).max())
     share = 0.49 / (max(norms) * sum(changed[1:]))
     for off, finite in ((share, True), (share / 0.9, False)):
-        assert np.isfinite(orbiting(monkeypatch, off).carries).all() == finite
+        assert np.isfinite(orbiting(monkeypatch, off).transition_bounds).all() == finite
     rough, P = orbiting(monkeypatch, share), max(norms)
-    more = (rough.carries - motion.carries)[motion.carries > 0.0]
-    ends = np.broadcast_to(ends[:, None], motion.carries.shape)[motion.carries > 0.0]
+    more = (rough.transition_bounds - motion.transition_bounds)[motion.transition_bounds > 0.0]
+    ends = np.broadcast_to(ends[:, None], motion.transition_bounds.shape)[motion.transition_bounds > 0.0]
     np.testing.assert_allclose(more, P * 0.49 / 0.51 * ends, rtol=1e-6)
 
 

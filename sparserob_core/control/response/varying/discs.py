@@ -203,18 +203,18 @@ class Discs:
 class Cauchy:
     """Entries of a system on discs over cells of time, between ``ends (s + 1,)``.
 
-    ``far (s, r, d, d + n)``: bounds of the distance of the entries of ``[A B c E]`` from a constant, for all `RADII`.
-    ``sizes (d, d + n)``: estimates of their absolute values.
+    ``distances (s, r, d, d + n)``: bounds of the distance of the entries of ``[A B c E]`` from a constant, for all
+    `RADII`. ``sizes (d, d + n)``: estimates of their absolute values.
     """
 
     system: System
     ends: Array
-    far: Array
+    distances: Array
     sizes: Array
 
     def bound_remainder(self, degree: int) -> TruncationBound:
         """Return bounds of the terms beyond a degree, of entries that are no polynomials of this degree."""
-        sizes = _bound_remainder(self.far, degree)
+        sizes = _bound_remainder(self.distances, degree)
         sizes[:, ~beyond(self.system, degree)] = 0.0
         return TruncationBound(self.ends, sizes)
 
@@ -356,11 +356,11 @@ class _Law:
         )
 
 
-def _bound_remainder(far: Array, degree: int) -> Array:
+def _bound_remainder(distances: Array, degree: int) -> Array:
     """Return bounds ``(s, d, d + n)`` of the terms beyond a degree, by the best of the `RADII`, from bounds
-    ``far (s, r, d, d + n)`` of the distance of the entries from a constant."""
+    ``distances (s, r, d, d + n)`` of the distance of the entries from a constant."""
     with np.errstate(all="ignore"):
-        bounds = far * (RADII ** -float(degree) / (RADII - 1.0))[:, None, None]
+        bounds = distances * (RADII ** -float(degree) / (RADII - 1.0))[:, None, None]
     return np.asarray(bounds.min(axis=1) * OUTWARD)
 
 

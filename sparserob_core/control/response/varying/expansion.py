@@ -40,7 +40,7 @@ BLUNTEST = 1e-10  # from which on a segment is halved even where that did not he
 SHORTEST = 2.0**-30  # of the horizon: a shorter segment without an enclosure holds a pole
 _CACHE: WeakKeyDictionary[Phase, dict[tuple[object, ...], Expansion]] = WeakKeyDictionary()
 FIRST = 8  # segments to begin with
-MOST = 100_000
+MOST_SEGMENTS = 100_000
 """Segments at most. Ten times as many take an hour and gigabytes; of a tenth systems would be refused that are solved
 in a minute."""
 LOOKED = 256  # segments after which the rest is estimated: a tenth of a second of work; ten times as many are a second
@@ -115,12 +115,14 @@ class Expansion:
     def of(system: System) -> Expansion:
         """Return the expansion of a system. Raise `InputError`, which names a time, where there is none, as at a pole
         or at the root of a negative number."""
-        first, stated = system.phases[0], system.stated
+        first, user_system = system.phases[0], system.stated
         kept = _CACHE.setdefault(first, {})
         key = system.horizon, *((phase.begin, ref(phase)) for phase in system.phases[1:])
         if key not in kept:
             kept[key] = (
-                Expansion._expand_system(system) if stated is system else Expansion.of(stated)._convert_units(system)
+                Expansion._expand_system(system)
+                if user_system is system
+                else Expansion.of(user_system)._convert_units(system)
             )
         return kept[key]
 
@@ -168,7 +170,7 @@ class Expansion:
             if segment.sharp:
                 ends.append(stop)
                 segments.append(segment)
-                if len(segments) in (LOOKED, MOST):
+                if len(segments) in (LOOKED, MOST_SEGMENTS):
                     _require_few_segments(system, look, ends)
             elif stop - start <= SHORTEST * horizon:
                 raise InputError(f"near t = {centre:.9g} the system {segment.why}", path="system")
@@ -189,10 +191,10 @@ class Expansion:
         state, inputs = np.tile(np.eye(d), (starts.size, 1, 1)), np.zeros(shape)
         error, sizes = np.zeros(starts.size), np.zeros(shape)
 
-        def follow(here: np.ndarray, step: Array, driven: Array, off: Array, pushed: Array) -> None:
+        def follow(here: np.ndarray, step: Array, driven: Array, off: Array, input_sizes: Array) -> None:
             before = state[here], inputs[here], error[here], sizes[here]
             state[here], inputs[here] = step @ before[0], step @ before[1] + driven
-            error[here], sizes[here] = self._bound_product_error(before, step, off), before[3] + pushed
+            error[here], sizes[here] = self._bound_product_error(before, step, off), before[3] + input_sizes
 
         first = self.segment_of(starts)
         last = np.clip(np.searchsorted(self.ends, stops, side="left") - 1, first, self.ends.size - 2)
@@ -748,10 +750,11 @@ def _require_few_segments(system: System, look: Look, ends: Sequence[float]) -> 
         for k in range(SAMPLED if step > 0.0 else 0):
             time = max(begin, end) + (k + 0.5) * step
             needed += step / look.length(law, time, step, SHORTEST * horizon)
-    if needed > MOST:
+    if needed > MOST_SEGMENTS:
         raise InputError(
             f"it changes so fast that it would take some {needed:.1g} segments of the horizon, each a polynomial of the"
-            f" time, and {MOST} can be followed; a shorter horizon takes fewer, or entries without what is so fast",
+            f" time, and {MOST_SEGMENTS} can be followed; a shorter horizon takes fewer, or entries without what is so"
+            " fast",
             path="system",
         )
 
@@ -798,11 +801,11 @@ def _find_coupled_states(A: Array) -> list[np.ndarray]:
     return [np.flatnonzero(labels == k) for k in range(count)]
 
 
-def _sum_forcing(pushes: Array, lost: Array) -> tuple[Array, Array]:
-    """Return the sums over orders of ``pushes (k, p, d, n)``, and the numbers to divide by, which are infinite where
-    the sum is 0. The sums are at least so large that ``lost (k, d, n)`` is at most the share `BLUNTEST` of them, also
-    where ``pushes`` are 0."""
-    inputs = np.maximum(pushes.sum(axis=1), lost / BLUNTEST)
+def _sum_forcing(forcing: Array, errors: Array) -> tuple[Array, Array]:
+    """Return the sums over orders of ``forcing (k, p, d, n)``, and the numbers to divide by, which are infinite where
+    the sum is 0. The sums are at least so large that ``errors (k, d, n)`` is at most the share `BLUNTEST` of them, also
+    where ``forcing`` are 0."""
+    inputs = np.maximum(forcing.sum(axis=1), errors / BLUNTEST)
     return inputs, np.where(inputs > 0.0, inputs, np.inf)
 
 

@@ -27,11 +27,11 @@ TRUNCATION_TOLERANCES = (1e-14, 1e-12, 1e-10)
 """Shares of the state, of which the first is taken that the estimated truncation error of the law reaches. A proof
 needs 1e-8."""
 NUMBERS = 400  # coefficients times states of a law; twice as many are matrices of 5 MB on each of its segments
-MOST_TERMS = 30  # the degree where entries are no polynomials: what 40 of them leave less is below what is rounded
+LARGEST_DEGREE = 30  # the degree where entries are no polynomials: what 40 of them leave less is below what is rounded
 LOOKS = 17  # times at which coefficients are looked at; nothing is proven with them
 DEGREE = 4  # of the coefficients that are looked at then
 MOST_PARTS = 64  # of the box: each is proven alone
-FAR = 700.0  # largest exponent by which parameters may move the state: its exponential is still a float
+LARGEST_EXPONENT = 700.0  # largest exponent by which parameters may move the state: its exponential is still a float
 _CACHE: WeakKeyDictionary[Phase, dict[tuple[object, ...], ParameterParts]] = WeakKeyDictionary()
 
 
@@ -156,7 +156,7 @@ class ParameterParts:
             tables.append((indices, (np.einsum("va,kaij->vkij", powers, averages),)))
         return _join_tables(tables)[0]
 
-    def left_out(self, part: int, begun: Array, inputs: Array, growth: float) -> Array:
+    def bound_truncation_error(self, part: int, initial_sizes: Array, inputs: Array, growth: float) -> Array:
         """Return upper bounds ``(d,)`` of the effect of the law's truncation error on any state at any parameter of a
         part.
 
@@ -164,7 +164,7 @@ class ParameterParts:
         ----------
         part : int
             The part of the parameters.
-        begun, inputs : Array
+        initial_sizes, inputs : Array
             Upper bounds of the initial state ``(d,)`` and of the inputs ``(m + mw,)``.
         growth : float
             Upper bound of the growth of states between two times, in the units of the part.
@@ -173,7 +173,7 @@ class ParameterParts:
         truncation, d = spread.remainder, spread.d
         assert truncation is not None
         units, forcing = law.units[:d], law.largest_inputs(spread) @ inputs / law.units[:d]
-        state = growth * (float((begun / units).max()) + float(np.diff(law.ends) @ forcing.max(axis=1)))
+        state = growth * (float((initial_sizes / units).max()) + float(np.diff(law.ends) @ forcing.max(axis=1)))
         A = (truncation.sizes[:, :, :d] * units).sum(axis=2) / units
         input_error = truncation.sizes[:, :, d:] @ inputs / units
         rate = state * A.max(axis=1) + input_error.max(axis=1)
@@ -266,14 +266,14 @@ def _choose_parts(system: System) -> tuple[tuple[Array, ...], list[Cauchy | None
     nu, counts, lowest = box.dimension, np.ones(box.dimension, dtype=int), max(1, powers)
     scale = _choose_state_units(system)
     exponent = _estimate_exponent(system, scale)
-    if exponent > FAR:
+    if exponent > LARGEST_EXPONENT:
         raise InputError(
             path="system.parameters",
             expected="a box, beside the time t and in A, over which the state has an expansion in double precision:"
             " smaller intervals, or a shorter horizon",
             got=f"parameters that move the state by up to e^{exponent:.2g}",
         )
-    degrees = [n for n in range(lowest, MOST_TERMS + 1) if d * comb(nu + n, nu) <= NUMBERS]
+    degrees = [n for n in range(lowest, LARGEST_DEGREE + 1) if d * comb(nu + n, nu) <= NUMBERS]
     while degrees and counts.prod() <= MOST_PARTS:
         edges, series_bounds = _bound_parts(system, counts)
         for tolerance, degree in product(TRUNCATION_TOLERANCES, degrees):
