@@ -177,11 +177,11 @@ class FeedbackConstraint(ConstraintSource):
         those of a mixed constraint before and after the control jumps."""
         flat, loop = self.flat, self.loop
         if flat.gains is None or loop.measurable is None:
-            return [(slice(None), loop.seen_from(times))]
+            return [(slice(None), loop.locate_state(times))]
         commanded, half = flat.commanded(times), flat.h.size // 2
         return [
-            (slice(half), loop.seen_from(times, commanded[:, 0])),
-            (slice(half, None), loop.seen_from(times, commanded[:, -1])),
+            (slice(half), loop.locate_state(times, commanded[:, 0])),
+            (slice(half, None), loop.locate_state(times, commanded[:, -1])),
         ]
 
     def _compute_left_sides(self, x: Array, times: Array) -> Array:

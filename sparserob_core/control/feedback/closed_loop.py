@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, final
 import numpy as np
 
 from sparserob_core.control.enclosures.cache import remember
-from sparserob_core.control.feedback.innovations import KNOWN, Answers, innovations_seen
+from sparserob_core.control.feedback.innovations import KNOWN, Answers, build_innovations
 from sparserob_core.control.feedback.measurable import MeasurablePieces
 from sparserob_core.control.feedback.observer import Observer, innovations_of
 from sparserob_core.control.reach.functional import WorstFunctionals
@@ -164,7 +164,7 @@ class ClosedLoop:
     def innovations(self) -> Array:
         """Matrices ``(K, p, Q)`` from all deviations to every innovation."""
         problem, initial_count = self.functionals, int(self.begins.sum())
-        state_innovations = innovations_seen(
+        state_innovations = build_innovations(
             problem.response, problem.dictionary, problem.disturbance, initial_count > 0, pieces=self.measurable
         )
         return innovations_of(state_innovations, initial_count, self.observer, self.anew)
@@ -333,10 +333,10 @@ class ClosedLoop:
         lower: Array,
         upper: Array,
         H: Array,
-        beside: tuple[Array, Array] | None = None,
+        added_terms: tuple[Array, Array] | None = None,
     ) -> tuple[Array, Array]:
         """Return the `bounds` for ``H (r, d)`` or ``(k, r, d)``, and the part of each that is due to the length of the
-        cell. ``beside``: terms that are added at both ends, ``(k, r, 1 + Q)`` or ``(k, r, 1)`` each, and linear
+        cell. ``added_terms``: terms that are added at both ends, ``(k, r, 1 + Q)`` or ``(k, r, 1)`` each, and linear
         between.
 
         On a cell every functional is within ``(b - a)^2 / 8`` times its largest second derivative of its chord, and a
@@ -349,7 +349,7 @@ class ClosedLoop:
         radii = np.concatenate([[1.0], self.spread.radii])
         chord_distances = self._bound_chord_errors(x, H, lower, upper - lower, pieces, ends[0])
         sizes = np.abs(H) @ np.maximum(np.abs(ends[0]), np.abs(ends[1]))
-        for end, addition in zip(along, beside or (), strict=False):
+        for end, addition in zip(along, added_terms or (), strict=False):
             end[..., : addition.shape[-1]] += addition
             sizes[..., : addition.shape[-1]] += np.abs(addition)
         heights, error_bounds = [self.height(functional) for functional in along], ROUND_OFF * (sizes @ radii)
@@ -398,7 +398,7 @@ class ClosedLoop:
         radii = np.concatenate([[1.0], self.spread.radii])
         state_sizes, input_sizes = np.abs(nodes[:-1]) @ radii, motion.flow.sizes * (np.abs(inputs) @ radii)[:, None]
         if self.measurable is not None:
-            contributions, driving_sizes = self.measurable.reached
+            contributions, driving_sizes = self.measurable.effect_sizes
             state_sizes, input_sizes = state_sizes + contributions, np.concatenate([input_sizes, driving_sizes], axis=2)
         return motion.bound_state_errors(state_sizes, input_sizes)
 
@@ -407,7 +407,7 @@ class ClosedLoop:
         along = direction @ self.states(x, np.array([time]))[0]
         return self.spread.worst(along[1:])
 
-    def seen_from(self, times: Array, acting: np.ndarray | None = None) -> np.ndarray:
+    def locate_state(self, times: Array, acting: np.ndarray | None = None) -> np.ndarray:
         """Return the pieces ``(k,)`` of the grid in which the state at ``times (k,)`` is taken.
 
         A breakpoint belongs to the piece that it ends. With ``acting (k,)`` a row also contains the control on these
@@ -428,11 +428,11 @@ class ClosedLoop:
         """
         if self.measurable is not None:
             acting_pieces = None if acting is None else np.array([acting])
-            piece = int(self.origin[self.seen_from(np.array([time]), acting_pieces)[0]])
+            piece = int(self.origin[self.locate_state(np.array([time]), acting_pieces)[0]])
             return self.measurable.signal(deviation, time, direction, piece)
         return self.functionals.response.grid.breakpoints, (self.entries @ (self.spread.middle + deviation)).T
 
-    def begun(self, deviation: Array) -> Array:
+    def compute_initial_state(self, deviation: Array) -> Array:
         """Return the initial state ``(d,)`` of a deviation ``(Q,)``."""
         return np.asarray(self.start + self.begins @ deviation)
 
@@ -464,7 +464,7 @@ class ClosedLoop:
         g = table_of(rows, columns, on_control[rows, columns], (count, self.variables))
         d = np.einsum("pli,liq->pq", on_noise[firsts], self.entries) + free[firsts] @ self.begins
         if self.measurable is not None:
-            pieces = self.origin[self.seen_from(np.full(count, time), acting)]
+            pieces = self.origin[self.locate_state(np.full(count, time), acting)]
             d[:, : self.measurable.size] = self.measurable.weights(time, H[firsts], pieces[firsts])
             for piece in np.unique(pieces):
                 rows = pieces == piece

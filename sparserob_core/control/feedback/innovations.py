@@ -27,7 +27,7 @@ DEPENDENT = 1e-9  # of its own size, the rest of a column that is a combination 
 KNOWN = np.zeros((1, 0))
 
 
-def innovations_seen(
+def build_innovations(
     response: Response,
     control: Dictionary,
     model: DisturbanceModel | None,
@@ -49,14 +49,14 @@ def innovations_seen(
     if pieces is not None:
         return np.concatenate([_build_measurable_innovations(response, control, pieces), initial_innovations], axis=2)
     grid, steps = response.grid, response.steps(KNOWN)
-    block, pushes = _build_disturbance_matrices(response, model)
+    block, input_effects = _build_disturbance_matrices(response, model)
     commanded = grid.commanded(control.breakpoints)
-    D = np.zeros((K, d, model.block_count, pushes.shape[2]))
+    D = np.zeros((K, d, model.block_count, input_effects.shape[2]))
     for piece in range(int(np.searchsorted(commanded, K - 1))):  # what happens on the last one is seen when all is over
         innovation, last = D[commanded[piece] + 1], int(block[piece]) + 1
         first = int(block[np.searchsorted(commanded, commanded[piece])])
         innovation[:, first:last] = np.tensordot(steps.Phi[0, response.which[piece]], innovation[:, first:last], axes=1)
-        innovation[:, block[piece]] += pushes[piece]
+        innovation[:, block[piece]] += input_effects[piece]
     return np.concatenate([D.reshape(K, d, -1), initial_innovations], axis=2)
 
 
@@ -69,8 +69,13 @@ def _build_disturbance_matrices(response: Response, model: DisturbanceModel) -> 
     return block, steps.Gamma[0, response.which] @ grid.of_modes(steps.E[0])[grid.modes]
 
 
-def unfelt(
-    response: Response, model: DisturbanceModel | None, far: Array, begun: Array, rows: Array, least: float
+def find_negligible_entries(
+    response: Response,
+    model: DisturbanceModel | None,
+    disturbance_radii: Array,
+    initial_radii: Array,
+    rows: Array,
+    least: float,
 ) -> np.ndarray:
     """Return which entries ``(Q,)`` of the deviations move none of the rows by more than ``least`` at any breakpoint.
     The entries are those of the disturbance, block after block, and then those of the initial state.
@@ -81,9 +86,9 @@ def unfelt(
         Response of the system.
     model : DisturbanceModel or None
         Disturbance, if any.
-    far : ndarray, shape (mw,)
+    disturbance_radii : ndarray, shape (mw,)
         Largest deviations of the disturbance.
-    begun : ndarray, shape (d,) or (0,)
+    initial_radii : ndarray, shape (d,) or (0,)
         Largest deviations of the initial state; empty for a single initial state.
     rows : ndarray, shape (r, d)
         Rows on the state.
@@ -92,32 +97,32 @@ def unfelt(
     """
     grid, steps, first = response.grid, response.steps(KNOWN), 0
     if model is not None:
-        block, pushes = _build_disturbance_matrices(response, model)
-        first, pushes = model.block_count * far.size, pushes * far
-        columns = block[:, None] * far.size + np.arange(far.size)
-    nodes = np.zeros((response.initial_state.size, first + begun.size))
-    nodes[:, first:] = np.eye(len(nodes), begun.size) * begun
+        block, input_effects = _build_disturbance_matrices(response, model)
+        first, input_effects = model.block_count * disturbance_radii.size, input_effects * disturbance_radii
+        columns = block[:, None] * disturbance_radii.size + np.arange(disturbance_radii.size)
+    nodes = np.zeros((response.initial_state.size, first + initial_radii.size))
+    nodes[:, first:] = np.eye(len(nodes), initial_radii.size) * initial_radii
     largest_movements = np.abs(rows @ nodes).max(axis=0, initial=0.0)
     for piece in range(grid.pieces):
         nodes = steps.Phi[0, response.which[piece]] @ nodes
         if first:
-            nodes[:, columns[piece]] += pushes[piece]
+            nodes[:, columns[piece]] += input_effects[piece]
         largest_movements = np.maximum(largest_movements, np.abs(rows @ nodes).max(axis=0, initial=0.0))
-    is_felt: np.ndarray = largest_movements > least
-    return ~is_felt
+    is_effective: np.ndarray = largest_movements > least
+    return ~is_effective
 
 
 def _build_measurable_innovations(response: Response, control: Dictionary, pieces: MeasurablePieces) -> Array:
-    """Return the matrices ``D`` of `innovations_seen` for measurable disturbances, whose deviations are their effects
+    """Return the matrices ``D`` of `build_innovations` for measurable disturbances, whose deviations are their effects
     on the state at the end of every piece."""
     grid, K = response.grid, control.pieces
     ends = control.breakpoints[grid.control_piece + 1]
-    flows = pieces.carried(np.arange(grid.pieces), ends)
+    flows = pieces.compute_transitions(np.arange(grid.pieces), ends)
     D = np.zeros((K, response.initial_state.size, pieces.size))
     for piece in range(grid.pieces):
         if grid.control_piece[piece] + 1 < K:
             entries, outward = pieces.at(piece)
-            D[grid.control_piece[piece] + 1, :, entries] = flows[piece] @ outward * pieces.seen(piece)
+            D[grid.control_piece[piece] + 1, :, entries] = flows[piece] @ outward * pieces.mark_answered(piece)
     return D
 
 
@@ -177,7 +182,7 @@ class Answers:
         return bool(np.unique(position).size == position.size and (value == 1.0).all())
 
 
-def answers(D: Array, mask: np.ndarray, channels: int, seen: Array | None = None) -> Answers:
+def answers(D: Array, mask: np.ndarray, channels: int, innovations: Array | None = None) -> Answers:
     """Return coordinates of the gains that respond to innovations.
 
     Variables are numbered piece by piece of the control, and then channel by channel of every cluster of innovations.
@@ -190,7 +195,7 @@ def answers(D: Array, mask: np.ndarray, channels: int, seen: Array | None = None
         True at ``[k, j]`` where piece ``k`` responds to the innovation at breakpoint ``j``.
     channels : int
         Number ``m`` of controls.
-    seen : ndarray, shape (K, d, Q), optional
+    innovations : ndarray, shape (K, d, Q), optional
         All innovations, where ``D`` leaves out some of their entries. The gains have effects at these entries too.
 
     Returns
@@ -199,7 +204,7 @@ def answers(D: Array, mask: np.ndarray, channels: int, seen: Array | None = None
         Variables of the gains.
     """
     K, d, Q = D.shape
-    groups = list(_group_pieces(D, mask, D if seen is None else seen))
+    groups = list(_group_pieces(D, mask, D if innovations is None else innovations))
     sizes = np.zeros((K, 1 + max((group.cluster for group in groups), default=0)), dtype=int)
     for group in groups:
         sizes[group.pieces, group.cluster] = channels * group.free.size
@@ -217,7 +222,7 @@ def answers(D: Array, mask: np.ndarray, channels: int, seen: Array | None = None
             _flatten_entries((k * channels + i) * Q + group.columns[cols], variables[..., rows], group.Z[rows, cols])
         )
         rows, cols = np.nonzero(group.G)
-        positions = ((k * K + group.seen[cols // d]) * channels + i) * d + cols % d
+        positions = ((k * K + group.breakpoints[cols // d]) * channels + i) * d + cols % d
         gain.append(_flatten_entries(positions, variables[..., rows], group.G[rows, cols]))
     return Answers(
         (K, channels, Q, d), piece, channel, entry, np.ones(entry.size), _join_entries(effect), _join_entries(gain)
@@ -227,12 +232,12 @@ def answers(D: Array, mask: np.ndarray, channels: int, seen: Array | None = None
 @final
 @dataclass(frozen=True, eq=False)
 class _PieceGroup:
-    """``pieces`` of the control that answer the same breakpoints ``seen`` of one ``cluster``, by number, and
+    """``pieces`` of the control that answer the same ``breakpoints`` of one ``cluster``, by number, and
     `_compute_coordinates` of these."""
 
     pieces: np.ndarray
     cluster: int
-    seen: np.ndarray
+    breakpoints: np.ndarray
     columns: np.ndarray
     free: np.ndarray
     Z: Array
@@ -278,8 +283,8 @@ def _cluster_breakpoints(where: np.ndarray) -> list[np.ndarray]:
     return [np.array(sorted(members)) for members, _ in sorted(clusters, key=lambda cluster: min(cluster[0]))]
 
 
-def _compute_coordinates(seen: Array) -> tuple[np.ndarray, np.ndarray, Array, Array]:
-    """Return coordinates of the effects of gains on innovations ``seen (J, d, Q)``.
+def _compute_coordinates(innovations: Array) -> tuple[np.ndarray, np.ndarray, Array, Array]:
+    """Return coordinates of the effects of gains on ``innovations (J, d, Q)``.
 
     Returns
     -------
@@ -294,7 +299,7 @@ def _compute_coordinates(seen: Array) -> tuple[np.ndarray, np.ndarray, Array, Ar
     """
     from scipy.linalg import qr
 
-    flat = seen.reshape(-1, seen.shape[2])
+    flat = innovations.reshape(-1, innovations.shape[2])
     sizes = np.linalg.norm(flat, axis=0)
     columns = np.flatnonzero(sizes > 0.0)
     unit = flat[:, columns] / sizes[columns]

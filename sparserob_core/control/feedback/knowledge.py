@@ -21,7 +21,7 @@ from typing import final
 import numpy as np
 
 from sparserob_core.control.feedback.closed_loop import ClosedLoop
-from sparserob_core.control.feedback.innovations import innovations_seen
+from sparserob_core.control.feedback.innovations import build_innovations
 from sparserob_core.sip.convex_set import Array, Box, ConvexSet
 from sparserob_core.sip.finite import Spread
 from sparserob_core.sip.inner.simplex.counterpart import Growing
@@ -41,13 +41,13 @@ class Knowledge(ABC):
     """Information of a causal control about signals.
 
     Signals are arrays that begin with the deviations ``(Q,)``. The number of reports that every piece of the control
-    knows is ``seen (K,)``. The rows ``N (R, Q)`` are linear functions of the deviations; ``begun (R,)`` is the number
-    of reports that are older than the time of each row.
+    knows is ``known_reports (K,)``. The rows ``N (R, Q)`` are linear functions of the deviations; ``past_reports (R,)``
+    is the number of reports that are older than the time of each row.
     """
 
     N: Array
-    seen: np.ndarray
-    begun: np.ndarray
+    known_reports: np.ndarray
+    past_reports: np.ndarray
     work: float = 0.0
 
     @property
@@ -62,7 +62,7 @@ class Knowledge(ABC):
 
     @property
     @abstractmethod
-    def most(self) -> Array:
+    def contribution_bounds(self) -> Array:
         """Upper bounds ``(R,)`` of the contribution of the deviations to every row."""
 
     @abstractmethod
@@ -71,12 +71,12 @@ class Knowledge(ABC):
         two signals."""
 
     @abstractmethod
-    def gives(self, signals: Array, beside: Array) -> Array:
+    def gives(self, signals: Array, offsets: Array) -> Array:
         """Return the largest contribution of the deviations to every row, among signals whose first reports are those
         of a given signal: ``(S, R, reports + 1)``.
 
-        Where this value plus ``beside``, of the same shape, is not above 0, any number may stand instead that keeps the
-        sum at or below 0.
+        Where this value plus ``offsets``, of the same shape, is not above 0, any number may stand instead that keeps
+        the sum at or below 0.
         """
 
     @abstractmethod
@@ -115,7 +115,7 @@ class Knowledge(ABC):
     @cached_property
     def first(self) -> np.ndarray:
         """The first piece that may know of a report, ``(reports + 1,)``."""
-        return np.searchsorted(self.seen, np.arange(self.reports + 1), side="right")
+        return np.searchsorted(self.known_reports, np.arange(self.reports + 1), side="right")
 
 
 @final
@@ -127,8 +127,8 @@ class OfDisturbances(Knowledge):
     N: Array
     spread: Spread
     width: int
-    seen: np.ndarray
-    begun: np.ndarray
+    known_reports: np.ndarray
+    past_reports: np.ndarray
     work: float = 0.0
 
     @property
@@ -147,7 +147,7 @@ class OfDisturbances(Knowledge):
         return extreme(self.spread, self.N)
 
     @cached_property
-    def most(self) -> Array:
+    def contribution_bounds(self) -> Array:
         """Upper bounds ``(R,)`` of the contribution of the worst deviations to every row."""
         return np.asarray(np.abs(self.N * self.worst).sum(axis=1))
 
@@ -155,14 +155,14 @@ class OfDisturbances(Knowledge):
         """Return the deviations bit by bit."""
         return signal[: reports * self.width].tobytes()
 
-    def gives(self, signals: Array, beside: Array) -> Array:
+    def gives(self, signals: Array, offsets: Array) -> Array:
         """Return the contribution of the signal's own blocks, plus that of the worst blocks from every report on."""
         return sums(self.by_block(self.N * signals[:, None]).sum(axis=3)) + self._later_support_values
 
     def changed(self, signal: Array, row: int, report: int) -> tuple[float, Array]:
         """Return the largest contribution to the row, and the signal with the blocks that are the worst for the row
         from ``report`` on."""
-        stop, start, z = self.begun[row] * self.width, report * self.width, signal.copy()
+        stop, start, z = self.past_reports[row] * self.width, report * self.width, signal.copy()
         z[start:stop] = self.worst[row, start:stop]
         return float(self.N[row, :start] @ z[:start]) + float(self._later_support_values[row, report]), z
 
@@ -179,7 +179,7 @@ class OfDisturbances(Knowledge):
         excess = own[:, :, None] + scale * (past_values - later_responses + self._sum_later_blocks(closed * worst))
         excess = excess / units[:, None]
         excess[:, :, -1] = -np.inf
-        excess = np.where(np.arange(excess.shape[2]) < self.begun[:, None], excess, -np.inf)
+        excess = np.where(np.arange(excess.shape[2]) < self.past_reports[:, None], excess, -np.inf)
         for flat_index in np.argsort(-excess, axis=None).tolist():
             signal, row, report = (int(v) for v in np.unravel_index(flat_index, excess.shape))
             if excess[signal, row, report] <= NONE:
@@ -230,9 +230,9 @@ class OfOutputs(Knowledge):
         Noises of all outputs, about their middle.
     place : slice
         Entries of the noise among all deviations of the loop.
-    seen : ndarray, shape (K,)
+    known_reports : ndarray, shape (K,)
         Number of reports that every piece of the control knows.
-    begun : ndarray, shape (R,)
+    past_reports : ndarray, shape (R,)
         Number of reports that are older than the time of each row.
     limit : float
         Largest work.
@@ -246,8 +246,8 @@ class OfOutputs(Knowledge):
     hidden: tuple[Array, Array]
     noise: Spread
     place: slice
-    seen: np.ndarray
-    begun: np.ndarray
+    known_reports: np.ndarray
+    past_reports: np.ndarray
     limit: float = np.inf
     passed: Callable[[], bool] = lambda: False
     work: float = 0.0
@@ -281,7 +281,7 @@ class OfOutputs(Knowledge):
 
     @staticmethod
     def of(
-        loop: ClosedLoop, N: Array, times: Array, measured: Array, seen: np.ndarray, share: float
+        loop: ClosedLoop, N: Array, times: Array, measured: Array, known_reports: np.ndarray, share: float
     ) -> OfOutputs | None:
         """Return the knowledge of a loop that measures outputs with a noise.
 
@@ -295,7 +295,7 @@ class OfOutputs(Knowledge):
             Times of the rows.
         measured : ndarray, shape (K,)
             Times of the measurements.
-        seen : ndarray, shape (K,)
+        known_reports : ndarray, shape (K,)
             Number of reports that every piece of the control knows.
         share : float
             Factor of the sets of the noise and of the initial states.
@@ -316,11 +316,11 @@ class OfOutputs(Knowledge):
         if hidden is None or any(about(convex) is None and not convex.is_box for _, convex in spread.sets):
             return None
         plain, problem = replace(observer, L=np.zeros_like(observer.L)), loop.functionals
-        entering = innovations_seen(problem.response, problem.dictionary, problem.disturbance, initial_count > 0)
-        outputs = plain.seen(entering, initial_count)
+        entering = build_innovations(problem.response, problem.dictionary, problem.disturbance, initial_count > 0)
+        outputs = plain.compute_innovations(entering, initial_count)
         C = np.concatenate([outputs[:, :, : loop.noise.start], outputs[:, :, loop.noise.stop :]], axis=2)
         begins = np.searchsorted(measured, times)
-        return OfOutputs(N, C, spread, hidden, Spread(((measured.size, noise),)), loop.noise, seen, begins)
+        return OfOutputs(N, C, spread, hidden, Spread(((measured.size, noise),)), loop.noise, known_reports, begins)
 
     @property
     def reports(self) -> int:
@@ -333,7 +333,7 @@ class OfOutputs(Knowledge):
         return np.zeros(self.N.shape[1] + self.C.shape[0] * self.C.shape[1])
 
     @cached_property
-    def most(self) -> Array:
+    def contribution_bounds(self) -> Array:
         """Largest contribution ``(R,)`` of the deviations to every row, whatever the outputs."""
         return self.spread.support(self.N)
 
@@ -345,23 +345,23 @@ class OfOutputs(Knowledge):
         """Return the outputs bit by bit."""
         return self.outputs(signal)[:reports].tobytes()
 
-    def signal(self, z: Array, beside: Array, noise: Array, reports: int) -> Array:
+    def signal(self, z: Array, reference: Array, noise: Array, reports: int) -> Array:
         """Return the signal of deviations ``z (Q,)`` whose first ``reports`` outputs are those of the signal
-        ``beside``, and whose later outputs have this ``noise (J, p)``."""
+        ``reference``, and whose later outputs have this ``noise (J, p)``."""
         outputs = self.C @ z + noise
-        outputs[:reports] = self.outputs(beside)[:reports]
+        outputs[:reports] = self.outputs(reference)[:reports]
         return np.concatenate([z, outputs.ravel()]) + 0.0
 
-    def gives(self, signals: Array, beside: Array) -> Array:
+    def gives(self, signals: Array, offsets: Array) -> Array:
         """Solve one linear program for each row and report, the most promising ones first.
 
         For a signal, this ends when at least `LOOKED` programs were solved and some row is above 0. Entries that were
         not found are ``-inf``.
         """
-        values = np.full(beside.shape, -np.inf)
-        for signal_values, offset, signal in zip(values, beside, signals, strict=True):
+        values = np.full(offsets.shape, -np.inf)
+        for signal_values, offset, signal in zip(values, offsets, signals, strict=True):
             bounds, is_known = (
-                np.broadcast_to(self.most[:, None], offset.shape).copy(),
+                np.broadcast_to(self.contribution_bounds[:, None], offset.shape).copy(),
                 np.zeros(offset.shape, dtype=bool),
             )
             for report in range(1, self.reports + 1):
@@ -453,7 +453,7 @@ class OfOutputs(Knowledge):
             along = self.N + acting @ output_matrix
             noise = self.noise.support(acting)
             bounds = noise + self.spread.support(along)
-            rows = np.flatnonzero(report < self.begun)
+            rows = np.flatnonzero(report < self.past_reports)
             for number, signal in enumerate(signals):
                 offset = own[number] - scale * (acting @ signal[Q:])
                 promises = (offset + scale * bounds) / units

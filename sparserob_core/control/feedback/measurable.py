@@ -30,7 +30,7 @@ from sparserob_core.sip.convex_set import Array, ConvexSet
 KNOWN = np.zeros((1, 0))
 TERMS = 8  # of the expansion that bounds a slope
 ENCLOSED_KEPT = 8  # lists of times at which what a piece has done is remembered: both ends of the cells of a few rows
-SEEN = 1e-7  # of the largest extent of a piece's set, one along which it is answered
+ANSWERED_SHARE = 1e-7  # of the largest extent of a piece's set, one along which it is answered
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,11 +90,11 @@ class MeasurablePieces:
         outward = self.states[:, None] * self.zonoids[piece].outward
         return slice(self._starts[piece], self._starts[piece + 1]), outward
 
-    def seen(self, piece: int) -> np.ndarray:
+    def mark_answered(self, piece: int) -> np.ndarray:
         """Return which coordinates ``(r,)`` of a piece the control responds to: those whose extent is not
         negligible."""
         sizes = np.linalg.norm(self.zonoids[piece].outward, axis=0)
-        large: np.ndarray = sizes > SEEN * sizes.max(initial=0.0)
+        large: np.ndarray = sizes > ANSWERED_SHARE * sizes.max(initial=0.0)
         return large
 
     @cached_property
@@ -162,7 +162,7 @@ class MeasurablePieces:
         return np.asarray(h**2 / 8.0 * slope + SUPPORT_ERROR * np.abs(self.within(upper, H, pieces)))
 
     @property
-    def reached(self) -> tuple[Array, Array]:
+    def effect_sizes(self) -> tuple[Array, Array]:
         """Sizes that `VaryingMotion.left_out` needs for a system whose transitions are inexact; 0 here, where they are
         not.
 
@@ -172,13 +172,13 @@ class MeasurablePieces:
         L, d = self.functionals.response.grid.pieces, self.states.size
         return np.zeros((L, d)), np.zeros((L, d, 0))
 
-    def carried(self, pieces: np.ndarray, times: Array) -> Array:
+    def compute_transitions(self, pieces: np.ndarray, times: Array) -> Array:
         """Return the transitions ``(k, d, d)`` of the state from the ends of ``pieces (k,)`` to later ``times (k,)``;
         the identity for earlier times."""
         response = self.functionals.response
         return response.flows(np.clip(times - response.grid.breakpoints[pieces + 1], 0.0, None))[0]
 
-    def pushes(self, piece: int, until: float) -> KernelPolynomial:
+    def build_kernel(self, piece: int, until: float) -> KernelPolynomial:
         """Return the kernel from a disturbance on ``piece`` to the state at the time ``until`` within the piece."""
         return KernelPolynomial.of(*self._matrices, until - float(self.functionals.response.grid.breakpoints[piece]))
 
@@ -188,7 +188,7 @@ class MeasurablePieces:
         Every row takes the state in one of ``pieces (r,)``; only deviations of earlier pieces contribute.
         """
         weights, count = np.zeros((H.shape[0], self.size)), int(pieces.max(initial=0))
-        flows = self.carried(np.arange(count), np.full(count, time))
+        flows = self.compute_transitions(np.arange(count), np.full(count, time))
         for piece in range(count):
             entries, outward = self.at(piece)
             rows = pieces > piece
@@ -238,7 +238,7 @@ class MeasurablePieces:
         composing the signal."""
         effects = np.zeros(self.size)
         for piece, (zonoid, arc) in enumerate(zip(self.zonoids, self._compose_arcs(deviation), strict=True)):
-            effects[self.at(piece)[0]] = zonoid.reached(arc)
+            effects[self.at(piece)[0]] = zonoid.evaluate_signal(arc)
         return effects
 
     def _compose_arcs(self, deviation: Array) -> list[Arc]:
@@ -254,7 +254,7 @@ class MeasurablePieces:
         """Return the set of effects of a piece on the state at a time within it, in the coordinates of the state."""
         model, identity = self.functionals.disturbance, np.eye(self.states.size)
         assert model is not None
-        return Zonoid(self.pushes(piece, time), tuple(corners(model.bound)), identity, identity)
+        return Zonoid(self.build_kernel(piece, time), tuple(corners(model.bound)), identity, identity)
 
 
 @final
@@ -332,7 +332,7 @@ class VaryingPieces(MeasurablePieces):
         return np.asarray((deviations + widths / 2.0) * OUTWARD)
 
     @cached_property
-    def reached(self) -> tuple[Array, Array]:
+    def effect_sizes(self) -> tuple[Array, Array]:
         """Sizes that `VaryingMotion.left_out` needs; the errors of kernels are added to the flows of inputs, as larger
         inputs."""
         motion, errors = self.motion, self.errors
@@ -343,13 +343,13 @@ class VaryingPieces(MeasurablePieces):
         input_sizes = flow.sizes[..., columns] + kernel.sizes[..., columns] * (kernel.error / flow.error)[:, None, None]
         return state_bounds * OUTWARD, input_sizes * errors.error_radii * OUTWARD
 
-    def carried(self, pieces: np.ndarray, times: Array) -> Array:
+    def compute_transitions(self, pieces: np.ndarray, times: Array) -> Array:
         ends = self.functionals.response.grid.breakpoints[pieces + 1]
         return np.asarray(self.motion.expansion.flow(ends, np.maximum(ends, times)).state)
 
-    def pushes(self, piece: int, until: float) -> KernelPolynomial:
-        """Return the kernel as in `MeasurablePieces.pushes`, joined from the kernels between marks, each on parts in
-        which the system does not change much."""
+    def build_kernel(self, piece: int, until: float) -> KernelPolynomial:
+        """Return the kernel as in `MeasurablePieces.build_kernel`, joined from the kernels between marks, each on parts
+        in which the system does not change much."""
         motion, channels = self.motion, self.motion.expansion.channels[0]
         start, marks = float(self.functionals.response.grid.breakpoints[piece]), motion.grid.breakpoints
         ends = np.concatenate([[start], marks[(marks > start) & (marks < until)], [until]])
@@ -381,5 +381,5 @@ def measurable_pieces(functionals: WorstFunctionals) -> MeasurablePieces | None:
     zonoids: dict[int, Zonoid] = {}
     for piece, step in enumerate(response.which.tolist()):
         if step not in zonoids:
-            zonoids[step] = Zonoid.of(pieces.pushes(piece, ends[piece]), model.bound)
+            zonoids[step] = Zonoid.of(pieces.build_kernel(piece, ends[piece]), model.bound)
     return replace(pieces, zonoids=tuple(zonoids[step] for step in response.which.tolist()))

@@ -62,7 +62,7 @@ class Observer:
     noisy: bool
 
     @staticmethod
-    def of(measured: Measurements, seen: Array, flows: Array, radii: Array) -> Observer:
+    def of(measured: Measurements, input_effects: Array, flows: Array, radii: Array) -> Observer:
         """Return the one-step predictor of Kalman (1960) for deviations of given sizes, a stable observer.
 
         Where the outputs determine the whole state and there is no noise, it predicts from the last measurement alone.
@@ -71,20 +71,20 @@ class Observer:
         ----------
         measured : Measurements
             Outputs and their noise.
-        seen : ndarray, shape (K, d, Q)
+        input_effects : ndarray, shape (K, d, Q)
             Contribution of the deviations to the state from breakpoint to breakpoint.
         flows : ndarray, shape (K - 1, d, d)
             Transitions of the state from each breakpoint to the next.
         radii : ndarray, shape (Q,)
             Largest deviations.
         """
-        C, K = np.asarray(measured.C), seen.shape[0]
+        C, K = np.asarray(measured.C), input_effects.shape[0]
         p, d = C.shape
         L = np.zeros((K, d, p))
         box, middle = measured.noises.bounding_box(), measured.noises.middle()
         noise = (box.upper - box.lower) / 2.0  # from its middle, which is no deviation
         is_state_known = measured.noise is None and p == d and np.linalg.matrix_rank(C) == d
-        input_factors = seen * radii
+        input_factors = input_effects * radii
         P = input_factors[0] @ input_factors[0].T
         for j in range(K - 1):
             if is_state_known:
@@ -105,22 +105,24 @@ class Observer:
         noise."""
         return np.asarray(self.C @ states + (self.middle[:, None] if noise is None else noise))
 
-    def seen(self, D: Array, begun: int) -> Array:
+    def compute_innovations(self, D: Array, initial_count: int) -> Array:
         """Return the matrices ``(K, p, Q + K p)`` from all deviations to the innovations, or ``(K, p, Q)`` without a
         noise.
 
         Disturbance and initial state enter the state as ``D (K, d, Q)`` from breakpoint to breakpoint. The entries of
-        the noise stand before the last ``begun`` entries, which belong to the initial state.
+        the noise stand before the last ``initial_count`` entries, which belong to the initial state.
         """
         (K, d, Q), p = D.shape, self.C.shape[0]
         count = K * p if self.noisy else 0
-        inputs = np.concatenate([D[:, :, : Q - begun], np.zeros((K, d, count)), D[:, :, Q - begun :]], axis=2)
+        inputs = np.concatenate(
+            [D[:, :, : Q - initial_count], np.zeros((K, d, count)), D[:, :, Q - initial_count :]], axis=2
+        )
         innovations, error = np.zeros((K, p, Q + count)), np.zeros((d, Q + count))
         for j in range(K):
             error = error + inputs[j]
             innovations[j] = self.C @ error
             if self.noisy:
-                first = Q - begun + j * p
+                first = Q - initial_count + j * p
                 innovations[j, :, first : first + p] += np.eye(p)
             if j + 1 < K:
                 error = self.flows[j] @ error - self.L[j] @ innovations[j]
@@ -133,12 +135,16 @@ class Observer:
         return Observer(C, L, self.flows * states[:, None] / states, self.middle * outputs, self.noisy)
 
 
-def innovations_of(entering: Array, begun: int, observer: Observer | None, anew: bool) -> Array:
+def innovations_of(entering: Array, initial_count: int, observer: Observer | None, anew: bool) -> Array:
     """Return the matrices ``(K, p, Q)`` from all deviations to the innovations.
 
     Disturbance and initial state enter the state as ``entering (K, d, Q')``. The entries of the noise stand before the
-    last ``begun`` entries, which belong to the initial state. With ``anew``, as many entries of the next period's
-    initial state stand between them; no measurement of this period depends on them.
+    last ``initial_count`` entries, which belong to the initial state. With ``anew``, as many entries of the next
+    period's initial state stand between them; no measurement of this period depends on them.
     """
-    innovations = entering if observer is None else observer.seen(entering, begun)
-    return np.insert(innovations, np.full(begun, innovations.shape[2] - begun), 0.0, axis=2) if anew else innovations
+    innovations = entering if observer is None else observer.compute_innovations(entering, initial_count)
+    return (
+        np.insert(innovations, np.full(initial_count, innovations.shape[2] - initial_count), 0.0, axis=2)
+        if anew
+        else innovations
+    )

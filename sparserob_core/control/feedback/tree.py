@@ -172,7 +172,7 @@ class Tree:
     def units(self) -> Array:
         """Largest possible size of every row, ``(R,)``, by which the row is divided."""
         s = self.sampled
-        size = np.abs(self._control_coefficients).sum(axis=(1, 2)) + self.knowledge.most + np.abs(s.b)
+        size = np.abs(self._control_coefficients).sum(axis=(1, 2)) + self.knowledge.contribution_bounds + np.abs(s.b)
         return np.where(size > 0.0, size, 1.0)
 
     def add(self, z: Array) -> bool:
@@ -217,7 +217,7 @@ class Tree:
 
     def _compute_information_key(self, z: Array, k: int) -> tuple[int, bytes]:
         """Return a key that is equal for all signals that the control on piece ``k`` cannot distinguish."""
-        return k, self.knowledge.history(z, int(self.knowledge.seen[k]))
+        return k, self.knowledge.history(z, int(self.knowledge.known_reports[k]))
 
     def changed(self, signal: int, row: int, report: int) -> Array:
         """Return the worst signal for a row among those that share the first ``report`` reports with a signal of the
@@ -231,7 +231,7 @@ class Tree:
         if key in self._imposed_keys:
             return False
         self._imposed_keys.add(key)
-        is_informed, unit = self.knowledge.seen > report, self.units[row]
+        is_informed, unit = self.knowledge.known_reports > report, self.units[row]
         channel, piece = np.nonzero(self._control_coefficients[row] * ~is_informed)
         noise, _ = self.knowledge.changed(z, row, report)
         columns, values = [self._columns[signal][channel, piece]], [self._control_coefficients[row][channel, piece]]
@@ -363,6 +363,6 @@ class Tree:
         offsets = sums(control_values)[:, :, knowledge.first] + later_best[:, knowledge.first] - s.b[:, None]
         if self.priced:
             offsets = offsets - found.x[0] * self.units[:, None]
-        offsets = np.where(reports <= knowledge.begun[:, None], offsets, -np.inf)
+        offsets = np.where(reports <= knowledge.past_reports[:, None], offsets, -np.inf)
         excess = offsets + scale * knowledge.gives(np.array(self.signals), offsets / scale)
         return np.asarray(excess / self.units[:, None])

@@ -128,38 +128,38 @@ class KernelPolynomial:
 @final
 @dataclass(frozen=True, eq=False)
 class Zonoid(ConvexSet):
-    """``Z`` of a piece in coordinates ``into (r, d)`` of the state, from what a disturbance makes of that (``pushes``),
+    """``Z`` of a piece in coordinates ``into (r, d)`` of the state, from what a disturbance makes of that (``kernel``),
     with the `corners` of ``W`` in ``parts``. ``outward (d, r)`` brings the coordinates back; the set is about round in
     them.
 
     Times count backwards, from the end of the piece.
     """
 
-    pushes: KernelPolynomial
+    kernel: KernelPolynomial
     parts: tuple[Array, ...]
     into: Array
     outward: Array
 
     @staticmethod
-    def of(pushes: KernelPolynomial, bound: ConvexSet) -> Zonoid:
+    def of(kernel: KernelPolynomial, bound: ConvexSet) -> Zonoid:
         """Return the set of one piece, in the coordinates in which the ellipsoid of its second moments is a ball."""
-        corner_sets, (d, mw) = tuple(corners(bound)), pushes.terms.shape[2:]
+        corner_sets, (d, mw) = tuple(corners(bound)), kernel.terms.shape[2:]
         nodes, weights = np.polynomial.legendre.leggauss(32)
-        share = weights * pushes.halves[:, None]
+        share = weights * kernel.halves[:, None]
         reach = (
             np.zeros(mw)
             if not corner_sets
             else np.max([np.abs(corner_set).max(axis=0) for corner_set in corner_sets], axis=0)
         )
-        powers = nodes[:, None] ** np.arange(pushes.terms.shape[1])
-        kernel_values = np.einsum("np,spdw->sndw", powers, pushes.terms) * reach
+        powers = nodes[:, None] ** np.arange(kernel.terms.shape[1])
+        kernel_values = np.einsum("np,spdw->sndw", powers, kernel.terms) * reach
         moments = (
             (kernel_values * np.sqrt(share)[:, :, None, None]).reshape(-1, d, mw).transpose(1, 0, 2).reshape(d, -1)
         )
         U, sizes, _ = np.linalg.svd(moments, full_matrices=False)
         kept = sizes > NEGLIGIBLE * sizes.max(initial=0.0)
         U, sizes = U[:, kept], sizes[kept]
-        return Zonoid(pushes, corner_sets, (U / sizes).T, U * sizes)
+        return Zonoid(kernel, corner_sets, (U / sizes).T, U * sizes)
 
     @property
     def dimension(self) -> int:
@@ -197,22 +197,22 @@ class Zonoid(ConvexSet):
     @property
     def count(self) -> int:
         """Number ``S`` of parts of the piece."""
-        return int(self.pushes.ends.size - 1)
+        return int(self.kernel.ends.size - 1)
 
     @property
     def channels(self) -> int:
         """Number ``mw`` of entries of a disturbance."""
-        return int(self.pushes.terms.shape[3])
+        return int(self.kernel.terms.shape[3])
 
     @cached_property
     def coefficients(self) -> Array:
         """``K`` on every part as a polynomial of ``u`` from -1 to 1 across it, ``(S, p + 1, r, mw)``."""
-        return np.asarray(self.into @ self.pushes.terms)
+        return np.asarray(self.into @ self.kernel.terms)
 
     @cached_property
     def integrals(self) -> Array:
         """The integral of the `coefficients` over time from the middle of a part, ``(S, p + 2, r, mw)``."""
-        orders, halves = np.arange(1, self.coefficients.shape[1] + 1), self.pushes.halves
+        orders, halves = np.arange(1, self.coefficients.shape[1] + 1), self.kernel.halves
         terms = halves[:, None, None, None] * self.coefficients / orders[:, None, None]
         return np.concatenate([np.zeros_like(self.coefficients[:, :1]), terms], axis=1)
 
@@ -230,7 +230,7 @@ class Zonoid(ConvexSet):
         return np.concatenate([first[None], self.coefficients.sum(axis=1)])
 
     @cached_property
-    def bend(self) -> Array:
+    def curvature_bounds(self) -> Array:
         """Bounds of the second derivatives of ``K`` by ``u`` on every part, ``(S, r, mw)``."""
         orders = np.arange(self.coefficients.shape[1])
         return np.asarray((np.abs(self.coefficients) * (orders * (orders - 1))[:, None, None]).sum(axis=1))
@@ -253,8 +253,8 @@ class Zonoid(ConvexSet):
         return points.reshape(np.shape(directions))
 
     def signals(self, points: Array) -> list[Arc]:
-        """Return a signal that leads nearly to each of the points ``(k, r)`` of the set (`reached` says where): a mean
-        of at most ``r`` that attain support functions and of the middle (Caratheodory)."""
+        """Return a signal that leads nearly to each of the points ``(k, r)`` of the set (`evaluate_signal` says where):
+        a mean of at most ``r`` that attain support functions and of the middle (Caratheodory)."""
         all_directions, shares = self._decompose_points(points)
         return [
             _combine_arcs([self.best(a) for a in directions[share > 0.0]], share[share > 0.0], self.channels)
@@ -266,12 +266,12 @@ class Zonoid(ConvexSet):
         arcs = [self._sweep_corners(corner_set, direction[None]).arc() for corner_set in self.parts]
         return _combine_arcs(arcs, np.ones(len(arcs)), self.channels)
 
-    def reached(self, signal: Arc) -> Array:
+    def evaluate_signal(self, signal: Arc) -> Array:
         """Return the point ``(r,)`` that a signal leads to."""
-        ends, halves = self.pushes.ends, self.pushes.halves
-        times_left = ends[-1] * (1.0 - np.concatenate([[0.0], signal.ends]))
-        part_numbers = np.clip(np.searchsorted(ends, times_left, side="right") - 1, 0, self.count - 1)
-        along = (times_left - ends[part_numbers]) / halves[part_numbers] - 1.0
+        ends, halves = self.kernel.ends, self.kernel.halves
+        remaining_times = ends[-1] * (1.0 - np.concatenate([[0.0], signal.ends]))
+        part_numbers = np.clip(np.searchsorted(ends, remaining_times, side="right") - 1, 0, self.count - 1)
+        along = (remaining_times - ends[part_numbers]) / halves[part_numbers] - 1.0
         orders = np.arange(self.integrals.shape[1])
         powers = along[:, None] ** orders - (-1.0) ** orders
         cumulative = np.concatenate([np.zeros((1, *self.across.shape[1:])), np.cumsum(self.across, axis=0)])
@@ -288,7 +288,7 @@ class Zonoid(ConvexSet):
     def _decompose_points(self, points: Array) -> tuple[Array, Array]:
         """Return directions ``(k, r, r)`` and shares ``(k, r)``, at most 1 together, such that the support points of
         the directions in these shares add up nearly to ``points (k, r)`` of the set. The gauge of a point is a linear
-        program whose columns are generated, as in `ConvexSet`. By how much they miss it, `reached` says."""
+        program whose columns are generated, as in `ConvexSet`. By how much they miss it, `evaluate_signal` says."""
         k, r = points.shape
         signs = np.where(points < 0.0, -1.0, 1.0)
         lengths = np.linalg.norm(points, axis=1)
@@ -328,7 +328,7 @@ class _Sweep:
         self.zonoid, self.part, self.directions = zonoid, part, directions
         heights = np.tensordot(directions, zonoid.nodes, axes=(1, 1)) @ part.T  # (N, S + 1, v)
         self.best = heights[:, :-1].argmax(axis=2)
-        curvature = np.tensordot(np.abs(directions), zonoid.bend, axes=(1, 1))  # (N, S, mw)
+        curvature = np.tensordot(np.abs(directions), zonoid.curvature_bounds, axes=(1, 1))  # (N, S, mw)
         curvature = curvature @ np.abs(part[:, None] - part).transpose(2, 0, 1).reshape(part.shape[1], -1)
         curvature = np.take_along_axis(
             curvature.reshape(*self.best.shape, part.shape[0], -1), self.best[:, :, None, None], axis=2
@@ -386,7 +386,7 @@ class _Sweep:
     def arc(self) -> Arc:
         """Return the signal of the first direction."""
         _, s, low, high, best = self.cells
-        ends = self.zonoid.pushes.ends
+        ends = self.zonoid.kernel.ends
         clean_parts, halves, begins = np.flatnonzero(self.clean[0]), np.diff(ends) / 2.0, ends[:-1]
         stop = np.concatenate([ends[clean_parts + 1], begins[s] + halves[s] * (high + 1.0)])  # backwards in time
         start = np.concatenate([begins[clean_parts], begins[s] + halves[s] * (low + 1.0)])
@@ -425,14 +425,14 @@ def _build_expansion_matrices(size: int, count: int) -> Array:
     return matrices
 
 
-def _is_nonnegative(left: Array, right: Array, bent: Array, spare: Array | float) -> np.ndarray:
+def _is_nonnegative(left: Array, right: Array, curvature: Array, spare: Array | float) -> np.ndarray:
     """Return whether a function is certainly not negative on a cell, given its values at the ends.
 
-    The second derivative times half the square of the cell's length is at most ``bent``. The function is then at least
-    its chord less a parabola, which Cauchy's inequality bounds. Violations by ``spare`` count as rounding.
+    The second derivative times half the square of the cell's length is at most ``curvature``. The function is then at
+    least its chord less a parabola, which Cauchy's inequality bounds. Violations by ``spare`` count as rounding.
     """
     near = np.sqrt(np.maximum(left, 0.0)) + np.sqrt(np.maximum(right, 0.0))
-    return (left >= -spare) & (right >= -spare) & (near**2 >= bent - spare)
+    return (left >= -spare) & (right >= -spare) & (near**2 >= curvature - spare)
 
 
 def _evaluate_polynomials(P: Array, u: Array) -> Array:

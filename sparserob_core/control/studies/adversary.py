@@ -130,7 +130,7 @@ def _find_in_closed_loop(constraint: StateConstraint, decision: Array, loop: Clo
         direction=direction,
         bound=float(bounds[row]) - offset,
         parameter=np.zeros(0),
-        initial_state=loop.begun(deviation),
+        initial_state=loop.compute_initial_state(deviation),
         violation=float(worst.violations[0]),
         breakpoints=breakpoints,
         disturbance=disturbance,

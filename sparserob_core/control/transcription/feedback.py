@@ -17,7 +17,7 @@ from sparserob_core.control.constraints.feedback_curved import FeedbackCurvedCon
 from sparserob_core.control.constraints.flat import FlatConstraint
 from sparserob_core.control.constraints.state import StateConstraint
 from sparserob_core.control.feedback.closed_loop import ClosedLoop, deviations_of
-from sparserob_core.control.feedback.innovations import Answers, answers, innovations_seen, unfelt
+from sparserob_core.control.feedback.innovations import Answers, answers, build_innovations, find_negligible_entries
 from sparserob_core.control.feedback.measurable import MeasurablePieces, measurable_pieces
 from sparserob_core.control.feedback.observer import Observer, between, innovations_of
 from sparserob_core.control.feedback.zonoid import has_corners
@@ -245,7 +245,7 @@ def _build_measurements(mask: np.ndarray, theirs: Posed, own: Posed, units: Unit
     blocks = 0 if disturbance is None else disturbance.block_count
     deviations = np.tile(units.disturbances[: problem.system.disturbances], blocks)
     deviations = deviations if pieces is None else np.ones(pieces.size)
-    innovations = innovations_seen(own.response, own.control, disturbance, has_initial_set, pieces)
+    innovations = build_innovations(own.response, own.control, disturbance, has_initial_set, pieces)
     output_units, observer, initial_units = units.states, None, units.states[: len(units.states) * has_initial_set]
     if problem.measurements is not None and theirs.problem.measurements is not None:
         output_units = theirs.problem.measurements.units(units.states)
@@ -378,13 +378,17 @@ def _find_ineffective_entries(own: Posed, spread: Spread) -> np.ndarray:
         np.zeros(0) if convex is None else convex.width(np.eye(convex.dimension)) for convex in sets
     )
     rows = _normalise_rows(own.constraints, own.problem.system.states)
-    is_unfelt = unfelt(own.response, None if bound is None else model, disturbance_widths, initial_widths, rows, STILL)
+    is_negligible = find_negligible_entries(
+        own.response, None if bound is None else model, disturbance_widths, initial_widths, rows, STILL
+    )
     if bound is not None and model is not None:
-        entries = _combine_over_times(bound, is_unfelt[: is_unfelt.size - initial_widths.size])
-        is_still[: is_unfelt.size - initial_widths.size] = np.tile(entries, model.block_count)
+        entries = _combine_over_times(bound, is_negligible[: is_negligible.size - initial_widths.size])
+        is_still[: is_negligible.size - initial_widths.size] = np.tile(entries, model.block_count)
     if own.problem.initial_set is not None:
         periods = 1 + _has_next_initial_state(own)
-        entries = _combine_over_times(own.problem.initial_set, is_unfelt[is_unfelt.size - initial_widths.size :])
+        entries = _combine_over_times(
+            own.problem.initial_set, is_negligible[is_negligible.size - initial_widths.size :]
+        )
         is_still[spread.size - initial_widths.size * periods :] = np.tile(entries, periods)
     return is_still
 

@@ -243,7 +243,7 @@ def test_the_signal_of_the_worst_deviation_takes_the_state_there(name):
         ends, values = loop.signal(deviation, time, c)
         assert values.shape == (case.E.shape[1], ends.size - 1)
         assert all(case.bound.contains(w[None], 1e-9)[0] for w in values.T)
-        begun = loop.begun(deviation)
+        begun = loop.compute_initial_state(deviation)
         if case.begun is None:
             assert (begun == case.start).all()
         else:

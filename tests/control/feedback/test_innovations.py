@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import sparserob_core as sr
-from sparserob_core.control.feedback.innovations import answers, unfelt
+from sparserob_core.control.feedback.innovations import answers, find_negligible_entries
 from sparserob_core.control.policies.affine import AffinePolicy
 from sparserob_core.control.problem.system import LinearSystem
 from sparserob_core.control.sets.sets import Box
@@ -112,16 +112,19 @@ def test_what_a_deviation_does_to_no_row_by_any_breakpoint_is_unfelt() -> None:
     forgot = (1.0 - np.exp(-1.5)) / 3.0
     response, model, rows = functionals.response, functionals.disturbance, np.array([[0.5, 0.0], [0.0, -2.0]])
     for least in (*(pushed * 1.001), *(pushed * 0.999), forgot * 1.001, forgot * 0.999):
-        found = unfelt(response, model, np.ones(2), np.zeros(0), np.eye(2), least).reshape(4, 2)
+        found = find_negligible_entries(response, model, np.ones(2), np.zeros(0), np.eye(2), least).reshape(4, 2)
         assert found.tolist() == [[one <= least, forgot <= least] for one in pushed.tolist()]
-        found = unfelt(response, model, np.ones(2), np.array([0.1, 0.2]), rows, least)
+        found = find_negligible_entries(response, model, np.ones(2), np.array([0.1, 0.2]), rows, least)
         effects = [[0.5 * one, 2.0 * forgot] for one in pushed.tolist()]
         assert found[:8].reshape(4, 2).tolist() == [[one <= least for one in pair] for pair in effects]
         assert found[8:].tolist() == [least >= 0.05 * np.exp(6.0), least >= 0.4]
-        assert unfelt(response, None, np.zeros(0), np.array([0.1, 0.2]), rows, least).tolist() == found[8:].tolist()
-    found = unfelt(response, model, np.array([0.0, 1.0]), np.zeros(0), np.eye(2), 1e-12)
+        assert (
+            find_negligible_entries(response, None, np.zeros(0), np.array([0.1, 0.2]), rows, least).tolist()
+            == found[8:].tolist()
+        )
+    found = find_negligible_entries(response, model, np.array([0.0, 1.0]), np.zeros(0), np.eye(2), 1e-12)
     assert found.tolist() == [True, False] * 4
-    assert unfelt(response, model, np.ones(2), np.ones(2), np.zeros((0, 2)), 0.0).all()
+    assert find_negligible_entries(response, model, np.ones(2), np.ones(2), np.zeros((0, 2)), 0.0).all()
 
 
 def test_variables_on_less_of_an_entry_are_as_many_times_smaller() -> None:

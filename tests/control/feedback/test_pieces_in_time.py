@@ -68,7 +68,7 @@ def test_what_a_piece_does_is_the_integral_of_the_support_function(name: str) ->
         onward = exponentials(
             case.A * float(case._of(case.grown, np.array(2.0)) - case._of(case.grown, np.array(high)))
         )
-        assert pieces.carried(np.array([piece]), np.array([2.0]))[0] == pytest.approx(onward, rel=1e-9)
+        assert pieces.compute_transitions(np.array([piece]), np.array([2.0]))[0] == pytest.approx(onward, rel=1e-9)
 
 
 @pytest.mark.slow
@@ -130,7 +130,7 @@ def test_what_an_expansion_leaves_out_of_what_a_piece_does_is_in_the_bounds(monk
         assert loop.motion is not None
         left, under_way = (
             loop._bound_transition_errors(none, loop.motion),
-            loop.motion.bound_state_errors(*pieces.reached),
+            loop.motion.bound_state_errors(*pieces.effect_sizes),
         )
         assert under_way[0].min() > 1e-12 and (left >= under_way * (1.0 - 1e-12)).all()
 
@@ -201,7 +201,7 @@ def test_the_worst_signals_of_a_plant_whose_matrices_do_not_commute_attain_what_
                 arc = zonoid.best(a @ outward)
                 state = driven(low, low + arc.ends * (high - low), arc.values * pieces.disturbances)
                 reached = float(a @ state)
-                np.testing.assert_allclose(outward @ zonoid.reached(arc), state, atol=1e-9)
+                np.testing.assert_allclose(outward @ zonoid.evaluate_signal(arc), state, atol=1e-9)
                 assert float(zonoid.support(a @ outward)) == pytest.approx(reached, abs=1e-9)
                 pushed = both.deviations
                 told = pushed.kernel(piece).most(Enclosed(a[None], np.zeros((1, 2))), pushed.summands)

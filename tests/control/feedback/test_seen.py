@@ -164,7 +164,7 @@ def test_a_coordinate_along_which_nearly_nothing_happens_is_not_answered():
     outward = np.array([[1.0, 0.0, 1e-9, 0.3], [0.0, 0.0, 0.0, 0.4]])
     stub = SimpleNamespace(outward=outward, dimension=4)
     few = dataclasses.replace(pieces, zonoids=(stub, *pieces.zonoids[1:]))
-    assert few.seen(0).tolist() == [True, False, False, True]
+    assert few.mark_answered(0).tolist() == [True, False, False, True]
     at, states = few.at(1)
     assert (at.start, at.stop) == (4, 4 + pieces.zonoids[1].dimension)
     assert (states == pieces.states[:, None] * pieces.zonoids[1].outward).all()

@@ -103,12 +103,12 @@ def test_a_signal_leads_where_an_exponential_says(name: str) -> None:
     """Signals that jump anywhere, at ends of parts too, not those of the best corners alone."""
     A, E, length, bound = CASES[name]
     found, rng = Zonoid.of(KernelPolynomial.of(A, E, length), bound), np.random.default_rng(6)
-    of_parts = 1.0 - found.pushes.ends[1:-1] / length
+    of_parts = 1.0 - found.kernel.ends[1:-1] / length
     for ends in (np.ones(1), np.append(np.sort(rng.uniform(size=7)), 1.0), np.append(of_parts[::-1], 1.0)):
         values = rng.normal(size=(ends.size, E.shape[1]))
         truth = found.into @ effect(A, E, length, ends, values)
         np.testing.assert_allclose(
-            found.reached(Arc(ends, values)), truth, rtol=1e-12, atol=1e-12 * np.abs(truth).max()
+            found.evaluate_signal(Arc(ends, values)), truth, rtol=1e-12, atol=1e-12 * np.abs(truth).max()
         )
 
 
@@ -121,7 +121,7 @@ def test_a_signal_does_not_miss_its_point_where_columns_are_the_same_but_for_rou
     A, E, length, bound = CASES[name]
     found, rng = Zonoid.of(KernelPolynomial.of(A, E, length), bound), np.random.default_rng(seed)
     points = found.support_point(rng.normal(size=(8, 4))) * rng.uniform(size=(8, 1))
-    reached = np.array([found.reached(one) for one in found.signals(points)])
+    reached = np.array([found.evaluate_signal(one) for one in found.signals(points)])
     assert np.abs(reached - points).max() <= 1e-13
 
 
