@@ -280,12 +280,14 @@ class CurvedConstraint(StateConstraint):
         return across(self.set, z, states - self.set.support_point(directions) @ self.set.frame.T / self.unit)
 
     @shaped
-    def beside(self, x: Float[Array, " n"], times: Float[Array, " k"]) -> Float[Array, "k d"]:
+    def compute_added_terms(self, x: Float[Array, " n"], times: Float[Array, " k"]) -> Float[Array, "k d"]:
         return np.zeros(self.set.dimension) - self.reference.at(times)
 
     @shaped
-    def outwardness(self, states: Float[Array, "d n"], beside: Float[Array, " d"] | None = None) -> Float[Array, " n"]:
-        states = states if beside is None else states + beside[:, None]
+    def outwardness(
+        self, states: Float[Array, "d n"], added_terms: Float[Array, " d"] | None = None
+    ) -> Float[Array, " n"]:
+        states = states if added_terms is None else states + added_terms[:, None]
         sizes = self.set.gauge(states.T) - 1.0
         return sizes if np.isfinite(sizes).all() else self.set.violation(states.T)
 

@@ -8,7 +8,7 @@ from typing import final
 import numpy as np
 
 from sparserob_core.control.constraints.explanation import ConstraintSource, TimedExplanation
-from sparserob_core.control.constraints.feedback import not_linear, told
+from sparserob_core.control.constraints.feedback import describe_deviations, not_linear
 from sparserob_core.control.feedback.closed_loop import ROUND_OFF, ClosedLoop
 from sparserob_core.control.feedback.effort import Effort, largest_effort
 from sparserob_core.control.problem.units import Units
@@ -129,4 +129,4 @@ class FeedbackEffort(ConstraintSource):
         signs = index[: self.prices.size]
         text = f"{self.name}: the control against {signs.size} signs <= the cost"
         description = TimedExplanation(text, self.name, text, 0.0, self._row_signs[row] * signs)
-        return told(description, self.loop, index[self.prices.size :])
+        return describe_deviations(description, self.loop, index[self.prices.size :])

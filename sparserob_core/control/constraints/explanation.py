@@ -99,10 +99,10 @@ class TimedExplanation(Explanation):
         Parameter of the constraint.
     disturbance : ndarray, shape (mw, pieces), optional
         Worst disturbance.
-    begun : ndarray, shape (d,), optional
+    initial_state : ndarray, shape (d,), optional
         Worst initial state, where there is more than one.
     deviation : ndarray, shape (d,), optional
-        Deviation of ``begun`` from the centre of the initial states.
+        Deviation of ``initial_state`` from the centre of the initial states.
     cause : str
         Uncertain quantities that move the quantity.
     quantity : str
@@ -144,7 +144,7 @@ class TimedExplanation(Explanation):
     direction: Array
     parameter: Array | None = None
     disturbance: Array | None = None
-    begun: Array | None = None
+    initial_state: Array | None = None
     deviation: Array | None = None
     cause: str = "disturbance"
     quantity: str = ""
@@ -172,7 +172,7 @@ class TimedExplanation(Explanation):
             self.time,
             self.parameter,
             self.disturbance,
-            self.begun,
+            self.initial_state,
             self.where if self.names.corners else "",
         )
 
@@ -236,19 +236,19 @@ class TimedExplanation(Explanation):
         return f"{self.text} and {other.text} leave nothing between them{self._where_clause}"
 
     def _describe_uncontrollable(
-        self, other: TimedExplanation, rest: Array, share: float, allowed: float, moved: float
+        self, other: TimedExplanation, rest: Array, share: float, allowed: float, shift: float
     ) -> str:
         """Return the sentence for two rows whose quantities the control moves alike, so that it cannot change their
         combination ``rest'x``."""
         side = -1.0 if rest[np.flatnonzero(rest)[0]] < 0 else 1.0
         free = (self.sign * self.free + share * other.sign * other.free) / self.scale
-        rest, allowed, moved = rest / self.scale, allowed / self.scale, moved / self.scale
+        rest, allowed, shift = rest / self.scale, allowed / self.scale, shift / self.scale
         relation = "at least" if side < 0 else "at most"
         unit = measured_in(rest, self.names)
-        note = f" less {moved:.4g}{unit} for the worst {self.cause}s" if moved > 0 and side > 0 else ""
-        note = f" and {moved:.4g}{unit} more for the worst {self.cause}s" if moved > 0 and side < 0 else note
-        stated, corner = _separate_corner(rest, self.names)
-        quantity, at = combination(side * stated, self.names, f"({self.time:.6g})"), self._where_clause
+        note = f" less {shift:.4g}{unit} for the worst {self.cause}s" if shift > 0 and side > 0 else ""
+        note = f" and {shift:.4g}{unit} more for the worst {self.cause}s" if shift > 0 and side < 0 else note
+        user_normal, corner = _separate_corner(rest, self.names)
+        quantity, at = combination(side * user_normal, self.names, f"({self.time:.6g})"), self._where_clause
         asking = f"{self.statement} and {other.statement} ask"
         if self.names.corners and corner is None:  # the two are about different corners
             first, second = sorted(
@@ -360,8 +360,8 @@ def explanation(
     direction, system = H[row], functionals.response.system
     gain = None if mixed is None else mixed[0][row]
     normal = direction if gain is None else np.concatenate([direction, gain])
-    stated, corner = _separate_corner(normal, functionals.names)
-    sign = -1.0 if np.count_nonzero(stated) == 1 and stated.sum() < 0 else 1.0
+    user_normal, corner = _separate_corner(normal, functionals.names)
+    sign = -1.0 if np.count_nonzero(user_normal) == 1 and user_normal.sum() < 0 else 1.0
     contributions = functionals.parts(time, direction, parameter)
     sigma = contributions.sigma
     free, limit = sign * contributions.free + 0.0, sign * float(h[row]) + 0.0  # no negative zeros
@@ -375,7 +375,7 @@ def explanation(
     ]
     cause = " and ".join(names) or "disturbance"
     quantity, where = (
-        combination(sign * stated / scale, functionals.names, f"({time:.6g})", direction.size),
+        combination(sign * user_normal / scale, functionals.names, f"({time:.6g})", direction.size),
         system.describe(parameter) if parameter.size else corner or "",
     )
     unit = unit_of_row(normal / scale, functionals.names, direction.size)
@@ -401,7 +401,7 @@ def explanation(
         cause,
         quantity=quantity,
         bound=_format_bound(
-            combination(sign * stated / scale, functionals.names, states=direction.size),
+            combination(sign * user_normal / scale, functionals.names, states=direction.size),
             limit / scale,
             None if opposite is None else opposite / scale,
             sign,

@@ -26,7 +26,7 @@ ZOOMED, ZOOMS, CLOSER = 9, 14, 4.0  # samples around a maximum, and how often th
 NEAR, FEW = 1e-3, 4  # maxima that are so near to their limit are refined, and so many in any case
 HALVINGS, HALVED = 14, 200  # how often samples are drawn closer, and how many intervals at a time
 HIDDEN, SHARE = 2e-10, 0.2  # a violation that samples may miss; the share of the largest that they may
-BEGUN = 20  # times of a window that a method begins with
+FIRST_TIMES = 20  # times of a window that a method begins with
 STATES = 60_000_000  # numbers in the states that are sampled at once
 IDLE = 1e-14  # of the largest coefficient, one that is rounding
 SAME = 1e-12  # of the largest one, a singular value of equations that depend on one another
@@ -148,7 +148,9 @@ class FeedbackConstraint(ConstraintSource):
     def family(self) -> ConstraintFamily:
         """Return the constraint as a family."""
         start, stop = self.flat.start, self.flat.stop
-        positions = np.unique(np.linspace(0, self.times.size - 1, min(BEGUN, self.times.size)).round().astype(int))
+        positions = np.unique(
+            np.linspace(0, self.times.size - 1, min(FIRST_TIMES, self.times.size)).round().astype(int)
+        )
         source = self if self.exact else self.flat
         family = indexed(self, Box(np.array([start]), np.array([stop])), self.times[positions][:, None], source)
         family = replace(family, scale=self.scale)
@@ -190,7 +192,7 @@ class FeedbackConstraint(ConstraintSource):
         values = np.concatenate(
             [flat.H[rows] @ self.loop.states(x, times, pieces) for rows, pieces in self._group_rows(times)], axis=1
         )
-        values[:, :, 0] += flat.moved(times)
+        values[:, :, 0] += flat.compute_reference_terms(times)
         if flat.gains is not None:
             values += np.einsum("rm,krmq->krq", flat.gains, self.loop.controls(x)[flat.commanded(times)])
         return np.asarray(values)
@@ -198,7 +200,7 @@ class FeedbackConstraint(ConstraintSource):
     def uncertain(self, index: Array) -> UncertainRows:
         """Return the rows at one time."""
         flat, time = self.flat, index[:1]
-        allowed = flat.h - flat.moved(time)[0]
+        allowed = flat.h - flat.compute_reference_terms(time)[0]
         if flat.gains is None:
             rows = self.loop.state_rows(float(time[0]), flat.H, allowed, *self._row_parts)
             # what cannot deviate need not be answered
@@ -307,7 +309,7 @@ class FeedbackConstraint(ConstraintSource):
         that."""
         flat, ends = self.flat, (lower[:, 0], upper[:, 0])
         proven = flat.h.size if flat.gains is None else flat.h.size // 2
-        additions = [flat.moved(times)[:, :proven, None] for times in ends]
+        additions = [flat.compute_reference_terms(times)[:, :proven, None] for times in ends]
         if flat.gains is not None:
             acting = flat.commanded((ends[0] + ends[1]) / 2)[:, 0]
             control_terms = flat.gains[:proven] @ self.loop.controls(x)[acting]
@@ -323,7 +325,7 @@ class FeedbackConstraint(ConstraintSource):
     def explain(self, index: Array, row: int) -> Explanation:
         """Return the description of one constraint for a reader, for every disturbance, or at the deviations that the
         index holds."""
-        description = told(self.flat.explain(index[:1], row), self.loop, index[1:])
+        description = describe_deviations(self.flat.explain(index[:1], row), self.loop, index[1:])
         if not self._unanswered_rows[row]:
             return description
         last = float(self.loop.functionals.dictionary.breakpoints[-2])
@@ -488,7 +490,7 @@ class FeedbackControl(ConstraintSource):
         right = f"{self.h[row] + 0.0:.6g} {self.measured[row]}".rstrip() if self.bound is None else "its peak"
         text = f"{self.name}: {terms} <= {right}"
         description = TimedExplanation(text, self.name, text, time, direction)
-        return told(description, self.loop, index[1:], controls=True)
+        return describe_deviations(description, self.loop, index[1:], controls=True)
 
 
 def worst_of_each(found: Array, times: Array) -> Separation:
@@ -499,7 +501,7 @@ def worst_of_each(found: Array, times: Array) -> Separation:
     return Separation(times[order][:, None], rows[order], heights[order], float(found.max()))
 
 
-def told(said: TimedExplanation, loop: ClosedLoop, w: Array, controls: bool = False) -> TimedExplanation:
+def describe_deviations(said: TimedExplanation, loop: ClosedLoop, w: Array, controls: bool = False) -> TimedExplanation:
     """Return the description of a constraint for every disturbance, or at the deviations ``w (Q,)`` if ``w`` is not
     empty. ``controls`` says that the constraint is on the controls, not on the state."""
     problem, noises = loop.functionals, loop.noises(w) if w.size else None
@@ -507,7 +509,7 @@ def told(said: TimedExplanation, loop: ClosedLoop, w: Array, controls: bool = Fa
     sources = ("disturbance", problem.disturbance), ("noise", noisy), ("initial state", problem.initial)
     text = f"{said.statement} for every {' and '.join(name for name, s in sources if s is not None) or 'disturbance'}"
     if not w.size and loop.spread.size:
-        return replace(said, text=text, disturbance=None, begun=None, deviation=None, quantity="", noise=None)
+        return replace(said, text=text, disturbance=None, initial_state=None, deviation=None, quantity="", noise=None)
     point, width = loop.spread.middle + w, problem.response.system.disturbances
     signal = changes = None
     if loop.measurable is not None:
@@ -523,7 +525,7 @@ def told(said: TimedExplanation, loop: ClosedLoop, w: Array, controls: bool = Fa
         text=text,
         disturbance=signal,
         changes=changes,
-        begun=problem.response.initial_state + deviation,
+        initial_state=problem.response.initial_state + deviation,
         deviation=deviation,
         following=loop.following @ point if loop.anew else None,
         quantity="",

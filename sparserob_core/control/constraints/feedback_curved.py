@@ -18,7 +18,14 @@ import numpy as np
 from sparserob_core.control.constraints.control import Places
 from sparserob_core.control.constraints.curved import STEP, CurvedConstraint
 from sparserob_core.control.constraints.explanation import ConstraintSource, TimedExplanation, of_gauge
-from sparserob_core.control.constraints.feedback import STATES, FeedbackConstraint, acting, indexed, rows_at, told
+from sparserob_core.control.constraints.feedback import (
+    STATES,
+    FeedbackConstraint,
+    acting,
+    describe_deviations,
+    indexed,
+    rows_at,
+)
 from sparserob_core.control.constraints.local_maxima import climb, highest_at, ridden, turns
 from sparserob_core.control.feedback.closed_loop import ROUND_OFF, ClosedLoop
 from sparserob_core.control.problem.units import Units
@@ -27,7 +34,7 @@ from sparserob_core.sip.convex_set import Array, Box, ConvexSet
 from sparserob_core.sip.finite import UncertainRows
 from sparserob_core.sip.program import ConstraintFamily, Enclosure, Explanation, Separation
 
-BEGUN = 5  # times that a method begins with, in the directions of the axes
+FIRST_TIMES = 5  # times that a method begins with, in the directions of the axes
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,7 +104,9 @@ class Turning(ABC):
         cube = np.ones(self._cube_dimension)
         low, high = (ends[position] for ends, position in zip(self.spans, (0, -1), strict=True))
         index_set = Box(np.append(low, -cube), np.append(high, cube))
-        positions = np.unique(np.linspace(0, self.times.size - 1, min(BEGUN, self.times.size)).round().astype(int))
+        positions = np.unique(
+            np.linspace(0, self.times.size - 1, min(FIRST_TIMES, self.times.size)).round().astype(int)
+        )
         axes = np.vstack([np.eye(self._cube_dimension), -np.eye(self._cube_dimension)])
         start = np.hstack([np.repeat(self.times[positions], len(axes))[:, None], np.tile(axes, (positions.size, 1))])
         family = indexed(self, index_set, start, self.source)
@@ -233,7 +242,9 @@ class Turning(ABC):
     def explain(self, index: Array, row: int) -> Explanation:
         """Return the description of one constraint for a reader, for every disturbance, or at the deviations that the
         index holds."""
-        return told(self.explained(index[: 1 + self._cube_dimension]), self.loop, index[1 + self._cube_dimension :])
+        return describe_deviations(
+            self.explained(index[: 1 + self._cube_dimension]), self.loop, index[1 + self._cube_dimension :]
+        )
 
 
 @final
@@ -275,15 +286,15 @@ class FeedbackCurved(Turning):
 
     def answers(self, x: Array, times: Array) -> Array:
         values = self.loop.states(x, times)
-        values[:, :, 0] += self.curved.beside(x, times)
+        values[:, :, 0] += self.curved.compute_added_terms(x, times)
         return values
 
     def between(self, x: Array, lower: Array, upper: Array, H: Array) -> tuple[Array, Array]:
-        additions = tuple(H @ self.curved.beside(x, times)[:, :, None] for times in (lower, upper))
+        additions = tuple(H @ self.curved.compute_added_terms(x, times)[:, :, None] for times in (lower, upper))
         return self.loop.bounded(x, lower, upper, H, (additions[0], additions[1]))
 
     def rows(self, time: float, H: Array, h: Array) -> UncertainRows:
-        shift = H @ self.curved.beside(np.zeros(0), np.array([time]))[0]
+        shift = H @ self.curved.compute_added_terms(np.zeros(0), np.array([time]))[0]
         return self.loop.state_rows(time, H, h - shift, np.zeros(1, dtype=int), np.ones(1))
 
     def explained(self, index: Array) -> TimedExplanation:

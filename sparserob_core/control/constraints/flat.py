@@ -14,8 +14,8 @@ from sparserob_core.control.constraints.explanation import TimedExplanation, exp
 from sparserob_core.control.constraints.local_maxima import (
     TINY,
     along_spans,
-    beside_kinks,
     climb,
+    find_kink_neighbours,
     local_maxima,
     step_out,
     vertices,
@@ -262,7 +262,7 @@ class FlatConstraint(StateConstraint):
         self, indices: Float[Array, "k j"]
     ) -> tuple[Float[Array, " n"], Float[Array, "n d"], Float[Array, "n nu"], Float[Array, " n"]]:
         parameters = np.repeat(self.parameters.clamp(indices[:, 1:]), self.h.size, axis=0)
-        count, rhs = indices.shape[0], self.h[None] - self.moved(indices[:, 0])
+        count, rhs = indices.shape[0], self.h[None] - self.compute_reference_terms(indices[:, 0])
         H = self.H if count == 1 else np.tile(self.H, (count, 1))
         return np.repeat(indices[:, 0], self.h.size), H, parameters, rhs.ravel()
 
@@ -274,12 +274,12 @@ class FlatConstraint(StateConstraint):
         answer: Array = self.functionals.values(x, indices[:, 0], self.H[rows], parameters) - self.h[rows]
         if not self.reference.moves and self.gains is None:
             return answer
-        answer += self.beside(x, indices[:, 0])[np.arange(rows.size), rows]
+        answer += self.compute_added_terms(x, indices[:, 0])[np.arange(rows.size), rows]
         return answer
 
     @shaped
-    def beside(self, x: Float[Array, " n"], times: Float[Array, " k"]) -> Float[Array, "k r"]:
-        additions = self.moved(times)
+    def compute_added_terms(self, x: Float[Array, " n"], times: Float[Array, " k"]) -> Float[Array, "k r"]:
+        additions = self.compute_reference_terms(times)
         if self.gains is not None:
             control = self.functionals.control(x)[:, self.commanded(times)]
             additions = additions + np.einsum("rm,mkr->kr", self.gains, control)
@@ -294,7 +294,7 @@ class FlatConstraint(StateConstraint):
         return np.pad(rows, ((0, 0), (0, self.functionals.variables - rows.shape[1])))
 
     @shaped
-    def moved(self, times: Float[Array, " k"]) -> Float[Array, "k r"]:
+    def compute_reference_terms(self, times: Float[Array, " k"]) -> Float[Array, "k r"]:
         """Return ``-H r(t)``."""
         return MovingReference(self.reference, self.H).at(times)
 
@@ -328,7 +328,7 @@ class FlatConstraint(StateConstraint):
             [
                 positions,
                 along_spans(values, positions, self.pieces, spans),
-                beside_kinks(values, self.times, self.kinks, KEPT),
+                find_kink_neighbours(values, self.times, self.kinks, KEPT),
             ]
         )
         heights, rows = values[tuple(positions.T)], positions[:, 1]
@@ -364,7 +364,7 @@ class FlatConstraint(StateConstraint):
     @shaped
     def explain(self, index: Float[Array, " j"], row: int) -> TimedExplanation:
         time, parameter = float(index[0]), self.parameters.clamp(index[None, 1:])[0]
-        allowed = self.h - self.moved(index[:1])[0]
+        allowed = self.h - self.compute_reference_terms(index[:1])[0]
         if self.gains is None:
             return explanation(self.name, self.functionals, self.H, allowed, row, time, parameter)
         mixed = (self.gains, int(self.commanded(index[:1])[0, row]))
@@ -390,8 +390,10 @@ class FlatConstraint(StateConstraint):
         return self.H[rows][:, None], np.ones((rows.size, 1))
 
     @shaped
-    def outwardness(self, states: Float[Array, "d n"], beside: Float[Array, " r"] | None = None) -> Float[Array, " n"]:
-        allowed = self.h if beside is None else self.h - beside
+    def outwardness(
+        self, states: Float[Array, "d n"], added_terms: Float[Array, " r"] | None = None
+    ) -> Float[Array, " n"]:
+        allowed = self.h if added_terms is None else self.h - added_terms
         return np.asarray((self.H @ states - allowed[:, None]).max(axis=0))
 
     @property
@@ -467,7 +469,7 @@ class FlatConstraint(StateConstraint):
         if self.functionals.execution is not None:
             answer = answer + self._compute_execution_errors(self.functionals.execution, x)
         has_additions = self.reference.moves or self.gains is not None
-        return answer + self.beside(x, self.times).T if has_additions else answer
+        return answer + self.compute_added_terms(x, self.times).T if has_additions else answer
 
     def _compute_execution_errors(self, execution: Execution, x: Array) -> Array:
         """Return the contribution of the worst errors of execution to all rows at every lattice point and sampled time,
@@ -502,9 +504,9 @@ class FlatConstraint(StateConstraint):
             neighbours[:, 0] = (at[:, None] + steps[:, None] * STENCIL).ravel()
             samples = self.violations(x, neighbours, rows[live].repeat(3)).reshape(-1, 3)
             before, now, after = samples.T
-            slope, bend = (after - before) / 2, 2 * now - before - after
-            is_inside = np.abs(slope) < bend
-            share = slope / np.where(is_inside, bend, np.maximum(np.abs(slope), TINY))
+            slope, curvature = (after - before) / 2, 2 * now - before - after
+            is_inside = np.abs(slope) < curvature
+            share = slope / np.where(is_inside, curvature, np.maximum(np.abs(slope), TINY))
             error, size = np.abs(violations[live] - now), np.maximum(1.0, np.abs(now))
             is_sure = is_inside & (share * slope <= 2 * ARRIVED * size)
             if look == 0:

@@ -16,7 +16,7 @@ UNSURE = 4.0  # by how much the rise that a parabola predicts may be wrong
 CLOSE = 1e-6  # found maxima that are one, in times and on the cube of directions
 # Indices of a curved set that are found at once, and those told where nothing is violated. With ten times fewer of the
 # first, rounds grow with the length of a wall that is ridden; with ten times more, there are more than help.
-MOST, TOLD = 64, 8
+MOST_RETURNED, FEWEST_RETURNED = 64, 8
 TURNS = 4  # directions at a time in which a curved set may be left
 # Of them and of times, from how many directions are climbed to. With ten times fewer, a violation beside a wall that is
 # ridden for long is left to the proof, which meets one a round.
@@ -79,7 +79,7 @@ def along_spans(values: Array, maxima: np.ndarray, pieces: np.ndarray, kept: int
     return np.concatenate(positions)
 
 
-def beside_kinks(values: Array, times: Array, kinks: np.ndarray, kept: int) -> np.ndarray:
+def find_kink_neighbours(values: Array, times: Array, kinks: np.ndarray, kept: int) -> np.ndarray:
     """Return positions ``(k, 3)`` in ``values (v, r, times)`` next to ``kinks``, the places among ``times`` at which
     anything turns or jumps. At these positions the violation may rise above 0 between samples; there are at most
     ``kept`` before and ``kept`` behind kinks. A parabola across a kink does not see that, one on either side of it
@@ -90,27 +90,28 @@ def beside_kinks(values: Array, times: Array, kinks: np.ndarray, kept: int) -> n
         near_distance, far_distance = (np.abs(times[at + k * step] - times[at]) for k in (1, 2))
         base, next_, last = (values[:, :, at + k * step] for k in (0, 1, 2))
         rate = (next_ - base) / near_distance
-        bend = ((last - next_) / (far_distance - near_distance) - rate) / far_distance
-        slope = rate - bend * near_distance
-        # The vertex is slope / (-2 bend) away and slope^2 / (-4 bend) higher, of which parabolas may be wrong by 4.
-        rises = (slope > 0.0) & (slope < -2.0 * bend * far_distance) & (slope**2 >= bend * base)
+        curvature = ((last - next_) / (far_distance - near_distance) - rate) / far_distance
+        slope = rate - curvature * near_distance
+        # The vertex is slope / (-2 curvature) away and slope^2 / (-4 curvature) higher, of which parabolas may be
+        # wrong by 4.
+        rises = (slope > 0.0) & (slope < -2.0 * curvature * far_distance) & (slope**2 >= curvature * base)
         v, r, t = rises.nonzero()
         order = np.argsort(-base[v, r, t], kind="stable")[:kept]
         positions.append(np.stack([v[order], r[order], at[t[order]] + step], axis=1))
     return np.concatenate(positions)
 
 
-def turns(heights: Array, beside: np.ndarray, unit: float) -> tuple[np.ndarray, int]:
+def turns(heights: Array, neighbours: np.ndarray, unit: float) -> tuple[np.ndarray, int]:
     """Return positions ``(k, 2)`` in ``heights (r, times)`` of local maxima over directions, at most `TURNS` at a time,
     and how many of them are to be climbed from. These are the first ones: those that may be above 0 between the sampled
-    directions, but at least `TOLD` and at most `HELD`. ``beside (r, j)``: the numbers of the directions that are
-    neighbours of each.
+    directions, but at least `FEWEST_RETURNED` and at most `HELD`. ``neighbours (r, j)``: the numbers of the directions
+    that are neighbours of each.
 
     The worst case of a disturbance that has corners has several maxima: what lies between sampled directions may make
     any of them the largest.
     """
-    highest, lowest = heights[beside[:, 0]], heights[beside[:, 0]]
-    for neighbour in beside.T[1:]:  # one by one: in six dimensions they are hundreds
+    highest, lowest = heights[neighbours[:, 0]], heights[neighbours[:, 0]]
+    for neighbour in neighbours.T[1:]:  # one by one: in six dimensions they are hundreds
         neighbour_heights = heights[neighbour]
         np.maximum(highest, neighbour_heights, out=highest)
         np.minimum(lowest, neighbour_heights, out=lowest)
@@ -122,7 +123,7 @@ def turns(heights: Array, beside: np.ndarray, unit: float) -> tuple[np.ndarray, 
     first = np.argsort(-promised, kind="stable")
     first = first[: int(is_peak[rows, times].sum())]
     likely = int((promised[first] * unit > -NEAR).sum())
-    return np.stack([rows[first], times[first]], axis=1), min(HELD, max(TOLD, likely))
+    return np.stack([rows[first], times[first]], axis=1), min(HELD, max(FEWEST_RETURNED, likely))
 
 
 def highest_at(times: np.ndarray, heights: Array) -> np.ndarray:
@@ -163,16 +164,17 @@ def ridden(
     Returns
     -------
     indices : ndarray, shape (k, j)
-        Indices of the violations, at most `MOST`. The best `TOLD` are returned even where nothing is violated.
+        Indices of the violations, at most `MOST_RETURNED`. The best `FEWEST_RETURNED` are returned even where nothing
+        is violated.
     violations : ndarray, shape (k,)
         Violations, worst first; negative where there is a margin.
     """
     line, times = heights[None, None], held[:, 0]
-    peaks = local_maxima(line, (1,), MOST)
-    peaks = np.unique(np.vstack([peaks, beside_kinks(line, times, kinks, MOST)]), axis=0)
+    peaks = local_maxima(line, (1,), MOST_RETURNED)
+    peaks = np.unique(np.vstack([peaks, find_kink_neighbours(line, times, kinks, MOST_RETURNED)]), axis=0)
     vertex_times, promised = vertices(line, peaks, times)
     promised = line[0, 0, peaks[:, 2]] + UNSURE * (promised - line[0, 0, peaks[:, 2]])
-    spans = along_spans(line, peaks, pieces, MOST)[:, 2]
+    spans = along_spans(line, peaks, pieces, MOST_RETURNED)[:, 2]
     points = held[peaks[:, 2]]
     points[:, 0] = vertex_times
     order = np.argsort(-promised, kind="stable")
@@ -183,7 +185,7 @@ def ridden(
     groups = [climbed(points[first]), nearer, (held[sample_positions], heights[sample_positions])]
     indices, violations = np.vstack([group[0] for group in groups]), np.concatenate([group[1] for group in groups])
     order = _select_distinct(indices, violations)
-    order = order[(violations[order] > 0.0) | (np.arange(order.size) < TOLD)][:MOST]
+    order = order[(violations[order] > 0.0) | (np.arange(order.size) < FEWEST_RETURNED)][:MOST_RETURNED]
     return indices[order], violations[order]
 
 
@@ -199,8 +201,8 @@ def _move_to_vertices(
         neighbours = points.repeat(3, axis=0)
         neighbours[:, 0] += np.tile(width * np.array([-1.0, 0.0, 1.0]), len(points))
         before, now, after = turned(neighbours)[1].reshape(-1, 3).T
-        slope, bend = (after - before) / 2, 2 * now - before - after
-        share = slope / np.where(np.abs(slope) < bend, bend, np.maximum(np.abs(slope), TINY))
+        slope, curvature = (after - before) / 2, 2 * now - before - after
+        share = slope / np.where(np.abs(slope) < curvature, curvature, np.maximum(np.abs(slope), TINY))
         points[:, 0] += width * share
         width /= NEARER
     return turned(points)

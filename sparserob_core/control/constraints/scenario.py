@@ -67,7 +67,9 @@ class ScenarioConstraint:
         G, offset = self.base.functionals.rows_under(times, directions, self.parameters[samples], signals, deviations)
         direct, zero_decision = self.base.direct(indices[:, 0]), np.zeros(self.base.functionals.variables)
         G = G if direct is None else G + direct
-        return G.reshape(k, r, -1), self.h - self.base.beside(zero_decision, indices[:, 0]) - offset.reshape(k, r)
+        return G.reshape(k, r, -1), self.h - self.base.compute_added_terms(
+            zero_decision, indices[:, 0]
+        ) - offset.reshape(k, r)
 
     def worst(self, x: Array) -> Separation:
         """Return local maxima in time of the worst sample's violation, at the breakpoints and between them."""
@@ -83,7 +85,7 @@ class ScenarioConstraint:
 
     def _find_worst_samples(self, x: Array) -> tuple[Array, np.ndarray]:
         """Return the largest violation over the samples, ``(r, times)``, and the sample that has it."""
-        additions = self.base.beside(x, self._times).T
+        additions = self.base.compute_added_terms(x, self._times).T
         if self.parameters.shape[1] == 0:
             margins, sample = self._margins
             undisturbed = self._compute_states(x, slice(0, 1), None, None)[0]

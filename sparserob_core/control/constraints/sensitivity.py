@@ -67,7 +67,7 @@ class Functional:
         return force if signals is None else force + np.swapaxes(self.grid.driven(self.W, signals[:, None]), 1, 2)
 
     @property
-    def pushed(self) -> Array:
+    def disturbance_weights(self) -> Array:
         """Weights ``(k, L, mw)`` on the disturbance on every piece."""
         return self.grid.through(self.driven[:, :, 0], self.W[:, 0])
 
@@ -148,7 +148,7 @@ class Sensitivity:
         times, points, z = np.split(indices, [1, 1 + self._nu], axis=1)
         parameters, model = self.constraint.parameters.clamp(points), self.constraint.functionals.disturbance
         at = self._build_functional(times[:, 0], parameters, z, rows)
-        weights = at.pushed
+        weights = at.disturbance_weights
         by_block, support = None if model is None else model.on_blocks, self.constraint.functionals.measurable
         closed = signals is None and support is not None
         if signals is None and by_block is not None:
@@ -256,14 +256,14 @@ class Sensitivity:
     ) -> Array:
         """Return `Functional.in_time` of a system that changes with time, ``c'(A(t) x(t) + B(t) u + E(t) w)``."""
         A, inputs = self._response.propagator.law.entries(times, parameters)
-        along, pushes = (at.direction[:, None] @ A)[:, 0], (at.direction[:, None] @ inputs)[:, 0]
+        along, input_weights = (at.direction[:, None] @ A)[:, 0], (at.direction[:, None] @ inputs)[:, 0]
         weights = self._response.weights(times, along, parameters)
         control = self.constraint.functionals.on_grid(x)
         acting = control[:, at.now].T
         values = _evaluate_functionals(weights, at.start, control, signals)
         if signals is not None:
             acting = np.hstack([acting, signals[np.arange(times.size), :, at.now]])
-        return np.asarray(values + (pushes[:, : acting.shape[1]] * acting).sum(axis=1))[:, None]
+        return np.asarray(values + (input_weights[:, : acting.shape[1]] * acting).sum(axis=1))[:, None]
 
     def _locate_pieces(self, times: Array) -> np.ndarray:
         """Return the pieces on which the times are approached: from the left, but from the right at the start of the

@@ -124,7 +124,7 @@ class StateConstraint(ConstraintSource):
         return z
 
     @abstractmethod
-    def beside(self, x: Float[Array, " n"], times: Float[Array, " k"]) -> Float[Array, "k j"]:
+    def compute_added_terms(self, x: Float[Array, " n"], times: Float[Array, " k"]) -> Float[Array, "k j"]:
         """Return the terms that are added at times ``(k,)`` for a decision ``x (n,)``.
 
         For flat sides ``G u(t) - H r(t)``, ``(k, r)``, is added to the rows. For a curved set ``-r(t)``, ``(k, d)``, is
@@ -132,15 +132,17 @@ class StateConstraint(ConstraintSource):
         """
 
     @abstractmethod
-    def outwardness(self, states: Float[Array, "d n"], beside: Float[Array, " j"] | None = None) -> Float[Array, " n"]:
-        """Return a cheap measure ``(n,)`` of states ``(d, n)`` at one time, with what is `beside` them: positive
+    def outwardness(
+        self, states: Float[Array, "d n"], added_terms: Float[Array, " j"] | None = None
+    ) -> Float[Array, " n"]:
+        """Return a cheap measure ``(n,)`` of states ``(d, n)`` at one time, with `compute_added_terms`: positive
         outside the set, not positive inside, growing outwards."""
 
     @shaped
-    def excess(self, states: Float[Array, "d n"], beside: Float[Array, " j"] | None = None) -> Float[Array, " n"]:
+    def excess(self, states: Float[Array, "d n"], added_terms: Float[Array, " j"] | None = None) -> Float[Array, " n"]:
         """Return the violation ``(n,)`` of the constraint by states ``(d, n)``, negative where there is a margin. With
         flat sides it is the `outwardness` itself."""
-        return self.outwardness(states, beside)
+        return self.outwardness(states, added_terms)
 
     @shaped
     def direct(self, times: Float[Array, " k"]) -> Float[Array, "q n"] | None:

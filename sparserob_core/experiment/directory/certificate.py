@@ -405,7 +405,7 @@ def _apply_worst_deviations(experiment: ControlExperiment, said: TimedExplanatio
     if feedback is None or experiment.problem.disturbance_class != "piecewise_constant":
         return said
     from sparserob_core.control.constraints.control import STEP, of_control
-    from sparserob_core.control.constraints.feedback import told
+    from sparserob_core.control.constraints.feedback import describe_deviations
 
     loop, time, controls = feedback.loop, said.time, feedback.loop.controls(decision)
     piece = int(np.searchsorted(experiment.control.breakpoints[1:-1], time, side="right"))
@@ -416,4 +416,4 @@ def _apply_worst_deviations(experiment: ControlExperiment, said: TimedExplanatio
     else:
         along = said.direction @ loop.states(decision, np.array([time]))[0]
         along = along if said.gain is None or said.piece is None else along + said.gain @ controls[said.piece]
-    return told(said, loop, loop.spread.worst(along[1:]))
+    return describe_deviations(said, loop, loop.spread.worst(along[1:]))

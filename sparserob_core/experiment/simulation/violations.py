@@ -27,7 +27,10 @@ class ViolationCount:
         self._is_curved = constraint.sides is None
         self.units, self._own_constraint = units, constraint.divided(units)
         self._is_inside = (times >= constraint.start - slack) & (times <= constraint.stop + slack)
-        self._offsets, self._own_offsets = constraint.beside(x, times), self._own_constraint.beside(x, times)
+        self._offsets, self._own_offsets = (
+            constraint.compute_added_terms(x, times),
+            self._own_constraint.compute_added_terms(x, times),
+        )
         self.violated, self.largest, self.time = 0, -np.inf, np.nan
         self._last_state = np.zeros((constraint.functionals.response.initial_state.size, 0))
 

@@ -197,12 +197,12 @@ def test_what_is_said_at_a_deviation_is_the_deviation() -> None:
     )
     assert said.disturbance.tolist() == [pytest.approx([0.2, -0.05])]
     assert said.deviation == pytest.approx(w[2:])
-    assert said.begun == pytest.approx(np.array([-1.0, 0.5]) + w[2:])
+    assert said.initial_state == pytest.approx(np.array([-1.0, 0.5]) + w[2:])
     assert said.text.endswith("for every disturbance and initial state")
     assert loop.spread.middle[:2] == pytest.approx(0.05)
     known = model(initial_set=None)
     said = family(known, "control").explain(np.array([0.0, 0.1, 0.1]), 0)
-    assert said.text.endswith("for every disturbance") and said.begun is None
+    assert said.text.endswith("for every disturbance") and said.initial_state is None
     assert said.disturbance.tolist() == [pytest.approx([0.15, 0.15])]
 
 
