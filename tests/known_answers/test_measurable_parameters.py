@@ -17,7 +17,7 @@ import sparserob_core as sr
 from sparserob_core.checker.claims.case import Case
 from sparserob_core.checker.reach.missed import BoundedInputOver
 from sparserob_core.control.reach.varying_measurable import VaryingMeasurable
-from sparserob_core.control.studies.adversary import pushed_by, worst_signal
+from sparserob_core.control.studies.adversary import evaluate_disturbance, worst_signal
 from sparserob_core.experiment.assemble import ControlExperiment, assemble
 from sparserob_core.experiment.check.check import check
 from sparserob_core.experiment.config.load import load_config
@@ -286,7 +286,7 @@ def test_the_worst_signal_at_a_parameter_attains_what_is_claimed(name: str, plac
         parameter = np.array([p])
         ends, signal = worst_signal(functionals, time, ROWS[1], parameter)
         assert signal is not None
-        attained = pushed_by(functionals, time, ROWS[1], parameter, (ends, signal))
+        attained = evaluate_disturbance(functionals, time, ROWS[1], parameter, (ends, signal))
         claimed = functionals.offsets(np.array([time]), ROWS[1:], parameter[None])
         assert attained == pytest.approx(float(claimed[0]), abs=1e-12)
 

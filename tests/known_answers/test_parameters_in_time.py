@@ -16,7 +16,7 @@ from scipy.optimize import linprog
 
 import sparserob_core as sr
 from sparserob_core.control.studies.laws import ParametersInTime
-from sparserob_core.control.studies.simulate import walk
+from sparserob_core.control.studies.simulate import simulate_states
 from sparserob_core.control.transcription.provable import unprovable
 from sparserob_core.experiment.assemble import assemble
 from sparserob_core.experiment.check.check import check
@@ -119,14 +119,14 @@ def test_a_drawn_trajectory_has_a_parameter_of_its_own() -> None:
     model = assemble(load_config(made)).transcription
     drawn = ParametersInTime.of(model.stated)
     assert drawn is not None
-    state = list(walk(model.response, model.functionals.on_grid(np.ones(10)), np.zeros((400, 0)), None))[-1]
+    state = list(simulate_states(model.response, model.functionals.on_grid(np.ones(10)), np.zeros((400, 0)), None))[-1]
     uniform = drawn.at(state, drawn.draw("iid", 400, None, np.random.default_rng(0)))[0]
     assert uniform.std() == pytest.approx(np.hypot(0.6, 2.0) / np.sqrt(12), rel=0.1)
     corners = drawn.at(state, drawn.draw("vertices", 400, None, np.random.default_rng(0)))
     assert {round(x, 9) for x in corners[0].tolist()} == {0.8, 1.4, 2.8, 3.4}  # -1 + 2 (1 + p) + 2 q
     np.testing.assert_array_equal(corners[1:3], 0.0)
     np.testing.assert_array_equal(corners[3:], state[3:])
-    upper = drawn.seen(np.array([1.0, *(drawn.every[-1][0, 1:])]))
+    upper = drawn.find_corner(np.array([1.0, *(drawn.every[-1][0, 1:])]))
     near = drawn.at(state, drawn.draw("neighbours", 400, np.tile(upper, (400, 1)), np.random.default_rng(0)))[0]
     assert near.min() >= 3.14 - 1e-9 and near.max() <= 3.4 + 1e-9  # a tenth of the way to a random one, at most
     at_corner = drawn.at(state, upper[None])[0]

@@ -13,7 +13,7 @@ from scipy.integrate import quad, solve_ivp
 from scipy.optimize import linprog
 
 import sparserob_core as sr
-from sparserob_core.control.studies.adversary import pushed_by, worst_signal
+from sparserob_core.control.studies.adversary import evaluate_disturbance, worst_signal
 from sparserob_core.experiment.assemble import assemble
 from sparserob_core.experiment.check.check import check
 from sparserob_core.experiment.config.load import load_config
@@ -134,7 +134,7 @@ def test_the_worst_signal_attains_what_is_claimed_and_reaches_the_wall(finished:
     for time, direction, wall in (*walls, (1.0, np.array([-1.0, 0.0]), 0.45), (1.37, np.array([-1.0, 0.3]), np.inf)):
         ends, signal = worst_signal(functionals, time, direction, none)
         assert signal is not None
-        attained = pushed_by(functionals, time, direction, none, (ends, signal))
+        attained = evaluate_disturbance(functionals, time, direction, none, (ends, signal))
         claimed = float(functionals.offsets(np.array([time]), direction[None], none[None])[0])
         assert claimed - 1e-12 <= attained <= claimed + 1e-12
         state = np.array([-1.0, 0.5])
@@ -219,7 +219,9 @@ def test_the_worst_signal_in_a_triangle_attains_what_is_claimed(leaning: Path) -
         ends, signal = worst_signal(functionals, time, direction, none)
         assert signal is not None
         claimed = float(support(np.array([time]), direction[None], none[None])[0])
-        assert pushed_by(functionals, time, direction, none, (ends, signal)) == pytest.approx(claimed, abs=1e-12)
+        assert evaluate_disturbance(functionals, time, direction, none, (ends, signal)) == pytest.approx(
+            claimed, abs=1e-12
+        )
         row = np.stack([np.full(s.size, direction[0]), direction[0] * (time - s) + direction[1]])
         gains = np.stack([0.1 * s * row[0] + np.cos(3 * s) * row[1], 0.5 * row[1]])
         beside = float((corners @ gains).max(axis=0)[s < time].sum() * HORIZON / s.size)

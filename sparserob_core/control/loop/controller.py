@@ -294,7 +294,7 @@ class Controller:
 
     def _is_expected_output(self, outputs: Array) -> bool:
         assert self._measuring is not None
-        innovation = self._measuring.seen(outputs)[-1]
+        innovation = self._measuring.list_innovations(outputs)[-1]
         lower, upper = (
             bound[self._next_piece - self._plan.first] for bound in self._plan.known.answering.loop.expected
         )
@@ -320,7 +320,7 @@ class Controller:
     def _compute_innovations(self, state: Array) -> list[Array]:
         """Return the innovations that the applied plan answers when this state is measured, one vector for each
         breakpoint since the plan began; a single zero vector where the plan has no feedback."""
-        return [np.zeros(state.size)] if self._measuring is None else self._measuring.seen(state)
+        return [np.zeros(state.size)] if self._measuring is None else self._measuring.list_innovations(state)
 
     def _compute_control(self, piece: int, state: Array | None) -> Array:
         nominal = self._nominal_control[:, piece]

@@ -24,9 +24,9 @@ from sparserob_core.sip.convex_set import Array, ConvexSet
 
 SHORT = 0.5  # norm times length of a step: what is left of the expansion is then 1e-14 of the row
 BENDING = 7  # terms of the bounds of derivatives; what is left of them is 1e-6 of the row's size in balanced units
-MOST = 2**27  # numbers that the rows of all steps take (1 GB)
+STORAGE_LIMIT = 2**27  # numbers that the rows of all steps take (1 GB)
 ROWS = 2**22  # numbers of rows that are expanded at once (32 MB)
-MOVED = 46  # a power of 1/2 of the horizon: what a witness loses by it is rounding, and 53 bits hold sums of such times
+TIME_BITS = 46  # a power of 1/2 of the horizon: a witness loses rounding by it, and 53 bits hold sums of such times
 INWARDS = 1e-12  # of a set without axes, what corners and boundary points may be off: thousands of roundings
 HALVED = 44  # halvings of a step across a switch: what is left of it is rounding
 MOST_SWITCHES = 4096  # of a set without corners, whose best value changes all the time
@@ -73,7 +73,7 @@ class Adjoint:
         balanced, (units, _) = matrix_balance(A, permute=False, separate=True)
         speed = float(np.linalg.norm(balanced, 2)) * horizon
         count = 2 ** max(6, ceil(log2(max(speed, 1e-300) / SHORT)))
-        if not count * A.shape[0] <= MOST:
+        if not count * A.shape[0] <= STORAGE_LIMIT:
             raise NotEnclosable(
                 f"its fastest part moves {speed:.2g} times within the horizon, which takes too many steps"
             )
@@ -109,7 +109,7 @@ class Adjoint:
         return np.stack(terms, axis=1)
 
     @cached_property
-    def bends(self) -> tuple[Array, Array, Array]:
+    def derivative_bounds(self) -> tuple[Array, Array, Array]:
         """Bounds of ``|l''|`` in the user's units, ``(N, d)``, and of ``|l' A B|`` and ``|l' A^2 B|``, ``(N, q)`` each,
         on every step."""
         d, h = self.A.shape[0], self.step
@@ -172,8 +172,8 @@ def within(bound: ConvexSet, points: Array) -> Array:
 
 
 def tidy(times: Array, horizon: float) -> Array:
-    """Times moved by a share of at most `MOVED` of the horizon to where their differences are not rounded."""
-    unit = 2.0 ** (ceil(log2(horizon)) - MOVED)
+    """Times moved by a share of at most `TIME_BITS` of the horizon to where their differences are not rounded."""
+    unit = 2.0 ** (ceil(log2(horizon)) - TIME_BITS)
     return np.asarray(np.minimum(np.round(times / unit) * unit, horizon))
 
 
@@ -200,15 +200,15 @@ class WorstRow:
         Adjoint of ``c``.
     centre : ndarray, shape (d,)
         Centre of the initial states.
-    begun : ConvexSet or None
+    initial_deviations : ConvexSet or None
         Deviations of the initial state from the centre.
     grid : ndarray, shape (L + 1,)
         Ends of the pieces.
     drives : ndarray, shape (q', L)
         Known values of the first inputs on the pieces.
-    pushes : AdjointDisturbances or None
+    disturbances : AdjointDisturbances or None
         Disturbances, which are the other inputs.
-    beside : tuple of ndarray, optional
+    control_terms : tuple of ndarray, optional
         Breakpoints of the control, and ``g'u`` on the pieces between them.
     moving : tuple of ndarray, optional
         Times and values of ``c'r``.
@@ -216,36 +216,36 @@ class WorstRow:
 
     adjoint: Adjoint
     centre: Array
-    begun: ConvexSet | None
+    initial_deviations: ConvexSet | None
     grid: Array
     drives: Array
-    pushes: AdjointDisturbances | None
-    beside: tuple[Array, Array] | None = None
+    disturbances: AdjointDisturbances | None
+    control_terms: tuple[Array, Array] | None = None
     moving: tuple[Array, Array] | None = None
 
     def cuts(self) -> Array:
         """Times between which the row is smooth but for disturbances about to switch, increasing."""
         cuts: list[Array] = [self.grid if self.drives.any() else self.grid[[0, -1]]]
-        cuts += [] if self.pushes is None or self.pushes.changes is None else [self.pushes.changes]
-        cuts += [] if self.beside is None else [self.beside[0]]
+        cuts += [] if self.disturbances is None or self.disturbances.changes is None else [self.disturbances.changes]
+        cuts += [] if self.control_terms is None else [self.control_terms[0]]
         cuts += [] if self.moving is None else [self.moving[0]]
         cuts += [np.asarray(np.arange(self.adjoint.nodes.shape[0]) * self.adjoint.step, dtype=float)]
         return np.unique(np.concatenate(cuts))
 
     def at(self, times: Array, inside: Array | None = None) -> tuple[Array, Array]:
         """Bounds ``(k,)`` of the largest value at ``times (k,)``: one that is reached, and one that is not exceeded but
-        for rounding, which `lost` bounds; with the control of the pieces that hold the times ``inside``."""
+        for rounding, which `error_bound` bounds; with the control of the pieces that hold the times ``inside``."""
         rows, middle = self.adjoint.rows(times), self._compute_drive_effect(times)
         low = middle + rows @ self.centre
-        if self.begun is not None:
-            low = low + self.begun.support(rows)
+        if self.initial_deviations is not None:
+            low = low + self.initial_deviations.support(rows)
         if self.moving is not None:
             low = low - np.interp(times, *self.moving)
-        if self.beside is not None:
-            breaks, values = self.beside
+        if self.control_terms is not None:
+            breaks, values = self.control_terms
             pieces = np.searchsorted(breaks, times if inside is None else inside, side="right") - 1
             low = low + values[np.clip(pieces, 0, values.size - 1)]
-        if self.pushes is None:
+        if self.disturbances is None:
             return low, low
         support_values = self._bound_disturbances(times)
         return low + support_values[:, 0], low + support_values[:, 1]
@@ -267,11 +267,11 @@ class WorstRow:
         return self.adjoint.integrals(times - start) - self.adjoint.integrals(times - stop)
 
     def _bound_disturbances(self, times: Array) -> Array:
-        assert self.pushes is not None
-        bound, columns = self.pushes.bound, self.pushes.inputs
-        if self.pushes.changes is not None:
+        assert self.disturbances is not None
+        bound, columns = self.disturbances.bound, self.disturbances.inputs
+        if self.disturbances.changes is not None:
             total = np.zeros(times.size)
-            for a, b in pairwise(self.pushes.changes):
+            for a, b in pairwise(self.disturbances.changes):
                 total += bound.support(self._integrate_between(times, a, b)[:, columns])
             return np.stack([total, total], axis=1)
         steps, shares = self.adjoint.placed(times)
@@ -286,20 +286,20 @@ class WorstRow:
 
     def _bound_integrals(self, steps: np.ndarray, shares: Array) -> Array:
         """Bounds of the integrals over the first shares ``(k,)`` of some steps, ``(k, 2)``."""
-        assert self.pushes is not None
+        assert self.disturbances is not None
         powers = shares[:, None] ** np.arange(ORDER + 1)
-        points = self.adjoint.coefficients[steps][:, :, self.pushes.inputs] * powers[..., None]
+        points = self.adjoint.coefficients[steps][:, :, self.disturbances.inputs] * powers[..., None]
         lengths = shares * self.adjoint.step
-        return integrated(self.pushes.bound, points, lengths, np.full(lengths.size, self._accuracy))
+        return integrated(self.disturbances.bound, points, lengths, np.full(lengths.size, self._accuracy))
 
     @cached_property
     def _accuracy(self) -> float:
-        assert self.pushes is not None
-        largest = np.abs(self.adjoint.coefficients[:, 0, self.pushes.inputs]).sum(axis=1).max(initial=0.0)
-        return float(1e-14 * self.pushes.bound.radius_bound * largest * self.grid[-1])
+        assert self.disturbances is not None
+        largest = np.abs(self.adjoint.coefficients[:, 0, self.disturbances.inputs]).sum(axis=1).max(initial=0.0)
+        return float(1e-14 * self.disturbances.bound.radius_bound * largest * self.grid[-1])
 
     @cached_property
-    def lost(self) -> float:
+    def error_bound(self) -> float:
         """Bound of the rounding error and the truncation error of any value of the row.
 
         It counts the rounding of rows that are doubled again and again, and that of the transition over a step, which
@@ -311,7 +311,7 @@ class WorstRow:
         terms = 2 * self.adjoint.A.shape[0] * (ceil(log2(steps)) + 2) + ORDER + 8 + ROUNDED * steps
         size = float((np.abs(self.adjoint.nodes / self.adjoint.units) @ self._state_magnitudes).max())
         size += float((np.abs(self.adjoint.coefficients[:, 0]) @ self._input_magnitudes).sum() * self.adjoint.step)
-        size += 0.0 if self.beside is None else float(np.abs(self.beside[1]).max())
+        size += 0.0 if self.control_terms is None else float(np.abs(self.control_terms[1]).max())
         size += 0.0 if self.moving is None else float(np.abs(self.moving[1]).max())
         norms = np.linalg.norm(self.adjoint.nodes, axis=1)
         inputs = float(np.linalg.norm(self.adjoint.B, axis=0) @ self._input_magnitudes) * self.adjoint.step
@@ -325,36 +325,44 @@ class WorstRow:
     def _state_magnitudes(self) -> Array:
         """Largest absolute values of the initial states, ``(d,)``."""
         magnitudes = np.abs(self.centre)
-        return magnitudes if self.begun is None else magnitudes + self.begun.reach(np.eye(magnitudes.size))
+        return (
+            magnitudes
+            if self.initial_deviations is None
+            else magnitudes + self.initial_deviations.reach(np.eye(magnitudes.size))
+        )
 
     @cached_property
     def _input_magnitudes(self) -> Array:
         """Largest absolute values of the inputs, ``(q,)``."""
         magnitudes = np.zeros(self.adjoint.B.shape[1])
         magnitudes[: self.drives.shape[0]] = np.abs(self.drives).max(axis=1, initial=0.0)
-        if self.pushes is not None:
-            magnitudes[self.pushes.inputs] = self.pushes.bound.reach(np.eye(self.pushes.bound.dimension))
+        if self.disturbances is not None:
+            magnitudes[self.disturbances.inputs] = self.disturbances.bound.reach(
+                np.eye(self.disturbances.bound.dimension)
+            )
         return magnitudes
 
     @cached_property
     def _curvature_bounds(self) -> Array:
         """Bounds ``(N,)`` of the curvature of the row on every step: times an eighth of the square of a cell's width
         they bound its excess over the chord."""
-        state_bounds, first_bounds, second_bounds = self.adjoint.bends
+        state_bounds, first_bounds, second_bounds = self.adjoint.derivative_bounds
         magnitudes = self._input_magnitudes.copy()
         curvature = state_bounds @ self._state_magnitudes
-        if self.pushes is not None and self.pushes.changes is None:  # the slope of an integral that is a support
-            curvature = curvature + first_bounds[:, self.pushes.inputs] @ magnitudes[self.pushes.inputs]
-            magnitudes[self.pushes.inputs] = 0.0
+        if self.disturbances is not None and self.disturbances.changes is None:
+            # the slope of an integral that is a support
+            curvature = curvature + first_bounds[:, self.disturbances.inputs] @ magnitudes[self.disturbances.inputs]
+            magnitudes[self.disturbances.inputs] = 0.0
         # of inputs on pieces: the change of l' A B from one end of a piece to the other, summed, and that at the last
         total = self.adjoint.step * (second_bounds @ magnitudes).sum() + (first_bounds @ magnitudes).max(initial=0.0)
         return np.asarray(curvature + total)
 
     def enclosed(self, lower: Array, upper: Array) -> Array:
-        """Upper bounds ``(k,)`` on cells of times ``(k,)``, each between two `cuts`; but for `lost` they are proven."""
+        """Upper bounds ``(k,)`` on cells of times ``(k,)``, each between two `cuts`; but for `error_bound` they are
+        proven."""
         ends, indices = np.unique(np.concatenate([lower, upper]), return_inverse=True)
         count, middles = lower.size, (lower + upper) / 2
-        if self.beside is None:
+        if self.control_terms is None:
             high = self.at(ends)[1][indices]
         else:
             high = self.at(np.concatenate([lower, upper]), np.tile(middles, 2))[1]
@@ -368,34 +376,40 @@ class WorstRow:
                 np.clip((middles / self.adjoint.step).astype(int), 0, self._curvature_bounds.size - 1)
             ],
         )
-        return np.asarray(np.maximum(high[:count], high[count:]) + (upper - lower) ** 2 / 8 * curvature + self.lost)
+        return np.asarray(
+            np.maximum(high[:count], high[count:]) + (upper - lower) ** 2 / 8 * curvature + self.error_bound
+        )
 
     def witness(self, time: float) -> tuple[Array, Array, Array | None]:
         """The deviation ``(d,)`` of the initial state that is worst at a time, and a disturbance ``(mw, M)`` between
         times ``(M + 1,)``, ``None`` where there is none."""
         row = self.adjoint.rows(np.array([time]))[0]
-        state = np.zeros(row.size) if self.begun is None else within(self.begun, self.begun.support_point(row))
-        if self.pushes is None:
+        state = (
+            np.zeros(row.size)
+            if self.initial_deviations is None
+            else within(self.initial_deviations, self.initial_deviations.support_point(row))
+        )
+        if self.disturbances is None:
             return state, self.grid[[0, -1]], None
-        bound, columns = self.pushes.bound, self.pushes.inputs
-        changes = self._find_switches(time) if self.pushes.changes is None else self.pushes.changes
+        bound, columns = self.disturbances.bound, self.disturbances.inputs
+        changes = self._find_switches(time) if self.disturbances.changes is None else self.disturbances.changes
         gains = np.stack([self._integrate_between(np.array([time]), a, b)[0, columns] for a, b in pairwise(changes)])
         values = np.where(
             np.abs(gains).max(axis=1)[:, None] > 0.0, within(bound, bound.support_point(gains)), bound.interior_point()
         )
-        if self.pushes.changes is None:
+        if self.disturbances.changes is None:
             is_change = np.concatenate([[True], (np.diff(values, axis=0) != 0).any(axis=1)])
             changes, values = np.append(changes[:-1][is_change], changes[-1]), values[is_change]
         return state, changes, values.T
 
-    def reached(self, time: float, deviation: Array, changes: Array, disturbance: Array | None) -> float:
+    def evaluate(self, time: float, deviation: Array, changes: Array, disturbance: Array | None) -> float:
         """The value of the row at a time from the centre and one deviation, and under one disturbance, as of `witness`,
         but for rounding, and with the control of the piece that begins last where it jumps."""
         times = np.array([time])
-        deterministic = replace(self, centre=self.centre + deviation, begun=None, pushes=None)
+        deterministic = replace(self, centre=self.centre + deviation, initial_deviations=None, disturbances=None)
         value = float(deterministic.at(times)[0][0])
-        if self.pushes is not None and disturbance is not None:
-            columns, ends = self.pushes.inputs, np.minimum(changes, time)
+        if self.disturbances is not None and disturbance is not None:
+            columns, ends = self.disturbances.inputs, np.minimum(changes, time)
             gains = -np.diff(self.adjoint.integrals(time - ends)[:, columns], axis=0)
             value += float((gains * disturbance.T).sum())
         return value
@@ -403,8 +417,8 @@ class WorstRow:
     def _find_switches(self, time: float) -> Array:
         """Times between which one value of a measurable disturbance is best for the row at ``time``: the ends of the
         steps before it, and where the best value changes within one."""
-        assert self.pushes is not None
-        bound, columns = self.pushes.bound, self.pushes.inputs
+        assert self.disturbances is not None
+        bound, columns = self.disturbances.bound, self.disturbances.inputs
         ends = np.append(np.arange(0.0, time, self.adjoint.step), time)
         start, stop = ends[:-1], ends[1:]
 

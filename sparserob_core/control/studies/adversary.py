@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 PARTS = 4  # equal parts of every piece on which a measurable worst case is looked for
 HALVINGS = 40  # of a part across a switch of the worst disturbance
 SIGNAL = 4096  # parts at most; a set without corners has a worst disturbance that is constant nowhere
-LOST = 1e-14  # of the largest integrand times the horizon: what a constant on a part may lose
+LOSS_TOLERANCE = 1e-14  # of the largest integrand times the horizon: what a constant on a part may lose
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -176,7 +176,7 @@ def worst_signal(
     return points, signal
 
 
-def pushed_by(
+def evaluate_disturbance(
     functionals: WorstFunctionals, time: float, direction: Array, parameter: Array, signal: tuple[Array, Array]
 ) -> float:
     """Return the contribution of a disturbance to ``direction'x(time)``.
@@ -292,24 +292,26 @@ class _VaryingAdjoint:
         return ends, rows
 
 
-Way: TypeAlias = _SwitchedAdjoint | _VaryingAdjoint
+DisturbanceAdjoint: TypeAlias = _SwitchedAdjoint | _VaryingAdjoint
 
 
-def _build_adjoint(response: Response, parameter: Array, time: float, direction: Array) -> Way:
+def _build_adjoint(response: Response, parameter: Array, time: float, direction: Array) -> DisturbanceAdjoint:
     if response.grid.varying:
         response = response.at(parameter)
         return _VaryingAdjoint(VaryingMotion(response.propagator, response.initial_state), direction, time)
     return _SwitchedAdjoint.of(response, parameter, time, direction)
 
 
-def _refine_parts(bound: ConvexSet, flow: Way, parts: tuple[Array, Array], horizon: float) -> tuple[Array, Array]:
+def _refine_parts(
+    bound: ConvexSet, flow: DisturbanceAdjoint, parts: tuple[Array, Array], horizon: float
+) -> tuple[Array, Array]:
     """The parts, halved wherever the best constant on one is not the best at both of its ends; the most lossy of them
     when they are too many."""
     starts, ends = parts
     active = np.arange(starts.size)
     for _ in range(HALVINGS):
         loss, size = _measure_loss(bound, flow, starts[active], ends[active])
-        allowed = LOST * size * horizon
+        allowed = LOSS_TOLERANCE * size * horizon
         middles = (starts[active] + ends[active]) / 2
         open_ = np.flatnonzero((loss > allowed) & (middles > starts[active]) & (middles < ends[active]))
         open_ = open_[np.argsort(-loss[open_], kind="stable")][: max(0, SIGNAL - starts.size)]
@@ -323,7 +325,7 @@ def _refine_parts(bound: ConvexSet, flow: Way, parts: tuple[Array, Array], horiz
     return starts[order], ends[order]
 
 
-def _measure_loss(bound: ConvexSet, flow: Way, starts: Array, ends: Array) -> tuple[Array, float]:
+def _measure_loss(bound: ConvexSet, flow: DisturbanceAdjoint, starts: Array, ends: Array) -> tuple[Array, float]:
     """Return the loss of the best constant on each part against the best values at its two ends, times the part's
     length, ``(k,)``, and the largest absolute support value there."""
     best = bound.support_point(flow.gains(starts, ends))

@@ -71,7 +71,7 @@ class CausalBound:
         Weight of the effort under every signal, with the cost ``worst``; at most 1 together.
     outputs : tuple of ndarray, shape (K, p)
         Measured outputs under every signal, relative to the nominal ones, where a noise hides outputs.
-    begun : tuple of ndarray, shape (d,)
+    initial_states : tuple of ndarray, shape (d,)
         Initial state of every signal, where a noise hides outputs.
     """
 
@@ -81,7 +81,7 @@ class CausalBound:
     ended: Ended = "settled"
     shares: tuple[float, ...] = ()
     outputs: tuple[Array, ...] = ()
-    begun: tuple[Array, ...] = ()
+    initial_states: tuple[Array, ...] = ()
 
 
 @final
@@ -201,9 +201,9 @@ class CausalSearch:
         )
 
     def hiding(
-        self, limits: CausalLimits, beside: tuple[Tree, Grown] | None, highest: float | None = None
+        self, limits: CausalLimits, other: tuple[Tree, Grown] | None, highest: float | None = None
     ) -> Tree | None:
-        """A tree of signals that a noise hides, with those that have a multiplier in one ``beside`` it; ``None`` where
+        """A tree of signals that a noise hides, with those that have a multiplier in an ``other`` tree; ``None`` where
         nothing is hidden. Noise and initial states stay what they are under all factors up to the ``highest``."""
         points, measured, s = self.model.control.breakpoints, self.model.problem.measurements, self.sampled
         if measured is None:
@@ -213,7 +213,7 @@ class CausalSearch:
         if knowledge is None:
             return None
         knowledge.limit, knowledge.passed = limits.work, limits.passed
-        signals = [beside[0].signals[index] for index in np.unique(beside[1].signals)] if beside is not None else []
+        signals = [other[0].signals[index] for index in np.unique(other[1].signals)] if other is not None else []
         return self._build_tree(knowledge, signals, limits, highest)
 
     def _build_tree(
@@ -294,7 +294,7 @@ class CausalSearch:
             best = better
         return None if best is None else (tree, best)
 
-    def _grow(self, tree: Tree, centre: Grown, most: int, idle: int) -> bool:
+    def _grow(self, tree: Tree, centre: Grown, limit: int, idle: int) -> bool:
         """Add signals that are the worst if the control answers a share of what the policy answers, and return whether
         there are new ones.
 
@@ -303,10 +303,10 @@ class CausalSearch:
         shares = ANSWERED if self.decision is not None else (0.0,)
         at = min(idle, len(shares) - 1)
         return any(
-            self._add_departures(tree, centre, most, share) for share in dict.fromkeys((*shares[at:], *shares[:at]))
+            self._add_departures(tree, centre, limit, share) for share in dict.fromkeys((*shares[at:], *shares[:at]))
         )
 
-    def _add_departures(self, tree: Tree, centre: Grown, most: int, share: float) -> bool:
+    def _add_departures(self, tree: Tree, centre: Grown, limit: int, share: float) -> bool:
         """Add signals that depart from a signal of the tree at a report and are the worst for a row from there on, and
         return whether there are new ones.
 
@@ -320,7 +320,7 @@ class CausalSearch:
         departures, z = set[tuple[int, int]](), np.array(tree.signals)
         tree.work += z.shape[0] * (self.sampled.N.size + self.sampled.T.size)
         for signal, report, child in tree.knowledge.leaving(z, own, answered, scale, tree.units):
-            if len(departures) >= min(AT_ONCE, most):
+            if len(departures) >= min(AT_ONCE, limit):
                 break
             if (signal, report) not in departures and tree.add(child):
                 departures.add((signal, report))

@@ -271,16 +271,18 @@ class Horizons:
 @dataclass(frozen=True, eq=False)
 class _TaylorRow:
     """Taylor coefficients ``(M,)`` in the horizon of what no control changes, and ``(M, K, m)`` of the weights on the
-    control's pieces; the truth is off by at most ``lost``."""
+    control's pieces; the truth is off by at most ``error_bound``."""
 
     lifted: LiftedSystem
     coefficients: Array
     weights: Array
-    lost: float
+    error_bound: float
 
     def times(self, factor: float) -> _TaylorRow:
         """Return the sum multiplied by ``factor``."""
-        return _TaylorRow(self.lifted, factor * self.coefficients, factor * self.weights, abs(factor) * self.lost)
+        return _TaylorRow(
+            self.lifted, factor * self.coefficients, factor * self.weights, abs(factor) * self.error_bound
+        )
 
     def plus(self, other: _TaylorRow) -> _TaylorRow:
         """Return the sum of two."""
@@ -288,14 +290,14 @@ class _TaylorRow:
             self.lifted,
             self.coefficients + other.coefficients,
             self.weights + other.weights,
-            self.lost + other.lost,
+            self.error_bound + other.error_bound,
         )
 
     def least(self, control: ConvexSet) -> float:
         """A lower bound of the least value over every control and every horizon of the interval."""
         support_values = summed(control, -self.weights[None, None], None)[0, 0].sum(axis=0)
         above, _ = polynomial_bound(self.lifted.space, (support_values[:-1] - self.coefficients)[None])
-        return -float(above[0] + support_values[-1] + self.lost * (1.0 + 1e-12))
+        return -float(above[0] + support_values[-1] + self.error_bound * (1.0 + 1e-12))
 
 
 def _replace_disturbance(lifted: LiftedSystem, columns: slice) -> LiftedSystem:

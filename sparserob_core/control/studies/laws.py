@@ -229,10 +229,10 @@ class ParametersInTime:
         rows = np.stack([self.depends.rows(share) for share in shares])
         if directions is None:
             return rows
-        corner_rows = np.stack([self.seen(direction) for direction in directions])
+        corner_rows = np.stack([self.find_corner(direction) for direction in directions])
         return np.asarray(corner_rows + rng.uniform(0.0, NEAR, size=(count, 1, 1)) * (rows - corner_rows))
 
-    def seen(self, direction: Array) -> Array:
+    def find_corner(self, direction: Array) -> Array:
         """Return the corner, as rows ``(d, size)``, that belongs to a ``direction (size or more,)`` on all states; any
         one of the corners that the direction does not distinguish."""
         d, size = self.every[0].shape

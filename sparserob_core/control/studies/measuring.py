@@ -49,7 +49,7 @@ class Measuring:
         """Return the control of a decision."""
         return Measuring(model, model.pieces(decision), model.answering.loop.gains(decision), noises)
 
-    def seen(self, measured: Array) -> list[Array]:
+    def list_innovations(self, measured: Array) -> list[Array]:
         """Return all innovations ``(p,)`` so far, if ``measured (p,)`` is the measurement as the next piece begins,
         without changing the state of this object."""
         return [

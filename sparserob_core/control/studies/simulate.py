@@ -64,7 +64,7 @@ class PieceMotion(Protocol):
         ``disturbance (mw, n or 1)``."""
 
 
-def walk(
+def simulate_states(
     response: Response,
     control: Array | Callable[[int, Array], Array],
     parameters: Array,
@@ -190,7 +190,7 @@ class _TimeVaryingMotion:
 
 
 def delivered(command: Array, errors: Array) -> Callable[[int, Array], Array]:
-    """Return a function that gives `walk` the delivered control: a ``command (m + constants, L)`` with
+    """Return a function that gives `simulate_states` the delivered control: a ``command (m + constants, L)`` with
     ``errors (L, m, n)``, as shares of it, in ``n`` trajectories."""
 
     def acting(piece: int, state: Array) -> Array:

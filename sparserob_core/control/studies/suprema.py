@@ -18,7 +18,7 @@ from sparserob_core.control.problem.terms.windows import MixedConstraint, PathCo
 from sparserob_core.control.reach.functional import WorstFunctionals
 from sparserob_core.control.sets.sets import Polytope
 from sparserob_core.control.studies.adjoint import Adjoint, AdjointDisturbances, WorstRow, tidy, within
-from sparserob_core.control.studies.adversary import pushed_by, worst_signal
+from sparserob_core.control.studies.adversary import evaluate_disturbance, worst_signal
 from sparserob_core.control.transcription.grid import grid_of
 from sparserob_core.control.transcription.transcribe import prepare, windows_of
 from sparserob_core.errors import InputError, NotEnclosable
@@ -37,7 +37,7 @@ NOTHING = 1e-12  # of a row's unit: one that is nowhere larger is 0 but for roun
 LOOKS = 65  # times at which values of a row are looked at first
 BINS = 240  # equal parts of a window, on each of which both sides are told: the width of a figure in half points
 TERMS = 4  # of a row, at most, that are spelt out
-LOST = 2e-11  # of a row's largest value: by so much both sides are told wider, for the rounding of whoever checks them
+ROUNDING_SHARE = 2e-11  # of a row's largest value, by which both sides are reported wider: a checker rounds as well
 SUMMED = 2e-12  # of the terms that make it, which are more where they cancel: rounding was a twentieth of that
 
 
@@ -241,10 +241,10 @@ def _bound_known_row(
     time = tidied if row.start <= tidied <= row.stop else best
     state, changes, disturbance = worst.witness(time)
     edges, middles = _divide_window(row)
-    rounding_error = LOST * max(float(np.abs(samples).max()), abs(bounds.lower)) + worst.lost
+    rounding_error = ROUNDING_SHARE * max(float(np.abs(samples).max()), abs(bounds.lower)) + worst.error_bound
     return BoundedRow(
         row,
-        worst.reached(time, state, changes, disturbance) - rounding_error,
+        worst.evaluate(time, state, changes, disturbance) - rounding_error,
         bounds.upper + rounding_error,
         time,
         np.zeros(0),
@@ -252,7 +252,7 @@ def _bound_known_row(
         changes,
         disturbance,
         edges,
-        worst.at(middles)[0] - worst.lost,
+        worst.at(middles)[0] - worst.error_bound,
         _bound_bins(edges, bounds),
         bounds.cells,
         bounds.reason,
@@ -324,13 +324,13 @@ def _bound_by_program(
         disturbance = within(problem.disturbance, disturbance.T).T
         if functionals.measurable is not None:  # whose worst signal is found to rounding, or less
             support = float(functionals.offsets(*at)[0]) - functionals.parts(*of_state).initial_support
-            shortfall = max(0.0, support - pushed_by(functionals, *of_state, (changes, disturbance)))
+            shortfall = max(0.0, support - evaluate_disturbance(functionals, *of_state, (changes, disturbance)))
     edges, middles = _divide_window(row)
     low = np.full(middles.size, -np.inf)
     for p in (bounds.index[1:], middle[1:]):
         indices = np.hstack([(middles / units[0])[:, None], np.tile(p, (middles.size, 1))])
         low = np.maximum(low, family.violations(decision, indices)[:, 0] if middles.size else low)
-    rounding_error = max(LOST * max(size, abs(bounds.lower)), SUMMED * magnitude / unit)
+    rounding_error = max(ROUNDING_SHARE * max(size, abs(bounds.lower)), SUMMED * magnitude / unit)
     own_edges = edges / units[0]
     return BoundedRow(
         row,
@@ -359,7 +359,7 @@ def _sum_magnitudes(functionals: WorstFunctionals, theta: Array, state: Array, t
     return float((initial_effect + control_effect).max())
 
 
-Told: TypeAlias = Callable[[str, int, int], None]
+Announce: TypeAlias = Callable[[str, int, int], None]
 
 
 def bound_rows(
@@ -367,16 +367,16 @@ def bound_rows(
     dictionaries: tuple[Dictionary, Dictionary],
     theta: Array,
     tolerance: float,
-    told: Told,
+    announce: Announce,
     notify: Notify = ignore,
     deadline: Deadline | None = None,
 ) -> list[BoundedRow]:
-    """Bound all rows of a problem (`rows_of`) by `bound_row`; before each row, ``told`` receives its description, its
-    number, and the number of rows."""
+    """Bound all rows of a problem (`rows_of`) by `bound_row`; before each row, ``announce`` receives its description,
+    its number, and the number of rows."""
     rows, bounds = rows_of(problem), []
     for i, row in enumerate(rows):
         at = problem.names.corners.at(row.direction)
-        told(
+        announce(
             f"{row.constraint}: {row.sense} of {row.quantity(problem)}" + (f" at {at}" if at else ""),
             i,
             len(rows),

@@ -9,7 +9,7 @@ import numpy as np
 
 from sparserob_core.control.response.response import Response
 from sparserob_core.control.studies.adversary import Adversary, find_adversaries
-from sparserob_core.control.studies.simulate import delivered, fine_times, finer, walk, worst_errors
+from sparserob_core.control.studies.simulate import delivered, fine_times, finer, simulate_states, worst_errors
 from sparserob_core.control.transcription.record import Transcription
 from sparserob_core.errors import InputError
 from sparserob_core.experiment.assemble import Experiment
@@ -95,14 +95,14 @@ def propagated(model: Transcription, theta: Array, arrays: Mapping[str, Array]) 
         worst_cases = (arrays["times"], arrays["directions"], arrays["parameters"])
         acting = delivered(command, worst_errors(inner_response, execution, command, worst_cases))
         disturbances = None if disturbances is None else disturbances[:, :, fine_grid.disturbance_piece]
-    states = np.stack(list(walk(fine_response, acting, arrays["parameters"], disturbances, initial_states)))
+    states = np.stack(list(simulate_states(fine_response, acting, arrays["parameters"], disturbances, initial_states)))
     return times, np.ascontiguousarray(states.transpose(2, 1, 0))
 
 
 def controlled(
     model: Transcription, decision: Array, which: np.ndarray, noises: Array | None = None
 ) -> Array | Callable[[int, Array], Array]:
-    """Return the control at a decision, in the form in which `walk` takes it.
+    """Return the control at a decision, in the form in which `simulate_states` takes it.
 
     Parameters
     ----------

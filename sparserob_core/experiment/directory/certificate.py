@@ -146,7 +146,7 @@ def causal_data(bound: CausalBound) -> dict[str, Any]:
     return {
         "lower_bound": bound.lower if np.isfinite(bound.lower) else None,
         "signals": list(bound.signals),
-        **({"outputs": list(bound.outputs), "initial_states": list(bound.begun)} if bound.outputs else {}),
+        **({"outputs": list(bound.outputs), "initial_states": list(bound.initial_states)} if bound.outputs else {}),
         **({"shares": list(bound.shares)} if bound.shares else {}),
         "multipliers": [
             {

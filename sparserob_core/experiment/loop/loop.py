@@ -17,7 +17,7 @@ from sparserob_core.control.loop.controller import Controller
 from sparserob_core.control.problem.names import joined
 from sparserob_core.control.response.response import Response
 from sparserob_core.control.studies.laws import LawName, ParametersInTime, Uncertainty, noises
-from sparserob_core.control.studies.simulate import fine_times, finer, walk
+from sparserob_core.control.studies.simulate import fine_times, finer, simulate_states
 from sparserob_core.control.transcription.own_units import row_units
 from sparserob_core.control.transcription.record import Transcription
 from sparserob_core.errors import InputError
@@ -167,7 +167,7 @@ def _simulate_loops(
         for period, (disturbance, noise) in enumerate(zip(disturbances, noise_signals, strict=True)):
             pieces = law_grid.control_piece if law == ADVERSARY else np.arange(law_grid.pieces)
             closing = _LoopInput(model, acting, pieces, noise, period * model.problem.horizon, to_user_states)
-            path = walk(fine, closing, parameter, disturbance, initial_state)
+            path = simulate_states(fine, closing, parameter, disturbance, initial_state)
             states = np.stack(list(path if to_user_states is None else map(to_user_states, path)))
             for name, largest in _measure_violations(model, finished, states, times, closing.applied).items():
                 largest_violations[name] = max(largest_violations[name], largest)
@@ -285,7 +285,7 @@ def _replay_worst_cases(worst: Mapping[str, Array], beside: ParametersInTime | N
         ]
         noise_signals = [worst["noises"][case] if "noises" in worst else None for case in cases]
         row_slice = slice(row, row + 1)
-        parameter_rows = None if beside is None else beside.seen(worst["directions"][row])[None]
+        parameter_rows = None if beside is None else beside.find_corner(worst["directions"][row])[None]
         yield (
             ADVERSARY,
             disturbances,

@@ -19,9 +19,9 @@ from sparserob_core.control.studies.simulate import (
     delivered,
     fine_times,
     finer,
+    simulate_states,
     times_inside,
     trajectories_at_once,
-    walk,
 )
 from sparserob_core.control.transcription.own_units import row_units
 from sparserob_core.errors import InputError
@@ -123,7 +123,7 @@ def simulate(
             pairs = zip(states, replayed["directions"], strict=True)
             states = np.stack(
                 [
-                    parameters_in_time.at(trajectory, parameters_in_time.seen(direction)[None])
+                    parameters_in_time.at(trajectory, parameters_in_time.find_corner(direction)[None])
                     for trajectory, direction in pairs
                 ]
             )
@@ -188,7 +188,9 @@ def _simulate_samples(
             control = delivered(control, errors)
         for violation_count in violation_counts:
             violation_count.begin(size)
-        for position, state in enumerate(walk(fine, control, drawn_parameters, disturbances, initial_states)):
+        for position, state in enumerate(
+            simulate_states(fine, control, drawn_parameters, disturbances, initial_states)
+        ):
             if parameters_in_time is not None and parameter_rows is not None:
                 state = parameters_in_time.at(state, parameter_rows)
             envelope.add(position, state)

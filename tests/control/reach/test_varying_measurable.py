@@ -18,7 +18,7 @@ from sparserob_core.control.reach.support import Supports
 from sparserob_core.control.reach.varying_execution import VaryingExecution
 from sparserob_core.control.reach.varying_measurable import VaryingMeasurable
 from sparserob_core.control.reach.varying_motion import VaryingMotion
-from sparserob_core.control.studies.adversary import pushed_by, worst_signal
+from sparserob_core.control.studies.adversary import evaluate_disturbance, worst_signal
 from sparserob_core.control.transcription.transcribe import Transcription, prepare
 from sparserob_core.sip.convex_set import Array
 from tests.support.enclosed import assert_bounded_on_cells
@@ -94,7 +94,7 @@ def test_the_worst_signal_attains_it() -> None:
         signal = worst_signal(functionals, time, H[0], NONE)
         assert signal[1] is not None
         assert ((signal[1] >= BOX.lower[:, None]) & (signal[1] <= BOX.upper[:, None])).all()
-        attained = pushed_by(functionals, time, H[0], NONE, (signal[0], signal[1]))
+        attained = evaluate_disturbance(functionals, time, H[0], NONE, (signal[0], signal[1]))
         assert attained == pytest.approx(values(support(), np.array([time]), H[:1])[0, 0], abs=1e-13)
 
 

@@ -42,7 +42,7 @@ def integral(a: float, b: float, weigh: object, column: int) -> float:
 def truth(row: WorstRow, kind: str, t: float) -> float:
     """By transitions and quadrature."""
     line = C @ expm(A * t)
-    total = float(line @ row.centre + row.begun.support(line[None])[0])
+    total = float(line @ row.centre + row.initial_deviations.support(line[None])[0])
     for a, b, u in zip(GRID[:-1], GRID[1:], row.drives[0], strict=True):
         if a < t:
             total += u * integral(t - min(b, t), t - a, np.asarray, 0)
@@ -92,8 +92,8 @@ def test_a_witness_reaches_the_worst_value(kind: str) -> None:
     row = worst(kind)
     for t in (0.5, 2.5, 3.75):
         deviation, changes, signal = row.witness(t)
-        assert row.begun.contains(deviation)
-        assert row.reached(t, deviation, changes, signal) == pytest.approx(row.at(np.array([t]))[1][0], abs=1e-10)
+        assert row.initial_deviations.contains(deviation)
+        assert row.evaluate(t, deviation, changes, signal) == pytest.approx(row.at(np.array([t]))[1][0], abs=1e-10)
         if kind == "constant":
             assert np.isin(changes, GRID).all()
 
@@ -118,4 +118,4 @@ def test_what_a_transition_is_off_by_counts_as_often_as_there_are_steps() -> Non
     for horizon in (3e3, 3e4):
         turning = Adjoint.of(np.array([[0.0, 1.0], [-1.0, 0.0]]), np.zeros((2, 1)), np.array([1.0, 0.0]), horizon)
         row = WorstRow(turning, np.array([1.0, 0.0]), None, np.array([0.0, horizon]), np.zeros((1, 1)), None)
-        assert abs(float(row.at(np.array([horizon]))[0][0]) - cos(horizon)) < row.lost < 1e-10
+        assert abs(float(row.at(np.array([horizon]))[0][0]) - cos(horizon)) < row.error_bound < 1e-10

@@ -21,7 +21,7 @@ from sparserob_core.control.response.parameters import ParameterIndex
 from sparserob_core.control.response.response import Response
 from sparserob_core.control.sets.sets import NormBall, Polytope
 from sparserob_core.control.studies.laws import Uncertainty, admissibility
-from sparserob_core.control.studies.simulate import fine_times, finer, times_inside, walk
+from sparserob_core.control.studies.simulate import fine_times, finer, simulate_states, times_inside
 from sparserob_core.control.transcription.transcribe import prepare
 from sparserob_core.experiment.simulation.simulation import clopper_pearson
 from tests.support.plants import held, indicators, random_system, simulated, uniform, walsh
@@ -210,7 +210,9 @@ def test_trajectories_agree_with_an_integrator_and_with_augmented_exponentials(n
         times = fine_times(model.response, ParameterIndex(None), np.array([0.123]))
         fine = Response(system, finer(model.response.grid, times), model.response.initial_state)
         grid = model.response.grid
-        paths = np.stack(list(walk(fine, u[:, grid.control_piece], np.zeros((3, 0)), w[:, :, grid.disturbance_piece])))
+        paths = np.stack(
+            list(simulate_states(fine, u[:, grid.control_piece], np.zeros((3, 0)), w[:, :, grid.disturbance_piece]))
+        )
         assert {0.0, 0.123, 1.5} <= set(times.tolist())
         ends = itertools.pairwise(model.response.grid.breakpoints.tolist())
         assert times_inside(times, model.response.grid.breakpoints) == min(
@@ -248,7 +250,7 @@ def test_every_trajectory_has_its_own_parameter():
     grid = model.response.grid
     paths = np.stack(
         list(
-            walk(
+            simulate_states(
                 Response(model.response.system, finer(grid, grid.breakpoints), model.response.initial_state),
                 u[:, grid.control_piece],
                 parameters,
@@ -433,7 +435,7 @@ def test_an_orbit_in_metres_and_seconds_is_walked_to_rounding() -> None:
     A = np.array([[0, 0, 1, 0], [0, 0, 0, 1], [0, 0, 0, 2 * n], [0, 3 * n * n, -2 * n, 0]])
     grid = TimeGrid(np.linspace(0.0, horizon, 25), np.arange(24), np.arange(24))
     response = Response(sr.LinearSystem(A, np.eye(4)[:, 2:]), grid, np.array(begin))
-    *_, state = walk(response, np.zeros((2, 24)), np.zeros((1, 0)), None)
+    *_, state = simulate_states(response, np.zeros((2, 24)), np.zeros((1, 0)), None)
     with ctx.workprec(200):
         power = arb_mat([[arb(v) * horizon for v in row] for row in A.tolist()]).exp()
         exact = [float(v) for v in (power * arb_mat([[arb(v)] for v in begin])).entries()]
