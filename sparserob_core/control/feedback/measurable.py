@@ -163,8 +163,8 @@ class MeasurablePieces:
 
     @property
     def effect_sizes(self) -> tuple[Array, Array]:
-        """Sizes that `VaryingMotion.left_out` needs for a system whose transitions are inexact; 0 here, where they are
-        not.
+        """Sizes that `VaryingMotion.bound_state_errors` needs for a system whose transitions are inexact; 0 here, where
+        they are not.
 
         The first array ``(K, d)`` bounds the contribution of the current piece to every state, at all marks but the
         last. The second array ``(K, d, m)`` bounds what drives the states between marks.
@@ -333,8 +333,8 @@ class VaryingPieces(MeasurablePieces):
 
     @cached_property
     def effect_sizes(self) -> tuple[Array, Array]:
-        """Sizes that `VaryingMotion.left_out` needs; the errors of kernels are added to the flows of inputs, as larger
-        inputs."""
+        """Sizes that `VaryingMotion.bound_state_errors` needs; the errors of kernels are added to the flows of inputs,
+        as larger inputs."""
         motion, errors = self.motion, self.errors
         axes = np.vstack([np.eye(motion.states), -np.eye(motion.states)])
         ends = self.enclosed(motion.grid.breakpoints[:-1], axes, motion.origin)[..., 1]

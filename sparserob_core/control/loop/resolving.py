@@ -152,7 +152,7 @@ class ProvenPlan:
         share = np.divide(room, rise, out=np.ones_like(room), where=rise > 0.0).min(initial=1.0)
         return np.asarray(nominal + min(1.0, float(share)) * (control - nominal))
 
-    def left(self, piece: int, innovations: Sequence[Array]) -> Array:
+    def remaining_control(self, piece: int, innovations: Sequence[Array]) -> Array:
         """Return the nominal control ``(m, K')`` that remains from piece ``piece`` of this plan on, if nothing more
         happens than was measured: one innovation ``(d,)`` for each breakpoint so far."""
         nominal = self.known.pieces(self.decision)[:, piece:]
@@ -162,11 +162,11 @@ class ProvenPlan:
         gains = feedback.loop.gains(self.decision)[piece:, : len(innovations)]
         return np.asarray(nominal + np.einsum("kjmd,jd->mk", gains, np.array(innovations)))
 
-    def cost_left(self, piece: int, innovations: Sequence[Array]) -> float:
+    def remaining_cost(self, piece: int, innovations: Sequence[Array]) -> float:
         """Return the cost of the remaining control under feedback, from piece ``piece`` of this plan on: of the nominal
         control, or of its peaks over the deviations that may still happen."""
         feedback, problem = self.known.answering, self.known.problem
-        nominal, spread = self.left(piece, innovations), feedback.loop.spread
+        nominal, spread = self.remaining_control(piece, innovations), feedback.loop.spread
         size = np.abs(nominal)
         if feedback.charge.cost == "peak":
             effects = feedback.loop.effects(self.decision)[piece:].copy()
@@ -280,7 +280,7 @@ class Resolving:
             model = remaining(self._model, piece, state, before)
             gap = float(self._model.control.breakpoints[piece] - self._model.control.breakpoints[plan.first])
             result = answered_in_own_units(partial(self._solve_from_cuts, plan.cuts, gap), model.program, tools)
-            known_cost = plan.cost_left(piece - plan.first, innovations)
+            known_cost = plan.remaining_cost(piece - plan.first, innovations)
             full = self._judge_result(
                 model, result, piece, result.decision, result.cost, result.lower_bound, known_cost
             )
@@ -308,9 +308,11 @@ class Resolving:
         tracked = retuning.solve(plan_piece, state, tools.deadline.at_most(np.inf))
         if tracked is None:
             return Solved(None)
-        decision = retuned(plan.known, plan.decision, plan_piece, plan.left(plan_piece, innovations), tracked.decision)
+        decision = retuned(
+            plan.known, plan.decision, plan_piece, plan.remaining_control(plan_piece, innovations), tracked.decision
+        )
         tuned = replace(plan, decision=decision)
-        cost, known_cost = (candidate.cost_left(plan_piece, innovations) for candidate in (tuned, plan))
+        cost, known_cost = (candidate.remaining_cost(plan_piece, innovations) for candidate in (tuned, plan))
         return Solved(tuned, cost, cheaper=is_cheaper(cost, known_cost))
 
     def _solve_open_loop(
@@ -358,7 +360,7 @@ class Resolving:
         )
         control_units = np.repeat(units.controls, own.control.functions)
         decision = None if result.decision is None else result.decision * control_units
-        tail = plan.left(piece - plan.first, innovations).ravel() / control_units
+        tail = plan.remaining_control(piece - plan.first, innovations).ravel() / control_units
         known_cost = units.cost * float(program.cost(tail))
         cuts = tuple(replace(cut, index=cut.index * index_units(program, cut)) for cut in result.indices)
         result = replace(result, indices=cuts)
@@ -385,7 +387,9 @@ class Resolving:
         if relative_gap(tracked.lower, tracked.cost, own.program.added(tracked.decision)) > self._method.tolerance:
             return None
         control_units = np.repeat(units.controls, own.control.functions)
-        known_cost = float(own.program.cost(plan.left(piece - plan.first, innovations).ravel() / control_units))
+        known_cost = float(
+            own.program.cost(plan.remaining_control(piece - plan.first, innovations).ravel() / control_units)
+        )
         decision, cost = tracked.decision * control_units, units.cost * tracked.cost
         return Solved(
             ProvenPlan(model, decision, piece, state=state.copy()),

@@ -111,10 +111,10 @@ def _is_plain_problem(model: Transcription) -> bool:
     return is_plain and model.response.uniform and grid.pieces == model.control.pieces
 
 
-def retuned(model: Transcription, decision: Array, piece: int, left: Array, found: Array) -> Array:
-    """Return the decision with another control from ``piece`` on: ``found (m K',)`` instead of ``left (m, K')``. The
-    nominal control moves by the difference."""
+def retuned(model: Transcription, decision: Array, piece: int, remaining_control: Array, found: Array) -> Array:
+    """Return the decision with another control from ``piece`` on: ``found (m K',)`` instead of ``remaining_control (m,
+    K')``. The nominal control moves by the difference."""
     changed = decision.copy()
-    nominal = changed[: model.control.pieces * left.shape[0]].reshape(left.shape[0], -1)
-    nominal[:, piece:] += found.reshape(left.shape) - left
+    nominal = changed[: model.control.pieces * remaining_control.shape[0]].reshape(remaining_control.shape[0], -1)
+    nominal[:, piece:] += found.reshape(remaining_control.shape) - remaining_control
     return changed

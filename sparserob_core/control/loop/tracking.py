@@ -50,11 +50,11 @@ class Tracked:
 @dataclass(frozen=True, eq=False)
 class _Instants:
     """Quantities that all pieces share at some times after they begin: ``flow``, ``driven (q, d, d)``, and the support
-    value of the disturbance in the rows until then, ``pushed (q, K + 1, R)``."""
+    value of the disturbance in the rows until then, ``support_values (q, K + 1, R)``."""
 
     flow: Array
     driven: Array
-    pushed: Array
+    support_values: Array
 
 
 def trackable(own: Transcription) -> bool:
@@ -384,7 +384,7 @@ class Tracking:
         Under gains, the effect of the control that answers is included."""
         block = self._get_block(level, parent)
         if self._answering is None:
-            return np.asarray(block.pushed[:, piece])
+            return np.asarray(block.support_values[:, piece])
         key = (level, parent, piece)
         if key not in self._support_cache:
             self._support_cache[key] = self._answering.added(block.flow, block.driven, piece)

@@ -22,7 +22,7 @@ import numpy as np
 import numpy.typing as npt
 
 from sparserob_core.brief import noun
-from sparserob_core.control.problem.expression import Entries, beside
+from sparserob_core.control.problem.expression import Entries, join_columns
 from sparserob_core.control.problem.phase import Matrix, Phase
 from sparserob_core.control.problem.system import System
 from sparserob_core.control.sets.sets import Product, product
@@ -167,7 +167,7 @@ def joined(
             E = _get_disturbance_matrix(disturbance.entering(f"disturbance.{i}", phase))
             acts = start < phase.until - SAME_TIME * horizon and phase.begin + SAME_TIME * horizon < stop
             columns.append(E if acts else np.zeros((phase.states, sets[i].dimension)))
-        phases.append(replace(phase, E=reduce(beside, columns)))
+        phases.append(replace(phase, E=reduce(join_columns, columns)))
     kinds = tuple(disturbance.kind for disturbance in every)
     set_and_classes: tuple[ConvexSet, Classes] = (product(sets), kind)
     if len(set(kinds)) > 1 or grids is not None:

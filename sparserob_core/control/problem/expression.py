@@ -106,12 +106,12 @@ class _Parser:
 
     def __init__(self, text: str, names: tuple[str, ...]) -> None:
         self.text, self.names = text, names
-        self.seen: set[str] = set()
+        self.used_names: set[str] = set()
 
     def expression(self, tree: ast.expr) -> Expression:
         """Return the expression of a syntax tree."""
         evaluation = self.parse(tree, 0)
-        return Expression(self.text, frozenset(self.seen), evaluation)
+        return Expression(self.text, frozenset(self.used_names), evaluation)
 
     def parse(self, node: ast.expr, depth: int) -> Evaluation:
         """Return the evaluation of a node; raise `InputError` for a node that is too deep or not on the whitelist."""
@@ -149,7 +149,7 @@ class _Parser:
     def name(self, name: str) -> Evaluation:
         """Return the evaluation of a parameter or of a constant such as ``pi``."""
         if name in self.names:
-            self.seen.add(name)
+            self.used_names.add(name)
             return lambda values: values[name]
         if name in CONSTANTS:
             value = np.float64(CONSTANTS[name])
@@ -179,13 +179,13 @@ class _Parser:
         """Return the evaluation of ``kepler(M, e)``, in which ``e`` is a number."""
         if len(node.args) != 2 or node.keywords or any(isinstance(argument, ast.Starred) for argument in node.args):
             raise self.fault("kepler takes two arguments, as in kepler(M, 0.2)")
-        names_before, self.seen = self.seen, set()
-        anomaly, anomaly_names = self.parse(node.args[0], depth + 1), self.seen
-        self.seen = set()
+        names_before, self.used_names = self.used_names, set()
+        anomaly, anomaly_names = self.parse(node.args[0], depth + 1), self.used_names
+        self.used_names = set()
         evaluation = self.parse(node.args[1], depth + 1)
-        if self.seen:
-            raise self.fault(f"the eccentricity of kepler(M, e) must be a number, it depends on {min(self.seen)}")
-        self.seen = names_before | anomaly_names
+        if self.used_names:
+            raise self.fault(f"the eccentricity of kepler(M, e) must be a number, it depends on {min(self.used_names)}")
+        self.used_names = names_before | anomaly_names
         with np.errstate(all="ignore"):
             eccentricity = float(evaluation({}))
         if not 0.0 <= eccentricity < 1.0:
@@ -343,7 +343,7 @@ class Joined:
         )
 
 
-def beside(left: Entries, right: Entries) -> Entries:
+def join_columns(left: Entries, right: Entries) -> Entries:
     """Return two matrices as one, in a row.
 
     Parameters

@@ -87,7 +87,7 @@ class Corners:
         d, size = self.added
         return [*range(d), *range(size, states)]
 
-    def stated(self, direction: Array, states: Array) -> Array:
+    def select_corner(self, direction: Array, states: Array) -> Array:
         """Return trajectories of which the first ``d`` states are those at the corner of a direction.
 
         Parameters

@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from sparserob_core.brief import noun
 from sparserob_core.control.enclosures.taylor import TaylorModel, TaylorSpace
-from sparserob_core.control.problem.expression import ExpressionMatrix, above, beside
+from sparserob_core.control.problem.expression import ExpressionMatrix, above, join_columns
 from sparserob_core.control.problem.tracing import SAME
 from sparserob_core.control.sets.sets import Box
 from sparserob_core.control.sets.strangers import require_consistent
@@ -125,7 +125,7 @@ class Phase:
         """
         if self.c is None:
             return self
-        return replace(self, B=beside(self._get_entry("B"), self._get_entry("c")), c=None)
+        return replace(self, B=join_columns(self._get_entry("B"), self._get_entry("c")), c=None)
 
     def between(self, begin: float, until: float) -> Phase:
         """Return the phase from another time and until another time.
@@ -275,7 +275,7 @@ class Phase:
             for name, block in blocks.items()
             if name != "c" or self.c is not None
         }
-        A = above(beside(self._get_entry("A"), np.zeros((d, k))), np.hstack([rows, np.zeros((k, k))]))
+        A = above(join_columns(self._get_entry("A"), np.zeros((d, k))), np.hstack([rows, np.zeros((k, k))]))
         return replace(self, A=A, B=extended["B"], E=extended["E"], c=extended.get("c"))
 
     @shaped

@@ -20,7 +20,8 @@ EPSILON = float(np.finfo(float).eps)
 HALVINGS = 48  # halvings of an interval, after which its contribution is below rounding
 NODES, WEIGHTS = np.polynomial.legendre.leggauss(17)  # with 9 nodes intervals would be halved four times more
 RADIUS = 3.0  # sum of the half-axes of the ellipse: with 2 the error is 1e-9, with 4 each interval is halved once more
-MISSED = 64.0 / 15.0 * RADIUS ** (2.0 - 2.0 * NODES.size) / (1.0 - RADIUS**-2.0)  # error bound, relative to M: 3e-15
+# error bound, relative to M: 3e-15
+ERROR_FACTOR = 64.0 / 15.0 * RADIUS ** (2.0 - 2.0 * NODES.size) / (1.0 - RADIUS**-2.0)
 CUTS = 3  # divisions at sign changes before an interval is halved: a polynomial has one or two of them on a piece
 SECANTS = 10  # steps of the secant method; with half of them a part near a sign change is halved a few times more
 NEAR_END = 1e-9  # share of an interval next to its ends: an interval with a sign change there is halved
@@ -73,7 +74,7 @@ def curved_integral(bound: ConvexSet, terms: Array, lengths: Array, accuracy: Ar
         assert maxima is not None
         sizes = np.abs(terms).sum(axis=1) @ reach
         middle = bound.support(powers @ terms) @ WEIGHTS / 2.0
-        error = np.where(np.isfinite(maxima), MISSED * maxima, np.inf)
+        error = np.where(np.isfinite(maxima), ERROR_FACTOR * maxima, np.inf)
         # the support function changes by at most the reach of the set along the change of its argument
         constant, constant_error = bound.support(terms[:, 0]), np.abs(terms[:, 1:]).sum(axis=1) @ reach
         is_better = constant_error < error

@@ -22,7 +22,7 @@ _VERTEX_DIMENSIONS = 6
 _VERTEX_ROWS = 200
 _MEETINGS = 20_000  # meetings of rows that are tried as vertices of a set without an interior: a second or two
 _REGULAR = 1e-12  # determinant of unit rows from which on their meeting is known to a thousandth
-_BESIDE = 1e-9  # relative violation of a row by a meeting, above which fractions are not needed to exclude it
+_VIOLATED = 1e-9  # relative violation of a row by a meeting, above which fractions are not needed to exclude it
 _SWEEPS = 12
 _ORDINARY = 10  # binary orders of magnitude of the scale factors within which rows and columns are not scaled
 _TOGETHER = 64  # linear programs that are solved as one
@@ -212,7 +212,7 @@ class Polytope(ConvexSet):
         normals, ends = (self.H / norms[:, None])[choices], (self.h / norms)[choices]
         is_regular = np.abs(np.linalg.det(normals)) > _REGULAR
         points = np.linalg.solve(normals[is_regular], ends[is_regular][..., None])[..., 0]
-        is_outside = points @ self.H.T - self.h > _BESIDE * (np.abs(points) @ np.abs(self.H).T + np.abs(self.h))
+        is_outside = points @ self.H.T - self.h > _VIOLATED * (np.abs(points) @ np.abs(self.H).T + np.abs(self.h))
         candidates = np.concatenate([choices[is_regular][~is_outside.any(axis=1)], choices[~is_regular]])
         H, h = ([[Fraction(float(x)) for x in row] for row in array] for array in (self.H, self.h[:, None]))
         meetings = {_intersect_hyperplanes([H[i] for i in choice], [h[i][0] for i in choice]) for choice in candidates}

@@ -51,7 +51,7 @@ FINER = 2.0**-11  # of the numbers that are added up, the unit of an equality: i
 
 @final
 @dataclass(frozen=True, eq=False)
-class Seen:
+class AnsweredMeasurements:
     """Measurements that a control answers, in one set of units.
 
     ``answers``: the coordinates of the gains. ``pieces``: the pieces on which measurable disturbances are the
@@ -82,8 +82,8 @@ class FeedbackModel(Acting):
     policy: Policy
     mask: np.ndarray
     charge: Charge
-    seen: Seen
-    first: tuple[Posed, Seen]
+    measurements: AnsweredMeasurements
+    first: tuple[Posed, AnsweredMeasurements]
     """Problem in the own units in which the measurements were computed first, and these measurements."""
     formulation: Formulation = "reduced"
 
@@ -95,12 +95,12 @@ class FeedbackModel(Acting):
     def in_own(self, theirs: Posed, own: Posed, units: Units) -> FeedbackModel:
         """Return this control with its measurements in the problem's ``own`` units."""
         measurements = self.first[1] if own is self.first[0] else _build_measurements(self.mask, theirs, own, units)[0]
-        return replace(self, seen=measurements)
+        return replace(self, measurements=measurements)
 
-    def from_state(self, model: Transcription, begun: Posed) -> Transcription:
+    def from_state(self, model: Transcription, posed: Posed) -> Transcription:
         """Return the program of the same problem from another initial state; it shares the record of the measurements,
         and the explanations of the families, with the program of ``model``."""
-        transcription = transcribed(begun, self)
+        transcription = transcribed(posed, self)
         named = {family.name: family for family in model.program.families}
         families = [
             replace(
@@ -128,12 +128,12 @@ class FeedbackModel(Acting):
 
     def telling(self, own: Posed, units: Units) -> Telling:
         """Return the conversion to the user's units, with the units of the deviations that end a literal index."""
-        assert self.seen.deviations is not None
-        return Telling(units, deviations=self.seen.deviations)
+        assert self.measurements.deviations is not None
+        return Telling(units, deviations=self.measurements.deviations)
 
-    def units_beside(self, own: Posed, units: Units) -> Array:
+    def compute_extra_units(self, own: Posed, units: Units) -> Array:
         """Return one unit of each gain, and of each variable that is charged, in the user's units."""
-        answers, deviations = self.seen.answers, self.seen.deviations
+        answers, deviations = self.measurements.answers, self.measurements.deviations
         assert deviations is not None
         peaks = np.repeat(units.controls, own.control.pieces)
         charged = {"nominal": peaks[:0], "peak": peaks, "worst": np.full(1, units.cost)}[self.charge.cost]
@@ -143,7 +143,7 @@ class FeedbackModel(Acting):
         """Return the families that hold for every deviation, the gains with their bounds, and the variables that bound
         the charge."""
         functionals, problem, pieces = posed.functionals, posed.problem, posed.control.pieces
-        measurements, gains, charge = self.seen, self.seen.answers, self.charge
+        measurements, gains, charge = self.measurements, self.measurements.answers, self.charge
         nominal, first = functionals.variables, functionals.variables + gains.variables
         size = first + {"nominal": 0, "peak": nominal, "worst": 1}[charge.cost]
         loop = ClosedLoop(
@@ -220,7 +220,7 @@ def answering(policy: Policy, mask: np.ndarray, posed: Posed, own: Posed, units:
     scaled, outputs = _build_measurements(mask, posed, own, units)
     assert scaled.deviations is not None
     pieces, observer = scaled.pieces, scaled.observer
-    measurements = Seen(
+    measurements = AnsweredMeasurements(
         answers=_scale_to_user_units(scaled.answers, outputs, scaled.deviations),
         pieces=None if pieces is None else pieces.in_units_of(posed.functionals, units.states, units.disturbances),
         observer=None if observer is None else observer.in_units(units.states, outputs),
@@ -230,7 +230,9 @@ def answering(policy: Policy, mask: np.ndarray, posed: Posed, own: Posed, units:
     return FeedbackModel(policy, mask, policy.charge, measurements, (own, scaled))
 
 
-def _build_measurements(mask: np.ndarray, theirs: Posed, own: Posed, units: Units) -> tuple[Seen, Array]:
+def _build_measurements(
+    mask: np.ndarray, theirs: Posed, own: Posed, units: Units
+) -> tuple[AnsweredMeasurements, Array]:
     """Return the measurements that a control answers, in ``own`` units, and one unit of each measured output in the
     user's units. ``theirs`` is the problem in the user's units."""
     problem, disturbance, has_initial_set = (
@@ -263,7 +265,9 @@ def _build_measurements(mask: np.ndarray, theirs: Posed, own: Posed, units: Unit
     coordinates = coordinates.on(power_of_two(np.where(is_small, spread.radii, 1.0)))
     equality_units = FINER * power_of_two(np.maximum(added_up(problem, own.functionals), np.abs(h)))
     ends = _split_equalities(H / equality_units[:, None], h / equality_units)
-    return Seen(coordinates, pieces, observer, ends, still, deviations, _step_units(problem)), output_units
+    return AnsweredMeasurements(
+        coordinates, pieces, observer, ends, still, deviations, _step_units(problem)
+    ), output_units
 
 
 def _split_equalities(H: Array, h: Array) -> tuple[Array, Array]:

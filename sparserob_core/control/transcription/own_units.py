@@ -199,7 +199,7 @@ def reaches(
     control: ConvexSet,
     H: Array,
     times: Array,
-    beside: Array | None = None,
+    added_terms: Array | None = None,
     G: Array | None = None,
 ) -> tuple[Array, Array]:
     """Return the largest distance of ``H x(t)`` from 0 at some times, and the largest sum of absolute values from which
@@ -220,7 +220,7 @@ def reaches(
         The rows on the state.
     times : array (T,)
         The times.
-    beside : array (T, r), optional
+    added_terms : array (T, r), optional
         Numbers that are added to ``H x(t)``.
     G : array (r, m), optional
         Rows on the control: ``G u`` of any control is added.
@@ -260,8 +260,8 @@ def reaches(
             down[batch] += model.support(-on_noise)
             magnitudes[batch] += np.abs(on_noise @ np.diag(extent(model.bound))).sum(axis=(1, 2))
     high, low, sums = (values.reshape(shape).swapaxes(1, 2) for values in (up, down, magnitudes))
-    if beside is not None:
-        high, low, sums = high + beside, low - beside, sums + np.abs(beside)
+    if added_terms is not None:
+        high, low, sums = high + added_terms, low - added_terms, sums + np.abs(added_terms)
     if G is not None:
         high, low = high + control.support(G), low + control.support(-G)
         sums = sums + np.abs(G) @ extent(control)

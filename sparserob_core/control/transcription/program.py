@@ -73,25 +73,25 @@ class OpenLoopModel(Acting):
             families = [family.literal or family for family in families]
         return ProgramPart(families=families, activity=np.outer(problem.counts, control.lengths).ravel())
 
-    def from_state(self, model: Transcription, begun: Posed) -> Transcription:
+    def from_state(self, model: Transcription, posed: Posed) -> Transcription:
         """Return the program of the same problem from another initial state. Everything that does not depend on this
         state is shared, and the families are in their reduced form only."""
         reduced_families = {
             constraint.name: replace(
                 _build_reduced_family(constraint), row_units=family.row_units, index_units=family.index_units
             )
-            for constraint, family in zip(begun.constraints, model.program.families, strict=False)
+            for constraint, family in zip(posed.constraints, model.program.families, strict=False)
         }
-        A, b = _build_scaled_equalities(begun)
+        A, b = _build_scaled_equalities(posed)
         program = replace(
             model.program,
-            **quadratics(begun.problem, model.control, begun.functionals.variables),
+            **quadratics(posed.problem, model.control, posed.functionals.variables),
             families=[reduced_families.get(family.name, family) for family in model.program.families],
             A=A if b.size else None,
             b=b if b.size else None,
-            errors=final_errors(begun) if b.size else None,
+            errors=final_errors(posed) if b.size else None,
         )
-        return begun.became(OpenLoopModel(), program)
+        return posed.became(OpenLoopModel(), program)
 
     def free(self, model: Transcription) -> Transcription:
         """Return the program as it is: only the control itself has a cost."""
@@ -103,7 +103,7 @@ class OpenLoopModel(Acting):
         model = own.functionals.disturbance
         return Telling(units, blocks=np.zeros(0) if model is None else _block_units(model, units))
 
-    def units_beside(self, own: Posed, units: Units) -> Array:
+    def compute_extra_units(self, own: Posed, units: Units) -> Array:
         """Return an empty array: the decision has no entries after the nominal ones."""
         return np.zeros(0)
 
@@ -184,7 +184,7 @@ def held_nominally(problem: OptimalControlProblem) -> OptimalControlProblem:
     return replace(problem, control=ranged, control_step=None, terminal=problem.terminal_sets)
 
 
-def way_back(theirs: Posed, own: Transcription, units: Units) -> tuple[Array, Array, Array]:
+def compute_conversion_factors(theirs: Posed, own: Transcription, units: Units) -> tuple[Array, Array, Array]:
     """Return the factors from own units to the user's units for every entry of a decision ``(n,)``, of its image
     ``(k,)``, and for every equality ``(e,)``."""
     rows, pieces, controls = own.rows, own.control.pieces, units.controls
@@ -193,7 +193,7 @@ def way_back(theirs: Posed, own: Transcription, units: Units) -> tuple[Array, Ar
     sides = ratios(slants, slanting / rows.sides[:, None], controls)
     steps, own_steps = (Steps.of(posed.held, posed.control) for posed in (theirs, own))
     changes = np.repeat(ratios(steps.H, own_steps.divided(rows.steps).H, controls), steps.times.size)
-    extra_units = own.acting.units_beside(own, units)
+    extra_units = own.acting.compute_extra_units(own, units)
     sizes = [] if own.functionals.execution is None else [np.repeat(controls, pieces)]  # bounded from both sides
     decision = np.concatenate([np.repeat(controls, own.control.functions), *sizes, extra_units])
     image = np.concatenate([np.repeat(np.concatenate([controls, sides]), pieces), changes, *2 * sizes, extra_units])

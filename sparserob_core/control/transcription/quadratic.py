@@ -25,7 +25,7 @@ from sparserob_core.sip.convex_set import Array
 if TYPE_CHECKING:
     from scipy.sparse import csc_array
 
-MOST = 5000  # values of a control that may be coupled: a matrix of their square
+COUPLING_LIMIT = 5000  # values of a control that may be coupled: a matrix of their square
 POINTS = 16  # of Gauss' rule, on times on which the norm of A is at most 2: half of them leave a millionth of a digit
 SHORT = 0.5  # the norm of F h up to which W is read off one exponential
 
@@ -145,7 +145,7 @@ def _integrate_varying(
     assert expansion is not None
     m = M.shape[0] - d - 1
 
-    def moved(pieces: np.ndarray, stops: Array) -> Array:
+    def compute_transitions(pieces: np.ndarray, stops: Array) -> Array:
         flow, decided = expansion.flow(grid.breakpoints[pieces], stops), grid.control_piece[pieces] >= 0
         transitions = np.tile(np.eye(M.shape[0]), (stops.size, 1, 1))
         drift = flow.state @ reference - reference + flow.control[:, :, m:].sum(axis=2) + flow.disturbance @ noise
@@ -162,9 +162,9 @@ def _integrate_varying(
     half = np.diff(propagator.marks)[:, None] / 2
     times = (propagator.marks[:-1, None] + half * (1.0 + points)).ravel()
     pieces, weights = grid.locate(times), np.zeros((grid.pieces, *M.shape))
-    inside = moved(pieces, times)
+    inside = compute_transitions(pieces, times)
     np.add.at(weights, pieces, np.swapaxes(inside, 1, 2) @ M @ inside * (half * shares).reshape(-1, 1, 1))
-    return moved(np.arange(grid.pieces), grid.breakpoints[1:]), weights
+    return compute_transitions(np.arange(grid.pieces), grid.breakpoints[1:]), weights
 
 
 def quadratic_cost(problem: OptimalControlProblem, breakpoints: Array) -> QuadraticCost:
@@ -178,10 +178,10 @@ def quadratic_cost(problem: OptimalControlProblem, breakpoints: Array) -> Quadra
     if control is not None:
         P = csc_array(2.0 * kron(csc_array(control.Q), diags_array(np.diff(breakpoints))))
     if state is not None or final is not None:
-        if size > MOST:
+        if size > COUPLING_LIMIT:
             raise InputError(
-                f"a quadratic cost of the state couples all {size} values of the control, at most {MOST} can be;"
-                " expected fewer pieces",
+                f"a quadratic cost of the state couples all {size} values of the control, at most {COUPLING_LIMIT} can"
+                " be; expected fewer pieces",
                 path="cost",
             )
         coupled, q, constant = _condense_state_cost(nominal_pieces(problem, breakpoints), m, size)

@@ -131,7 +131,7 @@ class Acting(ABC):
         """Return the part of the program of a posed problem, in these units, that depends on this law."""
 
     @abstractmethod
-    def from_state(self, model: Transcription, begun: Posed) -> Transcription:
+    def from_state(self, model: Transcription, posed: Posed) -> Transcription:
         """Return the program of the same problem from another initial state, explained as the program of ``model``
         is."""
 
@@ -145,7 +145,7 @@ class Acting(ABC):
         """Return the conversion of families in own units to the user's units."""
 
     @abstractmethod
-    def units_beside(self, own: Posed, units: Units) -> Array:
+    def compute_extra_units(self, own: Posed, units: Units) -> Array:
         """Return one unit of every entry of a decision after the nominal entries, in the user's units."""
 
 

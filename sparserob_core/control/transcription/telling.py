@@ -34,25 +34,25 @@ class Telling:
         (normals, _), (own_normals, coordinates) = user.normals_in(self.units), source.normals_in(self.units)
         rows, begins = ratios(normals, own_normals, coordinates), source.index_units(self.units)
 
-        def told(one: ConstraintFamily, as_theirs: ConstraintFamily) -> ConstraintFamily:
+        def convert(one: ConstraintFamily, as_theirs: ConstraintFamily) -> ConstraintFamily:
             return self._attach_units(one, as_theirs, rows, begins)
 
         def sample(count: int, rng: np.random.Generator) -> ConstraintFamily:
             assert draw is not None
             drawn = draw(count, rng)
             if drawn.formulation != "sampled":
-                return told(drawn, theirs)
+                return convert(drawn, theirs)
             middle, explanation = (theirs.index_set.lower + theirs.index_set.upper) / 2.0, theirs.explanation
 
             def explain(index: Array, row: int) -> Explanation:
                 return explanation(np.append(index[0] * begins[0], middle[1:]), row).of_sample(round(float(index[1])))
 
-            return replace(told(drawn, drawn), explain=explain)
+            return replace(convert(drawn, drawn), explain=explain)
 
         def form(one: ConstraintFamily | None, as_theirs: ConstraintFamily | None) -> ConstraintFamily | None:
-            return None if one is None or as_theirs is None else told(one, as_theirs)
+            return None if one is None or as_theirs is None else convert(one, as_theirs)
 
-        draw, converted = own.sample, told(own, theirs)
+        draw, converted = own.sample, convert(own, theirs)
         literal = form(own.literal, theirs.literal)
         if literal is not None and literal.reduced is not None:
             literal = replace(literal, reduced=converted)

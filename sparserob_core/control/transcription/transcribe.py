@@ -30,10 +30,10 @@ from sparserob_core.control.transcription.own_units import (
 )
 from sparserob_core.control.transcription.program import (
     OpenLoopModel,
+    compute_conversion_factors,
     held_nominally,
     held_units,
     transcribed,
-    way_back,
 )
 from sparserob_core.control.transcription.record import Acting, Posed, Transcription
 from sparserob_core.control.transcription.steps import refuse_without_steps
@@ -113,8 +113,8 @@ def prepare(
                 f"which is rounding for a horizon of {problem.horizon:g}"
             )
     require_representable(problem)
-    stated, disturbance = _merge_disturbance_grids(problem, disturbance)
-    problem = accumulated(stated)
+    user_problem, disturbance = _merge_disturbance_grids(problem, disturbance)
+    problem = accumulated(user_problem)
     refuse_without_steps(problem, control)
     mask = answers_of(policy, control.breakpoints, problem.measurements)
     if problem.execution is not None and mask.any():
@@ -125,7 +125,7 @@ def prepare(
         from sparserob_core.control.transcription import feedback
 
         control = control.by_values()  # what answers a measurement is a value, which must not reach back before it
-        feedback.refuse(problem, control, disturbance, policy.charge.cost, stated.system.parameter_count > 0)
+        feedback.refuse(problem, control, disturbance, policy.charge.cost, user_problem.system.parameter_count > 0)
         if formulation != "reduced":
             raise InputError(
                 f"formulation: expected reduced with a policy that answers what is measured, got {formulation!r}"
@@ -137,7 +137,7 @@ def prepare(
     if policy is not None and mask.any():
         acting = feedback.answering(policy, mask, posed, *own())
     model = transcribed(posed, acting)
-    return replace(model, program=model.program.mirrored(lambda _: _build_own_units(model, *own())), given=stated)
+    return replace(model, program=model.program.mirrored(lambda _: _build_own_units(model, *own())), given=user_problem)
 
 
 def _merge_disturbance_grids(
@@ -280,7 +280,7 @@ def like(own: Transcription, problem: OptimalControlProblem) -> SemiInfiniteProg
 def _build_own_units(model: Transcription, posed: Posed, units: Units) -> OwnUnits:
     """Return the program of a problem that is ``posed`` in its own units, and the factors back to the user's units."""
     own, _ = _transcribe_in_own_units(model, posed, units)
-    decision, image, equalities = way_back(model, own, units)
+    decision, image, equalities = compute_conversion_factors(model, own, units)
 
     def wider() -> OwnUnits:
         return _build_own_units(model, *_scale_to_own_units(model, wide=True))

@@ -75,7 +75,7 @@ def draw_adversary(arrays: Mapping[str, Array], data: FigureData) -> Figure:
 
 def _select_corner(states: Array, direction: Array, data: FigureData) -> Array:
     """Return the states ``(d, T)`` of a worst case, at the corner of the parameters that fits its direction."""
-    return data.names.corners.stated(direction, states)
+    return data.names.corners.select_corner(direction, states)
 
 
 def _name_uncertainties(arrays: Mapping[str, Array], data: FigureData) -> str:

@@ -199,7 +199,7 @@ def test_a_resolved_plan_is_taken_only_where_it_costs_less_than_what_is_left(pla
 def test_the_cost_that_a_policy_has_left_is_the_cost_of_its_program(plans) -> None:
     for name in ("nominal", "peak"):
         plan = sr.controller(plans[name]).plan
-        assert plan.cost_left(0, [np.zeros(2)]) == pytest.approx(plans[name].result.cost, rel=1e-7)
+        assert plan.remaining_cost(0, [np.zeros(2)]) == pytest.approx(plans[name].result.cost, rel=1e-7)
 
 
 def test_a_plan_that_was_solved_anew_offers_its_program_from_the_measured_state(plans) -> None:

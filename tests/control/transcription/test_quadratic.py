@@ -141,7 +141,7 @@ def test_the_largest_cost_is_that_of_one_channel_held_at_its_reach() -> None:
 
 def test_more_values_than_can_be_coupled_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     problem = problem_of(np.random.default_rng(0), None, 0.0, "state", 1.0)
-    monkeypatch.setattr(quadratic, "MOST", 8)
+    monkeypatch.setattr(quadratic, "COUPLING_LIMIT", 8)
     assert quadratic_cost(problem, BREAKS).q.size == 8
     with pytest.raises(sr.InputError, match=r"cost: .*couples all 10 values"):
         quadratic_cost(problem, np.linspace(0.0, HORIZON, 6))

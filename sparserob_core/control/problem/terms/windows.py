@@ -465,7 +465,7 @@ def columns(rows: Any, count: int) -> Array:
     return np.pad(array, ((0, 0), (0, count - array.shape[1])))
 
 
-def at_corners(corners: Sequence[Array], H: npt.ArrayLike, *beside: npt.ArrayLike) -> list[Array]:
+def at_corners(corners: Sequence[Array], H: npt.ArrayLike, *added_columns: npt.ArrayLike) -> list[Array]:
     """Return rows on the states of the user as rows on a larger state ``z``, for all states ``x = corner z``.
 
     Parameters
@@ -474,7 +474,7 @@ def at_corners(corners: Sequence[Array], H: npt.ArrayLike, *beside: npt.ArrayLik
         The matrices that give the states of the user at each corner of the parameters.
     H : array (r, d)
         The coefficients of the states of the user.
-    beside : arrays (r,) or (r, q)
+    added_columns : arrays (r,) or (r, q)
         Further columns of the rows, which are repeated for each corner.
 
     Returns
@@ -483,7 +483,7 @@ def at_corners(corners: Sequence[Array], H: npt.ArrayLike, *beside: npt.ArrayLik
         The coefficients ``(k, size)`` of ``z``, and the further columns ``(k, 1)`` or ``(k, q)``. A row that repeats an
         earlier one is left out.
     """
-    extra_columns = [np.asarray(column) for column in beside]
+    extra_columns = [np.asarray(column) for column in added_columns]
     rows = np.vstack([np.column_stack([np.asarray(H) @ corner, *extra_columns]) for corner in corners])
     _, first = np.unique(rows, axis=0, return_index=True)
     widths = [corners[0].shape[1], *(1 if column.ndim == 1 else column.shape[1] for column in extra_columns)]

@@ -15,8 +15,8 @@ from sparserob_core.control.sets.sets import product
 from sparserob_core.sip.convex_set import Box
 
 
-def larger(problem: OptimalControlProblem, more: int, **told: Any) -> OptimalControlProblem:
-    """Return the problem with ``more`` further states; ``told`` holds its new system, constraints and names."""
+def larger(problem: OptimalControlProblem, more: int, **replacements: Any) -> OptimalControlProblem:
+    """Return the problem with ``more`` further states; ``replacements`` holds its new system, constraints and names."""
     d, zeros, initial_set = problem.system.states, np.zeros(more), problem.initial_set
     measurements, (state, _, final) = problem.measurements or Measurements(np.eye(d)), problem.cost.terms
     return replace(
@@ -25,7 +25,7 @@ def larger(problem: OptimalControlProblem, more: int, **told: Any) -> OptimalCon
         initial_set=initial_set if initial_set is None or not more else product([initial_set, Box(zeros, zeros)]),
         cost=replace(problem.cost, state=_pad_cost(state, more), final=_pad_cost(final, more)),
         measurements=replace(measurements, C=columns(measurements.C, d + more)),
-        **told,
+        **replacements,
     )
 
 
