@@ -184,17 +184,17 @@ def test_what_is_not_known_is_refused_by_its_own_sentence(what: str) -> None:
 
 
 def test_budgets_end_in_no_verdict(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(effort, "MOST", 0)
+    monkeypatch.setattr(effort, "MAX_PARTS", 0)
     with pytest.raises(Unchecked, match="was not bounded by 1 parts"):
         largest_effort(arb(1), 2.0)()
-    monkeypatch.setattr(cells, "MOST_BOXES", 0)
+    monkeypatch.setattr(cells, "MAX_BOXES", 0)
     proof = {"proof": {"path": {"tolerance": 1e-9, "lower": [[0.25]], "upper": [[1.875]]}}}
     wall = sr.PathConstraint(Polytope(DIRECTIONS, np.full(4, 9.0)), 0.25, 1.875)
     case = kind("turning").case(proof, path=[wall])
     with pytest.raises(Unchecked, match="neither shown nor refuted: after 6 cells a violation of more than 1e-09"):
         constraints.bounded(case, case.windows[0])
     monkeypatch.setattr(followed_rows, "FOLLOWED", 2)
-    monkeypatch.setattr(followed, "MOST_CELLS", 0)
+    monkeypatch.setattr(followed, "MAX_CELLS", 0)
     case = kind("known").case(proof, path=[wall])
     with pytest.raises(Unchecked, match=r"neither shown nor refuted: after \d+ cells more than"):
         constraints.bounded(case, case.windows[0])

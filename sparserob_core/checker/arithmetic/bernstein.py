@@ -21,7 +21,7 @@ from sparserob_core.sip.convex_set import Array
 
 ROUNDING = 2e-13
 HALVINGS = 60
-MOST_BOXES = 20_000
+MAX_BOXES = 20_000
 
 
 @lru_cache(maxsize=32)
@@ -74,7 +74,7 @@ def highest(coefficients: Array, symmetric: Sequence[bool], errors: Array, limit
         is_refuted = attained + slack[owner] > limit  # the polynomial attains this value
         is_stopped = (
             np.zeros(owner.size, dtype=bool)
-            if step < HALVINGS - 1 and owner.size <= MOST_BOXES
+            if step < HALVINGS - 1 and owner.size <= MAX_BOXES
             else np.ones(owner.size, dtype=bool)
         )
         is_given_up = np.isin(owner, owner[is_refuted | is_stopped & ~is_shown])

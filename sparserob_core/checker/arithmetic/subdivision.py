@@ -9,7 +9,7 @@ import numpy as np
 from sparserob_core.checker.outcome import NO_LIMIT, Broken, Clock, Unchecked
 from sparserob_core.sip.convex_set import Array
 
-MOST_CELLS = 100_000
+MAX_CELLS = 100_000
 
 
 def fill(lower: Array, upper: Array, low: Array, high: Array, clock: Clock = NO_LIMIT) -> None:
@@ -26,7 +26,7 @@ def fill(lower: Array, upper: Array, low: Array, high: Array, clock: Clock = NO_
     if (lower < low).any() or (upper > high).any() or (lower > upper).any():
         raise Broken("a cell lies outside what is to be covered")
     thick = high > low
-    if lower.shape[0] > MOST_CELLS and thick.sum() > 1:
+    if lower.shape[0] > MAX_CELLS and thick.sum() > 1:
         raise Unchecked(f"{lower.shape[0]} cells are too many to be told apart one by one")
     if not thick.any():
         if lower.shape[0] != 1:

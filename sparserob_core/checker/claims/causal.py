@@ -33,7 +33,7 @@ from sparserob_core.sip.convex_set import Array
 if TYPE_CHECKING:
     from flint import arb
 
-MOST = 100_000  # multipliers that are checked
+MAX_MULTIPLIERS = 100_000  # multipliers that are checked
 Pushed: TypeAlias = (
     "tuple[ConstraintRow, list[list[arb]], list[arb]]"  # a row, its weights of the disturbance and the initial state
 )
@@ -63,7 +63,7 @@ def causal_bound(case: Case, data: Mapping[str, Any], priced: bool) -> arb:
         )
     groups: list[dict[bytes, list[arb]]] = [{_encode_prefix(nominal_report, n): [ball(0)] * m} for n in known_blocks]
     entries = listed(data, "multipliers")
-    if len(entries) > MOST:
+    if len(entries) > MAX_MULTIPLIERS:
         raise Broken(f"{len(entries)} multipliers are too many to be checked")
     rows_by_key: Rows = {}
     for entry in entries:

@@ -22,9 +22,9 @@ from sparserob_core.sip.convex_set import Array
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-MOST_CELLS = 40_000  # cells of time examined per constraint; `TIMES` as many as it starts with, where that is more
+MAX_CELLS = 40_000  # cells of time examined per constraint; `TIMES` as many as it starts with, where that is more
 TIMES = 4
-MOST_BOXES = 8_000  # pairs of a box of parameters and a cell of directions
+MAX_BOXES = 8_000  # pairs of a box of parameters and a cell of directions
 BLAME = 0.2  # share of the error, or of the slack, from which one of its causes is treated before the others
 
 Reached: TypeAlias = VerifiedTube | LoopTube | TimelessTube
@@ -66,7 +66,7 @@ def prove(
     for box, sides, intervals in reversed(work):
         work_by_box.setdefault(box, []).append((sides, intervals))
     excess, cells, boxes = _LargestExcess(), 0, 0
-    cell_limit = max(MOST_CELLS, TIMES * sum(len(intervals) for _, _, intervals in work))
+    cell_limit = max(MAX_CELLS, TIMES * sum(len(intervals) for _, _, intervals in work))
     while work_by_box:
         # all directions of one box come before any of its halves, because the tube of a box is expensive
         box, stack = work_by_box.popitem()
@@ -79,7 +79,7 @@ def prove(
             open_cells = _OpenCells(np.zeros(len(box[0])))
             while intervals:
                 cells += len(intervals)
-                if cells > cell_limit or boxes > MOST_BOXES:
+                if cells > cell_limit or boxes > MAX_BOXES:
                     raise Unchecked(
                         f"neither shown nor refuted: after {cells} cells a violation of more than {TOLERANCE:.0e} of"
                         " its unit is not excluded"

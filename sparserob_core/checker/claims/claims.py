@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from flint import arb, arb_mat
 
 PRECISION = 96  # bits, where the numbers of a system are of one size
-MOST_PRECISION = 1024
+MAX_PRECISION = 1024
 VARYING = 96  # further bits for trees of products, where radii grow at each level; half of it shows after ten orbits
 SMALL_COST = 1e-6  # share of what is added up to a cost; a gap is relative to at least this share
 SMALL_GAP = 1e-11  # a gap that was closed may open by the rounding error that is subtracted from the lower bound
@@ -118,7 +118,7 @@ def precision_of(case: Case) -> int:
     sizes = np.abs(entries[np.isfinite(entries) & (entries != 0.0)])
     range_bits = np.log2(max(1.0, sizes.max(initial=1.0))) - np.log2(min(1.0, sizes.min(initial=1.0)))
     extra_bits = VARYING if problem.system.varies else 0
-    return int(min(PRECISION + extra_bits + np.ceil(range_bits), MOST_PRECISION))
+    return int(min(PRECISION + extra_bits + np.ceil(range_bits), MAX_PRECISION))
 
 
 def judged(name: str, derive: Callable[[], str]) -> Finding:

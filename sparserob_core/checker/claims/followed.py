@@ -18,7 +18,7 @@ from sparserob_core.checker.sets.known import known
 from sparserob_core.checker.sets.polynomials import HALF_ULP
 from sparserob_core.sip.convex_set import Array
 
-MOST_CELLS = 400_000  # cells of time examined for one row
+MAX_CELLS = 400_000  # cells of time examined for one row
 PARTS = 8  # of a cell whose bound is too large: the distance to a chord, quadratic in the length, falls to 1/64
 HALVINGS = 16  # rounds of examination: the last cells are 2^-45 of their first length, near rounding
 
@@ -48,7 +48,7 @@ class FollowedRow:
         for _ in range(HALVINGS):
             self.case.clock.check()
             count += start.size
-            if count > MOST_CELLS:
+            if count > MAX_CELLS:
                 break
             tops = self.worst.over(start, stop, self._bound_added_terms(start, stop))
             is_open = ~(tops <= limit)

@@ -26,7 +26,7 @@ from sparserob_core.sip.convex_set import Array
 if TYPE_CHECKING:
     from flint import arb, arb_mat
 
-MOST_MULTIPLIERS = 100_000
+MAX_MULTIPLIERS = 100_000
 
 
 def multiplied(case: Case, priced: bool) -> arb:
@@ -47,7 +47,7 @@ def weighted(case: Case, data: object) -> tuple[list[tuple[float, ConstraintRow]
     if not isinstance(data, Mapping):
         raise Broken("multipliers: expected those of constraints, equalities and pieces")
     entries = listed(data, "constraints")
-    if len(entries) > MOST_MULTIPLIERS:
+    if len(entries) > MAX_MULTIPLIERS:
         raise Broken(f"{len(entries)} multipliers are too many to be checked")
     rows = [weighted_row for entry in entries for weighted_row in rows_of(case, entry)]
     nu = numbers(listed(data, "equalities"), "equalities")

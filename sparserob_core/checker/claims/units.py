@@ -27,8 +27,8 @@ from sparserob_core.sip.convex_set import Array
 if TYPE_CHECKING:
     from flint import arb
 
-MOST_TIMES = 64  # times at which a window is examined
-MOST_HELD = 16_000_000  # weights of inputs on every piece that are in memory at once
+MAX_TIMES = 64  # times at which a window is examined
+MAX_WEIGHTS = 16_000_000  # weights of inputs on every piece that are in memory at once
 # The numbers that are added up count the range of the control, but at most so many times what the decision uses of it.
 # With a tenth of it, runs would be refused that were honest in the units of their whole range; with ten times as much,
 # a control of 1 in a range of 1e7 would forgive seven digits.
@@ -37,7 +37,7 @@ BEYOND = 2.0**20
 # less. A billionth of this unit is excused: less than the rounding of any number that the row could have, but more than
 # the radius of a ball around a 0. The run itself excuses less.
 NOTHING = 2.0**-50
-MOST_AXES = 4  # axes of the parameters at whose ends a window is examined
+MAX_AXES = 4  # axes of the parameters at whose ends a window is examined
 
 
 @final
@@ -163,7 +163,7 @@ class WindowUnits:
         bound = self.problem.system.parameters
         if bound is None:
             return []
-        axes = np.vstack([np.eye(bound.dimension)[:MOST_AXES], np.ones((1, bound.dimension))])
+        axes = np.vstack([np.eye(bound.dimension)[:MAX_AXES], np.ones((1, bound.dimension))])
         return [tuple(map(float, point)) for point in bound.support_point(np.vstack([axes, -axes]))]
 
     @remembered()
@@ -175,7 +175,7 @@ class WindowUnits:
             nodes, places = self._find_nodes()
             weights_per_time = len(nodes) * len(self._select_rows(states)[0])
             weights_per_time *= self.problem.system.controls + 1 + self.problem.system.disturbances
-            batches = np.array_split(places, min(places.size, -(-places.size * weights_per_time // MOST_HELD)))
+            batches = np.array_split(places, min(places.size, -(-places.size * weights_per_time // MAX_WEIGHTS)))
             results = [self._measure_batch(parameter, states, nodes[: batch[-1] + 1], batch) for batch in batches]
             reach_and_sums = (
                 np.max([reach for reach, _ in results], axis=0),
@@ -268,8 +268,8 @@ class WindowUnits:
         inside = [t for t in self.scene.grid if t < self.stop]
         nodes = sorted({*inside, self.start, self.stop})
         window = np.flatnonzero(np.array(nodes) >= self.start)
-        if window.size > MOST_TIMES:
-            window = window[np.unique(np.linspace(0, window.size - 1, MOST_TIMES).round().astype(int))]
+        if window.size > MAX_TIMES:
+            window = window[np.unique(np.linspace(0, window.size - 1, MAX_TIMES).round().astype(int))]
         return nodes, window
 
 

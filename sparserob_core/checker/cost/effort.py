@@ -22,7 +22,7 @@ from sparserob_core.sip.convex_set import Array
 if TYPE_CHECKING:
     from flint import arb
 
-MOST = 200_000  # parts of the search that are examined at most
+MAX_PARTS = 200_000  # parts of the search that are examined at most
 TOGETHER = 200  # parts that are bounded by one product of matrices
 
 
@@ -48,7 +48,7 @@ def at_most(
         clock.check()
         batch, pending = pending[-TOGETHER:], pending[:-TOGETHER]
         count += len(batch)
-        if count > MOST:
+        if count > MAX_PARTS:
             raise Unchecked(f"the largest effort was not bounded by {count} parts of the signs of the control")
         sums = (stacked([[ball(s) for s in signs] for signs, _ in batch]) * table).tolist()
         for (signs, is_open), (constant, *coefficients) in zip(batch, sums, strict=True):

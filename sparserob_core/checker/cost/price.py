@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from flint import arb, arb_mat
 
 ENOUGH = 1e-20  # the largest relative radius of the quadratic terms and their slopes
-MOST_BITS = 512  # the largest working precision: the terms of a guess of the flow determine half of these bits
+MAX_BITS = 512  # the largest working precision: the terms of a guess of the flow determine half of these bits
 KEPT = 3  # walks that are remembered: of the control, of another control, and of the control 0
 
 
@@ -227,7 +227,7 @@ class Price:
             if quadratic.blurred <= ENOUGH:
                 return quadratic
             bits *= 2
-            if bits > MOST_BITS:
+            if bits > MAX_BITS:
                 raise Unchecked("the quadratic cost cannot be resolved: the state grows too far over the horizon")
 
 

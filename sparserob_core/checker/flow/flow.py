@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 # with time. With 348 states a transition in balls takes as long as the rest of a check. With few states balls cost
 # nothing, and are right to many digits even where the system grows fast.
 COARSE = 16
-MOST_MARKS = 2**17  # the largest number of marks on the horizon
+MAX_MARKS = 2**17  # the largest number of marks on the horizon
 KEPT = 4096  # parts of the horizon whose flows are remembered
 WEIGHTS_KEPT = 64  # times whose `StateWeights` are remembered: with a thousand pieces each takes megabytes
 POINTS_KEPT = 256  # flows at single parameters that are remembered
@@ -137,7 +137,7 @@ class VerifiedFlow:
             for a, b in pairwise([start, *cuts, stop]):
                 stretch = self.law.stretches[self._find_stretch(a, b)]
                 count = (b - a) / stretch.stride * (1.0 - 1e-14) if stretch.is_still else 1.0
-                if not len(marks) + count <= MOST_MARKS:
+                if not len(marks) + count <= MAX_MARKS:
                     raise Unchecked("the system is too fast for its horizon to be followed")
                 marks += [float(t) for t in np.linspace(a, b, max(1, ceil(count)) + 1)[1:-1]] + [b]
         return marks

@@ -31,7 +31,7 @@ ROUGH = 2.0**-70  # the same over a box of parameters, which is less sharp anywa
 AT_ONCE = 4  # terms between two tests for whether more are needed
 TERMS = 64  # the largest order of the terms of a guess
 LONGER = 1.0 + 2.0**-30  # the largest share for which a flow is verified: ends of parts of time are rounded
-FAR = 300.0  # the largest exponent in Gronwall's inequality: with a larger one the bound is useless
+MAX_EXPONENT = 300.0  # the largest exponent in Gronwall's inequality: with a larger one the bound is useless
 
 
 @final
@@ -185,7 +185,7 @@ def verify(equation: Equation, terms: Sequence[Series], units: Array) -> Array:
         if n < len(F):
             residual[:, d:] += F_sizes[n] / (n + 1)
     growth = sum(pace(rates, units) / (k + 1) for k, rates in enumerate(A_sizes)) * longer
-    if not growth <= FAR:
+    if not growth <= MAX_EXPONENT:
         raise Unchecked("the system is too fast for a part of its horizon")
     worst = (residual / units[:, None]).max(axis=0, initial=0.0) * (np.exp(growth) * longer)
     return np.asarray(units[:, None] * worst * OUTWARD)

@@ -34,8 +34,8 @@ if TYPE_CHECKING:
 ORDER = 13  # degree of the polynomials
 REST = 2e-15  # about their truncation error in parts of a row: more widens the bounds, less needs shorter steps
 LONGEST = 16.0  # size of a system over a step, at most: the terms of its series are then below 1e6, and cancel little
-BENDING = 7  # degree of the polynomials that bound second derivatives
-MOST_STEPS = 2**17
+DERIVATIVE_ORDER = 7  # degree of the polynomials that bound second derivatives
+MAX_STEPS = 2**17
 BLOCK = 64  # rows in one ball matrix, a power of two: fewer need more calls, more make more rows that are not needed
 # Steps between rows that are products of ball matrices, a power of two, where it would take long to make all rows of
 # balls. Every row in between takes one more product of floats, with an error like that of the terms of polynomials.
@@ -44,7 +44,7 @@ APART = 16
 # Multiplications of balls for all rows, about six seconds; beyond, only every `APART`-th row is made of balls. With a
 # tenth of it bounds for plants whose rows take no time are wider than those that a run reports to the last digit.
 DEAR = 2**29
-MOST = 2**27  # entries of the rows of all steps, at most
+MAX_ENTRIES = 2**27  # entries of the rows of all steps, at most
 AT_ONCE = 2**22  # entries of rows that are computed at once
 # Terms of a product of floats in one partial sum; the partial sums are added up then. With 348 states an entry is
 # rounded 43 times instead of 348. With half of it products take a fourth longer, and with twice as much bounds along
@@ -74,7 +74,7 @@ class AdjointFlow:
         units = balanced(plain, horizon, speed)
         step = choose_step(plain * units / units[:, None], horizon)
         count = ceil(horizon / step)
-        if not (count <= MOST_STEPS and count * A.nrows() <= MOST):
+        if not (count <= MAX_STEPS and count * A.nrows() <= MAX_ENTRIES):
             raise Unchecked("the system is too fast for its horizon to be followed")
         clock.check()
         segment = solve([Series.known(A * ball(step))], [Series.known(zeros(A.nrows(), 0))], units)
@@ -141,9 +141,11 @@ class AdjointFlow:
     @cached_property
     def bending(self) -> Enclosed:
         """The matrices that turn an adjoint into the first terms of ``l'[A^2, A F, A^2 F]`` on a step,
-        ``(BENDING + 1, d, d + 2 q)``, with the remainder in the radius of the first."""
+        ``(DERIVATIVE_ORDER + 1, d, d + 2 q)``, with the remainder in the radius of the first."""
         once, twice = (Series.known(self.A * matrix) for matrix in (self.F, self.A))
-        return self._expand_adjoint(BENDING, twice.beside(once).beside(Series.known(self.A * once.matrix)).matrix)
+        return self._expand_adjoint(
+            DERIVATIVE_ORDER, twice.beside(once).beside(Series.known(self.A * once.matrix)).matrix
+        )
 
 
 def choose_step(A: Array, horizon: float) -> float:

@@ -26,7 +26,7 @@ from sparserob_core.sip.convex_set import Array
 FOLLOWED = 16
 # Number of pieces up to which adjoints are used: the effects of all pieces are summed at every end of a cell. With a
 # tenth of it tubes of 48 states on 1600 pieces end without a verdict; with ten times as many the sums take minutes.
-MOST_PIECES = 4000
+MAX_PIECES = 4000
 
 
 @final
@@ -71,7 +71,7 @@ class FollowedRows:
     def are_best(self) -> bool:
         """True if adjoints are used although a tube would do as well: for many states, or for measurable disturbances,
         which a tube integrates along matrices on every piece."""
-        if self.timing.answering or not self.disturbances.alike or len(self.timing.grid) > MOST_PIECES:
+        if self.timing.answering or not self.disturbances.alike or len(self.timing.grid) > MAX_PIECES:
             return False
         return self.are_possible and (self.problem.measurable is not None or self.problem.system.states >= FOLLOWED)
 

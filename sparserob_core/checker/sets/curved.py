@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 DIGITS = 4  # times the working precision, for the comparison of an ellipsoid with its factor
 LEAST = 2.0**-1000  # an error bound below this is rounded up: underflow has cost it digits
-MOST_ENDS = 8  # the largest dimension in which a ball of a p-norm is evaluated at all corners of a range
+MAX_CORNER_DIMENSION = 8  # the largest dimension in which a ball of a p-norm is evaluated at all corners of a range
 
 
 @final
@@ -141,7 +141,7 @@ class Ball(Shape):
             size, power = math.frexp(self.source.radius)
             return _bound_ellipsoid(self.centre, size**2 * np.eye(d), value, spread, power)
         w = self.source.support_point(value)
-        if d <= MOST_ENDS:
+        if d <= MAX_CORNER_DIMENSION:
             ends = value[:, None] + spread[:, None] * np.array(list(product((-1.0, 1.0), repeat=d)))
             excess = (self._evaluate_support(ends) - np.einsum("kw,kew->ke", w - self.centre, ends)).max(axis=1)
         else:

@@ -25,7 +25,7 @@ from sparserob_core.sip.convex_set import Array
 if TYPE_CHECKING:
     from flint import arb, fmpq
 
-MOST_CORNERS = 20_000  # intersections of facets that may be computed to list the corners of a polytope
+MAX_CORNERS = 20_000  # intersections of facets that may be computed to list the corners of a polytope
 
 
 class Flat(Shape):
@@ -477,7 +477,7 @@ def _find_intersections(
     from flint import fmpq, fmpq_mat
 
     d = len(rows[0]) - 1
-    if comb(len(rows) + len(planes), d) > MOST_CORNERS:
+    if comb(len(rows) + len(planes), d) > MAX_CORNERS:
         raise Unchecked(f"a polytope with {len(rows)} facets in {d} dimensions has too many corners to be listed")
     exact = [[fmpq(*Fraction(x).as_integer_ratio()) for x in row] for row in rows]
     walls = exact + [[fmpq(int(i == plane)) for i in range(d)] + [fmpq(0)] for plane in planes]

@@ -18,13 +18,13 @@ from sparserob_core.checker.sets.summands import Summand
 from sparserob_core.control.sets.sets import Box, ConvexSet, Cylinder, Ellipsoid, NormBall, Polytope, Product, Zonotope
 from sparserob_core.sip.convex_set import Array
 
-MOST_SIGNS = 10  # the largest dimension in which the facets of a 1-norm ball are listed
+MAX_FACET_DIMENSION = 10  # the largest dimension in which the facets of a 1-norm ball are listed
 
 
 def _build_ball(source: NormBall) -> Shape:
     if source.dimension == 1 or source.p == np.inf:
         return Boxed(source)
-    return Octahedral(source) if source.p == 1.0 and source.dimension <= MOST_SIGNS else Ball(source)
+    return Octahedral(source) if source.p == 1.0 and source.dimension <= MAX_FACET_DIMENSION else Ball(source)
 
 
 KINDS: Mapping[type[ConvexSet], Callable[[Any], Shape]] = MappingProxyType(

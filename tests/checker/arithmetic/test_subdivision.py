@@ -79,11 +79,11 @@ def test_a_point_is_one_cell_and_so_many_cells_are_not_told_apart(monkeypatch):
         fill(np.zeros((0, 2)), np.zeros((0, 2)), point, point)
     line = cells([([0.5, k], [0.5, k + 1]) for k in range(6)])
     plane = cells([([0, k], [1, k + 1]) for k in range(6)])
-    monkeypatch.setattr(subdivision, "MOST_CELLS", 5)
+    monkeypatch.setattr(subdivision, "MAX_CELLS", 5)
     fill(*line, np.array([0.5, 0.0]), np.array([0.5, 6.0]))  # in order, a line of cells is as long as it likes
     with pytest.raises(Unchecked):
         fill(*plane, np.array([0.0, 0.0]), np.array([1.0, 6.0]))
-    monkeypatch.setattr(subdivision, "MOST_CELLS", 6)
+    monkeypatch.setattr(subdivision, "MAX_CELLS", 6)
     fill(*plane, np.array([0.0, 0.0]), np.array([1.0, 6.0]))
 
 

@@ -140,7 +140,7 @@ def test_what_is_not_known_or_no_part_of_the_problem_is_refused_by_its_own_sente
 
 @pytest.mark.parametrize("where", ["multipliers", "causal"])
 def test_as_many_multipliers_as_are_read_and_no_more(where: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    module, name = (multipliers, "MOST_MULTIPLIERS") if where == "multipliers" else (causal_bounds, "MOST")
+    module, name = (multipliers, "MAX_MULTIPLIERS") if where == "multipliers" else (causal_bounds, "MAX_MULTIPLIERS")
     asked = multiplied() if where == "multipliers" else causally()
     with ctx.workprec(96):
         monkeypatch.setattr(module, name, 1)

@@ -313,7 +313,7 @@ def test_a_unit_is_no_more_than_a_row_reaches_however_few_numbers_are_held(
     found = units.units_of(case, case.windows[0])
     assert found.rows == pytest.approx(reach[order], rel=1e-12)
     sums = found.sums
-    monkeypatch.setattr(units, "MOST_HELD", 1)
+    monkeypatch.setattr(units, "MAX_WEIGHTS", 1)
     again = units.units_of(made.case(path=case.problem.path), case.windows[0])
     assert again.rows == pytest.approx(found.rows, rel=1e-12)
     assert again.sums == pytest.approx(sums, rel=1e-12)

@@ -700,7 +700,7 @@ def test_numbers_that_are_far_apart_are_computed_with_more_bits():
     for A, apart in (([[2.0**-10, 2.0**19]], 20 + 9), ([[0.25, 0.5]], 1 + 1), ([[1e-300, 1e300]], None)):
         plant = LinearSystem(np.array([*A, [0.0, 0.0]]), np.array([[0.5], [0.5]]))
         case = case_of(system=plant, initial_state=[0.0, 0.0], disturbance=None)
-        assert claims.precision_of(case) == (claims.MOST_PRECISION if apart is None else claims.PRECISION + apart)
+        assert claims.precision_of(case) == (claims.MAX_PRECISION if apart is None else claims.PRECISION + apart)
 
 
 def test_the_largest_cost_is_that_of_the_far_end_of_every_channel():

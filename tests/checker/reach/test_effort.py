@@ -65,7 +65,7 @@ def test_too_many_parts_and_no_time_are_no_verdict(monkeypatch):
     a, A, box = 0.1 * rng.normal(size=8), rng.normal(size=(8, 3)), Box(-np.ones(3), np.ones(3))
     with ctx.workprec(96):
         top = largest(a, A, box)
-        monkeypatch.setattr(effort, "MOST", 3)
+        monkeypatch.setattr(effort, "MAX_PARTS", 3)
         with pytest.raises(Unchecked):
             judged(a, A, box, top * (1 + 1e-9))
         with pytest.raises(Unchecked):
