@@ -20,8 +20,8 @@ from sparserob_core.checker.flow.flow import VerifiedFlow
 from sparserob_core.checker.flow.plant import Plant
 from sparserob_core.checker.outcome import Broken, Clock, Unchecked
 from sparserob_core.checker.problem import disturbances
-from sparserob_core.checker.problem.lasting import Lasting, on_one_grid
-from sparserob_core.checker.problem.turns import in_turns
+from sparserob_core.checker.problem.held import Lasting, on_one_grid
+from sparserob_core.checker.problem.time_varying import in_turns
 from sparserob_core.checker.reach import followed as followed_rows
 from sparserob_core.checker.reach.preimages import Pushed
 from sparserob_core.checker.sets import flat

@@ -1,5 +1,5 @@
 """Guards disturbances of a list that are constant on pieces of their own (control/response/disturbance.py,
-`held_components`, and checker/problem/lasting.py): values by a linear program of integrals that no line of the package
+`held_components`, and checker/problem/held.py): values by a linear program of integrals that no line of the package
 had a part in, and by problems in which all of them share the dictionary's pieces."""
 
 from __future__ import annotations

@@ -14,7 +14,7 @@ from scipy.optimize import linprog
 
 import sparserob_core as sr
 from sparserob_core.checker.claims.case import Case
-from sparserob_core.checker.reach.missed import BoundedInputOver
+from sparserob_core.checker.reach.bounded_inputs import BoundedInputOver
 from sparserob_core.experiment.assemble import ControlExperiment, assemble
 from sparserob_core.experiment.check.check import check
 from sparserob_core.experiment.config.load import load_config

@@ -15,7 +15,7 @@ from scipy.optimize import linprog
 
 import sparserob_core as sr
 from sparserob_core.checker.claims.case import Case
-from sparserob_core.checker.reach.missed import BoundedInputOver
+from sparserob_core.checker.reach.bounded_inputs import BoundedInputOver
 from sparserob_core.control.reach.varying_measurable import VaryingMeasurable
 from sparserob_core.control.studies.adversary import evaluate_disturbance, worst_signal
 from sparserob_core.experiment.assemble import ControlExperiment, assemble

@@ -18,12 +18,12 @@ from sparserob_core.checker.cost.price import Price
 from sparserob_core.checker.flow.flows import VerifiedFlows
 from sparserob_core.checker.outcome import Broken, Clock, Unchecked
 from sparserob_core.checker.problem.disturbances import Disturbances
+from sparserob_core.checker.problem.held import on_one_grid
 from sparserob_core.checker.problem.integrals import integrating, spelt
-from sparserob_core.checker.problem.lasting import on_one_grid
 from sparserob_core.checker.problem.returning import RETURN, returning
 from sparserob_core.checker.problem.superposition import parted
+from sparserob_core.checker.problem.time_varying import in_turns
 from sparserob_core.checker.problem.timing import Timing, before
-from sparserob_core.checker.problem.turns import in_turns
 from sparserob_core.checker.reach.followed import FollowedRows
 from sparserob_core.checker.reach.sources import Sources
 from sparserob_core.checker.reach.states import Scene, StatesOverBoxes

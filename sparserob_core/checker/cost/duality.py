@@ -21,7 +21,7 @@ from sparserob_core.checker.arithmetic.series import exactly
 from sparserob_core.checker.cost.price import Price, Tangent
 from sparserob_core.checker.flow.flows import VerifiedFlows
 from sparserob_core.checker.outcome import Broken
-from sparserob_core.checker.problem.lasting import Lasting, summed
+from sparserob_core.checker.problem.held import Lasting, summed
 from sparserob_core.checker.problem.timing import before
 from sparserob_core.checker.sets.known import known
 from sparserob_core.control.problem.dictionary import Dictionary

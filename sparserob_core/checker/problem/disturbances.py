@@ -10,7 +10,7 @@ from typing import final
 import numpy as np
 
 from sparserob_core.checker.outcome import Unchecked
-from sparserob_core.checker.problem.lasting import Lasting
+from sparserob_core.checker.problem.held import Lasting
 from sparserob_core.checker.problem.timing import Timing
 from sparserob_core.checker.sets.known import middle
 from sparserob_core.control.problem.dictionary import Dictionary

@@ -15,9 +15,9 @@ from sparserob_core.checker.arithmetic.series import stacked
 from sparserob_core.checker.flow.flows import VerifiedFlows
 from sparserob_core.checker.outcome import Unchecked
 from sparserob_core.checker.problem.timing import Timing, before
+from sparserob_core.checker.reach.bounded_inputs import BoundedInputAt, BoundedInputOver, SizedInput
 from sparserob_core.checker.reach.execution import FollowedExecution
 from sparserob_core.checker.reach.kernels import BoundedInput, BoundedInputHere
-from sparserob_core.checker.reach.missed import BoundedInputAt, BoundedInputOver, SizedInput
 from sparserob_core.checker.sets.known import summands_of
 from sparserob_core.checker.sets.summands import channels
 from sparserob_core.control.problem.problem import OptimalControlProblem

@@ -19,7 +19,7 @@ from sparserob_core.checker.flow.flow import VerifiedFlow
 from sparserob_core.checker.flow.flows import VerifiedFlows
 from sparserob_core.checker.flow.law import ParameterBox
 from sparserob_core.checker.flow.segment import Powers, VerifiedSegment, shifted
-from sparserob_core.checker.problem.lasting import Lasting
+from sparserob_core.checker.problem.held import Lasting
 from sparserob_core.checker.sets.known import known
 from sparserob_core.checker.sets.polynomials import OUTWARD, Enclosed, rounding
 from sparserob_core.sip.convex_set import Array, ConvexSet

@@ -21,7 +21,7 @@ from sparserob_core.checker.flow.flow import VerifiedFlow
 from sparserob_core.checker.flow.law import ParameterBox
 from sparserob_core.checker.flow.plant import Plant
 from sparserob_core.checker.flow.segment import VerifiedSegment
-from sparserob_core.checker.problem.lasting import Lasting
+from sparserob_core.checker.problem.held import Lasting
 from sparserob_core.checker.reach.states import Lines, Scene, States, _list_blocks, enclosed, ring
 from sparserob_core.checker.reach.tube import Polynomial, ProjectedStates, VerifiedTube
 from sparserob_core.checker.sets.polynomials import Enclosed

@@ -1,4 +1,4 @@
-"""Guards checker/problem/lasting.py: what components give that have one value on several pieces is their sum, with the
+"""Guards checker/problem/held.py: what components give that have one value on several pieces is their sum, with the
 first of these, no more certain than the parts; and where they may jump."""
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ import pytest
 from flint import arb
 
 import sparserob_core as sr
-from sparserob_core.checker.problem.lasting import Lasting, on_one_grid, summed
+from sparserob_core.checker.problem.held import Lasting, on_one_grid, summed
 from sparserob_core.control.problem.system import LinearSystem
 from sparserob_core.control.sets.sets import Box, Product
 

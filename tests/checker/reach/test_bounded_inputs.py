@@ -1,4 +1,4 @@
-"""Guards checker/reach/missed: what enters at any time: integrals of absolute
+"""Guards checker/reach/bounded_inputs: what enters at any time: integrals of absolute
 values between closed forms, and their bends."""
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ import sparserob_core.checker.flow.segment as segments
 from sparserob_core.checker.arithmetic.series import stacked
 from sparserob_core.checker.flow.flow import VerifiedFlow
 from sparserob_core.checker.flow.plant import Plant
+from sparserob_core.checker.reach.bounded_inputs import BoundedInputAt, SizedInput
 from sparserob_core.checker.reach.execution import FollowedExecution
-from sparserob_core.checker.reach.missed import BoundedInputAt, SizedInput
 from sparserob_core.checker.sets.known import middle, summands_of
 from sparserob_core.checker.sets.summands import Summand, channels
 from sparserob_core.control.problem.system import VaryingSystem

@@ -1,4 +1,4 @@
-"""Guards checker/problem/turns: what takes turns, acts late or is uncertain is one system with laws in the time."""
+"""Guards checker/problem/time_varying: systems that take turns, act late or are uncertain become one in the time."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import sparserob_core as sr
-from sparserob_core.checker.problem.turns import in_turns
+from sparserob_core.checker.problem.time_varying import in_turns
 from sparserob_core.control.problem.expression import parse_matrix
 from sparserob_core.control.problem.system import LinearSystem, SwitchedSystem
 
