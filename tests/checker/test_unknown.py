@@ -20,10 +20,10 @@ from sparserob_core.checker.flow.flow import VerifiedFlow
 from sparserob_core.checker.flow.plant import Plant
 from sparserob_core.checker.outcome import Broken, Clock, Unchecked
 from sparserob_core.checker.problem import disturbances
-from sparserob_core.checker.problem.held import Lasting, on_one_grid
-from sparserob_core.checker.problem.time_varying import in_turns
+from sparserob_core.checker.problem.held import HeldComponents, on_one_grid
+from sparserob_core.checker.problem.time_varying import make_time_varying
 from sparserob_core.checker.reach import followed as followed_rows
-from sparserob_core.checker.reach.preimages import Pushed
+from sparserob_core.checker.reach.preimages import ReachableSubspace
 from sparserob_core.checker.sets import flat
 from sparserob_core.checker.sets.known import known
 from sparserob_core.control.policies import policy
@@ -79,7 +79,7 @@ def returning(case: Case) -> object:
 
 
 def largest_effort(a: arb, limit: float) -> Callable[[], object]:
-    return lambda: effort.at_most([a], [[arb(0)]], lambda row: arb(0), np.zeros(1), arb(limit), Clock())
+    return lambda: effort.prove_effort_limit([a], [[arb(0)]], lambda row: arb(0), np.zeros(1), arb(limit), Clock())
 
 
 def observed() -> object:
@@ -107,7 +107,7 @@ UNKNOWN: dict[str, tuple[Callable[[], object], type[Exception], str]] = {
         lambda: (
             forced(
                 test_lists.case_of("in time, measurable"), disturbance=Cylinder(NormBall(3.0, 0.1, dimension=1), 2)
-            ).sources.strayed
+            ).sources.measurable_input
         ),
         Unchecked,
         "measurable disturbances in boxes, polytopes, ellipsoids, balls, zonotopes, and products of",
@@ -118,12 +118,12 @@ UNKNOWN: dict[str, tuple[Callable[[], object], type[Exception], str]] = {
         "errors of execution without feedback",
     ),
     "parameters in no box beside errors of execution": (
-        lambda: in_turns(forced(test_lists.case_of("of two classes"), execution=[0.1], system=UNSURE).problem),
+        lambda: make_time_varying(forced(test_lists.case_of("of two classes"), execution=[0.1], system=UNSURE).problem),
         Unchecked,
         "boxes of parameters",
     ),
     "fixed states under two classes": (
-        lambda: constraints.missed(test_lists.case_of("of two classes", terminal=[Equality([0.0, None])])),
+        lambda: constraints.compute_residuals(test_lists.case_of("of two classes", terminal=[Equality([0.0, None])])),
         Unchecked,
         "the uncertainty may reach x1",
     ),
@@ -141,7 +141,7 @@ UNKNOWN: dict[str, tuple[Callable[[], object], type[Exception], str]] = {
     "an effort that is larger": (largest_effort(arb(2), 0.5), Broken, "causes the effort 2.0"),
     "a system that is too fast": (lambda: kernel_of([[-1e9]], [[1.0]], 1.0), Unchecked, "too fast for its horizon"),
     "numbers that are not exact": (
-        lambda: Pushed.of([(arb_mat([[arb(1, 0.1)]]), arb_mat([[1]]))], [[1]]),
+        lambda: ReachableSubspace.of([(arb_mat([[arb(1, 0.1)]]), arb_mat([[1]]))], [[1]]),
         Unchecked,
         "the numbers of the system are not exact",
     ),
@@ -169,7 +169,9 @@ UNKNOWN: dict[str, tuple[Callable[[], object], type[Exception], str]] = {
     ),
     "few functions on own pieces": (lambda: on_one_grid(LISTS, FEWER), Unchecked, "take any value on each piece"),
     "own pieces of one set": (
-        lambda: Lasting.of(forced(kind("known").case(), disturbance_breakpoints=(ENDS, ENDS)).problem, [0.0, 1.0]),
+        lambda: HeldComponents.of(
+            forced(kind("known").case(), disturbance_breakpoints=(ENDS, ENDS)).problem, [0.0, 1.0]
+        ),
         Unchecked,
         "with breakpoints of their own, the checker knows lists of sets only",
     ),
@@ -210,10 +212,10 @@ def test_disturbances_with_breakpoints_of_their_own_are_on_one_grid() -> None:
     both = np.array([0.0, 1.0, 2.0]), own
     problem, joint = on_one_grid(forced(case, disturbance_breakpoints=both).problem, dictionary)
     assert joint.breakpoints.tolist() == [0.0, 0.5, 1.0, 2.0]  # two that differ by rounding are one
-    lasting = Lasting.of(problem, joint.breakpoints[:-1].tolist())
+    lasting = HeldComponents.of(problem, joint.breakpoints[:-1].tolist())
     assert lasting is not None and [one.tolist() for _, one in lasting.parts] == [[0, 2], [0, 1, 2]]
     assert [columns for columns, _ in lasting.parts] == [slice(0, 1), slice(1, 2)]
-    assert Lasting.of(kind("known").case().problem, [0.0]) is None
+    assert HeldComponents.of(kind("known").case().problem, [0.0]) is None
 
 
 def test_what_so_many_pieces_may_answer_is_no_array(monkeypatch: pytest.MonkeyPatch) -> None:

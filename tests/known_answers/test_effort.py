@@ -15,7 +15,7 @@ from flint import arb
 from scipy.optimize import LinearConstraint, linprog, milp
 
 import sparserob_core as sr
-from sparserob_core.checker.cost.effort import at_most
+from sparserob_core.checker.cost.effort import prove_effort_limit
 from sparserob_core.checker.outcome import Broken, Clock, Unchecked
 from sparserob_core.control.feedback.effort import largest_effort
 from sparserob_core.control.studies.answer import ControlResult
@@ -123,7 +123,7 @@ def test_the_checker_bounds_the_effort_and_refuses_less_than_the_worst_vertex(se
         return sum((abs(x) for x in b), arb(0))
 
     def judged(limit: float) -> int:
-        return at_most(*balls, support, np.ones(Q), arb(limit), Clock(10.0))
+        return prove_effort_limit(*balls, support, np.ones(Q), arb(limit), Clock(10.0))
 
     assert judged(truth * (1.0 + 1e-12)) >= 1
     with pytest.raises(Broken, match="effort"):

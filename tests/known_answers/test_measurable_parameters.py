@@ -298,7 +298,7 @@ def test_the_checker_bounds_them_over_boxes_and_cells_of_time_from_above_and_by_
     experiment = of_problem(system=weak, disturbance=bound)
     control = np.zeros((2, 4)).tolist()
     case = Case(experiment.problem, experiment.control, experiment.disturbance, {"decision": control})
-    strayed, c, box = case.sources.strayed, np.array([0.3, -2.0]), ((-0.02, 0.0), (-0.01, 0.01))
+    strayed, c, box = case.sources.measurable_input, np.array([0.3, -2.0]), ((-0.02, 0.0), (-0.01, 0.01))
     assert isinstance(strayed, BoundedInputOver)
     tube = tube_of(case, box)
     start, stop = 1.52, 1.53

@@ -412,7 +412,7 @@ def test_random_analytic_coefficients_are_integrated_in_any_unit_of_time_and_len
     assert (off <= allowed + 2 * missed).all()
     with ctx.workprec(192):
         Phi, Gamma, _ = VerifiedFlow(Plant.of(system, horizon), horizon).over(0.0, horizon)
-    for i, row in enumerate(Phi.beside(Gamma).matrix.tolist()):
+    for i, row in enumerate(Phi.append_columns(Gamma).matrix.tolist()):
         for j, ball in enumerate(row):
             far = abs(np.longdouble(float(ball.mid())) - again[i, j])
             assert far <= float(ball.rad()) + 2 * abs(found[i, j] - again[i, j]) + 1e-15 * abs(again[i, j])

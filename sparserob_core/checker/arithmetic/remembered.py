@@ -12,10 +12,10 @@ T = TypeVar("T")
 
 
 def remembered(
-    most: Callable[[], int] | None = None, key: Callable[..., Hashable] | None = None
+    capacity: Callable[[], int] | None = None, key: Callable[..., Hashable] | None = None
 ) -> Callable[[Callable[Concatenate[S, P], T]], Callable[Concatenate[S, P], T]]:
     """Return a decorator that remembers values of a method on each object, under a ``key`` of the object and the
-    arguments. Beyond ``most()`` values the oldest are forgotten."""
+    arguments. Beyond ``capacity()`` values the oldest are forgotten."""
 
     def of(method: Callable[Concatenate[S, P], T]) -> Callable[Concatenate[S, P], T]:
         attribute = f"_{method.__name__}_remembered"
@@ -26,7 +26,7 @@ def remembered(
             cache_key = (given, *named.items()) if key is None else key(self, *given, **named)
             if cache_key not in cache:
                 value = method(self, *given, **named)
-                while most is not None and len(cache) >= most():
+                while capacity is not None and len(cache) >= capacity():
                     cache.pop(next(iter(cache)))
                 cache[cache_key] = value
             return cache[cache_key]

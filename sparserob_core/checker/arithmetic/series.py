@@ -150,7 +150,7 @@ class Series:
         n, tables = self.shape[0], [[row[first:last] for row in coefficient.tolist()] for coefficient in self.parts]
         return Series(self.monomials, [arb_mat(n, len(rows[0]), [x for row in rows for x in row]) for rows in tables])
 
-    def beside(self, other: Series) -> Series:
+    def append_columns(self, other: Series) -> Series:
         """Return the series with the columns of another one at its right."""
         from flint import arb_mat
 

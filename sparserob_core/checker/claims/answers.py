@@ -18,7 +18,7 @@ from sparserob_core.checker.arithmetic.remembered import remembered
 from sparserob_core.checker.arithmetic.series import exactly, stacked
 from sparserob_core.checker.claims.case import STEP, Case, number, numbers, shaped
 from sparserob_core.checker.cost.duality import EFFORT, ConstraintRow, steps
-from sparserob_core.checker.cost.effort import at_most
+from sparserob_core.checker.cost.effort import prove_effort_limit
 from sparserob_core.checker.cost.gains import GainsBound, reach
 from sparserob_core.checker.outcome import CANCELLED, FIGURES, Broken, Unchecked
 from sparserob_core.checker.problem.timing import before
@@ -204,7 +204,7 @@ class VerifiedFeedback:
         deviations = loop.deviations
         axes = [[ball(int(b == axis)) for b in range(deviations.starts[-1])] for axis in range(deviations.starts[-1])]
         support_values = np.array([float(x.mid()) for x in deviations.supports(axes)])
-        at_most(a, A, deviations.support, support_values, limit, case.clock)
+        prove_effort_limit(a, A, deviations.support, support_values, limit, case.clock)
 
     def least(self, rows: Sequence[tuple[float, ConstraintRow]], priced: bool) -> arb:
         """Return a ball whose lower end bounds from below what gains, and charged peaks or an effort, add to the sum of
@@ -267,7 +267,7 @@ class VerifiedFeedback:
     def following(self, named: NamedDeviations, entry: Mapping[str, Any], name: str) -> NamedDeviations:
         """Return the deviations that the first control of the next period answers, in a plan that repeats: the entry
         names the ``following`` deviation ``(d,)`` of the next initial state, where there are several."""
-        inner_deviations = named.loop.deviations.rests[: named.loop.deviations.begun]
+        inner_deviations = named.loop.deviations.rests[: named.loop.deviations.initial_block]
         if self.case.problem.initial_set is None:
             return NamedDeviations(self.case, named.loop, inner_deviations)
         point = numbers(entry.get("following"), f"{name}: following")
@@ -326,17 +326,17 @@ class NamedDeviations:
                 )
                 for s in range(self.loop.outputs)
             ]
-            for responses in self.loop.seen
+            for responses in self.loop.innovation_matrices
         ]
 
     def given(self, direction: Array, time: float) -> arb:
         """Return the contribution of disturbance and initial state to ``c'x(t)``, ``c (d,)``, without control."""
         case, loop = self.case, self.loop
-        weights = case.duality.pushed(direction, time, loop.changes)
+        weights = case.duality.compute_disturbance_weights(direction, time, loop.changes)
         blocks, loop_deviations = [*zip(loop.deviations.sets, self.z, strict=True)], loop.deviations
         # noise reaches the state through answers alone
-        blocks = blocks[: loop_deviations.blocks] + blocks[loop_deviations.begun :]
-        weights += [] if case.problem.initial_set is None else [case.duality.carried(direction, time)]
+        blocks = blocks[: loop_deviations.blocks] + blocks[loop_deviations.initial_block :]
+        weights += [] if case.problem.initial_set is None else [case.duality.compute_initial_weights(direction, time)]
         return sum(
             (
                 weight * (ball(centre) + deviation)
@@ -354,7 +354,7 @@ def _read_deviations(case: Case, loop: VerifiedLoop, entry: Mapping[str, Any], n
     from flint import arb
 
     points, loop_deviations = list[Array](), loop.deviations
-    noises = loop_deviations.begun - loop_deviations.blocks
+    noises = loop_deviations.initial_block - loop_deviations.blocks
     if case.problem.disturbance is not None:
         points = list(shaped(entry, "disturbance", (loop_deviations.width, loop_deviations.blocks), f"{name}: ").T)
     if noises and loop.measured is not None:
@@ -366,7 +366,7 @@ def _read_deviations(case: Case, loop: VerifiedLoop, entry: Mapping[str, Any], n
         member = known(shape).member(point)
         if member is None:
             kinds = ("disturbance", "noise", "deviation of the initial state")
-            kind = kinds[(index >= loop_deviations.blocks) + (index >= loop_deviations.begun)]
+            kind = kinds[(index >= loop_deviations.blocks) + (index >= loop_deviations.initial_block)]
             raise Broken(f"{name}: the {kind} {point.tolist()} is not shown to be in its set")
         deviations.append([v - arb(float(c)) for v, c in zip(member, middle, strict=True)])
     return deviations

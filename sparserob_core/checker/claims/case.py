@@ -22,7 +22,7 @@ from sparserob_core.checker.problem.held import on_one_grid
 from sparserob_core.checker.problem.integrals import integrating, spelt
 from sparserob_core.checker.problem.returning import RETURN, returning
 from sparserob_core.checker.problem.superposition import parted
-from sparserob_core.checker.problem.time_varying import in_turns
+from sparserob_core.checker.problem.time_varying import make_time_varying
 from sparserob_core.checker.problem.timing import Timing, before
 from sparserob_core.checker.reach.followed import FollowedRows
 from sparserob_core.checker.reach.sources import Sources
@@ -68,12 +68,12 @@ class Case:
         if self.given is None:
             object.__setattr__(self, "given", self.problem)
             object.__setattr__(self, "problem", returning(self.problem))
-        plain = in_turns(spelt(self.problem))
+        plain = make_time_varying(spelt(self.problem))
         expanded = parted(plain)
         is_uncertain = expanded.system.varies and expanded.system.parameters is not None
         if (expanded is not plain or is_uncertain) and self.policy is not None:
             raise Unchecked("the checker knows no feedback beside parameters and the time")
-        object.__setattr__(self, "problem", in_turns(integrating(expanded)))
+        object.__setattr__(self, "problem", make_time_varying(integrating(expanded)))
         if self.problem.disturbance_breakpoints is not None:
             problem, dictionary = on_one_grid(self.problem, self.disturbance)
             object.__setattr__(self, "problem", problem)
@@ -83,7 +83,7 @@ class Case:
             object.__setattr__(self, "control", Dictionary.indicators(self.control.breakpoints))
 
     @property
-    def stated(self) -> OptimalControlProblem:
+    def original_problem(self) -> OptimalControlProblem:
         """The problem as it was given, whose states come first."""
         return self.problem if self.given is None else self.given
 
@@ -162,7 +162,7 @@ class Case:
     @cached_property
     def followed(self) -> FollowedRows:
         """The rows that are followed by their adjoints."""
-        return FollowedRows(self.problem, self.stated, self.timing, self.disturbances)
+        return FollowedRows(self.problem, self.original_problem, self.timing, self.disturbances)
 
     @cached_property
     def sources(self) -> Sources:
@@ -233,10 +233,10 @@ class Case:
             None if changes is None else self.disturbances.held,
             changes or [],
             self.problem.initial_set,
-            self.disturbances.lasting,
+            self.disturbances.held_components,
         )
 
-    def beside(
+    def build_added_terms(
         self, window: ConstraintWindow, basis: Array, gains: Array, parameter: Sequence[float] | None = None
     ) -> AddedTerms | None:
         """Return the terms that are added to the state in the rows ``basis (b, d)`` on the state and ``gains (b, m)``
@@ -262,7 +262,12 @@ class Case:
         """The data that lower bounds are derived from."""
         disturbances = self.disturbances
         return Duality(
-            self.problem, self.control, disturbances.changes, self.flows, disturbances.held, disturbances.lasting
+            self.problem,
+            self.control,
+            disturbances.changes,
+            self.flows,
+            disturbances.held,
+            disturbances.held_components,
         )
 
 

@@ -34,10 +34,10 @@ if TYPE_CHECKING:
     from flint import arb
 
 MAX_MULTIPLIERS = 100_000  # multipliers that are checked
-Pushed: TypeAlias = (
+WeightedRow: TypeAlias = (
     "tuple[ConstraintRow, list[list[arb]], list[arb]]"  # a row, its weights of the disturbance and the initial state
 )
-Rows: TypeAlias = dict[tuple[str, float, bytes], Pushed]
+Rows: TypeAlias = dict[tuple[str, float, bytes], WeightedRow]
 SHARE = 1.0 - 2.0**-40  # of a price is shared, so that rounding does not share more than the price
 
 
@@ -115,7 +115,7 @@ def _require_supported(case: Case) -> None:
         raise Unchecked("the checker bounds causal policies in indicators")
 
 
-def _read_entry(case: Case, entry: object, signals: int, rows: Rows) -> tuple[float, int, Pushed]:
+def _read_entry(case: Case, entry: object, signals: int, rows: Rows) -> tuple[float, int, WeightedRow]:
     """Return the multiplier of an entry, the number of its signal, and its constraint. With the constraint come the
     weights of the disturbance and of the initial state in it."""
     if not isinstance(entry, Mapping):
@@ -141,14 +141,14 @@ def _read_entry(case: Case, entry: object, signals: int, rows: Rows) -> tuple[fl
             initial_middle = middle(case.problem.initial_set)
             if not known(case.problem.initial_set).contains(initial_middle):
                 raise Unchecked("the middle of the initial states is not shown to be one of them")
-            initial_weights = case.duality.carried(direction, time)
+            initial_weights = case.duality.compute_initial_weights(direction, time)
             row = replace(
                 row,
                 constant=sum(
                     (c * x for c, x in zip(initial_weights, balls(initial_middle), strict=True)), row.constant
                 ),
             )
-        rows[key] = row, case.duality.pushed(direction, time), initial_weights
+        rows[key] = row, case.duality.compute_disturbance_weights(direction, time), initial_weights
     return y, signal_index, rows[key]
 
 
@@ -202,7 +202,7 @@ def _read_initial_deviations(case: Case, data: Mapping[str, Any], count: int) ->
 
 
 def _read_outputs(
-    case: Case, data: Mapping[str, Any], signals: list[Array], begun: list[list[arb]], known_at_all: int
+    case: Case, data: Mapping[str, Any], signals: list[Array], initial_deviations: list[list[arb]], known_at_all: int
 ) -> list[Array]:
     """Return the outputs ``(p, K)`` under every signal, relative to the nominal ones. At the first ``known_at_all``
     breakpoints what remains of each must be shown to be a noise of the set."""
@@ -218,9 +218,11 @@ def _read_outputs(
             raise Broken(f"causal: outputs of shape {outputs.shape}, expected {(K, measurements.outputs)}")
     for j in range(known_at_all):
         time = float(times[j])
-        disturbance_weights = [case.duality.pushed(row, time) for row in C] if j else [[] for _ in C]
-        initial_weights = [case.duality.carried(row, time) if j else balls(row) for row in C]
-        for w, deviation, outputs in zip(signals, begun, outputs_by_signal, strict=True):
+        disturbance_weights = (
+            [case.duality.compute_disturbance_weights(row, time) for row in C] if j else [[] for _ in C]
+        )
+        initial_weights = [case.duality.compute_initial_weights(row, time) if j else balls(row) for row in C]
+        for w, deviation, outputs in zip(signals, initial_deviations, outputs_by_signal, strict=True):
             case.clock.check()
             noise = []
             for a in range(measurements.outputs):

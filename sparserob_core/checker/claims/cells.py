@@ -27,7 +27,7 @@ TIMES = 4
 MAX_BOXES = 8_000  # pairs of a box of parameters and a cell of directions
 BLAME = 0.2  # share of the error, or of the slack, from which one of its causes is treated before the others
 
-Reached: TypeAlias = VerifiedTube | LoopTube | TimelessTube
+AnyTube: TypeAlias = VerifiedTube | LoopTube | TimelessTube
 Interval: TypeAlias = tuple[int, float, float]
 """The number of a piece of the grid, and the start and the end of a part of it, which may be the same time."""
 
@@ -50,7 +50,7 @@ Work: TypeAlias = tuple[Corners, Sides, list[Interval]]
 
 
 def prove(
-    tubes: Callable[[Corners], Reached],
+    tubes: Callable[[Corners], AnyTube],
     parameters: Parameters,
     work: Sequence[Work],
     clock: Clock,
@@ -102,7 +102,7 @@ def prove(
 class BoxOfStates:
     """A box of parameters with the reachable states over it."""
 
-    tube: Reached
+    tube: AnyTube
     parameters: Parameters
     box: Corners
     clock: Clock
@@ -236,7 +236,7 @@ def _bound_rows(
         yield interval, polynomials, tops[number * len(rows) : (number + 1) * len(rows)].tolist()
 
 
-def _bound_polynomials(tube: Reached, flat: Sequence[tuple[Polynomial, float]]) -> Array:
+def _bound_polynomials(tube: AnyTube, flat: Sequence[tuple[Polynomial, float]]) -> Array:
     """Return upper bounds ``(k,)`` of polynomials with their errors, each less the value that it is allowed to reach. A
     bound is at most 0 where halving boxes shows that. No bound need be sharp, whatever its sign."""
     tops, monomials = np.empty(len(flat)), tube.flow.monomials
@@ -284,14 +284,14 @@ def _is_smaller_box_better(poly: Polynomial, top: float, interval: Interval) -> 
     return bool(np.abs(poly.coefficients[0, 1:]).sum() > np.abs(poly.coefficients[1:]).sum())
 
 
-def _measure_influence(tube: Reached, poly: Polynomial) -> Array:
+def _measure_influence(tube: AnyTube, poly: Polynomial) -> Array:
     """Return how much each parameter contributes to what is left open, ``(nu,)``: by the coefficients of the system
     where the expansion causes the error, by bounded inputs where these do, else by the polynomial."""
     expansion = poly.expansion > BLAME * poly.error
     sizes = tube.flow.sizes if expansion else np.abs(poly.coefficients).sum(axis=0)
     influence: Array = np.array(tube.flow.monomials.exponents, dtype=float).T @ sizes
-    if poly.bent is not None and poly.turning > BLAME * poly.error:
-        return poly.bent
+    if poly.parameter_errors is not None and poly.turning > BLAME * poly.error:
+        return poly.parameter_errors
     return influence
 
 

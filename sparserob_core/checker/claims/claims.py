@@ -240,8 +240,8 @@ def _verify_repeat(case: Case, verdicts: Mapping[str, str]) -> str:
         raise Broken("the certificate and the problem differ about whether the plan repeats")
     if case.problem.system.delay > 0.0:
         raise Broken("with a delay the last controls of a period act in the next one")
-    fixed, centre = dict(case.equalities), np.asarray(case.stated.initial_state, dtype=float)
-    single_states = single(case.stated)
+    fixed, centre = dict(case.equalities), np.asarray(case.original_problem.initial_state, dtype=float)
+    single_states = single(case.original_problem)
     for state in single_states:
         if fixed.get(state) != float(centre[state]):
             name = case.problem.names.state(state)
@@ -264,12 +264,12 @@ def _require_strict_return(case: Case, window: ConstraintWindow) -> None:
     """Raise `Unchecked` unless the set of initial states also holds what the proof of the return excuses."""
     from flint import arb
 
-    bound = case.stated.initial_set
+    bound = case.original_problem.initial_set
     assert bound is not None
-    window_facets, initial_facets = window.seen.facets, known(bound).facets
+    window_facets, initial_facets = window.enclosed_set.facets, known(bound).facets
     if window_facets is None or initial_facets is None:
         return  # along the gauge a share of the whole set is excused, and the return is proven for a smaller set
-    limits, single_states = dict[tuple[float, ...], list[arb]](), {*single(case.stated)}
+    limits, single_states = dict[tuple[float, ...], list[arb]](), {*single(case.original_problem)}
     for c, b in initial_facets:
         if not set(np.flatnonzero(c).tolist()) <= single_states:
             limits.setdefault(tuple(c.tolist()), []).append(b)

@@ -20,7 +20,7 @@ from sparserob_core.checker.arithmetic.series import stacked
 from sparserob_core.checker.arithmetic.subdivision import fill
 from sparserob_core.checker.claims.answers import feedback_of
 from sparserob_core.checker.claims.case import Case, number, numbers
-from sparserob_core.checker.claims.cells import Interval, Proven, Reached, Work, prove
+from sparserob_core.checker.claims.cells import AnyTube, Interval, Proven, Work, prove
 from sparserob_core.checker.claims.followed import FollowedRow
 from sparserob_core.checker.claims.units import WindowUnits, nominal_sizes, units_of
 from sparserob_core.checker.claims.window import ConstraintWindow
@@ -62,7 +62,7 @@ def bounded(case: Case, window: ConstraintWindow) -> str:
         raise Unchecked("the certificate holds no cells for a constraint that was not proven on cells")
     normals = normals_of(window, entry.get("normals"))
     covered(case, window, lower, upper)
-    if case.followed.are_best and window.seen.facets is not None:
+    if case.followed.are_best and window.enclosed_set.facets is not None:
         proven = _prove_by_adjoints(case, window)
     else:
         basis, gains, work = _prepare_work(case, window, normals, lower, upper)
@@ -75,8 +75,8 @@ def bounded(case: Case, window: ConstraintWindow) -> str:
 
 def _format_tolerance(case: Case, window: ConstraintWindow, normals: Array) -> str:
     """Return, in words, the largest violation that counts as none; of a curved set the largest along its normals."""
-    if window.seen.facets is None:
-        curved = Curved(window.seen, normals, units_of(case, window).least)
+    if window.enclosed_set.facets is None:
+        curved = Curved(window.enclosed_set, normals, units_of(case, window).least)
         axes = np.eye(len(normals))
         return f" of its gauge, where {max(curved.true(z).slack for z in np.vstack([axes, -axes])):.2g} is excused"
     return (
@@ -87,7 +87,7 @@ def _format_tolerance(case: Case, window: ConstraintWindow, normals: Array) -> s
 
 def _prove_by_adjoints(case: Case, window: ConstraintWindow) -> Proven:
     """Show by the adjoints of the rows that no row of a flat set is exceeded by more than what counts as none."""
-    facets, units = window.seen.facets, units_of(case, window).rows.tolist()
+    facets, units = window.enclosed_set.facets, units_of(case, window).rows.tolist()
     assert facets is not None
     count, bound, share = 0, -np.inf, -np.inf
     for (direction, b), unit in zip(facets, units, strict=True):
@@ -108,7 +108,7 @@ def _format_units(case: Case, window: ConstraintWindow) -> str:
 def normals_of(window: ConstraintWindow, data: object) -> Array:
     """Return the vectors ``(b, d)`` whose combinations are the directions of a curved set: the normals of the
     certificate, or else the axes of the coordinates that the set bounds."""
-    shape, b, d = window.seen, window.seen.spanned, window.shape.dimension
+    shape, b, d = window.enclosed_set, window.enclosed_set.spanned, window.shape.dimension
     if data is None:
         return shape.lifted(np.eye(b))
     normals = numbers(data, "normals")
@@ -131,7 +131,7 @@ def covered(case: Case, window: ConstraintWindow, lower: Array, upper: Array) ->
     """Raise `Broken` unless the cells, with corners ``(k, 1 + nu + b)``, fill the window in time and the set of
     parameters, and for a curved set every face of the cube of directions."""
     nu = case.problem.system.parameter_count
-    b = 0 if window.seen.facets is not None else window.seen.spanned
+    b = 0 if window.enclosed_set.facets is not None else window.enclosed_set.spanned
     if lower.ndim != 2 or lower.shape != upper.shape or lower.shape[1] != 1 + nu + b:
         raise Broken(f"its cells are no pairs of corners with {1 + nu + b} coordinates")
     low, high = _find_extent(case, window, lower, upper)
@@ -174,7 +174,7 @@ def _prepare_work(
     and the cells in the form that `prove` takes, with their times cut at every kink and jump."""
     nu, units = case.problem.system.parameter_count, units_of(case, window)
     basis, gains, flat = _extract_facets(window, units)
-    curved = None if flat is not None else Curved(window.seen, normals, units.least)
+    curved = None if flat is not None else Curved(window.enclosed_set, normals, units.least)
     pairs = case.clock.each(zip(lower, upper, strict=True))
     keys = [(tuple(a[1:].tolist()), tuple(b[1:].tolist())) for a, b in pairs]
     order = sorted(range(len(keys)), key=lambda i: (keys[i], lower[i, 0]))
@@ -203,7 +203,7 @@ def _find_cuts(case: Case) -> Array:
 def _extract_facets(window: ConstraintWindow, units: WindowUnits) -> tuple[Array, Array, Sides | None]:
     """Return the normals of a flat set's facets, on the state ``(b, d)`` and on the control ``(b, m)``, and its rows.
     Opposite facets share a normal. The rows are ``None`` for a curved set."""
-    facet_basis, facets = basis_of(window.seen), window.seen.facets
+    facet_basis, facets = basis_of(window.enclosed_set), window.enclosed_set.facets
     if facet_basis is None or facets is None:
         return np.zeros((0, 0)), np.zeros((0, 0)), None
     basis, z = facet_basis
@@ -227,11 +227,11 @@ def prove_on_cells(
 ) -> Proven:
     """Show with `prove` that a constraint is kept on the parts ``work`` of ``cells`` between lower and upper corners.
     The rows to bound are combinations of ``rows``, ``(b, d)`` on the state and ``(b, m)`` on the control."""
-    added_terms = case.beside(window, *rows)
+    added_terms = case.build_added_terms(window, *rows)
     return prove(tubes(case, *rows, *cells), parameters_of(case), work, case.clock, added_terms)
 
 
-def tubes(case: Case, basis: Array, gains: Array, lower: Array, upper: Array) -> Callable[[Corners], Reached]:
+def tubes(case: Case, basis: Array, gains: Array, lower: Array, upper: Array) -> Callable[[Corners], AnyTube]:
     """Return a function that makes the reachable states over a box of parameters, for combinations of ``basis (b, d)``
     on the state and ``gains (b, m)`` on the control. Boxes of a set that is no box are widened by a share `WIDER` of
     the cells."""
@@ -260,7 +260,7 @@ def equalities(case: Case) -> str:
     worst, states = 0.0, np.eye(case.problem.system.states)[[state for state, _ in case.equalities]]
     sizes = nominal_sizes(case, states, np.zeros((len(states), 0))).tolist()
     for (state, value), (residual, term_size), size, row in zip(
-        case.equalities, missed(case), sizes, states, strict=True
+        case.equalities, compute_residuals(case), sizes, states, strict=True
     ):
         allowed = min(EQUALITY * max(term_size, abs(value)), TOLERANCE * max(size, abs(value)))
         if not residual <= allowed:
@@ -272,7 +272,7 @@ def equalities(case: Case) -> str:
     return f"kept to {worst:.1e}{of_fixed(case)}"
 
 
-def missed(case: Case) -> list[tuple[arb, float]]:
+def compute_residuals(case: Case) -> list[tuple[arb, float]]:
     """Return for every fixed state its largest absolute residual as a ball, and the size of the numbers added up to it:
     initial state, control, and deviations without the control and with it."""
     scene, d = replace(case.scene, disturbance=None, initial_set=None), case.problem.system.states
@@ -283,7 +283,9 @@ def missed(case: Case) -> list[tuple[arb, float]]:
     for state, value in case.equalities:
         (final_value, *responses), (goal,) = last[state], balls([value])
         if not case.answering:
-            final_value = final_value * 0 if _is_at_rest(case, state) else final_value + pushed_by_middle(case, state)
+            final_value = (
+                final_value * 0 if _is_at_rest(case, state) else final_value + compute_middle_effect(case, state)
+            )
         residual = final_value - goal
         high, low = residual + feedback.support(responses), feedback.support([-x for x in responses]) - residual
         residuals.append((high.max(low), float(sums[state]) + (feedback.added(state) if case.answering else 0.0)))
@@ -298,7 +300,7 @@ def _compute_final_state(case: Case, scene: Scene) -> list[list[arb]]:
     return list(States(case.price.flow, scene).last.matrix.tolist())
 
 
-def pushed_by_middle(case: Case, state: int) -> arb:
+def compute_middle_effect(case: Case, state: int) -> arb:
     """Return what the disturbance in the middle of its set adds to a state at the end."""
     (total,), middle = balls([0.0]), case.disturbances.middle
     if middle.any():

@@ -61,11 +61,11 @@ class FollowedRow:
                 break
         raise Unchecked(f"neither shown nor refuted: after {count} cells more than {limit!r} is not excluded")
 
-    def beside(self, time: float, inside: float) -> tuple[float, float]:
+    def enclose_added_terms(self, time: float, inside: float) -> tuple[float, float]:
         """Return a lower and an upper bound of the terms that the reference and the control add to the row at a time. A
         mixed constraint takes the control of the piece that holds the time ``inside``."""
         case, window, (state, gains) = self.case, self.window, self.window.split(self.direction)
-        offset, _ = window.moved(time, time)
+        offset, _ = window.evaluate_reference(time, time)
         total = -sum((a * b for a, b in zip(balls(state), offset, strict=True)), ball(0.0))
         if window.is_mixed:
             ends = case.control.breakpoints
@@ -93,9 +93,9 @@ class FollowedRow:
         bounds, execution = np.zeros((2, start.size)), self._execution
         if self.window.reference is not None or self.window.is_mixed:
             cells = self.case.clock.each(zip(start.tolist(), stop.tolist(), strict=True))
-            bounds = np.array([[self.beside(t, (a + b) / 2)[1] for t in (a, b)] for a, b in cells]).T
+            bounds = np.array([[self.enclose_added_terms(t, (a + b) / 2)[1] for t in (a, b)] for a, b in cells]).T
         if execution is not None:
-            chord_distances = execution.bent_over(self.window.split(self.direction)[0], start, stop)
+            chord_distances = execution.bound_chord_errors(self.window.split(self.direction)[0], start, stop)
             execution_bounds = np.stack([self.erring(times)[1] for times in (start, stop)]) + chord_distances
             bounds = bounds + execution_bounds + HALF_ULP * 4.0 * (np.abs(bounds) + execution_bounds)
         return bounds
@@ -107,10 +107,10 @@ class FollowedRow:
         if any(deviation_set is not None and known(deviation_set).facets is None for deviation_set in sets):
             return
         middles = (start + stop) / 2
-        top, overestimates = self.worst.most(middles)
+        top, overestimates = self.worst.bound_largest_value(middles)
         least = (top - overestimates) - HALF_ULP * 8.0 * np.abs(top)
         if self.window.reference is not None or self.window.is_mixed:
-            lower_bounds = [self.beside(t, t)[0] for t in middles.tolist()]
+            lower_bounds = [self.enclose_added_terms(t, t)[0] for t in middles.tolist()]
             least = least + np.array(lower_bounds) - HALF_ULP * 8.0 * np.abs(lower_bounds)
         errors, _ = self.erring(middles)
         least = least + errors - HALF_ULP * 8.0 * np.abs(errors)

@@ -15,7 +15,7 @@ from sparserob_core.checker.arithmetic.balls import ball, balls
 from sparserob_core.checker.arithmetic.remembered import remembered
 from sparserob_core.checker.claims.answers import PEAK, WORST, NamedDeviations, feedback_of
 from sparserob_core.checker.claims.case import EQUALS, STEP, Case, listed, number, numbers, shaped
-from sparserob_core.checker.claims.constraints import pushed_by_middle
+from sparserob_core.checker.claims.constraints import compute_middle_effect
 from sparserob_core.checker.claims.window import ConstraintWindow
 from sparserob_core.checker.cost.duality import EFFORT, ConstraintRow
 from sparserob_core.checker.outcome import Broken, Unchecked
@@ -57,7 +57,7 @@ def weighted(case: Case, data: object) -> tuple[list[tuple[float, ConstraintRow]
         direction = np.eye(case.problem.system.states)[state]
         row = _derive_row(case, direction, case.problem.horizon, case.nominal_parameter, ball(value), disturbed=False)
         # a disturbance of one point counts; where none may reach the state, any member of its set may stand for it
-        rows.append((multiplier, replace(row, constant=row.constant + pushed_by_middle(case, state))))
+        rows.append((multiplier, replace(row, constant=row.constant + compute_middle_effect(case, state))))
     if case.control.functions >= case.control.pieces:  # every piece has a function of its own
         return rows, None
     return rows, shaped(data, "pieces", (case.problem.system.controls, case.control.pieces))
@@ -149,7 +149,7 @@ def _derive_base_row(
     c, gain = np.split(direction, [case.problem.system.states])
     limit = fixed_limit(case, direction, time) if window is None else window.limit(direction, time)
     row = _derive_row(case, c, time, parameter.tolist(), limit, disturbed=not case.answering)
-    measurable_input = None if case.followed.are_best else case.sources.strayed_at(parameter.tolist())
+    measurable_input = None if case.followed.are_best else case.sources.measurable_input_at(parameter.tolist())
     if measurable_input is not None:
         row = replace(row, constant=row.constant + ball(measurable_input.added(c, time)[0]))
     sizes, early_bound = case.sources.erring(c, time, parameter.tolist())
@@ -169,7 +169,7 @@ def _derive_row(
         return case.duality.row(c, time, parameter, limit, disturbed)
     worst, problem, delay = case.followed.worst(c, None), case.problem, case.problem.system.delay
     m, starts = problem.system.controls, np.append(case.control.breakpoints[:-1] + delay, np.inf)
-    initial_weights, input_weights = worst.carried(time), worst.weights(time, starts[:-1], starts[1:])
+    initial_weights, input_weights = worst.compute_initial_weights(time), worst.weights(time, starts[:-1], starts[1:])
     initial_state = balls(np.asarray(problem.initial_state, dtype=float))
     constant = sum((w * x for w, x in zip(initial_weights, initial_state, strict=True)), ball(0)) - limit
     if problem.system.drifts:  # a drift is an input that is 1
@@ -180,7 +180,7 @@ def _derive_row(
     if disturbed and problem.initial_set is not None:
         constant = constant + known(problem.initial_set).support(initial_weights)
     if disturbed and problem.disturbance is not None:
-        constant = constant + worst.pushed_by(time)
+        constant = constant + worst.compute_worst_effect(time)
     return ConstraintRow(constant, [weights[:m] for weights in input_weights])
 
 

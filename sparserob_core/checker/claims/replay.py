@@ -14,8 +14,8 @@ from sparserob_core.checker.arithmetic.balls import ball, balls
 from sparserob_core.checker.arithmetic.series import exactly, stacked
 from sparserob_core.checker.claims.answers import NamedDeviations, commanded, feedback_of
 from sparserob_core.checker.claims.case import EQUALS, Case, number, numbers, shaped
-from sparserob_core.checker.claims.cells import Reached
-from sparserob_core.checker.claims.constraints import missed
+from sparserob_core.checker.claims.cells import AnyTube
+from sparserob_core.checker.claims.constraints import compute_residuals
 from sparserob_core.checker.claims.followed import FollowedRow
 from sparserob_core.checker.claims.multipliers import admissible, asked, fixed_limit, piece_of, sized
 from sparserob_core.checker.claims.units import units_of
@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 ROUNDED = 1e-11
 
 
-def reached(case: Case, time: float, parameter: Array, signal: object, deviation: object = None) -> list[arb]:
+def compute_state(case: Case, time: float, parameter: Array, signal: object, deviation: object = None) -> list[arb]:
     """Return the state ``(d,)`` at a time and a parameter ``(nu,)`` under the control of the case. The disturbance is a
     ``signal (mw, pieces)`` on the common grid, the initial state has a ``deviation (d,)``; neither is read where the
     problem has none.
@@ -48,10 +48,10 @@ def reached(case: Case, time: float, parameter: Array, signal: object, deviation
     w = _read_disturbance(case, signal) if case.problem.disturbance is not None else None
     weights = case.flows.at(parameter.tolist()).weights([0.0, *(t for t in case.timing.grid[1:-1] if t < time), time])
     x = weights.free * _enclose_initial_state(case, deviation)
-    for k, (acts, pushes) in enumerate(zip(weights.control, weights.disturbance, strict=True)):
-        x = x + acts * case.scene.control[k]
+    for k, (control_weight, disturbance_weight) in enumerate(zip(weights.control, weights.disturbance, strict=True)):
+        x = x + control_weight * case.scene.control[k]
         if w is not None:
-            x = x + pushes * stacked([[v] for v in balls(w[:, k])])
+            x = x + disturbance_weight * stacked([[v] for v in balls(w[:, k])])
     state: list[arb] = x.entries()
     return state
 
@@ -93,7 +93,7 @@ def witnessed(case: Case, data: Mapping[str, Any]) -> tuple[arb, float]:
             _project_onto_direction(direction, named, feedback.loop.nodes[-1].tolist()),
             fixed_limit(case, direction, time),
         )
-        slack = EQUALITY * max(term_size for _, term_size in missed(case))
+        slack = EQUALITY * max(term_size for _, term_size in compute_residuals(case))
     else:
         window, parameter = case.window(name), numbers(data.get("parameter", []), "parameter")
         sized(direction, window.shape.dimension, name)
@@ -106,10 +106,10 @@ def witnessed(case: Case, data: Mapping[str, Any]) -> tuple[arb, float]:
             value = _project_onto_direction(
                 direction, named, rows if piece is None else rows + feedback.commands[piece].tolist()
             )
-        elif case.sources.strayed is not None:
+        elif case.sources.measurable_input is not None:
             value = _enclose_largest_value(case, window.split(direction), time, parameter.tolist(), piece)
         else:
-            state = reached(case, time, parameter, data.get("disturbance"), data.get("deviation"))
+            state = compute_state(case, time, parameter, data.get("disturbance"), data.get("deviation"))
             state += [] if piece is None else case.pieces[piece].entries()
             value = _project_onto_direction(direction, None, [[x] for x in state])
         execution = case.sources.delivered_at(parameter.tolist())
@@ -134,7 +134,7 @@ def _enclose_largest_value(
 ) -> arb:
     """Return a ball that holds the largest ``c'x(t) + gain'u`` under measurable disturbances, at a parameter, for a
     ``direction`` ``(c, gain)`` and the control ``u`` on a ``piece``, where there is one."""
-    (c, gain), zero, measurable_input = direction, ball(0.0), case.sources.strayed_at(parameter)
+    (c, gain), zero, measurable_input = direction, ball(0.0), case.sources.measurable_input_at(parameter)
     assert measurable_input is not None
     row = case.duality.row(c, time, parameter, zero)
     low, high = measurable_input.added(c, time)
@@ -152,10 +152,10 @@ def _project_onto_direction(direction: Array, named: NamedDeviations | None, row
     return along(direction, [row[0] for row in rows] if named is None else named.of(rows))
 
 
-def exceeded(case: Case, said: Mapping[str, object], begun: Array | None = None) -> tuple[list[float], float]:
+def exceeded(case: Case, said: Mapping[str, object], initial_state: Array | None = None) -> tuple[list[float], float]:
     """Return the excess of the worst disturbance over each row of the constraint, at the time and parameter that a
-    report has ``said``, as estimates; and a slack that says how closely a reported figure must agree. ``begun (d,)`` is
-    the initial state, by default the worst one.
+    report has ``said``, as estimates; and a slack that says how closely a reported figure must agree. The
+    ``initial_state (d,)`` is by default the worst one.
 
     A mixed constraint at a jump of the control has its rows on both sides. A curved set is `Unchecked`."""
     name, time, control_set = (
@@ -172,22 +172,22 @@ def exceeded(case: Case, said: Mapping[str, object], begun: Array | None = None)
         slack = TOLERANCE * max(known(control_set).units, default=1.0)
         return [float((height - b).mid()) for height, (_, b) in zip(heights, facets, strict=True)], slack
     if name == EQUALS and case.equalities:
-        residuals = missed(case)
+        residuals = compute_residuals(case)
         return [float(residual) for residual, _ in residuals], TOLERANCE * max(term_size for _, term_size in residuals)
     window, parameter = case.window(name), numbers(said.get("parameter", []), "parameter")
     asked(case, window, time, parameter)  # not `admissible`: rounding may take a parameter at the edge out of its set
-    facets, facet_basis = window.seen.facets, basis_of(window.seen)
+    facets, facet_basis = window.enclosed_set.facets, basis_of(window.enclosed_set)
     if facets is None or facet_basis is None:
         raise Unchecked("the worst direction of a curved set is not told")
     pieces = _find_pieces(case, time, jumps=window.is_mixed)
     if case.followed.are_best:
-        over, slack = _compute_excess_by_adjoints(case, window, time, begun, pieces)
+        over, slack = _compute_excess_by_adjoints(case, window, time, initial_state, pieces)
         return over, slack + ROUNDED * case.problem.system.states * float(
             units_of(case, window).resolved.max(initial=0.0)
         )
     (basis, gains), z = np.split(facet_basis[0], [window.states], axis=1), facet_basis[1]
-    tube = _build_tube(case, parameter, begun, basis, gains)
-    added_terms = case.beside(window, basis, gains, parameter.tolist())
+    tube = _build_tube(case, parameter, initial_state, basis, gains)
+    added_terms = case.build_added_terms(window, basis, gains, parameter.tolist())
     polynomials = list[Polynomial]()
     for piece, k in pieces:
         cells = tube.cells(piece, time, time, z)
@@ -201,18 +201,18 @@ def exceeded(case: Case, said: Mapping[str, object], begun: Array | None = None)
 
 
 def _compute_excess_by_adjoints(
-    case: Case, window: ConstraintWindow, time: float, begun: Array | None, pieces: Sequence[tuple[int, int]]
+    case: Case, window: ConstraintWindow, time: float, initial_state: Array | None, pieces: Sequence[tuple[int, int]]
 ) -> tuple[list[float], float]:
     """Return the excess of the worst disturbance over each row of a flat set, by adjoints, with its accuracy."""
-    facets, over, slack = window.seen.facets, list[float](), 0.0
+    facets, over, slack = window.enclosed_set.facets, list[float](), 0.0
     assert facets is not None
     breaks = case.control.breakpoints.tolist()
     for _, k in pieces:
         for direction, b in facets:
             row = FollowedRow(case, window, np.asarray(direction, dtype=float))
-            worst = row.worst if begun is None else replace(row.worst, centre=begun, begun=None)
-            (top,), (overestimate,) = worst.most(np.array([time]))
-            low, high = row.beside(time, (breaks[k] + breaks[k + 1]) / 2)
+            worst = row.worst if initial_state is None else replace(row.worst, centre=initial_state, initial_set=None)
+            (top,), (overestimate,) = worst.bound_largest_value(np.array([time]))
+            low, high = row.enclose_added_terms(time, (breaks[k] + breaks[k + 1]) / 2)
             (error_low,), (error_high,) = row.erring(np.array([time]))
             low, high = low + error_low, high + error_high
             over.append(float(top - overestimate / 3.0 + (low + high) / 2.0) - float(b))
@@ -229,11 +229,15 @@ def _find_pieces(case: Case, time: float, jumps: bool) -> list[tuple[int, int]]:
     return sorted({(piece, k) for piece, k in places})
 
 
-def _build_tube(case: Case, parameter: Array, begun: Array | None, basis: Array, gains: Array) -> Reached:
-    """Return the reachable states at a parameter, from the initial state ``begun (d,)`` alone where it is given."""
+def _build_tube(case: Case, parameter: Array, initial_state: Array | None, basis: Array, gains: Array) -> AnyTube:
+    """Return the reachable states at a parameter, from ``initial_state (d,)`` alone where it is given."""
     if case.answering:
         return LoopTube(feedback_of(case).loop, basis, gains)
-    scene = case.scene if begun is None else replace(case.scene, initial_state=begun.tolist(), initial_set=None)
+    scene = (
+        case.scene
+        if initial_state is None
+        else replace(case.scene, initial_state=initial_state.tolist(), initial_set=None)
+    )
     flow = case.flows.at(parameter.tolist())
     return VerifiedTube(ProjectedStates(States(flow, scene), basis), flow.box)
 

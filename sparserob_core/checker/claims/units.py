@@ -252,16 +252,16 @@ class WindowUnits:
             high, low, sums = high + up, low + down, sums + np.maximum(np.abs(up), np.abs(down))
         return np.maximum(np.abs(high), np.abs(low)).max(axis=0), sums.max(axis=0)
 
-    def _sum_over_pieces(self, nodes: list[float], pushed: Array) -> Array:
+    def _sum_over_pieces(self, nodes: list[float], interval_weights: Array) -> Array:
         """Return the weights of the disturbance on its pieces, from those on the intervals between ``nodes``."""
         if self.problem.disturbance is None or len(nodes) < 2:
-            return pushed
+            return interval_weights
         middles = (np.array(nodes[:-1]) + np.array(nodes[1:])) / 2
         blocks = np.searchsorted(self.scene.changes, middles, side="right")
-        weights: Array = np.add.reduceat(pushed, np.flatnonzero(np.diff(blocks, prepend=-1)), axis=0)
-        if self.scene.lasting is None:
+        weights: Array = np.add.reduceat(interval_weights, np.flatnonzero(np.diff(blocks, prepend=-1)), axis=0)
+        if self.scene.held_components is None:
             return weights
-        return self.scene.lasting.gathered(weights[..., None], np.zeros((*weights.shape, 1)))[0][..., 0]
+        return self.scene.held_components.gathered(weights[..., None], np.zeros((*weights.shape, 1)))[0][..., 0]
 
     def _find_nodes(self) -> tuple[list[float], npt.NDArray[np.intp]]:
         """Return the grid up to the window's end, with both its ends, and the places of the times to examine."""

@@ -48,7 +48,7 @@ class ConstraintWindow:
     reference: Array | None = None
 
     @property
-    def seen(self) -> Shape:
+    def enclosed_set(self) -> Shape:
         """The set in ball arithmetic."""
         return known(self.shape)
 
@@ -65,11 +65,11 @@ class ConstraintWindow:
     def limit(self, direction: Array, time: float) -> arb:
         """Return the upper bound of ``c'x + g'u`` that the constraint sets at a time, ``(c, g)`` the direction."""
         c, _ = self.split(direction)
-        offset, _ = self.moved(time, time)
+        offset, _ = self.evaluate_reference(time, time)
         terms = [ball(a) * r for a, r in zip(c, offset, strict=True) if a]
-        return sum(terms, self.seen.limit(direction))
+        return sum(terms, self.enclosed_set.limit(direction))
 
-    def moved(self, start: float, stop: float) -> tuple[list[arb], list[arb]]:
+    def evaluate_reference(self, start: float, stop: float) -> tuple[list[arb], list[arb]]:
         """Return ``r(start)`` and the derivative ``r'`` on ``[start, stop]``, ``(d,)`` each, between two times of the
         reference; outside of its times ``r`` is constant."""
         zero = [ball(0.0)] * self.states
@@ -127,7 +127,7 @@ class AddedTerms:
         """Return the polynomials ``found`` of ``c'x``, one for every row of ``z (k, b)``, on an interval with the added
         terms. ``piece`` is the one whose control counts, by default that at ``start``; ``within`` the box of parameters
         with its monomials."""
-        offset, slope = self.window.moved(start, stop)
+        offset, slope = self.window.evaluate_reference(start, stop)
         basis = exactly(self.basis)
         level = -basis * stacked([[r] for r in offset])
         if self.window.is_mixed:
@@ -188,17 +188,17 @@ class AddedTerms:
             axis_bounds = [one.over(side, times, within) for side in (axis, -axis)]
             error += off[state] * max(float(np.abs(b.ends).sum(axis=1).max()) + b.off for b in axis_bounds) * OUTWARD
         total = _add_terms(poly, terms, error)
-        width_errors = bounds.wide if total.bent is None else total.bent + bounds.wide
+        width_errors = bounds.wide if total.parameter_errors is None else total.parameter_errors + bounds.wide
         turning = total.turning + float(bounds.wide.sum())
-        return replace(total, kinks=total.kinks + bounds.over, turning=turning, bent=width_errors)
+        return replace(total, kinks=total.kinks + bounds.over, turning=turning, parameter_errors=width_errors)
 
 
-def _add_terms(poly: Polynomial, terms: Array, lost: float) -> Polynomial:
+def _add_terms(poly: Polynomial, terms: Array, error: float) -> Polynomial:
     """Return the sum of a polynomial and another one with coefficients ``terms (J, M)`` of the first monomials. All
-    errors of these coefficients together are at most ``lost``."""
+    errors of these coefficients together are at most ``error``."""
     missing = max(0, len(terms) - poly.coefficients.shape[0])
     coefficients = np.pad(poly.coefficients, ((0, missing), (0, 0)))
     changed = coefficients[: len(terms), : terms.shape[1]]
     changed += terms
-    lost += 2.0 * HALF_ULP * float(np.abs(changed).sum())
-    return replace(poly, coefficients=coefficients, error=(poly.error + lost) * OUTWARD)
+    error += 2.0 * HALF_ULP * float(np.abs(changed).sum())
+    return replace(poly, coefficients=coefficients, error=(poly.error + error) * OUTWARD)

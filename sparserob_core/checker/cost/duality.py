@@ -21,7 +21,7 @@ from sparserob_core.checker.arithmetic.series import exactly
 from sparserob_core.checker.cost.price import Price, Tangent
 from sparserob_core.checker.flow.flows import VerifiedFlows
 from sparserob_core.checker.outcome import Broken
-from sparserob_core.checker.problem.held import Lasting, summed
+from sparserob_core.checker.problem.held import HeldComponents, summed
 from sparserob_core.checker.problem.timing import before
 from sparserob_core.checker.sets.known import known
 from sparserob_core.control.problem.dictionary import Dictionary
@@ -60,8 +60,8 @@ class Duality:
     """The data from which lower bounds are derived.
 
     ``changes`` are the times at which the disturbance may jump, ``None`` without a disturbance. ``held`` is the set of
-    the disturbances that are constant between these times. ``flows`` are those of the system. ``lasting`` says which
-    components are held over several intervals.
+    the disturbances that are constant between these times. ``flows`` are those of the system. ``held_components``
+    says which components are held over several intervals.
     """
 
     problem: OptimalControlProblem
@@ -69,7 +69,7 @@ class Duality:
     changes: list[float] | None
     flows: VerifiedFlows
     held: ConvexSet | None = None
-    lasting: Lasting | None = None
+    held_components: HeldComponents | None = None
 
     def control_piece(self, time: float) -> int:
         """Return the index of the piece of the control that is commanded at a time."""
@@ -133,11 +133,13 @@ class Duality:
         if disturbed and problem.initial_set is not None:
             constant = constant + known(problem.initial_set).support(initial_slope)
         if disturbed and self.held is not None:
-            for block_slope in summed(self.lasting, block_slopes):
+            for block_slope in summed(self.held_components, block_slopes):
                 constant = constant + known(self.held).support(block_slope)
         return ConstraintRow(constant, slope)
 
-    def pushed(self, direction: Array, time: float, jumps: list[float] | None = None) -> list[list[arb]]:
+    def compute_disturbance_weights(
+        self, direction: Array, time: float, jumps: list[float] | None = None
+    ) -> list[list[arb]]:
         """Return the coefficients ``(mw,)`` of every block of the disturbance in ``c'x(t)``, for a known system. The
         blocks begin at ``jumps``, or by default at the `changes` of the problem."""
         jumps = self.changes if jumps is None else jumps
@@ -149,7 +151,7 @@ class Duality:
         zero_slope = [ball(0.0)] * self.problem.system.disturbances
         return [slopes[s] if s < time else zero_slope for s in jumps]
 
-    def carried(self, direction: Array, time: float) -> list[arb]:
+    def compute_initial_weights(self, direction: Array, time: float) -> list[arb]:
         """Return the coefficients ``(d,)`` of the initial state in ``c'x(t)``, for a known system."""
         row = exactly(direction[None])
         return list((row * self.flows.at(()).weights([0.0, time]).free).entries())

@@ -26,7 +26,7 @@ MAX_PARTS = 200_000  # parts of the search that are examined at most
 TOGETHER = 200  # parts that are bounded by one product of matrices
 
 
-def at_most(
+def prove_effort_limit(
     a: list[arb], A: list[list[arb]], support: Callable[[list[arb]], arb], reach: Array, limit: arb, clock: Clock
 ) -> int:
     """Show that the largest effort ``max_z sum_k |a_k + A_k z|``, ``A (n, Q)``, is at most a ``limit``; return the

@@ -15,7 +15,7 @@ from sparserob_core.checker.arithmetic.remembered import remembered
 from sparserob_core.checker.arithmetic.series import stacked
 from sparserob_core.checker.cost.duality import ConstraintRow
 from sparserob_core.checker.reach.closed_loop import VerifiedLoop
-from sparserob_core.checker.reach.preimages import Pushed, SeenDeviations
+from sparserob_core.checker.reach.preimages import MeasuredDeviations, ReachableSubspace
 from sparserob_core.checker.sets.known import known
 from sparserob_core.checker.sets.shape import width
 from sparserob_core.sip.convex_set import ConvexSet
@@ -70,7 +70,7 @@ class GainsBound:
         are together. Each has its breakpoints, the matrix of `_compute_inverse`, and its blocks."""
         groups: list[tuple[list[int], set[int]]] = []
         for j in np.flatnonzero(self.answers[k, : k + 1]).tolist():
-            measured_blocks = {block for block in self.loop.seen[j] if self._segments[block]}
+            measured_blocks = {block for block in self.loop.innovation_matrices[j] if self._segments[block]}
             if not measured_blocks:
                 continue
             cluster, separate = ([j], measured_blocks), []
@@ -86,11 +86,11 @@ class GainsBound:
     def _compute_inverse(self, members: tuple[int, ...]) -> tuple[arb_mat, list[int]]:
         """Return a generalised inverse ``(q, J d)`` of the matrix from the blocks to the states measured at these
         breakpoints, and the numbers of the blocks. From measurements it gives deviations with the same measurements."""
-        blocks = sorted({block for j in members for block in self.loop.seen[j] if self._segments[block]})
+        blocks = sorted({block for j in members for block in self.loop.innovation_matrices[j] if self._segments[block]})
         d = self.loop.outputs
         table: list[list[arb]] = []
         for j in members:
-            responses = self.loop.seen[j]
+            responses = self.loop.innovation_matrices[j]
             response_rows = {
                 block: _multiply_by_segments(response, self._segments[block])
                 for block, response in responses.items()
@@ -106,7 +106,8 @@ class GainsBound:
             ]
         groups = [self._find_measuring_states(block) for block in blocks]
         pattern = np.vstack(
-            [np.hstack([g.pattern & (b in self.loop.seen[j]) for g, b in zip(groups, blocks, strict=True)])
+            [np.hstack([g.pattern & (b in self.loop.innovation_matrices[j])
+                        for g, b in zip(groups, blocks, strict=True)])
              for j in members]
         )  # fmt: skip
         state_count = max(group.states for group in groups)
@@ -114,25 +115,27 @@ class GainsBound:
         ends = np.cumsum([group.pattern.shape[1] for group in groups]).tolist()
         columns = [(end, group.entries) for end, group in zip(ends, groups, strict=True)]
         reach = np.array([float(length) for block in blocks for _, length in self._segments[block]])
-        return SeenDeviations(stacked(table), pattern, rows, columns, reach).inverse(), blocks
+        return MeasuredDeviations(stacked(table), pattern, rows, columns, reach).inverse(), blocks
 
     def _list_zeros(self, block: int) -> list[arb]:
         """Return zeros, one for each of the segments of a block."""
         return [ball(0.0)] * len(self._segments[block])
 
-    def _find_measuring_states(self, block: int) -> Pushed:
+    def _find_measuring_states(self, block: int) -> ReachableSubspace:
         """Return which states can measure the deviations of a block; each state measures its own initial deviation."""
         loop, vectors = self.loop, [vector for vector, _ in self._segments[block]]
         if loop.measured is not None:  # through the observer every output may measure every deviation
-            return Pushed(np.ones((loop.outputs, len(vectors)), dtype=bool), loop.outputs, len(vectors))
-        if loop.initial is not None and block == loop.deviations.begun:
-            return Pushed(np.array([[bool(v) for v in row] for row in vectors]).T, len(vectors), len(vectors))
+            return ReachableSubspace(np.ones((loop.outputs, len(vectors)), dtype=bool), loop.outputs, len(vectors))
+        if loop.initial is not None and block == loop.deviations.initial_block:
+            return ReachableSubspace(
+                np.array([[bool(v) for v in row] for row in vectors]).T, len(vectors), len(vectors)
+            )
         return self._find_states_along(vectors)
 
     @remembered(key=lambda self, vectors: tuple(map(tuple, vectors)))
-    def _find_states_along(self, vectors: list[list[Fraction]]) -> Pushed:
+    def _find_states_along(self, vectors: list[list[Fraction]]) -> ReachableSubspace:
         """Return which states can measure deviations along some directions."""
-        return self.loop.pushed(vectors)
+        return self.loop.find_reachable_subspace(vectors)
 
     @cached_property
     def _segments(self) -> list[list[tuple[list[Fraction], arb]]]:
@@ -150,9 +153,9 @@ def reach(shape: ConvexSet, channel: int) -> arb:
     return high.max(low).max(high * 0)
 
 
-def _multiply_by_segments(push: arb_mat, segments: Sequence[tuple[list[Fraction], arb]]) -> list[list[arb]]:
+def _multiply_by_segments(response: arb_mat, segments: Sequence[tuple[list[Fraction], arb]]) -> list[list[arb]]:
     """Return the matrix of a block times its segments: the coefficients of the segments in every entry."""
-    rows, columns = push.tolist(), [[(b, v) for b, v in enumerate(vector) if v] for vector, _ in segments]
+    rows, columns = response.tolist(), [[(b, v) for b, v in enumerate(vector) if v] for vector, _ in segments]
     return [
         [sum((row[b] if v == 1 else row[b] * rational(v) for b, v in column), ball(0)) for column in columns]
         for row in rows

@@ -30,7 +30,7 @@ KEPT = 8  # tables of segments that are remembered, each as large as a hundred m
 
 @final
 @dataclass(frozen=True, eq=False)
-class Walk:
+class QuadraticTerms:
     """The quadratic terms of the cost at a control: their ``value``, and their derivatives ``slope``, ``m`` balls per
     piece.
 
@@ -44,7 +44,7 @@ class Walk:
     terms: float
 
 
-def walked(nominal: NominalMotion, control: Dictionary, pieces: Sequence[arb_mat]) -> Walk:
+def evaluate_quadratic_terms(nominal: NominalMotion, control: Dictionary, pieces: Sequence[arb_mat]) -> QuadraticTerms:
     """Return the quadratic terms of the cost at a control ``(m, 1)`` on every piece, and their derivatives: ``z = (x,
     1, u)`` is propagated along the nominal trajectory, and the costates backwards. A control acts after the delay, and
     costs when it is commanded."""
@@ -79,7 +79,7 @@ def walked(nominal: NominalMotion, control: Dictionary, pieces: Sequence[arb_mat
     radii = [float(value.rad()), *(float(g.rad()) for entry in slope for g in entry)]
     is_exact = max(radii) == 0.0
     blurred = 0.0 if is_exact else float("inf") if not np.isfinite(sum(radii)) else max(radii) / (max(sizes) or 1.0)
-    return Walk(value, slope, blurred, terms)
+    return QuadraticTerms(value, slope, blurred, terms)
 
 
 def nominal_states(nominal: NominalMotion, control: Dictionary, pieces: Sequence[arb_mat]) -> list[arb_mat]:
@@ -164,7 +164,7 @@ class NominalMotion:
     def step(self, start: float, stop: float) -> arb_mat:
         """Return the square matrix that maps ``z`` at the beginning of an interval to ``z`` at its end."""
         Phi, Gamma, Delta = self.flow.over(start, stop)
-        return self._lift(Phi.beside(Gamma).beside(Delta).matrix, 1)
+        return self._lift(Phi.append_columns(Gamma).append_columns(Delta).matrix, 1)
 
     @remembered(key=lambda self, start, stop: self.flow.alike(start, stop))
     def weight(self, start: float, stop: float) -> arb_mat:

@@ -15,7 +15,7 @@ import numpy as np
 
 from sparserob_core.checker.arithmetic.balls import ball, balls, rational
 from sparserob_core.checker.arithmetic.series import norm, stacked
-from sparserob_core.checker.cost.nominal import NominalMotion, Walk, nominal_states, walked
+from sparserob_core.checker.cost.nominal import NominalMotion, QuadraticTerms, evaluate_quadratic_terms, nominal_states
 from sparserob_core.checker.flow.flow import VerifiedFlow
 from sparserob_core.checker.outcome import NO_LIMIT, Broken, Clock, Unchecked
 from sparserob_core.checker.sets.known import known
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 ENOUGH = 1e-20  # the largest relative radius of the quadratic terms and their slopes
 MAX_BITS = 512  # the largest working precision: the terms of a guess of the flow determine half of these bits
-KEPT = 3  # walks that are remembered: of the control, of another control, and of the control 0
+KEPT = 3  # quadratic terms that are remembered: those of the control, of another control, and of the control 0
 
 
 @final
@@ -50,7 +50,9 @@ class Price:
     control: Dictionary
     flow: VerifiedFlow
     clock: Clock = NO_LIMIT
-    _latest_walks: deque[tuple[Sequence[arb_mat], int, Walk]] = field(default_factory=lambda: deque(maxlen=KEPT))
+    _latest_terms: deque[tuple[Sequence[arb_mat], int, QuadraticTerms]] = field(
+        default_factory=lambda: deque(maxlen=KEPT)
+    )
     _motions_by_precision: dict[int, NominalMotion] = field(default_factory=dict)
 
     @cached_property
@@ -207,23 +209,23 @@ class Price:
         """The control that stays 0."""
         return [stacked([[ball(0)]] * self.problem.system.controls)] * len(self._piece_lengths)
 
-    def _evaluate_quadratic(self, pieces: Sequence[arb_mat]) -> Walk:
+    def _evaluate_quadratic(self, pieces: Sequence[arb_mat]) -> QuadraticTerms:
         """Return the quadratic terms and their slopes, at the working precision that they need; the latest are
         remembered."""
         from flint import ctx
 
-        for control, bits, quadratic in self._latest_walks:
+        for control, bits, quadratic in self._latest_terms:
             if control is pieces and bits >= ctx.prec:
                 return quadratic
-        self._latest_walks.append((pieces, int(ctx.prec), self._resolve_quadratic(pieces, int(ctx.prec))))
-        return self._latest_walks[-1][2]
+        self._latest_terms.append((pieces, int(ctx.prec), self._resolve_quadratic(pieces, int(ctx.prec))))
+        return self._latest_terms[-1][2]
 
-    def _resolve_quadratic(self, pieces: Sequence[arb_mat], bits: int) -> Walk:
+    def _resolve_quadratic(self, pieces: Sequence[arb_mat], bits: int) -> QuadraticTerms:
         from flint import ctx
 
         while True:
             with ctx.workprec(bits):
-                quadratic = walked(self._nominal_motion, self.control, pieces)
+                quadratic = evaluate_quadratic_terms(self._nominal_motion, self.control, pieces)
             if quadratic.blurred <= ENOUGH:
                 return quadratic
             bits *= 2

@@ -11,7 +11,7 @@ import numpy as np
 
 from sparserob_core.checker.arithmetic.remembered import remembered
 from sparserob_core.checker.flow.flow import VerifiedFlow
-from sparserob_core.checker.flow.law import Law, ParameterBox, most
+from sparserob_core.checker.flow.law import Law, ParameterBox, bound_entries
 from sparserob_core.checker.flow.plant import Plant
 from sparserob_core.checker.flow.units import pace
 from sparserob_core.checker.outcome import Unchecked
@@ -111,7 +111,7 @@ class VerifiedFlows:
             for stretch in law.stretches:
                 u = law.units
                 for j in range(sizes.size):
-                    size = most(stretch.table[law.monomials.linear(j)])
+                    size = bound_entries(stretch.table[law.monomials.linear(j)])
                     sizes[j] += (stretch.stop - stretch.start) * pace(size[:, : len(u)], u)
             return int(sizes.argmax()) if sizes.any() else int(np.argmax(box.halves))
         except Unchecked:

@@ -131,7 +131,7 @@ class Stretch:
         return sizes[0] * OUTWARD**2, sizes[1] * OUTWARD**2
 
 
-def most(table: Sequence[Sequence[arb_poly]]) -> Array:
+def bound_entries(table: Sequence[Sequence[arb_poly]]) -> Array:
     """Return bounds ``(d, d + w)`` of the absolute values of polynomials on [-1, 1], up to rounding of floats."""
     return np.array([[sum(float(c.abs_upper()) for c in entry.coeffs()) for entry in row] for row in table])
 
@@ -216,7 +216,7 @@ class Law:
         """The approximate size of the part of the law that belongs to each monomial of the parameters, ``(M,)``."""
         weights = np.zeros(self.monomials.size)
         for stretch in self.stretches:
-            weights += [most(table).sum() for table in stretch.table]
+            weights += [bound_entries(table).sum() for table in stretch.table]
         return weights
 
     def _rebuild_stretch(self, other: Stretch) -> Stretch:
@@ -276,7 +276,7 @@ class Law:
         try:
             _, middle = self._tabulate_law(start, stop, phase, NONE)
             d, u = len(middle[0]), self.units
-            size = most(middle[0])
+            size = bound_entries(middle[0])
             radii = np.array([[sum(float(c.rad()) for c in e.coeffs()) for e in row] for row in middle[0]])
             rate, length = pace(size[:, :d], u), float((stop - start) * OUTWARD)
             ratios = np.ones(d) if rate * length <= LONG else _find_unit_factors(size[:, :d] * u / u[:, None] * length)
@@ -315,13 +315,13 @@ class Law:
         return frame, tables
 
 
-def _find_unit_factors(most: Array) -> Array | None:
+def _find_unit_factors(bounds: Array) -> Array | None:
     """Return factors ``(d,)`` of the units of the states that make the system small enough, ``None`` where none are
-    found. It moves the states by at most ``M = most (d, d)``; with ``g = SHORTER LONG``, ``u = (1 - M / g)^-1 1``
+    found. It moves the states by at most ``M = bounds (d, d)``; with ``g = SHORTER LONG``, ``u = (1 - M / g)^-1 1``
     satisfies ``M u <= g u`` where it is positive."""
-    relative = most / (SHORTER * LONG)
+    relative = bounds / (SHORTER * LONG)
     u = np.linalg.lstsq(np.eye(len(relative)) - relative, np.ones(len(relative)), rcond=None)[0]
     if not (np.isfinite(u).all() and u.min() > 0.0):
         return None
     ratios = np.maximum(u, 1.0)
-    return np.asarray(ratios) if (most @ ratios <= LONG * ratios).all() else None
+    return np.asarray(ratios) if (bounds @ ratios <= LONG * ratios).all() else None

@@ -207,13 +207,15 @@ class Equation:
     def begin(self) -> Series:
         """The flow at the share 0."""
         d, monomials = self.A[0].shape[0], self.A[0].monomials
-        return Series.constant(monomials, identity(d)).beside(Series.constant(monomials, zeros(d, self.F[0].shape[1])))
+        return Series.constant(monomials, identity(d)).append_columns(
+            Series.constant(monomials, zeros(d, self.F[0].shape[1]))
+        )
 
     @cached_property
     def _inputs(self) -> list[Series]:
         d = self.A[0].shape[0]
         zero = Series.constant(self.A[0].monomials, zeros(d, d))
-        return [zero.beside(term) for term in self.F]
+        return [zero.append_columns(term) for term in self.F]
 
     def slope(self, terms: Sequence[Series], n: int) -> Series:
         """Return the term of order ``n`` of ``A P + [0 F]``; for the same terms of ``P`` it is remembered."""

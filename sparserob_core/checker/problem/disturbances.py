@@ -10,7 +10,7 @@ from typing import final
 import numpy as np
 
 from sparserob_core.checker.outcome import Unchecked
-from sparserob_core.checker.problem.held import Lasting
+from sparserob_core.checker.problem.held import HeldComponents
 from sparserob_core.checker.problem.timing import Timing
 from sparserob_core.checker.sets.known import middle
 from sparserob_core.control.problem.dictionary import Dictionary
@@ -29,21 +29,21 @@ class Disturbances:
     timing: Timing
 
     @cached_property
-    def lasting(self) -> Lasting | None:
+    def held_components(self) -> HeldComponents | None:
         """The components of the disturbance that are held over several of its pieces, ``None`` where there are none."""
-        return Lasting.of(self.problem, self.changes or [])
+        return HeldComponents.of(self.problem, self.changes or [])
 
     @property
     def alike(self) -> bool:
         """True where all disturbances are of one class, and those on pieces are constant on the same pieces."""
-        return not self.several and self.lasting is None
+        return not self.several and self.held_components is None
 
     def may_jump(self, time: float) -> np.ndarray:
         """Return which components ``(mw,)`` of the disturbance may have another value from a time on, among those that
         are constant on pieces."""
         assert self.problem.disturbance is not None
-        if self.lasting is not None:
-            return self.lasting.may_jump(time)
+        if self.held_components is not None:
+            return self.held_components.may_jump(time)
         return np.full(self.problem.disturbance.dimension, time in (self.changes or ()))
 
     @property

@@ -41,7 +41,7 @@ def on_one_grid(problem: OptimalControlProblem, dictionary: Dictionary) -> tuple
 
 @final
 @dataclass(frozen=True, eq=False)
-class Lasting:
+class HeldComponents:
     """The components of a disturbance that are held over several pieces.
 
     ``changes`` are the breakpoints of the pieces, without the horizon. ``parts`` has for every part of the disturbance
@@ -53,7 +53,7 @@ class Lasting:
     parts: tuple[tuple[slice, np.ndarray], ...]
 
     @staticmethod
-    def of(problem: OptimalControlProblem, changes: list[float]) -> Lasting | None:
+    def of(problem: OptimalControlProblem, changes: list[float]) -> HeldComponents | None:
         """Return the held components of a problem `on_one_grid`, whose disturbance may jump at the ``changes``;
         ``None`` where no part of it has its own breakpoints."""
         if problem.disturbance_breakpoints is None:
@@ -67,7 +67,7 @@ class Lasting:
             firsts = [bisect_right(changes, time + slack) - 1 for time in times[:-1].tolist()]
             pairs.append((slice(column, column + factor.dimension), np.array(firsts)))
             column += factor.dimension
-        return Lasting(changes, tuple(pairs))
+        return HeldComponents(changes, tuple(pairs))
 
     def gathered(self, mid: Array, rad: Array) -> tuple[Array, Array]:
         """Return the coefficients ``(pieces, ..., mw, b)`` of the first pieces of the disturbance and their error
@@ -92,11 +92,11 @@ class Lasting:
         )
 
 
-def summed(lasting: Lasting | None, weights: Sequence[Sequence[arb]]) -> list[list[arb]]:
+def summed(held_components: HeldComponents | None, weights: Sequence[Sequence[arb]]) -> list[list[arb]]:
     """Return weights ``(mw,)`` on every piece, added up exactly to the first piece of the interval on which a component
     is held."""
     sums = [list(row) for row in weights]
-    for columns, firsts in () if lasting is None else lasting.parts:
+    for columns, firsts in () if held_components is None else held_components.parts:
         first = 0
         for piece in range(len(sums)):
             first = piece if piece in firsts else first

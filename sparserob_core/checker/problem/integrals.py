@@ -170,7 +170,7 @@ class RunningIntegrals:
         windows = np.array([[coordinate.begin, coordinate.end] for coordinate in coordinates])
         return RunningIntegrals(System((phase,), None, system.delay), *windows.T)
 
-    def is_beside(self, phase: Phase, d: int) -> bool:
+    def agrees_with(self, phase: Phase, d: int) -> bool:
         """Return True where a phase agrees with this system in the first ``d`` states, whatever is integrated with
         them."""
         pairs = [(phase.entry(name), self.system.phases[0].entry(name)) for name in PARTS]

@@ -42,24 +42,24 @@ NO_PLANE = "the checker knows parameters beside the time that the state depends 
 @final
 class Affine:
     """A number of which only the ``parameters`` that it depends on are known, by their places, at any time. It is an
-    affine function of them; where it is ``bent``, it may be any function of them."""
+    affine function of them; where ``is_nonlinear`` is True, it may be any function of them."""
 
-    __slots__ = ("bent", "parameters")
+    __slots__ = ("is_nonlinear", "parameters")
 
-    def __init__(self, parameters: frozenset[int] = frozenset(), bent: bool = False) -> None:
-        self.parameters, self.bent = parameters, bent
+    def __init__(self, parameters: frozenset[int] = frozenset(), is_nonlinear: bool = False) -> None:
+        self.parameters, self.is_nonlinear = parameters, is_nonlinear
 
     def _add(self, other: object, product: bool = False) -> Affine:
         if not isinstance(other, Affine):
             return self
         is_bilinear = product and bool(self.parameters) and bool(other.parameters)
-        return Affine(self.parameters | other.parameters, self.bent or other.bent or is_bilinear)
+        return Affine(self.parameters | other.parameters, self.is_nonlinear or other.is_nonlinear or is_bilinear)
 
     def _multiply(self, other: object) -> Affine:
         return self._add(other, product=True)
 
     def _apply_nonlinear(self, *_: object) -> Affine:
-        return Affine(self.parameters, self.bent or bool(self.parameters))
+        return Affine(self.parameters, self.is_nonlinear or bool(self.parameters))
 
     def _return_self(self) -> Affine:
         return self
@@ -110,7 +110,7 @@ class ParameterExpansion:
         for index, value in np.ndenumerate(matrix):
             nonzero[index] = isinstance(value, Affine) or float(value) != 0.0
             if isinstance(value, Affine):
-                if value.bent:
+                if value.is_nonlinear:
                     raise Unchecked(NO_PLANE)
                 dependent[(list(value.parameters), *index)] = True
         return nonzero, dependent
@@ -134,13 +134,13 @@ class ParameterExpansion:
     def is_affine(self) -> bool:
         """True where the state is shown to be an affine function of the parameters."""
         try:
-            _ = self.moved
+            _ = self.sensitive_states
         except Unchecked:
             return False
         return True
 
     @cached_property
-    def moved(self) -> list[list[int]]:
+    def sensitive_states(self) -> list[list[int]]:
         """The coordinates of every ``y_j`` that may differ from 0; raises `Unchecked` where the state is not shown to
         be affine in the parameters."""
         d, nu = self.system.states, len(self.middle)
@@ -172,15 +172,15 @@ class ParameterExpansion:
     @property
     def size(self) -> int:
         """The number of all coordinates."""
-        return self.system.states + sum(map(len, self.moved))
+        return self.system.states + sum(map(len, self.sensitive_states))
 
-    def seen(self, shares: tuple[float, ...]) -> Array:
+    def compute_projection(self, shares: tuple[float, ...]) -> Array:
         """Return the matrix ``(d, size)`` that gives ``x`` from all coordinates, at the shares ``s_j`` of the
         parameters."""
         d = self.system.states
         projection, column = np.zeros((d, self.size)), d
         projection[:, :d] = np.eye(d)
-        for share, states in zip(shares, self.moved, strict=True):
+        for share, states in zip(shares, self.sensitive_states, strict=True):
             for state in states:
                 projection[state, column] = share
                 column += 1
@@ -189,7 +189,7 @@ class ParameterExpansion:
     def corners(self) -> Iterator[tuple[float, ...]]:
         """Return the corners of a box that contains all shares ``s_j``; a parameter without any effect has the share 0
         only."""
-        pairs = zip(self.scales, self.moved, strict=True)
+        pairs = zip(self.scales, self.sensitive_states, strict=True)
         return product(*((-1.0, 1.0) if scale and states else (0.0,) for scale, states in pairs))
 
 
@@ -204,7 +204,11 @@ class Larger:
 
     def __call__(self, p: Any) -> np.ndarray:
         """Return the matrix at a time ``(1,)``."""
-        tables, coordinates, d = self.parts.tables(self.entry, p[0]), self.parts.moved, self.parts.system.states
+        tables, coordinates, d = (
+            self.parts.tables(self.entry, p[0]),
+            self.parts.sensitive_states,
+            self.parts.system.states,
+        )
         if self.name != "A":
             return np.concatenate(
                 [tables[0], *(table[states] for table, states in zip(tables[1:], coordinates, strict=True))]
@@ -228,15 +232,15 @@ def parted(problem: OptimalControlProblem) -> OptimalControlProblem:
     if not expansion.is_affine:  # then the flow is expanded on boxes of parameters
         return problem
     d, extra = system.states, expansion.size - system.states
-    corners = [expansion.seen(shares) for shares in expansion.corners()]
-    moved_states = {state for states in expansion.moved for state in states}
-    if any(moved_states & set(end.fixed.tolist()) for end in problem.terminal_equalities):
+    corners = [expansion.compute_projection(shares) for shares in expansion.corners()]
+    all_sensitive_states = {state for states in expansion.sensitive_states for state in states}
+    if any(all_sensitive_states & set(end.fixed.tolist()) for end in problem.terminal_equalities):
         raise Unchecked("the checker knows fixed final values of states that no parameter beside the time moves")
     is_numbered = sum(not isinstance(entry, Return) for entry in problem.windows) > 1
     labels = [entry.name or (f"path[{i}]" if is_numbered else "path") for i, entry in enumerate(problem.windows)]
     state_names = list(problem.names.states or [f"x{i + 1}" for i in range(d)])
     units = list(problem.names.state_units)
-    for name, scale, states in zip(system.names, expansion.scales, expansion.moved, strict=True):
+    for name, scale, states in zip(system.names, expansion.scales, expansion.sensitive_states, strict=True):
         state_names += [f"{state_names[i]} per {scale:.3g} {name}" for i in states]
         units += [units[i] for i in states] if problem.names.state_units else []
     return replace(

@@ -13,7 +13,7 @@ from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.control.sets.sets import Box
 
 
-def in_turns(problem: OptimalControlProblem) -> OptimalControlProblem:
+def make_time_varying(problem: OptimalControlProblem) -> OptimalControlProblem:
     """Return the problem with such a system where that is needed, else the problem itself: for errors of execution with
     switches or parameters, and for measurable disturbances with a box of parameters."""
     system = problem.system

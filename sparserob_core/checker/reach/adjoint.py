@@ -139,12 +139,12 @@ class AdjointFlow:
         return self._expand_adjoint(ORDER, self.F)
 
     @cached_property
-    def bending(self) -> Enclosed:
+    def derivative_terms(self) -> Enclosed:
         """The matrices that turn an adjoint into the first terms of ``l'[A^2, A F, A^2 F]`` on a step,
         ``(DERIVATIVE_ORDER + 1, d, d + 2 q)``, with the remainder in the radius of the first."""
         once, twice = (Series.known(self.A * matrix) for matrix in (self.F, self.A))
         return self._expand_adjoint(
-            DERIVATIVE_ORDER, twice.beside(once).beside(Series.known(self.A * once.matrix)).matrix
+            DERIVATIVE_ORDER, twice.append_columns(once).append_columns(Series.known(self.A * once.matrix)).matrix
         )
 
 
@@ -293,12 +293,12 @@ class AdjointRow:
         return np.asarray((np.abs(self.driven.mid) + self.driven.rad).sum(axis=1).max(axis=0) * OUTWARD)
 
     @cached_property
-    def bends(self) -> tuple[Array, Array, Array]:
+    def derivative_bounds(self) -> tuple[Array, Array, Array]:
         """The upper bounds on every step of ``|l''|``, ``(N, d)``, of ``|l'AF|`` and of ``|l'A^2 F|``, ``(N, q)``
         each."""
         if self.opposite is not None:
-            return self.opposite.bends
-        d, q, terms = self.motion.states, self.motion.F.ncols(), self.motion.bending
+            return self.opposite.derivative_bounds
+        d, q, terms = self.motion.states, self.motion.F.ncols(), self.motion.derivative_terms
         bounds = np.zeros((self.count, d + 2 * q))
         batch_size = max(1, AT_ONCE // (d + 2 * q))
         for start in range(0, self.count, batch_size):
@@ -335,7 +335,7 @@ class SupportIntegrals:
         """The upper bounds of the absolute values of the support functions on every step and its neighbours,
         ``(N, S)``."""
         _, errors, size = self._polynomials
-        heights = (size + errors) @ np.array([summand.far for summand in self.summands]).T * OUTWARD
+        heights = (size + errors) @ np.array([summand.radii for summand in self.summands]).T * OUTWARD
         padded = np.pad(heights, ((1, 1), (0, 0)), mode="edge")
         return np.asarray(np.maximum(heights, np.maximum(padded[:-2], padded[2:])))
 
@@ -345,7 +345,7 @@ class SupportIntegrals:
         P, errors, size = (values[steps] for values in self._polynomials)
         integrals = []
         for summand in self.summands:
-            value, excess, deficit, tops = summand.swept(P, errors, size, 2.0 * shares - 1.0)
+            value, excess, deficit, tops = summand.integrate_support(P, errors, size, 2.0 * shares - 1.0)
             rounded = rounding(4 * ORDER) * 2.0 * tops
             integrals.append((value, (excess + rounded) * OUTWARD, (deficit + rounded) * OUTWARD))
         value, excess, deficit = (
@@ -393,7 +393,7 @@ class Stopped:
     """
 
     parts: Sequence[tuple[AdjointRow, float]]
-    ways: Sequence[tuple[AdjointRow, float, float]] = ()
+    segments: Sequence[tuple[AdjointRow, float, float]] = ()
 
     @staticmethod
     def integral(parts: Sequence[tuple[AdjointRow, float]], row: Array, begin: float, end: float) -> Stopped:
@@ -473,12 +473,12 @@ class Worst:
     ----------
     adjoint
         The adjoint of the row ``c``.
-    centre, begun
+    centre, initial_set
         The centre of the initial states, ``(d,)``, and the set of deviations from it, or ``None``.
     grid, drives
         Times ``(L + 1,)``, and the known inputs between them, ``(q', L)``, which enter by the first inputs of the
         adjoint.
-    pushed
+    disturbance_set
         The set of the disturbance, which enters by the last inputs.
     changes
         The times ``(M + 1,)`` between which the disturbance is constant; ``None`` where it is measurable.
@@ -486,10 +486,10 @@ class Worst:
 
     adjoint: AdjointRow | Stopped
     centre: Array
-    begun: ConvexSet | None
+    initial_set: ConvexSet | None
     grid: Array
     drives: Enclosed
-    pushed: ConvexSet | None
+    disturbance_set: ConvexSet | None
     changes: Array | None
 
     @property
@@ -539,7 +539,7 @@ class Worst:
                 size += np.abs(effects.mid[:, :used]) @ np.abs(u)
         return mid, rad + rounding(used + self.grid.size) * size
 
-    def most(self, times: Array) -> tuple[Array, Array]:
+    def bound_largest_value(self, times: Array) -> tuple[Array, Array]:
         """Return upper bounds ``(k,)`` of the largest value at exact ``times (k,)``, and how far these bounds may be
         above it, ``(k,)``. The second result is proven for flat sets only."""
         rows = self.adjoint.at(times)
@@ -547,8 +547,8 @@ class Worst:
         size = np.abs(rows.mid) @ np.abs(self.centre)
         top = top + rows.mid @ self.centre
         rad = rad + rows.rad @ np.abs(self.centre) + rounding(self.centre.size) * size
-        supports = [] if self.begun is None else [_evaluate_support(self.begun, rows)]
-        if self.pushed is not None:
+        supports = [] if self.initial_set is None else [_evaluate_support(self.initial_set, rows)]
+        if self.disturbance_set is not None:
             supports.append(
                 self._evaluate_held(times) if self.changes is not None else self._evaluate_measurable(times)
             )
@@ -557,7 +557,7 @@ class Worst:
         rad = (rad + 8.0 * HALF_ULP * (np.abs(top) + size)) * OUTWARD
         return top + rad, 3.0 * rad
 
-    def carried(self, time: float) -> list[arb]:
+    def compute_initial_weights(self, time: float) -> list[arb]:
         """Return the weights ``(d,)`` of the initial state in the row at a time."""
         from flint import arb
 
@@ -569,37 +569,39 @@ class Worst:
         each."""
         from flint import arb
 
-        has_begun, columns = starts < time, self.adjoint.motion.F.ncols()
+        has_started, columns = starts < time, self.adjoint.motion.F.ncols()
         weights = [[arb(0)] * columns for _ in range(starts.size)]
         effects = self.adjoint.between(
-            np.full(has_begun.sum(), time), starts[has_begun], np.minimum(stops[has_begun], time)
+            np.full(has_started.sum(), time), starts[has_started], np.minimum(stops[has_started], time)
         )
         for k, mid, rad in zip(
-            np.flatnonzero(has_begun).tolist(), effects.mid.tolist(), effects.rad.tolist(), strict=True
+            np.flatnonzero(has_started).tolist(), effects.mid.tolist(), effects.rad.tolist(), strict=True
         ):
             weights[k] = [arb(m, r) for m, r in zip(mid, rad, strict=True)]
         return weights
 
-    def pushed_by(self, time: float) -> arb:
+    def compute_worst_effect(self, time: float) -> arb:
         """Return what the worst disturbance adds to the row at a time."""
         from flint import arb
 
-        assert self.pushed is not None
+        assert self.disturbance_set is not None
         if self.changes is None:
             (value,), (rad,) = self._evaluate_measurable(np.array([time]))
             return arb(float(value), float(2.0 * rad))
         weights = self.weights(time, self.changes[:-1], self.changes[1:])
-        return sum((known(self.pushed).support(weight[self._disturbance_columns]) for weight in weights), arb(0))
+        return sum(
+            (known(self.disturbance_set).support(weight[self._disturbance_columns]) for weight in weights), arb(0)
+        )
 
     def _evaluate_held(self, times: Array) -> tuple[Array, Array]:
         """Return what the worst disturbance that is constant between ``changes`` adds to the row at ``times (k,)``, and
         how much more it may be, ``(k,)`` each."""
-        assert self.pushed is not None and self.changes is not None
+        assert self.disturbance_set is not None and self.changes is not None
         top, rad = np.zeros(times.size), np.zeros(times.size)
         for start, stop in zip(self.changes[:-1], self.changes[1:], strict=True):
             effects = self.adjoint.between(times, float(start), float(stop))
             support, error = _evaluate_support(
-                self.pushed,
+                self.disturbance_set,
                 Enclosed(effects.mid[:, self._disturbance_columns], effects.rad[:, self._disturbance_columns]),
             )
             top, rad = top + support, rad + error + HALF_ULP * np.abs(top)
@@ -608,14 +610,14 @@ class Worst:
     @cached_property
     def _disturbance_middle(self) -> Array:
         """The middle of the set of a measurable disturbance, ``(mw,)``."""
-        assert self.pushed is not None
-        return middle(self.pushed)
+        assert self.disturbance_set is not None
+        return middle(self.disturbance_set)
 
     @cached_property
     def _disturbance_integrals(self) -> SupportIntegrals:
         """The integrals of the support functions of a measurable disturbance about the middle of its set."""
-        assert self.pushed is not None
-        return SupportIntegrals(self._single_adjoint, self._disturbance_columns, summands_of(self.pushed))
+        assert self.disturbance_set is not None
+        return SupportIntegrals(self._single_adjoint, self._disturbance_columns, summands_of(self.disturbance_set))
 
     def _evaluate_measurable(self, times: Array) -> tuple[Array, Array]:
         """Return what the worst measurable disturbance adds to the row at ``times (k,)``, and error bounds, ``(k,)``
@@ -633,12 +635,12 @@ class Worst:
     def _evaluate_stopped(self, stopped: Stopped, times: Array) -> tuple[Array, Array]:
         """Return what the worst measurable disturbance adds to an integral that has ended at all ``times (k,)``, and
         error bounds, ``(k,)`` each."""
-        assert self.pushed is not None
-        if not stopped.ways or (times < stopped.parts[0][1]).any():
+        assert self.disturbance_set is not None
+        if not stopped.segments or (times < stopped.parts[0][1]).any():
             raise Unchecked("of measurable disturbances one integral at a time is followed")
         top, rad = np.zeros(times.size), np.zeros(times.size)
-        radius: Array = np.abs(self._disturbance_middle) + np.array(known(self.pushed).radius)
-        for row, length, rounded in stopped.ways:
+        radius: Array = np.abs(self._disturbance_middle) + np.array(known(self.disturbance_set).radius)
+        for row, length, rounded in stopped.segments:
             value, error = replace(self, adjoint=row)._evaluate_measurable(np.full(times.size, length))
             top = top + value
             rad = (
@@ -650,14 +652,16 @@ class Worst:
     def _curvature_bounds(self) -> Array:
         """The upper bounds ``(N,)`` of the downward curvature of the largest value on every step. Times an eighth of
         the square of the width of a cell, they bound how far the largest value lies above its chord."""
-        states, once, twice = self._single_adjoint.bends
-        state_bound = np.abs(self.centre) + (0.0 if self.begun is None else np.array(known(self.begun).radius))
+        states, once, twice = self._single_adjoint.derivative_bounds
+        state_bound = np.abs(self.centre) + (
+            0.0 if self.initial_set is None else np.array(known(self.initial_set).radius)
+        )
         curvature = states @ state_bound
         inputs = np.zeros(once.shape[1])
         used = self.drives.mid.shape[0]
         inputs[:used] = (np.abs(self.drives.mid) + self.drives.rad).max(axis=1, initial=0.0)
-        if self.pushed is not None:
-            radius = np.array(known(self.pushed).radius)
+        if self.disturbance_set is not None:
+            radius = np.array(known(self.disturbance_set).radius)
             if self.changes is None:  # an integral of a support function, whose argument changes at the rate l'AE
                 curvature = curvature + once[:, self._disturbance_columns] @ radius
             else:
@@ -667,12 +671,12 @@ class Worst:
         total = self._single_adjoint.step * float((twice @ inputs).sum()) + float((once @ inputs).max(initial=0.0))
         return np.asarray((curvature + total) * OUTWARD)
 
-    def over(self, start: Array, stop: Array, beside: Array | float = 0.0) -> Array:
+    def over(self, start: Array, stop: Array, added_values: Array | float = 0.0) -> Array:
         """Return upper bounds ``(k,)`` of the largest value on cells from ``start (k,)`` to ``stop (k,)``, each between
-        two `cuts`, with the values ``beside (2, k)`` at both ends, and linear in between."""
+        two `cuts`, with the values ``added_values (2, k)`` at both ends, and linear in between."""
         ends, positions = np.unique(np.concatenate([start, stop]), return_inverse=True)
         batch_size = max(1, AT_ONCE // self.adjoint.motion.states)  # the adjoints at all ends take much memory
-        bounds = [self.most(ends[k : k + batch_size])[0] for k in range(0, ends.size, batch_size)]
+        bounds = [self.bound_largest_value(ends[k : k + batch_size])[0] for k in range(0, ends.size, batch_size)]
         tops = np.concatenate(bounds)[positions]
         width, curvature = (stop - start) * OUTWARD, np.zeros(start.size)
         if width.any():
@@ -680,8 +684,8 @@ class Worst:
             curvature = np.maximum(
                 *(self._curvature_bounds[np.clip((t / step).astype(int), 0, last)] for t in (start, stop))
             )
-        end_values = tops.reshape(2, -1) + beside
-        rounding_error = 4.0 * HALF_ULP * (np.abs(end_values) + np.abs(beside)).max(axis=0)
+        end_values = tops.reshape(2, -1) + added_values
+        rounding_error = 4.0 * HALF_ULP * (np.abs(end_values) + np.abs(added_values)).max(axis=0)
         return np.asarray(end_values.max(axis=0) + (width**2 / 8.0 * curvature + rounding_error) * OUTWARD)
 
     def cuts(self, more: Sequence[float]) -> Array:
@@ -691,7 +695,7 @@ class Worst:
         if isinstance(self.adjoint, AdjointRow):
             times.append(np.arange(self.adjoint.count + 1) * self.adjoint.step)
         times += [self.grid] if self.drives.mid.any() or self.drives.rad.any() else []
-        times += [self.changes] if self.pushed is not None and self.changes is not None else []
+        times += [self.changes] if self.disturbance_set is not None and self.changes is not None else []
         return np.unique(np.concatenate(times))
 
 

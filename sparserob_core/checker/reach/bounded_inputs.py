@@ -21,7 +21,7 @@ from sparserob_core.checker.arithmetic.series import Series, exactly, products
 from sparserob_core.checker.flow.flow import VerifiedFlow
 from sparserob_core.checker.flow.flows import VerifiedFlows
 from sparserob_core.checker.flow.law import ParameterBox
-from sparserob_core.checker.reach.kernels import Added, BoundedInput, BoundedInputHere, above_chord, pushes
+from sparserob_core.checker.reach.kernels import Added, BoundedInput, BoundedInputHere, above_chord, compute_kernel
 from sparserob_core.checker.reach.states import enclosed, ring
 from sparserob_core.checker.reach.tube import Around
 from sparserob_core.checker.sets.along import NormSummand
@@ -79,9 +79,9 @@ class SizedInput:
         return slice(self.first, self.first + self.summands[0].dimension)
 
     @cached_property
-    def far(self) -> Array:
+    def radii(self) -> Array:
         """The upper bounds ``(S, m)`` of what enters by each of the `columns`, in absolute value, for a size of 1."""
-        return np.array([summand.far for summand in self.summands])
+        return np.array([summand.radii for summand in self.summands])
 
     def piece_at(self, time: float) -> int:
         """Return the index of the piece of the command from a time on; before the first and after the last piece, that
@@ -92,7 +92,7 @@ class SizedInput:
     def largest(self, piece: int) -> Array:
         """Return upper bounds of the absolute values of what enters by each of the `columns` on a piece, up to
         rounding."""
-        return np.asarray((self.sizes.mid[piece] + self.sizes.rad[piece]) @ self.far)
+        return np.asarray((self.sizes.mid[piece] + self.sizes.rad[piece]) @ self.radii)
 
     def reaching(self, rows: Array) -> Array:
         """Return ``rows (n, d)`` with 0 for the states that the input does not reach."""
@@ -130,7 +130,7 @@ class BoundedInputAt(BoundedInputHere):
         low, high = self._bound_effects(c[None], time)
         return float(low[0]), float(high[0])
 
-    def bent(self, c: Array, start: float, stop: float) -> float:
+    def bound_chord_error(self, c: Array, start: float, stop: float) -> float:
         """Return an upper bound of how far `added` lies above its chord on ``[start, stop]``."""
         axes = np.eye(c.size)
         start_bounds = self._bound_effects(np.vstack([axes, -axes]), start)[1].reshape(2, -1).max(axis=0)
@@ -145,10 +145,10 @@ class BoundedInputAt(BoundedInputHere):
         owner = self.owner[indices]
         mid, rad = self.input.sizes.mid[owner, None], self.input.sizes.rad[owner, None]
         # a support function may be negative, where the middle of a thin set is not in it
-        at_least = np.where(low > 0.0, low * np.maximum(mid - rad, 0.0), low * (mid + rad)).sum(axis=(0, 2))
-        at_most = (high * (mid + rad)).sum(axis=(0, 2))
-        rounding_error = rounding(2 * indices.size * self.input.shares.size + 8) * at_most
-        return at_least - rounding_error * OUTWARD, at_most + rounding_error * OUTWARD
+        lower = np.where(low > 0.0, low * np.maximum(mid - rad, 0.0), low * (mid + rad)).sum(axis=(0, 2))
+        upper = (high * (mid + rad)).sum(axis=(0, 2))
+        rounding_error = rounding(2 * indices.size * self.input.shares.size + 8) * upper
+        return lower - rounding_error * OUTWARD, upper + rounding_error * OUTWARD
 
     def _bound_integrals(self, rows: Array, time: float, pieces: np.ndarray) -> tuple[Array, Array, np.ndarray]:
         """Return lower and upper bounds ``(q, n, S)`` of the integrals of the support functions of all summands along
@@ -188,8 +188,8 @@ class BoundedInputAt(BoundedInputHere):
 
     @remembered(lambda: TIMES_KEPT)
     def _compute_kernel(self, start: float, stop: float) -> Enclosed:
-        """Return the kernel of an interval in powers of ``u`` from -1 to 1, ``(p + 1, d, m)``, as `pushes` does."""
-        kernel = pushes(self.law, start, stop, self.input.columns)
+        """Return the kernel of an interval in powers of ``u`` from -1 to 1, ``(p + 1, d, m)``, by `compute_kernel`."""
+        kernel = compute_kernel(self.law, start, stop, self.input.columns)
         return Enclosed(kernel.mid[:, 0], kernel.rad[:, 0])
 
     @remembered(lambda: KEPT)
@@ -293,7 +293,7 @@ class BoundedInputOver(BoundedInput):
     @remembered(lambda: TIMES_KEPT)
     def _compute_kernel(self, flow: VerifiedFlow, start: float, stop: float) -> Enclosed:
         """Return the kernel of an interval between marks, ``(p + 1, M, d, m)``."""
-        return pushes(flow, start, stop, self.input.columns)
+        return compute_kernel(flow, start, stop, self.input.columns)
 
     @remembered(lambda: KEPT)
     def _collect_transitions(self, flow: VerifiedFlow, time: float) -> tuple[Enclosed, Enclosed, np.ndarray]:
@@ -303,7 +303,7 @@ class BoundedInputOver(BoundedInput):
         ends = [t for t in self.input.breakpoints.tolist() if t < time]
         marks = flow.marks([*ends, time]) if ends else [time]
         steps = [flow.over(*pair)[0] for pair in pairwise(marks)]
-        d, m = flow.states, self.input.far.shape[1]
+        d, m = flow.states, self.input.radii.shape[1]
         if not steps:
             none = np.zeros((2, 0, flow.monomials.size, d, d)), np.zeros((2, 0, 1, flow.monomials.size, d, m))
             return Enclosed(*none[0]), Enclosed(*none[1]), np.zeros(0, dtype=int)

@@ -24,7 +24,7 @@ from sparserob_core.checker.arithmetic.series import around, exactly, identity, 
 from sparserob_core.checker.flow.flow import VerifiedFlow
 from sparserob_core.checker.flow.plant import Plant, modes_at
 from sparserob_core.checker.reach.deviations import Deviations
-from sparserob_core.checker.reach.preimages import Pushed
+from sparserob_core.checker.reach.preimages import ReachableSubspace
 from sparserob_core.checker.sets.polynomials import OUTWARD, Enclosed, rounding
 from sparserob_core.control.sets.sets import ConvexSet
 from sparserob_core.sip.convex_set import Array
@@ -110,7 +110,7 @@ class VerifiedLoop:
         """Return the transition ``(d, d)`` of a part of a piece of the grid, and what the inputs add to the nominal
         state and to the responses, ``(d, 1 + Q)``."""
         Phi, Gamma, Delta = self.flow.over(start, stop)
-        return Phi.matrix, Gamma.beside(Delta).matrix * self.drives[piece]
+        return Phi.matrix, Gamma.append_columns(Delta).matrix * self.drives[piece]
 
     def _compute_piece_flow(self, piece: int) -> tuple[arb_mat, arb_mat]:
         """Return the transition ``(d, d)`` of a piece of the grid, and the effect ``(d, mw)`` of a disturbance that is
@@ -118,17 +118,17 @@ class VerifiedLoop:
         Phi, _, Delta = self.flow.over(self.grid[piece], self.grid[piece + 1])
         return Phi.matrix, Delta.matrix
 
-    def pushed(self, vectors: Sequence[Sequence[Fraction]]) -> Pushed:
+    def find_reachable_subspace(self, vectors: Sequence[Sequence[Fraction]]) -> ReachableSubspace:
         """Return which states a block of the disturbance along ``vectors (q, mw)`` reaches. For a system that may
         change with time, only the positions of entries that may differ from 0 are used."""
         if not self.flow.plant.is_timed:
-            return Pushed.of([(mode["A"], mode["E"]) for mode in modes_at(self.system, ())], vectors)
+            return ReachableSubspace.of([(mode["A"], mode["E"]) for mode in modes_at(self.system, ())], vectors)
         d, m = self.flow.states, self.flow.driven
         is_nonzero = self.flow.law.there
-        return Pushed.linked(is_nonzero[:, :d], is_nonzero[:, d + m :], vectors)
+        return ReachableSubspace.linked(is_nonzero[:, :d], is_nonzero[:, d + m :], vectors)
 
     @cached_property
-    def seen(self) -> list[dict[int, arb_mat]]:
+    def innovation_matrices(self) -> list[dict[int, arb_mat]]:
         """The matrices ``D_jl (p, mw)`` of every innovation ``j``, by block ``l``; blocks without effect are absent."""
         return self._entering_effects if self.measured is None else self._compute_observer_innovations(self.measured)
 
@@ -144,7 +144,7 @@ class VerifiedLoop:
             for block, effect in entering.items():
                 error[block] = error[block] + effect if block in error else effect
             innovation = {block: C * effect for block, effect in error.items()}
-            if self.deviations.begun > self.deviations.blocks:
+            if self.deviations.initial_block > self.deviations.blocks:
                 innovation[self.deviations.blocks + j] = unit
             innovations.append(innovation)
             if j + 1 == len(self.breakpoints) - 1:
@@ -169,7 +169,7 @@ class VerifiedLoop:
         K = len(self.breakpoints) - 1
         effects: list[dict[int, arb_mat]] = [{} for _ in range(K)]
         if self.initial is not None:
-            effects[0][self.deviations.begun] = identity(self.system.states)
+            effects[0][self.deviations.initial_block] = identity(self.system.states)
         for piece in range(len(self.grid) - 1 if self.deviations.blocks else 0):
             k, (_, block) = self.on(piece), self._find_acting_indices(piece)
             if k + 1 >= K:
@@ -192,7 +192,7 @@ class VerifiedLoop:
                 if not self.gains[k, j].any():
                     continue
                 M = exactly(self.gains[k, j])
-                for block, matrix in self.seen[j].items():
+                for block, matrix in self.innovation_matrices[j].items():
                     for i, row in enumerate((M * matrix).tolist()):
                         for b, value in enumerate(row):
                             rows[i][starts[block] + b] = rows[i][starts[block] + b] + value
@@ -232,7 +232,7 @@ class VerifiedLoop:
             answers = [[] for _ in begin]
         else:
             begin = [v + ball(m) for v, m in zip(begin, self.deviations.sets[-1][1], strict=True)]
-        zero = [ball(0)] * self.deviations.starts[self.deviations.begun]
+        zero = [ball(0)] * self.deviations.starts[self.deviations.initial_block]
         nodes = [stacked([[v, *zero, *row] for v, row in zip(begin, answers, strict=True)])]
         for piece, ends in enumerate(pairwise(self.grid)):
             Phi, effect = self._compute_part_flow(piece, *ends)
@@ -265,20 +265,20 @@ class VerifiedLoop:
         piece acts there."""
         return bisect_right(self.breakpoints, (self.grid[piece] + self.grid[piece + 1]) / 2) - 1
 
-    def heights(self, state: arb_mat, rows: Array | arb_mat, beside: arb_mat | None = None) -> list[arb]:
+    def heights(self, state: arb_mat, rows: Array | arb_mat, added_terms: arb_mat | None = None) -> list[arb]:
         """Return the largest ``c'x`` over all deviations, for every row ``c`` of ``rows (r, d)``, from a nominal
-        ``state`` and its responses ``(d, 1 + Q)``. A nominal value and responses ``beside (r, 1 + Q)`` are added to
-        each row."""
+        ``state`` and its responses ``(d, 1 + Q)``. A nominal value and responses ``added_terms (r, 1 + Q)`` are added
+        to each row."""
         product = exactly(rows) * state
-        along = (product if beside is None else product + beside).tolist()
+        along = (product if added_terms is None else product + added_terms).tolist()
         supports = self.deviations.supports([row[1:] for row in along])
         return [row[0] + support for row, support in zip(along, supports, strict=True)]
 
-    def highest(self, piece: int, time: float, rows: Array | arb_mat, beside: arb_mat | None = None) -> list[arb]:
+    def highest(self, piece: int, time: float, rows: Array | arb_mat, added_terms: arb_mat | None = None) -> list[arb]:
         """Return the `heights` of ``rows (r, d)`` at a time in a piece of the grid."""
-        return self.heights(self.state(piece, time), rows, beside)
+        return self.heights(self.state(piece, time), rows, added_terms)
 
-    def bent(self, piece: int, start: float, stop: float, rows: Array | arb_mat) -> Array:
+    def bound_chord_error(self, piece: int, start: float, stop: float, rows: Array | arb_mat) -> Array:
         """Return upper bounds ``(r,)`` of how far ``max c'x(t)`` lies above its chord on ``[start, stop]``, a part of a
         piece of the grid without marks. The states are a polynomial in the share ``s`` of the cell, and a term
         ``a s^n`` differs from its chord by at most ``(n - 1) n^(-n / (n - 1)) |a|``."""

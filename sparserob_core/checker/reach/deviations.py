@@ -40,7 +40,7 @@ class Deviations:
         return 0 if self.shape is None else self.held
 
     @property
-    def begun(self) -> int:
+    def initial_block(self) -> int:
         """The index of the block of the initial deviation, where there is one: the last block."""
         return self.blocks + self.noises
 

@@ -96,16 +96,16 @@ class FollowedExecution(BoundedInputHere):
         error = (errors * high + rounding(2 * change.size + 8) * np.abs(change) * high).sum(axis=(1, 2)) * OUTWARD
         return (up * low + down * high).sum(axis=(1, 2)) - error, (up * high + down * low).sum(axis=(1, 2)) + error
 
-    def bent(self, c: Array, start: float, stop: float) -> float:
+    def bound_chord_error(self, c: Array, start: float, stop: float) -> float:
         """Return an upper bound of the distance between `added` and its chord on ``[start, stop]``, which lies within
         one piece."""
-        return float(self.bent_over(c, np.array([start]), np.array([stop]))[0])
+        return float(self.bound_chord_errors(c, np.array([start]), np.array([stop]))[0])
 
-    def bent_over(self, c: Array, start: Array, stop: Array) -> Array:
+    def bound_chord_errors(self, c: Array, start: Array, stop: Array) -> Array:
         """Return upper bounds ``(k,)`` of the distance between `added` and its chord on every interval from
         ``start (k,)`` to ``stop (k,)``, each within one piece."""
         indices, change, errors = self.jumps
-        steepest, step = self.absolute(c).row.bends[1], self.motion.step
+        steepest, step = self.absolute(c).row.derivative_bounds[1], self.motion.step
         ages = np.stack([start, stop])[:, :, None] - self.breakpoints[indices]
         places = np.clip(np.floor(ages / step).astype(int) + np.array([-1, 1])[:, None, None], 0, len(steepest) - 1)
         tops = _find_largest(steepest, places[0], places[1] + 1)

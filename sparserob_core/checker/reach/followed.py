@@ -32,11 +32,11 @@ MAX_PIECES = 4000
 @final
 @dataclass(frozen=True, eq=False)
 class FollowedRows:
-    """The rows of a ``problem`` that are computed by their adjoints, with the adjoints made so far. ``stated`` is the
-    problem as given by the user."""
+    """The rows of a ``problem`` that are computed by their adjoints, with the adjoints made so far.
+    ``original_problem`` is the problem as given by the user."""
 
     problem: OptimalControlProblem
-    stated: OptimalControlProblem
+    original_problem: OptimalControlProblem
     timing: Timing
     disturbances: Disturbances
 
@@ -47,10 +47,10 @@ class FollowedRows:
         system = self.problem.system
         if not system.switches:
             return None
-        integrals, d = RunningIntegrals.of(spelt(self.stated)), self.stated.system.states
+        integrals, d = RunningIntegrals.of(spelt(self.original_problem)), self.original_problem.system.states
         return (
             integrals
-            if integrals is not None and all(integrals.is_beside(phase, d) for phase in system.phases)
+            if integrals is not None and all(integrals.agrees_with(phase, d) for phase in system.phases)
             else None
         )
 

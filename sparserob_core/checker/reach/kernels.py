@@ -72,7 +72,7 @@ class BoundedInputHere(BoundedInput):
         piece in one channel."""
 
     @abstractmethod
-    def bent(self, c: Array, start: float, stop: float) -> float:
+    def bound_chord_error(self, c: Array, start: float, stop: float) -> float:
         """Return an upper bound of how far `added` lies above its chord on ``[start, stop]``, which lies within one
         piece of the command and one segment of the system."""
 
@@ -84,11 +84,11 @@ class BoundedInputHere(BoundedInput):
         """Return the mean of both bounds at every time, and an error bound that includes the curvature in time."""
         ends = np.array([self.added(c, time) for time in times])
         gap = float((ends[:, 1] - ends[:, 0]).max())
-        chord_error = self.bent(c, times[0], times[-1]) if times[-1] > times[0] else 0.0
+        chord_error = self.bound_chord_error(c, times[0], times[-1]) if times[-1] > times[0] else 0.0
         return Added(ends.mean(axis=1)[:, None], gap + chord_error, 0.0, np.zeros(0))
 
 
-def pushes(law: VerifiedFlow, start: float, stop: float, columns: slice) -> Enclosed:
+def compute_kernel(law: VerifiedFlow, start: float, stop: float, columns: slice) -> Enclosed:
     """Return the kernel of an interval without marks: its length times some ``columns`` of ``Phi(stop, s) [B c E](s)``.
     Coefficients ``(p + 1, M, d, m)`` are those of powers of ``u`` from -1 to 1; the remainder is in the radius of the
     first. ``(1 + u) / 2`` is the share of the interval that is left at ``s``."""
@@ -104,11 +104,11 @@ def pushes(law: VerifiedFlow, start: float, stop: float, columns: slice) -> Encl
 
 
 def above_chord(
-    law: VerifiedFlow, rows: Array | arb_mat, start: float, stop: float, begun: Array, size: Array, first: int
+    law: VerifiedFlow, rows: Array | arb_mat, start: float, stop: float, start_bounds: Array, size: Array, first: int
 ) -> Array:
     """Return upper bounds ``(r,)`` of how far sums of integrals of ``|c'Phi(t, s) B_j(s)|`` up to ``t`` lie above their
-    chords on a cell between two marks, at every parameter, for ``rows (r, d)``. ``begun (d,)`` bounds these sums at
-    ``start`` for every state, ``size (m,)`` the inputs, which enter by the columns from the ``first`` one on.
+    chords on a cell between two marks, at every parameter, for ``rows (r, d)``. ``start_bounds (d,)`` bounds these
+    sums at ``start`` for every state, ``size (m,)`` the inputs, which enter by the columns from the ``first`` one on.
 
     An integrand that started before is ``|c'Phi(t, start) y|``. It lies above its chord by no more than ``c'Phi(t,
     start) y`` differs from its own chord: a term ``a s^n`` by at most ``(n - 1) n^(-n / (n - 1)) |a|``. What starts
@@ -117,10 +117,10 @@ def above_chord(
     enclosure, d = Enclosed.of(lines), lines.ncols()
     row_bounds = np.abs(enclosure.mid) + enclosure.rad
     terms, remainder = law.within(start, stop, start, stop, ORDER + 1)
-    total = 2.0 * (row_bounds @ remainder[:, :d]) @ begun
+    total = 2.0 * (row_bounds @ remainder[:, :d]) @ start_bounds
     for n, term in enumerate(terms[2:], 2):
         values = enclosed([term.columns(0, d).along(lines)])
-        total += (n - 1) * n ** (-n / (n - 1)) * ((np.abs(values.mid) + values.rad).sum(axis=(0, 1)) @ begun)
+        total += (n - 1) * n ** (-n / (n - 1)) * ((np.abs(values.mid) + values.rad).sum(axis=(0, 1)) @ start_bounds)
     if size.any():
         bounds, slope, units = law.sizes(start, stop)
         entering = slice(d + first, d + first + size.size)

@@ -20,7 +20,7 @@ from sparserob_core.checker.arithmetic.series import identity, stacked
 from sparserob_core.checker.flow.flow import VerifiedFlow
 from sparserob_core.checker.reach.closed_loop import VerifiedLoop
 from sparserob_core.checker.reach.deviations import Deviations, of_block, rounded_radii
-from sparserob_core.checker.reach.kernels import above_chord, pushes
+from sparserob_core.checker.reach.kernels import above_chord, compute_kernel
 from sparserob_core.checker.sets.along import NormSummand
 from sparserob_core.checker.sets.known import middle, summands_of
 from sparserob_core.checker.sets.polynomials import OUTWARD, Enclosed, product, rounding
@@ -61,7 +61,7 @@ class VerifiedKernel:
         errors = (errors + np.einsum("nd,spdw->nsw", a.rad, np.abs(self.coefficients))) * OUTWARD
         return plain, errors
 
-    def most(self, a: Enclosed, summands: Sequence[Summand | NormSummand]) -> Enclosed:
+    def integrate_support(self, a: Enclosed, summands: Sequence[Summand | NormSummand]) -> Enclosed:
         """Return the integral of the support function of ``K(r)'a`` over all parts, for ``a (N, d)``, as middles and
         radii ``(N,)``. The set is the sum of ``summands``."""
         polynomials = (values.reshape(-1, *values.shape[2:]) for values in self.along(a))
@@ -96,16 +96,16 @@ class MeasurableDeviations(Deviations):
 
     def kernel(self, piece: int) -> VerifiedKernel:
         """Return the kernel of a piece of the grid."""
-        return self.way(self.grid[piece], self.grid[piece + 1])
+        return self.build_kernel(self.grid[piece], self.grid[piece + 1])
 
     @remembered(lambda: KEPT, lambda self, start, stop: self.flow.alike(start, stop))
-    def way(self, start: float, stop: float) -> VerifiedKernel:
+    def build_kernel(self, start: float, stop: float) -> VerifiedKernel:
         """Return the kernel of an interval; its parts are the intervals between marks, each with its own ``u`` from -1
         to 1."""
         kernels, transition = list[Enclosed](), identity(self.flow.states)
         columns = slice(self.flow.driven, self.flow.driven + self.width)
         for first, last in reversed(list(pairwise(self.flow.marks([start, stop])))):
-            terms = pushes(self.flow, first, last, columns)
+            terms = compute_kernel(self.flow, first, last, columns)
             kernels.append(product(Enclosed.of(transition), Enclosed(terms.mid[:, 0], terms.rad[:, 0])))
             transition = transition * self.flow.over(first, last)[0].matrix
         order = max(len(kernel.mid) for kernel in kernels)
@@ -125,7 +125,7 @@ class MeasurableDeviations(Deviations):
         for piece in range(self.blocks):
             kernel = self.kernel(piece)
             if id(kernel) not in cached:
-                ends = kernel.most(exact, self.summands)
+                ends = kernel.integrate_support(exact, self.summands)
                 cached[id(kernel)] = kernel, (ends.mid + ends.rad).reshape(2, d).max(axis=0)
             radii.append(cached[id(kernel)][1])
         return rounded_radii(radii, self.sets)
@@ -147,7 +147,7 @@ class MeasurableDeviations(Deviations):
             used = np.flatnonzero((np.abs(rows.mid) + rows.rad).any(axis=1))
             if not used.size:
                 continue
-            integrals = kernel.most(Enclosed(rows.mid[used], rows.rad[used]), self.summands)
+            integrals = kernel.integrate_support(Enclosed(rows.mid[used], rows.rad[used]), self.summands)
             for index, m, r in zip(
                 (used // len(pieces)).tolist(), integrals.mid.tolist(), integrals.rad.tolist(), strict=True
             ):
@@ -169,7 +169,7 @@ class MeasurableLoop(VerifiedLoop):
         return MeasurableDeviations(self.shape, width, self.initial, pieces, flow=self.flow, grid=self.grid)
 
     @cached_property
-    def seen(self) -> list[dict[int, arb_mat]]:
+    def innovation_matrices(self) -> list[dict[int, arb_mat]]:
         """The transitions ``D_jl`` from the end of every piece ``l`` to the next breakpoint ``j`` of the control,
         ``(d, d)``."""
         K = len(self.breakpoints) - 1
@@ -207,37 +207,39 @@ class MeasurableLoop(VerifiedLoop):
         Phi, effect = self._compute_part_flow(piece, self.grid[piece], time)
         return Phi * self.nodes[piece] + effect
 
-    def highest(self, piece: int, time: float, rows: Array | arb_mat, beside: arb_mat | None = None) -> list[arb]:
+    def highest(self, piece: int, time: float, rows: Array | arb_mat, added_terms: arb_mat | None = None) -> list[arb]:
         """Return the `heights` of ``rows (r, d)`` at a time in a piece, with the disturbance up to this time."""
         from flint import arb
 
-        heights = super().highest(piece, time, rows, beside)
+        heights = super().highest(piece, time, rows, added_terms)
         if time == self.grid[piece]:
             return heights
-        effect = self.under_way(piece, time, rows)
+        effect = self.compute_partial_effect(piece, time, rows)
         return [
             height + arb(m, r) for height, m, r in zip(heights, effect.mid.tolist(), effect.rad.tolist(), strict=True)
         ]
 
-    def under_way(self, piece: int, time: float, rows: Array | arb_mat) -> Enclosed:
-        """Return the most that deviations of the disturbance on a piece add to ``rows (r, d)`` up to a time in this
-        piece, ``(r,)``."""
-        return self.deviations.way(self.grid[piece], time).most(as_enclosed(rows), self.deviations.summands)
+    def compute_partial_effect(self, piece: int, time: float, rows: Array | arb_mat) -> Enclosed:
+        """Return upper bounds of what deviations of the disturbance on a piece add to ``rows (r, d)`` up to a time in
+        this piece, ``(r,)``."""
+        return self.deviations.build_kernel(self.grid[piece], time).integrate_support(
+            as_enclosed(rows), self.deviations.summands
+        )
 
-    def bent(self, piece: int, start: float, stop: float, rows: Array | arb_mat) -> Array:
+    def bound_chord_error(self, piece: int, start: float, stop: float, rows: Array | arb_mat) -> Array:
         """Return upper bounds ``(r,)`` of how far ``max c'x(t)`` lies above its chord on ``[start, stop]``. The
         disturbance on the piece itself adds a sum of integrals of absolute values, or less."""
         axes = np.vstack([np.eye(self.system.states), -np.eye(self.system.states)])
         start_bounds, size = (
             np.zeros(len(axes)),
-            sum((summand.far for summand in self.deviations.summands), np.zeros(self.deviations.width)),
+            sum((summand.radii for summand in self.deviations.summands), np.zeros(self.deviations.width)),
         )
         if start > self.grid[piece]:
-            ends = self.under_way(piece, start, axes)
+            ends = self.compute_partial_effect(piece, start, axes)
             start_bounds = np.maximum(ends.mid + ends.rad, 0.0) * OUTWARD
         states = start_bounds.reshape(2, -1).max(axis=0)
         chord_error = above_chord(self.flow, rows, start, stop, states, size * OUTWARD, self.flow.driven)
-        return np.asarray((super().bent(piece, start, stop, rows) + chord_error) * OUTWARD)
+        return np.asarray((super().bound_chord_error(piece, start, stop, rows) + chord_error) * OUTWARD)
 
 
 def as_enclosed(rows: Array | arb_mat) -> Enclosed:

@@ -41,7 +41,7 @@ Pattern = npt.NDArray[np.bool_]
 
 @final
 @dataclass(frozen=True, eq=False)
-class Pushed:
+class ReachableSubspace:
     """The states that each entry of a disturbance reaches in ``x' = A x + E w``, whatever the times, and whichever of
     several systems act.
 
@@ -60,7 +60,7 @@ class Pushed:
     entries: int
 
     @staticmethod
-    def of(modes: Sequence[tuple[arb_mat, arb_mat]], vectors: Sequence[Sequence[Fraction]]) -> Pushed:
+    def of(modes: Sequence[tuple[arb_mat, arb_mat]], vectors: Sequence[Sequence[Fraction]]) -> ReachableSubspace:
         """Return the reached states for a disturbance along ``vectors (q, mw)``, without rounding; `Unchecked` unless
         the entries of all systems ``A (d, d)``, ``E (d, mw)`` are floats. The reached subspace is the smallest one that
         holds the columns of every ``E`` along the vectors and that no ``A`` leaves. It is found within ``d`` steps."""
@@ -78,16 +78,18 @@ class Pushed:
             images = [row for a in systems for row in (fmpq_mat(spanned) * a).tolist()] if spanned else []
             spanned = spanning([*spanned, *images])
             pattern = pattern | (linked @ pattern.astype(int) > 0)
-        return Pushed(pattern, len(spanned), fmpq_mat([row for matrix in columns for row in matrix.tolist()]).rank())
+        return ReachableSubspace(
+            pattern, len(spanned), fmpq_mat([row for matrix in columns for row in matrix.tolist()]).rank()
+        )
 
     @staticmethod
-    def linked(A: Pattern, E: Pattern, vectors: Sequence[Sequence[Fraction]]) -> Pushed:
+    def linked(A: Pattern, E: Pattern, vectors: Sequence[Sequence[Fraction]]) -> ReachableSubspace:
         """Return the reached states from the positions of entries that may differ from 0, of ``A (d, d)`` and
         ``E (d, mw)``, for a disturbance along ``vectors (q, mw)``."""
         pattern: Pattern = E.astype(int) @ np.array([[bool(v) for v in vector] for vector in vectors]).T > 0
         for _ in range(len(A) - 1):
             pattern = pattern | (A.astype(int) @ pattern.astype(int) > 0)
-        return Pushed(pattern, int(pattern.any(axis=1).sum()), int(pattern.any(axis=0).sum()))
+        return ReachableSubspace(pattern, int(pattern.any(axis=1).sum()), int(pattern.any(axis=0).sum()))
 
 
 def _convert_to_rational(rows: Sequence[Sequence[arb]]) -> fmpq_mat:
@@ -98,7 +100,7 @@ def _convert_to_rational(rows: Sequence[Sequence[arb]]) -> fmpq_mat:
 
 @final
 @dataclass(frozen=True, eq=False)
-class SeenDeviations:
+class MeasuredDeviations:
     """The effect of some blocks of deviations on some innovations.
 
     Attributes
@@ -120,7 +122,7 @@ class SeenDeviations:
     reach: Array | None = None
 
     @cached_property
-    def most(self) -> int:
+    def rank_bound(self) -> int:
         """An upper bound of the rank: the capacity of a cut between rows and columns, of which a group counts at most
         its number of independent members. Any cut is such a bound. The smallest one is found by the largest flow (Ford
         and Fulkerson 1956)."""
@@ -151,7 +153,7 @@ class SeenDeviations:
         from flint import ctx
         from scipy.linalg import qr
 
-        r, c, rank = self.matrix.nrows(), self.matrix.ncols(), self.most
+        r, c, rank = self.matrix.nrows(), self.matrix.ncols(), self.rank_bound
         D, rows, columns = (
             _equilibrate(self.matrix) if rank == c or self.reach is None else _scale_by_reach(self.matrix, self.reach)
         )

@@ -40,7 +40,7 @@ class Sources:
     is_still: bool
 
     @cached_property
-    def strayed(self) -> BoundedInput | None:
+    def measurable_input(self) -> BoundedInput | None:
         """The measurable disturbances, counted from the middle of their set, where the control does not answer them;
         else ``None``. They are the errors of a command of size 1 through the columns of ``E``."""
         bound = self.problem.measurable
@@ -58,9 +58,9 @@ class Sources:
             return BoundedInputOver(self.flows, entering)
         return BoundedInputAt(self.flows.at(()), entering)
 
-    def strayed_at(self, parameter: Sequence[float]) -> BoundedInputHere | None:
-        """Return `strayed` at one parameter."""
-        return None if self.strayed is None else self.strayed.at(parameter)
+    def measurable_input_at(self, parameter: Sequence[float]) -> BoundedInputHere | None:
+        """Return `measurable_input` at one parameter."""
+        return None if self.measurable_input is None else self.measurable_input.at(parameter)
 
     @cached_property
     def execution(self) -> BoundedInput | None:
@@ -89,7 +89,7 @@ class Sources:
 
     def entering(self, parameter: Sequence[float] | None) -> list[BoundedInput]:
         """Return all bounded inputs, at one parameter where it is given."""
-        sources = (self.execution, self.strayed)
+        sources = (self.execution, self.measurable_input)
         return [source if parameter is None else source.at(parameter) for source in sources if source is not None]
 
     def erring(self, c: Array, time: float, parameter: Sequence[float]) -> tuple[Array | None, arb]:

@@ -19,7 +19,7 @@ from sparserob_core.checker.flow.flow import VerifiedFlow
 from sparserob_core.checker.flow.flows import VerifiedFlows
 from sparserob_core.checker.flow.law import ParameterBox
 from sparserob_core.checker.flow.segment import Powers, VerifiedSegment, shifted
-from sparserob_core.checker.problem.held import Lasting
+from sparserob_core.checker.problem.held import HeldComponents
 from sparserob_core.checker.sets.known import known
 from sparserob_core.checker.sets.polynomials import OUTWARD, Enclosed, rounding
 from sparserob_core.sip.convex_set import Array, ConvexSet
@@ -47,7 +47,7 @@ class Scene:
         The centre of the initial states, ``(d,)``, and the set of deviations from it.
     disturbance, changes
         The set of the disturbance, ``None`` without one, and the breakpoints between which it is constant.
-    lasting
+    held_components
         The components of the disturbance that are held over several of these intervals.
     """
 
@@ -57,7 +57,7 @@ class Scene:
     disturbance: ConvexSet | None
     changes: list[float]
     initial_set: ConvexSet | None = None
-    lasting: Lasting | None = None
+    held_components: HeldComponents | None = None
 
 
 @final
@@ -158,10 +158,10 @@ class States:
 
     @remembered(key=lambda self, *pair: tuple(map(id, pair)))
     def _join_blocks(self, first: StateBlock, second: StateBlock) -> StateBlock:
-        Delta = (second.Phi * first.Delta).beside(second.Delta)
+        Delta = (second.Phi * first.Delta).append_columns(second.Delta)
         return StateBlock(second.Phi * first.Phi, Delta, second.Gamma.columns(0, 0))
 
-    def seen(
+    def project(
         self, basis: Array, place: int, start: float, stop: float, order: int
     ) -> tuple[Enclosed, list[tuple[ConvexSet, Enclosed]]]:
         """Return the states projected onto rows ``basis (b, d)`` on a part from ``start`` to ``stop`` of the interval
@@ -193,8 +193,8 @@ class States:
             firsts = np.flatnonzero(np.diff(block, prepend=-1))
             rad = (rad + rounding(len(mid)) * np.abs(mid)) * OUTWARD
             mid, rad = (np.add.reduceat(values, firsts, axis=0) for values in (mid, rad))
-            if scene.lasting is not None:
-                mid, rad = scene.lasting.gathered(mid, rad)
+            if scene.held_components is not None:
+                mid, rad = scene.held_components.gathered(mid, rad)
             effects.append((scene.disturbance, Enclosed(mid, rad)))
         if scene.initial_set is not None:
             initial = ring(flow.monomials, propagated_rows, self.effect(place)[0])

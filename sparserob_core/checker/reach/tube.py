@@ -53,7 +53,7 @@ class Polynomial:
         How much the bound may be above the true value because the worst disturbance switches within the cell.
     turning
         About the part of ``kinks`` that is due to the size of the box of parameters.
-    bent
+    parameter_errors
         A further part of the error, due to each parameter, ``(nu,)``; ``None`` where there is none.
     """
 
@@ -62,7 +62,7 @@ class Polynomial:
     expansion: float
     kinks: float
     turning: float = 0.0
-    bent: Array | None = None
+    parameter_errors: Array | None = None
 
 
 class Around(NamedTuple):
@@ -87,12 +87,12 @@ class ProjectedStates:
     )
 
     def on(self, place: int, start: float, stop: float) -> tuple[Enclosed, list[tuple[ConvexSet, Enclosed]]]:
-        """Return `States.seen` for the basis on ``[start, stop]``, a part of an interval between marks."""
+        """Return `States.project` for the basis on ``[start, stop]``, a part of an interval between marks."""
         key = place, start, stop
         if key not in self._projections:
             if len(self._projections) >= CELLS_KEPT or not self.states.flow.monomials.degree:
                 self._projections.clear()
-            self._projections[key] = self.states.seen(self.basis, place, start, stop, ORDER)
+            self._projections[key] = self.states.project(self.basis, place, start, stop, ORDER)
         return self._projections[key]
 
 
@@ -251,7 +251,7 @@ class LoopTube:
         begin, end = self._enclose_heights(piece, start, z), self._enclose_heights(piece, stop, z)
         chord_errors = np.zeros(z.shape[0])
         if start < stop:
-            chord_errors = self.loop.bent(piece, start, stop, _combine_rows(z, self.basis))
+            chord_errors = self.loop.bound_chord_error(piece, start, stop, _combine_rows(z, self.basis))
         errors = np.maximum(begin.rad, end.rad) + rounding(2) * (np.abs(begin.mid) + np.abs(end.mid)) + chord_errors
         chords = np.stack([begin.mid, end.mid - begin.mid] if start < stop else [begin.mid])
         return [

@@ -71,13 +71,15 @@ class NormSummand:
         return np.asarray((heights + errors).reshape(2, -1).max(axis=0) * OUTWARD)
 
     @cached_property
-    def far(self) -> Array:
+    def radii(self) -> Array:
         """The upper bounds ``(mw,)`` of the distance from the point to the set's ends along every coordinate."""
         return np.pad(self._radii, (self.before, self.after))
 
-    def swept(self, plain: Array, off: Array, sizes: Array, ends: Array) -> tuple[Array, Array, Array, Array]:
-        """Return the integrals of the support function along polynomials, as `Summand.swept` does; ``sizes`` are not
-        used."""
+    def integrate_support(
+        self, plain: Array, off: Array, sizes: Array, ends: Array
+    ) -> tuple[Array, Array, Array, Array]:
+        """Return the integrals of the support function along polynomials, as `Summand.integrate_support` does;
+        ``sizes`` are not used."""
         own = plain[:, :, self.before : self.before + self.offset.size]
         outputs = [np.zeros(0)] * 3
         for first in range(0, len(plain), AT_ONCE):
@@ -85,7 +87,7 @@ class NormSummand:
             batch_outputs = self._integrate(own[batch], ends[batch])
             outputs = [np.concatenate(pair) for pair in zip(outputs, batch_outputs, strict=True)]
         value, errors, tops = outputs
-        errors = (errors + (ends + 1.0) * (off @ self.far)) * OUTWARD
+        errors = (errors + (ends + 1.0) * (off @ self.radii)) * OUTWARD
         return value, errors, errors, tops
 
     def _integrate(self, plain: Array, ends: Array) -> tuple[Array, Array, Array]:

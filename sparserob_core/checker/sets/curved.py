@@ -46,7 +46,7 @@ class Ellipsoidal(Shape):
     def holds(self, point: Sequence[arb]) -> bool:
         return bool(self._compute_squared_gauge([x - m for x, m in zip(point, balls(self.centre), strict=True)]) <= 1)
 
-    def far(self, direction: Sequence[arb]) -> list[arb]:
+    def compute_support_offset(self, direction: Sequence[arb]) -> list[arb]:
         images = [along(row, direction) for row in self.source.shape]
         size = total(c * v for c, v in zip(direction, images, strict=True)).nonnegative_part().sqrt()
         return [v / size for v in images]
@@ -72,10 +72,10 @@ class Ellipsoidal(Shape):
 
     @cached_property
     def norm(self) -> Norm:
-        return Norm(self.source.factor, self.missed, 2.0)
+        return Norm(self.source.factor, self.factor_residual, 2.0)
 
     @cached_property
-    def missed(self) -> float:
+    def factor_residual(self) -> float:
         """The upper bound, in balls, of the difference between the matrix ``S`` and ``L L'`` relative to ``L L'``: of
         the norm of ``L^-1 S L'^-1 - 1``, with the rounded Cholesky factor ``L``."""
         from flint import arb_mat, ctx
@@ -115,7 +115,7 @@ class Ball(Shape):
         power_sum = total(_compute_power(size, q) for size in sizes if not size.is_zero())
         return power_sum if power_sum.is_zero() else _compute_power(power_sum, 1 / q)
 
-    def far(self, direction: Sequence[arb]) -> list[arb]:
+    def compute_support_offset(self, direction: Sequence[arb]) -> list[arb]:
         q = ball(self.source.p) / (ball(self.source.p) - 1)
         powers = [_compute_power(c, q - 1) if not c.is_zero() else c for c in direction]
         size = self.gauge(powers)
@@ -225,8 +225,11 @@ class Cylindrical(Shape):
     def gauge(self, offsets: Sequence[arb]) -> arb:
         return self.base.gauge(self._project_onto_base(offsets))
 
-    def far(self, direction: Sequence[arb]) -> list[arb]:
-        return [*self.base.far(direction[: self.spanned]), *balls(np.zeros(self.dimension - self.spanned))]
+    def compute_support_offset(self, direction: Sequence[arb]) -> list[arb]:
+        return [
+            *self.base.compute_support_offset(direction[: self.spanned]),
+            *balls(np.zeros(self.dimension - self.spanned)),
+        ]
 
     def bound(self, value: Array, spread: Array) -> tuple[Array, Array]:
         raise Broken("a disturbance is unbounded")

@@ -67,13 +67,13 @@ def product(left: Enclosed, right: Enclosed) -> Enclosed:
 class Truncated:
     """Polynomials in the time on ``[0, 1]`` and in the parameters on ``[-1, 1]``, with bounded truncation errors.
 
-    The ``coefficients`` are ``(n, J + 1, M)``. The error of each polynomial is at most ``lost (n,)``: products drop the
-    terms beyond the degrees, and bound them.
+    The ``coefficients`` are ``(n, J + 1, M)``. The error of each polynomial is at most ``error (n,)``: products drop
+    the terms beyond the degrees, and bound them.
     """
 
     monomials: Monomials
     coefficients: Array
-    lost: Array
+    error: Array
 
     def __mul__(self, other: Truncated) -> Truncated:
         left, right = self.coefficients, other.coefficients
@@ -91,23 +91,23 @@ class Truncated:
         a, b = self.size, other.size
         dropped = np.maximum(a * b - kept, 0.0) + rounding(J * len(first) + 4) * a * b
         return Truncated(
-            self.monomials, coefficients, (dropped + a * other.lost + (b + other.lost) * self.lost) * OUTWARD
+            self.monomials, coefficients, (dropped + a * other.error + (b + other.error) * self.error) * OUTWARD
         )
 
     def __add__(self, other: Truncated) -> Truncated:
         coefficients, size = self.coefficients + other.coefficients, self.size + other.size
-        return Truncated(self.monomials, coefficients, (self.lost + other.lost + rounding(1) * size) * OUTWARD)
+        return Truncated(self.monomials, coefficients, (self.error + other.error + rounding(1) * size) * OUTWARD)
 
     def scaled(self, factors: Array) -> Truncated:
         """Return each polynomial times a number."""
         coefficients, sizes = self.coefficients * factors[:, None, None], np.abs(factors)
-        return Truncated(self.monomials, coefficients, sizes * (self.lost + rounding(1) * self.size) * OUTWARD)
+        return Truncated(self.monomials, coefficients, sizes * (self.error + rounding(1) * self.size) * OUTWARD)
 
     def plus(self, number: float) -> Truncated:
         """Return each polynomial plus a number."""
         coefficients = self.coefficients.copy()
         coefficients[:, 0, 0] += number
-        return Truncated(self.monomials, coefficients, self.lost + rounding(1) * (self.size + abs(number)))
+        return Truncated(self.monomials, coefficients, self.error + rounding(1) * (self.size + abs(number)))
 
     @cached_property
     def size(self) -> Array:
@@ -148,11 +148,11 @@ def _bound_lengths(monomials: Monomials, parts: Array, none: Array) -> tuple[Arr
     is_valid = np.isfinite(middle) & (middle > TINY)
     middle = np.where(is_valid, middle, 1.0)
     e = square.scaled(1.0 / middle).plus(-1.0)
-    deviation = np.abs(e.coefficients).sum(axis=(1, 2)) + e.lost
+    deviation = np.abs(e.coefficients).sum(axis=(1, 2)) + e.error
     is_near = is_valid & (deviation < NEAR)
     root = (e * (e * e.scaled(none + 1.0 / 16.0).plus(-1.0 / 8.0)).plus(1.0 / 2.0)).plus(1.0).scaled(np.sqrt(middle))
     deviation = np.where(is_near, deviation, 0.0)
     excess = np.sqrt(middle) * deviation**4 * 5.0 / 128.0 / (1.0 - deviation) ** 3.5
-    error = (root.lost + rounding(8) * root.size) * OUTWARD
+    error = (root.error + rounding(8) * root.size) * OUTWARD
     coefficients = np.where(is_near[:, None, None], root.coefficients, 0.0)
     return coefficients, np.where(is_near, error, np.inf), np.where(is_near, excess, np.inf)

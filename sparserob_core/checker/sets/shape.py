@@ -169,7 +169,7 @@ class Shape(ABC):
         """Return the factor by which the set must be enlarged about its centre to contain ``centre + offsets``."""
         raise Unchecked(f"the checker cannot tell who is in a {self.source.kind}")
 
-    def far(self, direction: Sequence[arb]) -> list[arb]:
+    def compute_support_offset(self, direction: Sequence[arb]) -> list[arb]:
         """Return balls near the offset from the centre to the point of the set farthest out in a direction."""
         raise Unchecked(f"the checker does not know how far a {self.source.kind} reaches")
 
@@ -244,12 +244,16 @@ def basis_of(shape: Shape) -> tuple[Array, Array] | None:
     return np.array(vectors).reshape(len(vectors), shape.dimension), z[:, : len(vectors)]
 
 
-def far_point(shape: Shape, direction: Array) -> list[arb]:
+def find_inner_support_point(shape: Shape, direction: Array) -> list[arb]:
     """Return a point of the set far out in a direction, in exact numbers and proven to be in the set; the centre
     where none better is. A rounded point would be far outside a thin set that is oblique to the axes."""
     from flint import arb, ctx
 
-    middle, offset, spare = balls(shape.centre), shape.far(balls(direction)), arb(2) ** (SPARE - ctx.prec)
+    middle, offset, spare = (
+        balls(shape.centre),
+        shape.compute_support_offset(balls(direction)),
+        arb(2) ** (SPARE - ctx.prec),
+    )
     while spare < 0.5:
         point = [(m + (1 - spare) * v).mid() for m, v in zip(middle, offset, strict=True)]
         if shape.holds(point):

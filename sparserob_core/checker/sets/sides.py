@@ -11,7 +11,7 @@ import numpy as np
 
 from sparserob_core.checker.arithmetic.balls import below
 from sparserob_core.checker.outcome import TOLERANCE, Unchecked
-from sparserob_core.checker.sets.shape import Shape, along, dot, far_point, total
+from sparserob_core.checker.sets.shape import Shape, along, dot, find_inner_support_point, total
 from sparserob_core.sip.convex_set import Array
 
 if TYPE_CHECKING:
@@ -95,7 +95,7 @@ class Sides:
     @staticmethod
     def cell(curved: Curved, low: Array, high: Array) -> Sides:
         """Return the rows of a curved set on the cell of directions ``[low, high]``."""
-        w = far_point(curved.shape, curved.floats((low + high) / 2))
+        w = find_inner_support_point(curved.shape, curved.floats((low + high) / 2))
         free = np.flatnonzero(high > low)
         rows = []
         for ends in product((0, 1), repeat=free.size):

@@ -37,7 +37,7 @@ class Summand:
         return int(self.corners.shape[1])
 
     @cached_property
-    def far(self) -> Array:
+    def radii(self) -> Array:
         """The upper bound of the absolute value of every coordinate on the set, ``(mw,)``."""
         return np.asarray((np.abs(self.corners) + self.rad).max(axis=0) * OUTWARD)
 
@@ -45,13 +45,15 @@ class Summand:
         """Return the set with 0 in further coordinates before and after its own."""
         return Summand(*(np.pad(table, ((0, 0), (before, after))) for table in (self.corners, self.rad)))
 
-    def swept(self, plain: Array, off: Array, sizes: Array, ends: Array) -> tuple[Array, Array, Array, Array]:
+    def integrate_support(
+        self, plain: Array, off: Array, sizes: Array, ends: Array
+    ) -> tuple[Array, Array, Array, Array]:
         """Return the integrals of the support function over ``u`` from -1 to ``ends (n,)``, along polynomials ``plain
         (n, p + 1, mw)`` with error bounds ``off`` and sums of absolute values ``sizes``. They are values, how much more
         and how much less they may be, and bounds of the absolute support values without their errors."""
         P = np.einsum("npw,vw->npv", plain, self.corners)
         e = (off @ (np.abs(self.corners) + self.rad).T + sizes @ self.rad.T) * OUTWARD
-        return *swept(P, e, ends), np.abs(P).sum(axis=1).max(axis=1)
+        return *integrate_maximum(P, e, ends), np.abs(P).sum(axis=1).max(axis=1)
 
 
 def channels(count: int) -> list[Summand]:
@@ -64,13 +66,13 @@ def integrate(summands: Sequence[Summand | NormSummand], plain: Array, off: Arra
     ``summands`` along polynomials ``plain (n, p + 1, mw)`` with error bounds ``off (n, mw)``."""
     (count, order, mw), sizes = plain.shape, np.abs(plain).sum(axis=1)
     errors = off + rounding(4 * order + 32 + mw) * sizes
-    integrals = [summand.swept(plain, errors, sizes, np.ones(count))[:3] for summand in summands]
+    integrals = [summand.integrate_support(plain, errors, sizes, np.ones(count))[:3] for summand in summands]
     value, excess, deficit = (np.stack(columns, axis=1) / 2.0 for columns in zip(*integrals, strict=True))
     rounded = rounding(4) * (np.abs(value) + excess)
     return value - deficit - rounded, value + excess + rounded
 
 
-def swept(P: Array, e: Array, ends: Array) -> tuple[Array, Array, Array]:
+def integrate_maximum(P: Array, e: Array, ends: Array) -> tuple[Array, Array, Array]:
     """Return the integrals of the largest of ``v`` polynomials ``P (M, p + 1, v)``, over ``u`` from -1 to ``ends
     (M,)``, and how much more and how much less they may be. Error bounds ``e (M, v)`` of the polynomials allow for the
     rounding errors in the sum of two values."""

@@ -16,7 +16,7 @@ from sparserob_core.checker.claims.claims import judged, precision_of
 from sparserob_core.checker.claims.constraints import covered, cut_times, prove_on_cells
 from sparserob_core.checker.claims.followed import FollowedRow
 from sparserob_core.checker.claims.multipliers import admissible
-from sparserob_core.checker.claims.replay import reached
+from sparserob_core.checker.claims.replay import compute_state
 from sparserob_core.checker.claims.window import ConstraintWindow
 from sparserob_core.checker.outcome import FIGURES, TOLERANCE, Broken, Finding, Unchecked
 from sparserob_core.checker.sets.known import known
@@ -77,7 +77,7 @@ def _list_rows(case: Case) -> list[SupremumRow]:
         SupremumRow(window, direction, b)
         for window in case.windows
         if window not in case.returned
-        for direction, b in window.seen.facets or []
+        for direction, b in window.enclosed_set.facets or []
     ]
     if rows:
         return rows
@@ -120,26 +120,26 @@ def _verify_row(case: Case, asked: SupremumRow, entry: Mapping[str, Any]) -> str
     lower, upper = (None if entry.get(side) is None else number(entry, side) for side in ("lower", "upper"))
     if lower is not None and upper is not None and lower > upper:
         raise Broken(f"from {lower!r} to {upper!r} is empty")
-    reached_side, proven_side = (lower, upper) if sense == "sup" else (upper, lower)
-    if reached_side is None:
+    attained_side, proven_side = (lower, upper) if sense == "sup" else (upper, lower)
+    if attained_side is None:
         raise Unchecked("no value is written that is reached")
     sign = 1.0 if sense == "sup" else -1.0
-    low, high = sign * reached_side, None if proven_side is None else sign * proven_side
+    low, high = sign * attained_side, None if proven_side is None else sign * proven_side
     _verify_margin(asked, entry, sign, high)
     case.clock.check()
     row = FollowedRow(case, asked.window, asked.direction)
     value = _enclose_witness_value(case, asked, entry, row)
     if not value[1] >= low:
-        raise Broken(f"{reached_side!r} is written, its witness reaches {sign * value[1]!r}")
+        raise Broken(f"{attained_side!r} is written, its witness reaches {sign * value[1]!r}")
     if not value[0] >= low:
-        raise Unchecked(f"{reached_side!r} is written, and the witness is followed to {sign * value[0]!r} only")
+        raise Unchecked(f"{attained_side!r} is written, and the witness is followed to {sign * value[0]!r} only")
     if high is None:
-        raise Unchecked(f"{reached_side:.9g} is reached, and no bound is written on the other side")
+        raise Unchecked(f"{attained_side:.9g} is reached, and no bound is written on the other side")
     if value[0] > high:
         raise Broken(f"{proven_side!r} is written, its witness reaches {sign * value[0]!r}")
     count = row.prove(high)[0] if case.followed.are_possible else _prove_row_on_cells(case, asked, high)
     side = "above" if sense == "sup" else "below"
-    return f"{reached_side:.9g} is reached, nothing is {side} {proven_side:.9g} ({count} cells)"
+    return f"{attained_side:.9g} is reached, nothing is {side} {proven_side:.9g} ({count} cells)"
 
 
 def _verify_margin(asked: SupremumRow, entry: Mapping[str, Any], sign: float, high: float | None) -> None:
@@ -174,7 +174,7 @@ def _enclose_witness_value(
     if problem.initial_set is not None and not known(problem.initial_set).contains(deviation):
         raise Broken("the deviation of the initial state is not shown to be in its set")
     changes, signal = _read_signal(case, entry)
-    low, high = row.beside(time, time)
+    low, high = row.enclose_added_terms(time, time)
     execution = case.sources.delivered_at(parameter.tolist())
     if execution is not None:  # an enclosure of the worst errors
         errors = execution.added(window.split(asked.direction)[0], time)
@@ -184,7 +184,7 @@ def _enclose_witness_value(
         value = row.worst.along(time, deviation, changes, signal)
         return value[0] + low - 4.0 * HALF_ULP * (abs(value[0]) + abs(low)), value[1] + high
     fine, on_grid = _refine_grid(case, changes, signal)
-    state = reached(fine, time, parameter, on_grid, entry.get("deviation"))
+    state = compute_state(fine, time, parameter, on_grid, entry.get("deviation"))
     direction = window.split(asked.direction)[0]
     total = sum((a * x for a, x in zip(balls(direction), state, strict=True)), ball(0.0))
     return below(total + low), above(total + high)
@@ -233,7 +233,7 @@ def _prove_row_on_cells(case: Case, asked: SupremumRow, limit: float) -> int:
     cells."""
     window = asked.window
     single_row = replace(window, shape=Polytope(asked.direction[None], np.array([limit])))
-    facet_basis = basis_of(single_row.seen)
+    facet_basis = basis_of(single_row.enclosed_set)
     assert facet_basis is not None
     (basis, gains), z = np.split(facet_basis[0], [window.states], axis=1), facet_basis[1]
     unit = SHARE * abs(limit) or 1.0  # the excused excess is subtracted from the limit, of which it is a rounding error

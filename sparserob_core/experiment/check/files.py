@@ -415,7 +415,7 @@ def _complete_state(case: Case, said: object) -> object:
     The added ones are known. A state that has all coordinates is returned as it is.
     """
     initial_state = np.asarray(case.problem.initial_state, dtype=float)
-    if not isinstance(said, list) or len(said) != case.stated.system.states:
+    if not isinstance(said, list) or len(said) != case.original_problem.system.states:
         return said
     return [*said, *initial_state[len(said) :].tolist()]
 
@@ -453,7 +453,7 @@ def _compare_units(case: Case, summary: Mapping[str, Any]) -> list[str]:
     wrong = [f"units: {unit} is none of the config's" for unit in dict.fromkeys(map(repr, different))]
     effort = case.problem.cost_unit
     cost = names.time if case.counts else effort
-    user_states, units = case.stated.system.states, list(names.state_units)
+    user_states, units = case.original_problem.system.states, list(names.state_units)
     for key, unit in (("time", names.time), ("states", units[:user_states]), ("cost", cost), ("J", effort)):
         allowed = (unit, units) if key == "states" else (unit,)  # earlier versions wrote the units of added states too
         wrong += [f"units: {key} is {entry[key]!r}, not {unit!r}"] if key in entry and entry[key] not in allowed else []

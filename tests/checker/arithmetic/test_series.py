@@ -164,13 +164,13 @@ def test_parts_of_matrices_are_put_together_and_taken_apart():
     A, B = rng.normal(size=(2, 2, 2, 3))
     with ctx.workprec(96):
         left, right = (Series(known, [matrix(m) for m in one]) for one in (A, B))
-        both, below = left.beside(right), left.above(matrix([[7.0, 8.0, 9.0]]))
+        both, below = left.append_columns(right), left.above(matrix([[7.0, 8.0, 9.0]]))
         assert (values_of(both) == np.concatenate([A, B], axis=2)).all()
         assert (values_of(both.columns(1, 4)) == np.concatenate([A, B], axis=2)[:, :, 1:4]).all()
         assert both.columns(2, 2).shape == (2, 0)
         assert (values_of(below)[:, :2] == A).all() and values_of(below)[:, 2].tolist() == [[7, 8, 9], [0, 0, 0]]
         assert (values_of(left.transpose()) == A.transpose(0, 2, 1)).all()
-        assert left.beside(left.columns(0, 0)).shape == (2, 3)
+        assert left.append_columns(left.columns(0, 0)).shape == (2, 3)
         total = dot([left, right], [left.transpose(), right.transpose()])
         truth = left * left.transpose() + right * right.transpose()
         assert (values_of(total) == values_of(truth)).all()

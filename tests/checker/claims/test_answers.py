@@ -469,7 +469,9 @@ def test_a_direction_of_a_fixed_state_is_that_state_alone_at_the_end():
 def test_the_effort_is_looked_for_where_deviations_go(monkeypatch):
     """How far every entry goes, from the middle of its set, is handed on."""
     told = []
-    monkeypatch.setattr("sparserob_core.checker.claims.answers.at_most", lambda *given: told.append(given) or 1)
+    monkeypatch.setattr(
+        "sparserob_core.checker.claims.answers.prove_effort_limit", lambda *given: told.append(given) or 1
+    )
     feedback_of(case_of(cost="worst", disturbance=Box([-0.1], [0.3])))._verify_effort(arb(9.0))
     a, A, _, reach, limit, _ = told[0]
     assert reach == pytest.approx([0.2, 0.2]) and float(limit) == 9.0

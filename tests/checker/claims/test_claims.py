@@ -221,7 +221,7 @@ def test_a_final_state_is_met_to_rounding():
 def test_what_fixed_states_miss_is_told_with_the_rounding_of_the_largest(monkeypatch):
     case = case_of(terminal=[Equality([0.5])])
     said = {"constraint": replay.EQUALS, "time": 2.0, "violation": 3.0}
-    monkeypatch.setattr(replay, "missed", lambda case: [(arb(3), 2.0), (arb(-1), 64.0), (arb(2), 0.5)])
+    monkeypatch.setattr(replay, "compute_residuals", lambda case: [(arb(3), 2.0), (arb(-1), 64.0), (arb(2), 0.5)])
     assert replay.exceeded(case, said) == ([3.0, -1.0, 2.0], 64.0 * replay.TOLERANCE)
 
 

@@ -32,7 +32,7 @@ class Erring(BoundedInputHere):
     def least(self, c: np.ndarray, time: float) -> np.ndarray:
         raise NotImplementedError
 
-    def bent(self, c: np.ndarray, start: float, stop: float) -> float:
+    def bound_chord_error(self, c: np.ndarray, start: float, stop: float) -> float:
         return 0.01 * float(FAR @ np.abs(c))
 
 

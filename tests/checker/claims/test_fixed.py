@@ -53,7 +53,7 @@ def test_a_push_that_is_known_counts_in_a_fixed_state(which: str) -> None:
 def test_a_state_that_a_known_push_moves_does_not_rest() -> None:
     case = case_of("one that pushes", 1.0, status="certified", decision=[[0.0] * 4])
     with ctx.workprec(96):
-        ((off, _),) = constraints.missed(case)
+        ((off, _),) = constraints.compute_residuals(case)
         assert off.contains(0) and not constraints._is_at_rest(case, 0)
         assert constraints._is_at_rest(case_of("beside one that varies", decision=[[0.0] * 4]), 1)
 

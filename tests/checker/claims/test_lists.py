@@ -92,7 +92,7 @@ def truth(name: str, rows: np.ndarray, time: float, u: np.ndarray = U) -> np.nda
 def test_a_row_at_one_time_is_exceeded_by_what_the_worst_case_does_then(name: str) -> None:
     limits = np.array([1.0, 2.0, 3.0, 4.0])
     case = case_of(name, path=[sr.PathConstraint(sr.Polytope(DIRECTIONS, limits), 0.25, 1.875)])
-    order = [int(np.abs(DIRECTIONS - c[:2]).sum(axis=1).argmin()) for c, _ in case.windows[0].seen.facets]
+    order = [int(np.abs(DIRECTIONS - c[:2]).sum(axis=1).argmin()) for c, _ in case.windows[0].enclosed_set.facets]
     for time in (0.25, 0.8125, 1.875):
         said = {"constraint": "path", "time": time, "parameter": [], "violation": 0.0}
         found = np.array(replay.exceeded(case, said)[0])

@@ -114,7 +114,7 @@ def test_a_wall_may_be_where_the_worst_deviation_takes_the_loop_and_no_nearer(na
     with pytest.raises(Broken, match="exceeded"):
         constraints.bounded(near, near.windows[0])
     # row by row, and at single deviations
-    order = [int(np.abs(DIRECTIONS - c[:2]).sum(axis=1).argmin()) for c, _ in judged.windows[0].seen.facets]
+    order = [int(np.abs(DIRECTIONS - c[:2]).sum(axis=1).argmin()) for c, _ in judged.windows[0].enclosed_set.facets]
     rng = np.random.default_rng(5)
     for t in (0, 60, int(np.searchsorted(times, loop.breakpoints[1])), times.size - 1):
         said = {"constraint": "path", "time": float(times[t]), "violation": 0.0}

@@ -45,7 +45,7 @@ class Told(BoundedInputHere):
     def least(self, c: np.ndarray, time: float) -> np.ndarray:
         raise NotImplementedError
 
-    def bent(self, c: np.ndarray, start: float, stop: float) -> float:
+    def bound_chord_error(self, c: np.ndarray, start: float, stop: float) -> float:
         return 0.0
 
 
@@ -75,7 +75,7 @@ def test_each_allowance_beside_a_row_covers_its_own_loss_alone(lost: str, monkey
     made, rng = kind("known"), np.random.default_rng(3)
     case = made.case(path=[walls("known", "moving" if lost == "conversion" else "mixed", made)[0](np.full(4, 9.0))])
     basis, gains = (np.eye(2), np.zeros((2, 0))) if lost == "conversion" else (np.zeros((2, 2)), np.eye(2))
-    beside = case.beside(case.windows[0], basis, gains)
+    beside = case.build_added_terms(case.windows[0], basis, gains)
     assert beside is not None
     monkeypatch.setattr(window, "HALF_ULP", 0.0)
     monkeypatch.setattr(window, "OUTWARD", 1.0)
@@ -84,7 +84,7 @@ def test_each_allowance_beside_a_row_covers_its_own_loss_alone(lost: str, monkey
     for _ in range(25):
         start = float(rng.uniform(0.3, 0.45))
         z = np.array([[1.0, 0.0], [0.0, -1.0]]) if lost == "conversion" else rng.normal(size=(2, 2))
-        (offset, _), u = case.windows[0].moved(start, start), [arb(float(v)) for v in made.u[:, 0]]
+        (offset, _), u = case.windows[0].evaluate_reference(start, start), [arb(float(v)) for v in made.u[:, 0]]
         beside_it = [-x for x in offset] if lost == "conversion" else u
         for poly, row in zip(beside.added([polynomial([0.0])] * 2, start, start, z), z, strict=True):
             truth = sum((arb(float(a)) * x for a, x in zip(row, beside_it, strict=True)), arb(0))
@@ -100,13 +100,13 @@ def test_what_stands_beside_a_row_is_off_by_no_more_than_it_says(which: str) -> 
     held = case.windows[0]
     basis = np.array([[1.0 / 3.0, 0.7], [1.0 / 3.0 + 1e-12, 0.7]])
     gains = np.array([[0.1, 0.3], [0.1, 0.3 + 1e-12]])
-    beside = case.beside(held, basis, gains)
+    beside = case.build_added_terms(held, basis, gains)
     assert beside is not None
     for _ in range(15):
         start = float(rng.uniform(0.3, 0.35))
         z = rng.normal(size=(3, 1)) * np.array([1.0, -1.0])
         for poly, row in zip(beside.added([polynomial([0.0])] * 3, start, start, z), z, strict=True):
-            (offset, _), u = held.moved(start, start), made.u[:, 0]
+            (offset, _), u = held.evaluate_reference(start, start), made.u[:, 0]
             truth = -sum(
                 (
                     arb(a) * arb(c) * r
@@ -157,7 +157,7 @@ def test_a_bound_of_a_time_rounds_down(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_a_chord_of_what_errors_of_execution_add_is_as_near_to_both_ends_as_it_says() -> None:
     made, rng = kind("alone"), np.random.default_rng(8)
     case = made.case(path=[walls("alone", "fixed", made)[0](np.full(4, 9.0))], execution=np.array([0.1, 0.25]))
-    beside = case.beside(case.windows[0], np.eye(2), np.zeros((2, 2)))
+    beside = case.build_added_terms(case.windows[0], np.eye(2), np.zeros((2, 2)))
     assert beside is not None
     for _ in range(40):
         low = rng.normal(size=2) * 10.0 ** rng.uniform(-3, 0, size=2)

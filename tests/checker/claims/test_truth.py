@@ -56,9 +56,15 @@ def test_a_row_is_the_worst_case_of_every_control(name: str) -> None:
             assert slope == pytest.approx(exact.control[0], abs=1e-13), (name, time)
             idle = replace(made, u=np.zeros((2, 3)), **({} if disturbed else {"bound": None, "begun": None}))
             assert float(found.constant.mid()) == pytest.approx(idle.heights(time, row[None])[0] - limit, abs=1e-13)
-        pushed = [[float(x.mid()) for x in block] for block in duality.pushed(row, time)] if made.bound else []
+        pushed = (
+            [[float(x.mid()) for x in block] for block in duality.compute_disturbance_weights(row, time)]
+            if made.bound
+            else []
+        )
         assert np.array(pushed).reshape(-1, 2) == pytest.approx(exact.blocks[0], abs=1e-13)
-        assert [float(x.mid()) for x in duality.carried(row, time)] == pytest.approx(exact.free[0], abs=1e-13)
+        assert [float(x.mid()) for x in duality.compute_initial_weights(row, time)] == pytest.approx(
+            exact.free[0], abs=1e-13
+        )
 
 
 @pytest.mark.parametrize("name", KINDS)
@@ -75,7 +81,7 @@ def test_a_row_along_its_adjoint_is_the_one_that_exponentials_give(name: str, mo
             row, limit = DIRECTIONS[2], arb(0.375)
             found = multipliers._derive_row(one, row, time, [], limit, disturbed=True)
             exact = one.duality.row(row, time, [], limit)
-            strayed = one.sources.strayed
+            strayed = one.sources.measurable_input
             low, high = (0.0, 0.0) if strayed is None else strayed.added(row, time)
             constant = exact.constant + arb((low + high) / 2.0, (high - low) / 2.0 * (1.0 + 1e-9))
             pairs = [(found.constant, constant)]
@@ -96,7 +102,7 @@ def test_a_replayed_state_is_that_of_its_disturbance(name: str) -> None:
     at_blocks = np.searchsorted(CHANGES, case.timing.grid[:-1], side="right") - 1
     for time in (0.0, 0.3, 1.0, 1.75, 2.0):
         said = None if made.bound is None else signal[:, at_blocks].tolist()
-        found = replay.reached(case, time, np.zeros(0), said, None if made.begun is None else deviation.tolist())
+        found = replay.compute_state(case, time, np.zeros(0), said, None if made.begun is None else deviation.tolist())
         w = made.motion.weights(np.eye(2), time)
         exact = w.free @ START + (w.control * made.u.T).sum(axis=(1, 2)) + w.before @ BEFORE + w.drift
         if made.bound is not None:
@@ -123,7 +129,7 @@ def test_a_wall_may_be_where_the_worst_case_is_and_no_nearer(
     case = made.case(proof, path=[wall(highest + room)])
     assert "margin" in constraints.bounded(case, case.windows[0])
     # no more room is told than there is
-    order = [int(np.abs(DIRECTIONS - c[:2]).sum(axis=1).argmin()) for c, _ in case.windows[0].seen.facets]
+    order = [int(np.abs(DIRECTIONS - c[:2]).sum(axis=1).argmin()) for c, _ in case.windows[0].enclosed_set.facets]
     assert -room.min() - 1e-12 <= told[0].bound <= 0.0
     assert (-room[order] / units.units_of(case, case.windows[0]).rows).max() - 1e-12 <= told[0].share <= 0.0
     near = highest + 5e-3
@@ -219,7 +225,7 @@ def test_measurable_disturbances_of_an_integral_are_those_of_pieces(
         assert slack < 1e-7
     assert found[1] == pytest.approx(found[0], abs=1e-9)
     with pytest.raises(Unchecked, match="one integral at a time"):
-        case.followed.worst(np.array([0.0, 0.0, 1.0, 1.0]), case.scene).most(np.array([1.8]))
+        case.followed.worst(np.array([0.0, 0.0, 1.0, 1.0]), case.scene).bound_largest_value(np.array([1.8]))
 
 
 def test_a_quadratic_cost_of_a_system_in_time_is_an_integral_by_hand() -> None:
@@ -286,7 +292,7 @@ def test_a_row_at_one_time_is_exceeded_by_what_the_worst_case_does_then(name: st
     for k in (0, len(times) // 2, len(times) - 1):
         said = {"constraint": "path", "time": float(times[k]), "parameter": [], "violation": 0.0}
         found = np.array(replay.exceeded(case, said)[0]).reshape(-1, len(DIRECTIONS))
-        order = [int(np.abs(DIRECTIONS - c[:2]).sum(axis=1).argmin()) for c, _ in case.windows[0].seen.facets]
+        order = [int(np.abs(DIRECTIONS - c[:2]).sum(axis=1).argmin()) for c, _ in case.windows[0].enclosed_set.facets]
         assert found.max(axis=0) == pytest.approx((heights[k] - highest)[order], abs=1e-12)
 
 
@@ -308,7 +314,7 @@ def test_a_unit_is_no_more_than_a_row_reaches_however_few_numbers_are_held(
             if made.bound is not None and made.begun is not None:
                 most = most + made.bound.support(s * w.blocks).sum(axis=1) + made.begun.support(s * w.free)
             reach = np.maximum(reach, np.abs(most))
-    facets = case.windows[0].seen.facets
+    facets = case.windows[0].enclosed_set.facets
     order = [int(np.abs(DIRECTIONS - c).sum(axis=1).argmin()) for c, _ in facets]
     found = units.units_of(case, case.windows[0])
     assert found.rows == pytest.approx(reach[order], rel=1e-12)
@@ -374,7 +380,7 @@ def test_what_errors_of_execution_add_beside_a_row_is_near_its_chord() -> None:
     size = np.abs(made.u).T[np.searchsorted(ENDS, fine.breakpoints[:-1], side="right") - 1] * shares
     case = made.case(path=[walls("alone", "fixed", made)[0](np.full(4, 9.0))], execution=shares)
     c = np.array([0.5, -1.25])
-    beside = case.beside(case.windows[0], c[None], np.zeros((1, 2)))
+    beside = case.build_added_terms(case.windows[0], c[None], np.zeros((1, 2)))
     assert beside is not None and case.sources.execution is not None
     for a, b in ((0.125, 0.1875), (0.25, 0.5), (0.75, 1.0), (1.5, 2.0), (1.25, 1.25)):
         none, times = Polynomial(np.zeros((1, 1)), 0.0, 0.0, 0.0), [a] if a == b else [a, b]

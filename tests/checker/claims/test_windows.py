@@ -78,7 +78,7 @@ def test_measurable_disturbances_in_time_stray_from_their_middle_by_half_their_w
     plant = sr.VaryingSystem.of([["-t"]], [[1]], 2.0, [[1, "t"]])
     bound = Box([-0.1, 0.05], [0.3, 0.05])
     case = case_of(system=plant, disturbance=bound, disturbance_class="measurable")
-    held, strayed = case.disturbances.held, case.sources.strayed
+    held, strayed = case.disturbances.held, case.sources.measurable_input
     assert isinstance(held, Box)
     np.testing.assert_array_equal(held.lower, held.upper)
     np.testing.assert_allclose(held.lower, [0.1, 0.05], rtol=1e-15)
@@ -167,16 +167,16 @@ def test_a_wall_that_moves_is_where_it_is_at_every_time():
             with pytest.raises(Broken):
                 kept(case)
     window = case_of(sr.PathConstraint(below(1.0), relative_to=moving)).windows[0]
-    offset, slope = window.moved(0.5, 0.75)
+    offset, slope = window.evaluate_reference(0.5, 0.75)
     assert (float(offset[0].mid()), float(slope[0].mid())) == (0.5, 1.0)
-    offset, slope = window.moved(1.5, 1.5)
+    offset, slope = window.evaluate_reference(1.5, 1.5)
     assert (float(offset[0].mid()), float(slope[0].mid())) == (0.75, -0.5)
     assert float(window.limit(np.ones(1), 1.5).mid()) == 1.75
     assert float(window.limit(-np.ones(1), 1.5).mid()) == 9.0 - 0.75
     assert window.cuts([0.0, 1.0]) == [0.0, 1.0, 2.0]
     assert not window.is_mixed
     for time, value in ((-1.0, 0.0), (2.0, 0.5), (3.0, 0.5)):
-        assert float(window.moved(time, time)[0][0].mid()) == value
+        assert float(window.evaluate_reference(time, time)[0][0].mid()) == value
 
 
 def mixed(size, start=0.0, stop=None):
@@ -331,8 +331,8 @@ def test_a_witness_leads_to_what_it_says():
         "violation": 0.25,
     }  # fmt: skip
     assert "exceeded by 0.25 at t = 1" in claims._verify_witness(case_of(wall, certificate={"witness": data}))
-    assert float(replay.reached(case_of(wall), 2.0, np.zeros(0), [[0.25, -0.1]])[0].mid()) == pytest.approx(1.15)
-    assert float(replay.reached(case_of(wall), 0.5, np.zeros(0), [[0.2, -0.1]])[0].mid()) == pytest.approx(1.35)
+    assert float(replay.compute_state(case_of(wall), 2.0, np.zeros(0), [[0.25, -0.1]])[0].mid()) == pytest.approx(1.15)
+    assert float(replay.compute_state(case_of(wall), 0.5, np.zeros(0), [[0.2, -0.1]])[0].mid()) == pytest.approx(1.35)
     for wrong in (
         {"violation": 0.25 + 1e-6},
         {"violation": 0.25 - 1e-6},
@@ -629,7 +629,7 @@ def test_the_unit_of_a_row_is_the_smallest_of_its_width_its_limit_and_how_far_it
     ball = case_of(NormBall(2.0, 3.0, centre=[0.5]))
     window = ball.windows[0]
     assert units_of(ball, window).slack(np.array([2.0]), window.limit(np.array([2.0]), 0.0)) == pytest.approx(
-        6e-9 if window.seen.facets is None else 2e-9 * 2.5, rel=0.5
+        6e-9 if window.enclosed_set.facets is None else 2e-9 * 2.5, rel=0.5
     )
     flat = case_of(Box([-9.0], [2.0]))
     slack = units_of(flat, flat.windows[0]).slack

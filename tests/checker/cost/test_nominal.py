@@ -14,7 +14,7 @@ from scipy.integrate import solve_ivp
 import sparserob_core as sr
 from sparserob_core.checker.arithmetic.balls import balls
 from sparserob_core.checker.arithmetic.series import Series, identity, stacked
-from sparserob_core.checker.cost.nominal import NominalMotion, nominal_states, walked
+from sparserob_core.checker.cost.nominal import NominalMotion, evaluate_quadratic_terms, nominal_states
 from sparserob_core.checker.cost.price import Price
 from sparserob_core.checker.flow.flow import FlowPart, VerifiedFlow
 from sparserob_core.checker.flow.plant import Plant
@@ -194,7 +194,10 @@ def test_values_slopes_and_states_are_those_of_an_integrator(varying: bool) -> N
     with ctx.workprec(IN_TIME if varying else BITS):
         nominal = nominal_of(problem, (0.05,))
         pieces = [stacked([balls([u])]) for u in control]
-        found, states = walked(nominal, dictionary, pieces), nominal_states(nominal, dictionary, pieces)
+        found, states = (
+            evaluate_quadratic_terms(nominal, dictionary, pieces),
+            nominal_states(nominal, dictionary, pieces),
+        )
     value, seen = integrated(problem, control, edges)
     assert float(found.value.mid()) == pytest.approx(value, rel=1e-10)
     assert found.blurred < 1e-22

@@ -60,7 +60,7 @@ def exact(start: float, stop: float) -> list[arb]:
 
 def entries(flow: VerifiedFlow, start: float, stop: float) -> list[arb]:
     Phi, B, E = flow.over(start, stop)
-    return Phi.beside(B).beside(E).matrix.entries()
+    return Phi.append_columns(B).append_columns(E).matrix.entries()
 
 
 @pytest.mark.parametrize(("start", "stop"), [(0.0, 0.125), (0.5, 1.75), (0.0, 3.0), (2.0, 2.25), (1.5, 1.5)])
@@ -104,7 +104,7 @@ def test_a_chord_of_a_loop_is_missed_by_its_powers_and_twice_what_is_left_of_the
         deviations=SimpleNamespace(radii=np.array([4.0])),
     )
     with ctx.workprec(BITS):
-        bound = VerifiedLoop.bent(told, 0, 0.0, 1.0, np.array([[1.0]]))
+        bound = VerifiedLoop.bound_chord_error(told, 0, 0.0, 1.0, np.array([[1.0]]))
     share = np.linspace(0.0, 1.0, 10001)
     chords = [float((share - share**n).max()) for n in (2, 3)]
     expected = (2 * chords[0] + 3 * chords[1] + 2 * 0.5) * (1.0 + 0.5 * 4.0)
@@ -266,7 +266,7 @@ def test_intervals_from_anywhere_to_anywhere_hold_what_an_integrator_says(name: 
         edge = min(edge.stop, edge.stride)
         for start, stop in ((0.0, until), (0.37, 1.61), (0.0, edge), (edge / 2, min(until, 1.5 * edge)), (1.3, 1.3)):
             Phi, B, E = flow.over(start, stop)
-            whole = Phi.beside(B).beside(E)
+            whole = Phi.append_columns(B).append_columns(E)
             for point in points(box):
                 p = np.array(box.middle) + np.array(box.halves) * point
                 close(at(whole, point), 0.0, integrated(system, start, stop, p), system, near)
@@ -340,8 +340,8 @@ def test_a_flow_at_one_parameter_is_that_of_the_known_system_and_is_remembered()
         known = flow.at([0.01, -0.02])
         assert known is flow.at((0.01, -0.02)) and known.monomials.size == 1 and known.at((0.01, -0.02)) is known
         whole = known.over(0.0, 2.0)
-        close(whole[0].beside(whole[1]).beside(whole[2]).matrix, 0.0, integrated(spring(), 0.0, 2.0, (0.01, -0.02)),
-              spring, 1e-24)  # fmt: skip
+        close(whole[0].append_columns(whole[1]).append_columns(whole[2]).matrix, 0.0,
+              integrated(spring(), 0.0, 2.0, (0.01, -0.02)), spring, 1e-24)  # fmt: skip
         assert flow.driven == 2 and flow.states == 2
 
 

@@ -10,12 +10,12 @@ import pytest
 from flint import arb
 
 import sparserob_core as sr
-from sparserob_core.checker.problem.held import Lasting, on_one_grid, summed
+from sparserob_core.checker.problem.held import HeldComponents, on_one_grid, summed
 from sparserob_core.control.problem.system import LinearSystem
 from sparserob_core.control.sets.sets import Box, Product
 
 CHANGES = [0.0, 0.4, 1.0, 1.7, 2.0]
-LASTING = Lasting(CHANGES, ((slice(0, 1), np.array([0, 2])), (slice(1, 3), np.array([0, 1, 4]))))
+LASTING = HeldComponents(CHANGES, ((slice(0, 1), np.array([0, 2])), (slice(1, 3), np.array([0, 1, 4]))))
 PIECES = {0: {0: [0, 1], 2: [2, 3, 4]}, 1: {0: [0], 1: [1, 2, 3], 4: [4]}, 2: {0: [0], 1: [1, 2, 3], 4: [4]}}
 
 
@@ -66,7 +66,7 @@ def test_breakpoints_are_one_where_they_differ_by_rounding_alone():
     known, joint = on_one_grid(problem, sr.Dictionary.indicators([0.0, 1.0, 2.0]))
     assert joint.breakpoints.tolist() == [0.0, 0.5, 0.5001, 0.501, 1.0, 2.0]
     assert [list(one) for one in known.disturbance_breakpoints or ()][2] == [0.0, 1.0, 2.0]
-    lasting = Lasting.of(known, joint.breakpoints[:-1].tolist())
+    lasting = HeldComponents.of(known, joint.breakpoints[:-1].tolist())
     assert lasting is not None
     assert [firsts.tolist() for _, firsts in lasting.parts] == [[0, 1, 3], [0, 1, 2], [0, 4]]
 

@@ -52,12 +52,12 @@ def test_seen_at_any_parameters_the_larger_system_is_the_one_at_these() -> None:
     larger = parted(problem_of(system)).system
     assert larger.varies
     (law,), (big,) = system.phases, larger.phases
-    assert parts.moved == [[1, 2], [1, 2], []]
+    assert parts.sensitive_states == [[1, 2], [1, 2], []]
     assert parts.scales == pytest.approx([0.4, 0.25, 0.0], rel=1e-15)
     for _ in range(5):
         p, t, z = rng.uniform(BOX.lower, BOX.upper), float(rng.uniform(0.0, 2.0)), rng.normal(size=parts.size)
         shares = [(v - m) / s if s else 0.0 for v, m, s in zip(p.tolist(), parts.middle, parts.scales, strict=True)]
-        seen, here = parts.seen(tuple(shares)), [t, *p.tolist()]
+        seen, here = parts.compute_projection(tuple(shares)), [t, *p.tolist()]
         np.testing.assert_allclose(
             seen @ matrix(big, "A", [t]) @ z, matrix(law, "A", here) @ seen @ z, rtol=1e-13, atol=1e-13
         )
@@ -99,7 +99,7 @@ def test_rows_are_those_of_every_corner_and_what_begins_is_certain_of_the_new_co
             cost=sr.Cost(final=Quadratic(np.eye(3), np.array([0.0, 1.0, 0.0]))),
         )
     )
-    seen = [parts.seen(corner) for corner in parts.corners()]
+    seen = [parts.compute_projection(corner) for corner in parts.corners()]
     walls, mixed = made.path
     (end,), (total,) = made.terminal, made.integral
 
@@ -171,7 +171,7 @@ def test_a_parameter_that_meets_a_state_that_depends_on_one_is_refused(place: tu
     made = object.__new__(sr.System)
     made.__dict__.update(system.__dict__ | {"phases": (other,)})
     with pytest.raises(Unchecked, match="affinely"):
-        assert ParameterExpansion(made, tuple(BOX.interior_point().tolist())).moved
+        assert ParameterExpansion(made, tuple(BOX.interior_point().tolist())).sensitive_states
 
 
 @pytest.mark.parametrize("name", ["A", "B", "E", "c"])
@@ -200,7 +200,10 @@ def test_all_that_is_downstream_of_an_entry_with_a_parameter_depends_on_it(name:
             parameters=Box([-1.0, -1.0], [1.0, 1.0]),
             names=("p", "q"),
         )
-        assert ParameterExpansion(system, (0.0, 0.0)).moved == [[1, 2, 3, 4], [2, 3, 4] if other != name else []]
+        assert ParameterExpansion(system, (0.0, 0.0)).sensitive_states == [
+            [1, 2, 3, 4],
+            [2, 3, 4] if other != name else [],
+        ]
 
 
 @pytest.mark.parametrize(

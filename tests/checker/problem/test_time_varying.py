@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import sparserob_core as sr
-from sparserob_core.checker.problem.time_varying import in_turns
+from sparserob_core.checker.problem.time_varying import make_time_varying
 from sparserob_core.control.problem.expression import parse_matrix
 from sparserob_core.control.problem.system import LinearSystem, SwitchedSystem
 
@@ -26,7 +26,7 @@ def problem(plant: Any, **more: Any) -> sr.OptimalControlProblem:
 
 def test_laws_in_turns_are_those_of_the_systems_that_take_turns() -> None:
     turns = SwitchedSystem([(0.75, system("-p1")), (2.0, system("p1^2"))])
-    found = in_turns(problem(turns, execution=np.array([0.1]))).system
+    found = make_time_varying(problem(turns, execution=np.array([0.1]))).system
     assert found.varies and found.horizon == 2.0
     assert [phase.begin for phase in found.phases] == [0.0, 0.75]
     assert found.parameters is not None and found.parameters.bounding_box().upper.tolist() == [0.75]
@@ -49,6 +49,6 @@ def test_laws_in_turns_are_those_of_the_systems_that_take_turns() -> None:
 )
 def test_only_what_is_followed_in_time_is_changed(plant: Any, more: dict[str, Any], changed: bool) -> None:
     given = problem(plant, **more)
-    found = in_turns(given)
+    found = make_time_varying(given)
     assert (found is not given) == changed == found.system.varies
     assert found.system.delay == plant.delay

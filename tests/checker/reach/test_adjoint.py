@@ -78,7 +78,7 @@ def test_cells_bound_every_value_in_them_closely(kind: str) -> None:
     times = times[times <= HORIZON]
     bounds = row.over(times[:-1], times[1:])
     inside = times[:-1, None] + np.diff(times)[:, None] * np.linspace(0.0, 1.0, 17)
-    tops, wide = (part.reshape(inside.shape) for part in row.most(inside.ravel()))
+    tops, wide = (part.reshape(inside.shape) for part in row.bound_largest_value(inside.ravel()))
     values = tops - wide
     assert wide.max() < 1e-11
     assert (bounds[:, None] >= values).all()
@@ -98,16 +98,22 @@ def test_a_signal_reaches_no_more_than_the_worst_and_its_value_is_known(kind: st
         low, high = row.along(3.5, deviation, GRID, signal)
         assert high - low < 1e-12
         best = max(best, low)
-    assert best <= row.most(np.array([3.5]))[0][0]
+    assert best <= row.bound_largest_value(np.array([3.5]))[0][0]
 
 
 def test_the_measurable_worst_is_that_of_ever_shorter_pieces() -> None:
-    whole = worst("measurable").most(np.array([HORIZON]))[0][0]
+    whole = worst("measurable").bound_largest_value(np.array([HORIZON]))[0][0]
     row = worst("constant")
     short = [
-        Worst(row.adjoint, row.centre, row.begun, GRID, row.drives, row.pushed, np.linspace(0.0, HORIZON, n + 1)).most(
-            np.array([HORIZON])
-        )[0][0]
+        Worst(
+            row.adjoint,
+            row.centre,
+            row.initial_set,
+            GRID,
+            row.drives,
+            row.disturbance_set,
+            np.linspace(0.0, HORIZON, n + 1),
+        ).bound_largest_value(np.array([HORIZON]))[0][0]
         for n in (4, 64, 512)
     ]
     assert all(a < b for a, b in pairwise(short))
@@ -169,7 +175,11 @@ def test_what_the_flow_is_off_by_on_a_step_is_in_the_terms_of_rows_and_in_those_
     for terms, of_wide, columns in (
         (motion.rows, wide.rows, np.eye(3)),
         (motion.inputs, wide.inputs, np.array(F)),
-        (motion.bending, wide.bending, np.hstack([np.array(A) @ A, np.array(A) @ F, np.array(A) @ A @ F])),
+        (
+            motion.derivative_terms,
+            wide.derivative_terms,
+            np.hstack([np.array(A) @ A, np.array(A) @ F, np.array(A) @ A @ F]),
+        ),
     ):
         more = of_wide.rad - terms.rad
         np.testing.assert_allclose(more[0], off @ np.abs(columns), rtol=1e-6)
@@ -226,8 +236,11 @@ def test_what_rows_are_off_by_is_in_every_bound_and_counts_once() -> None:
         assert high >= up.along(t, deviation, GRID, signal)[1] - 1e-12
         assert high - low <= up.along(t, deviation, GRID, signal)[1] - down.along(t, deviation, GRID, signal)[0] + 1e-9
     # with sets, whose support functions may be more than is met; and without
-    for some, slack in ((lambda one: one, 8e-3), (lambda one: replace(one, pushed=None, begun=None), 1e-9)):
-        tops, highest = some(blurred).most(times)[0], some(up).most(times)[0]
+    for some, slack in (
+        (lambda one: one, 8e-3),
+        (lambda one: replace(one, disturbance_set=None, initial_set=None), 1e-9),
+    ):
+        tops, highest = some(blurred).bound_largest_value(times)[0], some(up).bound_largest_value(times)[0]
         assert (highest <= tops + 1e-12).all()
         assert (tops <= highest + slack).all()
 
@@ -256,7 +269,7 @@ def radii(kind: str) -> dict[str, np.ndarray]:
         "rounded": rounded,
         "between": known.between(times, 0.1, 0.2).rad,
         "drives": row._evaluate_inputs(times)[1],
-        "most": row.most(times)[1],
+        "most": row.bound_largest_value(times)[1],
         "along": np.array([high - low]),
         "supported": module._evaluate_support(Box([-0.2], [0.5]), Enclosed(np.array([[0.7]]), np.array([[1e-9]])))[1],
     }
@@ -330,7 +343,7 @@ def test_every_radius_is_enlarged_by_what_its_own_sum_may_round(kind: str, monke
     with monkeypatch.context() as patched:
         told(patched, 0.0, COARSE, 1.0)
         half = radii(kind)
-    values = np.abs(worst(kind).most(np.array([0.3, 2.2, 3.99]))[0])
+    values = np.abs(worst(kind).bound_largest_value(np.array([0.3, 2.2, 3.99]))[0])
     assert (half["most"] - plain["most"] >= 3.0 * 8.0 * COARSE * values * 0.99).all()
     assert (half["along"] > plain["along"]).all()
     assert (half["rounded"] > plain["rounded"]).all() and (half["between"] > plain["between"]).all()
@@ -342,7 +355,7 @@ def test_what_is_left_of_the_expansion_of_a_bend_is_in_its_bound(rate: float, mo
     monkeypatch.setattr(module, "DERIVATIVE_ORDER", 0)
     known = AdjointRow.of(AdjointFlow.of(arb_mat([[rate]]), arb_mat([[1.0]]), HORIZON, Clock()), np.ones(1))
     ends = known.nodes.mid[1:, 0]
-    rows, once, twice = (part[:, 0] for part in known.bends)
+    rows, once, twice = (part[:, 0] for part in known.derivative_bounds)
     for bound, power in ((rows, 2), (once, 1), (twice, 2)):
         assert (rate**power * ends <= bound).all()
         assert (bound <= rate**power * ends * (1.0 + 1e-9)).all()
@@ -437,7 +450,7 @@ def test_integrals_are_off_by_what_all_steps_are_and_by_what_their_sum_is_rounde
         return values, np.full(count, 0.1), np.full(count, 0.2), np.full(count, 3.0)
 
     known = swept([[1.0]] * 4, 0.0, [[1.0]])
-    known = replace(known, summands=[cast(Summand, SimpleNamespace(swept=found, far=np.ones(1)))])
+    known = replace(known, summands=[cast(Summand, SimpleNamespace(integrate_support=found, radii=np.ones(1)))])
     with monkeypatch.context() as patched, ctx.workprec(128):
         told(patched, COARSE, half, outward)
         value, more, less = (part[:, 0] for part in known._end_integrals)

@@ -149,7 +149,7 @@ def test_a_chord_is_missed_by_no_more_than_is_said_and_hardly_less(system: Varyi
                 path = np.array([found.added(C, float(start + (stop - start) * s))[0] for s in share[:-1]])
                 path = np.append(path, found.added(C, stop)[0])
                 above = (path - (1 - share) * path[0] - share * path[-1]).max()
-                said = found.bent(C, start, stop)
+                said = found.bound_chord_error(C, start, stop)
                 assert above <= said * (1 + 1e-9) + 1e-13
                 ratios.append(above / max(said, 1e-12))
     assert max(ratios) > (0.4 if system is ROCKET else 0.2)
@@ -163,7 +163,7 @@ def test_what_begins_within_a_cell_bends_it_too() -> None:
         stop = min(1.5, *(one for one in found.marks if one > 1.0))
         path = np.array([found.added(C, float(t))[0] for t in 1.0 + share * (stop - 1.0)])
         above = (path - (1 - share) * path[0] - share * path[-1]).max()
-        assert above <= found.bent(C, 1.0, stop) and above > 0.0
+        assert above <= found.bound_chord_error(C, 1.0, stop) and above > 0.0
 
 
 def test_bounds_allow_for_what_is_rounded_and_for_the_size_of_the_control() -> None:
@@ -208,7 +208,7 @@ def test_what_enters_by_the_last_columns_bends_as_it_does() -> None:
             path = np.array([found.added(C, float(t))[1] for t in start + share[:-1] * (stop - start)])
             path = np.append(path, found.added(C, stop)[1])
             above = (path - (1 - share) * path[0] - share * path[-1]).max()
-            said = found.bent(C, start, stop)
+            said = found.bound_chord_error(C, start, stop)
             assert above <= said * (1 + 1e-9) + 1e-13
             ratios.append(above / max(said, 1e-12))
     assert max(ratios) > 0.1

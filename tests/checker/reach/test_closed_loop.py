@@ -18,7 +18,7 @@ from sparserob_core.checker.claims.cells import prove
 from sparserob_core.checker.outcome import Broken, Clock
 from sparserob_core.checker.reach.closed_loop import VerifiedLoop
 from sparserob_core.checker.reach.measurable import MeasurableLoop
-from sparserob_core.checker.reach.preimages import Pushed
+from sparserob_core.checker.reach.preimages import ReachableSubspace
 from sparserob_core.checker.reach.tube import LoopTube, TimelessTube
 from sparserob_core.checker.sets.known import known
 from sparserob_core.checker.sets.parameters import Parameters
@@ -104,7 +104,7 @@ def test_what_a_short_cell_adds_is_an_eighth_of_its_square_times_the_curvature_o
         for piece, a, b in parts(loop):
             length = min(b - a, 0.05 / np.linalg.norm(case.A, 2))
             low = float(a + rng.uniform(0.0, b - a - length))
-            bent = loop.bent(piece, low, low + length, H)
+            bent = loop.bound_chord_error(piece, low, low + length, H)
             _, rates, _ = case.states(v, M, low + np.linspace(0.0, 1.0 - 1e-12, 31) * length)
             owed = length**2 / 8.0 * (np.abs(H @ case.A @ rates).max(axis=0) @ sizes)
             assert (bent <= 1.1 * owed + 1e-12).all()
@@ -122,7 +122,7 @@ def test_no_time_of_a_cell_is_above_its_chord_by_more_than_that(name):
             share = np.linspace(0.0, 1.0 - 1e-12, 31)
             states, _, _ = case.states(v, M, low + share * (high - low))
             over = case.height(H @ states) - ((1.0 - share)[:, None] * ends[0] + share[:, None] * ends[1])
-            assert (over.max(axis=0) <= loop.bent(piece, low, high, H) + 1e-12).all()
+            assert (over.max(axis=0) <= loop.bound_chord_error(piece, low, high, H) + 1e-12).all()
 
 
 def test_a_parabola_is_an_eighth_of_its_acceleration_above_its_chord_and_no_more_in_a_system_in_t():
@@ -130,7 +130,7 @@ def test_a_parabola_is_an_eighth_of_its_acceleration_above_its_chord_and_no_more
     loop = made("level")[1]
     with ctx.workprec(192):
         for piece, (low, high) in ((0, (0.25, 0.5)), (1, (0.75, 1.0))):
-            (bent,) = loop.bent(piece, low, high, np.array([[1.0, 0.0]]))
+            (bent,) = loop.bound_chord_error(piece, low, high, np.array([[1.0, 0.0]]))
             answers = np.array([[float(x.mid()) for x in row] for row in loop.inputs(piece).tolist()])[0]
             owed = 0.0625 / 8.0 * (np.abs(answers) @ np.concatenate([[1.0], loop.deviations.radii]))
             assert bent == pytest.approx(owed, rel=1e-9)
@@ -146,13 +146,13 @@ def test_what_a_power_series_on_a_cell_leaves_out_is_added(monkeypatch):
             ends = np.array([[float(h.upper()) for h in loop.highest(piece, t, H)] for t in (low, high)])
             states, _, _ = case.states(v, M, low + share * (high - low))
             over = case.height(H @ states) - ((1.0 - share)[:, None] * ends[0] + share[:, None] * ends[1])
-            assert (over.max(axis=0) <= loop.bent(piece, low, high, H) + 1e-12).all()
+            assert (over.max(axis=0) <= loop.bound_chord_error(piece, low, high, H) + 1e-12).all()
             # of a term of the third power, which is left out, a chord leaves this much at most
             terms, _ = loop.flow.within(low, high, low, high, 4)
             both = arb_mat([*loop.state(piece, low).tolist(), *loop.drives[piece].tolist()])
             third = np.abs(H @ table(terms[3].matrix * both)) @ np.concatenate([[1.0], loop.deviations.radii])
             second = np.abs(H @ table(terms[2].matrix * both)) @ np.concatenate([[1.0], loop.deviations.radii])
-            bent = loop.bent(piece, low, high, H)
+            bent = loop.bound_chord_error(piece, low, high, H)
             assert (bent >= second / 4.0 + third * 2.0 / 3.0**1.5).all()
             most = max(most, float(third.max()))
     assert most > 1e-3, "nothing was left out"
@@ -173,7 +173,7 @@ def test_measurable_disturbances_reach_what_signals_that_jump_often_reach_and_li
                 assert max(float(h.rad()) for h in heights) < 1e-10
         for piece, a, b in parts(loop):
             low, high = sorted(rng.uniform(a, b, size=2).tolist())
-            bent = loop.bent(piece, low, high, H)
+            bent = loop.bound_chord_error(piece, low, high, H)
             share = np.linspace(0.0, 1.0, 5)
             values = np.array(
                 [[float(h.mid()) for h in loop.highest(piece, float(t), H)] for t in low + share * (high - low)]
@@ -197,9 +197,9 @@ def test_the_integral_of_a_kernel_is_that_of_the_support_function(name):
             begin, length = float(case.grid[piece]), float(case.grid[piece + 1] - case.grid[piece])
             for share in (1.0, 0.37):
                 pushed = loop.deviations
-                kernel = pushed.kernel(piece) if share == 1.0 else pushed.way(begin, begin + share * length)
-                found = kernel.most(Enclosed(a, np.zeros_like(a)), loop.deviations.summands)
-                wide = kernel.most(Enclosed(a, np.full_like(a, 1e-3)), loop.deviations.summands)
+                kernel = pushed.kernel(piece) if share == 1.0 else pushed.build_kernel(begin, begin + share * length)
+                found = kernel.integrate_support(Enclosed(a, np.zeros_like(a)), loop.deviations.summands)
+                wide = kernel.integrate_support(Enclosed(a, np.full_like(a, 1e-3)), loop.deviations.summands)
                 parts = 120
                 ends = np.linspace(0.0, share * length, parts + 1)
                 r = ((ends[:-1] + ends[1:])[:, None] / 2 + np.diff(ends)[:, None] / 2 * nodes).ravel()
@@ -218,7 +218,7 @@ def test_the_integral_of_a_kernel_is_that_of_the_support_function(name):
                 assert (np.abs(found.mid - truth) <= found.rad + 2e-5).all()
                 assert (found.rad < 1e-11).all()
                 for offset in 1e-3 * rng.uniform(-1, 1, size=(3, *a.shape)):
-                    moved = kernel.most(Enclosed(a + offset, np.zeros_like(a)), loop.deviations.summands)
+                    moved = kernel.integrate_support(Enclosed(a + offset, np.zeros_like(a)), loop.deviations.summands)
                     assert (moved.mid + moved.rad <= wide.mid + wide.rad + 1e-12).all()
                     assert (moved.mid - moved.rad >= wide.mid - wide.rad - 1e-12).all()
                 assert (wide.rad < 0.1).all()
@@ -314,7 +314,7 @@ def test_an_innovation_adds_up_what_a_disturbance_did_on_every_part_of_its_piece
                 Box([-1.0], [1.0]),
                 None,
             )
-            found = [{b: float(push[0, 0].mid()) for b, push in one.items()} for one in loop.seen]
+            found = [{b: float(push[0, 0].mid()) for b, push in one.items()} for one in loop.innovation_matrices]
             assert found == seen
 
 
@@ -331,7 +331,7 @@ def test_who_sees_what_in_a_system_in_t_follows_from_where_its_numbers_are_not_z
             while more := {i for j in reached for i in np.flatnonzero(A[:, j]).tolist()} - reached:
                 reached |= more
             seen[list(reached), place] = True
-        found = Pushed.linked(A != 0.0, E != 0.0, np.eye(mw, dtype=int)[entries].tolist())
+        found = ReachableSubspace.linked(A != 0.0, E != 0.0, np.eye(mw, dtype=int)[entries].tolist())
         assert found.pattern.tolist() == seen.tolist()
         assert (found.states, found.entries) == (seen.any(axis=1).sum(), seen.any(axis=0).sum())
 
@@ -342,7 +342,7 @@ def test_the_error_of_a_chord_holds_all_that_is_lost_in_rational_numbers(monkeyp
     ends = {time: Enclosed(rng.normal(size=200), 1e-3 * rng.uniform(size=200)) for time in (0.25, 0.5)}
     missed = 1e-2 * rng.uniform(size=200)
     monkeypatch.setattr(LoopTube, "_enclose_heights", lambda self, piece, time, z: ends[time])
-    tube = LoopTube(SimpleNamespace(bent=lambda *given: missed), np.eye(2), np.zeros((2, 0)))
+    tube = LoopTube(SimpleNamespace(bound_chord_error=lambda *given: missed), np.eye(2), np.zeros((2, 0)))
     found = tube.cells(0, 0.25, 0.5, np.zeros((200, 2)))
     for i, poly in enumerate(found):
         radius = max(Fraction(part.rad[i]) for part in ends.values())

@@ -9,7 +9,7 @@ import pytest
 from flint import arb, ctx
 
 from sparserob_core.checker.cost import effort
-from sparserob_core.checker.cost.effort import _compute_chord_slope, at_most
+from sparserob_core.checker.cost.effort import _compute_chord_slope, prove_effort_limit
 from sparserob_core.checker.outcome import Broken, Clock, Unchecked
 from sparserob_core.checker.sets.known import known
 from sparserob_core.control.sets.sets import Box, NormBall
@@ -27,7 +27,7 @@ def largest(a, A, convex):
 
 def judged(a, A, convex, limit, clock=None):
     rows = [[arb(float(v)) for v in row] for row in A]
-    return at_most(
+    return prove_effort_limit(
         [arb(float(v)) for v in a], rows, lambda b: known(convex).support(b), np.array(known(convex).radius),
         arb(float(limit)), clock or Clock(),
     )  # fmt: skip

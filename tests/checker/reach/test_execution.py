@@ -86,7 +86,7 @@ def test_a_chord_is_missed_by_no_more_than_is_said_and_hardly_less(execution: Fo
         share = np.linspace(0.0, 1.0, 41)
         path = np.array([execution.added(C, start + (stop - start) * s)[0] for s in share])
         off = (path - (1 - share) * path[0] - share * path[-1]).max()
-        ratios.append(off / execution.bent(C, start, stop))
+        ratios.append(off / execution.bound_chord_error(C, start, stop))
     assert 0.5 < max(ratios) <= 1.0
 
 
@@ -105,7 +105,7 @@ def test_a_chord_is_missed_by_no_more_wherever_it_begins_among_the_parts(rate: f
             for begin in (number * part + 1e-9, (number + 1) * part - length - 1e-9):
                 heights = [(np.exp(rate * (begin + s * length)) - 1.0) / rate / 8.0 for s in (0.0, 0.5, 1.0)]
                 missed = abs(heights[1] - (heights[0] + heights[2]) / 2)
-                bound = one.bent(np.array([1.0]), begin, begin + length)
+                bound = one.bound_chord_error(np.array([1.0]), begin, begin + length)
                 assert missed * (1.0 - 1e-6) - 1e-15 * max(heights) <= bound
                 assert bound <= missed * np.exp(3.0 * 6.0 * part) + 1e-15 * max(heights)
 
@@ -139,8 +139,8 @@ def test_rows_and_their_opposites_are_made_once(execution: FollowedExecution) ->
 
 def test_many_intervals_are_bounded_as_each_alone(execution: FollowedExecution) -> None:
     start, stop = np.array([0.0, 0.6, 2.05]), np.array([0.5, 0.8, 2.45])
-    each = [execution.bent(C, a, b) for a, b in zip(start, stop, strict=True)]
-    np.testing.assert_array_equal(execution.bent_over(C, start, stop), each)
+    each = [execution.bound_chord_error(C, a, b) for a, b in zip(start, stop, strict=True)]
+    np.testing.assert_array_equal(execution.bound_chord_errors(C, start, stop), each)
     low, high = execution.added_at(C, stop)
     assert [(a, b) for a, b in zip(low, high, strict=True)] == [execution.added(C, t) for t in stop]
 

@@ -12,7 +12,13 @@ from flint import arb_mat, ctx
 from sparserob_core.checker.reach.measurable import MeasurableLoop
 from sparserob_core.checker.sets.known import summands_of
 from sparserob_core.checker.sets.polynomials import Enclosed, product
-from sparserob_core.checker.sets.summands import _evaluate_polynomials, _find_crossings, channels, integrate, swept
+from sparserob_core.checker.sets.summands import (
+    _evaluate_polynomials,
+    _find_crossings,
+    channels,
+    integrate,
+    integrate_maximum,
+)
 from sparserob_core.control.problem.system import LinearSystem
 from sparserob_core.control.sets.sets import Box, NormBall, Zonotope
 
@@ -28,7 +34,7 @@ def test_the_integral_of_the_largest_of_polynomials_is_enclosed_and_sharp():
     P = rng.normal(size=(12, 5, 3)) * 0.7 ** np.arange(5)[:, None]
     ends = np.where(np.arange(12) % 3, 1.0, rng.uniform(-0.9, 0.9, size=12))
     none = np.zeros((12, 3))
-    value, more, less = swept(P, none, ends)
+    value, more, less = integrate_maximum(P, none, ends)
     truth = np.array([largest(p, end) for p, end in zip(P, ends, strict=True)])
     assert (less <= 1e-13).all()  # what rounding does to what is added up
     assert (value <= truth + 1e-6).all() and (truth <= value + more + 1e-6).all()
@@ -40,7 +46,7 @@ def test_two_that_cross_are_integrated_from_crossing_to_crossing():
     P = np.zeros((2, 3, 2))
     P[0, 1] = [1.0, -1.0]
     P[1, 2, 0], P[1, 0, 1] = 1.0, 0.25
-    value, more, less = swept(P, np.zeros((2, 2)), np.ones(2))
+    value, more, less = integrate_maximum(P, np.zeros((2, 2)), np.ones(2))
     assert value == pytest.approx([1.0, 2.0 * (0.125 + (1.0 - 0.125) / 3.0)])
     assert (more < 1e-12).all() and (less <= 1e-13).all()
 
@@ -48,7 +54,7 @@ def test_two_that_cross_are_integrated_from_crossing_to_crossing():
 def test_many_parts_are_added_up_with_what_rounding_does_to_them():
     """``max(T, -T)`` of Chebyshev's polynomial of degree 8 has 9 parts, whose integrals cancel in its powers."""
     T = np.polynomial.chebyshev.cheb2poly([0] * 8 + [1])
-    value, more, less = swept(np.stack([T, -T], axis=1)[None], np.zeros((1, 2)), np.ones(1))
+    value, more, less = integrate_maximum(np.stack([T, -T], axis=1)[None], np.zeros((1, 2)), np.ones(1))
     turns = np.concatenate([[1.0], np.cos(np.pi * (2 * np.arange(8) + 1) / 16), [-1.0]])
     whole = [np.cos(9 * a) / 18 - np.cos(7 * a) / 14 for a in np.arccos(turns)]
     truth = float(np.abs(np.diff(whole)).sum())
@@ -59,7 +65,7 @@ def test_many_parts_are_added_up_with_what_rounding_does_to_them():
 def test_segments_together_reach_as_far_as_all_of_them():
     generators = np.array([[0.5, -0.25], [0.25, 1.0], [-0.125, 0.5]])
     summands = summands_of(Zonotope(np.array([3.0, -2.0]), generators))
-    far = sum(summand.far for summand in summands)
+    far = sum(summand.radii for summand in summands)
     np.testing.assert_allclose(far, np.abs(generators).sum(axis=0), rtol=1e-11)
     assert (far >= np.abs(generators).sum(axis=0)).all()
     plain, zero = np.array([[[1.0, 0.5], [0.2, -0.3]]]), np.zeros((1, 2))
@@ -79,7 +85,7 @@ def test_errors_of_polynomials_are_errors_of_the_integral():
     """What stands for the largest is off by its own error; another one may be larger by both."""
     P = np.array([[[3.0, 1.0]]])
     for e in ([0.1, 0.4], [0.4, 0.1], [0.25, 0.25]):
-        value, more, less = swept(P, np.array([e]), np.array([0.5]))
+        value, more, less = integrate_maximum(P, np.array([e]), np.array([0.5]))
         assert value[0] == pytest.approx(4.5)
         assert more[0] == pytest.approx(1.5 * (e[0] + 2.0 * max(e)))
         assert less[0] == pytest.approx(1.5 * e[0])
@@ -99,7 +105,7 @@ def kernel_of(A, E, length):
     bound = Box(-np.ones(plant.disturbances), np.ones(plant.disturbances))
     ends = [0.0, 1.0]
     loop = MeasurableLoop(plant, [0.0] * plant.states, still, none, ends, ends, [], bound)
-    return loop.deviations.way(0.0, length)
+    return loop.deviations.build_kernel(0.0, length)
 
 
 @pytest.mark.parametrize("rate", [-1.5, 0.0, 2.0])
@@ -109,12 +115,12 @@ def test_the_integral_of_an_exponential_is_the_closed_form(rate):
         summands, a = summands_of(Box([-0.5], [0.5])), Enclosed(np.array([[1.0], [-3.0]]), np.zeros((2, 1)))
         for length in (0.08, 0.2, 0.5, 0.8):
             kernel = kernel_of(rate, 2.0, length)
-            found = kernel.most(a, summands)
+            found = kernel.integrate_support(a, summands)
             height = length if rate == 0.0 else np.expm1(rate * length) / rate
             truth = np.array([1.0, 3.0]) * height
             assert (np.abs(found.mid - truth) <= found.rad + 1e-15).all()
             assert (found.rad <= 1e-11).all()
-        wide = kernel.most(Enclosed(a.mid, np.full((2, 1), 0.25)), summands)
+        wide = kernel.integrate_support(Enclosed(a.mid, np.full((2, 1), 0.25)), summands)
         assert (wide.mid + wide.rad >= np.array([1.25, 3.25]) * height * (1 - 1e-13)).all()
         assert (wide.rad <= 0.25 * height * 4.0).all()
 
@@ -129,8 +135,8 @@ def test_summands_are_segments_of_a_box_and_corners_of_what_has_them():
     with ctx.workprec(128):
         kernel = kernel_of(np.zeros((2, 2)), np.eye(2), 1.0)
         a = Enclosed(np.array([[1.0, -2.0]]), np.zeros((1, 2)))
-        assert kernel.most(a, box).mid == pytest.approx([2.0 + 3.0])
-        assert kernel.most(a, [ball]).mid == pytest.approx([1.0])
+        assert kernel.integrate_support(a, box).mid == pytest.approx([2.0 + 3.0])
+        assert kernel.integrate_support(a, [ball]).mid == pytest.approx([1.0])
 
 
 def exact(values):

@@ -22,11 +22,11 @@ from sparserob_core.checker.flow.flows import VerifiedFlows
 from sparserob_core.checker.flow.law import ParameterBox
 from sparserob_core.checker.flow.plant import Plant
 from sparserob_core.checker.outcome import LOOKED, Broken, Clock, Unchecked
-from sparserob_core.checker.reach.kernels import pushes
+from sparserob_core.checker.reach.kernels import compute_kernel
 from sparserob_core.checker.reach.states import Scene, States
 from sparserob_core.checker.reach.tube import Polynomial, ProjectedStates, VerifiedTube
 from sparserob_core.checker.sets.known import known
-from sparserob_core.checker.sets.shape import excess, far_point
+from sparserob_core.checker.sets.shape import excess, find_inner_support_point
 from sparserob_core.control.problem.expression import parse_matrix
 from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.control.problem.system import LinearSystem
@@ -119,7 +119,7 @@ def test_a_point_far_out_in_a_thin_ellipsoid_is_at_its_edge(thin):
     S = (turn * np.array([1.0, 1e-2, thin])) @ turn.T
     shape, direction = known(Ellipsoid(np.zeros(3), (S + S.T) / 2)), turn[:, 2]
     with ctx.workprec(96):
-        point = far_point(shape, direction)
+        point = find_inner_support_point(shape, direction)
         reached = sum((a * x for a, x in zip(exact(direction), point, strict=True)), arb(0))
         assert shape.holds(point)
         assert 1.0 - reached / shape.support(exact(direction)) < 1e-15
@@ -307,7 +307,7 @@ def test_the_kernel_of_a_measurable_disturbance_is_as_sharp_in_any_units(factor)
     A, E = turn @ [[0.0, 1.0], [-2.0, -0.5]] @ np.linalg.inv(turn), turn @ [[0.3], [1.0]]
     size, plant = np.array([1.0, factor]), LinearSystem(A, np.zeros((2, 1)), E=E)
     with ctx.workprec(160):
-        found = pushes(VerifiedFlow(Plant.of(plant, 5.0), 5.0), 1.0, 1.25, slice(1, 2))
+        found = compute_kernel(VerifiedFlow(Plant.of(plant, 5.0), 5.0), 1.0, 1.25, slice(1, 2))
     value, off = found.mid[:, 0], found.rad[:, 0].sum(axis=0)
     assert (off <= 1e-14 * size[:, None]).all()
     for at in (-1.0, -0.3, 0.5, 1.0):
@@ -328,8 +328,8 @@ def test_what_a_row_is_made_of_is_known_as_well_on_many_pieces_as_on_one() -> No
         flows, c, time = VerifiedFlows.of(stiff, float(ends[-1])), np.array([1.0, 2.0]), float(ends[-3])
         duality = Duality(problem, sr.Dictionary.indicators(ends), None, flows)
         row = duality.row(c, time, (), arb(0), disturbed=False)
-        pushed = duality.pushed(c, time, ends[:-1].tolist())
-        carried = duality.carried(c, time)
+        pushed = duality.compute_disturbance_weights(c, time, ends[:-1].tolist())
+        carried = duality.compute_initial_weights(c, time)
     inverse = np.linalg.inv(stiff.phases[0].A.T)
     lags = np.array([scipy.linalg.expm(stiff.phases[0].A.T * max(0.0, time - s)) @ c for s in ends])
     assert [float(x.mid()) for x in carried] == pytest.approx(lags[0].tolist(), abs=1e-11)

@@ -13,7 +13,7 @@ from sparserob_core.checker.flow.flow import VerifiedFlow
 from sparserob_core.checker.flow.plant import Plant, modes_at
 from sparserob_core.checker.outcome import Unchecked
 from sparserob_core.checker.reach.closed_loop import VerifiedLoop
-from sparserob_core.checker.reach.preimages import Pushed, SeenDeviations
+from sparserob_core.checker.reach.preimages import MeasuredDeviations, ReachableSubspace
 from sparserob_core.control.problem.system import LinearSystem, VaryingSystem
 from sparserob_core.control.sets.sets import Box
 
@@ -32,7 +32,7 @@ GRIDS = {
 }
 
 
-def seen_of(A: np.ndarray, E: np.ndarray, changes: list[float]) -> SeenDeviations:
+def seen_of(A: np.ndarray, E: np.ndarray, changes: list[float]) -> MeasuredDeviations:
     """What all innovations at 1, 2 and 3 see of a disturbance that may jump at these times."""
     d, mw = E.shape
     system = LinearSystem(A, np.ones((d, 1)), E)
@@ -47,19 +47,24 @@ def seen_of(A: np.ndarray, E: np.ndarray, changes: list[float]) -> SeenDeviation
         changes[:-1],
         Box(-np.ones(mw), np.ones(mw)),
     )
-    pushed = Pushed.of([(mode["A"], mode["E"]) for mode in modes_at(system, ())], np.eye(mw, dtype=int).tolist())
-    blocks = sorted({block for seen in loop.seen for block in seen})
+    pushed = ReachableSubspace.of(
+        [(mode["A"], mode["E"]) for mode in modes_at(system, ())], np.eye(mw, dtype=int).tolist()
+    )
+    blocks = sorted({block for seen in loop.innovation_matrices for block in seen})
     table = np.empty((3 * d, len(blocks) * mw), dtype=object)
     table[:] = arb(0)
     pattern = np.zeros(table.shape, dtype=bool)
     for j in (1, 2, 3):
         for place, block in enumerate(blocks):
-            if block in loop.seen[j]:
+            if block in loop.innovation_matrices[j]:
                 where = slice((j - 1) * d, j * d), slice(place * mw, (place + 1) * mw)
-                table[where], pattern[where] = np.array(loop.seen[j][block].tolist(), dtype=object), pushed.pattern
+                table[where], pattern[where] = (
+                    np.array(loop.innovation_matrices[j][block].tolist(), dtype=object),
+                    pushed.pattern,
+                )
     rows = [(d * j, pushed.states) for j in (1, 2, 3)]
     columns = [(mw * (k + 1), pushed.entries) for k in range(len(blocks))]
-    return SeenDeviations(arb_mat(table.tolist()), pattern, rows, columns)
+    return MeasuredDeviations(arb_mat(table.tolist()), pattern, rows, columns)
 
 
 def floats(matrix: arb_mat) -> np.ndarray:
@@ -74,7 +79,7 @@ def test_a_preimage_is_seen_as_what_it_is_a_preimage_of(name: str, grid: str) ->
         D, X = seen.matrix, seen.inverse()
         off = D * X * D - D
         assert all(abs(x) < 1e-12 for x in off.entries())
-        assert seen.most == np.linalg.matrix_rank(floats(D), tol=1e-9)
+        assert seen.rank_bound == np.linalg.matrix_rank(floats(D), tol=1e-9)
 
 
 def test_no_rank_is_above_the_bound_whatever_the_numbers_are() -> None:
@@ -105,15 +110,19 @@ def test_no_rank_is_above_the_bound_whatever_the_numbers_are() -> None:
             list(zip(np.cumsum(sizes).tolist(), most.tolist(), strict=True))
             for sizes, most in ((r, most_r), (c, most_c))
         ]
-        seen = SeenDeviations(arb_mat(D.tolist()), pattern, *ends)
-        assert np.linalg.matrix_rank(D, tol=1e-9) <= seen.most <= min(most_r.sum(), most_c.sum(), r.sum(), c.sum())
+        seen = MeasuredDeviations(arb_mat(D.tolist()), pattern, *ends)
+        assert (
+            np.linalg.matrix_rank(D, tol=1e-9) <= seen.rank_bound <= min(most_r.sum(), most_c.sum(), r.sum(), c.sum())
+        )
 
 
 def test_of_all_deviations_that_are_seen_alike_those_of_least_squares_are_told() -> None:
     """Whatever the sizes of the columns: how far each reaches is its unit."""
     for sizes in ([1.0, 1000.0], [1.0, 1.0], [0.01, 3.0]):
         D = np.array([sizes])
-        seen = SeenDeviations(arb_mat(D.tolist()), np.ones((1, 2), dtype=bool), [(1, 1)], [(1, 1), (2, 1)], np.ones(2))
+        seen = MeasuredDeviations(
+            arb_mat(D.tolist()), np.ones((1, 2), dtype=bool), [(1, 1)], [(1, 1), (2, 1)], np.ones(2)
+        )
         found = np.array([[float(x.mid()) for x in row] for row in seen.inverse().tolist()])
         np.testing.assert_allclose(found, np.linalg.pinv(D), rtol=1e-12)
 
@@ -154,11 +163,11 @@ def test_what_systems_that_take_turns_bring_to_a_state_counts_wherever_any_of_th
     """``w`` enters the first state; one system leads it to the second one, another from there to the third."""
     entry = arb_mat([[1], [0], [0]])
     lead = [arb_mat([[0, 0, 0], [1, 0, 0], [0, 0, 0]]), arb_mat([[0, 0, 0], [0, 0, 0], [0, 1, 0]])]
-    alone = [Pushed.of([(A, entry)], [[1]]) for A in lead]
+    alone = [ReachableSubspace.of([(A, entry)], [[1]]) for A in lead]
     assert [one.states for one in alone] == [2, 1] and not alone[0].pattern[2, 0]
-    together = Pushed.of([(A, entry) for A in lead], [[1]])
+    together = ReachableSubspace.of([(A, entry) for A in lead], [[1]])
     assert together.states == 3 and together.entries == 1 and together.pattern.all()
-    elsewhere = Pushed.of([(lead[0], entry), (lead[0], arb_mat([[0], [0], [1]]))], [[1]])
+    elsewhere = ReachableSubspace.of([(lead[0], entry), (lead[0], arb_mat([[0], [0], [1]]))], [[1]])
     assert elsewhere.states == 3 and elsewhere.entries == 1
 
 
@@ -167,13 +176,13 @@ def test_rows_that_are_nothing_but_rounding_do_not_hide_the_others() -> None:
     told, left = [[3.0, -8.0], [-1e-5, -2e-5]], [[-9e-16, -9e-15], [-6e-32, -7e-31]]
     with ctx.workprec(96):
         table = [[arb(v) for v in row] for row in told] + [[arb(v, 1e-28) for v in row] for row in left]
-        seen = SeenDeviations(arb_mat(table), np.ones((4, 2), dtype=bool), [(2, 2), (4, 2)], [(2, 2)])
+        seen = MeasuredDeviations(arb_mat(table), np.ones((4, 2), dtype=bool), [(2, 2), (4, 2)], [(2, 2)])
         X = seen.inverse()
         assert np.abs(floats(X * seen.matrix) - np.eye(2)).max() < 1e-15
         assert not floats(X)[:, 2:].any()
         assert max(float(x.rad()) for x in (X * seen.matrix).entries()) < 1e-20
         with pytest.raises(Unchecked):
-            SeenDeviations(arb_mat(table[2:]), np.ones((2, 2), dtype=bool), [(2, 2)], [(2, 2)]).inverse()
+            MeasuredDeviations(arb_mat(table[2:]), np.ones((2, 2), dtype=bool), [(2, 2)], [(2, 2)]).inverse()
 
 
 def test_of_deviations_that_are_seen_alike_those_are_taken_that_reach_farthest() -> None:
@@ -181,7 +190,7 @@ def test_of_deviations_that_are_seen_alike_those_are_taken_that_reach_farthest()
     one = [(1, 1)]
     with ctx.workprec(96):
         for reach in ([1.0, 1.0, 1e-9], [1e-9, 1.0, 1e-12], [1.0, 2.0, 1e-3]):
-            X = SeenDeviations(
+            X = MeasuredDeviations(
                 arb_mat([[1.0, 1.0, 1e3]]), np.ones((1, 3), dtype=bool), one, [(3, 3)], np.array(reach)
             ).inverse()
             share = np.abs(floats(X)[:, 0]) / reach
@@ -197,5 +206,5 @@ def test_what_may_change_with_time_is_not_taken_for_exact_where_it_seems_still()
         law, ends = VerifiedFlow(Plant.of(system, 1.0), 1.0), [0.0, 0.5, 1.0]
         still, none = [arb_mat(1, 1)] * 2, np.zeros((2, 2, 1, 2))
         loop = VerifiedLoop(system, [0.0, 0.0], still, none, ends, ends, ends[:2], Box([-1, -1], [1, 1]), law=law)
-        found = loop.pushed([[Fraction(1), Fraction(0)], [Fraction(0), Fraction(1)]])
+        found = loop.find_reachable_subspace([[Fraction(1), Fraction(0)], [Fraction(0), Fraction(1)]])
     assert law.law.is_still and (found.states, found.entries) == (2, 2)

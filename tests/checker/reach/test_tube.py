@@ -21,7 +21,7 @@ from sparserob_core.checker.flow.flow import VerifiedFlow
 from sparserob_core.checker.flow.law import ParameterBox
 from sparserob_core.checker.flow.plant import Plant
 from sparserob_core.checker.flow.segment import VerifiedSegment
-from sparserob_core.checker.problem.held import Lasting
+from sparserob_core.checker.problem.held import HeldComponents
 from sparserob_core.checker.reach.states import Lines, Scene, States, _list_blocks, enclosed, ring
 from sparserob_core.checker.reach.tube import Polynomial, ProjectedStates, VerifiedTube
 from sparserob_core.checker.sets.polynomials import Enclosed
@@ -158,7 +158,7 @@ EVENTS = [0.0, 0.3, 0.5, 0.8, 1.2, 2.0]
 PUSHES = [0.8, -1.0, 0.3, 0.6, -0.4]
 BREAKS = [0.0, 0.5, 1.2]
 START, BEGUN = np.array([-1.0, 0.5]), NormBall(p=1.0, radius=0.2, dimension=2)
-LASTS = Lasting(BREAKS, ((slice(0, 1), np.array([0, 1, 2])), (slice(1, 2), np.array([0, 2]))))
+LASTS = HeldComponents(BREAKS, ((slice(0, 1), np.array([0, 1, 2])), (slice(1, 2), np.array([0, 2]))))
 PLANTS = {
     "known": (spring(), POINT, 0), "one": (spring(), ONE, 8), "two": (spring(), BOTH, 6), "turns": (turned(), BOTH, 6),
     "few powers": (spring(), BOTH, 1), "moving": (moving(), POINT, 0), "moving, one": (moving(), ONE, 6),

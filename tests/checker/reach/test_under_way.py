@@ -34,7 +34,7 @@ def test_what_began_before_a_cell_bends_within_it() -> None:
             times = (low + share * (high - low)).tolist()
             values = np.array([[float(h.mid()) for h in loop.highest(0, t, H)] for t in times])
             over = (values - ((1.0 - share)[:, None] * values[0] + share[:, None] * values[-1])).max(axis=0)
-            bent = loop.bent(0, low, high, H)
+            bent = loop.bound_chord_error(0, low, high, H)
             assert (over <= bent + 1e-12).all()
             assert (bent <= 0.2).all()
             most = max(most, float(over.max()))
@@ -48,7 +48,7 @@ def test_what_enters_less_and_less_is_above_its_chord_by_how_fast_that_falls() -
         still, none, ends = [arb_mat(1, 1)], np.zeros((1, 1, 1, 1)), [0.0, 1.0]
         law = VerifiedFlow(Plant.of(system, 1.0), 1.0)
         loop = MeasurableLoop(system, [0.0], still, none, ends, ends, [], Box([-0.1], [0.1]), law=law)
-        (bent,) = loop.bent(0, 0.25, 0.375, np.array([[1.0]]))
+        (bent,) = loop.bound_chord_error(0, 0.25, 0.375, np.array([[1.0]]))
         heights = [float(loop.highest(0, t, np.array([[1.0]]))[0].mid()) for t in (0.25, 0.3125, 0.375)]
     owed = 0.125**2 / 8.0 * 0.1
     assert heights[1] - (heights[0] + heights[2]) / 2.0 == pytest.approx(owed, rel=1e-9)

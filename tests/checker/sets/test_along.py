@@ -68,7 +68,7 @@ def test_integrals_hold_what_balls_of_many_digits_say_and_are_close(name: str, e
     def swept(off: np.ndarray) -> list[np.ndarray]:
         return [
             np.sum(one, axis=0)
-            for one in zip(*(summand.swept(plain, off, sizes, ends) for summand in summands), strict=True)
+            for one in zip(*(summand.integrate_support(plain, off, sizes, ends) for summand in summands), strict=True)
         ]
 
     value, more, less, tops = swept(zero + 1e-15 * sizes)
@@ -85,8 +85,8 @@ def test_integrals_hold_what_balls_of_many_digits_say_and_are_close(name: str, e
     assert -less[4] - 1e-15 <= exact - value[4] <= more[4] + 1e-15
     assert ((more + less) <= (1e-11 if "long" in name else 3e-13) * tops).all()
     moved = swept(zero + 1e-3)
-    assert (moved[1] >= more + 1e-3 * (end + 1.0) * sum(summand.far.sum() for summand in summands) * (1 - 1e-9)).all()
-    np.testing.assert_allclose(moved[0], value, rtol=0.0, atol=2e-3 * sum(summand.far.sum() for summand in summands))
+    assert (moved[1] >= more + 1e-3 * (end + 1.0) * sum(summand.radii.sum() for summand in summands) * (1 - 1e-9)).all()
+    np.testing.assert_allclose(moved[0], value, rtol=0.0, atol=2e-3 * sum(summand.radii.sum() for summand in summands))
 
 
 def test_heights_count_from_any_point_and_allow_for_what_the_factor_of_a_long_ellipsoid_misses() -> None:
@@ -174,7 +174,7 @@ def test_balls_that_are_nearly_those_of_the_1_norm_take_few_cells(p: float, monk
 
     monkeypatch.setattr("sparserob_core.checker.sets.along._bound_support", most)
     zero, plain = np.zeros((1, 2)), np.array([[[0.45, 0.25], [-0.35, 0.55]]])
-    value, more, less, _ = curve(NormBall(p, 0.7, dimension=2)).swept(plain, zero, zero, np.ones(1))
+    value, more, less, _ = curve(NormBall(p, 0.7, dimension=2)).integrate_support(plain, zero, zero, np.ones(1))
     q, edge = p / (p - 1.0), 0.2 / 0.9
     nodes, weights = np.polynomial.legendre.leggauss(40)
     apart = np.concatenate([[0.0], np.geomspace(1e-4 / q, 0.6, 60)])
@@ -194,5 +194,5 @@ def test_summands_of_a_product_are_those_of_its_factors_in_their_own_columns() -
     inner = product([NormBall(2.0, 0.5, dimension=2), Box([-1.0], [2.0])])
     ball, box, last = summands_of(product([inner, Box([0.0], [4.0])]))
     assert [summand.dimension for summand in (ball, box, last)] == [4, 4, 4]
-    np.testing.assert_allclose([summand.far for summand in (ball, box, last)],
+    np.testing.assert_allclose([summand.radii for summand in (ball, box, last)],
                                [[0.5, 0.5, 0, 0], [0, 0, 1.5, 0], [0, 0, 0, 2]], rtol=1e-11)  # fmt: skip

@@ -56,13 +56,13 @@ def test_sums_lose_no_more_than_they_say_and_say_little():
         (a.scaled(factors), exact(a.coefficients) * exact(factors)[:, None, None], np.abs(factors) * a.size),
     ):
         off = np.abs(truth - exact(found.coefficients)).sum(axis=(1, 2))
-        assert (off <= exact(found.lost)).all()
-        assert (found.lost <= 2e-15 * size).all()
+        assert (off <= exact(found.error)).all()
+        assert (found.error <= 2e-15 * size).all()
     for number in (-1.0, 1.0 / 3.0, 1e6):
         found, truth = a.plus(number), exact(a.coefficients)
         truth[:, 0, 0] += Fraction(number)
-        assert (np.abs(truth - exact(found.coefficients)).sum(axis=(1, 2)) <= exact(found.lost)).all()
-        assert (found.lost <= 2e-15 * (a.size + abs(number))).all()
+        assert (np.abs(truth - exact(found.coefficients)).sum(axis=(1, 2)) <= exact(found.error)).all()
+        assert (found.error <= 2e-15 * (a.size + abs(number))).all()
 
 
 def test_a_product_bounds_what_it_drops_and_what_rounding_does():
@@ -83,8 +83,8 @@ def test_a_product_bounds_what_it_drops_and_what_rounding_does():
                     else:
                         beyond += np.abs(term)
     off = np.abs(kept - exact(found.coefficients)).sum(axis=(1, 2))
-    assert (off + beyond <= exact(found.lost)).all()
-    assert (exact(found.lost) <= beyond * (1 + Fraction(1, 10**11)) + exact(3e-14 * a.size * b.size)).all()
+    assert (off + beyond <= exact(found.error)).all()
+    assert (exact(found.error) <= beyond * (1 + Fraction(1, 10**11)) + exact(3e-14 * a.size * b.size)).all()
 
 
 def test_what_was_lost_before_is_carried_on():
@@ -93,13 +93,13 @@ def test_what_was_lost_before_is_carried_on():
     number[0, 0, 0] = 1.0
     for lost, more in ((0.25, 0.0), (0.0, 0.5), (0.25, 0.5)):
         a, b = Truncated(KNOWN, 2.0 * number, np.array([lost])), Truncated(KNOWN, -3.0 * number, np.array([more]))
-        assert (a * b).lost[0] == pytest.approx((2.0 + lost) * (3.0 + more) - 6.0, rel=1e-9, abs=1e-12)
-        assert (a * b).lost[0] >= (2.0 + lost) * (3.0 + more) - 6.0
-        assert (a + b).lost[0] == pytest.approx(lost + more, abs=1e-12)
-        assert (a + b).lost[0] >= lost + more
-        assert a.scaled(np.array([-4.0])).lost[0] == pytest.approx(4.0 * lost, abs=2e-12)
-        assert a.scaled(np.array([-4.0])).lost[0] >= 4.0 * lost
-        assert a.plus(5.0).lost[0] == pytest.approx(lost, abs=1e-13)
+        assert (a * b).error[0] == pytest.approx((2.0 + lost) * (3.0 + more) - 6.0, rel=1e-9, abs=1e-12)
+        assert (a * b).error[0] >= (2.0 + lost) * (3.0 + more) - 6.0
+        assert (a + b).error[0] == pytest.approx(lost + more, abs=1e-12)
+        assert (a + b).error[0] >= lost + more
+        assert a.scaled(np.array([-4.0])).error[0] == pytest.approx(4.0 * lost, abs=2e-12)
+        assert a.scaled(np.array([-4.0])).error[0] >= 4.0 * lost
+        assert a.plus(5.0).error[0] == pytest.approx(lost, abs=1e-13)
 
 
 def valued(coefficients, share, delta):
@@ -173,7 +173,7 @@ def test_rounding_of_the_root_and_of_the_reciprocal_comes_on_top_of_what_product
     middle = square.coefficients[:, 0, 0]
     e = square.scaled(1.0 / middle).plus(-1.0)
     inner = e * e.scaled(none + 1.0 / 16.0).plus(-1.0 / 8.0)
-    products = (e * inner.plus(0.5)).plus(1.0).scaled(np.sqrt(middle)).lost
+    products = (e * inner.plus(0.5)).plus(1.0).scaled(np.sqrt(middle)).error
     assert (lost >= products + 4.0 * HALF_ULP * np.sqrt(middle)).all()
     assert (lost <= products + 1e-14 * np.sqrt(middle)).all()
 

@@ -17,7 +17,7 @@ from sparserob_core.checker.arithmetic.balls import balls
 from sparserob_core.checker.outcome import RESOLVED, TOLERANCE, Broken, Unchecked
 from sparserob_core.checker.sets.known import known
 from sparserob_core.checker.sets.parameters import Parameters, halfspaces
-from sparserob_core.checker.sets.shape import basis_of, excess, facet, far_point, widths
+from sparserob_core.checker.sets.shape import basis_of, excess, facet, find_inner_support_point, widths
 from sparserob_core.checker.sets.sides import Bounded, Curved, Sides
 from sparserob_core.control.sets.sets import Box, Cylinder, Ellipsoid, NormBall, Polytope, Product
 
@@ -102,7 +102,7 @@ def test_a_point_far_out_is_in_the_set_and_at_its_edge(name):
     shape, rng = known(SETS[name]), np.random.default_rng(2)
     for direction in [*rng.normal(size=(20, 2)), np.array([0.0, -1.0]), np.array([1.0, 0.0])]:
         with ctx.workprec(96):
-            point = far_point(shape, direction)
+            point = find_inner_support_point(shape, direction)
             assert shape.holds(point)
             reached = sum((a * x for a, x in zip(balls(direction), point, strict=True)), arb(0))
             height = shape.support(balls(direction))
@@ -294,7 +294,7 @@ def test_a_cylinder_is_its_base_and_free_beyond_it():
         assert (shape.centre == [0.1, -0.2, 0.0, 0.0]).all()
         assert shape.holds(balls([0.1, -0.2, 1e9, -1e9]))
         assert not shape.holds(balls([3.0, 0.0, 0.0, 0.0]))
-        assert [float(v.mid()) for v in shape.far(balls([1.0, 0.5, 0.0, 0.0]))][2:] == [0.0, 0.0]
+        assert [float(v.mid()) for v in shape.compute_support_offset(balls([1.0, 0.5, 0.0, 0.0]))][2:] == [0.0, 0.0]
         assert shape.gauge(balls([0.3, 0.1, 5.0, 5.0])).overlaps(known(base).gauge(balls([0.3, 0.1])))
         with pytest.raises(Broken):
             shape.support(balls([1.0, 0.0, 0.0, 1e-300]))
@@ -512,7 +512,7 @@ def test_a_kind_of_set_without_an_answer_says_so():
     for question in (
         lambda: flat.centre,
         lambda: flat.gauge(balls([1.0, 0.0])),
-        lambda: flat.far(balls([1.0, 0.0])),
+        lambda: flat.compute_support_offset(balls([1.0, 0.0])),
         lambda: known(SETS["ellipsoid"]).shares(np.ones(2)),
         lambda: many.holds(balls([0.0, 0.0])),
     ):

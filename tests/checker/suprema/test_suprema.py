@@ -63,7 +63,7 @@ def written(made: Kind, which: str, far: float = 1.0, **more: Any) -> tuple[Any,
     if which == "mixed":  # where the control jumps, a witness sees what comes after
         seen = ~np.isin(times, ENDS)
         times, heights = times[seen], heights[seen]
-    facets = made.case(path=[wall(limits)], **more).windows[0].seen.facets
+    facets = made.case(path=[wall(limits)], **more).windows[0].enclosed_set.facets
     rows = []
     for direction, b in facets:
         i = int(np.abs(DIRECTIONS - direction[:2]).sum(axis=1).argmin())

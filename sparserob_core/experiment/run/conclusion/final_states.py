@@ -54,7 +54,7 @@ def _enclose_errors(model: Transcription, result: Result) -> np.ndarray | None:
 
     from sparserob_core.checker.claims.case import Case
     from sparserob_core.checker.claims.claims import precision_of
-    from sparserob_core.checker.claims.constraints import missed
+    from sparserob_core.checker.claims.constraints import compute_residuals
     from sparserob_core.checker.outcome import Broken, Clock, Unchecked
 
     assert result.decision is not None
@@ -62,7 +62,7 @@ def _enclose_errors(model: Transcription, result: Result) -> np.ndarray | None:
     case = Case(model.stated, model.control, model.disturbance, {"decision": theta.tolist()}, Clock(SECONDS))
     try:
         with ctx.workprec(precision_of(case)):
-            error_bounds = [float(error_bound.upper()) * OUTWARDS for error_bound, _ in missed(case)]
+            error_bounds = [float(error_bound.upper()) * OUTWARDS for error_bound, _ in compute_residuals(case)]
     except (Broken, Unchecked, ZeroDivisionError):
         return None
     return np.array(error_bounds) if np.isfinite(error_bounds).all() else None
