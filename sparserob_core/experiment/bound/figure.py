@@ -15,13 +15,13 @@ if TYPE_CHECKING:
 
     from sparserob_core.experiment.bound.record import Bound, WorstCase
 
-MOST = 8  # largest number of panels: more of them are too small to be read on a page
+MAX_PANELS = 8  # largest number of panels: more of them are too small to be read on a page
 ROOM = 0.12  # empty space above and below the curves, as a share of their height
 
 
 def draw_bound(found: Bound) -> Figure:
-    """Return the figure of worst cases: a panel for every quantity that has a window of positive length, `MOST` at
-    most.
+    """Return the figure of worst cases: a panel for every quantity that has a window of positive length, at most
+    `MAX_PANELS`.
 
     Each panel has the largest and the smallest value over all uncertainty, as bands between the bound that is reached
     and the one that is proven, and the walls.
@@ -30,7 +30,7 @@ def draw_bound(found: Bound) -> Figure:
     for row in found.over_parameters:
         if row.edges.size:
             panels.setdefault((row.quantity, row.direction.size > row.deviation.size), []).append(row)
-    shown = list(panels.values())[:MOST]
+    shown = list(panels.values())[:MAX_PANELS]
     figure, axes = look.panels(len(shown), 1.9, extra=0.3)
     for ax, rows in zip(axes, shown, strict=True):
         _draw_panel(ax, rows)

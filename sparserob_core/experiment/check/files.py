@@ -99,7 +99,7 @@ NOTHING: tuple[object, ...] = (None, {}, [])
 MULTIPLIER = {"constraint", "time", "parameter", "direction", "multiplier"}
 CELLS = {"tolerance", "lower", "upper"}
 WITNESS = {"constraint", "time", "parameter", "direction", "disturbance", "violation"}
-BEGUN = {"deviation"}
+DEVIATION = {"deviation"}
 """Keys of a witness, and of a multiplier under feedback, where the initial states are a set."""
 NOISE = {"noise"}
 """Keys of both, where a policy measures outputs with a noise."""
@@ -143,7 +143,7 @@ def _list_unread(case: Case) -> set[str]:
         for entry in entries if isinstance(entries, list) else []:
             is_mixed = isinstance(entry, Mapping) and str(entry.get("constraint")) in mixed_windows
             extra_keys = ({"piece"} if is_mixed else set()) | ({"disturbance"} if case.answering else set())
-            extra_keys |= BEGUN if case.answering and case.problem.initial_set is not None else set()
+            extra_keys |= DEVIATION if case.answering and case.problem.initial_set is not None else set()
             extra_keys |= NOISE if noisy else set()
             extra_keys |= {"changes"} if case.measurable and case.answering else set()
             unread |= _list_extra_keys("multipliers.constraints", entry, MULTIPLIER | extra_keys)
@@ -155,10 +155,14 @@ def _list_unread(case: Case) -> set[str]:
             unread |= _list_extra_keys(
                 f"proof.{name}", proof.get(name), CELLS if _is_flat(shape) else CELLS | {"normals"}
             )
-    witness_keys = WITNESS | (BEGUN if case.problem.initial_set is not None else set()) | (NOISE if noisy else set())
+    witness_keys = (
+        WITNESS | (DEVIATION if case.problem.initial_set is not None else set()) | (NOISE if noisy else set())
+    )
     is_mixed = isinstance(witness, Mapping) and str(witness.get("constraint")) in mixed_windows
     witness_keys = witness_keys | {"piece"} if is_mixed else witness_keys
-    witness_keys = witness_keys - {"disturbance", *BEGUN} if case.measurable and not case.answering else witness_keys
+    witness_keys = (
+        witness_keys - {"disturbance", *DEVIATION} if case.measurable and not case.answering else witness_keys
+    )
     return unread | (_list_extra_keys("witness", witness, witness_keys) if "witness" in read else set())
 
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from sparserob_core.brief import brief
 from sparserob_core.experiment.comparison.curve import Curve
-from sparserob_core.experiment.config.plain import BESIDE, value_text
+from sparserob_core.experiment.config.plain import IRRELEVANT, value_text
 
 
 @final
@@ -55,7 +55,7 @@ class Comparison:
         """The keys in which the configs differ, each with its value in every run. Of components with different names
         the name stands for all of their options."""
         configs = [
-            {key: section for key, section in curve.config.items() if key not in BESIDE} for curve in self.curves
+            {key: section for key, section in curve.config.items() if key not in IRRELEVANT} for curve in self.curves
         ]
         return list(_list_differences("", configs))
 

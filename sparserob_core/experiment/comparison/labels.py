@@ -9,7 +9,7 @@ from typing import Any
 from sparserob_core.experiment.config.plain import value_text
 
 COMPONENTS = ("method", "maximiser", "regulariser", "solver")
-UNSEEN = frozenset({"problem", "dictionaries", "title", "observers", "plugins", "method", "maximiser", "seed"})
+UNLABELLED = frozenset({"problem", "dictionaries", "title", "observers", "plugins", "method", "maximiser", "seed"})
 
 
 def labels(configs: Sequence[Mapping[str, Any]], searched: Sequence[bool]) -> list[str]:
@@ -40,7 +40,7 @@ def _list_differences(config: Mapping[str, Any], peers: Sequence[Mapping[str, An
     yield from _list_option_differences(config, peers, "method")
     yield from _list_option_differences(config, peers, "maximiser")
     for section in config:
-        if section in UNSEEN:
+        if section in UNLABELLED:
             continue
         if section in COMPONENTS and len({_get_full_name(peer, section) for peer in peers}) > 1:
             yield f"{section} {_get_full_name(config, section)}"

@@ -14,7 +14,7 @@ from sparserob_core.errors import InputError
 from sparserob_core.experiment.comparison.curve import Curve, read_curve
 from sparserob_core.experiment.comparison.labels import labels
 from sparserob_core.experiment.comparison.profiles import Instance, Measure, Profiles
-from sparserob_core.experiment.config.plain import BESIDE, value_text
+from sparserob_core.experiment.config.plain import IRRELEVANT, value_text
 from sparserob_core.experiment.sweep.plan import FILE
 from sparserob_core.experiment.sweep.study import RUNS, read_study
 
@@ -24,7 +24,7 @@ SLACK = 1e-7
 and its size."""
 PROBLEM = ("problem", "dictionaries", "policy")
 """Sections of a config that say which problem is solved; the others, but for the seed, say who solves it."""
-NEITHER = frozenset({*PROBLEM, *BESIDE, "seed", "plugins"})
+NEITHER = frozenset({*PROBLEM, *IRRELEVANT, "seed", "plugins"})
 DIFFERENCES = 3  # parts of a problem that its label names at most
 
 

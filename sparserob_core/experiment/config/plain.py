@@ -7,7 +7,7 @@ import json
 from collections.abc import Mapping
 from typing import Any
 
-BESIDE = ("executor", "observers", "title", "limits")
+IRRELEVANT = ("executor", "observers", "title", "limits")
 """Keys of a config that do not decide the result of a finished run."""
 
 
@@ -17,7 +17,7 @@ def identity(plain: Mapping[str, Any]) -> str:
     These are the executor, the observers, the title and the limits. The hash is that of the JSON text with sorted keys
     and without spaces.
     """
-    kept = {key: value for key, value in plain.items() if key not in BESIDE}
+    kept = {key: value for key, value in plain.items() if key not in IRRELEVANT}
     text = json.dumps(kept, sort_keys=True, separators=(",", ":"), allow_nan=False)
     return hashlib.sha256(text.encode()).hexdigest()
 

@@ -37,7 +37,7 @@ SAME = 1e-9  # difference that is allowed between dependent arrays, as a share o
 LARGEST_TEXT = 2**27
 """Largest number of bytes of a JSON file. The largest that runs write have some 10 million; with ten times the limit a
 file could take all memory of a machine."""
-MOST_ENTRIES, MOST_LISTS = 2**23, 2**21
+MAX_ENTRIES, MAX_LISTS = 2**23, 2**21
 """Largest numbers of commas and of brackets in a JSON file; they are counted before it is read. A number takes some 50
 bytes, a list or an object 200. The largest files that runs write have a million of either. A file of empty lists alone
 would take 25 times its size, and the time limit of a check could not end the reading."""
@@ -376,8 +376,8 @@ def _read_json(file: Path) -> tuple[object, bool]:
         raise InputError(f"{file}: cannot be read: expected at most {LARGEST_TEXT} bytes, got {size}")
     text = file.read_text(encoding="utf-8")
     for kind, count, limit in (
-        ("entries", text.count(","), MOST_ENTRIES),
-        ("lists and objects", text.count("[") + text.count("{"), MOST_LISTS),
+        ("entries", text.count(","), MAX_ENTRIES),
+        ("lists and objects", text.count("[") + text.count("{"), MAX_LISTS),
     ):
         if count > limit:
             raise InputError(f"{file}: cannot be read: expected at most {limit} {kind}, got {count}")

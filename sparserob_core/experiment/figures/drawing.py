@@ -21,7 +21,7 @@ from sparserob_core.experiment.assemble import ControlExperiment, Experiment, co
 from sparserob_core.experiment.directory.sparsity import sparsity
 from sparserob_core.experiment.figures.active import Active, stored_active
 from sparserob_core.experiment.figures.figure_data import (
-    MOST_STATES,
+    MAX_STATES,
     FigureData,
     MeasuredOutputs,
     Wall,
@@ -151,14 +151,14 @@ def choose_states(experiment: Experiment, theta: Array) -> Sequence[int] | None:
     """Return the states that figures show, chosen by their ranges at a few times where there are very many;
     ``None`` for all."""
     model = experiment.model
-    if model is None or model.problem.system.states <= MOST_STATES:
+    if model is None or model.problem.system.states <= MAX_STATES:
         return None
     problem, own_states = model.problem, model.problem.names.corners.own(model.problem.system.states)
-    if len(own_states) <= MOST_STATES:
+    if len(own_states) <= MAX_STATES:
         return own_states
     rough_tube = _compute_tube(model, np.ravel(theta), np.linspace(0.0, problem.horizon, ROUGH), own_states)
     reach = rough_tube.upper.max(axis=1) - rough_tube.lower.min(axis=1)
-    return sorted({*telling(reach, [*_list_walls(model)])[:MOST_STATES], *(problem.names.in_plane or ())})
+    return sorted({*telling(reach, [*_list_walls(model)])[:MAX_STATES], *(problem.names.in_plane or ())})
 
 
 def _compute_tube(model: Transcription, decision: Array, times: Array, states: Sequence[int]) -> Tube:

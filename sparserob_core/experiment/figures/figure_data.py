@@ -16,7 +16,7 @@ from sparserob_core.experiment.terminal.printing import printable
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.events import RoundFinished
 
-MOST_STATES = 12  # drawn in one figure
+MAX_STATES = 12  # drawn in one figure
 IDLE = 1e-7  # of the largest control: less than that is no action but rounding
 
 
@@ -142,9 +142,9 @@ class FigureData:
 
     @cached_property
     def drawn_states(self) -> tuple[int, ...]:
-        """The states that figures show, in their order: all that are known, or `MOST_STATES` of them, `telling`."""
+        """The states that figures show, in their order: all that are known, or `MAX_STATES` of them, `telling`."""
         reach = self.tube_upper.max(axis=1) - self.tube_lower.min(axis=1)
-        return tuple(sorted(state for state in telling(reach, self.walls)[:MOST_STATES] if not np.isnan(reach[state])))
+        return tuple(sorted(state for state in telling(reach, self.walls)[:MAX_STATES] if not np.isnan(reach[state])))
 
     @property
     def path(self) -> Array:

@@ -12,7 +12,8 @@ from sparserob_core.sip.convex_set import Array
 MARGIN = 0.08  # of the larger side of what is drawn, around it; ten times as much leaves no picture
 SLIM = 0.25  # of the larger side, the smaller one at least: of a tenth nothing is seen, at 1 all is a square
 SAME = 1e-12  # of coordinates, what is rounding: with 0 a goal that is a point is empty, 1e9 times as much is seen
-FAR = 0.05  # of the larger side: a goal that is smaller is shown larger, too; at 0.5 all are, at 0.005 a dot stays one
+# of the larger side: a goal that is smaller is shown larger, too; at 0.5 all are, at 0.005 a dot stays one
+MAX_ENLARGED = 0.05
 CLOSE = 3.0  # sides of the goal that are shown of what is around it; of one no path is seen, of thirty no goal
 NEAR = 0.3  # of the larger side: a wall that is nearer to the path is within the view; of all walls one sees no path
 
@@ -109,7 +110,7 @@ class Plane:
         if not goals or not len(allowed):
             return None
         side = float(np.ptp(allowed, axis=0).max())
-        if not SAME * float(np.abs(allowed).max()) < side <= FAR * float((high - low).max()):
+        if not SAME * float(np.abs(allowed).max()) < side <= MAX_ENLARGED * float((high - low).max()):
             return None
         middle, half = (allowed.min(axis=0) + allowed.max(axis=0)) / 2, CLOSE * side / 2 * np.array([1.0, 0.5])
         return middle - half, middle + half

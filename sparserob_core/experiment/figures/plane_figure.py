@@ -19,7 +19,8 @@ if TYPE_CHECKING:
 
 PALE = "#BEE1F6"  # SKY at 45 % on white
 POINT = 0.01  # of the larger side: a smaller goal is drawn as a mark; at a tenth boxes that one sees become marks
-BESIDE = 0.08  # of the width: of nearer marks one has its time above, the lower one below; of a tenth all are one blot
+# of the width: of nearer marks one has its time above, the lower one below; of a tenth all are one blot
+MIN_SPACING = 0.08
 MARKS = 4  # parts of the horizon whose ends are marked
 
 
@@ -131,7 +132,7 @@ def _draw_marks(ax: Axes, data: FigureData, path: Array, frame: Array) -> None:
     marked_points = np.stack([np.interp(times, data.times, coordinate) for coordinate in path.T], axis=1)
     ax.plot(*marked_points.T, "o", color="white", markeredgecolor=look.BLUE, markersize=4.5, zorder=5)
     unit = f" {plain(data.names.time)}" if data.names.time else ""
-    spacing = BESIDE * (ax.get_xlim()[1] - ax.get_xlim()[0])
+    spacing = MIN_SPACING * (ax.get_xlim()[1] - ax.get_xlim()[0])
     is_crowded = np.abs(marked_points[:, None] - marked_points).max(axis=2) < spacing
     labelled_marks: list[int] = []
     for number in range(MARKS, -1, -1):  # of marks that crowd, the last ones have their times

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sparserob_core.experiment.figures import style as look
-from sparserob_core.experiment.figures.figure_data import MOST_STATES, FigureData, Wall, measured, plain
+from sparserob_core.experiment.figures.figure_data import MAX_STATES, FigureData, Wall, measured, plain
 from sparserob_core.experiment.figures.plane_figure import draw_plane
 from sparserob_core.experiment.figures.style import draw_legend, held, panels
 from sparserob_core.sip.result import relative_gap
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
     from sparserob_core.sip.convex_set import Array
 
-MOST_GAINS = 16  # pictures of gains in one figure
+MAX_GAINS = 16  # pictures of gains in one figure
 FLAT = 1.5  # half the least height of a switching function, in prices: at 15 the band is a line, at 1 it hides its edge
 HEADROOM = 1.15  # of the largest value, above it: at 1 it is on the frame, at 10 the band is a line
 IDLE = 1e-7  # of the control's bound: less than that is no action but rounding
@@ -152,7 +152,7 @@ def draw_outputs(data: FigureData) -> Figure:
     """Every output in the worst case, and the readings that noise makes of it at the instants of its measurement."""
     outputs = data.outputs
     assert outputs is not None
-    count = min(len(outputs.C), MOST_STATES)
+    count = min(len(outputs.C), MAX_STATES)
     figure, axes = panels(count, 1.9, extra=0.4)
     for output, ax in enumerate(axes):
         lower, upper = outputs.lower[output], outputs.upper[output]
@@ -187,7 +187,7 @@ def draw_gains(data: FigureData) -> Figure:
     assert data.gains is not None
     K, _, m, d = data.gains.shape
     sizes = np.abs(data.gains).max(axis=(0, 1))
-    shown = sorted(np.argsort(-sizes.ravel(), kind="stable")[:MOST_GAINS].tolist())
+    shown = sorted(np.argsort(-sizes.ravel(), kind="stable")[:MAX_GAINS].tolist())
     across = 1 if len(shown) < 3 else d if d <= 4 and len(shown) == m * d else 4
     figure, axes = _make_grid(len(shown), across)
     is_causal = np.tril(np.ones((K, K))) > 0

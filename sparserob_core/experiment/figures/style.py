@@ -31,7 +31,7 @@ EXCLUDED: dict[str, Any] = {"facecolor": MIST, "edgecolor": "#C4C4C4", "hatch": 
 WIDTH = 6.2
 """Width of every figure in inches: a text column at full size."""
 
-LETTERS, BESIDE = 104, 8
+LETTERS, MARKER_LETTERS = 104, 8
 """Letters that have room beside each other in a legend, and as how many of them a mark with its spaces is as wide: with
 more, or with narrower marks, the first and the last entry are cut off."""
 
@@ -95,8 +95,8 @@ def draw_legend(figure: Figure, axes: list[Axes]) -> None:
     """Draw a single legend below all panels."""
     entries = {label: handle for ax in axes for handle, label in zip(*ax.get_legend_handles_labels(), strict=True)}
     letters = len("".join(entries))
-    alone = letters <= 64 and letters + BESIDE * len(entries) <= LETTERS
-    few = 4 if max(map(len, entries), default=0) + BESIDE <= LETTERS / 4 else 3
+    alone = letters <= 64 and letters + MARKER_LETTERS * len(entries) <= LETTERS
+    few = 4 if max(map(len, entries), default=0) + MARKER_LETTERS <= LETTERS / 4 else 3
     figure.legend(
         entries.values(),
         entries.keys(),

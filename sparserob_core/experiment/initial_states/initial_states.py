@@ -29,7 +29,7 @@ from sparserob_core.sip.events import Notify, ignore
 from sparserob_core.sip.method import GAP_TOLERANCE
 
 __all__ = ["InitialStates", "initial_states"]
-FAR = 1e4  # times the numbers in the problem: a coordinate that may be as large as this is called unbounded
+UNBOUNDED = 1e4  # times the numbers in the problem: a coordinate that may be as large as this is called unbounded
 THINNEST = 1e-10  # of the first box, and of the walls of the problem: a coordinate without interior
 
 
@@ -140,7 +140,7 @@ def _choose_largest_size(problem: OptimalControlProblem) -> float:
     references = [entry.relative_to for entry in problem.of_states]
     sizes += [float(np.abs(np.asarray(rows)[:, 1:]).max()) for rows in references if rows is not None]
     sizes += [float(np.abs(end.values[end.fixed]).max()) for end in problem.terminal_equalities]
-    return FAR * max([1.0, float(np.abs(np.asarray(problem.initial_state)).max()), *sizes])
+    return UNBOUNDED * max([1.0, float(np.abs(np.asarray(problem.initial_state)).max()), *sizes])
 
 
 def _check_about(about: Sequence[float], problem: OptimalControlProblem) -> Array:

@@ -26,7 +26,7 @@ from sparserob_core.sip.result import Result
 
 HORIZON = "horizon"
 SCAN = 16  # number of equal parts into which the search first divides all horizons, where no curve asks for more
-MOST = 400  # largest number of runs of the search, without those of the curve
+MAX_RUNS = 400  # largest number of runs of the search, without those of the curve
 MET = 4.0  # largest distance of the two ends of a finished search, in widths
 
 
@@ -183,7 +183,7 @@ class HorizonSearch:
                 "" if self.problem.control_step is None else "; control_step is left out of what excludes horizons"
             )
             return f"no multipliers exclude {low:.9g} to {self._format_time(high)}{left_out}"
-        return f"{MOST} runs did not suffice" if len(self.points) > MOST else ""
+        return f"{MAX_RUNS} runs did not suffice" if len(self.points) > MAX_RUNS else ""
 
     def _bisect_points(self, low: float, points: list[float]) -> None:
         """Find the first feasible one of ``points`` beyond ``low``, and by bisection the shortest feasible horizon

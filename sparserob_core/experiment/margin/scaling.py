@@ -18,7 +18,7 @@ from sparserob_core.sip.convex_set import Array
 
 Sense: TypeAlias = Literal["largest", "smallest"]
 LARGEST = 1e6  # the largest factor that is tried
-MOST_UNCERTAIN = 1024.0  # the largest factor on a set of parameters, which changes the matrices
+MAX_UNCERTAIN = 1024.0  # the largest factor on a set of parameters, which changes the matrices
 CONTROL = "factor on the control set"
 SHORT = 1e-9  # share of a window that must remain where a control is held over several intervals in it
 POINT = 1e-6  # the factor that replaces 0 for a curved set, which must have an interior
@@ -188,7 +188,7 @@ def _scale_parameters(problem: OptimalControlProblem) -> Scaling:
         "largest half-width of a parameter",
         _multiply_by(_compute_half_width(bound)),
         affine=False,
-        highest=MOST_UNCERTAIN,
+        highest=MAX_UNCERTAIN,
     )
 
 

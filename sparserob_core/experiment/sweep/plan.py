@@ -17,12 +17,12 @@ from sparserob_core.encodings import name_of, path_of
 from sparserob_core.errors import ConfigError, InputError
 from sparserob_core.experiment.config.extending import extended, movable
 from sparserob_core.experiment.config.load import Loaded, load_config
-from sparserob_core.experiment.config.plain import BESIDE, difference, identity, value_text
+from sparserob_core.experiment.config.plain import IRRELEVANT, difference, identity, value_text
 from sparserob_core.experiment.config.reading.overrides import parse_overrides
 from sparserob_core.experiment.config.reading.reader import ConfigSource, read_source, read_value, write_yaml
 from sparserob_core.experiment.plugins.messages import nearest, shown
 from sparserob_core.experiment.run.events import StudyProgress
-from sparserob_core.experiment.sweep.axes import FIXED, MOST, Axis, parse_axes, require_whole
+from sparserob_core.experiment.sweep.axes import FIXED, MAX_POINTS, Axis, parse_axes, require_whole
 from sparserob_core.sip.events import Notify, ignore
 
 FILE = "sweep.yaml"
@@ -116,16 +116,16 @@ class Plan:
                 counts_text = ", ".join(f"{count} of {key}" for key, count in counts.items())
                 raise InputError(path="zip", expected="axes with equally many values", got=counts_text)
             return list(zip(*(axis.values for axis in self.axes), strict=True)) if self.axes else [()]
-        places = list(product(*(range(len(axis.values)) for axis in self._list_leading_axes(MOST))))
+        places = list(product(*(range(len(axis.values)) for axis in self._list_leading_axes(MAX_POINTS))))
         return [self._get_values(row) for row in places]
 
-    def _list_leading_axes(self, most: float = np.inf) -> list[Axis]:
-        """Return the axes without those that follow another one; raises `InputError` for more than ``most``
-        combinations."""
+    def _list_leading_axes(self, max_points: float = np.inf) -> list[Axis]:
+        """Return the axes without those that follow another one; raises `InputError` for more than
+        ``max_points`` combinations."""
         leading = [axis for axis in self.axes if not axis.follows]
         count = int(np.prod([len(axis.values) for axis in leading], dtype=float))
-        if count > most:
-            raise InputError(path="axes", expected=f"at most {MOST} points", got=str(count))
+        if count > max_points:
+            raise InputError(path="axes", expected=f"at most {MAX_POINTS} points", got=str(count))
         return leading
 
     def _get_values(self, places: Sequence[int]) -> tuple[Any, ...]:
@@ -190,7 +190,7 @@ class Plan:
     def apart_from(self, other: Plan) -> str:
         """Return the difference of the base from another study's in what decides results; empty where there is none."""
         own_base, other_base = (
-            {key: value for key, value in plan.base.data.items() if key not in BESIDE} for plan in (self, other)
+            {key: value for key, value in plan.base.data.items() if key not in IRRELEVANT} for plan in (self, other)
         )
         mismatch = difference(own_base, other_base)
         return (

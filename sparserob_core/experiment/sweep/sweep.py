@@ -48,7 +48,7 @@ STILLBORN = 3  # number of consecutive executors whose workers may die before th
 LETTERS = 60  # letters of the name of a run directory, before its hash
 DIGITS = 12  # digits of the hash in that name
 PARTIAL = ".partial"
-BEGUN_BY = re.compile(rf"-[0-9a-f]{{{DIGITS}}}\.(.*)\.(\d+){re.escape(PARTIAL)}")
+PARTIAL_OWNER = re.compile(rf"-[0-9a-f]{{{DIGITS}}}\.(.*)\.(\d+){re.escape(PARTIAL)}")
 """End of the name of a run that is not over: the host and the process that began it."""
 
 
@@ -541,7 +541,7 @@ class _SweepCall:
         """Remove the partial run directories of dead processes, and of this one."""
         for name in _list_directories(self.directory / RUNS, hidden=True):
             path = self.directory / RUNS / name
-            match = BEGUN_BY.search(name)
+            match = PARTIAL_OWNER.search(name)
             # a run has no lock before its first file and after its last one: the process in its name is checked as well
             owners = [owner_of(path), *([(int(match[2]), match[1])] if match else [])]
             if all(not owner[0] or owner == (os.getpid(), platform.node()) or is_dead(*owner) for owner in owners):

@@ -254,8 +254,8 @@ def test_a_file_that_is_too_large_is_refused_before_it_is_read(tmp_path: Path) -
 def test_text_with_too_many_parts_is_refused_before_lists_are_made_of_it(
     entry: str, most: int, said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(finished, "MOST_LISTS", 9)
-    monkeypatch.setattr(finished, "MOST_ENTRIES", 20)
+    monkeypatch.setattr(finished, "MAX_LISTS", 9)
+    monkeypatch.setattr(finished, "MAX_ENTRIES", 20)
     file, around = tmp_path / "x.json", 2 if most == 9 else 0  # an object and a list hold them
     file.write_text(f'{{"a": [{", ".join([entry] * (most - around))}]}}')
     assert len(read_json(file)["a"]) == most - around

@@ -121,7 +121,7 @@ def test_of_many_gains_the_largest_are_drawn_and_the_title_says_so(data: FigureD
     many = replace(data, gains=np.tile(data.gains, (1, 1, 1, 12)), **tiled)
     figure = run_figures.draw_gains(many)
     pictures = [ax for ax in figure.axes if ax.get_visible() and ax.collections and "answers" in ax.get_ylabel()]
-    assert len(pictures) == run_figures.MOST_GAINS
+    assert len(pictures) == run_figures.MAX_GAINS
     assert "the largest 16 of 24" in pictures[0].get_title()
 
 

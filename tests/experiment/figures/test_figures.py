@@ -17,7 +17,7 @@ from sparserob_core.experiment.assemble import ControlExperiment, assemble
 from sparserob_core.experiment.config.load import load_config
 from sparserob_core.experiment.figures import drawing
 from sparserob_core.experiment.figures.active import Active, active_of, stored_active
-from sparserob_core.experiment.figures.figure_data import MOST_STATES, FigureData, Wall
+from sparserob_core.experiment.figures.figure_data import MAX_STATES, FigureData, Wall
 from sparserob_core.experiment.figures.run_figures import draw_control, draw_convergence, draw_states, run_pictures
 from sparserob_core.experiment.figures.style import (
     _report_missing_letters,
@@ -193,7 +193,7 @@ def test_of_many_states_those_with_constraints_are_drawn_and_those_that_move_the
 @pytest.mark.parametrize("policy", ["open_loop", "affine"])
 def test_of_very_many_states_no_more_is_computed_than_is_drawn(policy: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Fourteen tanks of which the first is walled and those behind it move ever less."""
-    n = MOST_STATES + 2
+    n = MAX_STATES + 2
     problem = sr.OptimalControlProblem(
         system=sr.LinearSystem(np.diag(np.full(n, -1.0)) + np.eye(n, k=-1), np.eye(n)[:, :1], 0.1 * np.eye(n)[:, :1]),
         horizon=1.0,
@@ -213,11 +213,11 @@ def test_of_very_many_states_no_more_is_computed_than_is_drawn(policy: str, monk
     monkeypatch.setattr(drawing, "tube", counted)
     experiment, decision = result.experiment, np.asarray(result.decision)
     shown = drawing.choose_states(experiment, decision)
-    assert shown is not None and set(shown) == {*range(MOST_STATES)}
+    assert shown is not None and set(shown) == {*range(MAX_STATES)}
     data = drawing.figure_data(experiment, decision, None, (), None, states=shown)
-    assert data.drawn_states == tuple(shown) and data.of_states == f", {MOST_STATES} of {n} states"
-    assert np.isnan(data.tube_lower[MOST_STATES:]).all()
-    assert asked[0] == drawing.ROUGH * n and max(asked[1:]) == MOST_STATES * data.times.size
+    assert data.drawn_states == tuple(shown) and data.of_states == f", {MAX_STATES} of {n} states"
+    assert np.isnan(data.tube_lower[MAX_STATES:]).all()
+    assert asked[0] == drawing.ROUGH * n and max(asked[1:]) == MAX_STATES * data.times.size
     known = result.tube(data.times)
     np.testing.assert_allclose(data.tube_upper[list(shown)], known.upper[list(shown)], rtol=1e-12)
     np.testing.assert_allclose(data.state[list(shown)], known.nominal[list(shown)], rtol=1e-12)

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 # Bytes of a config, which may hold matrices as one text each. Large data belongs in a file of arrays, or in a plugin
 # that makes it. Ten times more takes half a minute to read; a tenth is a dense matrix of 200 states.
 LARGEST = 4_000_000
-MOST_VALUES = 200_000  # values of a config; an alias counts as all values that it stands for
+MAX_VALUES = 200_000  # values of a config; an alias counts as all values that it stands for
 
 __all__ = ["ConfigSource", "read_source", "read_value", "require_readable", "write_yaml"]
 
@@ -106,9 +106,9 @@ def read_source(config: str | File | Mapping[str, Any] | ConfigSource) -> Config
             f"{file}: expected a mapping of keys to values, got"
             f" {'a list' if isinstance(data, list) else repr(data)[:60]}"
         )
-    if _count_values(data, {}) > MOST_VALUES:
+    if _count_values(data, {}) > MAX_VALUES:
         raise ConfigError(
-            f"{file}: expected at most {MOST_VALUES} values, aliases counted as what they stand for, got more"
+            f"{file}: expected at most {MAX_VALUES} values, aliases counted as what they stand for, got more"
         )
     return ConfigSource(str(file), file.resolve().parent, data, "" if file.suffix == ".toml" else text)
 
@@ -116,9 +116,9 @@ def read_source(config: str | File | Mapping[str, Any] | ConfigSource) -> Config
 def require_readable(data: Mapping[str, Any], text: str) -> None:
     """Raise `ConfigError` where a config that was written as ``text`` is larger than `read_source` accepts."""
     size, values = len(text.encode()), _count_values(data, {})
-    if size > LARGEST or values > MOST_VALUES:
+    if size > LARGEST or values > MAX_VALUES:
         raise ConfigError(
-            f"the problem cannot be written: expected at most {LARGEST} bytes and {MOST_VALUES} values, got {size} and"
+            f"the problem cannot be written: expected at most {LARGEST} bytes and {MAX_VALUES} values, got {size} and"
             f" {values}"
         )
 
@@ -135,8 +135,8 @@ def read_value(text: str) -> object:
         raise ConfigError(f"override value {text!r}: {_describe_problem(error)}") from error
     except (YAMLError, RecursionError) as error:
         raise ConfigError(f"override value {text[:60]!r}: not valid YAML: {type(error).__name__}") from None
-    if _count_values(value, {}) > MOST_VALUES:
-        raise ConfigError(f"override value {text[:40]!r}...: expected at most {MOST_VALUES} values, got more")
+    if _count_values(value, {}) > MAX_VALUES:
+        raise ConfigError(f"override value {text[:40]!r}...: expected at most {MAX_VALUES} values, got more")
     return value
 
 
