@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import sparserob_core as sr
-from sparserob_core.experiment.config.stated.source import component_keys
+from sparserob_core.experiment.config.writing.source import component_keys
 from sparserob_core.experiment.plugins.guards import guarded
 
 

@@ -14,7 +14,7 @@ from sparserob_core.errors import InputError
 from sparserob_core.experiment.assemble import Experiment
 from sparserob_core.experiment.config.load import Loaded
 from sparserob_core.experiment.config.reading.reader import ConfigSource
-from sparserob_core.experiment.config.stated.source import source_of
+from sparserob_core.experiment.config.writing.source import source_of
 from sparserob_core.experiment.directory.finished import read_config
 from sparserob_core.experiment.run.outcome import Outcome, SolvedProblem
 

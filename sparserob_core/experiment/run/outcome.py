@@ -23,7 +23,7 @@ from sparserob_core.errors import InputError
 from sparserob_core.experiment.assemble import ControlExperiment, Experiment, assemble, tools_of
 from sparserob_core.experiment.config.load import Loaded, load_config
 from sparserob_core.experiment.config.reading.reader import ConfigSource, require_readable, write_yaml
-from sparserob_core.experiment.config.stated.source import component_keys, dictionary_keys, source_of
+from sparserob_core.experiment.config.writing.source import component_keys, dictionary_keys, source_of
 from sparserob_core.experiment.directory.provenance import git_revision, provenance
 from sparserob_core.experiment.directory.study import open_directory
 from sparserob_core.experiment.plugins.registry import load_registry

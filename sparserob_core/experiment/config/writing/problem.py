@@ -49,7 +49,7 @@ def problem_keys(problem: OptimalControlProblem) -> dict[str, Any]:
     unknown = {field.name for field in fields(problem)} - WRITTEN - set(problem.lists)
     if unknown:
         raise InputError(path=sorted(unknown)[0], expected="a field that a config can say", got="another one")
-    stated = {name: [entry for entry in entries if entry.stated] for name, entries in problem.lists.items()}
+    given_terms = {name: [entry for entry in entries if entry.stated] for name, entries in problem.lists.items()}
     fixed = bool(problem.repeat) and bool((widths(problem.initial_set, problem.system.states) == 0.0).any())
     ends = problem.terminal[: len(problem.terminal) - fixed]  # the key repeat adds its own end again
     keys: dict[str, Any] = {
@@ -61,7 +61,10 @@ def problem_keys(problem: OptimalControlProblem) -> dict[str, Any]:
         "weights": np.asarray(problem.weights).tolist(),
         "disturbance_class": _get_class(problem, 0),
         "terminal": [_write_terminal(f"terminal.{i}", entry) for i, entry in enumerate(ends)],
-        **{name: [_write_term(f"{name}.{i}", term) for i, term in enumerate(terms)] for name, terms in stated.items()},
+        **{
+            name: [_write_term(f"{name}.{i}", term) for i, term in enumerate(terms)]
+            for name, terms in given_terms.items()
+        },
         **_write_cost(problem.cost),
         **_write_names(problem.names),
     }
@@ -236,7 +239,7 @@ def _write_cost(cost: Cost) -> dict[str, Any]:
 def _write_names(names: Names) -> dict[str, Any]:
     keys: dict[str, Any] = {kind: list(getattr(names, kind)) for kind in ("states", "controls", "disturbances")}
     units = {kind: list(getattr(names, f"{kind[:-1]}_units")) for kind in keys}
-    stated = {**units, "time": names.time}
+    unit_names = {**units, "time": names.time}
     entries = {key: value for key, value in {**keys, "plane": list(names.plane)}.items() if value}
-    unit_keys = {key: value for key, value in stated.items() if value}
+    unit_keys = {key: value for key, value in unit_names.items() if value}
     return {"names": {**entries, **({"units": unit_keys} if unit_keys else {})}} if entries or unit_keys else {}

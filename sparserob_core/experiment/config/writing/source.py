@@ -12,7 +12,7 @@ from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.errors import InputError
 from sparserob_core.experiment.config.reading.reader import ConfigSource
-from sparserob_core.experiment.config.stated.problem import problem_keys
+from sparserob_core.experiment.config.writing.problem import problem_keys
 from sparserob_core.experiment.plugins.components import Registry
 from sparserob_core.experiment.plugins.guards import unguarded
 from sparserob_core.options import Options
@@ -20,17 +20,17 @@ from sparserob_core.options import Options
 NAME = "problem"  # its name in messages and in the folder of its runs, for a title may hold any character
 
 
-def source_of(problem: OptimalControlProblem, beside: Mapping[str, Any] | None = None) -> ConfigSource:
-    """Return the config of a problem together with the other keys ``beside`` it.
+def source_of(problem: OptimalControlProblem, other_keys: Mapping[str, Any] | None = None) -> ConfigSource:
+    """Return the config of a problem together with ``other_keys``.
 
     Raises `InputError` that begins with the key where no config can describe the problem.
     """
     title = {"title": problem.title} if problem.title else {}
     try:
-        stated = problem_keys(problem)
+        problem_section = problem_keys(problem)
     except InputError as error:
         raise error.under("problem") from None
-    return ConfigSource(NAME, File.cwd(), {**title, "problem": stated, **(beside or {})})
+    return ConfigSource(NAME, File.cwd(), {**title, "problem": problem_section, **(other_keys or {})})
 
 
 def component_keys(registry: Registry, kind: str, choice: object) -> dict[str, Any]:

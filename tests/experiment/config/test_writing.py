@@ -15,8 +15,8 @@ from sparserob_core.control.problem.phase import Phase
 from sparserob_core.experiment.assemble import problem_of
 from sparserob_core.experiment.config.load import load_config
 from sparserob_core.experiment.config.reading.reader import ConfigSource, require_readable, write_yaml
-from sparserob_core.experiment.config.stated.problem import WRITTEN, WRITTEN_OF_SYSTEM
-from sparserob_core.experiment.config.stated.source import component_keys, dictionary_keys, source_of
+from sparserob_core.experiment.config.writing.problem import WRITTEN, WRITTEN_OF_SYSTEM
+from sparserob_core.experiment.config.writing.source import component_keys, dictionary_keys, source_of
 from sparserob_core.experiment.plugins.registry import load_registry
 
 SETS = [
