@@ -106,11 +106,11 @@ class ControlExperiment(Experiment):
 class PlainExperiment(Experiment):
     """A semi-infinite program that is no control problem."""
 
-    stated: SemiInfiniteProgram
+    given: SemiInfiniteProgram
 
     @property
     def program(self) -> SemiInfiniteProgram:
-        return self.stated
+        return self.given
 
     def of_control(self, expected: str) -> ControlExperiment:
         raise InputError(f"{expected}, got a semi-infinite program of another kind")
@@ -124,7 +124,7 @@ class UntranscribedExperiment(Experiment):
     Its program has no constraints. The only known fact is that no term of its cost is negative.
     """
 
-    stated: OptimalControlProblem
+    given: OptimalControlProblem
     reason: str
 
     @property
@@ -133,7 +133,7 @@ class UntranscribedExperiment(Experiment):
 
     @property
     def problem(self) -> OptimalControlProblem:
-        return self.stated
+        return self.given
 
     def of_control(self, expected: str) -> ControlExperiment:
         raise TimeLimitError(self.reason)

@@ -91,13 +91,13 @@ def bound(
         _require_matching_control(control, shape, loaded, _has_answering_policy(loaded, problem, dictionaries[0]))
     deadline = Deadline(loaded.config.limits.seconds if seconds is None else float(seconds))
 
-    def told(text: str, done: int, total: int) -> None:
+    def report_progress(text: str, done: int, total: int) -> None:
         notify(StudyProgress(text=text, done=done, total=total))
 
     with open_study(loaded, out, "The experiment whose worst cases were bounded.", "-bound", write) as directory:
         theta = np.zeros(shape) if control is None else control
         try:
-            bounded_rows = bound_rows(problem, dictionaries, theta, float(tolerance), told, notify, deadline)
+            bounded_rows = bound_rows(problem, dictionaries, theta, float(tolerance), report_progress, notify, deadline)
         except InputError as error:
             raise loaded.located(("problem",), error) from error
         rows = tuple(worst_case(problem, row) for row in bounded_rows)

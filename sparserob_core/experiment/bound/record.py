@@ -230,7 +230,7 @@ def _to_plain(value: Any) -> Any:
     return value.tolist() if isinstance(value, np.ndarray) else value
 
 
-def bound_rows_told(found: Bound) -> list[tuple[str, ...]]:
+def list_bound_rows(found: Bound) -> list[tuple[str, ...]]:
     """Return every worst case as a row of a table, over all corners of the parameters, with the corner that
     reaches it."""
     rows = found.over_parameters
@@ -259,8 +259,8 @@ def bound_rows_told(found: Bound) -> list[tuple[str, ...]]:
     ]
 
 
-def columns_told(found: Bound) -> tuple[str, ...]:
-    """Return the names of the columns of `bound_rows_told`."""
+def list_bound_columns(found: Bound) -> tuple[str, ...]:
+    """Return the names of the columns of `list_bound_rows`."""
     time = f"at t [{found.time_unit}]" if found.time_unit else "at t"
     corner_column = ("at parameters",) if any(row.corner for row in found.rows) else ()
     return "constraint", "worst case", "at least", "at most", time, "wall", "margin", *corner_column

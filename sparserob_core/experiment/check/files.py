@@ -358,15 +358,15 @@ def _compare_worst(case: Case, summary: Mapping[str, Any]) -> list[str] | None:
         return [f"worst: {error}"]
 
 
-def _measure_excess(bound: ConvexSet, begun: Array, centre: Array) -> float:
+def _measure_excess(bound: ConvexSet, initial_state: Array, centre: Array) -> float:
     """Return how far an initial state lies outside a set of deviations from a centre, in the set's own unit.
 
     The rounding error of the sum of deviation and centre is not counted.
     """
     from sparserob_core.checker.arithmetic.balls import balls
 
-    shape, deviation = known(bound), begun - centre
-    rounded = np.finfo(float).eps * (np.abs(begun) + np.abs(centre))
+    shape, deviation = known(bound), initial_state - centre
+    rounded = np.finfo(float).eps * (np.abs(initial_state) + np.abs(centre))
     if shape.facets is not None:
         return excess(shape, balls(deviation), lambda c: balls([-float(np.abs(c) @ rounded)])[0])[0]
     distance = np.maximum(np.abs(deviation - shape.centre) - rounded, 0.0)
@@ -449,11 +449,11 @@ def _compare_units(case: Case, summary: Mapping[str, Any]) -> list[str]:
     rows = entry.get("rows") if isinstance(entry, Mapping) else None
     if not isinstance(entry, Mapping) or not isinstance(rows, Mapping | None):
         return ["units is no mapping with rows"]
-    stated_units = [
+    written_units = [
         entry.get("worst", ""),
         *(unit for row in (rows or {}).values() for unit in (row if isinstance(row, list) else [row])),
     ]
-    different = [unit for unit in stated_units if not isinstance(unit, str) or unit not in known_units]
+    different = [unit for unit in written_units if not isinstance(unit, str) or unit not in known_units]
     wrong = [f"units: {unit} is none of the config's" for unit in dict.fromkeys(map(repr, different))]
     effort = case.problem.cost_unit
     cost = names.time if case.counts else effort

@@ -47,7 +47,7 @@ class Comparison:
 
     def within(self, curve: Curve, share: float) -> float:
         """The evaluations after which the curve came within that share of the exact value; nan when it never did."""
-        needed = curve.reached(self.exact - share * abs(self.exact))
+        needed = curve.find_evaluations(self.exact - share * abs(self.exact))
         return needed if np.isfinite(needed) else np.nan
 
     @property

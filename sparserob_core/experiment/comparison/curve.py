@@ -58,11 +58,11 @@ class Curve:
     """Whether its cost is the time that the control acts."""
     cost_unit: str = ""
 
-    def reached_after(self, target: float) -> float:
+    def find_seconds(self, target: float) -> float:
         """The seconds after which the bound was at least ``target``; infinite when it never was."""
         return spent_until(target, self.bound, self.seconds)
 
-    def reached(self, target: float) -> float:
+    def find_evaluations(self, target: float) -> float:
         """The evaluations after which the bound was at least ``target``; infinite when it never was."""
         return spent_until(target, self.bound, self.evaluations)
 

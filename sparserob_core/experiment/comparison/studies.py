@@ -117,7 +117,7 @@ def _collect_times(curves: Sequence[Curve], seeds: Mapping[Any, None], target: f
     is missing."""
     times = dict.fromkeys(seeds, np.inf)
     for curve in curves:
-        needed = curve.reached(target) if measure == "evaluations" else curve.reached_after(target)
+        needed = curve.find_evaluations(target) if measure == "evaluations" else curve.find_seconds(target)
         # nan: it is not known
         times[curve.config.get("seed")] = float(np.fmin(times[curve.config.get("seed")], needed))
     return np.array(list(times.values()))

@@ -49,11 +49,11 @@ def movable(source: ConfigSource) -> tuple[dict[str, Any], list[Complaint]]:
 def _extend_source(source: ConfigSource, above: tuple[File, ...]) -> ConfigSource:
     if EXTENDS not in source.data:
         return source
-    stated = source.data[EXTENDS]
-    if not isinstance(stated, str) or not stated:
-        raise _make_error(source, f"expected the file of a config (got {shown(stated)})")
+    file_name = source.data[EXTENDS]
+    if not isinstance(file_name, str) or not file_name:
+        raise _make_error(source, f"expected the file of a config (got {shown(file_name)})")
     above = (*above, File(source.name).resolve())
-    file = source.folder / path_of(stated)
+    file = source.folder / path_of(file_name)
     if file.resolve() in above:
         circle = " -> ".join(config.name for config in (*above[above.index(file.resolve()) :], file))
         raise _make_error(source, f"the configs extend one another in a circle: {circle}")

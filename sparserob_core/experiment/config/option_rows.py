@@ -50,17 +50,20 @@ def option_rows(record: Plugin, ask: bool = True) -> list[OptionRow]:
 
 @final
 class _SchemaRows:
-    """The rows of a schema; ``parts`` are its definitions, ``seen`` the options at which each of them was listed."""
+    """The rows of a schema; ``parts`` are its definitions, ``first_keys`` the options at which each of them was
+    listed."""
 
     def __init__(self, parts: Mapping[str, Any]) -> None:
         self.parts = parts
-        self.seen: dict[str, str] = {}
+        self.first_keys: dict[str, str] = {}
 
     def rows(self, schema: Mapping[str, Any], above: str) -> Iterator[OptionRow]:
         for name, field in schema.get("properties", {}).items():
             members = [member for _, member in self._list_members(field)]
             below = list(self._list_references(field, above + name))
-            notes = [f"keys as in {self.seen[reference]}" for reference, _ in below if reference in self.seen]
+            notes = [
+                f"keys as in {self.first_keys[reference]}" for reference, _ in below if reference in self.first_keys
+            ]
             meaning = " ".join(str(field.get("description", "")).split())
             yield OptionRow(
                 name=above + name,
@@ -70,7 +73,7 @@ class _SchemaRows:
                 meaning=" ".join([meaning, *(f"({notes[0]})" for _ in notes[:1])]).strip(),
             )
             for reference, key in below:
-                if self.seen.setdefault(reference, key) == key:
+                if self.first_keys.setdefault(reference, key) == key:
                     yield from self.rows(self.parts.get(reference, {}), f"{key}.")
 
     def _list_members(self, field: Mapping[str, Any]) -> Iterator[tuple[str, Mapping[str, Any]]]:

@@ -111,7 +111,7 @@ def _draw_map(figure: Figure, ax: Axes, data: LandscapeData) -> None:
     ax.set_facecolor(look.MIST)
     if np.isposinf(data.values).any():
         ax.plot([], [], "s", color=look.MIST, markeredgecolor="#C4C4C4", label="no control meets these constraints")
-    walked = np.flatnonzero(data.accepted == 1.0)
+    accepted_places = np.flatnonzero(data.accepted == 1.0)
     refused, evaluated = data.accepted == 0.0, np.isnan(data.accepted)
     for mask, colour, label in ((refused, "#D9D9D9", "refused"), (evaluated, "white", "evaluated")):
         few = _thin_out(np.flatnonzero(mask))
@@ -127,8 +127,8 @@ def _draw_map(figure: Figure, ax: Axes, data: LandscapeData) -> None:
                 label=label,
                 rasterized=few.size > MAX_POINTS // 4,
             )
-    if walked.size:
-        path = data.visited[walked]
+    if accepted_places.size:
+        path = data.visited[accepted_places]
         has_moved = np.append(True, (np.diff(path, axis=0) != 0.0).any(axis=1))
         few = _thin_out(np.flatnonzero(has_moved))
         edge = [Stroke(linewidth=2.6, foreground=look.INK), Normal()]  # white in ink: seen on dark and on bright ground

@@ -235,7 +235,7 @@ class _LoopInput:
         The noise of measured outputs.
     begins : float
         The time at which the period begins, for the controller.
-    told : callable, optional
+    to_user_states : callable, optional
         The states at the parameters of a system that depends on the time.
     """
 
@@ -246,10 +246,10 @@ class _LoopInput:
         which: np.ndarray,
         noise: Array | None,
         begins: float,
-        told: Callable[[Array], Array] | None = None,
+        to_user_states: Callable[[Array], Array] | None = None,
     ) -> None:
         self.model, self.acting, self.which, self.noise, self.begins = model, acting, which, noise, begins
-        self.told = told
+        self.to_user_states = to_user_states
         self.applied = np.zeros((model.problem.system.controls, model.control.pieces))
         self._next_piece = 0
 
@@ -260,7 +260,7 @@ class _LoopInput:
         middle = (grid.breakpoints[piece] + grid.breakpoints[piece + 1]) / 2
         if self._next_piece < points.size - 1 and middle > points[self._next_piece]:
             time = self.begins + float(points[self._next_piece])
-            user_state = state if self.told is None else self.told(state)
+            user_state = state if self.to_user_states is None else self.to_user_states(state)
             self.applied[:, self._next_piece] = self.acting.step(time, self._measure_state(user_state[:, 0]))
             self._next_piece += 1
         return np.asarray(grid.inputs(self.applied)[:, piece, None])
@@ -274,7 +274,9 @@ class _LoopInput:
         return observer.outputs(state[:, None], noise)[:, 0]
 
 
-def _replay_worst_cases(worst: Mapping[str, Array], beside: ParametersInTime | None, periods: int) -> Iterator[Drawn]:
+def _replay_worst_cases(
+    worst: Mapping[str, Array], parameters_in_time: ParametersInTime | None, periods: int
+) -> Iterator[Drawn]:
     """Yield the worst case of every constraint under the plan; in the next period that of the next constraint
     follows."""
     count = worst["names"].size if worst else 0
@@ -285,7 +287,7 @@ def _replay_worst_cases(worst: Mapping[str, Array], beside: ParametersInTime | N
         ]
         noise_signals = [worst["noises"][case] if "noises" in worst else None for case in cases]
         row_slice = slice(row, row + 1)
-        parameter_rows = None if beside is None else beside.find_corner(worst["directions"][row])[None]
+        parameter_rows = None if parameters_in_time is None else parameters_in_time.find_corner(worst["directions"][row])[None]
         yield (
             ADVERSARY,
             disturbances,
@@ -299,13 +301,13 @@ def _replay_worst_cases(worst: Mapping[str, Array], beside: ParametersInTime | N
 def _sample_loops(
     model: Transcription,
     worst: Mapping[str, Array],
-    beside: ParametersInTime | None,
+    parameters_in_time: ParametersInTime | None,
     counts: tuple[int, int],
     rng: np.random.Generator,
 ) -> Iterator[Drawn]:
     """Yield some loops of every law, for a number of periods; a single loop where nothing is uncertain."""
     functionals, parameters, (count, periods) = model.functionals, model.parameters, counts
-    if not functionals.disturbed and parameters.set is None and model.noise is None and beside is None:
+    if not functionals.disturbed and parameters.set is None and model.noise is None and parameters_in_time is None:
         yield "iid", [None] * periods, np.zeros((1, 0)), None, None, [None] * periods
         return
     worst_points = tuple(worst[name] for name in ("times", "directions", "parameters")) if worst else (np.zeros(0),) * 3
@@ -315,7 +317,9 @@ def _sample_loops(
     for law in (law for law in LAWS if law != ADVERSARY and (worst or law != "neighbours")):
         disturbances, drawn_parameters, initial_states = uncertainty.draw(cast(LawName, law), count * periods, rng)
         noise_signals = noises(model.noise, cast(LawName, law), count * periods, model.control.pieces, rng)
-        parameter_rows = None if beside is None else beside.draw(cast(LawName, law), count, None, rng)
+        parameter_rows = (
+            None if parameters_in_time is None else parameters_in_time.draw(cast(LawName, law), count, None, rng)
+        )
         for row in range(count):
             row_slice, draws = slice(row, row + 1), range(row, count * periods, count)
             loop_disturbances = [None if disturbances is None else disturbances[p : p + 1] for p in draws]

@@ -71,7 +71,7 @@ def causal_upper(
         if not 0.0 < factor <= scaling.highest:
             break
         problem = scaling.at(factor)
-        stated = search.bound(tree, solution, np.inf, problem.disturbance, limits.ended, factor / base)
-        if proven(model, problem, stated, tools.deadline) is not None:
+        causal_bound = search.bound(tree, solution, np.inf, problem.disturbance, limits.ended, factor / base)
+        if proven(model, problem, causal_bound, tools.deadline) is not None:
             return factor, limits.ended
     return np.nan, limits.ended

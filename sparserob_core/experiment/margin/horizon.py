@@ -46,7 +46,7 @@ class HorizonSearch:
     method: Exchange
     tools: Tools
     width: float
-    told: Points
+    progress: Points
     points: dict[float, MarginPoint] = field(default_factory=dict)
     covered: list[tuple[float, float]] = field(default_factory=list)
     _farkas_multipliers: dict[float, list[Multiplier]] = field(default_factory=dict)
@@ -156,7 +156,7 @@ class HorizonSearch:
                 best = min(best, high)
             elif status == "infeasible" and self._is_excluded(low, high):
                 self.covered.append((low, high))
-                self.told.say(f"no horizon up to {self._format_time(high)} is feasible")
+                self.progress.say(f"no horizon up to {self._format_time(high)} is feasible")
                 continue
             short = high - low <= self.width
             if short and status in FEASIBLE:
@@ -179,10 +179,8 @@ class HorizonSearch:
             at = self._format_time(self._horizons.changes)
             return f"the system changes at {at}, and beyond horizons are looked at one by one only"
         if short:
-            left_out = (
-                "" if self.problem.control_step is None else "; control_step is left out of what excludes horizons"
-            )
-            return f"no multipliers exclude {low:.9g} to {self._format_time(high)}{left_out}"
+            note = "" if self.problem.control_step is None else "; control_step is left out of what excludes horizons"
+            return f"no multipliers exclude {low:.9g} to {self._format_time(high)}{note}"
         return f"{MAX_RUNS} runs did not suffice" if len(self.points) > MAX_RUNS else ""
 
     def _bisect_points(self, low: float, points: list[float]) -> None:
@@ -210,11 +208,11 @@ class HorizonSearch:
     def _run_horizon(self, horizon: float) -> MarginPoint:
         """Return the run at a horizon, which is made only once."""
         if horizon not in self.points:
-            model, result = self._solve_horizon(self.problem, horizon, self.told.begin(horizon))
+            model, result = self._solve_horizon(self.problem, horizon, self.progress.begin(horizon))
             self.points[horizon] = MarginPoint(
                 horizon, horizon, result.status, result.message, result.lower_bound, result.upper_bound
             )
-            self.told.end(self.points[horizon])
+            self.progress.end(self.points[horizon])
             if result.status == "infeasible" and self.problem.control_step is None:
                 self._farkas_multipliers[horizon] = _extract_multipliers(model, result)
             if result.stopped:

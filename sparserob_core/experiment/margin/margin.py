@@ -118,7 +118,7 @@ def margin(
         stopped = named(error)
         raise
     finally:
-        rows, seconds = dict(search.told.rows), search.told.seconds
+        rows, seconds = dict(search.progress.rows), search.progress.seconds
         with suppress(KeyboardInterrupt):  # an interrupt ends the observers: search and directory are finished
             broadcast(
                 SweepFinished(rows=rows, seconds=seconds, stopped=stopped, pressed=deadline.pressed, answer=answer)
@@ -129,7 +129,7 @@ def _make_start_event(search: MarginSearch | HorizonSearch, directory: Path) -> 
     """Return the first event for observers of a margin: a study of one axis without points."""
     scaled = None if isinstance(search, HorizonSearch) else search.scaling
     return SweepStarted(
-        title=f"{search.title}: margin of {search.told.of}",
+        title=f"{search.title}: margin of {search.progress.of}",
         directory=directory,
         axes=[HORIZON if scaled is None else scaled.label.replace(".", " ")],
         logarithmic=[False],

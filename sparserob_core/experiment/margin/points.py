@@ -40,12 +40,12 @@ class Points:
     def __init__(self, of: str, notify: Notify) -> None:
         self.of, self.notify = of, notify
         self.rows: dict[int, Mapping[str, Any]] = {}
-        self.began, self.count = time.monotonic(), 0
+        self.start_time, self.count = time.monotonic(), 0
 
     @property
     def seconds(self) -> float:
         """The seconds since the search began."""
-        return time.monotonic() - self.began
+        return time.monotonic() - self.start_time
 
     def say(self, text: str) -> None:
         """Report what is searched, in words."""
@@ -57,12 +57,12 @@ class Points:
         text = f"{self.of} at {factor:.9g} is run"
         self._report_progress(text, found=[(float(factor),)], now=[position], running=1)
 
-        def moved(number: int, lower: float, upper: float) -> None:
+        def report_bounds(number: int, lower: float, upper: float) -> None:
             self.notify(
                 PointProgress(point=position, round=number, lower_bound=lower, upper_bound=upper, seconds=self.seconds)
             )
 
-        return Bounds(moved).receive
+        return Bounds(report_bounds).receive
 
     def end(self, point: MarginPoint) -> None:
         """Report the answer of the run that began last."""

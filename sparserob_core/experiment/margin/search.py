@@ -145,7 +145,7 @@ class MarginSearch:
         The solver and the deadline.
     width : float
         The distance of the two sides that is asked for, relative to the factor where this is above 1.
-    told : Points
+    progress : Points
         The reports of the runs.
     points, seen, results : list, dict, dict
         The runs, the factors that were tried without proof, and the results by their factor.
@@ -163,9 +163,9 @@ class MarginSearch:
     method: Exchange
     tools: Tools
     width: float
-    told: Points
+    progress: Points
     points: list[MarginPoint] = field(default_factory=list)
-    seen: dict[float, str] = field(default_factory=dict)
+    estimates: dict[float, str] = field(default_factory=dict)
     results: dict[float, Result] = field(default_factory=dict)
     cuts: Sequence[Cut] = ()
     beyond: Callable[[dict[float, Result]], tuple[float, Ended | None]] | None = None
@@ -175,7 +175,7 @@ class MarginSearch:
         started, curve = time.perf_counter(), tuple[MarginPoint, ...]()
         sides: Sides | None = None
         try:
-            self.told.say(f"looking for the {self.scaling.sense} factor of {self.scaling.of}")
+            self.progress.say(f"looking for the {self.scaling.sense} factor of {self.scaling.of}")
             with self.tools.deadline.enforced():
                 critical = self._find_critical()
                 self.cuts = critical.cuts
@@ -227,7 +227,7 @@ class MarginSearch:
         if self.scaling.sense == "largest" and self.scaling.nested and self.run(0.0).status == "infeasible":
             return Critical("never")
         arguments = self.programs, self.joined, self.scaling, self.tools, self.width
-        return critical_factor(*arguments, self.told.notify, self.seen)
+        return critical_factor(*arguments, self.progress.notify, self.estimates)
 
     def _collect_known(self, said: str, sides: Sides | None) -> tuple[Sides, tuple[MarginPoint, ...]]:
         """Return the sides that an interrupted search knows, and every proven run on the feasible side as a curve.
@@ -243,7 +243,7 @@ class MarginSearch:
         )
         last, first = (-1, 0) if self.scaling.sense == "largest" else (0, -1)
         feasible, infeasible = proven[last] if proven else None, refused[first] if refused else None
-        attempts = [f"{answer} at {factor:.4g}" for factor, answer in sorted(self.seen.items())]
+        attempts = [f"{answer} at {factor:.4g}" for factor, answer in sorted(self.estimates.items())]
         hint = f"; not proven: it seems {', '.join(attempts)}" if attempts else ""
         note = "" if proven or refused else ", of which none proves anything" if self.points else ": nothing is proven"
         return ("undecided", f"{said} after {len(self.points)} runs{note}{hint}", feasible, infeasible), tuple(proven)
@@ -318,18 +318,18 @@ class MarginSearch:
         relaxed = RelaxedProgram(program, self.tools.solver, deadline=self.tools.deadline)
         return relaxed.solve(rows, 0.0).status == "infeasible"
 
-    def _solve_from_cuts(self, begun: Sequence[Cut], program: SemiInfiniteProgram, tools: Tools) -> Result:
-        """Return the result of a program in its own units, whose run begins with the constraints ``begun``."""
-        return self.method.close(program, tools, prover_of(program, tools), shifted(begun, 0.0, program))
+    def _solve_from_cuts(self, initial_cuts: Sequence[Cut], program: SemiInfiniteProgram, tools: Tools) -> Result:
+        """Return the result of a program in its own units, whose run begins with the constraints ``initial_cuts``."""
+        return self.method.close(program, tools, prover_of(program, tools), shifted(initial_cuts, 0.0, program))
 
-    def run(self, factor: float, begun: Sequence[Cut] = ()) -> MarginPoint:
+    def run(self, factor: float, initial_cuts: Sequence[Cut] = ()) -> MarginPoint:
         """Run the problem at a factor, unless that was done before.
 
         Parameters
         ----------
         factor : float
             The factor.
-        begun : sequence of Cut, default ()
+        initial_cuts : sequence of Cut, default ()
             Constraints with which the run begins.
 
         Returns
@@ -340,17 +340,19 @@ class MarginSearch:
         for point in self.points:
             if point.factor == factor:
                 return point
-        amount, tools = self.scaling.amount(factor), replace(self.tools, notify=self.told.begin(factor))
+        amount, tools = self.scaling.amount(factor), replace(self.tools, notify=self.progress.begin(factor))
         try:
-            result = answered_in_own_units(partial(self._solve_from_cuts, begun), self.programs.program(factor), tools)
+            result = answered_in_own_units(
+                partial(self._solve_from_cuts, initial_cuts), self.programs.program(factor), tools
+            )
         except InputError as error:
             point = MarginPoint(factor, amount, "failed", str(error), -np.inf, np.inf)
-            self.told.end(point)
+            self.progress.end(point)
             return point
         self.results[factor] = result
         point = MarginPoint(factor, amount, result.status, result.message, result.lower_bound, result.upper_bound)
         self.points.append(point)
-        self.told.end(point)
+        self.progress.end(point)
         if result.stopped:
             self.tools.deadline.check()
         return point

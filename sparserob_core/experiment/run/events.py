@@ -320,14 +320,14 @@ class _Listener:
     """The connection to one observer of one run, or of one study."""
 
     def __init__(self, name: str, observer: Observer) -> None:
-        self.name, self.observer, self.began = name, observer, False
+        self.name, self.observer, self.has_started = name, observer, False
 
     def receive(self, event: Event) -> bool:
         """Send an event to the observer; returns whether it takes further events."""
         last = isinstance(event, LAST)
-        self.began |= isinstance(event, FIRST)
+        self.has_started |= isinstance(event, FIRST)
         try:
-            if self.began or not last:
+            if self.has_started or not last:
                 self.observer.receive(event)
         except (Exception, SystemExit) as error:  # noqa: BLE001  an observer must not end the run
             self._warn(error)

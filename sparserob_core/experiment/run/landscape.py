@@ -383,12 +383,12 @@ class LandscapeAxes:
         first, second = ((pair[rank], c) for rank, c in zip(self.ranks, self.coordinates, strict=True))
         return (second, first) if self.orders and anchor[second] < anchor[first] else (first, second)
 
-    def of(self, told: tuple[int, ...], places: Array) -> Array | None:
+    def of(self, given_coordinates: tuple[int, ...], places: Array) -> Array | None:
         """Return the points of the map at the places of two indices.
 
         Parameters
         ----------
-        told : tuple of int
+        given_coordinates : tuple of int
             The coordinates ``(c,)`` that the places contain.
         places : array (n, 2, c)
             The places of the two indices.
@@ -398,10 +398,11 @@ class LandscapeAxes:
         array (n, 2) or None
             The points; ``None`` where the coordinates of the axes are not among those that the places contain.
         """
-        if not set(self.coordinates) <= set(told):
+        if not set(self.coordinates) <= set(given_coordinates):
             return None
         points = np.stack(
-            [places[:, r, told.index(c)] for r, c in zip(self.ranks, self.coordinates, strict=True)], axis=-1
+            [places[:, r, given_coordinates.index(c)] for r, c in zip(self.ranks, self.coordinates, strict=True)],
+            axis=-1,
         )
         return np.sort(points, axis=1) if self.orders else points
 

@@ -116,8 +116,8 @@ class SolvedProblem(ControlResult):
             The result.
         """
         loaded = experiment.loaded
-        stated = ConfigSource(loaded.source.name, loaded.source.folder, loaded.config.plain())
-        solved = SolvedProblem.asked(result, experiment.transcription, stated, causal)
+        source = ConfigSource(loaded.source.name, loaded.source.folder, loaded.config.plain())
+        solved = SolvedProblem.asked(result, experiment.transcription, source, causal)
         solved.__dict__["experiment"] = experiment
         return solved
 
@@ -403,9 +403,9 @@ class Outcome:
         of = self.result
         plain, causal = (of.plain, of.causal) if isinstance(of, ControlResult) else (of, None)
         loaded = self.experiment.loaded
-        stated = ConfigSource(loaded.source.name, loaded.source.folder, loaded.config.plain())
+        source = ConfigSource(loaded.source.name, loaded.source.folder, loaded.config.plain())
         kept = (self.directory, self.control, self.summary, self.remarks, self.interrupted)
-        return _rebuild_outcome, (stated, plain, *kept, causal)
+        return _rebuild_outcome, (source, plain, *kept, causal)
 
     def show(self, save: str | Path | None = None, *, serve: bool = False, connect: str | None = None) -> None:
         """Show the run in the viewer of Rerun.
@@ -440,7 +440,7 @@ class Outcome:
 
 
 def _rebuild_outcome(
-    stated: ConfigSource,
+    source: ConfigSource,
     result: Result,
     directory: Path,
     control: Array | None,
@@ -450,7 +450,7 @@ def _rebuild_outcome(
     causal: CausalBound | None = None,
 ) -> Outcome:
     """Return an outcome that was pickled; its experiment is built anew from its config."""
-    experiment = assemble(load_config(stated))
+    experiment = assemble(load_config(source))
     if isinstance(experiment, ControlExperiment):
         result = SolvedProblem.run(result, experiment, causal)
     return Outcome(result, directory, experiment, control, summary, remarks, interrupted)

@@ -83,11 +83,13 @@ def replay(
     return run.directory
 
 
-def play(told: Iterator[Event], *, save: str | Path | None, serve: bool, connect: str | None) -> tuple[str, ...]:
+def play(
+    event_stream: Iterator[Event], *, save: str | Path | None, serve: bool, connect: str | None
+) -> tuple[str, ...]:
     """Send events to a recorder, and return the sentence that says what was recorded."""
     observer = recorder(save, serve, connect, PATIENCE)
     try:
-        for event in told:
+        for event in event_stream:
             observer.receive(event)
     finally:
         observer.close()

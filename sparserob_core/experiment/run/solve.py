@@ -150,9 +150,9 @@ def solve(
         If an argument is at fault.
     """
     deadline, registry = Deadline(as_seconds(seconds)), load_registry()
-    stated = problem.origin if isinstance(problem, SemiInfiniteProgram) else problem
-    if isinstance(stated, OptimalControlProblem | Transcription):
-        deadline = _warn_unprovable(stated if isinstance(stated, OptimalControlProblem) else stated.problem, deadline)
+    given = problem.origin if isinstance(problem, SemiInfiniteProgram) else problem
+    if isinstance(given, OptimalControlProblem | Transcription):
+        deadline = _warn_unprovable(given if isinstance(given, OptimalControlProblem) else given.problem, deadline)
     model = _prepare_program(registry, problem, control, disturbance, policy)
     program = model if isinstance(model, SemiInfiniteProgram) else model.program
     if regulariser == "default":

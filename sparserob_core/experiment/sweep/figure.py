@@ -186,7 +186,7 @@ def _draw_map(study: Study, axes: Sequence[Axis]) -> Figure:
     ax.set_ylabel(measured(second.key, axis_unit(second.key, study.table)))
     for spine in ("top", "right"):
         ax.spines[spine].set_visible(True)
-    _finish_figure(figure, ax, study, told=False, marked=[status for status in MARKS if status != "certified"])
+    _finish_figure(figure, ax, study, has_labels=False, marked=[status for status in MARKS if status != "certified"])
     return figure
 
 
@@ -235,7 +235,7 @@ def _draw_categories(study: Study, axes: Sequence[Axis]) -> Figure:
         right_ax.set_xlim(left=0.0)
     left_ax.set_xlabel(measured("cost $J$", study.cost_unit) + ", down to its proven lower bound")
     right_ax.set_xlabel("seconds of the method (s)")
-    _finish_figure(figure, left_ax, study, told=False)
+    _finish_figure(figure, left_ax, study, has_labels=False)
     return figure
 
 
@@ -249,12 +249,12 @@ _BOX: dict[str, Any] = {
 }
 
 
-def _finish_figure(figure: Figure, ax: Axes, study: Study, told: bool, marked: Iterable[str] = MARKS) -> None:
+def _finish_figure(figure: Figure, ax: Axes, study: Study, has_labels: bool, marked: Iterable[str] = MARKS) -> None:
     """Add the title, and below the figure a legend of the markers that occur."""
     from matplotlib.lines import Line2D
 
     ax.set_title(plain(study.title))
-    handles, labels = ax.get_legend_handles_labels() if told else ([], [])
+    handles, labels = ax.get_legend_handles_labels() if has_labels else ([], [])
     for status in (mark for mark in marked if mark in study.counts):
         filled = MARKS[status] in FILLED
         handles.append(

@@ -78,19 +78,19 @@ class Bounds(Observer):
     """
 
     def __init__(self, tell: Callable[[int, float, float], object]) -> None:
-        self.tell, self.told = tell, (-1, -math.inf, math.inf)
+        self.tell, self.reported = tell, (-1, -math.inf, math.inf)
 
     def receive(self, event: Event) -> None:
         """Take the bounds of an event, and report them where they have changed."""
-        number, lower, upper = self.told
+        number, lower, upper = self.reported
         number = max(number, 0)
         if isinstance(event, RoundFinished):
             number, lower = event.round, max(lower, event.lower_bound)
             upper = upper if event.simplified else min(upper, event.upper_bound)
         elif isinstance(event, EvaluationsFinished) and not event.family:
             lower = max(lower, event.lower_bound)
-        if (number, lower, upper) != self.told:
-            self.told = (number, lower, upper)
+        if (number, lower, upper) != self.reported:
+            self.reported = (number, lower, upper)
             self.tell(number, lower, upper)
 
 

@@ -168,8 +168,8 @@ def sweep(
     InputError
         If an axis, a point's config or the directory is at fault. It is raised before anything is run.
     """
-    stated, out = _resolve_study(config, out)
-    plan = make_plan(as_config(stated), axes, overrides, points=points, number=_check_number(points, number))
+    source, out = _resolve_study(config, out)
+    plan = make_plan(as_config(source), axes, overrides, points=points, number=_check_number(points, number))
     if point is not None:
         _check_single_point(out, executor)
     checked = plan.checked(notify)
@@ -226,8 +226,8 @@ def outline(
     InputError
         If an axis, a point's config or the directory is at fault.
     """
-    stated, out = _resolve_study(config, out)
-    plan = make_plan(as_config(stated), axes, points=points, number=_check_number(points, number))
+    source, out = _resolve_study(config, out)
+    plan = make_plan(as_config(source), axes, points=points, number=_check_number(points, number))
     checked = plan.checked(notify)
     _build_executors(checked[0], executor)
     directory = None if out is None else Path(out)
@@ -342,8 +342,8 @@ class _SweepCall:
         self.answers: dict[str, PointAnswer] = {}
         self.pending: set[str] = set()
         self.done = self.failed = self.new = 0
-        self.began = time.monotonic()
-        self.due = self.began
+        self.start_time = time.monotonic()
+        self.due = self.start_time
 
     def run(self, factory: ExecutorFactory) -> Study:
         """Run every point that is not finished, and write the table."""
@@ -390,7 +390,7 @@ class _SweepCall:
         """Return the last event for observers of the study."""
         return SweepFinished(
             rows=self._list_known_rows(),
-            seconds=time.monotonic() - self.began,
+            seconds=time.monotonic() - self.start_time,
             stopped=self.stopped,
             pressed=self.pressed,
         )
@@ -471,7 +471,7 @@ class _SweepCall:
         index = self.places[digest][0]
 
         def tell(number: int, lower: float, upper: float) -> None:
-            seconds = time.monotonic() - self.began
+            seconds = time.monotonic() - self.start_time
             self.broadcast(
                 PointProgress(point=index, round=number, lower_bound=lower, upper_bound=upper, seconds=seconds)
             )
@@ -479,13 +479,13 @@ class _SweepCall:
         return [Bounds(tell)]
 
     def _collect_answer(
-        self, future: Future[PointAnswer], open_ones: dict[Future[PointAnswer], str], lost: list[str]
+        self, future: Future[PointAnswer], open_ones: dict[Future[PointAnswer], str], interrupted: list[str]
     ) -> None:
         digest = open_ones.pop(future)
         try:
             answer = future.result()
         except (BrokenExecutor, CancelledError):
-            lost.append(digest)
+            interrupted.append(digest)
             return
         except Exception as error:  # noqa: BLE001  what the executor could not send or fetch is this point's failure
             answer = PointAnswer(failure=named(error))
@@ -532,10 +532,11 @@ class _SweepCall:
         """Write the table as it is known now."""
         if self.alone:
             return
-        began, keys, rows = time.monotonic(), [axis.key for axis in self.plan.axes], self._list_rows()
+        start_time, keys, rows = time.monotonic(), [axis.key for axis in self.plan.axes], self._list_rows()
         self.made.write_text(TABLE, table_text(keys, rows))
         self.made.write_text(COLUMNS, columns_text(keys, rows))
-        self.due = time.monotonic() + RENEWED + 10.0 * (time.monotonic() - began)  # a long table is written less often
+        # a long table is written less often
+        self.due = time.monotonic() + RENEWED + 10.0 * (time.monotonic() - start_time)
 
     def _remove_partial_runs(self) -> None:
         """Remove the partial run directories of dead processes, and of this one."""
@@ -553,7 +554,7 @@ class _SweepCall:
             for future, point_hash in (open_ones or {}).items()
             if future.running() and self._get_partial_path(point_hash).exists()
         ]
-        seconds_left = (time.monotonic() - self.began) / self.new * len(self.pending) if self.new else None
+        seconds_left = (time.monotonic() - self.start_time) / self.new * len(self.pending) if self.new else None
         event = SweepProgress(
             text=_format_progress(self.done, len(self.points), len(running), self.failed, seconds_left),
             done=self.done,
@@ -565,7 +566,7 @@ class _SweepCall:
             axes=[axis.key for axis in self.plan.axes],
             places=self.places[digest] if digest else (),
             now=[self.places[point_hash][0] for point_hash in running],
-            seconds=time.monotonic() - self.began,
+            seconds=time.monotonic() - self.start_time,
         )
         self.notify(event)
         self.broadcast(event)

@@ -13,7 +13,7 @@ import pytest
 import sparserob_core as sr
 from sparserob_core.control.studies.suprema import rows_of
 from sparserob_core.control.transcription.terms.accumulated import accumulated
-from sparserob_core.experiment.bound.record import bound_rows_told, columns_told
+from sparserob_core.experiment.bound.record import list_bound_columns, list_bound_rows
 from tests.support.places import matrices, needs_plants
 
 OSCILLATOR = {"A": [[0, 1], [-1, 0]], "B": [[0], [1]]}
@@ -190,7 +190,7 @@ def test_entries_in_the_time_are_bounded_and_checked(tmp_path: Path) -> None:
     ]
     for row, exact in zip(found.over_parameters, (2.2, 0.8), strict=True):
         assert_encloses(row, exact)
-    assert [told[1:2] + told[-1:] for told in bound_rows_told(found)] == [("sup x1", "p = 0.5"), ("inf x1", "p = 0")]
+    assert [told[1:2] + told[-1:] for told in list_bound_rows(found)] == [("sup x1", "p = 0.5"), ("inf x1", "p = 0")]
     for run in ("constant", "measurable", "uncertain"):
         assert sr.check(tmp_path / run).status == "verified"
 
@@ -358,8 +358,8 @@ def test_two_runs_write_the_same_numbers(written: Path, tmp_path: Path) -> None:
 def test_what_the_table_shows_holds_too() -> None:
     names = {"units": {"time": "s"}}
     found = sr.bound(config(initial_state=[1 / 3, 0], terminal=[{"box": [2.0, None]}], names=names))
-    assert columns_told(found)[4] == "at t [s]"
-    for told, row in zip(bound_rows_told(found), found.rows, strict=True):
+    assert list_bound_columns(found)[4] == "at t [s]"
+    for told, row in zip(list_bound_rows(found), found.rows, strict=True):
         assert float(told[2]) <= row.lower <= row.upper <= float(told[3])
 
 

@@ -56,20 +56,20 @@ def _find_references(data: Any, path: Path) -> Iterator[tuple[Path, Any, Any]]:
 
 
 def _read_matrix(given: Mapping[str, object], folder: File, known: dict[File, dict[str, Array]]) -> Packed:
-    name, stated = given["name"], given["file"]
-    if not isinstance(stated, str) or not stated.endswith(SUFFIX):
-        raise InputError(path="file", expected=f"a file whose name ends with {SUFFIX}", got=shown(stated))
+    name, file_name = given["name"], given["file"]
+    if not isinstance(file_name, str) or not file_name.endswith(SUFFIX):
+        raise InputError(path="file", expected=f"a file whose name ends with {SUFFIX}", got=shown(file_name))
     if not isinstance(name, str) or not name:
         raise InputError(path="name", expected="the name of a matrix in the file", got=shown(name))
-    file = folder / path_of(stated)
+    file = folder / path_of(file_name)
     if file not in known:
         if not file.is_file():
-            raise InputError(path="file", expected=f"a file, relative to {folder}", got=f"{stated}, which is none")
+            raise InputError(path="file", expected=f"a file, relative to {folder}", got=f"{file_name}, which is none")
         known[file] = read_arrays(file, LARGEST)
     try:
         return matrix_in(known[file], name)
     except InputError as error:
-        error.path = (stated, *error.path)
+        error.path = (file_name, *error.path)
         raise
 
 

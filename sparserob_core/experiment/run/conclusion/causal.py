@@ -50,23 +50,23 @@ def with_causal(result: ControlResult, tools: Tools) -> ControlResult:
             if solved_tree is None:
                 return no_bound
             tree, solution, excludes_all = solved_tree
-            stated = search.bound(
+            causal_bound = search.bound(
                 tree, solution, np.inf if excludes_all else solution.value, model.problem.disturbance, limits.ended
             )
-            derived = proven(model, model.problem, stated, tools.deadline)
-            if derived is not None or not stated.outputs:
+            derived = proven(model, model.problem, causal_bound, tools.deadline)
+            if derived is not None or not causal_bound.outputs:
                 break
     except KeyboardInterrupt as error:
         tools.deadline.interrupt(error)
         return result
     if derived is None:
         return no_bound
-    if not stated.rows:  # every cost is at least 0: worth reporting only where the cost of the policy is 0
+    if not causal_bound.rows:  # every cost is at least 0: worth reporting only where the cost of the policy is 0
         return replace(result, causal=CausalBound(0.0, ended=limits.ended)) if cost == 0.0 else no_bound
     if excludes_all:
-        note = WORDS.format(len(stated.signals)) if result.status == "infeasible" else ""
-        return replace(result, causal=replace(stated, lower=np.inf), message=result.message + note)
-    return replace(result, causal=replace(stated, lower=min(derived, cost)))
+        note = WORDS.format(len(causal_bound.signals)) if result.status == "infeasible" else ""
+        return replace(result, causal=replace(causal_bound, lower=np.inf), message=result.message + note)
+    return replace(result, causal=replace(causal_bound, lower=min(derived, cost)))
 
 
 def _subtract_rest(rest: Array, signal: Array) -> Array:
@@ -109,7 +109,7 @@ def searched(
 
 
 def proven(
-    model: Transcription, problem: OptimalControlProblem, stated: CausalBound, deadline: Deadline | None = None
+    model: Transcription, problem: OptimalControlProblem, causal_bound: CausalBound, deadline: Deadline | None = None
 ) -> float | None:
     """Return the number that the multipliers of a causal bound prove, rounded downwards.
 
@@ -119,7 +119,7 @@ def proven(
         The problem on its dictionaries.
     problem : OptimalControlProblem
         The problem for which the bound is derived.
-    stated : CausalBound
+    causal_bound : CausalBound
         The bound, with its signals and multipliers.
     deadline : Deadline, optional
         The end of the time; the check takes at most `SECONDS`.
@@ -134,7 +134,7 @@ def proven(
     from sparserob_core.checker.claims.claims import derived_causal_bound
     from sparserob_core.checker.outcome import Broken, Clock, Unchecked
 
-    policy, excludes_all = model.answering.policy, stated.lower == np.inf
+    policy, excludes_all = model.answering.policy, causal_bound.lower == np.inf
     try:
         case = Case(
             problem,
@@ -144,7 +144,7 @@ def proven(
             Clock((deadline or Deadline()).at_most(SECONDS)),
             policy=policy,
         )
-        derived = derived_causal_bound(case, finite(causal_data(stated)), priced=not excludes_all)
+        derived = derived_causal_bound(case, finite(causal_data(causal_bound)), priced=not excludes_all)
     except (Broken, Unchecked, ZeroDivisionError):
         return None
     return None if excludes_all and not derived > 0.0 else derived

@@ -79,10 +79,15 @@ def with_activity(experiment: ControlExperiment, result: Result, tools: Tools) -
     return replace(result, activity=replace(activity, lower=lower))
 
 
-def _is_proven_better(program: SemiInfiniteProgram, other: Result, most: float) -> bool:
-    """Return whether another decision counts less than ``most`` and is proven for every family of constraints."""
+def _is_proven_better(program: SemiInfiniteProgram, other: Result, count_limit: float) -> bool:
+    """Return whether another decision counts less than ``count_limit`` and is proven for every family of
+    constraints."""
     proven = other.status in PROVEN and len(other.proofs) == len(program.families)
-    return proven and np.isfinite(most) and count(program, np.asarray(other.decision)) < most * (1.0 - INWARDS)
+    return (
+        proven
+        and np.isfinite(count_limit)
+        and count(program, np.asarray(other.decision)) < count_limit * (1.0 - INWARDS)
+    )
 
 
 def _compute_factor(experiment: ControlExperiment) -> float | None:
@@ -124,13 +129,13 @@ def _compute_share(program: SemiInfiniteProgram, counted: float) -> float | None
     return share_of(program, counted) if np.isfinite(counted) else None
 
 
-def _minimise_count(experiment: ControlExperiment, result: Result, tools: Tools, most: float) -> Result | None:
+def _minimise_count(experiment: ControlExperiment, result: Result, tools: Tools, count_limit: float) -> Result | None:
     """Return the result of the program whose cost is below the count; ``None`` where it gives nothing."""
     if result.stopped or tools.deadline.passed:
         return None
     try:
         cuts = [*result.dual.cuts, *result.indices]
-        beaten, rounds = most if np.isfinite(most) else 0.0, max(ROUNDS, len(result.history))
+        beaten, rounds = count_limit if np.isfinite(count_limit) else 0.0, max(ROUNDS, len(result.history))
         cells = {proof.family: max(CELLS, proof.cells) for proof in result.proofs}
         method = LeastCount(cuts, beaten, rounds, cells)
         count_result = solve_in_own_units(method, experiment.program, tools)
