@@ -204,7 +204,7 @@ def test_the_worst_signals_of_a_plant_whose_matrices_do_not_commute_attain_what_
                 np.testing.assert_allclose(outward @ zonoid.evaluate_signal(arc), state, atol=1e-9)
                 assert float(zonoid.support(a @ outward)) == pytest.approx(reached, abs=1e-9)
                 pushed = both.deviations
-                told = pushed.kernel(piece).most(Enclosed(a[None], np.zeros((1, 2))), pushed.summands)
+                told = pushed.kernel(piece).integrate_support(Enclosed(a[None], np.zeros((1, 2))), pushed.summands)
                 assert told.mid[0] == pytest.approx(reached, abs=1e-9) and told.rad[0] < 1e-12
                 time = 0.3 * low + 0.7 * high
                 ends, signal = pieces.signal(np.zeros(pieces.size), time, a, piece)
@@ -213,5 +213,5 @@ def test_the_worst_signals_of_a_plant_whose_matrices_do_not_commute_attain_what_
                 assert pieces.within(np.array([time]), a[None], np.array([piece]))[0, 0] == pytest.approx(
                     reached, abs=1e-9
                 )
-                told = both.under_way(piece, time, a[None])
+                told = both.compute_partial_effect(piece, time, a[None])
                 assert told.mid[0] == pytest.approx(reached, abs=1e-9) and told.rad[0] < 1e-12

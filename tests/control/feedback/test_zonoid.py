@@ -173,7 +173,7 @@ def test_the_support_function_is_that_of_the_checker_to_all_digits(name: str) ->
         )  # fmt: skip
         kernel = undriven(problem, [0.0, length]).deviations.kernel(0)
         rows = a @ found.into
-        truth = kernel.most(Enclosed(rows, np.zeros_like(rows)), summands_of(bound))
+        truth = kernel.integrate_support(Enclosed(rows, np.zeros_like(rows)), summands_of(bound))
     sizes = np.abs(found.support(a)).max()
     assert truth.rad.max() < 1e-10 * sizes
     assert found.support(a) == pytest.approx(truth.mid, rel=1e-10, abs=1e-11 * sizes)
