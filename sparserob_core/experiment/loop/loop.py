@@ -287,7 +287,9 @@ def _replay_worst_cases(
         ]
         noise_signals = [worst["noises"][case] if "noises" in worst else None for case in cases]
         row_slice = slice(row, row + 1)
-        parameter_rows = None if parameters_in_time is None else parameters_in_time.find_corner(worst["directions"][row])[None]
+        parameter_rows = (
+            None if parameters_in_time is None else parameters_in_time.find_corner(worst["directions"][row])[None]
+        )
         yield (
             ADVERSARY,
             disturbances,
