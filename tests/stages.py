@@ -16,8 +16,8 @@ from collections.abc import Iterable
 from pathlib import Path
 
 NAMES = Path(__file__).parent / "long.txt"
-LIMIT = 0.3
-"""Seconds of a set of parameters, in the mean. With ten times as many the first stage takes three times as long; with a
+LIMIT = 0.15
+"""Seconds of a set of parameters, in the mean. With ten times as many the first stage takes four times as long; with a
 tenth it is left with half of the tests."""
 DURATION = re.compile(r"\s*([\d.]+)s call\s+(tests/\S+?::[\w:]+)")
 

@@ -52,9 +52,10 @@ def test_what_takes_long_is_the_first_of_the_second_stage(conftest: Any, monkeyp
 
 
 def test_a_test_takes_long_where_its_sets_of_parameters_do_in_the_mean() -> None:
-    table = ["0.50s call     tests/test_a.py::test_one[x]", "0.20s call     tests/test_a.py::test_one[y]",
-             "9.00s setup    tests/test_a.py::test_two", "0.29s call     tests/test_a.py::test_two"]  # fmt: skip
-    assert stages.choose(table) == ["tests/test_a.py::test_one"]
+    seconds = {"call     tests/test_a.py::test_one[x]": 1.5, "call     tests/test_a.py::test_one[y]": 0.6,
+               "setup    tests/test_a.py::test_two": 9.0, "call     tests/test_a.py::test_two": 0.9}  # fmt: skip
+    table = [f"{factor * stages.LIMIT:.3f}s {name}" for name, factor in seconds.items()]
+    assert stages.choose([*table, "3 passed in 2.00s"]) == ["tests/test_a.py::test_one"]
 
 
 def test_every_test_that_takes_long_is_there() -> None:
