@@ -3,13 +3,16 @@ and are narrow; what changes with time is not taken for what does not, and poles
 
 from __future__ import annotations
 
+from fractions import Fraction
 from itertools import pairwise
 
 import numpy as np
 import pytest
-from flint import arb, arb_mat, ctx
+from flint import arb, arb_mat, arb_poly, ctx
 
 import sparserob_core as sr
+from sparserob_core.checker.arithmetic.models import Frame
+from sparserob_core.checker.arithmetic.monomials import NONE
 from sparserob_core.checker.arithmetic.series import Series
 from sparserob_core.checker.flow import law as laws
 from sparserob_core.checker.flow.law import LONG, Law, ParameterBox, Stretch
@@ -284,3 +287,12 @@ def test_a_plant_that_is_finite_at_no_time_that_is_looked_at_has_units(monkeypat
     monkeypatch.setattr(Plant, "looked_at", lambda plant, parameter: iter(()))
     law = Law(Plant.of(VaryingSystem.of([["t"]], [[1]], 2.0), 2.0), 2.0, ParameterBox())
     assert law.units.tolist() == [1.0] and law.stretches[-1].stop == 2.0
+
+
+def test_the_size_of_a_law_counts_the_rounding_of_the_sum_of_its_coefficients() -> None:
+    """Coefficients that floats add up to less than they are."""
+    coefficients = [1.0, *[2.0**-54] * 20]
+    stretch = Stretch(0.0, 2.0, Frame(NONE, 20), [[[arb_poly(coefficients)]]], np.ones(1))
+    exact = sum(map(Fraction, coefficients)), sum(n * Fraction(c) for n, c in enumerate(coefficients))
+    for size, truth in zip(stretch.sizes, exact, strict=True):
+        assert truth <= Fraction(size.item()) <= truth * (1 + Fraction(1, 10**11))
