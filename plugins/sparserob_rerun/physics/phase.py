@@ -20,13 +20,13 @@ SIDE = 420.0
 WIDER = {True: 260.0, False: 0.0}
 """How much wider than high a plane of two states is, in the arrangement of a search and in the others: it fills its
 panel there. With ten times as much the words beside it are outside; with a tenth half of the panel is empty."""
-EXTENT = (-40.0, 790.0, -24.0, 530.0)  # left, right, top and bottom of the plane, where it is as wide as high
+EXTENT = (-40.0, 830.0, -24.0, 530.0)  # left, right, top and bottom of the plane, where it is as wide as high
 FLAT, LENGTH = 0.4, 640.0  # a plane that is flatter is drawn that long, and what it shows is said below it
 SLICES = 36
 ROOM = 2.0  # the panel is half as large as the drawing
 POINT = 8.0  # pixels: a goal that is smaller is drawn as a square of that size
 LAYERS = ("hatch", "slices", "frame", "worst", "curve", "arcs", "wall")
-LINE, ENTRY = 36.0, 340.0  # of words beside a plot, from one to the next, and how wide the longest are
+LINE, ENTRY = 36.0, 380.0  # of words beside a plot, from one to the next, and how wide the longest are
 COLUMNS, WIDE = 2, 400.0  # of words below one, which have the width of the panel
 
 

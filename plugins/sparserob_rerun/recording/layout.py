@@ -104,9 +104,9 @@ def _columns(rrb: Any, shown: Shown) -> tuple[list[Any], list[int]]:
     if shown.searches:  # the search is what is seen first: its map has more than half of the screen
         terrain = [_terrain(shown)] if shown.landscape else []
         below = rrb.Horizontal(search.climb(rrb, shown.stages, shown.budget), _lane(rrb, shown), column_shares=[3, 1])
-        left = rrb.Vertical(*terrain, below, row_shares=[4, 1][-1 - len(terrain) :])
+        left = rrb.Vertical(*terrain, below, row_shares=[5, 1][-1 - len(terrain) :])
         right = [rrb.Horizontal(*words, *map_words), *plots, *plane]
-        return [left, rrb.Vertical(*right, row_shares=[11, 12, 9][: len(right)])], [9, 5]
+        return [left, rrb.Vertical(*right, row_shares=[11, 12, 9][: len(right)])], [2, 1]
     numbers = [_violation(rrb, shown), _bounds(rrb)]
     middle = (
         rrb.Vertical(_terrain(shown), *numbers, row_shares=[10, _room(shown), 5])
