@@ -48,19 +48,19 @@ def pytest_collection_finish() -> None:
 @pytest.hookimpl(tryfirst=True)  # before the tests of the other stage are left out
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Make every set of parameters after the first ``n`` of a test that is marked ``first(n)`` one of the second
-    stage; the tests that take long, too, which are its first."""
+    stage; of the others those that take long, too, with which it begins."""
     met, long = Counter[str](), read_names()
-    items.sort(key=lambda item: item.nodeid.partition("[")[0] not in long)
     for item in items:
-        if item.nodeid.partition("[")[0] in long and item.get_closest_marker("slow") is None:
+        name, first = item.nodeid.partition("[")[0], item.get_closest_marker("first")
+        if item.get_closest_marker("slow") is not None:
+            continue
+        met[name] += 1
+        if first is not None and met[name] > first.args[0]:
+            item.add_marker(pytest.mark.slow)
+        elif name in long:
             item.add_marker(pytest.mark.long)
             item.add_marker(pytest.mark.slow)
-        first = item.get_closest_marker("first")
-        if first is not None and item.get_closest_marker("slow") is None:
-            name = item.nodeid.partition("[")[0]
-            met[name] += 1
-            if met[name] > first.args[0]:
-                item.add_marker(pytest.mark.slow)
+    items.sort(key=lambda item: item.get_closest_marker("long") is None)
 
 
 def pytest_runtest_setup(item: pytest.Item) -> None:

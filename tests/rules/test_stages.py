@@ -42,13 +42,19 @@ def test_the_first_sets_of_parameters_are_of_the_first_stage_and_the_others_of_t
 
 def test_what_takes_long_is_the_first_of_the_second_stage(conftest: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(conftest, "read_names", lambda: {"tests/test_some.py::test_long"})
-    items = [Item("test_quick"), Item("test_large", pytest.mark.slow), Item("test_long[1]"), Item("test_long[2]")]
+    larger = Item("test_long[3]", pytest.mark.slow)
+    items = [
+        Item("test_quick"),
+        Item("test_large", pytest.mark.slow),
+        larger,
+        Item("test_long[1]"),
+        Item("test_long[2]"),
+    ]
     conftest.pytest_collection_modifyitems(items)
-    assert [item.nodeid.split("::")[1] for item in items] == [
-        "test_long[1]", "test_long[2]", "test_quick", "test_large",
-    ]  # fmt: skip
-    assert ["slow" in item.marks for item in items] == [True, True, False, True]
-    assert ["long" in item.marks for item in items] == [True, True, False, False]
+    names = [item.nodeid.split("::")[1] for item in items]
+    assert names == ["test_long[1]", "test_long[2]", "test_quick", "test_large", "test_long[3]"]
+    assert ["slow" in item.marks for item in items] == [True, True, False, True, True]
+    assert ["long" in item.marks for item in items] == [True, True, False, False, False]
 
 
 def test_a_test_takes_long_where_its_sets_of_parameters_do_in_the_mean() -> None:
