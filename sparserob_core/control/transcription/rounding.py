@@ -1,8 +1,8 @@
 """Effect of rounding on a lower bound.
 
 An allowance for this effect is subtracted before the bound is reported. A later derivation of the bound from its
-multipliers is then not to find a smaller one. The allowance is a fixed `SHARE` of the numbers that are added up, not a
-count of their operations.
+multipliers is then not to find a smaller one. The allowance is a fixed `SHARE` of the numbers that are
+added up; the loss by measurable signals alone counts their operations as well (`RobustBound.rounding`).
 """
 
 from __future__ import annotations

@@ -12,7 +12,7 @@ The walk of `solve_finite`, each step only where the ones before gave no answer 
    sharp enough, the solver is asked for more digits of it (`more_digits`). Where the solver says infeasible, or nothing
    is believed, the elastic program is asked how far the rows must be relaxed: its multipliers may prove infeasibility.
 5. `_report_failure`: the best of what was not believed, and what was wrong with it. Where a solver was named, the walk
-   begins anew without it (`solver.Asked.instead`).
+   begins anew without it (`solver.AccountedSolver.instead`).
 """
 
 from __future__ import annotations

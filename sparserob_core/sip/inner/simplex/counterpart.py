@@ -614,28 +614,36 @@ def robust_bound(
     ``deviations (r, Q)`` and ``mu (e,)``. It is the minimum over the bounds of the program alone. Quadratic terms are
     replaced by their tangent ``at (n,)``, of 0 unless given. Not ``priced``: of the weighted sum of the rows, which is
     positive only where nothing is feasible."""
-    cost = program.tangent(np.zeros(program.n) if at is None else at)
-    slope, constant = (cost.q.copy() if priced else np.zeros(program.n)), -float(mu @ program.b)
-    constant, size = constant + cost.constant * priced, abs(constant) + abs(cost.constant) * priced
-    slope = slope + mu @ program.A
-    noise, first = np.abs(slope) + np.abs(mu) @ np.abs(program.A), 0
-    terms = [(np.zeros(0, dtype=int), np.zeros(0))]
+    constant, size = -add_pairwise(mu * program.b), float(np.abs(mu) @ np.abs(program.b))
+    slope, noise = mu @ program.A, np.abs(mu) @ np.abs(program.A)
+    if priced:
+        constant, size = constant + program.constant, size + abs(program.constant)
+        slope, noise = slope + program.q, noise + np.abs(program.q)
+    if priced and program.P is not None and at is not None:
+        gradient, sizes = np.asarray(program.P @ at), np.asarray(abs(program.P) @ np.abs(at))
+        constant, size = constant - 0.5 * add_pairwise(at * gradient), size + 0.5 * float(np.abs(at) @ sizes)
+        slope, noise = slope + gradient, noise + sizes
+    none = np.zeros(0, dtype=int), np.zeros(0)
+    terms, magnitudes, longest, first = [none], [none], 2 * len(blocks) + program.b.size, 0
     for block in blocks:
         multipliers, w = y[first : first + block.h.size], deviations[first : first + block.h.size]
         first += block.h.size
         used = np.flatnonzero(multipliers)
         if not used.size:
             continue
-        weight = np.zeros(block.d.shape)
-        np.add.at(weight, block.part[used], (multipliers[used] * block.factor[used])[:, None] * w[used])
+        weight, weight_size = np.zeros((2, *block.d.shape))
+        entries = (multipliers[used] * block.factor[used])[:, None] * w[used]
+        np.add.at(weight, block.part[used], entries)
+        np.add.at(weight_size, block.part[used], np.abs(entries))  # rows of one part may cancel
+        longest += int(np.bincount(block.part[used]).max())
         terms += [weighted(multipliers, block.g), weighted(weight.ravel(), block.stacked)]
-        constant += add_pairwise((weight * block.d).ravel())
-        size += float(np.abs(weight).ravel() @ np.abs(block.d).ravel())
-        constant -= add_pairwise(multipliers * block.h)
-        size += float(multipliers @ np.abs(block.h))
+        magnitudes += [terms[-2], weighted(weight_size.ravel(), block.stacked)]
+        constant += add_pairwise((weight * block.d).ravel()) - add_pairwise(multipliers * block.h)
+        size += float((weight_size * np.abs(block.d)).sum() + multipliers @ np.abs(block.h))
     column, value = (np.concatenate(arrays) for arrays in zip(*terms, strict=True))
     slope = slope + np.bincount(column, value, program.n)
-    noise = noise + np.bincount(column, np.abs(value), program.n)
+    noise_column, noise_value = (np.concatenate(arrays) for arrays in zip(*magnitudes, strict=True))
+    noise = noise + np.bincount(noise_column, np.abs(noise_value), program.n)
     weights = program.weights if priced else np.zeros(program.n)
     if priced and program.blocks is not None:
         tilted = without_norms(Terms(constant, slope, noise, weights, None, size, at), program)
@@ -643,10 +651,12 @@ def robust_bound(
     ends = np.stack([program.lower, program.upper, np.clip(0.0, program.lower, program.upper)])
     with np.errstate(invalid="ignore"):
         least = (weights * np.abs(ends) + np.where(slope == 0.0, 0.0, slope * ends)).min(axis=0)
-        magnitudes = np.where(noise > 0.0, noise * np.abs(ends[:2]).max(axis=0), 0.0)
-    bound, size = constant + add_pairwise(least), size + float(magnitudes.sum())
+        reach = np.where(noise > 0.0, np.abs(ends[:2]).max(axis=0), np.abs(ends[2]))
+        largest = np.where(noise + weights > 0.0, (noise + weights) * reach, 0.0)
+    bound, size = constant + add_pairwise(least), size + float(largest.sum())
     # a slope has a term for each entry of its column; other sums are by pairs, but for those over the blocks
-    longest = int(np.bincount(column, minlength=1).max()) + program.b.size + len(blocks)
+    longest += int(np.bincount(column, minlength=1).max())
     longest += 0 if program.P is None else int(np.diff(program.P.indptr).max(initial=0))
-    rounding = bound_rounding(longest + max(program.n, max((block.d.size for block in blocks), default=1)).bit_length())
+    count = max(program.n, *(max(block.d.size, block.h.size) for block in blocks), 1)
+    rounding = bound_rounding(longest + count.bit_length())
     return RobustBound(bound, size, rounding) if np.isfinite(bound) else RobustBound(-np.inf, size, rounding)
