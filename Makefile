@@ -132,7 +132,7 @@ test-pythons:
 	    touch $$place/installed; \
 	  fi; \
 	  echo "$$python: $$($$place/bin/python --version)"; tried="$$tried $$python"; \
-	  $$place/bin/python -m pytest -q --numprocesses 2 --dist worksteal -p no:cacheprovider || status=$$?; \
+	  $$place/bin/python -m pytest -q -m "(long or not slow) and not benchmark" --numprocesses 2 --dist worksteal -p no:cacheprovider || status=$$?; \
 	done; \
 	if [ -z "$$tried" ]; then echo "none of $(PYTHONS) was found" >&2; exit 1; fi; exit $$status
 

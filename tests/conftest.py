@@ -65,9 +65,10 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 def pytest_runtest_setup(item: pytest.Item) -> None:
     """Leave out slow tests that have not begun at ``SPARSEROB_UNTIL``, in seconds since 1970: a run with a limit
-    ends by itself, and says how many tests are left. Without it all are run."""
-    until = os.environ.get("SPARSEROB_UNTIL")
-    if until is not None and item.get_closest_marker("slow") is not None and time.time() > float(until):
+    ends by itself, and says how many tests are left. Those that only take long are always run; without a limit all
+    are."""
+    until, marked = os.environ.get("SPARSEROB_UNTIL"), {mark.name for mark in item.iter_markers()}
+    if until is not None and "slow" in marked and "long" not in marked and time.time() > float(until):
         pytest.skip("the time of this run is over; make test-slow runs it")
 
 

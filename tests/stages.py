@@ -2,7 +2,8 @@
 
 ::
 
-    python -m pytest -n 2 -m "(long or not slow) and not benchmark" --durations=0 | python -m tests.stages
+    python -m pytest -n 2 -m "(long or not slow) and not benchmark" --durations=0 --durations-min=0 > table
+    python -m tests.stages < table
 
 writes their names anew into ``tests/long.txt``, from the table of durations that pytest prints.
 """

@@ -67,7 +67,7 @@ def test_a_test_takes_long_where_its_sets_of_parameters_do_in_the_mean() -> None
 def test_every_test_that_takes_long_is_there() -> None:
     """A test of another name would be one of the first stage again. Of a class the name of the class is looked for."""
     defined = {
-        f"{file.relative_to(ROOT)}::{node.name}"
+        f"{file.relative_to(ROOT).as_posix()}::{node.name}"
         for file in {ROOT / name.partition("::")[0] for name in stages.read_names()}
         if file.is_file()
         for node in ast.walk(ast.parse(file.read_text(encoding="utf-8")))
