@@ -72,8 +72,8 @@ def _build_disturbance_matrices(response: Response, model: DisturbanceModel) -> 
 def find_negligible_entries(
     response: Response,
     model: DisturbanceModel | None,
-    disturbance_radii: Array,
-    initial_radii: Array,
+    disturbance_widths: Array,
+    initial_widths: Array,
     rows: Array,
     least: float,
 ) -> np.ndarray:
@@ -86,10 +86,10 @@ def find_negligible_entries(
         Response of the system.
     model : DisturbanceModel or None
         Disturbance, if any.
-    disturbance_radii : ndarray, shape (mw,)
-        Largest deviations of the disturbance.
-    initial_radii : ndarray, shape (d,) or (0,)
-        Largest deviations of the initial state; empty for a single initial state.
+    disturbance_widths : ndarray, shape (mw,)
+        Widths of the set of the disturbance along the axes.
+    initial_widths : ndarray, shape (d,) or (0,)
+        Widths of the set of initial states; empty for a single initial state.
     rows : ndarray, shape (r, d)
         Rows on the state.
     least : float
@@ -98,10 +98,10 @@ def find_negligible_entries(
     grid, steps, first = response.grid, response.steps(KNOWN), 0
     if model is not None:
         block, input_effects = _build_disturbance_matrices(response, model)
-        first, input_effects = model.block_count * disturbance_radii.size, input_effects * disturbance_radii
-        columns = block[:, None] * disturbance_radii.size + np.arange(disturbance_radii.size)
-    nodes = np.zeros((response.initial_state.size, first + initial_radii.size))
-    nodes[:, first:] = np.eye(len(nodes), initial_radii.size) * initial_radii
+        first, input_effects = model.block_count * disturbance_widths.size, input_effects * disturbance_widths
+        columns = block[:, None] * disturbance_widths.size + np.arange(disturbance_widths.size)
+    nodes = np.zeros((response.initial_state.size, first + initial_widths.size))
+    nodes[:, first:] = np.eye(len(nodes), initial_widths.size) * initial_widths
     largest_movements = np.abs(rows @ nodes).max(axis=0, initial=0.0)
     for piece in range(grid.pieces):
         nodes = steps.Phi[0, response.which[piece]] @ nodes

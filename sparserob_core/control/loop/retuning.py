@@ -25,7 +25,7 @@ from sparserob_core.sip.convex_set import Array
 @final
 class Kept:
     """Effect of future disturbances under the gains of a ``decision (n,)``, from piece ``piece`` on, on rows ``H (R,
-    d)``: the `Answering` of a `Tracking`."""
+    d)``: the `FutureEffects` of a `Tracking`."""
 
     def __init__(self, model: Transcription, decision: Array, piece: int, H: Array) -> None:
         loop = model.answering.loop

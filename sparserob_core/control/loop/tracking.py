@@ -84,7 +84,7 @@ def trackable(own: Transcription) -> bool:
     return is_flat and is_on_grid and bool((box.lower <= 0.0).all() and (box.upper >= 0.0).all())
 
 
-class FutureAnswers(Protocol):
+class FutureEffects(Protocol):
     """Effect of future disturbances under gains on rows ``H x <= h (R,)``. Times are counted as in the nominal problem:
     from the beginning of each of its ``K`` pieces."""
 
@@ -107,7 +107,7 @@ class Tracking:
     """Solver for `trackable` transcriptions from one initial state ``(d,)`` after another. With ``answering``, the
     control also has gains that do not change; ``own`` is then the remaining problem if nothing happens."""
 
-    def __init__(self, own: Transcription, answering: Callable[[Array], FutureAnswers] | None = None) -> None:
+    def __init__(self, own: Transcription, answering: Callable[[Array], FutureEffects] | None = None) -> None:
         problem, response, steps = own.problem, own.response, own.response.steps(KNOWN)
         self.own, self.K, self.m = own, own.control.pieces, problem.system.controls
         self.bound, self.horizon = problem.disturbance, problem.horizon

@@ -72,9 +72,9 @@ class DisturbanceSupport:
         """
         grid, comparison = self.lifted.grid, self.lifted.comparison
         curvature_rows, slope_norms, curvature_norms, norms, squared = self._curvature_terms
-        sizes = self._sum_over_blocks(start, self._bound_coefficients, curvature_rows, plain=True, kept="bent").sum(
-            axis=2
-        )
+        sizes = self._sum_over_blocks(
+            start, self._bound_coefficients, curvature_rows, plain=True, kept="curvature"
+        ).sum(axis=2)
         pieces = np.minimum(np.maximum(grid.breakpoints.searchsorted(start, side="right") - 1, 0), grid.pieces - 1)
         flow = comparison.over(start - grid.breakpoints[pieces], cells=True).flow
         reach = comparison.over(widths, cells=True)
@@ -362,7 +362,7 @@ def propagate_effect(
 
     Returns
     -------
-    Carried
+    PropagatedEffect
         The effect in the coordinates of the phase that begins.
     """
     effect = np.moveaxis(np.tensordot(past.turn, old, axes=1), 1, 0)

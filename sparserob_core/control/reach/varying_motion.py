@@ -12,8 +12,8 @@ in the parameters. With ``x = sum_a delta^a x_a + R`` (`ExpandedSystem`), the re
 So the remainder is at most the norm of the transitions times the integral of ``sum_j n_j sum_(b > D - j) a_b``, with
 ``a_b`` and ``n_j`` the norms of all coefficients of ``A`` and of the state of a degree. The transitions are such an
 expansion themselves, and their norm is bounded from the norms of their own coefficients. For entries that are no
-polynomials the remainder of their power series (`Left`) is added: that of ``A`` times all coefficients of the state,
-and that of ``[B E]`` times inputs.
+polynomials the remainder of their power series (`TruncationBound`) is added: that of ``A`` times all coefficients of
+the state, and that of ``[B E]`` times inputs.
 """
 
 from __future__ import annotations
@@ -59,8 +59,8 @@ STRETCHES = 256  # of pieces, whose bounds count at their largest; a tenth mixes
 
 @dataclass(frozen=True, eq=False)
 class VaryingMotion:
-    """The `Motion` of a system that changes with time from one initial state ``(d,)``; each state is a block of its
-    own, so that all bounds are entry by entry."""
+    """The `EnclosedMotion` of a system that changes with time from one initial state ``(d,)``; each state is a block
+    of its own, so that all bounds are entry by entry."""
 
     propagator: Propagator
     initial_state: Array
@@ -153,7 +153,7 @@ class VaryingMotion:
         return {}
 
     def propagate(self, within: Array, pieces: np.ndarray, start_states: Array, inputs: Array) -> Array:
-        """`Motion.propagate`."""
+        """`EnclosedMotion.propagate`."""
         flow = self.over(within, pieces)
         states = np.einsum("kij,kj->ki", flow.state, start_states[:, 0]) + np.einsum("kim,km->ki", flow.control, inputs)
         return np.asarray(states[:, None])
@@ -177,7 +177,7 @@ class VaryingMotion:
     def deviation(
         self, rows: Array, start: Array, width: Array, pieces: np.ndarray, states: Array, inputs: Array
     ) -> Array:
-        """`Motion.deviation`."""
+        """`EnclosedMotion.deviation`."""
         return self.bound_chord_errors(
             rows, start, width, pieces, states[:, 0, :, None], inputs[:, :, None], np.ones(1)
         )
@@ -228,7 +228,7 @@ class VaryingMotion:
         return np.asarray((width**2 / 8)[:, None] * row_curvature * OUTWARD)
 
     def along(self, control: Array, rows: Array, others: Array) -> Array:
-        """`Motion.along`."""
+        """`EnclosedMotion.along`."""
         error_bounds, sizes = self.under(control)
         return np.asarray(product(rows, error_bounds.T) + product(others, sizes.T))
 
@@ -792,7 +792,7 @@ class Truncation:
 
 @dataclass(frozen=True, eq=False)
 class SpreadMotion:
-    """The `Motion` of a system over a cell of parameters: the motion of all coefficients on the cell, and a
+    """The `EnclosedMotion` of a system over a cell of parameters: the motion of all coefficients on the cell, and a
     ``truncation`` for the terms beyond their degree."""
 
     truncation: Truncation
@@ -853,7 +853,7 @@ class SpreadMotion:
 
     @property
     def influence(self) -> Array:
-        """`Motion.influence`."""
+        """`EnclosedMotion.influence`."""
         return self.truncation.influence
 
     @property
@@ -862,11 +862,11 @@ class SpreadMotion:
         return self.motion.norm
 
     def nodes(self, control: Array) -> Array:
-        """`Motion.nodes`."""
+        """`EnclosedMotion.nodes`."""
         return self._separate_coefficients(self.motion.nodes(control)[:, 0])
 
     def propagate(self, within: Array, pieces: np.ndarray, start_states: Array, inputs: Array) -> Array:
-        """`Motion.propagate`."""
+        """`EnclosedMotion.propagate`."""
         return self._separate_coefficients(
             self.motion.propagate(within, pieces, start_states.reshape(len(start_states), 1, -1), inputs)[:, 0]
         )
@@ -874,14 +874,14 @@ class SpreadMotion:
     def deviation(
         self, rows: Array, start: Array, width: Array, pieces: np.ndarray, states: Array, inputs: Array
     ) -> Array:
-        """`Motion.deviation`, of every coefficient on the cell."""
+        """`EnclosedMotion.deviation`, of every coefficient on the cell."""
         bounds = self.motion.deviation(
             self.along_cell(rows), start, width, pieces, states.reshape(len(states), 1, -1), inputs
         )
         return np.asarray(bounds.reshape(start.size, len(rows), -1).sum(axis=2) * OUTWARD)
 
     def along(self, control: Array, rows: Array, others: Array) -> Array:
-        """Return the bounds of `Motion.along`, with the truncation error and the rounding of the sums over
+        """Return the bounds of `EnclosedMotion.along`, with the truncation error and the rounding of the sums over
         coefficients."""
         bounds = self.motion.along(control, self.sizes(rows), (1.0 + self.space.size) * self.sizes(others))
         return np.asarray(bounds + rows @ self.truncation.under(control).T * OUTWARD)

@@ -324,7 +324,7 @@ class LiftedSystem:
         self, rows: Array, start: Array, width: Array, pieces: np.ndarray, states: Array, inputs: Array
     ) -> Array:
         """Return bounds ``(k, r)`` of the distance of ``rows (r, d)`` of the state from their chords, summed over the
-        Taylor coefficients (`Motion.deviation`).
+        Taylor coefficients (`EnclosedMotion.deviation`).
 
         They are the smaller of two: by the second derivative of the rows in time, and mode by mode by the second
         derivative or by twice the distance that the mode can move (as in `DisturbanceSupport.deviation`).
@@ -352,7 +352,7 @@ class LiftedSystem:
         )
 
     def along(self, control: Array, rows: Array, others: Array) -> Array:
-        """Return sums ``(r, L)`` of norm bounds on every piece of the grid, block by block (`Motion.along`).
+        """Return sums ``(r, L)`` of norm bounds on every piece of the grid, block by block (`EnclosedMotion.along`).
 
         ``rows (r, q)`` are the weights of the remainder of the Taylor models of the state, rounding included, and
         ``others (r, q)`` those of the models themselves, summed over their coefficients.

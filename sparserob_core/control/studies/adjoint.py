@@ -178,7 +178,7 @@ def tidy(times: Array, horizon: float) -> Array:
 
 
 @dataclass(frozen=True, eq=False)
-class AdjointDisturbances:
+class DisturbanceInputs:
     """Disturbances ``w(t)`` in a set ``bound``.
 
     They are constant between the times ``changes (M + 1,)`` or, without these, measurable. They enter by the columns
@@ -206,7 +206,7 @@ class WorstRow:
         Ends of the pieces.
     drives : ndarray, shape (q', L)
         Known values of the first inputs on the pieces.
-    disturbances : AdjointDisturbances or None
+    disturbances : DisturbanceInputs or None
         Disturbances, which are the other inputs.
     control_terms : tuple of ndarray, optional
         Breakpoints of the control, and ``g'u`` on the pieces between them.
@@ -219,7 +219,7 @@ class WorstRow:
     initial_deviations: ConvexSet | None
     grid: Array
     drives: Array
-    disturbances: AdjointDisturbances | None
+    disturbances: DisturbanceInputs | None
     control_terms: tuple[Array, Array] | None = None
     moving: tuple[Array, Array] | None = None
 

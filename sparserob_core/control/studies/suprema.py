@@ -17,7 +17,7 @@ from sparserob_core.control.problem.terms.repeat import Return
 from sparserob_core.control.problem.terms.windows import MixedConstraint, PathConstraint
 from sparserob_core.control.reach.functional import WorstFunctionals
 from sparserob_core.control.sets.sets import Polytope
-from sparserob_core.control.studies.adjoint import Adjoint, AdjointDisturbances, WorstRow, tidy, within
+from sparserob_core.control.studies.adjoint import Adjoint, DisturbanceInputs, WorstRow, tidy, within
 from sparserob_core.control.studies.adversary import evaluate_disturbance, worst_signal
 from sparserob_core.control.transcription.grid import grid_of
 from sparserob_core.control.transcription.transcribe import prepare, windows_of
@@ -211,7 +211,7 @@ def followed(
         grid.inputs(pieces),
         None
         if problem.disturbance is None
-        else AdjointDisturbances(problem.disturbance, slice(B.shape[1], inputs.shape[1]), changes),
+        else DisturbanceInputs(problem.disturbance, slice(B.shape[1], inputs.shape[1]), changes),
         (control.breakpoints, gains @ pieces) if gains.size else None,
         reference,
     )

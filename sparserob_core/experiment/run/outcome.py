@@ -87,7 +87,7 @@ class SolvedProblem(ControlResult):
 
     Parameters
     ----------
-    origin : ConfigSource or Asked
+    origin : ConfigSource or SolveArguments
         The config of the result, or the arguments of `solve`, which become a config when one is needed.
 
     Notes
@@ -133,7 +133,7 @@ class SolvedProblem(ControlResult):
             The result.
         model : Transcription
             The problem on its dictionaries.
-        origin : ConfigSource or Asked
+        origin : ConfigSource or SolveArguments
             The config of the result, or the arguments of `solve`.
         causal : CausalBound, optional
             The bound for every causal policy.

@@ -114,7 +114,7 @@ class Rounds:
         ledger.tell(number, answer, separations, program.cost(x) if feasible else np.inf, kept=working.size)
         self.kept = (answer, separations) if feasible else self.kept
 
-        # Secure: where time runs out, prove a decision that keeps away from the constraints while there is some.
+        # Tighten: where time runs out, prove a decision that keeps away from the constraints while there is some.
         imposed = tighten_in_time(working, ledger, prover, answer, separations, number)
 
         # Exchange: impose them, drop what has been idle; of what is violated though imposed, solve a crude answer more

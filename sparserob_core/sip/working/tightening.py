@@ -37,7 +37,7 @@ PATIENT = 8
 # Largest number of rounds of tightening. Each imposes violated constraints, or has at least twice the margin of the one
 # before. With a third of them, a constraint that is active on a hundred pieces is not yet imposed; ten times as many
 # are a search of their own.
-TIGHTENED = 10
+MAX_TIGHTENINGS = 10
 # Share of the cost that the first margin may cost. With a tenth of it, a proof along an active constraint takes three
 # times as many cells; with ten times as much, the upper bound is of no use.
 SPARED = 1e-3
@@ -90,7 +90,7 @@ def proofs_of(
         return proofs, False
     violations, imposed = left_open(ledger.program, proofs), False
     is_violated = any(above(*pair)[1].size for pair in found)  # then the rounds are used up, and no more may follow
-    if violations and not is_violated and not _has_tightened(ledger):
+    if violations and not is_violated and not _is_proven_cheaply(ledger):
         imposed = _tighten(working, ledger, prover, answer, violations, witnesses(ledger.program, proofs))
     # Without cells, another proof would be the same one.
     if any(proof.cells for proof in proofs) and not any(proof.verdict == "refuted" for proof in proofs):
@@ -136,19 +136,19 @@ def tighten_in_time(
         x = candidate.solution.x
         ledger.prove(candidate, separate(ledger.program, x, ledger.tools, ALLOWED), prover(x, GLANCE))
     violations, violated = [ViolatedRow.largest(*pair) for pair in found], [above(*pair) for pair in found]
-    is_near = working.tightenings == 0
+    is_near = working.due_count == 0
     if deadline.left is None:  # with nothing left to impose, the proof of this decision follows at once
         is_near = is_near and (ledger.open(answer.solution.x) or any(rows.size for _, rows, _ in violated))
     is_near = is_near and _is_near(working, ledger.program, answer, violations)
     if deadline.left is None:
-        working.tightenings += is_near
+        working.due_count += is_near
         is_due = is_near or (number >= PATIENT and number & (number - 1) == 0)
     else:
-        is_due = is_near or (working.tightenings < len(DUE) and deadline.used >= DUE[working.tightenings])
-        working.tightenings += is_due
+        is_due = is_near or (working.due_count < len(DUE) and deadline.used >= DUE[working.due_count])
+        working.due_count += is_due
         longest = max(np.diff(round_times, prepend=0.0), default=0.0)
         is_due = is_due or (ledger.proven is None and deadline.left <= RESERVED * longest)
-    if not is_due or _has_tightened(ledger):
+    if not is_due or _is_proven_cheaply(ledger):
         return False
     if not any(rows.size for _, rows, _ in violated):  # the answer may be proven as it is, which takes less time
         ledger.prove(answer, found, prover(answer.solution.x, GLANCE // 4))
@@ -218,8 +218,8 @@ def _tighten(
     """Prove a tightened decision, so that there is an upper bound while the proof of a better one continues.
 
     The decision is the optimum of the imposed and the ``violated`` rows. The first margin is what the share ``spared``
-    of the cost pays for, plus twice its largest violation. Later margins add twice what the proof leaves open. An
-    addition is temporary where new constraints were imposed for it, and is omitted where it makes the program
+    of the cost pays for, plus twice the largest violation of the answer. Later margins add twice what the proof leaves
+    open. An addition is temporary where new constraints were imposed for it, and is omitted where it makes the program
     infeasible. Where even the first margin makes it infeasible, a hundredth of ``spared`` is tried. Where only the
     margin that large cells require makes it infeasible, smaller cells are used, with a margin that costs `DEAR` of the
     cost or a part of it. Nothing is proven where every margin makes the program infeasible.
@@ -249,7 +249,7 @@ def _tighten(
     program, margin, imposed = ledger.program, working.margin, 0
     kept: tuple[CheckedAnswer, Found] | None = None  # a short proof left cells open, and no search finds a violation
     cells, dear_margin = GLANCE, _compute_dear_margin(abs(program.cost(answer.solution.x)), working.priced(answer))
-    for _ in range(TIGHTENED):
+    for _ in range(MAX_TIGHTENINGS):
         cost, price = abs(program.cost(answer.solution.x)), working.priced(answer)
         fresh = working.impose(violated)
         imposed += fresh
@@ -336,6 +336,6 @@ def _is_near(
     return PAID * distance * price <= SPARED * abs(program.cost(answer.solution.x))
 
 
-def _has_tightened(ledger: Ledger) -> bool:
+def _is_proven_cheaply(ledger: Ledger) -> bool:
     """Return whether a decision is proven that costs little more than a tightened decision must."""
     return ledger.proven is not None and ledger.gap(ledger.proven[0].solution.x) <= PAID * SPARED

@@ -84,7 +84,7 @@ class Working(ABC):
         Whether there is a Slater point for the margin.
     allowed : int
         Number of times that the margin was raised to allow for rounding.
-    tightenings : int
+    due_count : int
         Number of times that a proven decision was due, by its price or by the share of a limit that has passed.
     """
 
@@ -94,7 +94,7 @@ class Working(ABC):
     ceiling: float = LARGEST_MARGIN
     slater: bool = True
     allowed: int = 0
-    tightenings: int = 0
+    due_count: int = 0
 
     @property
     @abstractmethod

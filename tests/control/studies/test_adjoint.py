@@ -11,7 +11,7 @@ import pytest
 from scipy.linalg import expm
 
 from sparserob_core.control.sets.sets import Box, Polytope
-from sparserob_core.control.studies.adjoint import Adjoint, AdjointDisturbances, WorstRow, tidy
+from sparserob_core.control.studies.adjoint import Adjoint, DisturbanceInputs, WorstRow, tidy
 
 A = np.array([[0.0, 1.0, 0.0], [-9.0, -0.4, 2.0], [0.3, 0.0, -1.5]])
 B = np.array([[0.0, 0.2], [1.0, 0.0], [0.0, 1.0]])
@@ -21,7 +21,7 @@ GRID = np.array([0.0, 0.7, 1.9, 3.1, 4.0])
 
 def worst(kind: str, sign: float = 1.0) -> WorstRow:
     changes = None if kind == "measurable" else GRID
-    pushes = None if kind == "none" else AdjointDisturbances(Box([-0.2], [0.5]), slice(1, 2), changes)
+    pushes = None if kind == "none" else DisturbanceInputs(Box([-0.2], [0.5]), slice(1, 2), changes)
     return WorstRow(
         Adjoint.of(A, B if pushes is not None else B[:, :1], sign * C, HORIZON),
         np.array([0.2, -1.0, 0.4]),

@@ -483,22 +483,22 @@ class Expansion:
         return (self,)
 
     def over(self, starts: Array, stops: Array, points: Array) -> tuple[Array, Array]:
-        """Return the response over intervals to states and inputs, in the form of `Parts.over`. The system is known,
-        and ``points`` are not used."""
+        """Return the response over intervals to states and inputs, in the form of `ParameterParts.over`. The system is
+        known, and ``points`` are not used."""
         flow = self.flow(starts, stops)
         return flow.state[None], np.concatenate([flow.control, flow.disturbance], axis=2)[None]
 
     def along(self, starts: Array, stops: Array, parameters: Array) -> tuple[Array, Array]:
-        """Return the response over intervals to states and inputs, in the form of `Parts.along`."""
+        """Return the response over intervals to states and inputs, in the form of `ParameterParts.along`."""
         state, inputs = self.over(starts, stops, parameters)
         return state[0], inputs[0]
 
     def entries(self, times: Array, parameters: Array) -> tuple[Array, Array]:
-        """Return ``A`` and ``[B E]`` at times, in the form of `Parts.entries`."""
+        """Return ``A`` and ``[B E]`` at times, in the form of `ParameterParts.entries`."""
         return self.at(times)
 
     def averages(self, breaks: Array, points: Array) -> Array:
-        """Return estimates of ``A`` between times, in the form of `Parts.averages`."""
+        """Return estimates of ``A`` between times, in the form of `ParameterParts.averages`."""
         return np.asarray(self.average(breaks))[None]
 
     def on_cell(self, law: ExpandedSystem, low: Array, high: Array) -> Expansion:
@@ -515,7 +515,7 @@ class Expansion:
         -------
         Expansion
             The system of all coefficients of the state, as polynomials that are from -1 to 1 on the cell. The terms of
-            the law beyond their degree are in the `ExpandedSystem.left` of its ``spread``.
+            the law beyond their degree are in the `ExpandedSystem.remainder` of its ``spread``.
         """
         d, recentring, (coefficients, remainders) = law.d, law.recentred(low, high), self._reshape_law(law)
         sizes = np.abs(coefficients).sum(axis=1)
