@@ -14,8 +14,11 @@ from sparserob_core.control.sets.sets import Box
 
 
 def make_time_varying(problem: OptimalControlProblem) -> OptimalControlProblem:
-    """Return the problem with such a system where that is needed, else the problem itself: for errors of execution with
-    switches or parameters, and for measurable disturbances with a box of parameters."""
+    """Return the problem with one system that depends on the time, where that is needed, else the problem itself.
+
+    It is needed for errors of execution with phases or parameters, and for measurable disturbances over a box of
+    parameters.
+    """
     system = problem.system
     is_execution_case = problem.execution is not None and bool(system.switches or system.parameter_count)
     is_measurable_case = problem.measurable is not None and isinstance(system.parameters, Box)

@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 ORDER = 13  # degree of the polynomials
 REST = 2e-15  # about their truncation error in parts of a row: more widens the bounds, less needs shorter steps
 LONGEST = 16.0  # size of a system over a step, at most: the terms of its series are then below 1e6, and cancel little
-DERIVATIVE_ORDER = 7  # degree of the polynomials that bound second derivatives
+DERIVATIVE_DEGREE = 7  # degree of the polynomials that bound second derivatives
 MAX_STEPS = 2**17
 BLOCK = 64  # rows in one ball matrix, a power of two: fewer need more calls, more make more rows that are not needed
 # Steps between rows that are products of ball matrices, a power of two, where it would take long to make all rows of
@@ -141,10 +141,10 @@ class AdjointFlow:
     @cached_property
     def derivative_terms(self) -> Enclosed:
         """The matrices that turn an adjoint into the first terms of ``l'[A^2, A F, A^2 F]`` on a step,
-        ``(DERIVATIVE_ORDER + 1, d, d + 2 q)``, with the remainder in the radius of the first."""
+        ``(DERIVATIVE_DEGREE + 1, d, d + 2 q)``, with the remainder in the radius of the first."""
         once, twice = (Series.known(self.A * matrix) for matrix in (self.F, self.A))
         return self._expand_adjoint(
-            DERIVATIVE_ORDER, twice.append_columns(once).append_columns(Series.known(self.A * once.matrix)).matrix
+            DERIVATIVE_DEGREE, twice.append_columns(once).append_columns(Series.known(self.A * once.matrix)).matrix
         )
 
 
@@ -386,7 +386,7 @@ class Stopped:
     ----------
     parts
         The adjoints, and the time from which each is constant.
-    ways
+    segments
         For an integral of a row from ``a`` to ``b``, the adjoints that a measurable disturbance meets, backwards in
         time: that of the row over the length ``b - a``, then over the length ``a`` that of ``r(b - a) - r(0)``, where
         ``r(s)`` is the adjoint of the row after ``s``. With each, its length and the rounding error of this length.

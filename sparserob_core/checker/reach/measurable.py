@@ -220,8 +220,8 @@ class MeasurableLoop(VerifiedLoop):
         ]
 
     def compute_partial_effect(self, piece: int, time: float, rows: Array | arb_mat) -> Enclosed:
-        """Return upper bounds of what deviations of the disturbance on a piece add to ``rows (r, d)`` up to a time in
-        this piece, ``(r,)``."""
+        """Return enclosures ``(r,)`` of the largest effect on ``rows (r, d)`` that deviations of the disturbance have
+        on a piece, up to a time in it."""
         return self.deviations.build_kernel(self.grid[piece], time).integrate_support(
             as_enclosed(rows), self.deviations.summands
         )

@@ -132,7 +132,7 @@ class ControlConstraint(ConstraintSource):
         Values of the control, or its changes.
     values : csr_array, shape (N, q)
         Value of every function of the dictionary at the places.
-    extra_entries : int, default 0
+    extra_count : int, default 0
         Number of entries of the decision after the coefficients of the control.
     """
 
@@ -140,17 +140,17 @@ class ControlConstraint(ConstraintSource):
     set: ConvexSet
     places: Places
     values: csr_array
-    extra_entries: int = 0
+    extra_count: int = 0
 
     @staticmethod
     def of(
-        name: str, convex: ConvexSet, places: Places, dictionary: Dictionary, extra_entries: int = 0
+        name: str, convex: ConvexSet, places: Places, dictionary: Dictionary, extra_count: int = 0
     ) -> ControlConstraint:
-        """Return the constraint for a control in a ``dictionary``, whose coefficients are followed by ``extra_entries``
+        """Return the constraint for a control in a ``dictionary``, whose coefficients are followed by ``extra_count``
         entries of the decision."""
         from scipy.sparse import csr_array
 
-        return ControlConstraint(name, convex, places, csr_array(dictionary.sparse @ places.table), extra_entries)
+        return ControlConstraint(name, convex, places, csr_array(dictionary.sparse @ places.table), extra_count)
 
     def family(self) -> ConstraintFamily:
         """Return the constraint as a family; it does not depend on any uncertainty."""
@@ -172,7 +172,7 @@ class ControlConstraint(ConstraintSource):
         """Return ``G (k, 1, n)``, ``rhs (k, 1)`` at indices ``(k, 1 + m)``."""
         directions, places = unit(self.set, indices[:, 1:]), self.places.at(indices[:, 0])
         G = np.einsum("kc,kn->kcn", directions, self.values[:, places].toarray().T).reshape(indices.shape[0], 1, -1)
-        G = np.pad(G, ((0, 0), (0, 0), (0, self.extra_entries)))
+        G = np.pad(G, ((0, 0), (0, 0), (0, self.extra_count)))
         return G, (self.set.support(directions) - (directions * self.places.offset[places]).sum(axis=1))[:, None]
 
     def normals_in(self, units: Units) -> tuple[Array, Array]:
@@ -218,7 +218,7 @@ class ControlConstraint(ConstraintSource):
 
     def _evaluate_places(self, x: Array) -> Array:
         """Return the values of the control, or its changes, at every place, ``(q, m)``."""
-        coefficients = x[: x.size - self.extra_entries].reshape(self.set.dimension, -1)
+        coefficients = x[: x.size - self.extra_count].reshape(self.set.dimension, -1)
         answer: Array = (coefficients @ self.values).T + self.places.offset
         return answer
 

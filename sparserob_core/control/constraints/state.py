@@ -135,7 +135,7 @@ class StateConstraint(ConstraintSource):
     def outwardness(
         self, states: Float[Array, "d n"], added_terms: Float[Array, " j"] | None = None
     ) -> Float[Array, " n"]:
-        """Return a cheap measure ``(n,)`` of states ``(d, n)`` at one time, with `compute_added_terms`: positive
+        """Return a cheap measure ``(n,)`` of states ``(d, n)`` at one time, shifted by `compute_added_terms`: positive
         outside the set, not positive inside, growing outwards."""
 
     @shaped

@@ -172,7 +172,7 @@ def within(bound: ConvexSet, points: Array) -> Array:
 
 
 def tidy(times: Array, horizon: float) -> Array:
-    """Times moved by a share of at most `TIME_BITS` of the horizon to where their differences are not rounded."""
+    """Times moved by at most ``2^-TIME_BITS`` of the horizon to where their differences are not rounded."""
     unit = 2.0 ** (ceil(log2(horizon)) - TIME_BITS)
     return np.asarray(np.minimum(np.round(times / unit) * unit, horizon))
 

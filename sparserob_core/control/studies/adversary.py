@@ -201,7 +201,7 @@ class _SwitchedAdjoint:
     rows : ndarray, shape (J, d)
         Adjoint at these ends.
     exponentials : list of DoublingExponentials
-        Powers of the transition matrix of each phase.
+        Exponentials of the matrix of each phase.
     E : list of ndarray
         Matrix of the disturbance in each phase.
     """

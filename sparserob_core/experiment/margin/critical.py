@@ -59,7 +59,7 @@ def critical_factor(
     tools: Tools,
     width: float,
     notify: Notify,
-    estimates: dict[float, str],
+    unproven_answers: dict[float, str],
 ) -> Critical:
     """Find the critical factor to about ``width``; ordinary runs prove it afterwards.
 
@@ -77,7 +77,7 @@ def critical_factor(
         The accuracy.
     notify : callable
         A function that receives `StudyProgress`.
-    estimates : dict
+    unproven_answers : dict
         The factors that were tried; the answer at each is added here.
 
     Returns
@@ -93,7 +93,7 @@ def critical_factor(
         critical = _solve_scaled_gains(programs, scaling, tools)
         if critical.status != "unknown":
             return critical
-    return _search_by_slack(programs, scaling, tools, width, notify, estimates)
+    return _search_by_slack(programs, scaling, tools, width, notify, unproven_answers)
 
 
 def _solve_scaled_gains(programs: ParametricProgram, scaling: Scaling, tools: Tools) -> Critical:
@@ -138,14 +138,14 @@ def _search_by_slack(
     tools: Tools,
     width: float,
     notify: Notify,
-    estimates: dict[float, str],
+    unproven_answers: dict[float, str],
 ) -> Critical:
     """Find a bracket of the factor at which the least relaxation for feasibility changes its sign."""
 
     def slack(factor: float) -> float:
         value = _compute_slack(programs, factor, tools)
         answer = "feasible" if value <= 0 else "infeasible"
-        estimates[factor] = answer
+        unproven_answers[factor] = answer
         notify(StudyProgress(text=f"{scaling.of} at {factor:.9g}: {answer}"))
         return value
 

@@ -147,7 +147,7 @@ class MarginSearch:
         The distance of the two sides that is asked for, relative to the factor where this is above 1.
     progress : Points
         The reports of the runs.
-    points, seen, results : list, dict, dict
+    points, unproven_answers, results : list, dict, dict
         The runs, the factors that were tried without proof, and the results by their factor.
     cuts : sequence of Cut
         The constraints that are active at the critical factor, in the user's units.
@@ -165,7 +165,7 @@ class MarginSearch:
     width: float
     progress: Points
     points: list[MarginPoint] = field(default_factory=list)
-    estimates: dict[float, str] = field(default_factory=dict)
+    unproven_answers: dict[float, str] = field(default_factory=dict)
     results: dict[float, Result] = field(default_factory=dict)
     cuts: Sequence[Cut] = ()
     beyond: Callable[[dict[float, Result]], tuple[float, Ended | None]] | None = None
@@ -227,7 +227,7 @@ class MarginSearch:
         if self.scaling.sense == "largest" and self.scaling.nested and self.run(0.0).status == "infeasible":
             return Critical("never")
         arguments = self.programs, self.joined, self.scaling, self.tools, self.width
-        return critical_factor(*arguments, self.progress.notify, self.estimates)
+        return critical_factor(*arguments, self.progress.notify, self.unproven_answers)
 
     def _collect_known(self, said: str, sides: Sides | None) -> tuple[Sides, tuple[MarginPoint, ...]]:
         """Return the sides that an interrupted search knows, and every proven run on the feasible side as a curve.
@@ -243,7 +243,7 @@ class MarginSearch:
         )
         last, first = (-1, 0) if self.scaling.sense == "largest" else (0, -1)
         feasible, infeasible = proven[last] if proven else None, refused[first] if refused else None
-        attempts = [f"{answer} at {factor:.4g}" for factor, answer in sorted(self.estimates.items())]
+        attempts = [f"{answer} at {factor:.4g}" for factor, answer in sorted(self.unproven_answers.items())]
         hint = f"; not proven: it seems {', '.join(attempts)}" if attempts else ""
         note = "" if proven or refused else ", of which none proves anything" if self.points else ": nothing is proven"
         return ("undecided", f"{said} after {len(self.points)} runs{note}{hint}", feasible, infeasible), tuple(proven)

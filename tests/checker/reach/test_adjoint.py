@@ -352,7 +352,7 @@ def test_every_radius_is_enlarged_by_what_its_own_sum_may_round(kind: str, monke
 @pytest.mark.parametrize("rate", [2.0, 5.0])
 def test_what_is_left_of_the_expansion_of_a_bend_is_in_its_bound(rate: float, monkeypatch: pytest.MonkeyPatch) -> None:
     """``l = e^{a s}`` grows on every step, so that its bend is largest at the end; one term is expanded."""
-    monkeypatch.setattr(module, "DERIVATIVE_ORDER", 0)
+    monkeypatch.setattr(module, "DERIVATIVE_DEGREE", 0)
     known = AdjointRow.of(AdjointFlow.of(arb_mat([[rate]]), arb_mat([[1.0]]), HORIZON, Clock()), np.ones(1))
     ends = known.nodes.mid[1:, 0]
     rows, once, twice = (part[:, 0] for part in known.derivative_bounds)
