@@ -23,7 +23,7 @@ from sparserob_core.sip.result import Result
 from sparserob_core.sip.separation.separation import separate
 from sparserob_core.sip.working.counting import count, met, tidied
 from sparserob_core.sip.working.ledger import ALLOWED, CheckedAnswer, Found, Ledger, Prover, Violated, above
-from sparserob_core.sip.working.working import ViolatedRow, Working, fits
+from sparserob_core.sip.working.working import LargestViolation, Working, fits
 
 # Number of rounds without a multiplier after which a row is dropped. With 1, rows are dropped and imposed in turn; with
 # ten times as many, solving takes longer the more rounds there were.
@@ -203,9 +203,9 @@ class PlainRows(Working):
         self.idle = np.concatenate([self.idle, np.zeros(fresh.h.size, dtype=int)])
         return int(fresh.h.size)
 
-    def knows(self, row: ViolatedRow) -> bool:
+    def knows(self, violation: LargestViolation) -> bool:
         """Return whether a constraint is imposed."""
-        return not self._find_new_rows([(row.at, row.row, row.family)]).h.size
+        return not self._find_new_rows([(violation.at, violation.row, violation.family)]).h.size
 
     def _find_new_rows(self, violated: Violated) -> Rows:
         """Return the rows of violated constraints that are not imposed."""
@@ -234,10 +234,10 @@ class PlainRows(Working):
         radii = np.maximum(np.abs(self.program.finite.lower), np.abs(self.program.finite.upper))
         return min(1.0, float(np.where(np.isfinite(radii), radii, 1.0).max()))
 
-    def distance(self, row: ViolatedRow) -> float:
+    def distance(self, violation: LargestViolation) -> float:
         """Return the distance by which a violated row has to be moved along its normal."""
-        G = rows_at(self.program, row.family, row.at, row.row).G
-        return row.violation / max(float(np.linalg.norm(G)), np.finfo(float).tiny)
+        G = rows_at(self.program, violation.family, violation.at, violation.row).G
+        return violation.size / max(float(np.linalg.norm(G)), np.finfo(float).tiny)
 
     def tightened(self, ledger: Ledger, answer: CheckedAnswer, margin: float) -> CheckedAnswer | None:
         """Return the optimum of the imposed rows tightened by ``margin``; ``None`` where there is none."""

@@ -30,7 +30,7 @@ from sparserob_core.sip.solver import AccountedSolver
 from sparserob_core.sip.working.ledger import ALLOWED, CheckedAnswer, Found, Ledger, Prover, Violated, above, unproven
 from sparserob_core.sip.working.plain import Close
 from sparserob_core.sip.working.tightening import GLANCE, SPARED
-from sparserob_core.sip.working.working import ViolatedRow, Working, size_of
+from sparserob_core.sip.working.working import LargestViolation, Working, size_of
 
 SHARES = (0.1, 0.5, 1.0)  # points from the best decision known to the relaxed optimum at which rows are sought
 ENDED = 0.05  # seconds after the deadline when it has passed for certain
@@ -288,9 +288,9 @@ class RobustRows(Working):
             count += 1
         return count
 
-    def knows(self, row: ViolatedRow) -> bool:
+    def knows(self, violation: LargestViolation) -> bool:
         """Return whether an index is imposed."""
-        return (row.family, row.at[0].tobytes()) in self.known
+        return (violation.family, violation.at[0].tobytes()) in self.known
 
     def priced(self, answer: CheckedAnswer) -> float:
         """Return the sum of the multipliers: the price of a margin of 1."""
@@ -306,9 +306,9 @@ class RobustRows(Working):
         """1: margins are in the rows' own units."""
         return 1.0
 
-    def distance(self, row: ViolatedRow) -> float:
+    def distance(self, violation: LargestViolation) -> float:
         """Return the violation, since margins are in the rows' own units."""
-        return row.violation
+        return violation.size
 
     def tightened(self, ledger: Ledger, answer: CheckedAnswer, margin: float) -> CheckedAnswer | None:
         """Return the optimum of the imposed rows tightened by ``margin``, accurate to a tenth of what the first margin

@@ -18,7 +18,7 @@ from sparserob_core.sip.proof.verdict import worst_of
 from sparserob_core.sip.result import Result
 from sparserob_core.sip.separation.separation import separate
 from sparserob_core.sip.working.ledger import ALLOWED, CheckedAnswer, Found, Ledger, Prover, Violated, above, witnesses
-from sparserob_core.sip.working.working import ViolatedRow, Working, left_open
+from sparserob_core.sip.working.working import LargestViolation, Working, left_open
 
 # Number of cells of a short proof. With a tenth, ordinary problems with parameters need a tightened decision although a
 # proof is quick; with ten times as many, a first upper bound along a constraint takes ten times longer.
@@ -135,7 +135,7 @@ def tighten_in_time(
     if candidate is not None and ledger.cheaper(candidate):
         x = candidate.solution.x
         ledger.prove(candidate, separate(ledger.program, x, ledger.tools, ALLOWED), prover(x, GLANCE))
-    violations, violated = [ViolatedRow.largest(*pair) for pair in found], [above(*pair) for pair in found]
+    violations, violated = [LargestViolation.of(*pair) for pair in found], [above(*pair) for pair in found]
     is_near = working.due_count == 0
     if deadline.left is None:  # with nothing left to impose, the proof of this decision follows at once
         is_near = is_near and (ledger.open(answer.solution.x) or any(rows.size for _, rows, _ in violated))
@@ -179,7 +179,7 @@ def back_off(working: Working, ledger: Ledger, prover: Prover, answer: CheckedAn
         Most violated constraints of each family at the answer.
     """
     x, program = answer.solution.x, ledger.program
-    violations = [ViolatedRow.largest(*pair) for pair in found if not pair[0].defines]
+    violations = [LargestViolation.of(*pair) for pair in found if not pair[0].defines]
     violated: Violated = [above(*pair) for pair in found]
     if not ledger.cheaper(answer) or not _is_near(working, program, answer, violations):
         return
@@ -211,7 +211,7 @@ def _tighten(
     ledger: Ledger,
     prover: Prover,
     answer: CheckedAnswer,
-    violations: Sequence[ViolatedRow],
+    violations: Sequence[LargestViolation],
     violated: Violated,
     spared: float = SPARED,
 ) -> bool:
@@ -234,7 +234,7 @@ def _tighten(
         Prover of the families.
     answer : CheckedAnswer
         Answer to the relaxed program.
-    violations : sequence of ViolatedRow
+    violations : sequence of LargestViolation
         Largest violations at the answer, found or not excluded.
     violated : Violated
         Constraints to impose.
@@ -309,7 +309,7 @@ def _solve_tightened(
     return None
 
 
-def _separate_violations(ledger: Ledger, x: Array) -> tuple[Found, Sequence[ViolatedRow], Violated]:
+def _separate_violations(ledger: Ledger, x: Array) -> tuple[Found, Sequence[LargestViolation], Violated]:
     """Return the separations at ``x (n,)``, the largest violations among them, and the constraints to impose."""
     separations = separate(ledger.program, x, ledger.tools, ALLOWED, max(1, len(ledger.history)))
     violated_pairs = [
@@ -317,19 +317,19 @@ def _separate_violations(ledger: Ledger, x: Array) -> tuple[Found, Sequence[Viol
     ]
     return (
         separations,
-        [ViolatedRow.largest(*pair) for pair in violated_pairs],
+        [LargestViolation.of(*pair) for pair in violated_pairs],
         [above(*pair) for pair in violated_pairs],
     )
 
 
 def _is_near(
-    working: Working, program: SemiInfiniteProgram, answer: CheckedAnswer, violations: Sequence[ViolatedRow]
+    working: Working, program: SemiInfiniteProgram, answer: CheckedAnswer, violations: Sequence[LargestViolation]
 ) -> bool:
     """Return whether a margin that covers the violations of an answer costs no more than the first one of `_tighten`.
 
     A round may take longer than all rounds before it, so the method does not wait for a better answer then.
     """
-    distance = max((working.distance(violation) for violation in violations if violation.violation > 0.0), default=0.0)
+    distance = max((working.distance(violation) for violation in violations if violation.size > 0.0), default=0.0)
     price = working.priced(answer)
     if distance > 0.0 and not price > 0.0:  # no row has a multiplier, so the price of a margin is unknown
         return False

@@ -39,12 +39,12 @@ AFFORDED = 0.5
 MANY_ACTIVE = 32
 
 
-class ViolatedRow(NamedTuple):
+class LargestViolation(NamedTuple):
     """Largest violation of a family that was found, or that is not excluded.
 
     Parameters
     ----------
-    violation : float
+    size : float
         The violation.
     family : str
         Name of the family.
@@ -54,16 +54,16 @@ class ViolatedRow(NamedTuple):
         Its row.
     """
 
-    violation: float
+    size: float
     family: str
     at: Array
     row: np.ndarray
 
     @staticmethod
-    def largest(family: ConstraintFamily, separation: Separation) -> ViolatedRow:
+    def of(family: ConstraintFamily, separation: Separation) -> LargestViolation:
         """Return the largest violation of a family that its separation has found."""
         largest = float(separation.violations.max(initial=0.0))
-        return ViolatedRow(largest, family.name, separation.indices[:1], separation.rows[:1])
+        return LargestViolation(largest, family.name, separation.indices[:1], separation.rows[:1])
 
 
 @dataclass(eq=False)
@@ -146,7 +146,7 @@ class Working(ABC):
         """Impose constraints that no answer contains yet; return the number of new constraints."""
 
     @abstractmethod
-    def knows(self, row: ViolatedRow) -> bool:
+    def knows(self, violation: LargestViolation) -> bool:
         """Return whether a constraint is imposed."""
 
     @abstractmethod
@@ -248,7 +248,7 @@ class Working(ABC):
         """Unit of margins."""
 
     @abstractmethod
-    def distance(self, row: ViolatedRow) -> float:
+    def distance(self, violation: LargestViolation) -> float:
         """Return the margin that removes a violation."""
 
     @abstractmethod
@@ -327,7 +327,7 @@ class Working(ABC):
         violated = [
             violation
             for pair in found
-            if (violation := ViolatedRow.largest(*pair)).violation > ALLOWED and self.knows(violation)
+            if (violation := LargestViolation.of(*pair)).size > ALLOWED and self.knows(violation)
         ]
         if not violated or not self.slater or self.floor >= self.ceiling:
             return False
@@ -407,7 +407,7 @@ def size_of(program: SemiInfiniteProgram, answer: CheckedAnswer) -> float:
     return max(SMALL_COST * program.added(x), abs(program.cost(x)))
 
 
-def left_open(program: SemiInfiniteProgram, proofs: Sequence[Proof]) -> list[ViolatedRow]:
+def left_open(program: SemiInfiniteProgram, proofs: Sequence[Proof]) -> list[LargestViolation]:
     """Return the violations that proofs could not exclude, each with the index of the largest violation found.
 
     Parameters
@@ -419,12 +419,12 @@ def left_open(program: SemiInfiniteProgram, proofs: Sequence[Proof]) -> list[Vio
 
     Returns
     -------
-    list of ViolatedRow
+    list of LargestViolation
         The violations. The list is empty where a proof excludes nothing at all, or is about another formulation than
         the imposed rows, since no margin would help then.
     """
     violations = [
-        ViolatedRow(
+        LargestViolation(
             proof.violation if proof.verdict == "refuted" else proof.bound,
             proof.family,
             proof.index[None],
@@ -436,4 +436,4 @@ def left_open(program: SemiInfiniteProgram, proofs: Sequence[Proof]) -> list[Vio
         and proof.formulation == program.family(proof.family).formulation
     ]
     complete = len(violations) == sum(proof.verdict != "proven" for proof in proofs)
-    return violations if complete and all(np.isfinite(violation.violation) for violation in violations) else []
+    return violations if complete and all(np.isfinite(violation.size) for violation in violations) else []
