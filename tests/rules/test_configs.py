@@ -40,7 +40,7 @@ EXPECTED: dict[str, tuple[str, float | None, float]] = {
     "experiment1_reduced": ("verified", 0.63230, 5e-4),
     "experiment1_repaired": ("certified", 0.63212, 2e-5),
     "experiment1_scenario": ("refuted", None, 0.0),
-    "experiment2_literal": ("refuted", None, 0.0),
+    "experiment2_literal": ("certified", 1.02167, 2e-5),
     "experiment2_printed": ("infeasible", None, 0.0),
     "experiment2_reduced": ("certified", None, 0.0),
     "experiment2_repaired": ("certified", 1.02007, 2e-5),
