@@ -11,7 +11,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from itertools import accumulate
 from math import isfinite
-from typing import TypeAlias
+from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 
@@ -21,6 +21,9 @@ from sparserob_core.sip.finite import FiniteProgram, FiniteSolution
 from sparserob_core.sip.inner.equalities import onto_equalities
 from sparserob_core.sip.inner.extended import extended_bound
 from sparserob_core.sip.inner.image import onto_stationary, within_bounds
+
+if TYPE_CHECKING:
+    from scipy.sparse import csc_array
 
 # Least allowance for the error of a sum, relative to the sum of the absolute values (see `bound_rounding`). With a
 # tenth of it, slopes of 0 are refused for what a projection leaves; ten times as much costs digits of bounds.
@@ -246,10 +249,8 @@ def _compute_terms(
     slope = program.q + _weigh_rows(y, program.G, mu, program.A)
     if curvature is None and program.P is not None:
         at = np.zeros(program.n) if at is None else at
-        gradient = np.asarray(program.P @ at)
-        sizes = np.asarray(abs(program.P) @ np.abs(at))  # what may cancel in the slope and in the square, and rounds
-        constant -= 0.5 * add_pairwise(at * gradient)
-        magnitude += 0.5 * float(np.abs(at) @ sizes)
+        gradient, sizes, square, square_size = tangent_terms(program.P, at)
+        constant, magnitude = constant - square, magnitude + square_size
         slope, noise = slope + gradient, noise + sizes
     if program.P is None:
         curvature = None
@@ -260,6 +261,13 @@ def _compute_terms(
     z = onto_stationary(program, start, slope)
     noise = np.abs(z) + noise.max(initial=0.0)
     return Terms(constant, -z, noise, program.weights, None, magnitude, image, round_off)
+
+
+def tangent_terms(P: csc_array, at: Array) -> tuple[Array, Array, float, float]:
+    """Return what the tangent of ``1/2 x'P x`` at a point ``at (n,)`` adds: ``P at`` to the slope, and
+    ``1/2 at'P at``, which is subtracted from the constant. After each comes what may cancel in it, and rounds."""
+    gradient, sizes = np.asarray(P @ at), np.asarray(abs(P) @ np.abs(at))
+    return gradient, sizes, 0.5 * add_pairwise(at * gradient), 0.5 * float(np.abs(at) @ sizes)
 
 
 def bound_rounding(count: int) -> float:

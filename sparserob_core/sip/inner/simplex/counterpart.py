@@ -24,7 +24,7 @@ import numpy as np
 from sparserob_core.errors import PluginError, named
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.finite import HIGHS, FiniteProgram, Spread, UncertainRows, entries_of, gathered
-from sparserob_core.sip.inner.duality import Terms, add_pairwise, bound_rounding, without_norms
+from sparserob_core.sip.inner.duality import Terms, add_pairwise, bound_rounding, tangent_terms, without_norms
 from sparserob_core.sip.inner.simplex.interruptible import run
 from sparserob_core.sip.inner.simplex.silence import silent
 from sparserob_core.sip.inner.simplex.tangents import Tangents
@@ -620,8 +620,8 @@ def robust_bound(
         constant, size = constant + program.constant, size + abs(program.constant)
         slope, noise = slope + program.q, noise + np.abs(program.q)
     if priced and program.P is not None and at is not None:
-        gradient, sizes = np.asarray(program.P @ at), np.asarray(abs(program.P) @ np.abs(at))
-        constant, size = constant - 0.5 * add_pairwise(at * gradient), size + 0.5 * float(np.abs(at) @ sizes)
+        gradient, sizes, square, square_size = tangent_terms(program.P, at)
+        constant, size = constant - square, size + square_size
         slope, noise = slope + gradient, noise + sizes
     none = np.zeros(0, dtype=int), np.zeros(0)
     terms, magnitudes, longest, first = [none], [none], 2 * len(blocks) + program.b.size, 0
