@@ -12,6 +12,7 @@ DEMO      := configs/experiment1_repaired.yaml
 LIVE      := configs/experiment1_reduced.yaml
 ANNEALING := maximiser.name=simulated_annealing maximiser.budget=1500 maximiser.cooling_range=1e-3 maximiser.polish=0.2 method.sc2=null method.indices=20 continuation.stop=1e-6
 LITERAL_LIVE := configs/experiment1_literal.yaml
+ALL_BUT_SLOW := "(long or not slow) and not benchmark"
 PIP       := $(BIN)/python -m pip install --quiet --quiet --disable-pip-version-check
 
 define SET_UP
@@ -102,7 +103,7 @@ tests: $(INSTALLED)
 # SINCE=REVISION (main): what the modules that were changed since can affect, by the imports.
 test-changed: $(INSTALLED)
 	@chosen=$$($(BIN)/python -m tests.changed $(SINCE)) && \
-	if [ -n "$$chosen" ]; then $(BIN)/python -m pytest -m "(long or not slow) and not benchmark" --numprocesses 2 --dist worksteal $$chosen; else echo "nothing was changed"; fi
+	if [ -n "$$chosen" ]; then $(BIN)/python -m pytest -m $(ALL_BUT_SLOW) --numprocesses 2 --dist worksteal $$chosen; else echo "nothing was changed"; fi
 
 test-slow: $(INSTALLED)
 	$(BIN)/python -m pytest -m slow --numprocesses 2 --dist worksteal -p no:cacheprovider
@@ -132,7 +133,7 @@ test-pythons:
 	    touch $$place/installed; \
 	  fi; \
 	  echo "$$python: $$($$place/bin/python --version)"; tried="$$tried $$python"; \
-	  $$place/bin/python -m pytest -q -m "(long or not slow) and not benchmark" --numprocesses 2 --dist worksteal -p no:cacheprovider || status=$$?; \
+	  $$place/bin/python -m pytest -q -m $(ALL_BUT_SLOW) --numprocesses 2 --dist worksteal -p no:cacheprovider || status=$$?; \
 	done; \
 	if [ -z "$$tried" ]; then echo "none of $(PYTHONS) was found" >&2; exit 1; fi; exit $$status
 
