@@ -196,7 +196,7 @@ def test_a_control_that_is_refuted_shows_by_how_much(tmp_path: Path) -> None:
         ({"terminal": [{"equals": [0, 0]}]}, "fixed final values"),
         (
             {
-                "system": {"A": A.tolist(), "B": B.tolist(), "delay": 0.1},
+                "system": {"A": [[0, 1], ["-4 - p", -0.3]], "B": B.tolist(), "parameters": {"p": [-0.1, 0.1]}},
                 "disturbance": {"norm": {"p": 2, "radius": 0.01}},
                 "disturbance_class": "measurable",
             },

@@ -142,7 +142,7 @@ def test_what_transitions_are_counted_by_is_what_the_piece_under_way_has_made_of
     off by, in the measure of what flows are."""
     case, _, pieces = made(name)
     marks, far = pieces.motion.grid.breakpoints, pieces.errors.error_radii
-    begun, driven = pieces.reached
+    begun, driven = pieces.effect_sizes
     for k, (mark, piece) in enumerate(zip(marks[:-1].tolist(), pieces.motion.origin.tolist(), strict=True)):
         start = float(case.grid[piece])
         truth = pushed(case, start, mark, np.vstack([np.eye(2), -np.eye(2)])).reshape(2, 2).max(axis=0)
