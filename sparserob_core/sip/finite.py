@@ -498,15 +498,12 @@ class Spread:
     ----------
     sets : tuple of (int, ConvexSet)
         Numbers of copies and sets, in the order of the entries of ``w``.
-    missed : float, default 0
-        Relative error with which a deviation is represented.
     still : ndarray of bool, shape (Q,), optional
         Entries that no control answers, since they deviate by no more than the resolution of doubles. Such entries
         count like all others, but no proof names them.
     """
 
     sets: tuple[tuple[int, ConvexSet], ...]
-    missed: float = 0.0
     still: np.ndarray | None = None
 
     @cached_property
@@ -548,13 +545,11 @@ class Spread:
 
     @cached_property
     def lost(self) -> float:
-        """Relative error with which points of the sets represent deviations.
-
-        The error is `missed` plus the rounding of points that are far from 0 compared with their deviations.
-        """
+        """Relative error with which points of the sets represent deviations: the rounding of points that are far from 0
+        compared with their deviations."""
         moving = self.radii > 0.0 if self.still is None else (self.radii > 0.0) & ~self.still
         ratio = (np.abs(self.middle) / np.where(moving, self.radii, np.inf)).max(initial=0.0)
-        return float(self.missed + np.finfo(float).eps * (1.0 + ratio))
+        return float(np.finfo(float).eps * (1.0 + ratio))
 
     @cached_property
     def chords(self) -> Array:

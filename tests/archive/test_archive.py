@@ -34,9 +34,14 @@ CHANGED: dict[str, tuple[dict[str, str], str]] = {
     "amplified-12": (MISSED, "the fixed x1 is missed by 4.69e-8, of which 1.1e-9 may be excused"),
     "amplified-15": (EXCEEDED, "the final set is exceeded by 0.00306, 0.4 per cent of its width"),
     "amplified-16": ({"equalities": "not checked"}, "the run claims nothing, and the fixed x1 is missed by 0.161"),
+    "config-measurable_feedback": (
+        dict.fromkeys(("control", "cost", "lower bound", "path", "terminal", "status"), "not checked"),
+        "feedback against measurable disturbances is retired, decision 41",
+    ),
 }
-"""Claims of that version that are judged otherwise today, with their verdict and the reason. All are about plants that
-amplify: then a claim excused 1e-9 of what the plant could reach, since decision 88 of what the user can read."""
+"""Claims of that version that are judged otherwise today, with their verdict and the reason. All but the last are about
+plants that amplify: then a claim excused 1e-9 of what the plant could reach, since decision 88 of what the user can
+read."""
 
 
 def in_stages(names: list[str]) -> list[Any]:

@@ -75,7 +75,6 @@ KINDS: dict[str, dict[str, Any]] = {
         policy={"name": "affine", "cost": "worst"},
     ),
     "feedback, curved": on(3, {**PUSHED, "terminal": [{"norm": {"p": 2, "radius": 0.6}}], "path": []}, policy=AFFINE),
-    "feedback, measurable": on(3, {**PUSHED, "disturbance_class": "measurable", "path": []}, policy=AFFINE),
     "feedback, infeasible": on(
         3, {**PUSHED, "disturbance": {"box": [2.0]}, "terminal": [{"box": [0.05, 0.05]}]}, policy=AFFINE
     ),

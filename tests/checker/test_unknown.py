@@ -32,7 +32,6 @@ from sparserob_core.control.problem.system import LinearSystem, VaryingSystem
 from sparserob_core.control.sets.sets import Box, Cylinder, Equality, NormBall, Polytope
 from tests.checker.claims import test_lists
 from tests.checker.claims.test_windows import case_of
-from tests.checker.reach.test_kernels import kernel_of
 from tests.support.worst_cases import DIRECTIONS, ENDS, kind
 
 JUST_ABOVE_1 = float(np.nextafter(1.0, 2.0))
@@ -139,7 +138,11 @@ UNKNOWN: dict[str, tuple[Callable[[], object], type[Exception], str]] = {
     ),
     "an effort that is known roughly": (largest_effort(arb(0, 1), 0.5), Unchecked, "known too roughly"),
     "an effort that is larger": (largest_effort(arb(2), 0.5), Broken, "causes the effort 2.0"),
-    "a system that is too fast": (lambda: kernel_of([[-1e9]], [[1.0]], 1.0), Unchecked, "too fast for its horizon"),
+    "a system that is too fast": (
+        lambda: VerifiedFlow(Plant.of(sr.LinearSystem([[-1e9]], [[1.0]]), 1.0), 1.0).marks([0.0, 1.0]),
+        Unchecked,
+        "too fast for its horizon",
+    ),
     "numbers that are not exact": (
         lambda: ReachableSubspace.of([(arb_mat([[arb(1, 0.1)]]), arb_mat([[1]]))], [[1]]),
         Unchecked,

@@ -125,15 +125,6 @@ class TestAnswered(ProblemContract):
         return REGISTRY.build("problem", "linear", ANSWERED)
 
 
-@pytest.mark.slow
-class TestMeasurable(TestAnswered):
-    """The same where the disturbance may jump at any time, between flat sets."""
-
-    def create(self):
-        flat = {"terminal": [{"box": 1.0}], "disturbance_class": "measurable"}
-        return REGISTRY.build("problem", "linear", {**ANSWERED, **flat})
-
-
 class Answering(sr.ProblemFactory):
     """The program of such a problem, every family with other parts."""
 

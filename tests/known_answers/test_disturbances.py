@@ -39,7 +39,6 @@ def ran(place, *given, **more):
         ("piecewise_constant", "open_loop"),
         ("piecewise_constant", "affine"),
         ("measurable", "open_loop"),
-        pytest.param("measurable", "affine", marks=pytest.mark.slow),
     ],
 )
 def test_a_list_of_boxes_is_one_box(tmp_path, kind, policy):

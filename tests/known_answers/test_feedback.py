@@ -324,8 +324,8 @@ def policies(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.mark.parametrize(
     ("changed", "said"),
     [
-        ({"disturbance_class": "l1_ball"}, "piecewise_constant or measurable"),
-        ({"system": {**SPRING["system"], "delay": 0.1}, "disturbance_class": "measurable"}, "delay"),
+        ({"disturbance_class": "l1_ball"}, "piecewise_constant, not l1_ball"),
+        ({"disturbance_class": "measurable"}, "not measurable; more pieces in dictionaries.disturbance"),
     ],
 )
 def test_what_is_not_built_is_refused_in_one_sentence(changed: dict[str, Any], said: str, tmp_path: Path) -> None:

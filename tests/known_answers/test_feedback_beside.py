@@ -140,15 +140,6 @@ def test_everything_together_keeps_every_guarantee(cost: str, tmp_path: Path) ->
     proven(run(together, tmp_path / "run", cost, pieces=8))
 
 
-@pytest.mark.slow
-def test_steps_and_sets_that_move_hold_under_measurable_disturbances(tmp_path: Path) -> None:
-    measurable = {"disturbance": {"box": [0.05, 0.05]}, "disturbance_class": "measurable"}
-    outcome = run({**SPRING, **STEPS, **measurable, "path": [MOVING]}, tmp_path / "run", "peak", pieces=4)
-    assert outcome.status == "certified", outcome.result.message
-    found = check(outcome.directory)
-    assert found.status == "verified", [claim for claim in found.claims if claim.verdict != "holds"]
-
-
 def test_small_steps_are_judged_in_their_own_unit(tmp_path: Path) -> None:
     """A double integrator that needs little: steps of a thousandth of what the control could be."""
     problem = {

@@ -152,7 +152,6 @@ KINDS: dict[str, dict[str, Any]] = {
         "control_step": {"box": 0.8},
     },
     "a box about every initial state": {**SPRING, "initial_state": {"centre": [0.5, 0.0], "box": [0.1, 0.1]}},
-    "a measurable disturbance": {**SPRING, "disturbance_class": "measurable", "disturbance": {"box": [0.05, 0.05]}},
     "fixed final states": {
         **SPRING,
         "system": {"A": A.tolist(), "B": B.tolist(), "E": [[0], [1]]},

@@ -19,7 +19,7 @@ from sparserob_core.control.sets.sets import Box, ConvexSet, Ellipsoid, NormBall
 @dataclass(frozen=True, eq=False)
 class Loop:
     """``x' = A x + B u + E w + c`` from ``start`` and a set of deviations ``begun``, under ``w`` in ``bound``, constant
-    between ``changes`` or ``measurable``; the control is constant between ``breakpoints``."""
+    between ``changes``; the control is constant between ``breakpoints``."""
 
     A: np.ndarray
     B: np.ndarray
@@ -30,9 +30,6 @@ class Loop:
     bound: ConvexSet | None = None
     begun: ConvexSet | None = None
     c: np.ndarray | None = None
-    measurable: bool = False
-    fine: int = 1
-    """Into how many parts a piece of the grid is cut here for a measurable disturbance."""
     C: np.ndarray | None = None
     """What is seen of the state, with ``noise``, and made an innovation of by ``observer (K, d, p)``."""
     noise: ConvexSet | None = None
@@ -52,7 +49,6 @@ class Loop:
             initial_set=self.begun,
             control=Box(-9.0 * np.ones(m), 9.0 * np.ones(m)),
             disturbance=self.bound,
-            disturbance_class="measurable" if self.measurable else "piecewise_constant",
             terminal=[Box(-99.0 * np.ones(d), 99.0 * np.ones(d))],
             measurements=None if self.C is None else sr.Measurements(self.C, self.noise),
         )
@@ -67,16 +63,9 @@ class Loop:
         return np.unique(np.concatenate([self.breakpoints, self.changes]))
 
     @cached_property
-    def jumps(self) -> np.ndarray:
-        """Where the disturbance is taken to jump."""
-        if not self.measurable:
-            return self.changes
-        return np.unique(np.concatenate([np.linspace(a, b, self.fine + 1) for a, b in pairwise(self.grid)]))
-
-    @cached_property
     def sets(self) -> list[tuple[ConvexSet, np.ndarray]]:
         """The set and the middle of every block of deviations."""
-        found = [] if self.bound is None else [(self.bound, self.bound.middle())] * (self.jumps.size - 1)
+        found = [] if self.bound is None else [(self.bound, self.bound.middle())] * (self.changes.size - 1)
         found += [] if self.noise is None else [(self.noise, self.noise.middle())] * (self.breakpoints.size - 1)
         return found if self.begun is None else [*found, (self.begun, self.begun.middle())]
 
@@ -96,7 +85,7 @@ class Loop:
         same shape, and the controls ``(K, m, 1 + Q)``."""
         d, m = self.B.shape
         width = 0 if self.bound is None else self.E.shape[1]
-        blocks = 0 if self.bound is None else self.jumps.size - 1
+        blocks = 0 if self.bound is None else self.changes.size - 1
         noises = 0 if self.noise is None else (self.breakpoints.size - 1) * self.noise.dimension
         Q = blocks * width + noises + (0 if self.begun is None else d)
         middle = np.zeros(self.E.shape[1]) if self.bound is None else self.bound.middle()
@@ -108,7 +97,7 @@ class Loop:
         error = np.hstack([np.zeros((d, 1)), X[:, 1:]])
         innovations = [self._innovation(0, error, 1 + blocks * width)]
         (found, rates), controls = np.zeros((2, times.size, d, 1 + Q)), []
-        marks = np.unique(np.concatenate([self.grid, self.jumps]))
+        marks = self.grid
         for k, (begin, end) in enumerate(pairwise(self.breakpoints)):
             U = np.zeros((m, 1 + Q))
             U[:, 0] = v[:, k]
@@ -121,7 +110,7 @@ class Loop:
                 drive = self.B @ U
                 drive[:, 0] += still
                 if blocks:
-                    at = 1 + (np.searchsorted(self.jumps, (a + b) / 2) - 1) * width
+                    at = 1 + (np.searchsorted(self.changes, (a + b) / 2) - 1) * width
                     drive[:, at : at + width] += self.E
                 last = b == marks[-1]
                 here = np.flatnonzero((times >= a) & ((times <= b) if last else (times < b)))
@@ -233,8 +222,6 @@ FAST = np.array([[0.0, 5.0], [-5.0, -0.1]])
 FORCE = np.array([[0.0], [1.0]])
 GUST = np.array([[0.3, 0.0], [1.0, -0.5]])
 TRIANGLE = Polytope(np.array([[1.0, 1.0], [-1.0, 0.0], [0.0, -1.0]]), np.array([0.2, 0.1, 0.05]))
-# no two corners are opposite
-SKEWED = Polytope(np.array([[-1.0, -1.0], [1.0, -0.5], [0.0, 1.0]]), np.array([0.2, 0.1, 0.05]))
 LOOPS = {
     "box": Loop(
         SLOW, FORCE, GUST, np.array([0.0, 0.5, 0.7, 1.5, 2.0]), np.array([0.0, 0.4, 1.0, 2.0]), np.array([-1.0, 0.5]),
@@ -259,15 +246,6 @@ LOOPS = {
         np.array([[0.0, 1.0], [0.0, 0.0]]), FORCE, FORCE, np.linspace(0.0, 2.0, 4), np.linspace(0.0, 2.0, 4),
         np.array([-1.0, 0.5]), None, TRIANGLE,
     ),
-    "measurable": Loop(
-        SLOW, FORCE, GUST, np.array([0.0, 0.5, 0.7, 1.5, 2.0]), np.array([0.0, 2.0]), np.array([-1.0, 0.5]),
-        Box(np.array([-0.1, 0.0]), np.array([0.2, 0.1])), Box(np.array([-0.1, -0.05]), np.array([0.05, 0.1])),
-        measurable=True, fine=20,
-    ),
-    "measurable in a triangle": Loop(
-        FAST, FORCE, GUST, np.array([0.0, 1.0, 2.0]), np.array([0.0, 2.0]), np.array([1.0, 0.0]), TRIANGLE,
-        measurable=True, fine=40,
-    ),
 }  # fmt: skip
 CHANGING = {
     "turning": Changing(
@@ -285,21 +263,7 @@ CHANGING = {
         np.array([[0.0, 1.0], [0.0, 0.0]]), FORCE, FORCE, np.linspace(0.0, 2.0, 4), np.linspace(0.0, 2.0, 4),
         np.array([-1.0, 0.5]), None, TRIANGLE, rate="1 + 0*t", factor="1 + 0*t",
     ),
-    "measurable in t": Changing(
-        SLOW, FORCE, GUST, np.array([0.0, 0.5, 0.7, 1.5, 2.0]), np.array([0.0, 1.0, 2.0]), np.array([-1.0, 0.5]),
-        Box(np.array([-0.1, 0.0]), np.array([0.2, 0.1])), Box(np.array([-0.1, -0.05]), np.array([0.05, 0.1])),
-        c=np.array([0.1, -0.3]), measurable=True, fine=20, rate="1 + t", grown="t + t^2/2", factor="cos(3*t)",
-    ),
-    "measurable in a triangle in t": Changing(
-        FAST, FORCE, GUST, np.array([0.0, 1.0, 2.0]), np.array([0.0, 2.0]), np.array([1.0, 0.0]), SKEWED,
-        measurable=True, fine=40, rate="exp(-t)", grown="1 - exp(-t)", factor="exp(-t)",
-    ),
 }  # fmt: skip
+STILL = [*LOOPS]
 LOOPS.update(CHANGING)
-STILL = [name for name, loop in LOOPS.items() if not loop.measurable and name not in CHANGING]
 EXACT = [*STILL, "turning", pytest.param("fading", marks=pytest.mark.slow)]
-STEADY = [name for name, loop in LOOPS.items() if loop.measurable and name not in CHANGING]
-MEASURABLE = [
-    *STEADY,
-    *(pytest.param(name, marks=pytest.mark.slow) for name, loop in CHANGING.items() if loop.measurable),
-]

@@ -83,7 +83,7 @@ def problem(kind):
     ), policy
 
 
-FIRST = ("known", "parametric", "taking turns", "measurable", "feedback", "feedback, measurable")
+FIRST = ("known", "parametric", "taking turns", "measurable", "feedback")
 KINDS = (*FIRST, "varying", "execution", "integrals", "feedback, integrals")
 
 

@@ -15,11 +15,11 @@ with every bound tightened by `BETWEEN`, which is more than what happens between
 measurable disturbances and errors of execution add the larger of two values: what the best constant function adds, and
 what the trapezoidal rule says of the best function.
 
-**Under feedback** (`affine`) both are programs of nominal controls and answers. The lower one answers every source that
-is constant on pieces once its piece is over, and knows nothing of others, which stand at their centre: a relaxation of
-every policy of this form, also of one that measures less. The upper one answers the same, or nothing where the policy
-measures outputs or a source is measurable. The cost ``worst`` lies between those of ``nominal`` and ``peak``. Where a
-program has not all of its rows after `ANSWERED` rounds, its value is still a lower one, and there is no upper one.
+**Under feedback** (`affine`) both are programs of nominal controls and answers. The lower one answers every source once
+its piece is over: a relaxation of every policy of this form, also of one that measures less. The upper one answers the
+same, or nothing where the policy measures outputs. The cost ``worst`` lies between those of ``nominal`` and ``peak``.
+Where a program has not all of its rows after `ANSWERED` rounds, its value is still a lower one, and there is no upper
+one.
 
 A cost that is the time of action (`sparsest`) is a program in integers on the same samples.
 """
@@ -749,26 +749,12 @@ def _sampled(plan: Plan) -> tuple[Rows, list[tuple[Array, float]], Curve | None]
     return rows, [entry for _, fixed, _ in every for entry in fixed], curve(plan, every[-1][2])
 
 
-def _without(plan: Plan) -> Plan:
-    """A plan whose measurable disturbances stand at their centre, which must be 0."""
-    if any(one.pieces is None and middle(one.bound).any() for one in plan.sources):
-        raise NotImplementedError("no oracle for feedback and measurable disturbances about another centre")
-    still = replace(plan)
-    still.sources = [
-        one if one.pieces is not None else replace(one, bound=Box(*(np.zeros(one.bound.dimension),) * 2))
-        for one in plan.sources
-    ]
-    return still
-
-
 def _bounds(plan: Plan, counts: bool, alphabet: tuple[float, ...] | None) -> tuple[float, float]:
     feedback, peak = plan.charge is not None, plan.charge == "peak"
-    measurable = any(one.pieces is None for one in plan.sources)
-    known = _without(plan) if feedback and measurable else plan
-    program = Program(known, *_sampled(known), counts, alphabet, feedback)
+    program = Program(plan, *_sampled(plan), counts, alphabet, feedback)
     found = program.solve(0.0, peak)
     lower = np.inf if found is None else float(program.objective @ found)
-    if feedback and (measurable or plan.problem.measurements is not None):  # the upper one answers nothing
+    if feedback and plan.problem.measurements is not None:  # the upper one answers nothing
         program = Program(plan, *_sampled(plan), counts, alphabet, False)
     peak = plan.charge in ("peak", "worst")
     found = program.solve(TIGHT, peak)

@@ -15,7 +15,6 @@ from typing import Any
 
 import clarabel
 import numpy as np
-from scipy.linalg import expm
 from scipy.optimize import linprog
 from scipy.sparse import coo_array, csc_matrix, csr_array
 
@@ -39,8 +38,7 @@ from tests.support.instances import (
 )
 
 FURTHER = 6 * TOGETHER  # numbers of policies with one of `KINDS` among their features
-KINDS = ("worst", "fixed", "repeat", "measurable", "curved")
-SPARE = 1.01  # times the measurable disturbance: what the trapezoidal rule may leave out between its nodes, and more
+KINDS = ("worst", "fixed", "repeat", "curved", "curved")  # by the last digit: what a number is stays
 ROUND = 5 * TOGETHER  # numbers of policies among whose sets of deviations there are ellipsoids
 LARGER = 2.0  # times the disturbance that open loops are tested with
 PER_PIECE = 8
@@ -66,7 +64,7 @@ class Outputs:
 class Answered:
     """A problem, its units, what its policy is charged, for how many pieces it answers (0: for ever), and its outputs
     with what one of each is in the user's units, where these are not the state. ``repeat``: it begins again at the
-    horizon; ``measurable``: the disturbance is any function of time."""
+    horizon."""
 
     problem: Instance
     units: Units
@@ -75,7 +73,6 @@ class Answered:
     outputs: Outputs | None = None
     scale: np.ndarray | None = None
     repeat: bool = False
-    measurable: bool = False
 
     def config(self) -> dict[str, Any]:
         """In the user's units."""
@@ -85,8 +82,6 @@ class Answered:
         stated = {**config(self.problem, self.units), "policy": {**policy, **memory}}
         if self.repeat:
             stated["problem"]["repeat"] = True
-        if self.measurable:
-            stated["problem"]["disturbance_class"] = "measurable"
         if self.outputs is not None:
             assert self.scale is not None
             seen: dict[str, Any] = {"C": (self.scale[:, None] * self.outputs.C / self.units.states).tolist()}
@@ -166,7 +161,7 @@ def _fits(problem: Instance, kind: str) -> bool:
         return K <= 8 and d <= 2 and not flat and disc and problem.ends_at is None and bool(problem.path)
     if kind == "fixed":
         return K <= 8 and flat and problem.ends_at is not None
-    small = {"worst": K <= 5, "repeat": K <= 8, "measurable": K <= 5 and d <= 2}[kind]
+    small = {"worst": K <= 5, "repeat": K <= 8}[kind]
     return small and flat and problem.ends_at is None and bool(problem.terminal)
 
 
@@ -174,9 +169,8 @@ def _fuller(rng: np.random.Generator, problem: Instance, kind: str, has: np.ndar
     """With what `richer` and `in_time` draw, as far as it stands beside a feature of `KINDS`."""
     if has[1]:
         fuller = richer(rng, problem)
-        curved = isinstance(fuller.step, Curved) and kind == "measurable"  # refused by name
-        problem = problem if curved or (kind == "repeat" and fuller.step is not None) else fuller
-    if has[2] and kind != "measurable":
+        problem = problem if kind == "repeat" and fuller.step is not None else fuller
+    if has[2]:
         timed = in_time(rng, problem)
         early = problem.step is not None or kind == "repeat"  # of a plan that repeats steps go on across the seam
         problem = replace(timed, late=0, before=None) if early else timed
@@ -184,15 +178,13 @@ def _fuller(rng: np.random.Generator, problem: Instance, kind: str, has: np.ndar
 
 
 def further(number: int) -> Answered:
-    """One of `KINDS` in turn: a cost of the largest effort, fixed final states, a plan that begins again, measurable
-    disturbances, curved sets on the path; beside it what `together` draws, as far as the truth is a program."""
+    """One of `KINDS` in turn: a cost of the largest effort, fixed final states, a plan that begins again, curved
+    sets on the path; beside it what `together` draws, as far as the truth is a program."""
     rng, kind = np.random.default_rng([number, 42]), KINDS[number % len(KINDS)]
     problem = drawn(rng)
     while not _fits(problem, kind):
         problem = drawn(rng)
     (d, m), has = problem.B.shape, rng.random(6) < 0.5
-    if kind == "measurable" and isinstance(problem.control, Curved):  # refused by name
-        problem = replace(problem, control=Flat.box(problem.control.support(np.eye(m))))
     if kind == "worst":
         problem = replace(problem, E=problem.E[:, :1])
     if kind == "fixed":
@@ -216,11 +208,11 @@ def further(number: int) -> Answered:
     if has[3]:
         problem = replace(problem, charge=replace(charge(rng, d, m), grouped=False))
     units, outputs, scale = drawn_units(rng, problem), None, None
-    if has[4] and kind not in ("worst", "measurable"):
+    if has[4] and kind != "worst":
         p = int(rng.integers(1, d + 1))
         noise = rng.uniform(0.001, 0.02, p) * (rng.random() < 0.5 and kind != "fixed")
         outputs, scale = Outputs(rng.normal(size=(p, d)), noise, 0.0), 10.0 ** rng.uniform(-6, 6, p)
-    return Answered(problem, units, cost, 0, outputs, scale, kind == "repeat", kind == "measurable")
+    return Answered(problem, units, cost, 0, outputs, scale, kind == "repeat")
 
 
 def rounder(number: int, problem: Instance) -> Instance:
@@ -333,7 +325,7 @@ def truth_answered(one: Answered) -> tuple[float, float]:
 
 
 def _sampled(one: Answered, some: Sampled, tight: bool) -> float:
-    policy = _Policy(one, _measured(one.problem, some, tight) if one.measurable else some)
+    policy = _Policy(one, some)
     always = [*_control_rows(one.problem, tight, policy.still), *policy.charged(one.cost)]
     sought = list[_Row]()
     for shape, start, stop in one.problem.path:
@@ -355,23 +347,6 @@ def _sampled(one: Answered, some: Sampled, tight: bool) -> float:
     if one.problem.mixed is not None:
         sought += _mixed_rows(policy, one.problem, some.sag if tight else 0.0 * some.sag)
     return policy.least(always, sought)
-
-
-def _measured(problem: Instance, some: Sampled, tight: bool) -> Sampled:
-    """With every step of the fine grid in place of the pieces of the disturbance: constant on each, which is one of the
-    measurable ones; or with room, the trapezoidal rule of the absolute kernel, which its chords are above but for the
-    kernel's curvature."""
-    (d, q), steps, noise = problem.E.shape, np.diff(some.times), list[np.ndarray]()
-    for s, h in enumerate(steps):
-        big = expm(h * np.block([[problem.A, problem.E], [np.zeros((q, d + q))]]))
-        inside = big[:d, d:]
-        pushes = [SPARE * h / 2 * big[:d, :d] @ problem.E, SPARE * h / 2 * problem.E] if tight else [inside]
-        for push in pushes:
-            column = np.zeros((len(some.times), d, q))
-            for j in range(s + 1, len(some.times)):
-                column[j] = expm((some.times[j] - some.times[s + 1]) * problem.A) @ push
-            noise.append(column)
-    return replace(some, noise=np.stack(noise, axis=-1))
 
 
 def _state_rows(

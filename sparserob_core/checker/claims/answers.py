@@ -23,7 +23,6 @@ from sparserob_core.checker.cost.gains import GainsBound, reach
 from sparserob_core.checker.outcome import CANCELLED, FIGURES, Broken, Unchecked
 from sparserob_core.checker.problem.timing import before
 from sparserob_core.checker.reach.closed_loop import VerifiedLoop
-from sparserob_core.checker.reach.measurable import MeasurableLoop
 from sparserob_core.checker.sets.known import known
 from sparserob_core.sip.convex_set import Array, ConvexSet
 
@@ -83,24 +82,17 @@ class VerifiedFeedback:
         """The system under the nominal control and the gains."""
         return self._close_loop(self.case.pieces, self.gains)
 
-    def _close_loop(self, nominal: Sequence[arb_mat], gains: Array, changes: list[float] | None = None) -> VerifiedLoop:
-        """Return the closed loop; where ``changes`` are given, under disturbances that jump at these times only. Raise
-        `Unchecked` for the kinds of systems and disturbances that the checker does not know under feedback."""
+    def _close_loop(self, nominal: Sequence[arb_mat], gains: Array) -> VerifiedLoop:
+        """Return the closed loop. Raise `Unchecked` for the kinds of systems and disturbances that the checker does not
+        know under feedback."""
         case = self.case
         system = case.problem.system
         if system.parameter_count:
             raise Unchecked("the checker knows feedback of known systems only")
-        if case.measurable and (system.switches or system.delay):
-            raise Unchecked("the checker knows feedback under measurable disturbances of one system, undelayed")
-        if not case.disturbances.alike:
-            raise Unchecked("the checker knows feedback under disturbances of one class, on one dictionary")
-        jump_times, measurements = (
-            (changes if case.measurable else case.disturbances.changes) or [],
-            case.problem.measurements,
-        )
-        if measurements is not None and case.measurable:
-            raise Unchecked("the checker knows outputs beside disturbances that are constant on pieces only")
-        return (MeasurableLoop if case.measurable and changes is None else VerifiedLoop)(
+        if case.measurable or not case.disturbances.alike:
+            raise Unchecked("the checker knows feedback under disturbances on the pieces of one dictionary")
+        jump_times = case.disturbances.changes or []
+        return VerifiedLoop(
             system,
             [float(v) for v in np.asarray(case.problem.initial_state)],
             nominal,
@@ -111,7 +103,7 @@ class VerifiedFeedback:
             case.problem.disturbance,
             case.problem.initial_set,
             tuple(float(v) for v in before(case.problem)),
-            measurements,
+            case.problem.measurements,
             self.observer,
             law=case.flows.at(()),
         )
@@ -232,18 +224,8 @@ class VerifiedFeedback:
 
     @cached_property
     def loop_at_rest(self) -> VerifiedLoop:
-        """The system without any control. Of measurable disturbances there are some, which jump often enough to move
-        the state in every direction in which any of them does."""
-        case = self.case
-        if not case.measurable:
-            return self._make_loop_at_rest(None)
-        fractions = np.arange(case.problem.system.states) / case.problem.system.states
-        intervals = zip(case.timing.grid[:-1], case.timing.grid[1:], strict=True)
-        return self._make_loop_at_rest([float(t) for a, b in intervals for t in a + fractions * (b - a)])
-
-    def _make_loop_at_rest(self, changes: list[float] | None) -> VerifiedLoop:
-        """Return the system without any control, under disturbances that jump at ``changes``."""
-        return self._close_loop(self._zero_control, self._zero_gains, changes)
+        """The system without any control."""
+        return self._close_loop(self._zero_control, self._zero_gains)
 
     @property
     def _zero_control(self) -> list[arb_mat]:
@@ -252,16 +234,8 @@ class VerifiedFeedback:
         return [none] * self.case.control.pieces
 
     def named(self, entry: Mapping[str, Any], name: str) -> NamedDeviations:
-        """Return the deviations that an entry of a certificate names, each shown to be in its set. With measurable
-        disturbances the entry also says at which ``changes`` its disturbance jumps."""
+        """Return the deviations that an entry of a certificate names, each shown to be in its set."""
         loop = self.loop_at_rest
-        if self.case.measurable:
-            changes = numbers(entry.get("changes"), f"{name}: changes")
-            if changes.ndim != 1 or not changes.size or changes[0] != 0.0 or not (np.diff(changes) > 0.0).all():
-                raise Broken(f"{name}: the disturbance must change at increasing times from 0 on")
-            if changes[-1] >= self.case.timing.grid[-1]:
-                raise Broken(f"{name}: the disturbance changes at {float(changes[-1]):.6g}, after the end")
-            loop = self._make_loop_at_rest([float(t) for t in changes])
         return NamedDeviations(self.case, loop, _read_deviations(self.case, loop, entry, name))
 
     def following(self, named: NamedDeviations, entry: Mapping[str, Any], name: str) -> NamedDeviations:

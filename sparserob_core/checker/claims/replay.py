@@ -74,7 +74,7 @@ def witnessed(case: Case, data: Mapping[str, Any]) -> tuple[arb, float]:
     )
     feedback, named, control_set = feedback_of(case), None, commanded(case, name)
     if case.answering:
-        if case.measurable or (case.problem.disturbance is not None and data.get("disturbance") is None):
+        if case.problem.disturbance is not None and data.get("disturbance") is None:
             raise Unchecked("the certificate holds no disturbance of the witness")
         named = feedback.named(data, name)
     if control_set is not None:

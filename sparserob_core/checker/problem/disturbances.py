@@ -80,11 +80,10 @@ class Disturbances:
 
     @cached_property
     def held(self) -> ConvexSet | None:
-        """The set of the disturbances that stay constant between `changes`; ``None`` where there are none. Without
-        feedback, a measurable disturbance is at the middle of its set here, and a bounded input contains its
-        deviations."""
+        """The set of the disturbances that stay constant between `changes`; ``None`` where there are none. A measurable
+        disturbance is at the middle of its set here, and a bounded input contains its deviations."""
         bound, classes = self.problem.disturbance, self.problem.disturbance_class
-        if self.timing.answering or self.problem.measurable is None or bound is None:
+        if self.problem.measurable is None or bound is None:
             return bound
         factors, kinds = ((bound,), (classes,)) if isinstance(classes, str) else (_list_factors(bound), classes)
         sets = [

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from fractions import Fraction
 from functools import cached_property
 from itertools import pairwise
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, final
 
 import numpy as np
 
@@ -38,6 +38,7 @@ if TYPE_CHECKING:
 ORDER = 8  # degree of the states in the time on a cell; the remainder counts twice, half of it needs shorter cells
 
 
+@final
 @dataclass(frozen=True, eq=False)
 class VerifiedLoop:
     """A known system under a control that answers innovations, with ``Q`` entries of deviations.
@@ -208,21 +209,11 @@ class VerifiedLoop:
             k, block = self._find_acting_indices(piece)
             drift = [balls([1.0, *zeros])] if self.flow.driven > self.system.controls else []
             entering = [balls([middle, *zeros]) for middle in self.deviations.middle.tolist()]
-            if self.deviations.blocks:
-                self._add_block_response(entering, block)
+            for i, row in enumerate(entering if self.deviations.blocks else ()):
+                column = 1 + block * self.system.disturbances + i
+                row[column] = row[column] + 1
             drives.append(stacked([*self.inputs(k).tolist(), *drift, *entering]))
         return drives
-
-    def _add_block_response(self, rows: list[list[arb]], block: int) -> None:
-        """Add the response to a block of the disturbance to the rows of the disturbance, in place."""
-        for i, row in enumerate(rows):
-            column = 1 + block * self.system.disturbances + i
-            row[column] = row[column] + 1
-
-    def _add_piece_effect(self, piece: int, state: arb_mat) -> arb_mat:
-        """Return the nominal state and the responses after a piece of the grid, from those at its end: the same, unless
-        the disturbance on the piece counts there."""
-        return state
 
     @cached_property
     def nodes(self) -> list[arb_mat]:
@@ -236,7 +227,7 @@ class VerifiedLoop:
         nodes = [stacked([[v, *zero, *row] for v, row in zip(begin, answers, strict=True)])]
         for piece, ends in enumerate(pairwise(self.grid)):
             Phi, effect = self._compute_part_flow(piece, *ends)
-            nodes.append(self._add_piece_effect(piece, Phi * nodes[-1] + effect))
+            nodes.append(Phi * nodes[-1] + effect)
         return nodes
 
     def state(self, piece: int, time: float) -> arb_mat:

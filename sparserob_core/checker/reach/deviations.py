@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import accumulate
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, final
 
 import numpy as np
 
@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from flint import arb
 
 
+@final
 @dataclass(frozen=True, eq=False)
 class Deviations:
     """The deviations that a control may answer, block by block. A set is ``None`` where there is no such deviation.
@@ -58,20 +59,18 @@ class Deviations:
 
     @cached_property
     def radii(self) -> Array:
-        """The upper bound of the absolute value of each entry of a deviation, ``(Q,)``, rounded up."""
-        return rounded_radii([], self.sets)
+        """The upper bound of the absolute value of each entry of a deviation from the middle, ``(Q,)``, rounded up."""
+        radii = [np.array(known(shape).radius) + np.abs(about) for shape, about in self.sets]
+        return np.asarray(np.nextafter(np.concatenate([np.zeros(0), *radii]) * OUTWARD, np.inf))
 
     def supports(self, every: Sequence[list[arb]]) -> list[arb]:
         """Return the support values ``max z'a`` over all deviations ``z``, for every ``a (Q,)`` in balls."""
-        return [self._evaluate_support(a) for a in every]
-
-    def _evaluate_support(self, a: list[arb]) -> arb:
-        blocks = (a[first : first + shape.dimension] for first, (shape, _) in zip(self.starts, self.sets, strict=False))
-        return sum((of_block(*pair, block) for pair, block in zip(self.sets, blocks, strict=True)), ball(0))
+        return [self.support(a) for a in every]
 
     def support(self, a: list[arb]) -> arb:
         """Return the support value ``max z'a`` over all deviations ``z``, for one ``a (Q,)`` in balls."""
-        return self.supports([a])[0]
+        blocks = (a[first : first + shape.dimension] for first, (shape, _) in zip(self.starts, self.sets, strict=False))
+        return sum((of_block(*pair, block) for pair, block in zip(self.sets, blocks, strict=True)), ball(0))
 
     @cached_property
     def middle(self) -> Array:
@@ -99,10 +98,3 @@ def of_block(shape: ConvexSet, about: Array, a: list[arb]) -> arb:
         for x, m in zip(a, balls(about), strict=True):
             total = total if m.is_zero() else total - x * m
     return total
-
-
-def rounded_radii(first: list[Array], sets: Sequence[tuple[ConvexSet, Array]]) -> Array:
-    """Return the radii ``first`` of some blocks and bounds of those of ``sets`` about their middles, ``(Q,)``, rounded
-    up."""
-    radii = [np.array(known(shape).radius) + np.abs(about) for shape, about in sets]
-    return np.asarray(np.nextafter(np.concatenate([np.zeros(0), *first, *radii]) * OUTWARD, np.inf))

@@ -41,10 +41,10 @@ class Sources:
 
     @cached_property
     def measurable_input(self) -> BoundedInput | None:
-        """The measurable disturbances, counted from the middle of their set, where the control does not answer them;
-        else ``None``. They are the errors of a command of size 1 through the columns of ``E``."""
+        """The measurable disturbances, counted from the middle of their set; ``None`` without such. They are the errors
+        of a command of size 1 through the columns of ``E``."""
         bound = self.problem.measurable
-        if bound is None or self.timing.answering:
+        if bound is None:
             return None
         summands, system = summands_of(bound), self.problem.system
         whole, ends = stacked([[v] for v in balls(np.ones(len(summands)))]), np.array([0.0, self.timing.grid[-1]])

@@ -128,8 +128,6 @@ class TimedExplanation(Explanation):
         Part of the normal on the control, for a mixed constraint.
     piece : int, optional
         Piece of the control in a mixed constraint.
-    changes : ndarray, optional
-        Beginnings of the disturbance's pieces, where they depend on the constraint.
     noise : ndarray, shape (K, p), optional
         Worst noise of the measurement at every breakpoint of the control, where there is a noise.
     following : ndarray, shape (d,), optional
@@ -158,7 +156,6 @@ class TimedExplanation(Explanation):
     names: Names = UNNAMED
     gain: Array | None = None
     piece: int | None = None
-    changes: Array | None = None
     noise: Array | None = None
     following: Array | None = None
 

@@ -167,31 +167,12 @@ class FeedbackConstraint(ConstraintSource):
 
     def excess(self, x: Array, indices: Array) -> Array:
         """Return violations ``(k, r)`` at times ``(k, 1)`` under the worst disturbances."""
-        violations = self.loop.height(self._compute_left_sides(x, indices[:, 0])) - self.flat.h
-        measurable = self.loop.measurable
-        if measurable is not None:
-            for rows, pieces in self._group_rows(indices[:, 0]):
-                violations[:, rows] += measurable.within(indices[:, 0], self.flat.H[rows], self.loop.origin[pieces])
-        return violations
-
-    def _group_rows(self, times: Array) -> list[tuple[slice, np.ndarray]]:
-        """Return the rows that look at the state at times ``(k,)`` in the same pieces of the grid, and these pieces:
-        those of a mixed constraint before and after the control jumps."""
-        flat, loop = self.flat, self.loop
-        if flat.gains is None or loop.measurable is None:
-            return [(slice(None), loop.locate_state(times))]
-        commanded, half = flat.commanded(times), flat.h.size // 2
-        return [
-            (slice(half), loop.locate_state(times, commanded[:, 0])),
-            (slice(half, None), loop.locate_state(times, commanded[:, -1])),
-        ]
+        return np.asarray(self.loop.height(self._compute_left_sides(x, indices[:, 0])) - self.flat.h)
 
     def _compute_left_sides(self, x: Array, times: Array) -> Array:
         """Return the left-hand sides at times ``(k,)`` and their responses to the deviations, ``(k, r, 1 + Q)``."""
         flat = self.flat
-        values = np.concatenate(
-            [flat.H[rows] @ self.loop.states(x, times, pieces) for rows, pieces in self._group_rows(times)], axis=1
-        )
+        values = flat.H @ self.loop.states(x, times)
         values[:, :, 0] += flat.compute_reference_terms(times)
         if flat.gains is not None:
             values += np.einsum("rm,krmq->krq", flat.gains, self.loop.controls(x)[flat.commanded(times)])
@@ -210,19 +191,17 @@ class FeedbackConstraint(ConstraintSource):
             half = part.size // 2
             part = np.concatenate([part[:half], part[half:] + 1 + part.max()])
         return self.loop.with_control(
-            self.loop.state_rows(float(time[0]), flat.H, allowed, part, factor, pieces), flat.gains, pieces
+            self.loop.state_rows(float(time[0]), flat.H, allowed, part, factor), flat.gains, pieces
         )
 
-    def against(self, x: Array, index: Array, row: int) -> tuple[Array, float, int | None]:
-        """Return a deviation ``(Q,)`` that is the worst at an index, what the control adds to the row then, and the
-        piece of the control that does so."""
+    def against(self, x: Array, index: Array, row: int) -> tuple[Array, float]:
+        """Return a deviation ``(Q,)`` that is the worst at an index, and what the control adds to the row then."""
         time, gains = index[:1], self.flat.gains
         w = self.loop.spread.worst(self._compute_left_sides(x, time)[0, row, 1:])
         if gains is None:
-            return w, 0.0, None
-        acting = int(self.flat.commanded(time)[0, row])
-        control = self.loop.controls(x)[acting]
-        return w, float(gains[row] @ (control[:, 0] + control[:, 1:] @ w)), acting
+            return w, 0.0
+        control = self.loop.controls(x)[int(self.flat.commanded(time)[0, row])]
+        return w, float(gains[row] @ (control[:, 0] + control[:, 1:] @ w))
 
     def met(self, x: Array) -> Array:
         """Return the nearest decision that meets an equality to rounding; one that no control enters is left as it
@@ -490,7 +469,7 @@ class FeedbackControl(ConstraintSource):
         right = f"{self.h[row] + 0.0:.6g} {self.measured[row]}".rstrip() if self.bound is None else "its peak"
         text = f"{self.name}: {terms} <= {right}"
         description = TimedExplanation(text, self.name, text, time, direction)
-        return describe_deviations(description, self.loop, index[1:], controls=True)
+        return describe_deviations(description, self.loop, index[1:])
 
 
 def worst_of_each(found: Array, times: Array) -> Separation:
@@ -501,9 +480,9 @@ def worst_of_each(found: Array, times: Array) -> Separation:
     return Separation(times[order][:, None], rows[order], heights[order], float(found.max()))
 
 
-def describe_deviations(said: TimedExplanation, loop: ClosedLoop, w: Array, controls: bool = False) -> TimedExplanation:
+def describe_deviations(said: TimedExplanation, loop: ClosedLoop, w: Array) -> TimedExplanation:
     """Return the description of a constraint for every disturbance, or at the deviations ``w (Q,)`` if ``w`` is not
-    empty. ``controls`` says that the constraint is on the controls, not on the state."""
+    empty."""
     problem, noises = loop.functionals, loop.noises(w) if w.size else None
     noisy = True if loop.observer is not None and loop.observer.noisy else None
     sources = ("disturbance", problem.disturbance), ("noise", noisy), ("initial state", problem.initial)
@@ -511,20 +490,14 @@ def describe_deviations(said: TimedExplanation, loop: ClosedLoop, w: Array, cont
     if not w.size and loop.spread.size:
         return replace(said, text=text, disturbance=None, initial_state=None, deviation=None, quantity="", noise=None)
     point, width = loop.spread.middle + w, problem.response.system.disturbances
-    signal = changes = None
-    if loop.measurable is not None:
-        breakpoints, signal = loop.signal(w, said.time, None if controls else said.direction, said.piece)
-        changes = breakpoints[:-1]
-    elif problem.disturbance is not None:
-        signal = point[: loop.noise.start].reshape(-1, width).T
+    signal = None if problem.disturbance is None else point[: loop.noise.start].reshape(-1, width).T
     if problem.initial is None:
-        return replace(said, text=text, disturbance=signal, changes=changes, quantity="", noise=noises)
+        return replace(said, text=text, disturbance=signal, quantity="", noise=noises)
     deviation = loop.begins @ point
     return replace(
         said,
         text=text,
         disturbance=signal,
-        changes=changes,
         initial_state=problem.response.initial_state + deviation,
         deviation=deviation,
         following=loop.following @ point if loop.anew else None,

@@ -233,11 +233,11 @@ class Turning(ABC):
         split = np.where(upper[:, 0] > lower[:, 0], split, widest)
         return Enclosure(violations, split)
 
-    def against(self, x: Array, index: Array, row: int) -> tuple[Array, float, int | None]:
+    def against(self, x: Array, index: Array, row: int) -> tuple[Array, float]:
         """Return a deviation ``(Q,)`` that is the worst at an index, and what stands beside the state then: no
         control."""
         along = self.normals(index[None, 1:])[0] @ self.answers(x, index[:1])[0]
-        return self.loop.spread.worst(along[1:]), 0.0, None
+        return self.loop.spread.worst(along[1:]), 0.0
 
     def explain(self, index: Array, row: int) -> Explanation:
         """Return the description of one constraint for a reader, for every disturbance, or at the deviations that the

@@ -16,10 +16,8 @@ import numpy as np
 
 from sparserob_core.control.enclosures.cache import remember
 from sparserob_core.control.feedback.innovations import KNOWN, Answers, build_innovations
-from sparserob_core.control.feedback.measurable import MeasurablePieces
 from sparserob_core.control.feedback.observer import Observer, innovations_of
 from sparserob_core.control.reach.functional import WorstFunctionals
-from sparserob_core.control.reach.measurable import SUPPORT_ERROR
 from sparserob_core.control.reach.varying_motion import VaryingMotion
 from sparserob_core.sip.convex_set import Array, ConvexSet
 from sparserob_core.sip.finite import Spread, UncertainRows, table_of
@@ -48,12 +46,9 @@ class ClosedLoop:
         Variables of the gains.
     spread : Spread
         Set of deviations: those of the disturbance, block after block; those of the noise, breakpoint after breakpoint;
-        and those of the initial state, where there is a set of them. A measurable disturbance deviates by its effect on
-        the state at the end of every piece of the grid.
+        and those of the initial state, where there is a set of them.
     variables : int
         Number of variables of the program.
-    measurable : MeasurablePieces, optional
-        Effects of measurable disturbances.
     observer : Observer, optional
         Source of the innovations of outputs. Without an observer they are the innovations of the whole state.
     anew : bool, default False
@@ -65,7 +60,6 @@ class ClosedLoop:
     answers: Answers
     spread: Spread
     variables: int
-    measurable: MeasurablePieces | None = None
     observer: Observer | None = None
     anew: bool = False
     _paths: dict[bytes, tuple[Array, Array]] = field(default_factory=dict, repr=False)
@@ -78,9 +72,8 @@ class ClosedLoop:
 
     @property
     def scales(self) -> bool:
-        """True where the deviations are in copies of a single set and no disturbance is measurable, so that they can be
-        `scaled`."""
-        return self.measurable is None and len(self.spread.sets) == 1
+        """True where the deviations are in copies of a single set, so that they can be `scaled`."""
+        return len(self.spread.sets) == 1
 
     def scaled(self, factor: float) -> ClosedLoop:
         """Return the same loop with all deviations multiplied by ``factor``."""
@@ -129,12 +122,12 @@ class ClosedLoop:
 
     @cached_property
     def entries(self) -> Array:
-        """Matrices ``(L, mw, Q)`` from all deviations to the deviation of the disturbance on every piece of the grid; 0
-        for measurable disturbances."""
+        """Matrices ``(L, mw, Q)`` from all deviations to the deviation of the disturbance on every piece of the
+        grid."""
         model, grid = self.functionals.disturbance, self.functionals.response.grid
         width = self.functionals.response.system.disturbances
         table = np.zeros((grid.pieces, width, self.spread.size))
-        if model is not None and self.measurable is None:
+        if model is not None:
             assert model.starts is not None
             block = np.searchsorted(model.starts, np.arange(grid.pieces), side="right") - 1
             for i in range(width):
@@ -165,7 +158,7 @@ class ClosedLoop:
         """Matrices ``(K, p, Q)`` from all deviations to every innovation."""
         problem, initial_count = self.functionals, int(self.begins.sum())
         state_innovations = build_innovations(
-            problem.response, problem.dictionary, problem.disturbance, initial_count > 0, pieces=self.measurable
+            problem.response, problem.dictionary, problem.disturbance, initial_count > 0
         )
         return innovations_of(state_innovations, initial_count, self.observer, self.anew)
 
@@ -190,8 +183,6 @@ class ClosedLoop:
     @cached_property
     def middles(self) -> Array:
         """The middle of the disturbance on every piece of the grid, ``(L, mw)``."""
-        if self.measurable is not None:
-            return np.tile(self.measurable.middle, (self.functionals.response.grid.pieces, 1))
         return np.asarray(self.entries @ self.spread.middle)
 
     def inputs(self, x: Array) -> Array:
@@ -221,8 +212,7 @@ class ClosedLoop:
         """Return the nominal state and every response at the breakpoints of the grid, ``(L + 1, d, 1 + Q)``, and their
         `drives`.
 
-        Results for the last two decisions are kept. The effect of a measurable disturbance is added at the end of its
-        piece.
+        Results for the last two decisions are kept.
         """
         key = x.tobytes()
         if key not in self._paths:
@@ -232,12 +222,8 @@ class ClosedLoop:
                 Phi, Gamma, step_numbers = motion.flow.state, motion.inputs, motion.every
             nodes = np.zeros((drives.shape[0] + 1, self.start.size, drives.shape[2]))
             nodes[0] = np.column_stack([self.start, self.begins])
-            is_last = np.append(np.diff(self.origin) > 0, True)
             for piece, step in enumerate(step_numbers.tolist()):
                 nodes[piece + 1] = Phi[step] @ nodes[piece] + Gamma[step] @ drives[piece]
-                if self.measurable is not None and is_last[piece]:
-                    entries, outward = self.measurable.at(int(self.origin[piece]))
-                    nodes[piece + 1, :, 1:][:, entries] += outward
             while len(self._paths) > 1:
                 self._paths.pop(next(iter(self._paths)))
             self._paths[key] = (nodes, drives)
@@ -319,8 +305,7 @@ class ClosedLoop:
 
     def values(self, x: Array, times: Array, H: Array) -> Array:
         """Return ``max_w H x(t)`` at ``times (k,)`` for ``H (r, d)``: ``(k, r)``."""
-        heights = self.height(H @ self.states(x, times))
-        return heights if self.measurable is None else heights + self.measurable.within(times, H)
+        return self.height(H @ self.states(x, times))
 
     def bounds(self, x: Array, lower: Array, upper: Array, H: Array) -> Array:
         """Return upper bounds ``(k, r)`` of ``max_w H x(t)`` over cells of time ``[lower, upper] (k,)``, each within
@@ -356,11 +341,6 @@ class ClosedLoop:
         error_bounds += (np.abs(H) @ rounding_errors[:, :, None])[:, :, 0]
         if self.motion is not None:
             error_bounds += (np.abs(H) @ self._bound_transition_errors(x, self.motion)[pieces][:, :, None])[:, :, 0]
-        if self.measurable is not None:
-            origins = self.origin[pieces]
-            inside = (self.measurable.within(end, H, origins) for end in (lower, upper))
-            heights = [height + contribution for height, contribution in zip(heights, inside, strict=True)]
-            error_bounds += self.measurable.allowance(lower, upper, H, origins) + SUPPORT_ERROR * (sizes @ radii)
         bounds = np.maximum(*heights) + chord_distances + error_bounds
         return np.where(np.isnan(bounds), np.inf, bounds), chord_distances
 
@@ -397,9 +377,6 @@ class ClosedLoop:
         nodes, inputs = self.path(x)
         radii = np.concatenate([[1.0], self.spread.radii])
         state_sizes, input_sizes = np.abs(nodes[:-1]) @ radii, motion.flow.sizes * (np.abs(inputs) @ radii)[:, None]
-        if self.measurable is not None:
-            contributions, driving_sizes = self.measurable.effect_sizes
-            state_sizes, input_sizes = state_sizes + contributions, np.concatenate([input_sizes, driving_sizes], axis=2)
         return motion.bound_state_errors(state_sizes, input_sizes)
 
     def worst(self, x: Array, time: float, direction: Array) -> Array:
@@ -407,43 +384,18 @@ class ClosedLoop:
         along = direction @ self.states(x, np.array([time]))[0]
         return self.spread.worst(along[1:])
 
-    def locate_state(self, times: Array, acting: np.ndarray | None = None) -> np.ndarray:
-        """Return the pieces ``(k,)`` of the grid in which the state at ``times (k,)`` is taken.
-
-        A breakpoint belongs to the piece that it ends. With ``acting (k,)`` a row also contains the control on these
-        pieces. A control that begins at the breakpoint has responded to what happened before, so the state is then
-        taken in the piece that begins.
-        """
-        ends, pieces = self.functionals.dictionary.breakpoints, self.grid.locate(times)
-        return pieces if acting is None else np.maximum(pieces, np.searchsorted(self.grid.commanded(ends), acting))
-
-    def signal(
-        self, deviation: Array, time: float, direction: Array | None, acting: int | None = None
-    ) -> tuple[Array, Array]:
-        """Return breakpoints and the disturbance ``(mw, L)`` between them that has a deviation ``(Q,)``.
-
-        A disturbance on blocks is given on the pieces of the grid. A measurable disturbance is the worst for
-        ``direction'x(time)`` on the piece that holds ``time``; the row may also contain the control on piece
-        ``acting``.
-        """
-        if self.measurable is not None:
-            acting_pieces = None if acting is None else np.array([acting])
-            piece = int(self.origin[self.locate_state(np.array([time]), acting_pieces)[0]])
-            return self.measurable.signal(deviation, time, direction, piece)
+    def signal(self, deviation: Array) -> tuple[Array, Array]:
+        """Return the breakpoints of the grid, and the disturbance ``(mw, L)`` between them that has a deviation
+        ``(Q,)``."""
         return self.functionals.response.grid.breakpoints, (self.entries @ (self.spread.middle + deviation)).T
 
     def compute_initial_state(self, deviation: Array) -> Array:
         """Return the initial state ``(d,)`` of a deviation ``(Q,)``."""
         return np.asarray(self.start + self.begins @ deviation)
 
-    def state_rows(
-        self, time: float, H: Array, h: Array, part: np.ndarray, factor: Array, acting: np.ndarray | None = None
-    ) -> UncertainRows:
-        """Return the rows ``H x(t) <= h`` at one time as `UncertainRows`.
-
-        The direction of row ``r`` is ``factor_r`` times that of the first row of its part, ``part_r``. With
-        ``acting (r,)``, the rows will also contain the control on these pieces (`with_control`).
-        """
+    def state_rows(self, time: float, H: Array, h: Array, part: np.ndarray, factor: Array) -> UncertainRows:
+        """Return the rows ``H x(t) <= h`` at one time as `UncertainRows`. The direction of row ``r`` is ``factor_r``
+        times that of the first row of its part, ``part_r``."""
         count = H.shape[0]
         firsts = [int(np.flatnonzero(part == p)[0]) for p in range(int(part.max()) + 1)]
         free, weights, on_noise = self.functionals.response.weights(np.full(count, time), H, np.zeros((count, 0)))
@@ -463,12 +415,6 @@ class ClosedLoop:
         rows, columns = np.nonzero(on_control)
         g = table_of(rows, columns, on_control[rows, columns], (count, self.variables))
         d = np.einsum("pli,liq->pq", on_noise[firsts], self.entries) + free[firsts] @ self.begins
-        if self.measurable is not None:
-            pieces = self.origin[self.locate_state(np.full(count, time), acting)]
-            d[:, : self.measurable.size] = self.measurable.weights(time, H[firsts], pieces[firsts])
-            for piece in np.unique(pieces):
-                rows = pieces == piece
-                offset[rows] += self.measurable.within(np.array([time]), H[rows], np.array([piece]))[0]
         return UncertainRows(g, h - offset, part, factor, tuple(matrices), d)
 
     def with_control(self, rows: UncertainRows, G: Array, pieces: np.ndarray, following: bool = False) -> UncertainRows:

@@ -19,7 +19,6 @@ from sparserob_core.control.response.response import Response
 from sparserob_core.sip.convex_set import Array
 
 if TYPE_CHECKING:
-    from sparserob_core.control.feedback.measurable import MeasurablePieces
     from sparserob_core.control.problem.dictionary import Dictionary
     from sparserob_core.control.response.disturbance import DisturbanceModel
 
@@ -32,7 +31,6 @@ def build_innovations(
     control: Dictionary,
     model: DisturbanceModel | None,
     begins: bool = False,
-    pieces: MeasurablePieces | None = None,
 ) -> Array:
     """Return the matrices ``D (K, d, Q)`` from the deviations to every innovation.
 
@@ -46,8 +44,6 @@ def build_innovations(
         initial_innovations[0] = np.eye(d)
     if model is None:
         return initial_innovations
-    if pieces is not None:
-        return np.concatenate([_build_measurable_innovations(response, control, pieces), initial_innovations], axis=2)
     grid, steps = response.grid, response.steps(KNOWN)
     block, input_effects = _build_disturbance_matrices(response, model)
     commanded = grid.commanded(control.breakpoints)
@@ -110,20 +106,6 @@ def find_negligible_entries(
         largest_movements = np.maximum(largest_movements, np.abs(rows @ nodes).max(axis=0, initial=0.0))
     is_effective: np.ndarray = largest_movements > least
     return ~is_effective
-
-
-def _build_measurable_innovations(response: Response, control: Dictionary, pieces: MeasurablePieces) -> Array:
-    """Return the matrices ``D`` of `build_innovations` for measurable disturbances, whose deviations are their effects
-    on the state at the end of every piece."""
-    grid, K = response.grid, control.pieces
-    ends = control.breakpoints[grid.control_piece + 1]
-    flows = pieces.compute_transitions(np.arange(grid.pieces), ends)
-    D = np.zeros((K, response.initial_state.size, pieces.size))
-    for piece in range(grid.pieces):
-        if grid.control_piece[piece] + 1 < K:
-            entries, outward = pieces.at(piece)
-            D[grid.control_piece[piece] + 1, :, entries] = flows[piece] @ outward * pieces.mark_answered(piece)
-    return D
 
 
 @final

@@ -303,11 +303,11 @@ class OfOutputs(Knowledge):
         Returns
         -------
         OfOutputs or None
-            ``None`` where there is no noise, where the disturbance is measurable, or where one of the sets, other than
+            ``None`` where there is no noise, or where one of the sets, other than
             the box of a disturbance or of initial states, has no half-spaces about its middle.
         """
         observer, sets, initial_count = loop.observer, loop.spread.sets, int(loop.begins.sum())
-        if observer is None or not observer.noisy or loop.measurable is not None:
+        if observer is None or not observer.noisy:
             return None
         noise_position = int(loop.noise.start > 0)  # whether a disturbance stands before the noise
         noise = sets[noise_position][1].scaled(share)

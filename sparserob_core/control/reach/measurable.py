@@ -32,7 +32,6 @@ from sparserob_core.shapes import Float, shaped
 from sparserob_core.sip.convex_set import Array, Box, ConvexSet
 
 ACCURACY = 1e-14  # of an integral over one interval, relative to the largest integrand times the horizon
-SUPPORT_ERROR = 1e-12  # of a support value under feedback, allowed for by the proof of a run; `check` encloses it
 ORDER = 12  # of the expansion that encloses a row; what is left of it on a short interval is 1e-14 of the row
 SHORT = 0.5  # time times speed that such an interval takes: twice as much leaves 1e-10, half as much doubles the work
 TINY = float(np.finfo(float).tiny)

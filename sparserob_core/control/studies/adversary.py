@@ -119,10 +119,10 @@ def _find_in_closed_loop(constraint: StateConstraint, decision: Array, loop: Clo
     row, time = int(worst.rows[0]), float(worst.indices[0, 0])
     _, directions, _, bounds = constraint.functionals_at(worst.indices[:1])
     response, direction = constraint.functionals.response, directions[row]
-    deviation, offset, acting = robust_constraint.against(decision, worst.indices[0], row)
+    deviation, offset = robust_constraint.against(decision, worst.indices[0], row)
     breakpoints, disturbance = response.grid.breakpoints, None
     if constraint.functionals.disturbance is not None:
-        breakpoints, disturbance = loop.signal(deviation, time, direction, acting)
+        breakpoints, disturbance = loop.signal(deviation)
     return Adversary(
         name=constraint.name,
         row=row,

@@ -18,14 +18,11 @@ from sparserob_core.control.constraints.flat import FlatConstraint
 from sparserob_core.control.constraints.state import StateConstraint
 from sparserob_core.control.feedback.closed_loop import ClosedLoop, deviations_of
 from sparserob_core.control.feedback.innovations import Answers, answers, build_innovations, find_negligible_entries
-from sparserob_core.control.feedback.measurable import MeasurablePieces, measurable_pieces
 from sparserob_core.control.feedback.observer import Observer, between, innovations_of
-from sparserob_core.control.feedback.zonoid import has_corners
 from sparserob_core.control.policies.policy import Charge, Policy
 from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.control.problem.units import Units, power_of_two
-from sparserob_core.control.reach.measurable import SUPPORT_ERROR
 from sparserob_core.control.reach.sizes import widths
 from sparserob_core.control.transcription.own_units import added_up, constraint_sides, extent, fixed, units_of_steps
 from sparserob_core.control.transcription.program import EQUALS, ranges, transcribed
@@ -54,8 +51,7 @@ FINER = 2.0**-11  # of the numbers that are added up, the unit of an equality: i
 class AnsweredMeasurements:
     """Measurements that a control answers, in one set of units.
 
-    ``answers``: the coordinates of the gains. ``pieces``: the pieces on which measurable disturbances are the
-    deviations, ``None`` without such disturbances. ``observer``: the observer of outputs, ``None`` where the state is
+    ``answers``: the coordinates of the gains. ``observer``: the observer of outputs, ``None`` where the state is
     measured. ``fixed``: the terminal equalities as rows ``H x(T) <= h``; the second half of the rows are the opposites
     of the first. ``still (Q,)``: true for entries of the deviations whose effect double precision does not resolve.
 
@@ -64,7 +60,6 @@ class AnsweredMeasurements:
     """
 
     answers: Answers
-    pieces: MeasurablePieces | None
     observer: Observer | None
     fixed: tuple[Array, Array]
     still: np.ndarray
@@ -149,9 +144,8 @@ class FeedbackModel(Acting):
         loop = ClosedLoop(
             functionals,
             gains,
-            _collect_deviations(posed, measurements.pieces, measurements.still),
+            _collect_deviations(posed, measurements.still),
             size,
-            measurements.pieces,
             measurements.observer,
             anew=_has_next_initial_state(posed),
         )
@@ -219,10 +213,9 @@ def answering(policy: Policy, mask: np.ndarray, posed: Posed, own: Posed, units:
     units."""
     scaled, outputs = _build_measurements(mask, posed, own, units)
     assert scaled.deviations is not None
-    pieces, observer = scaled.pieces, scaled.observer
+    observer = scaled.observer
     measurements = AnsweredMeasurements(
         answers=_scale_to_user_units(scaled.answers, outputs, scaled.deviations),
-        pieces=None if pieces is None else pieces.in_units_of(posed.functionals, units.states, units.disturbances),
         observer=None if observer is None else observer.in_units(units.states, outputs),
         fixed=_split_equalities(*fixed(posed.problem)),
         still=scaled.still,
@@ -240,14 +233,12 @@ def _build_measurements(
         own.functionals.disturbance,
         own.problem.initial_set is not None,
     )
-    pieces = measurable_pieces(own.functionals)
-    spread = _collect_deviations(own, pieces, None)
+    spread = _collect_deviations(own, None)
     still: np.ndarray = read_only(_find_ineffective_entries(own, spread))
     spread = replace(spread, still=still)
     blocks = 0 if disturbance is None else disturbance.block_count
     deviations = np.tile(units.disturbances[: problem.system.disturbances], blocks)
-    deviations = deviations if pieces is None else np.ones(pieces.size)
-    innovations = build_innovations(own.response, own.control, disturbance, has_initial_set, pieces)
+    innovations = build_innovations(own.response, own.control, disturbance, has_initial_set)
     output_units, observer, initial_units = units.states, None, units.states[: len(units.states) * has_initial_set]
     if problem.measurements is not None and theirs.problem.measurements is not None:
         output_units = theirs.problem.measurements.units(units.states)
@@ -265,9 +256,7 @@ def _build_measurements(
     coordinates = coordinates.on(power_of_two(np.where(is_small, spread.radii, 1.0)))
     equality_units = FINER * power_of_two(np.maximum(added_up(problem, own.functionals), np.abs(h)))
     ends = _split_equalities(H / equality_units[:, None], h / equality_units)
-    return AnsweredMeasurements(
-        coordinates, pieces, observer, ends, still, deviations, _step_units(problem)
-    ), output_units
+    return AnsweredMeasurements(coordinates, observer, ends, still, deviations, _step_units(problem)), output_units
 
 
 def _split_equalities(H: Array, h: Array) -> tuple[Array, Array]:
@@ -281,12 +270,8 @@ def refuse(
     """Raise `InputError` for what a policy is not built for, in one sentence; ``uncertain``: the system has parameters,
     which may be states by now."""
     paths, classes = problem.windows, problem.classes
-    sets = [entry.set for entry in paths] + problem.terminal_sets
-    steps = [] if problem.control_step is None else [problem.control_step]
-    curved = [convex.kind for convex in (*sets, problem.control, *steps) if convex.halfspaces() is None]
     named = [entry.name for entry in paths if entry.name in (of_control(problem), PEAK, EFFORT, EQUALS, STEP)]
-    bound, measurable = problem.disturbance, classes == {"measurable"}
-    uncertainty = [convex for convex in (None if measurable else bound, problem.initial_set) if convex is not None]
+    uncertainty = [convex for convex in (problem.disturbance, problem.initial_set) if convex is not None]
     slanted = [convex.kind for convex in uncertainty if _has_zero_chord(convex)]
     leaning = [convex.kind for convex in uncertainty if fixed(problem)[1].size and Spread(((1, convex),)).leans]
     reasons = {
@@ -294,34 +279,18 @@ def refuse(
             not control.is_indicators
         ),
         "system without uncertain parameters: else what is measured is not the disturbance alone": uncertain,
-        f"disturbance of one class, piecewise_constant or measurable, not {' and '.join(sorted(classes))}": len(classes)
-        > 1
-        or "l1_ball" in classes,
+        f"disturbance of the class piecewise_constant, not {' and '.join(sorted(classes))}; more pieces in"
+        " dictionaries.disturbance come as close to a measurable one as is wanted": not classes
+        <= {"piecewise_constant"},
         "disturbance on the pieces of one dictionary, not on some of its own": problem.disturbance_breakpoints
         is not None,
-        f"measurable disturbance in a set with known corners, which the {bound.kind if bound else ''} has not": bool(
-            measurable and bound is not None and not has_corners(bound)
-        ),
-        f"set with flat sides for states and controls under measurable disturbances, which the "
-        f"{' and the '.join(curved)} has not": measurable and bool(curved),
-        "cost other than worst under measurable disturbances": measurable and cost == "worst",
         f"set of disturbances and of initial states with an interior, or with sides that can be listed, which the"
         f" {' and the '.join(slanted)} has not: a flat set is a box of its own coordinates, whose directions are the"
         " columns of E": bool(slanted),
         f"set of disturbances and of initial states with an interior, or of axes that are points, beside fixed final"
         f" states, which the {' and the '.join(leaning)} has not: a small box of final states does": bool(leaning),
-        "disturbance that takes any value on each of its pieces": bool(classes)
-        and not measurable
-        and not disturbance.is_complete,
+        "disturbance that takes any value on each of its pieces": bool(classes) and not disturbance.is_complete,
         f"path constraint of another name than {' or '.join(map(str, named))}, which is taken": bool(named),
-        "terminal set with an interior under measurable disturbances: they reach a fixed state": measurable
-        and bool(problem.terminal_equalities),
-        "measurement of the whole state without noise under measurable disturbances": measurable
-        and problem.measurements is not None,
-        "control that acts at once under measurable disturbances, without a delay": measurable
-        and problem.system.delay > 0.0,
-        "single linear system under measurable disturbances, without pieces": measurable
-        and bool(problem.system.switches),
         "whole state that is measured without noise where a plan with a control_step repeats": bool(problem.repeat)
         and problem.control_step is not None
         and problem.measurements is not None,
@@ -352,13 +321,10 @@ def _scale_to_user_units(own: Answers, measured: Array, deviations: Array) -> An
     return replace(own, effect=effect, gain=gain)
 
 
-def _collect_deviations(posed: Posed, acting: MeasurablePieces | None, still: np.ndarray | None) -> Spread:
+def _collect_deviations(posed: Posed, still: np.ndarray | None) -> Spread:
     """Return the deviations of the disturbance, of the noise of measurements, and of the initial state of a problem.
     Some entries of these are ``still (Q,)``."""
     problem, disturbance, periods = posed.problem, posed.functionals.disturbance, 1 + _has_next_initial_state(posed)
-    if acting is not None:
-        sets = (*acting.sets, *deviations_of(None, 0, problem.initial_set, periods=periods).sets)
-        return Spread(sets, SUPPORT_ERROR, still)
     blocks = 0 if disturbance is None else disturbance.block_count
     noise = None if problem.measurements is None else problem.measurements.noise
     spread = deviations_of(problem.disturbance, blocks, problem.initial_set, noise, posed.control.pieces, periods)
@@ -376,7 +342,7 @@ def _find_ineffective_entries(own: Posed, spread: Spread) -> np.ndarray:
     is_still, model = np.zeros(spread.size, dtype=bool), own.functionals.disturbance
     if fixed(own.problem)[1].size:
         return is_still
-    bound = None if model is None or model.kind != "piecewise_constant" else own.problem.disturbance
+    bound = None if model is None else own.problem.disturbance
     sets = [bound, own.problem.initial_set]
     disturbance_widths, initial_widths = (
         np.zeros(0) if convex is None else convex.width(np.eye(convex.dimension)) for convex in sets

@@ -60,28 +60,20 @@ def announced(why: str, limited: bool) -> str:
     return f"{why}{ends}"
 
 
-def remarked(problem: OptimalControlProblem, result: Result, feedback: bool = False) -> Result:
+def remarked(problem: OptimalControlProblem, result: Result) -> Result:
     """Return the same result with a note on the unproven assumptions of its claim. Nothing is added where there is no
     claim, or no such assumption."""
-    assumptions = remark(problem, feedback)
+    assumptions = remark(problem)
     if not assumptions or assumptions in result.message or result.status not in ("certified", "verified"):
         return result
     return replace(result, message=f"{result.message}; {assumptions}")
 
 
-def remark(problem: OptimalControlProblem, feedback: bool = False) -> str:
+def remark(problem: OptimalControlProblem) -> str:
     """Return the unproven assumptions of a claim about a problem; empty where there are none. They are the properties
-    that sets of plugins state of themselves, and under ``feedback`` the accuracy of integrals over the set of
-    measurable disturbances, which the checker encloses."""
+    that sets of plugins state of themselves."""
     kinds = sorted({convex.kind for convex in strangers(problem)})
-    assumption = f"what sets of the kind {', '.join(kinds)} say of themselves is believed" if kinds else ""
-    integrals = (
-        "the integrals over measurable disturbances are allowed a relative error of 1e-12, which sparserob check"
-        " encloses"
-        if feedback and problem.measurable is not None
-        else ""
-    )
-    return "; ".join(filter(None, [assumption, integrals]))
+    return f"what sets of the kind {', '.join(kinds)} say of themselves is believed" if kinds else ""
 
 
 def growth(system: System, horizon: float) -> float:

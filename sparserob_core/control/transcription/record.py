@@ -173,15 +173,10 @@ class Transcription(Posed):
         does not contain these numbers, such as the number of a sample.
 
         Explanations are computed once and remembered. Several callers need the same ones: those that round a bound,
-        derive it, seek another bound, and write it down. To compose a disturbance that has the effect of a measurable
-        one may take long.
+        derive it, seek another bound, and write it down.
         """
         keys = [(cut.family, cut.formulation, cut.row, cut.index.tobytes()) for cut in cuts]
         fresh = {key: cut for key, cut in zip(keys, cuts, strict=True) if key not in self._explanation_cache}
-        loop = None if self.feedback is None else self.feedback.loop
-        if loop is not None and loop.measurable is not None and fresh:
-            size = loop.spread.size  # of the deviations, which end an index: those of the initial state come last
-            loop.measurable.compose([cut.index[-size:] for cut in fresh.values() if cut.index.size > size > 0])
         for key, cut in fresh.items():
             self._explanation_cache[key] = in_numbers(self.program, cut.family, cut.formulation, cut.index, cut.row)
         return [self._explanation_cache[key] for key in keys]

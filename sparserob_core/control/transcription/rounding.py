@@ -1,8 +1,7 @@
 """Effect of rounding on a lower bound.
 
 An allowance for this effect is subtracted before the bound is reported. A later derivation of the bound from its
-multipliers is then not to find a smaller one. The allowance is a fixed `SHARE` of the numbers that are
-added up; the loss by measurable signals alone counts their operations as well (`RobustBound.rounding`).
+multipliers is then not to find a smaller one. The allowance is a fixed `SHARE` of the numbers that are added up.
 """
 
 from __future__ import annotations
@@ -19,13 +18,11 @@ from sparserob_core.control.transcription.program import slanted
 from sparserob_core.control.transcription.record import Transcription
 from sparserob_core.control.transcription.steps import Steps
 from sparserob_core.sip.convex_set import Array
-from sparserob_core.sip.inner.simplex.counterpart import robust_bound
 from sparserob_core.sip.result import Result
 
 SHARE = 64 * 2.0**-52  # of the numbers that are added up to a row: products of a few matrices and sums of many terms
 INTEGRATED = 8.0  # weight of integrals of absolute values: enclosures of them add up many parts of each
 SMALL_GAP = 1e-11  # excess of the gap over its tolerance, after the reduction, that leaves a result certified
-UNPROVEN = "nothing is feasible, but the signals that were found for the worst disturbances do not prove it"
 
 
 def rounded_down(model: Transcription, result: Result, tolerance: float | None, prices: Array | None = None) -> Result:
@@ -41,25 +38,16 @@ def rounded_down(model: Transcription, result: Result, tolerance: float | None, 
     Further errors are subtracted as well. A multiplier of the wrong sign has an error (`_bound_sign_error`).
     Transitions have a relative error (`_estimate_transition_error`), and the truncation error of a law as a series in
     the parameters (`_bound_law_truncation`). With fewer functions than pieces, multipliers of the pieces have rounding
-    errors too (`_bound_image_error`). Signals of measurable disturbances under feedback prove only the deviations that
-    they attain, not those that they were composed for (`_bound_signal_loss`); where these do not prove that nothing is
-    feasible, the result does not claim it. ``prices (n,)`` are the prices of the decision, where the bound is the least
+    errors too (`_bound_image_error`). ``prices (n,)`` are the prices of the decision, where the bound is the least
     cost of the sizes of its entries at these prices.
     """
-    if result.status == "infeasible" and np.subtract(*_bound_signal_loss(model, result)) >= 0.0:
-        return replace(result, status="failed", message=UNPROVEN, infeasible=None, lower_bound=-np.inf)
     if not np.isfinite(result.lower_bound) or result.lower_bound <= 0.0:  # without multipliers 0 is exact
         return result
     share = SHARE + _estimate_transition_error(model)
     error = share * (
         _sum_row_magnitudes(model, result, share, prices) + _sum_tangent_magnitudes(model, result) + result.lower_bound
     )
-    error += (
-        _bound_sign_error(model, result)
-        + _bound_law_truncation(model, result)
-        + _bound_signal_loss(model, result)[0]
-        + _bound_image_error(model, result)
-    )
+    error += _bound_sign_error(model, result) + _bound_law_truncation(model, result) + _bound_image_error(model, result)
     lowered = max(0.0, result.lower_bound - error)
     dual = replace(result.dual, bound=min(result.dual.bound, lowered))
     answer = replace(result, lower_bound=lowered, dual=dual)
@@ -153,41 +141,6 @@ def _bound_law_truncation(model: Transcription, result: Result) -> float:
                 else abs(cut.multiplier) * float(np.abs(explanation.direction[: truncation.size]) @ truncation)
             )
     return error
-
-
-def _bound_signal_loss(model: Transcription, result: Result) -> tuple[float, float]:
-    """Return how much the bound falls, at most, at the signals of measurable disturbances instead of the deviations
-    that these signals represent; and the bound that the rows prove at these deviations, without the cost.
-
-    The first number is a sum over rows of the multiplier, times the residual of the row's signal, times the effect of
-    this residual on the row, with gains at their largest. Without such disturbances, and where rows are samples, the
-    numbers are 0 and ``inf``.
-
-    Residuals are not summed with their signs: other derivations of the bound count gains in other ways.
-    """
-    loop, cuts, finite = None if model.feedback is None else model.feedback.loop, result.dual.cuts, model.program.finite
-    is_literal = all(cut.formulation == "literal" for cut in cuts)
-    if loop is None or loop.measurable is None or not cuts or not is_literal:
-        return 0.0, np.inf
-    model.explained(cuts)  # all signals are composed at once
-    magnitudes, size, loss = np.maximum(np.abs(finite.lower), np.abs(finite.upper)), loop.measurable.size, 0.0
-    blocks, multipliers, deviations = [], [], []
-    for cut in cuts:
-        index, w = np.split(cut.index, [cut.index.size - loop.spread.size])
-        uncertain = model.program.family(cut.family).uncertain
-        assert uncertain is not None
-        rows = uncertain(index)
-        blocks.append(rows)
-        multipliers.append(np.where(np.arange(rows.h.size) == cut.row, cut.multiplier, 0.0))
-        deviations.append(np.tile(w, (rows.h.size, 1)))
-        number = int(rows.part[cut.row])
-        residual = (
-            cut.multiplier * abs(float(rows.factor[cut.row])) * np.abs(w[:size] - loop.measurable.attained(w[:size]))
-        )
-        loss += float(residual @ (np.abs(rows.d[number]) + abs(rows.C[number]) @ magnitudes)[:size])
-    arguments = finite, blocks, np.concatenate(multipliers), np.vstack(deviations), result.dual.mu
-    bound = robust_bound(*arguments, priced=False)
-    return loss, bound.value - max(SHARE, bound.rounding) * bound.size
 
 
 def added_up(model: Transcription, times: Array, directions: Array, parameters: Array) -> Array:

@@ -145,7 +145,6 @@ def _list_unread(case: Case) -> set[str]:
             extra_keys = ({"piece"} if is_mixed else set()) | ({"disturbance"} if case.answering else set())
             extra_keys |= DEVIATION if case.answering and case.problem.initial_set is not None else set()
             extra_keys |= NOISE if noisy else set()
-            extra_keys |= {"changes"} if case.measurable and case.answering else set()
             unread |= _list_extra_keys("multipliers.constraints", entry, MULTIPLIER | extra_keys)
             unread |= {"multipliers.constraints.parameter"} if _has_unused_parameter(case, entry) else set()
     if "proof" in read and isinstance(proof, Mapping):

@@ -60,7 +60,7 @@ def certificate(experiment: Experiment, result: Result) -> dict[str, Any] | None
     Under feedback ``decision`` is the nominal control, and ``gains (K, K, m, p)`` answer the innovations. The
     ``observer (K, d, p)`` makes innovations of outputs. ``policy`` has the cost that is charged, and the breakpoints
     that every piece answers, as ranges ``[first, last]`` counted from 0. Every constraint with a multiplier is at a
-    ``disturbance`` (a measurable one jumps at its ``changes``). It is also at a ``deviation`` of the initial state from
+    ``disturbance``. It is also at a ``deviation`` of the initial state from
     its centre where there is a set of them, and at a ``noise (K, p)`` of the outputs. ``causal`` is the bound for every
     causal policy.
 
@@ -237,7 +237,6 @@ def _write_multipliers(experiment: ControlExperiment, dual: Dual) -> dict[str, A
                 "multiplier": cut.multiplier,
                 **({} if program.spread is None else {"disturbance": _write_disturbance(problem, explanation)}),
                 **({} if program.spread is None else _write_deviations(problem, explanation)),
-                **({} if explanation.changes is None else {"changes": explanation.changes}),
                 **_write_noise(problem, explanation),
             }
             for cut, explanation in explained

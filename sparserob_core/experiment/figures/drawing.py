@@ -185,8 +185,6 @@ def _collect_feedback_data(
         _compute_tube(replace(model, feedback=None), model.nominal(decision), times, states),
     )
     nominal, effects = loop.nominal(decision), loop.effects(decision)
-    # of all measurable functions none is drawn evenly
-    is_piecewise = model.problem.disturbance_class == "piecewise_constant"
     return {
         "alone_lower": nominal_tube.lower,
         "alone_upper": nominal_tube.upper,
@@ -194,7 +192,7 @@ def _collect_feedback_data(
         "control_most": nominal + loop.spread.support(effects).T,
         "gains": loop.gains(decision),
         "outputs": _compute_outputs(model, decision, times),
-        **(_sample_effort(loop, nominal, effects, draws) if draws and is_piecewise else {}),
+        **(_sample_effort(loop, nominal, effects, draws) if draws else {}),
         **(_compute_worst_answers(model, decision) if draws else {}),
     }
 

@@ -1,5 +1,5 @@
-"""Guards checker/claims: directions of a curved set that are sums of coordinates, beside measurable disturbances and
-errors of execution: as floats and by how much these are off, or as balls."""
+"""Guards checker/claims: directions of a curved set that are sums of coordinates, and errors of execution: as floats
+and by how much these are off, or as balls."""
 
 from __future__ import annotations
 
@@ -8,16 +8,14 @@ from typing import Any, cast
 
 import numpy as np
 import pytest
-from flint import ctx
+from flint import arb_mat, ctx
 
 from sparserob_core.checker.claims.window import AddedTerms, ConstraintWindow
+from sparserob_core.checker.reach.closed_loop import VerifiedLoop
 from sparserob_core.checker.reach.kernels import BoundedInputHere
-from sparserob_core.checker.reach.measurable import as_enclosed
 from sparserob_core.checker.reach.tube import LoopTube, Polynomial
-from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.control.problem.system import LinearSystem
 from sparserob_core.control.sets.sets import Box, Ellipsoid
-from tests.support.undriven import undriven
 
 FAR = np.array([2.0, 0.5, 3.0])
 
@@ -78,22 +76,12 @@ def test_what_a_direction_is_off_by_is_added_as_along_the_axes() -> None:
             assert top <= truth * (1.0 + 1e-12) + 1e-14
 
 
-def test_rows_of_balls_are_as_wide_as_they_are() -> None:
-    from flint import arb, arb_mat
-
-    found = as_enclosed(arb_mat([[arb(0.5, 1e-3), arb(2.0)]]))
-    assert 1e-3 <= found.rad[0, 0] <= 1.001e-3 and found.rad[0, 1] <= 1e-15
-    np.testing.assert_array_equal(as_enclosed(np.eye(2)).rad, np.zeros((2, 2)))
-
-
-def test_a_loop_under_measurable_disturbances_is_seen_along_balls_as_along_floats() -> None:
-    A, E = np.array([[0.0, 1.0], [-1.0, -0.4]]), np.array([[1.0, 0.3], [0.0, 1.0]])
-    problem = OptimalControlProblem(
-        system=LinearSystem(A, [[0.0], [1.0]], E), horizon=2.0, initial_state=[0.0, 0.0], control=Box([-1.0], [1.0]),
-        terminal=[Box([-1.0, -1.0], [1.0, 1.0])], disturbance=Box([-0.1, -0.2], [0.1, 0.3]),
-        disturbance_class="measurable",
-    )  # fmt: skip
-    loop = undriven(problem, [0.0, 1.0, 2.0])
+def test_a_loop_is_seen_along_balls_as_along_floats() -> None:
+    plant = LinearSystem([[0.0, 1.0], [-1.0, -0.4]], [[0.0], [1.0]], [[1.0, 0.3], [0.0, 1.0]])
+    grid, gains = [0.0, 1.0, 2.0], np.full((2, 2, 1, 2), 0.25) * np.tri(2)[:, :, None, None]
+    loop = VerifiedLoop(
+        plant, [0.0, 0.0], [arb_mat(1, 1)] * 2, gains, grid, grid, grid[:-1], Box([-0.1, -0.2], [0.1, 0.3])
+    )
     z, axes, normals = np.array([[0.5, 0.25], [-0.75, 0.5]]), np.eye(2), np.array([[1.0, 0.5], [-0.25, 1.0]])
     summed, alone = (LoopTube(loop, basis, np.zeros((2, 0))) for basis in (normals, z @ normals))
     for piece, start, stop in ((0, 0.0, 0.0), (0, 0.2, 0.5), (1, 1.3, 1.7), (1, 2.0, 2.0)):

@@ -236,27 +236,6 @@ def test_a_row_is_what_the_policy_makes_of_it_at_its_deviations(name: str) -> No
             bounds.rows_of(case, {"multiplier": 1.0, **entry, **wrong})
 
 
-def test_a_row_of_measurable_disturbances_is_at_a_signal_that_jumps_where_it_says() -> None:
-    loop, v, M = driven("measurable")
-    jumping = replace(loop, changes=np.array([0.0, 0.3, 1.1, 2.0]), measurable=False)
-    case = case_of("measurable", terminal=[END])
-    off, named = admissible(jumping, np.random.default_rng(9))
-    entry = {"constraint": "terminal", "time": 2.0, "direction": [0.0, -2.0], "multiplier": 1.0, **named}
-    entry["changes"] = [0.0, 0.3, 1.1]
-    ((_, row),) = bounds.rows_of(case, entry)
-    x = jumping.states(v, M, np.array([2.0]))[0][0]
-    slope = np.array([[float(g.mid()) for g in piece] for piece in row.slope])
-    seen = np.array([[float(e.mid()) for e in part] for part in row.innovations])
-    made = v.T + np.einsum("kjmp,jp->km", M, seen)
-    truth = -2.0 * (x[1, 0] + x[1, 1:] @ off) - 0.5
-    assert float(row.constant.mid()) + (slope * made).sum() == pytest.approx(truth, abs=1e-9)
-    for wrong in ([0.0, 0.3], [0.1, 0.3, 1.1], [0.0, 1.1, 0.3], [0.0, 0.3, 2.0], [], [[0.0]], None):
-        with pytest.raises(Broken):
-            bounds.rows_of(case, {**entry, "changes": wrong})
-    with pytest.raises(Broken, match="expected"):
-        bounds.rows_of(case, "nothing")
-
-
 @pytest.mark.parametrize("name", ["box", "outputs"])
 def test_multipliers_prove_no_more_than_every_policy_of_the_kind_pays(name: str) -> None:
     """Random policies whose control stays in its set: the weighted sum of the rows is never less than what is told."""

@@ -55,19 +55,18 @@ REFUSED: dict[str, tuple[Callable[[], object], type[Exception], str]] = {
         Unchecked,
         "fewer functions than pieces",
     ),
-    "outputs of what is pushed at any time": (
+    "answers to what is pushed at any time": (
         lambda: (
             feedback_of(
                 case_of(
                     policy=AffinePolicy(),
                     disturbance_class="measurable",
-                    measurements=sr.Measurements([[1.0]]),
                     certificate={"gains": np.zeros((2, 2, 1, 1)).tolist()},
                 )
             ).loop
         ),
         Unchecked,
-        "outputs beside disturbances that are constant on pieces only",
+        "feedback under disturbances on the pieces of one dictionary",
     ),
     "a decision of another shape": (lambda: case_of(decision=((0.5,),)).theta, Broken, r"shape \(1, 1\), expected \(1"),
     "numbers for one": (lambda: number({"time": [1.0, 2.0]}, "time"), Broken, "time: expected a number"),

@@ -17,7 +17,6 @@ from sparserob_core.checker.arithmetic.series import exactly
 from sparserob_core.checker.claims.cells import prove
 from sparserob_core.checker.outcome import Broken, Clock
 from sparserob_core.checker.reach.closed_loop import VerifiedLoop
-from sparserob_core.checker.reach.measurable import MeasurableLoop
 from sparserob_core.checker.reach.preimages import ReachableSubspace
 from sparserob_core.checker.reach.tube import LoopTube, TimelessTube
 from sparserob_core.checker.sets.known import known
@@ -26,7 +25,7 @@ from sparserob_core.checker.sets.polynomials import Enclosed, rounding
 from sparserob_core.checker.sets.sides import Curved, Sides
 from sparserob_core.control.problem.system import LinearSystem
 from sparserob_core.control.sets.sets import Box, Ellipsoid
-from tests.support.closed_loops import EXACT, LOOPS, MEASURABLE, STEADY, STILL, exponentials, gains
+from tests.support.closed_loops import EXACT, LOOPS, STILL, gains
 
 H = np.array([[1.0, 0.0], [0.0, -1.0], [0.6, 0.8], [-1.0, 0.3]])
 
@@ -36,8 +35,7 @@ def made(name):
     """The loop in balls, and the one that is stepped, with its control and gains."""
     case = LOOPS[name]
     v, M = gains(np.random.default_rng(3), case)
-    kind = MeasurableLoop if case.measurable else VerifiedLoop
-    loop = kind(
+    loop = VerifiedLoop(
         case.system,
         case.start.tolist(),
         [arb_mat(column[:, None].tolist()) for column in v.T],
@@ -156,72 +154,6 @@ def test_what_a_power_series_on_a_cell_leaves_out_is_added(monkeypatch):
             assert (bent >= second / 4.0 + third * 2.0 / 3.0**1.5).all()
             most = max(most, float(third.max()))
     assert most > 1e-3, "nothing was left out"
-
-
-@pytest.mark.parametrize("name", MEASURABLE)
-def test_measurable_disturbances_reach_what_signals_that_jump_often_reach_and_little_more(name):
-    """A signal that jumps at given times only reaches less, by the square of how far these are apart."""
-    case, loop, v, M = made(name)
-    rng = np.random.default_rng(6)
-    with ctx.workprec(192):
-        for piece, (a, b) in enumerate(zip(case.grid[:-1].tolist(), case.grid[1:].tolist(), strict=True)):
-            for time in (a + (b - a) * 10 / case.fine, b) if piece in (0, case.grid.size - 2) else (b,):
-                truth = case.height(H @ case.states(v, M, np.array([time - 1e-13]))[0][0])
-                heights = loop.highest(piece, time, H)
-                assert all(float(h.upper()) >= t - 1e-9 for h, t in zip(heights, truth, strict=True))
-                assert all(float(h.lower()) <= t + 8.0 / case.fine**2 for h, t in zip(heights, truth, strict=True))
-                assert max(float(h.rad()) for h in heights) < 1e-10
-        for piece, a, b in parts(loop):
-            low, high = sorted(rng.uniform(a, b, size=2).tolist())
-            bent = loop.bound_chord_error(piece, low, high, H)
-            share = np.linspace(0.0, 1.0, 5)
-            values = np.array(
-                [[float(h.mid()) for h in loop.highest(piece, float(t), H)] for t in low + share * (high - low)]
-            )
-            over = values - ((1.0 - share)[:, None] * values[0] + share[:, None] * values[-1])
-            assert (over.max(axis=0) <= bent + 1e-12).all()
-            if np.linalg.norm(case.A, 2) * (high - low) < 0.5:
-                assert (bent <= 40.0 * (high - low) ** 2).all()
-
-
-@pytest.mark.parametrize("name", STEADY)
-def test_the_integral_of_a_kernel_is_that_of_the_support_function(name):
-    """Against Gauss's rule on many parts, of which few hold a place where another corner becomes the best one."""
-    case, loop, *_ = made(name)
-    nodes, weights = np.polynomial.legendre.leggauss(3)
-    rng = np.random.default_rng(7)
-    a = rng.normal(size=(4, 2))
-    middle = case.bound.middle()
-    with ctx.workprec(192):
-        for piece in (0, len(case.grid) - 2):
-            begin, length = float(case.grid[piece]), float(case.grid[piece + 1] - case.grid[piece])
-            for share in (1.0, 0.37):
-                pushed = loop.deviations
-                kernel = pushed.kernel(piece) if share == 1.0 else pushed.build_kernel(begin, begin + share * length)
-                found = kernel.integrate_support(Enclosed(a, np.zeros_like(a)), loop.deviations.summands)
-                wide = kernel.integrate_support(Enclosed(a, np.full_like(a, 1e-3)), loop.deviations.summands)
-                parts = 120
-                ends = np.linspace(0.0, share * length, parts + 1)
-                r = ((ends[:-1] + ends[1:])[:, None] / 2 + np.diff(ends)[:, None] / 2 * nodes).ravel()
-                w = (np.diff(ends)[:, None] / 2 * weights).ravel()
-                K = exponentials(case.A * r[:, None, None]) @ case.E
-                f = np.einsum("rdw,nd->nrw", K, a)
-                h = case.bound.support(f.reshape(-1, f.shape[2])).reshape(f.shape[:2]) - f @ middle
-                truth = h @ w
-                if share == 1.0:  # how far a piece pushes every state, either way
-                    tops = [case.bound.support(s * K.reshape(-1, K.shape[2])).reshape(K.shape[:2]) for s in (1.0, -1.0)]
-                    sides = np.array([w @ (top - s * K @ middle) for s, top in zip((1.0, -1.0), tops, strict=True)])
-                    far, first = sides.max(axis=0), loop.deviations.starts[piece]
-                    own = loop.deviations.radii[first : first + 2]
-                    assert (own >= far - 2e-5).all()
-                    assert (own <= far + 2e-5).all()
-                assert (np.abs(found.mid - truth) <= found.rad + 2e-5).all()
-                assert (found.rad < 1e-11).all()
-                for offset in 1e-3 * rng.uniform(-1, 1, size=(3, *a.shape)):
-                    moved = kernel.integrate_support(Enclosed(a + offset, np.zeros_like(a)), loop.deviations.summands)
-                    assert (moved.mid + moved.rad <= wide.mid + wide.rad + 1e-12).all()
-                    assert (moved.mid - moved.rad >= wide.mid - wide.rad - 1e-12).all()
-                assert (wide.rad < 0.1).all()
 
 
 @pytest.mark.parametrize("name", ["box", "ball and begun"])

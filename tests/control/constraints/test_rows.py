@@ -101,15 +101,15 @@ def test_a_deviation_that_is_told_reaches_the_violation(kind):
         for index in indices(one, rng, 2):
             values = one.violations(x, index[None])[0]
             for row, value in enumerate(values):
-                w, beside, acting = held.against(x, index, row)
+                w, beside = held.against(x, index, row)
                 assert (np.abs(w) <= loop.spread.radii + 1e-12).all()
                 _, directions, _, bounds = source.functionals_at(index[None])
                 states = loop.states(x, index[:1])[0]
                 reached = directions[row] @ (states[:, 0] + states[:, 1:] @ w)
                 if source.gains is None:
-                    assert (beside, acting) == (0.0, None)
+                    assert beside == 0.0
                 else:
-                    control = loop.controls(x)[acting]
+                    control = loop.controls(x)[source.commanded(index[:1])[0, row]]
                     assert beside == pytest.approx(source.gains[row] @ (control[:, 0] + control[:, 1:] @ w))
                 assert reached + beside - bounds[row] == pytest.approx(value, abs=1e-9)
                 looked += 1

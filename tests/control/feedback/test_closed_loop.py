@@ -15,7 +15,7 @@ import sparserob_core.control.response.varying.expansion as expansion
 from sparserob_core.control.feedback.closed_loop import shared
 from sparserob_core.control.response.varying.expansion import Expansion
 from sparserob_core.control.transcription.transcribe import prepare
-from tests.support.closed_loops import EXACT, LOOPS, MEASURABLE, STILL, Loop
+from tests.support.closed_loops import EXACT, LOOPS, STILL, Loop
 
 H = np.array([[1.0, 0.0], [0.0, -1.0], [0.6, 0.8], [-1.0, 0.3]])
 
@@ -150,43 +150,6 @@ def test_what_stands_beside_the_state_is_added_at_both_ends(name):
         assert (late == loop.bounded(x, lower, upper, H)[1]).all()
 
 
-@pytest.mark.first(1)
-@pytest.mark.parametrize("name", MEASURABLE)
-def test_bounds_of_measurable_disturbances_are_above_those_that_jump_often_and_near_them(name):
-    case, loop, x = made(name)
-    times = np.concatenate([np.linspace(a, b, 5)[1:] for a, b in zip(case.grid[:-1], case.grid[1:], strict=True)])
-    states = case.states(loop.nominal(x), loop.gains(x), times - 1e-13)[0]
-    sampled = case.height(H @ states)
-    exact = loop.values(x, times, H)
-    # a signal that jumps at other times only reaches less, by the square of the distance of its jumps
-    assert (sampled <= exact + 1e-9).all()
-    assert (exact <= sampled + 5.0 / case.fine**2 + 1e-6).all()
-    lower, upper = cells(case)
-    bounds, _ = loop.bounded(x, lower, upper, H)
-    dense = lower[:, None] + np.linspace(1e-9, 1.0 - 1e-9, 21) * (upper - lower)[:, None]
-    heights = loop.values(x, dense.ravel(), H).reshape(*dense.shape, -1)
-    assert (heights.max(axis=1) <= bounds + 1e-12).all()
-    narrow = (upper - lower) <= 0.0101
-    assert (bounds - heights.max(axis=1))[narrow].max() < 0.02
-
-
-@pytest.mark.parametrize("name", MEASURABLE)
-def test_a_bound_of_what_a_piece_adds_is_above_its_chord_by_what_its_slope_owes(name):
-    """What a measurable disturbance adds within a piece is an integral whose integrand is Lipschitz."""
-    case, loop, _ = made(name)
-    lower, upper = cells(case, (1.0, 0.5, 0.1))
-    pieces = loop.functionals.response.grid.locate((lower + upper) / 2)
-    allowed = loop.measurable.allowance(lower, upper, H, pieces)
-    share = np.linspace(0.0, 1.0, 41)
-    for i, piece in enumerate(pieces):
-        times = lower[i] + share * (upper[i] - lower[i])
-        within = loop.measurable.within(times, H, np.full(times.size, piece))
-        over = within - ((1.0 - share)[:, None] * within[0] + share[:, None] * within[-1])
-        assert (over.max(axis=0) <= allowed[i] + 1e-15).all()
-        if np.linalg.norm(case.A, 2) * (upper[i] - lower[i]) < 1.0:
-            assert (allowed[i] <= 3.0 * (upper[i] - lower[i]) ** 2).all()
-
-
 def test_a_loop_whose_deviations_are_larger_is_that_loop_with_larger_sets():
     _, loop, x = made("box")
     times = np.linspace(0.0, 2.0, 9)
@@ -227,8 +190,7 @@ def test_uncertain_rows_are_violated_by_the_worst_case_of_the_state_and_of_the_c
         plain = loop.state_rows(time, H, h[: len(H)], own, np.ones(len(H)))
         both = loop.with_control(plain, G, np.full(len(H), k)).excess(x, loop.spread)
         along = H @ loop.states(x, np.array([time]))[0] + G @ every[k]
-        within = 0.0 if loop.measurable is None else loop.measurable.within(np.array([time]), H)[0]
-        assert both == pytest.approx(loop.height(along) + within - h[: len(H)], abs=1e-9)
+        assert both == pytest.approx(loop.height(along) - h[: len(H)], abs=1e-9)
 
 
 @pytest.mark.first(5)
@@ -240,7 +202,7 @@ def test_the_signal_of_the_worst_deviation_takes_the_state_there(name):
         return
     for time, c in ((1.7, H[2]), (2.0, H[3])):
         deviation = loop.worst(x, time, c)
-        ends, values = loop.signal(deviation, time, c)
+        ends, values = loop.signal(deviation)
         assert values.shape == (case.E.shape[1], ends.size - 1)
         assert all(case.bound.contains(w[None], 1e-9)[0] for w in values.T)
         begun = loop.compute_initial_state(deviation)
@@ -259,7 +221,7 @@ def test_the_signal_of_the_worst_deviation_takes_the_state_there(name):
             states = case.states(loop.nominal(x), loop.gains(x), np.array([time - 1e-13]))[0][0]
             assert c @ (states[:, 0] + states[:, 1:] @ z) == pytest.approx(case.height(c @ states), abs=1e-9)
             continue
-        driven = dataclasses.replace(case, changes=ends, start=begun, begun=None, measurable=False)
+        driven = dataclasses.replace(case, changes=ends, start=begun, begun=None)
         # innovations are counted from the middle of the initial states
         gains, v = loop.gains(x), loop.nominal(x)
         if case.begun is not None:

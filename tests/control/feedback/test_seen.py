@@ -6,17 +6,14 @@ from __future__ import annotations
 import dataclasses
 from functools import cache
 from itertools import product
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from scipy.linalg import expm
 
 import sparserob_core as sr
 from sparserob_core.control.feedback.observer import Observer
 from sparserob_core.control.feedback.tree import Sampled
-from sparserob_core.control.feedback.zonoid import KernelPolynomial, Zonoid
-from sparserob_core.control.sets.sets import Box, Polytope
+from sparserob_core.control.sets.sets import Box
 from sparserob_core.control.transcription.transcribe import prepare
 from tests.support.closed_loops import LOOPS
 
@@ -130,41 +127,3 @@ def test_an_observer_predicts_with_the_least_error():
     apart = Observer.of(sr.Measurements(C, Box([-0.3, -0.1], [0.1, 0.5])), seen, flows, radii)
     assert apart.outputs(states) == pytest.approx(C @ states + np.array([[-0.1], [0.2]]))
     assert found.outputs(states, np.ones((p, 6))) == pytest.approx(C @ states + 1.0)
-
-
-def test_a_set_of_what_a_disturbance_does_has_chords_to_its_boundary():
-    A, E = np.array([[0.0, 1.0], [-2.0, -0.3]]), np.array([[0.3, 0.0], [1.0, -0.5]])
-    made = Zonoid.of(KernelPolynomial.of(A, E, 0.7), Box([-0.1, -0.2], [0.1, 0.2]))
-    zero, axes = np.zeros((2, 2)), np.eye(2)
-    assert not made.middle().any() and not made.interior_point().any() and made.is_symmetric
-    low, high = made.chord(zero, axes)
-    assert low == pytest.approx(-high)
-    angles = np.linspace(0.0, 2.0 * np.pi, 601)
-    c = np.stack([np.cos(angles), np.sin(angles)], axis=1)
-    reach = made.support(c)
-    for axis, far in zip(axes, high, strict=True):
-        along = c @ axis
-        assert far == pytest.approx((reach[along > 1e-6] / along[along > 1e-6]).min(), rel=1e-3)
-
-
-def test_the_coordinates_of_what_a_disturbance_does_have_second_moments_alike():
-    """Of corners of which none reaches farthest along both channels."""
-    A, E = np.array([[0.0, 1.0], [-2.0, -0.3]]), np.array([[0.3, 0.0], [1.0, -0.5]])
-    signs = np.array([[1.0, 1.0], [1.0, -1.0], [-1.0, 1.0], [-1.0, -1.0]])
-    bound = Polytope(signs / [0.4, 0.2], np.ones(4))
-    found, lengths = Zonoid.of(KernelPolynomial.of(A, E, 0.7), bound), (np.arange(100) + 0.5) * 0.7 / 100
-    steps = np.array([expm(A * s) for s in lengths]) @ (E * [0.4, 0.2])
-    moments = np.einsum("sij,skj->ik", steps, steps) * 0.7 / len(steps)
-    assert found.into @ moments @ found.into.T == pytest.approx(np.eye(2), abs=1e-3)
-    assert found.outward @ found.into == pytest.approx(np.eye(2), abs=1e-9)
-
-
-def test_a_coordinate_along_which_nearly_nothing_happens_is_not_answered():
-    pieces = made("measurable")[1].measurable
-    outward = np.array([[1.0, 0.0, 1e-9, 0.3], [0.0, 0.0, 0.0, 0.4]])
-    stub = SimpleNamespace(outward=outward, dimension=4)
-    few = dataclasses.replace(pieces, zonoids=(stub, *pieces.zonoids[1:]))
-    assert few.mark_answered(0).tolist() == [True, False, False, True]
-    at, states = few.at(1)
-    assert (at.start, at.stop) == (4, 4 + pieces.zonoids[1].dimension)
-    assert (states == pieces.states[:, None] * pieces.zonoids[1].outward).all()

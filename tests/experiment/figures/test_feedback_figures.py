@@ -16,7 +16,7 @@ from sparserob_core.experiment.assemble import ControlExperiment
 from sparserob_core.experiment.figures import drawing, run_figures
 from sparserob_core.experiment.figures.figure_data import FigureData
 from tests.support.places import CONFIGS
-from tests.support.problems import double_integrator, pushed_spring
+from tests.support.problems import double_integrator
 
 
 @pytest.fixture(scope="module")
@@ -95,24 +95,6 @@ def driven(outcome: sr.Outcome, worst: Adversary) -> np.ndarray:
         block[:-1, :-1], block[:-1, -1] = A, B @ acted[-1] + E @ w
         x = (expm((end - begin) * block) @ np.append(x, 1.0))[:-1]
     return np.array(acted)
-
-
-@pytest.mark.slow
-def test_what_answers_a_measurable_disturbance_is_drawn_too(tmp_path: Path) -> None:
-    config = {
-        "problem": pushed_spring(0.25),
-        "dictionaries": {"control": {"name": "piecewise_constant", "pieces": 4}},
-        "policy": {"name": "affine", "cost": "peak", "causal_signals": 0},
-    }
-    outcome = sr.run(config, out=tmp_path / "run", quiet=True, figures=False)
-    decision = outcome.result.decision
-    assert decision is not None and isinstance(outcome.experiment, ControlExperiment)
-    assert outcome.result.message.endswith("which sparserob check encloses")
-    data = drawing.figure_data(outcome.experiment, decision, None, (), None, draws=500)
-    worst = outcome.result.adversary("terminal")
-    assert data.answers is not None and np.abs(data.answers).max() > 1e-3
-    np.testing.assert_allclose(data.control.T + data.answers.sum(axis=1), driven(outcome, worst), atol=1e-7)
-    assert data.effort is None  # of all measurable functions none is drawn evenly
 
 
 def test_of_many_gains_the_largest_are_drawn_and_the_title_says_so(data: FigureData) -> None:

@@ -7,11 +7,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.control.studies.answer import ControlResult
 from sparserob_core.control.transcription.record import Transcription
-from sparserob_core.control.transcription.transcribe import prepare
 from sparserob_core.experiment.directory.artefacts import finite
 from sparserob_core.experiment.directory.certificate import causal_data
 from sparserob_core.sip.convex_set import Array
@@ -83,7 +81,7 @@ def active(model: Transcription, result: Result) -> list[tuple[str, float, Array
     middle, constraints = model.answering.loop.spread.middle, []
     for cut, explanation in zip(result.dual.cuts, model.explained(result.dual.cuts), strict=True):
         if explanation is not None:
-            signal = None if model.answering.loop.measurable is not None else explanation.disturbance
+            signal = explanation.disturbance
             constraints.append(
                 (cut.family, explanation.time, None if signal is None else _subtract_rest(middle, np.asarray(signal)))
             )
@@ -94,18 +92,10 @@ def searched(
     model: Transcription, decision: Array | None, rests: list[tuple[str, float, Array | None]]
 ) -> CausalSearch:
     """Return the search for a bound, which begins with a policy's ``decision`` and the constraints ``rests`` of its
-    bound.
-
-    For measurable disturbances the search takes those that are constant on the pieces of the grid, and begins without
-    the decision. A cost that no policy can avoid under these, none can avoid under all.
-    """
+    bound."""
     from sparserob_core.control.studies.causal import CausalSearch
 
-    if model.answering.loop.measurable is None:
-        return CausalSearch(model, decision, rests)
-    pieces = Dictionary.indicators(model.response.grid.breakpoints)
-    problem = replace(model.problem, disturbance_class="piecewise_constant")
-    return CausalSearch(prepare(problem, model.control, pieces, policy=model.answering.policy), None, rests)
+    return CausalSearch(model, decision, rests)
 
 
 def proven(
