@@ -47,7 +47,7 @@ def other(value: object, program: SemiInfiniteProgram) -> object:
     if callable(value):
         return lambda *arguments: value(*arguments) if arguments else None
     if isinstance(value, Spread):
-        return Spread(value.sets, value.missed + 1e-3)
+        return replace(value, still=np.ones(value.size, dtype=bool))
     return value[:-1]
 
 

@@ -97,7 +97,6 @@ class Loop:
         error = np.hstack([np.zeros((d, 1)), X[:, 1:]])
         innovations = [self._innovation(0, error, 1 + blocks * width)]
         (found, rates), controls = np.zeros((2, times.size, d, 1 + Q)), []
-        marks = self.grid
         for k, (begin, end) in enumerate(pairwise(self.breakpoints)):
             U = np.zeros((m, 1 + Q))
             U[:, 0] = v[:, k]
@@ -105,14 +104,14 @@ class Loop:
                 U += M[k, j] @ innovations[j]
             controls.append(U)
             before = X
-            inside = marks[(marks >= begin) & (marks <= end)]
+            inside = self.grid[(self.grid >= begin) & (self.grid <= end)]
             for a, b in pairwise(inside):
                 drive = self.B @ U
                 drive[:, 0] += still
                 if blocks:
                     at = 1 + (np.searchsorted(self.changes, (a + b) / 2) - 1) * width
                     drive[:, at : at + width] += self.E
-                last = b == marks[-1]
+                last = b == self.grid[-1]
                 here = np.flatnonzero((times >= a) & ((times <= b) if last else (times < b)))
                 after = self._step(a, np.append(times[here] - a, b - a), X, drive)
                 found[here], rates[here] = after[:-1], self.rates(times[here], after[:-1], drive)
@@ -126,7 +125,7 @@ class Loop:
                 error = onward - self.observer[k] @ innovations[k] + entered
             else:
                 error = entered
-            if end < marks[-1]:
+            if end < self.grid[-1]:
                 innovations.append(self._innovation(k + 1, error, 1 + blocks * width))
         return found, rates, np.array(controls)
 

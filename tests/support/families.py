@@ -66,7 +66,7 @@ def problem(kind):
             IntegralConstraint(H=[[1.0, 0.3]], G=[[0.5]], lower=-0.4, upper=0.7, start=0.3, stop=1.7),
             IntegralConstraint(G=[[1.0]], upper=0.9),
         ]
-    if kind.endswith("measurable"):
+    if kind == "measurable":
         path, terminal = FLAT, terminal[:1]
         more["disturbance_class"] = "measurable"
     if kind.startswith("feedback"):

@@ -38,7 +38,7 @@ from tests.support.instances import (
 )
 
 FURTHER = 6 * TOGETHER  # numbers of policies with one of `KINDS` among their features
-KINDS = ("worst", "fixed", "repeat", "curved", "curved")  # by the last digit: what a number is stays
+KINDS = ("worst", "fixed", "repeat", "curved", "curved")  # by the last digit; curved ones stand twice
 ROUND = 5 * TOGETHER  # numbers of policies among whose sets of deviations there are ellipsoids
 LARGER = 2.0  # times the disturbance that open loops are tested with
 PER_PIECE = 8

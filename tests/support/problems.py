@@ -32,11 +32,3 @@ def double_integrator(w: float) -> dict[str, Any]:
         "path": [{"box": [4.2, 1.6]}],
         "terminal": [{"box": [0.5, 0.4]}],
     }
-
-
-def pushed_spring(w: float) -> dict[str, Any]:
-    """The spring over four seconds, pushed by a measurable ``|w| <= w`` where the control acts; it has no path."""
-    return {
-        **spring(w, since=None, horizon=4.0, disturbance={"box": w}, disturbance_class="measurable"),
-        "system": {"A": [[0, 1], [-2, -0.5]], "B": [[0], [1]], "E": [[0], [1]]},
-    }

@@ -195,7 +195,7 @@ class VerifiedFeedback:
                 A.append([price * x for x in loop.effects[k][i]])
         deviations = loop.deviations
         axes = [[ball(int(b == axis)) for b in range(deviations.starts[-1])] for axis in range(deviations.starts[-1])]
-        support_values = np.array([float(x.mid()) for x in deviations.supports(axes)])
+        support_values = np.array([float(deviations.support(axis).mid()) for axis in axes])
         prove_effort_limit(a, A, deviations.support, support_values, limit, case.clock)
 
     def least(self, rows: Sequence[tuple[float, ConstraintRow]], priced: bool) -> arb:
@@ -306,7 +306,7 @@ class NamedDeviations:
     def given(self, direction: Array, time: float) -> arb:
         """Return the contribution of disturbance and initial state to ``c'x(t)``, ``c (d,)``, without control."""
         case, loop = self.case, self.loop
-        weights = case.duality.compute_disturbance_weights(direction, time, loop.changes)
+        weights = case.duality.compute_disturbance_weights(direction, time)
         blocks, loop_deviations = [*zip(loop.deviations.sets, self.z, strict=True)], loop.deviations
         # noise reaches the state through answers alone
         blocks = blocks[: loop_deviations.blocks] + blocks[loop_deviations.initial_block :]

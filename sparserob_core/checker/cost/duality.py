@@ -137,12 +137,10 @@ class Duality:
                 constant = constant + known(self.held).support(block_slope)
         return ConstraintRow(constant, slope)
 
-    def compute_disturbance_weights(
-        self, direction: Array, time: float, jumps: list[float] | None = None
-    ) -> list[list[arb]]:
+    def compute_disturbance_weights(self, direction: Array, time: float) -> list[list[arb]]:
         """Return the coefficients ``(mw,)`` of every block of the disturbance in ``c'x(t)``, for a known system. The
-        blocks begin at ``jumps``, or by default at the `changes` of the problem."""
-        jumps = self.changes if jumps is None else jumps
+        blocks begin at the `changes` of the problem."""
+        jumps = self.changes
         if not jumps:
             return []
         starts = sorted({0.0, *(s for s in jumps if s < time)})

@@ -262,8 +262,7 @@ class VerifiedLoop:
         to each row."""
         product = exactly(rows) * state
         along = (product if added_terms is None else product + added_terms).tolist()
-        supports = self.deviations.supports([row[1:] for row in along])
-        return [row[0] + support for row, support in zip(along, supports, strict=True)]
+        return [row[0] + self.deviations.support(row[1:]) for row in along]
 
     def highest(self, piece: int, time: float, rows: Array | arb_mat, added_terms: arb_mat | None = None) -> list[arb]:
         """Return the `heights` of ``rows (r, d)`` at a time in a piece of the grid."""

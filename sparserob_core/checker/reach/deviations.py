@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import accumulate
@@ -63,14 +62,10 @@ class Deviations:
         radii = [np.array(known(shape).radius) + np.abs(about) for shape, about in self.sets]
         return np.asarray(np.nextafter(np.concatenate([np.zeros(0), *radii]) * OUTWARD, np.inf))
 
-    def supports(self, every: Sequence[list[arb]]) -> list[arb]:
-        """Return the support values ``max z'a`` over all deviations ``z``, for every ``a (Q,)`` in balls."""
-        return [self.support(a) for a in every]
-
     def support(self, a: list[arb]) -> arb:
         """Return the support value ``max z'a`` over all deviations ``z``, for one ``a (Q,)`` in balls."""
         blocks = (a[first : first + shape.dimension] for first, (shape, _) in zip(self.starts, self.sets, strict=False))
-        return sum((of_block(*pair, block) for pair, block in zip(self.sets, blocks, strict=True)), ball(0))
+        return sum((_evaluate_block(*pair, block) for pair, block in zip(self.sets, blocks, strict=True)), ball(0))
 
     @cached_property
     def middle(self) -> Array:
@@ -90,7 +85,7 @@ class Deviations:
         return [differences[id(shape)] for shape, _ in self.sets]
 
 
-def of_block(shape: ConvexSet, about: Array, a: list[arb]) -> arb:
+def _evaluate_block(shape: ConvexSet, about: Array, a: list[arb]) -> arb:
     """Return the support value at ``a`` of a set minus the point ``about``; exactly 0 at ``a = 0``."""
     total = a[0] * 0
     if any(not x.is_zero() for x in a):

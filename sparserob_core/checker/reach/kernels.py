@@ -20,7 +20,7 @@ from sparserob_core.checker.sets.polynomials import OUTWARD, Enclosed, rounding
 from sparserob_core.sip.convex_set import Array
 
 if TYPE_CHECKING:
-    from flint import arb_mat
+    pass
 
 
 class Added(NamedTuple):
@@ -104,7 +104,7 @@ def compute_kernel(law: VerifiedFlow, start: float, stop: float, columns: slice)
 
 
 def above_chord(
-    law: VerifiedFlow, rows: Array | arb_mat, start: float, stop: float, start_bounds: Array, size: Array, first: int
+    law: VerifiedFlow, rows: Array, start: float, stop: float, start_bounds: Array, size: Array, first: int
 ) -> Array:
     """Return upper bounds ``(r,)`` of how far sums of integrals of ``|c'Phi(t, s) B_j(s)|`` up to ``t`` lie above their
     chords on a cell between two marks, at every parameter, for ``rows (r, d)``. ``start_bounds (d,)`` bounds these
@@ -114,8 +114,7 @@ def above_chord(
     start) y`` differs from its own chord: a term ``a s^n`` by at most ``(n - 1) n^(-n / (n - 1)) |a|``. What starts
     within the cell has a second derivative of at least ``-|c'B'| - |c'A B| - int |c'(A' + A^2) Phi B| ds``."""
     lines, width = exactly(rows), (stop - start) * (1.0 + rounding(2))
-    enclosure, d = Enclosed.of(lines), lines.ncols()
-    row_bounds = np.abs(enclosure.mid) + enclosure.rad
+    row_bounds, d = np.abs(rows), lines.ncols()
     terms, remainder = law.within(start, stop, start, stop, ORDER + 1)
     total = 2.0 * (row_bounds @ remainder[:, :d]) @ start_bounds
     for n, term in enumerate(terms[2:], 2):

@@ -55,13 +55,6 @@ class Enclosed:
         return Enclosed(mid.reshape(shape), bounds.reshape(shape))
 
 
-def product(left: Enclosed, right: Enclosed) -> Enclosed:
-    """Return matrices ``(..., a, d)`` times matrices ``(..., d, n)``, with error bounds."""
-    left_size, right_size = np.abs(left.mid), np.abs(right.mid)
-    rad = left_size @ (right.rad + rounding(left_size.shape[-1]) * right_size) + left.rad @ (right_size + right.rad)
-    return Enclosed(left.mid @ right.mid, rad * OUTWARD)
-
-
 @final
 @dataclass(frozen=True, eq=False)
 class Truncated:

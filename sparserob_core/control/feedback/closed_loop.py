@@ -229,11 +229,9 @@ class ClosedLoop:
             self._paths[key] = (nodes, drives)
         return self._paths[key]
 
-    def states(self, x: Array, times: Array, pieces: np.ndarray | None = None) -> Array:
-        """Return the nominal state and every response at ``times (k,)``, which lie in the given ``pieces (k,)`` of the
-        grid: ``(k, d, 1 + Q)``."""
-        pieces = self.grid.locate(times) if pieces is None else pieces
-        nodes, drives = self.path(x)
+    def states(self, x: Array, times: Array) -> Array:
+        """Return the nominal state and every response at ``times (k,)``: ``(k, d, 1 + Q)``."""
+        (nodes, drives), pieces = self.path(x), self.grid.locate(times)
         flow, input_flow = self._compute_flows(pieces, np.clip(times - self.grid.breakpoints[pieces], 0.0, None))
         return np.asarray(flow @ nodes[pieces] + input_flow @ drives[pieces])
 
@@ -384,10 +382,9 @@ class ClosedLoop:
         along = direction @ self.states(x, np.array([time]))[0]
         return self.spread.worst(along[1:])
 
-    def signal(self, deviation: Array) -> tuple[Array, Array]:
-        """Return the breakpoints of the grid, and the disturbance ``(mw, L)`` between them that has a deviation
-        ``(Q,)``."""
-        return self.functionals.response.grid.breakpoints, (self.entries @ (self.spread.middle + deviation)).T
+    def signal(self, deviation: Array) -> Array:
+        """Return the disturbance ``(mw, L)`` on the pieces of the grid that has a deviation ``(Q,)``."""
+        return np.asarray((self.entries @ (self.spread.middle + deviation)).T)
 
     def compute_initial_state(self, deviation: Array) -> Array:
         """Return the initial state ``(d,)`` of a deviation ``(Q,)``."""

@@ -82,8 +82,6 @@ class Retuning:
         loop, signal = model.answering.loop, model.functionals.disturbance
         if model.answering.charge.cost not in ("nominal", "peak") or not loop.spread.is_box or loop.middles.any():
             return None
-        if model.problem.disturbance_class != "piecewise_constant":
-            return None
         if signal is None or signal.starts is None or signal.starts.size != grid.pieces or not _is_plain_problem(model):
             return None
         try:

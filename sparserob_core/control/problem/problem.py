@@ -146,9 +146,9 @@ class OptimalControlProblem(Term):
     Notes
     -----
     Classes of disturbances. ``piecewise_constant``: the value on every interval of the disturbance's dictionary is in
-    the set. ``measurable``: any measurable function with values in the set. ``l1_ball``: the coefficients of channel
-    ``i`` in the dictionary have an absolute sum of at most ``upper_i``, where the set is a symmetric box; these are far
-    fewer disturbances.
+    the set. ``measurable``: any measurable function with values in the set; a policy does not answer these.
+    ``l1_ball``: the coefficients of channel ``i`` in the dictionary have an absolute sum of at most ``upper_i``, where
+    the set is a symmetric box; these are far fewer disturbances.
 
     Repetition. Every final state is one of the initial states. All constraints hold from there for another period, and
     therefore for all time. The step from any last control to any first one is in ``control_step`` too. No set has to be

@@ -50,8 +50,8 @@ STEP = 1e-6  # of the horizon, over which a slope is a difference: a tenth of it
 class VaryingExecution(Execution):
     """`Execution` of a system that changes with time.
 
-    ``disturbing``: the command enters through ``E``, all of it on every piece between ``breakpoints``, as the
-    disturbances of a `VaryingMeasurable` do. ``bound``: a set of the inputs through the columns ``through (m,)`` of
+    ``disturbing``: one command for all times enters through ``E``, as the disturbances of a `VaryingMeasurable` do.
+    ``bound``: a set of the inputs through the columns ``through (m,)`` of
     ``E`` together, in the place of separate channels. Then there is one share of 1, and integrals are those of the
     support function of the set.
     """
@@ -130,10 +130,7 @@ class VaryingExecution(Execution):
         With a delay, column 0 is the control before the first piece of the command; the pieces of the command follow.
         """
         grid = self.motion.grid
-        if not self.disturbing:
-            return np.asarray(grid.control_piece + self.late)
-        middles = (grid.breakpoints[:-1] + grid.breakpoints[1:]) / 2
-        return np.clip(np.searchsorted(self.breakpoints, middles) - 1, 0, self.breakpoints.size - 2)
+        return np.zeros(grid.pieces, dtype=int) if self.disturbing else np.asarray(grid.control_piece + self.late)
 
     @property
     def late(self) -> int:

@@ -122,7 +122,7 @@ def _find_in_closed_loop(constraint: StateConstraint, decision: Array, loop: Clo
     deviation, offset = robust_constraint.against(decision, worst.indices[0], row)
     breakpoints, disturbance = response.grid.breakpoints, None
     if constraint.functionals.disturbance is not None:
-        breakpoints, disturbance = loop.signal(deviation)
+        disturbance = loop.signal(deviation)
     return Adversary(
         name=constraint.name,
         row=row,

@@ -274,13 +274,14 @@ def refuse(
     uncertainty = [convex for convex in (problem.disturbance, problem.initial_set) if convex is not None]
     slanted = [convex.kind for convex in uncertainty if _has_zero_chord(convex)]
     leaning = [convex.kind for convex in uncertainty if fixed(problem)[1].size and Spread(((1, convex),)).leans]
+    finer = "; more pieces in dictionaries.disturbance come as close to a measurable one as is wanted"
+    finer = finer if "measurable" in classes else ""
     reasons = {
         "control that can have any value on every piece: an answer to a measurement does not reach back before it": (
             not control.is_indicators
         ),
         "system without uncertain parameters: else what is measured is not the disturbance alone": uncertain,
-        f"disturbance of the class piecewise_constant, not {' and '.join(sorted(classes))}; more pieces in"
-        " dictionaries.disturbance come as close to a measurable one as is wanted": not classes
+        f"disturbance of the class piecewise_constant, not {' and '.join(sorted(classes))}{finer}": not classes
         <= {"piecewise_constant"},
         "disturbance on the pieces of one dictionary, not on some of its own": problem.disturbance_breakpoints
         is not None,
@@ -342,15 +343,12 @@ def _find_ineffective_entries(own: Posed, spread: Spread) -> np.ndarray:
     is_still, model = np.zeros(spread.size, dtype=bool), own.functionals.disturbance
     if fixed(own.problem)[1].size:
         return is_still
-    bound = None if model is None else own.problem.disturbance
-    sets = [bound, own.problem.initial_set]
+    bound, sets = own.problem.disturbance, [own.problem.disturbance, own.problem.initial_set]
     disturbance_widths, initial_widths = (
         np.zeros(0) if convex is None else convex.width(np.eye(convex.dimension)) for convex in sets
     )
     rows = _normalise_rows(own.constraints, own.problem.system.states)
-    is_negligible = find_negligible_entries(
-        own.response, None if bound is None else model, disturbance_widths, initial_widths, rows, STILL
-    )
+    is_negligible = find_negligible_entries(own.response, model, disturbance_widths, initial_widths, rows, STILL)
     if bound is not None and model is not None:
         entries = _combine_over_times(bound, is_negligible[: is_negligible.size - initial_widths.size])
         is_still[: is_negligible.size - initial_widths.size] = np.tile(entries, model.block_count)

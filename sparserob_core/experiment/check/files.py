@@ -159,9 +159,7 @@ def _list_unread(case: Case) -> set[str]:
     )
     is_mixed = isinstance(witness, Mapping) and str(witness.get("constraint")) in mixed_windows
     witness_keys = witness_keys | {"piece"} if is_mixed else witness_keys
-    witness_keys = (
-        witness_keys - {"disturbance", *DEVIATION} if case.measurable and not case.answering else witness_keys
-    )
+    witness_keys = witness_keys - {"disturbance", *DEVIATION} if case.measurable else witness_keys
     return unread | (_list_extra_keys("witness", witness, witness_keys) if "witness" in read else set())
 
 

@@ -521,8 +521,8 @@ class ProblemKeys(ProblemFactory, Options):
     8}]``."""
 
     disturbance_class: DisturbanceClass = "piecewise_constant"
-    """``piecewise_constant``: in the disturbance's dictionary; ``measurable``: any measurable function; ``l1_ball``:
-    the coefficients of each channel have absolute sum at most the box's bound (a far smaller set)."""
+    """``piecewise_constant``: in the disturbance's dictionary; ``measurable``: any measurable function, in open loop;
+    ``l1_ball``: the coefficients of each channel have absolute sum at most the box's bound (a far smaller set)."""
 
     path: list[PathOptions] = Field(default_factory=list)
     """Sets in which the state stays, each from ``from`` (0 unless given) to ``to`` (the horizon unless given)."""

@@ -60,9 +60,8 @@ def certificate(experiment: Experiment, result: Result) -> dict[str, Any] | None
     Under feedback ``decision`` is the nominal control, and ``gains (K, K, m, p)`` answer the innovations. The
     ``observer (K, d, p)`` makes innovations of outputs. ``policy`` has the cost that is charged, and the breakpoints
     that every piece answers, as ranges ``[first, last]`` counted from 0. Every constraint with a multiplier is at a
-    ``disturbance``. It is also at a ``deviation`` of the initial state from
-    its centre where there is a set of them, and at a ``noise (K, p)`` of the outputs. ``causal`` is the bound for every
-    causal policy.
+    ``disturbance``. It is also at a ``deviation`` of the initial state from its centre where there is a set of them,
+    and at a ``noise (K, p)`` of the outputs. ``causal`` is the bound for every causal policy.
 
     Parameters
     ----------
@@ -401,7 +400,7 @@ def _write_witness(experiment: ControlExperiment, result: Result) -> dict[str, A
 def _apply_worst_deviations(experiment: ControlExperiment, said: TimedExplanation, decision: Array) -> TimedExplanation:
     """Return a constraint at the deviations that drive a closed loop to it most, where there is a loop."""
     feedback = experiment.transcription.feedback
-    if feedback is None or experiment.problem.disturbance_class != "piecewise_constant":
+    if feedback is None:
         return said
     from sparserob_core.control.constraints.control import STEP, of_control
     from sparserob_core.control.constraints.feedback import describe_deviations

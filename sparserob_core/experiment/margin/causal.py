@@ -6,10 +6,10 @@ from collections.abc import Callable
 
 import numpy as np
 
-from sparserob_core.control.studies.causal import CausalLimits, Ended
+from sparserob_core.control.studies.causal import CausalLimits, CausalSearch, Ended
 from sparserob_core.control.transcription.record import Transcription
 from sparserob_core.experiment.margin.scaling import Scaling
-from sparserob_core.experiment.run.conclusion.causal import active, proven, searched
+from sparserob_core.experiment.run.conclusion.causal import active, proven
 from sparserob_core.sip.events import Notify
 from sparserob_core.sip.method import Tools
 from sparserob_core.sip.result import Result
@@ -60,7 +60,7 @@ def causal_upper(
     infeasible = [entry for factor, entry in results.items() if entry.status == "infeasible" and factor > 0.0]
     constraints = [] if result is None else active(model, result)
     constraints += [constraint for entry in infeasible for constraint in active(model, entry)]
-    search = searched(model, None if result is None else result.decision, constraints)
+    search = CausalSearch(model, None if result is None else result.decision, constraints)
     limits = CausalLimits.of(charge, list(results.values()), model.program.n, lambda: tools.deadline.passed)
     solved_tree = search.largest_factor(scaling.highest / base, limits)
     if solved_tree is None:

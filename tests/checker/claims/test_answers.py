@@ -439,9 +439,14 @@ def test_chords_are_how_long_a_set_is_through_its_middle(shape, chords):
 
 def test_a_policy_is_refused_where_the_checker_does_not_know_the_system():
     judged = case_of()
-    free = replace(judged, problem=replace(judged.problem, disturbance_class="measurable"))
-    with pytest.raises(Unchecked, match="on the pieces of one dictionary"):
-        VerifiedFeedback(free).loop  # noqa: B018
+    bound = Product([Box([-0.1], [0.1]), Box([-0.1], [0.1])])
+    both = {"system": LinearSystem(np.zeros((1, 1)), np.ones((1, 1)), E=np.ones((1, 2))), "disturbance": bound}
+    for more in (
+        {"disturbance_class": "measurable"},
+        {**both, "disturbance_class": ("measurable", "piecewise_constant")},
+    ):
+        with pytest.raises(Unchecked, match="on the pieces of one dictionary"):
+            VerifiedFeedback(replace(judged, problem=replace(judged.problem, **more))).loop  # noqa: B018
     one = LinearSystem(lambda p: p[0] * np.ones((1, 1)), np.ones((1, 1)), E=np.ones((1, 1)), parameters=box(0.1))
     with pytest.raises(Unchecked, match="known systems only"):
         VerifiedFeedback(replace(judged, problem=replace(judged.problem, system=one))).loop  # noqa: B018

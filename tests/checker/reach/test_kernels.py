@@ -1,15 +1,11 @@
-"""Guards checker/sets/summands and products of checker/sets/polynomials: integrals of the largest of polynomials,
-and products of matrices that are known to a radius, in exact arithmetic and by hand."""
+"""Guards checker/sets/summands: integrals of the largest of polynomials, by hand and by the trapezoidal rule."""
 
 from __future__ import annotations
-
-from fractions import Fraction
 
 import numpy as np
 import pytest
 
 from sparserob_core.checker.sets.known import summands_of
-from sparserob_core.checker.sets.polynomials import Enclosed, product
 from sparserob_core.checker.sets.summands import (
     _evaluate_polynomials,
     _find_crossings,
@@ -105,32 +101,3 @@ def test_summands_are_segments_of_a_box_and_corners_of_what_has_them():
     line, none = np.array([[[1.0, -2.0]]]), np.zeros((1, 2))
     assert np.mean([ends.sum() for ends in integrate(box, line, none)]) == pytest.approx(2.0 + 3.0)
     assert np.mean(integrate([ball], line, none)) == pytest.approx(1.0)
-
-
-def exact(values):
-    return np.vectorize(Fraction, otypes=[object])(np.asarray(values, dtype=float))
-
-
-@pytest.mark.parametrize(("left", "right"), [(0.0, 0.0), (1e-3, 0.0), (0.0, 1e-3), (0.2, 0.5)])
-def test_a_product_with_a_matrix_that_is_known_to_a_radius_holds_every_product(left, right):
-    rng = np.random.default_rng(2)
-    mid, rows = rng.normal(size=(4, 30)), rng.normal(size=(30, 5))
-    A = Enclosed(mid, left * rng.uniform(0.5, 1.0, size=mid.shape))
-    B = Enclosed(rows, right * rng.uniform(0.5, 1.0, size=rows.shape))
-    found = product(A, B)
-    corners = []
-    for sign in (1.0, -1.0):  # as far from the middle as the radii let them, all in one direction
-        for i in range(4):
-            for j in range(5):
-                one = exact(mid[i]) + int(sign) * exact(np.sign(rows[:, j])) * exact(A.rad[i])
-                other = exact(rows[:, j]) + int(sign) * exact(np.sign(mid[i])) * exact(B.rad[:, j])
-                off = abs(sum(one * other) - Fraction(float(found.mid[i, j])))
-                if sign > 0:
-                    # the product of both radii counts wherever signs allow
-                    same = sum(exact(A.rad[i]) * exact(B.rad[:, j]) * exact(np.sign(mid[i]) * np.sign(rows[:, j])))
-                    corners.append(float(off + sum(exact(A.rad[i]) * exact(B.rad[:, j])) - same))
-                assert off <= Fraction(float(found.rad[i, j]))
-    largest_rad = found.rad.ravel()
-    assert (largest_rad >= np.array(corners) * (1 - 1e-13)).all()
-    assert (largest_rad <= np.array(corners) * (1 + 1e-9) + 30 * 5e-15 * 5).all()
-    assert (found.rad > 0.0).all()

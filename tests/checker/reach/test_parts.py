@@ -326,9 +326,9 @@ def test_what_a_row_is_made_of_is_known_as_well_on_many_pieces_as_on_one() -> No
     )
     with ctx.workprec(96):
         flows, c, time = VerifiedFlows.of(stiff, float(ends[-1])), np.array([1.0, 2.0]), float(ends[-3])
-        duality = Duality(problem, sr.Dictionary.indicators(ends), None, flows)
+        duality = Duality(problem, sr.Dictionary.indicators(ends), ends[:-1].tolist(), flows)
         row = duality.row(c, time, (), arb(0), disturbed=False)
-        pushed = duality.compute_disturbance_weights(c, time, ends[:-1].tolist())
+        pushed = duality.compute_disturbance_weights(c, time)
         carried = duality.compute_initial_weights(c, time)
     inverse = np.linalg.inv(stiff.phases[0].A.T)
     lags = np.array([scipy.linalg.expm(stiff.phases[0].A.T * max(0.0, time - s)) @ c for s in ends])

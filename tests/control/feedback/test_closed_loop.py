@@ -202,7 +202,7 @@ def test_the_signal_of_the_worst_deviation_takes_the_state_there(name):
         return
     for time, c in ((1.7, H[2]), (2.0, H[3])):
         deviation = loop.worst(x, time, c)
-        ends, values = loop.signal(deviation)
+        ends, values = loop.functionals.response.grid.breakpoints, loop.signal(deviation)
         assert values.shape == (case.E.shape[1], ends.size - 1)
         assert all(case.bound.contains(w[None], 1e-9)[0] for w in values.T)
         begun = loop.compute_initial_state(deviation)

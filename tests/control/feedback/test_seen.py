@@ -1,4 +1,4 @@
-"""Guards control/feedback/closed_loop, observer, tree, zonoid: what is seen, what gains make of it, and rows of signals
+"""Guards control/feedback/closed_loop, observer, tree: what is seen, what gains make of it, and rows of signals
 that are sampled, against a loop that is stepped."""
 
 from __future__ import annotations

@@ -12,8 +12,10 @@ import sparserob_core as sr
 from sparserob_core.control.constraints.curved import CurvedConstraint
 from sparserob_core.control.constraints.flat import FlatConstraint
 from sparserob_core.control.constraints.state import StateConstraint
+from sparserob_core.control.transcription import record
 from sparserob_core.control.transcription.record import Transcription
 from sparserob_core.control.transcription.transcribe import from_state, prepare
+from sparserob_core.sip.evidence import Cut
 from tests.support.plants import uniform
 
 SPRING = sr.LinearSystem(A=[[0, 1], [-2, -0.5]], B=[[0], [1]])
@@ -132,3 +134,14 @@ def test_cuts_of_a_literal_program_are_literal() -> None:
     assert {cut.formulation for cut in result.indices} == {"literal"}
     assert result.worst is not None
     assert result.worst.time is not None
+
+
+def test_constraints_of_a_result_are_put_in_numbers_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whoever rounds a bound, derives it, seeks another and writes it down asks for the same ones."""
+    model, asked = model_of("flat"), []
+    family = model.program.families[0]
+    cuts = [Cut(family.name, np.array([time]), row, 1.0) for row, time in ((0, 1.0), (1, 1.5))]
+    monkeypatch.setattr(record, "in_numbers", lambda *given: asked.append(given) or object())
+    found = model.explained(cuts)
+    assert [one is other for one, other in zip(found, model.explained(cuts[::-1])[::-1], strict=True)] == [True, True]
+    assert len(asked) == 2

@@ -18,7 +18,7 @@ from sparserob_core.sip.method import Tools
 from sparserob_core.sip.result import Result
 
 if TYPE_CHECKING:
-    from sparserob_core.control.studies.causal import CausalBound, CausalSearch
+    from sparserob_core.control.studies.causal import CausalBound
 
 SECONDS = 20.0  # for a bound in ball arithmetic
 WORDS = "; nor does any other causal policy with this dictionary exist: {} signals of the disturbance prove it"
@@ -33,13 +33,13 @@ def with_causal(result: ControlResult, tools: Tools) -> ControlResult:
     model = result.model
     if model.feedback is None or result.status == "failed" or result.stopped or tools.deadline.passed:
         return result
-    from sparserob_core.control.studies.causal import CausalBound, CausalLimits
+    from sparserob_core.control.studies.causal import CausalBound, CausalLimits, CausalSearch
 
     charge = model.feedback.charge
     if not charge.causal_signals or not model.problem.cost.is_linear:
         return result
     try:
-        search = searched(model, result.decision, active(model, result))
+        search = CausalSearch(model, result.decision, active(model, result))
         limits = CausalLimits.of(charge, [result], model.program.n, lambda: tools.deadline.passed)
         cost = result.cost if result.status in ("certified", "verified") else np.inf
         for hides in (True, False):  # of an unstable plant, balls may be too wide to show what a noise hides
@@ -82,20 +82,9 @@ def active(model: Transcription, result: Result) -> list[tuple[str, float, Array
     for cut, explanation in zip(result.dual.cuts, model.explained(result.dual.cuts), strict=True):
         if explanation is not None:
             signal = explanation.disturbance
-            constraints.append(
-                (cut.family, explanation.time, None if signal is None else _subtract_rest(middle, np.asarray(signal)))
-            )
+            deviations = None if signal is None else _subtract_rest(middle, np.asarray(signal))
+            constraints.append((cut.family, explanation.time, deviations))
     return constraints
-
-
-def searched(
-    model: Transcription, decision: Array | None, rests: list[tuple[str, float, Array | None]]
-) -> CausalSearch:
-    """Return the search for a bound, which begins with a policy's ``decision`` and the constraints ``rests`` of its
-    bound."""
-    from sparserob_core.control.studies.causal import CausalSearch
-
-    return CausalSearch(model, decision, rests)
 
 
 def proven(
