@@ -13,6 +13,7 @@ from scipy.linalg import expm
 from scipy.optimize import linprog
 
 import sparserob_core as sr
+from sparserob_core.control.feedback.loop_bounds import LoopBounds
 from sparserob_core.experiment.check.check import check
 
 HALF, K = 0.5, 4  # the grid of the independent program, in which delays and switches fall, and pieces of length 1
@@ -187,7 +188,7 @@ def test_between_two_times_the_bounds_of_a_late_control_hold_what_is_reached(lat
         shares = np.arange(parts + 1) / parts
         lower = (points[:-1, None] + np.diff(points)[:, None] * shares[:-1]).ravel()
         upper = (points[:-1, None] + np.diff(points)[:, None] * shares[1:]).ravel()
-        bounds = loop.bounds(x, lower, upper, H)
+        bounds = LoopBounds(loop).over_cells(x, lower, upper, H)[0]
         inside = np.linspace(lower, upper, 23)[1:-1]
         reached = np.stack([loop.values(x, times, H) for times in inside]).max(axis=0)
         assert (reached <= bounds + 1e-12).all()

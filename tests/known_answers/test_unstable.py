@@ -97,10 +97,10 @@ def test_a_fixed_end_that_doubles_cannot_reach_is_not_claimed(tmp_path: Path) ->
 def test_a_certificate_that_excuses_what_the_plant_could_reach_is_refuted(
     make: Callable[[str], Amplified], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    rounded = ClosedLoop._bound_rounding_errors
+    rounded = ClosedLoop.bound_rounding_errors
     monkeypatch.setattr(ConstraintFamily, "allowed", lambda family, x: TOLERANCE)
     monkeypatch.setattr(
-        ClosedLoop, "_bound_rounding_errors", lambda loop, x: tuple(0.0 * part for part in rounded(loop, x))
+        ClosedLoop, "bound_rounding_errors", lambda loop, x: tuple(0.0 * part for part in rounded(loop, x))
     )
     problem = make("affine")
     outcome = solved(problem, tmp_path)

@@ -12,7 +12,9 @@ from sparserob_core.control.constraints.control import Places
 from sparserob_core.control.constraints.explanation import ConstraintSource, TimedExplanation, combination
 from sparserob_core.control.constraints.flat import FlatConstraint
 from sparserob_core.control.constraints.local_maxima import local_maxima
-from sparserob_core.control.feedback.closed_loop import ROUND_OFF, ClosedLoop, shared
+from sparserob_core.control.feedback.closed_loop import ROUND_OFF, ClosedLoop
+from sparserob_core.control.feedback.loop_bounds import LoopBounds
+from sparserob_core.control.feedback.loop_rows import LoopRows, shared
 from sparserob_core.control.problem.names import unit_of_row
 from sparserob_core.control.problem.units import Units
 from sparserob_core.control.reach.sizes import row_sizes
@@ -183,15 +185,15 @@ class FeedbackConstraint(ConstraintSource):
         flat, time = self.flat, index[:1]
         allowed = flat.h - flat.compute_reference_terms(time)[0]
         if flat.gains is None:
-            rows = self.loop.state_rows(float(time[0]), flat.H, allowed, *self._row_parts)
+            rows = LoopRows(self.loop).of_state(float(time[0]), flat.H, allowed, *self._row_parts)
             # what cannot deviate need not be answered
             return replace(rows, exact=True, d=rows.d * (self.loop.spread.radii > 0.0)) if self.exact else rows
         pieces, (part, factor) = flat.commanded(time)[0], self._row_parts
         if pieces[0] != pieces[-1]:  # the rows of a control that jumps are others before and after
             half = part.size // 2
             part = np.concatenate([part[:half], part[half:] + 1 + part.max()])
-        return self.loop.with_control(
-            self.loop.state_rows(float(time[0]), flat.H, allowed, part, factor), flat.gains, pieces
+        return LoopRows(self.loop).with_control(
+            LoopRows(self.loop).of_state(float(time[0]), flat.H, allowed, part, factor), flat.gains, pieces
         )
 
     def against(self, x: Array, index: Array, row: int) -> tuple[Array, float]:
@@ -296,7 +298,9 @@ class FeedbackConstraint(ConstraintSource):
                 np.concatenate([addition + control_terms[..., :1], control_terms[..., 1:]], axis=-1)
                 for addition in additions
             ]
-        bounds, chord_distances = self.loop.bounded(x, *ends, flat.H[:proven], (additions[0], additions[1]))
+        bounds, chord_distances = LoopBounds(self.loop).over_cells(
+            x, *ends, flat.H[:proven], (additions[0], additions[1])
+        )
         excess, cells = bounds - flat.h[:proven], np.arange(bounds.shape[0])
         worst = excess.argmax(axis=1)
         return Enclosure(excess[cells, worst], np.zeros_like(cells), chord_distances[cells, worst])
@@ -354,9 +358,9 @@ def rows_at(
         pairs = [(places.table.shape[0] - 1, -1.0), (0, 1.0)]
     following = across_seam and loop.anew
     (piece, share), *further_pairs = pairs
-    rows = loop.control_rows(piece, share * H, h - H @ places.offset[place], extra)
+    rows = LoopRows(loop).of_control(piece, share * H, h - H @ places.offset[place], extra)
     for piece, share in further_pairs:
-        rows = loop.with_control(rows, share * H, np.full(h.size, piece), following=following)
+        rows = LoopRows(loop).with_control(rows, share * H, np.full(h.size, piece), following=following)
     return rows
 
 

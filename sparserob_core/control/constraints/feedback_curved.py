@@ -28,6 +28,8 @@ from sparserob_core.control.constraints.feedback import (
 )
 from sparserob_core.control.constraints.local_maxima import climb, highest_at, ridden, turns
 from sparserob_core.control.feedback.closed_loop import ROUND_OFF, ClosedLoop
+from sparserob_core.control.feedback.loop_bounds import LoopBounds
+from sparserob_core.control.feedback.loop_rows import LoopRows
 from sparserob_core.control.problem.units import Units
 from sparserob_core.control.sets.directions import faces, neighbours, on_surface, sampled, unit
 from sparserob_core.sip.convex_set import Array, Box, ConvexSet
@@ -291,11 +293,11 @@ class FeedbackCurved(Turning):
 
     def between(self, x: Array, lower: Array, upper: Array, H: Array) -> tuple[Array, Array]:
         additions = tuple(H @ self.curved.compute_added_terms(x, times)[:, :, None] for times in (lower, upper))
-        return self.loop.bounded(x, lower, upper, H, (additions[0], additions[1]))
+        return LoopBounds(self.loop).over_cells(x, lower, upper, H, (additions[0], additions[1]))
 
     def rows(self, time: float, H: Array, h: Array) -> UncertainRows:
         shift = H @ self.curved.compute_added_terms(np.zeros(0), np.array([time]))[0]
-        return self.loop.state_rows(time, H, h - shift, np.zeros(1, dtype=int), np.ones(1))
+        return LoopRows(self.loop).of_state(time, H, h - shift, np.zeros(1, dtype=int), np.ones(1))
 
     def explained(self, index: Array) -> TimedExplanation:
         return self.curved.explain(index, 0)

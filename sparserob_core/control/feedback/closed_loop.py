@@ -20,12 +20,11 @@ from sparserob_core.control.feedback.observer import Observer, innovations_of
 from sparserob_core.control.reach.functional import WorstFunctionals
 from sparserob_core.control.reach.varying_motion import VaryingMotion
 from sparserob_core.sip.convex_set import Array, ConvexSet
-from sparserob_core.sip.finite import Spread, UncertainRows, table_of
+from sparserob_core.sip.finite import Spread
 
 if TYPE_CHECKING:
     from sparserob_core.control.response.response import PieceTransitions, TimeGrid
 
-TERMS = 8  # of the Taylor expansion that bounds a curvature
 ROUND_OFF = 2.0**-46  # of the numbers that are added up
 FLOWS_KEPT = 8  # lists of times to which transitions of a system in t are remembered: each round asks for the same
 
@@ -232,20 +231,10 @@ class ClosedLoop:
     def states(self, x: Array, times: Array) -> Array:
         """Return the nominal state and every response at ``times (k,)``: ``(k, d, 1 + Q)``."""
         (nodes, drives), pieces = self.path(x), self.grid.locate(times)
-        flow, input_flow = self._compute_flows(pieces, np.clip(times - self.grid.breakpoints[pieces], 0.0, None))
+        flow, input_flow = self.compute_flows(pieces, np.clip(times - self.grid.breakpoints[pieces], 0.0, None))
         return np.asarray(flow @ nodes[pieces] + input_flow @ drives[pieces])
 
-    def _enclose_states(self, x: Array, times: Array, pieces: np.ndarray) -> tuple[Array, Array]:
-        """Return the `states` at ``times (k,)`` on these pieces, and bounds ``(k, d)`` of their rounding errors under
-        any deviation."""
-        nodes, drives = self.path(x)
-        flow, input_flow = self._compute_flows(pieces, np.clip(times - self.grid.breakpoints[pieces], 0.0, None))
-        sizes, drive_sizes, errors = self._bound_rounding_errors(x)
-        magnitudes = np.abs(flow) @ sizes[pieces, :, None] + np.abs(input_flow) @ drive_sizes[pieces, :, None]
-        rounding_errors = ROUND_OFF * magnitudes + np.abs(flow) @ errors[pieces, :, None]
-        return np.asarray(flow @ nodes[pieces] + input_flow @ drives[pieces]), rounding_errors[:, :, 0]
-
-    def _bound_rounding_errors(self, x: Array) -> tuple[Array, Array, Array]:
+    def bound_rounding_errors(self, x: Array) -> tuple[Array, Array, Array]:
         """Return bounds under any deviation: of the sizes of the nodes ``(L + 1, d)`` and of what drives them
         ``(L, ..)``, and of the rounding error of every node.
 
@@ -258,7 +247,11 @@ class ClosedLoop:
             sizes, drive_sizes = np.abs(nodes) @ radii, np.abs(drives) @ radii
             errors = np.zeros_like(sizes)
             if self.motion is None:
-                Phi, Gamma, step_numbers = self.steps.Phi[0], self.steps.Gamma[0], self.functionals.response.which
+                Phi, Gamma, step_numbers = (
+                    self.steps.Phi[0],
+                    self.steps.Gamma[0],
+                    self.functionals.response.which,
+                )
                 transitions = np.empty((step_numbers.size, *Phi.shape[1:]))
                 step_errors = np.einsum("kij,kj->ki", np.abs(Phi)[step_numbers], sizes[:-1])
                 step_errors = ROUND_OFF * (
@@ -283,7 +276,7 @@ class ClosedLoop:
         along = rows @ self.path(x)[0]
         return np.asarray(np.maximum(self.height(along), self.height(-along)).max(axis=0))
 
-    def _compute_flows(self, pieces: np.ndarray, durations: Array) -> tuple[Array, Array]:
+    def compute_flows(self, pieces: np.ndarray, durations: Array) -> tuple[Array, Array]:
         """Return the matrices that propagate a state, and the terms that drive it, over the first ``durations (k,)`` of
         ``pieces (k,)`` of the grid."""
         if self.motion is None:
@@ -305,78 +298,6 @@ class ClosedLoop:
         """Return ``max_w H x(t)`` at ``times (k,)`` for ``H (r, d)``: ``(k, r)``."""
         return self.height(H @ self.states(x, times))
 
-    def bounds(self, x: Array, lower: Array, upper: Array, H: Array) -> Array:
-        """Return upper bounds ``(k, r)`` of ``max_w H x(t)`` over cells of time ``[lower, upper] (k,)``, each within
-        one piece of the grid."""
-        return self.bounded(x, lower, upper, H)[0]
-
-    def bounded(
-        self,
-        x: Array,
-        lower: Array,
-        upper: Array,
-        H: Array,
-        added_terms: tuple[Array, Array] | None = None,
-    ) -> tuple[Array, Array]:
-        """Return the `bounds` for ``H (r, d)`` or ``(k, r, d)``, and the part of each that is due to the length of the
-        cell. ``added_terms``: terms that are added at both ends, ``(k, r, 1 + Q)`` or ``(k, r, 1)`` each, and linear
-        between.
-
-        On a cell every functional is within ``(b - a)^2 / 8`` times its largest second derivative of its chord, and a
-        support function of a chord lies below the chord of the support functions.
-        """
-        pieces = self.grid.locate((lower + upper) / 2)
-        states, rounding_errors = self._enclose_states(x, np.concatenate([lower, upper]), np.tile(pieces, 2))
-        ends, rounding_errors = np.split(states, 2), np.maximum(*np.split(rounding_errors, 2))
-        along = [H @ end for end in ends]
-        radii = np.concatenate([[1.0], self.spread.radii])
-        chord_distances = self._bound_chord_errors(x, H, lower, upper - lower, pieces, ends[0])
-        sizes = np.abs(H) @ np.maximum(np.abs(ends[0]), np.abs(ends[1]))
-        for end, addition in zip(along, added_terms or (), strict=False):
-            end[..., : addition.shape[-1]] += addition
-            sizes[..., : addition.shape[-1]] += np.abs(addition)
-        heights, error_bounds = [self.height(functional) for functional in along], ROUND_OFF * (sizes @ radii)
-        error_bounds += (np.abs(H) @ rounding_errors[:, :, None])[:, :, 0]
-        if self.motion is not None:
-            error_bounds += (np.abs(H) @ self._bound_transition_errors(x, self.motion)[pieces][:, :, None])[:, :, 0]
-        bounds = np.maximum(*heights) + chord_distances + error_bounds
-        return np.where(np.isnan(bounds), np.inf, bounds), chord_distances
-
-    def _bound_chord_errors(
-        self, x: Array, H: Array, start: Array, width: Array, pieces: np.ndarray, states: Array
-    ) -> Array:
-        """Bound the distance of ``H x(t)`` from its chord on every cell ``[start, start + width]``, for any deviations:
-        ``(k, r)``. Each cell lies within one of the ``pieces (k,)`` of the grid and begins in
-        ``states (k, d, 1 + Q)``."""
-        drives, radii = self.path(x)[1][pieces], np.concatenate([[1.0], self.spread.radii])
-        if self.motion is not None:
-            return self.motion.bound_chord_errors(H, start, width, pieces, states, drives, radii)
-        modes = self.grid.modes[pieces]
-        A = self.steps.A[0, modes]  # (1, d, d) of one system, (k, d, d) of several
-        h, rates = width[:, None, None], A @ states + drives
-        row, factor = H @ A, np.ones_like(h)
-        second = np.zeros((start.size, H.shape[-2], radii.size))
-        for order in range(TERMS):
-            second += factor * np.abs(row @ rates)
-            row, factor = row @ A, factor * h / (order + 1)
-        growth = np.linalg.norm(self.steps.A[0], 2, axis=(1, 2))[modes, None, None] * h
-        with np.errstate(over="ignore", invalid="ignore"):
-            tail = (
-                factor
-                * np.exp(growth)
-                * np.linalg.norm(row, axis=-1)[..., None]
-                * np.linalg.norm(rates, axis=1, keepdims=True)
-            )
-        return np.asarray((h[..., 0] ** 2 / 8.0) * ((second + tail) @ radii))
-
-    def _bound_transition_errors(self, x: Array, motion: VaryingMotion) -> Array:
-        """Bound the error that inexact transitions of a system that changes with time cause in the state on every
-        piece, ``(L, d)``."""
-        nodes, inputs = self.path(x)
-        radii = np.concatenate([[1.0], self.spread.radii])
-        state_sizes, input_sizes = np.abs(nodes[:-1]) @ radii, motion.flow.sizes * (np.abs(inputs) @ radii)[:, None]
-        return motion.bound_state_errors(state_sizes, input_sizes)
-
     def worst(self, x: Array, time: float, direction: Array) -> Array:
         """Return a deviation ``(Q,)`` that attains the worst case of ``c'x(t)``."""
         along = direction @ self.states(x, np.array([time]))[0]
@@ -390,111 +311,9 @@ class ClosedLoop:
         """Return the initial state ``(d,)`` of a deviation ``(Q,)``."""
         return np.asarray(self.start + self.begins @ deviation)
 
-    def state_rows(self, time: float, H: Array, h: Array, part: np.ndarray, factor: Array) -> UncertainRows:
-        """Return the rows ``H x(t) <= h`` at one time as `UncertainRows`. The direction of row ``r`` is ``factor_r``
-        times that of the first row of its part, ``part_r``."""
-        count = H.shape[0]
-        firsts = [int(np.flatnonzero(part == p)[0]) for p in range(int(part.max()) + 1)]
-        free, weights, on_noise = self.functionals.response.weights(np.full(count, time), H, np.zeros((count, 0)))
-        on_control = self.functionals.on_decision(weights)  # (r, m K), channel-major
-        offset = free @ self.start + self.functionals.given(weights)
-        offset = offset + np.einsum("rli,li->r", on_noise, self.middles)
-        K = self.functionals.dictionary.pieces
-        position, variable, value = self.answers.effect
-        m, Q = self.answers.shape[1], self.spread.size
-        control_entry, entry = position // Q, position % Q
-        piece, channel = control_entry // m, control_entry % m
-        matrices = []
-        for first in firsts:
-            data = on_control[first].reshape(m, K)[channel, piece] * value
-            kept = data != 0.0
-            matrices.append(table_of(entry[kept], self.nominal_size + variable[kept], data[kept], (Q, self.variables)))
-        rows, columns = np.nonzero(on_control)
-        g = table_of(rows, columns, on_control[rows, columns], (count, self.variables))
-        d = np.einsum("pli,liq->pq", on_noise[firsts], self.entries) + free[firsts] @ self.begins
-        return UncertainRows(g, h - offset, part, factor, tuple(matrices), d)
-
-    def with_control(self, rows: UncertainRows, G: Array, pieces: np.ndarray, following: bool = False) -> UncertainRows:
-        """Return the rows with ``G u_k`` added on the left, ``G (r, m)``, for the piece ``k`` of each row,
-        ``pieces (r,)``.
-
-        Rows of one part have the same direction of the control, times their factors, and the same piece. ``following``
-        says that the control is the first one of the next period, which responds to the initial state of that period.
-        """
-        from scipy.sparse import csr_array
-
-        K, Q = self.functionals.dictionary.pieces, self.spread.size
-        row, channel = np.nonzero(G)
-        coordinates = (row, channel * K + pieces[row])
-        g = csr_array(rows.g + csr_array((G[row, channel], coordinates), shape=rows.g.shape))
-        matrices = []
-        for p, C in enumerate(rows.C):
-            first = int(np.flatnonzero(rows.part == p)[0])
-            position, variable, value = self.of_piece(int(pieces[first]))
-            entry = position % Q - following * self.begins.shape[0]
-            response = csr_array(
-                (G[first][position // Q] * value, (entry, self.nominal_size + variable)), shape=C.shape
-            )
-            matrices.append(csr_array(C + response))
-        return replace(rows, g=g, C=tuple(matrices))
-
-    def control_rows(self, piece: int, H: Array, h: Array, extra: Array | None = None) -> UncertainRows:
-        """Return the rows ``H u_k <= h`` on one piece for every deviation; ``extra (r, n)`` is added on the left."""
-        part, factor = shared(H, self.spread)
-        firsts = [int(np.flatnonzero(part == p)[0]) for p in range(int(part.max()) + 1)]
-        position, variable, value = self.of_piece(piece)
-        Q, K = self.spread.size, self.functionals.dictionary.pieces
-        channel, entry = position // Q, position % Q
-        matrices = []
-        for first in firsts:
-            data = H[first][channel] * value
-            kept = data != 0.0
-            matrices.append(table_of(entry[kept], self.nominal_size + variable[kept], data[kept], (Q, self.variables)))
-        rows, channels = np.nonzero(H)
-        columns, values = channels * K + piece, H[rows, channels]
-        if extra is not None:
-            extra_entries = np.nonzero(extra)
-            rows, columns = np.concatenate([rows, extra_entries[0]]), np.concatenate([columns, extra_entries[1]])
-            values = np.concatenate([values, extra[extra_entries]])
-        g = table_of(rows, columns, values, (H.shape[0], self.variables))
-        return UncertainRows(g, h, part, factor, tuple(matrices), np.zeros((len(firsts), Q)))
-
     def controls(self, x: Array) -> Array:
         """Return the nominal control and its answers to the deviations on every piece, ``(K, m, 1 + Q)``."""
         return np.concatenate([self.nominal(x).T[:, :, None], self.effects(x)], axis=2)
-
-    def of_piece(self, piece: int) -> tuple[np.ndarray, np.ndarray, Array]:
-        """Return the entries of `Answers.effect` that belong to one piece: positions in ``(m, Q)``, variables and
-        values."""
-        position, variable, value = self.answers.effect
-        first, last = self._piece_offsets[piece : piece + 2]
-        m, Q = self.answers.shape[1], self.spread.size
-        return position[first:last] - piece * m * Q, variable[first:last], value[first:last]
-
-    @cached_property
-    def _piece_offsets(self) -> np.ndarray:
-        """Positions ``(K + 1,)`` at which the entries of `Answers.effect` of every piece begin; the entries are sorted
-        by piece."""
-        K, m, Q, _ = self.answers.shape
-        return np.searchsorted(self.answers.effect[0] // max(1, m * Q), np.arange(K + 1))
-
-
-def shared(H: Array, spread: Spread) -> tuple[np.ndarray, Array]:
-    """Group the rows of ``H (r, d)`` into parts of parallel rows; opposite rows share a part where deviations are
-    symmetric. Return the part of every row, and its factor relative to the first row of the part."""
-    part, factor = np.zeros(H.shape[0], dtype=int), np.ones(H.shape[0])
-    firsts: list[int] = []
-    for row in range(H.shape[0]):
-        for p, first in enumerate(firsts):
-            column = int(np.abs(H[first]).argmax())
-            share = H[row, column] / H[first, column]
-            if np.array_equal(H[row], share * H[first]) and (share > 0.0 or spread.is_symmetric):
-                part[row], factor[row] = p, share
-                break
-        else:
-            part[row] = len(firsts)
-            firsts.append(row)
-    return part, factor
 
 
 def deviations_of(

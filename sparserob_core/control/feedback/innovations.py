@@ -131,6 +131,18 @@ class Answers:
         """Number of variables of the gains."""
         return int(self.piece.size)
 
+    def of_piece(self, piece: int) -> tuple[np.ndarray, np.ndarray, Array]:
+        """Return the entries of ``effect`` that belong to one piece: positions in ``(m, Q)``, variables and values."""
+        position, variable, value = self.effect
+        first, last = self._piece_offsets[piece : piece + 2]
+        return position[first:last] - piece * self.shape[1] * self.shape[2], variable[first:last], value[first:last]
+
+    @cached_property
+    def _piece_offsets(self) -> np.ndarray:
+        """Positions ``(K + 1,)`` at which the entries of ``effect`` of every piece begin; they are sorted by piece."""
+        K, m, Q, _ = self.shape
+        return np.searchsorted(self.effect[0] // max(1, m * Q), np.arange(K + 1))
+
     def effects(self, numbers: Array) -> Array:
         """Return the effects ``F (K, m, Q)`` of the variables ``numbers (n,)``."""
         K, m, Q, _ = self.shape

@@ -1,5 +1,6 @@
-"""Guards control/feedback/closed_loop: the state and its responses are those of the loop as it is defined, and their
-enclosures over cells of time are above every time in them, by no more than a curvature owes."""
+"""Guards control/feedback/closed_loop, loop_bounds and loop_rows: the state and its responses are those of the loop as
+it is defined, and their enclosures over cells of time are above every time in them, by no more than a curvature
+owes."""
 
 from __future__ import annotations
 
@@ -12,7 +13,8 @@ import pytest
 
 import sparserob_core as sr
 import sparserob_core.control.response.varying.expansion as expansion
-from sparserob_core.control.feedback.closed_loop import shared
+from sparserob_core.control.feedback.loop_bounds import LoopBounds
+from sparserob_core.control.feedback.loop_rows import LoopRows, shared
 from sparserob_core.control.response.varying.expansion import Expansion
 from sparserob_core.control.transcription.transcribe import prepare
 from tests.support.closed_loops import EXACT, LOOPS, STILL, Loop
@@ -74,8 +76,7 @@ def test_the_state_and_every_response_are_those_of_a_loop_that_measures(name):
 def test_bounds_over_cells_are_above_every_time_in_them(name):
     case, loop, x = made(name)
     lower, upper = cells(case)
-    bounds, _ = loop.bounded(x, lower, upper, H)
-    assert (bounds == loop.bounds(x, lower, upper, H)).all()
+    bounds, _ = LoopBounds(loop).over_cells(x, lower, upper, H)
     times = lower[:, None] + np.linspace(0.0, 1.0 - 1e-12, 41) * (upper - lower)[:, None]
     states = case.states(loop.nominal(x), loop.gains(x), times.ravel())[0]
     heights = case.height(H @ states).reshape(*times.shape, -1)
@@ -84,7 +85,7 @@ def test_bounds_over_cells_are_above_every_time_in_them(name):
     assert (bounds - heights.max(axis=1))[narrow].max() < 0.02
     # at a point nothing is added but rounding
     inside = (case.grid[:-1] + case.grid[1:]) / 2
-    points = loop.bounds(x, inside, inside, H)
+    points = LoopBounds(loop).over_cells(x, inside, inside, H)[0]
     states = case.states(loop.nominal(x), loop.gains(x), inside)[0]
     assert points == pytest.approx(case.height(H @ states), abs=1e-10)
     assert (points >= case.height(H @ states) - 1e-12).all()
@@ -96,7 +97,7 @@ def test_what_a_cell_adds_to_its_chord_is_an_eighth_of_its_square_times_the_curv
     cells, and no less on cells on which the expansion does not converge at once."""
     case, loop, x = made(name)
     lower, upper = cells(case, (1.0, 0.6, 0.1, 0.005))
-    _, late = loop.bounded(x, lower, upper, H)
+    _, late = LoopBounds(loop).over_cells(x, lower, upper, H)
     h = upper - lower
     times = lower[:, None] + np.linspace(0.0, 1.0 - 1e-12, 41) * h[:, None]
     rates = case.states(loop.nominal(x), loop.gains(x), times.ravel())[1]
@@ -123,7 +124,7 @@ def test_a_bound_is_reached_where_the_curvature_is_constant(name):
         fall = (states[-1, 0] - states[0, 0]) / (states[-1, 1] - states[0, 1])
         row = np.array([[1.0, -fall]])
         still = loop.scaled(1e-12) if loop.scales else loop
-        (bound,) = still.bounds(x, np.array([low]), np.array([high]), row)[0]
+        (bound,) = LoopBounds(still).over_cells(x, np.array([low]), np.array([high]), row)[0][0]
         assert states[0] @ row[0] == pytest.approx(states[-1] @ row[0])
         assert bound == pytest.approx((states @ row[0]).max(), abs=1e-6)
         assert bound >= (states @ row[0]).max() - 1e-13
@@ -136,7 +137,7 @@ def test_what_stands_beside_the_state_is_added_at_both_ends(name):
     rng, size = np.random.default_rng(4), 1 + loop.spread.size
     whole = rng.normal(size=(2, lower.size, len(H), size))
     for beside in (whole, whole[..., :1]):
-        bounds, late = loop.bounded(x, lower, upper, H, (beside[0], beside[1]))
+        bounds, late = LoopBounds(loop).over_cells(x, lower, upper, H, (beside[0], beside[1]))
         share = np.linspace(0.0, 1.0 - 1e-12, 21)
         times = lower[:, None] + share * (upper - lower)[:, None]
         along = H @ case.states(loop.nominal(x), loop.gains(x), times.ravel())[0]
@@ -147,7 +148,7 @@ def test_what_stands_beside_the_state_is_added_at_both_ends(name):
         assert (heights.max(axis=1) <= bounds + 1e-12).all()
         lost = 1e-9 if name in STILL else 1e-7  # what the expansion of a system in t leaves out
         assert (bounds <= np.maximum(heights[:, 0], heights[:, -1]) + late + lost).all()
-        assert (late == loop.bounded(x, lower, upper, H)[1]).all()
+        assert (late == LoopBounds(loop).over_cells(x, lower, upper, H)[1]).all()
 
 
 def test_a_loop_whose_deviations_are_larger_is_that_loop_with_larger_sets():
@@ -177,18 +178,18 @@ def test_uncertain_rows_are_violated_by_the_worst_case_of_the_state_and_of_the_c
         first = int(np.flatnonzero(part == p)[0])
         assert (rows[part == p] == factor[part == p][:, None] * rows[first]).all()
     for time in (0.0, 0.3, float(case.breakpoints[1]), 1.7, 2.0):
-        told = loop.state_rows(time, rows, h, part, factor).excess(x, loop.spread)
+        told = LoopRows(loop).of_state(time, rows, h, part, factor).excess(x, loop.spread)
         assert told == pytest.approx(loop.values(x, np.array([time]), rows)[0] - h, abs=1e-9)
     m = case.B.shape[1]
     G = rng.normal(size=(len(H), m))
     every = loop.controls(x)
     for k in range(case.breakpoints.size - 1):
-        u = loop.control_rows(k, G, h[: len(H)], None).excess(x, loop.spread)
+        u = LoopRows(loop).of_control(k, G, h[: len(H)], None).excess(x, loop.spread)
         assert u == pytest.approx(loop.height(G @ every[k]) - h[: len(H)], abs=1e-9)
         time = float(case.breakpoints[k : k + 2].mean())
         own = np.arange(len(H))
-        plain = loop.state_rows(time, H, h[: len(H)], own, np.ones(len(H)))
-        both = loop.with_control(plain, G, np.full(len(H), k)).excess(x, loop.spread)
+        plain = LoopRows(loop).of_state(time, H, h[: len(H)], own, np.ones(len(H)))
+        both = LoopRows(loop).with_control(plain, G, np.full(len(H), k)).excess(x, loop.spread)
         along = H @ loop.states(x, np.array([time]))[0] + G @ every[k]
         assert both == pytest.approx(loop.height(along) - h[: len(H)], abs=1e-9)
 
@@ -244,4 +245,4 @@ def test_what_transitions_in_time_leave_out_is_in_the_bounds(monkeypatch):
     states = case.states(sharp.nominal(x), sharp.gains(x), times)[0]
     truths = case.height(H @ states)
     assert np.abs(rough.values(x, times, H) - truths).max() > 1e-7, "nothing was left out"
-    assert (truths <= rough.bounds(x, times, times, H)).all()
+    assert (truths <= LoopBounds(rough).over_cells(x, times, times, H)[0]).all()
