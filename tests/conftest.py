@@ -48,8 +48,8 @@ def pytest_collection_finish() -> None:
 @pytest.hookimpl(tryfirst=True)  # before the tests of the other stage are left out
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Make every set of parameters after the first ``n`` of a test that is marked ``first(n)`` one of the second
-    stage; of the others those that take long, too, with which it begins."""
-    met, long = Counter[str](), read_names()
+    stage; of the others those that take long, too, with which it begins. It ends with the longest."""
+    met, long, longest = Counter[str](), read_names("long"), read_names("longest")
     for item in items:
         name, first = item.nodeid.partition("[")[0], item.get_closest_marker("first")
         if item.get_closest_marker("slow") is not None:
@@ -60,7 +60,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         elif name in long:
             item.add_marker(pytest.mark.long)
             item.add_marker(pytest.mark.slow)
-    items.sort(key=lambda item: item.get_closest_marker("long") is None)
+    items.sort(key=lambda item: (item.get_closest_marker("long") is None, item.nodeid.partition("[")[0] in longest))
 
 
 def pytest_runtest_setup(item: pytest.Item) -> None:

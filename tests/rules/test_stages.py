@@ -40,37 +40,45 @@ def test_the_first_sets_of_parameters_are_of_the_first_stage_and_the_others_of_t
     assert not any("slow" in one.marks for one in others)
 
 
-def test_what_takes_long_is_the_first_of_the_second_stage(conftest: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(conftest, "read_names", lambda: {"tests/test_some.py::test_long"})
+def test_the_second_stage_begins_with_what_takes_long_and_ends_with_the_longest(
+    conftest: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    names = {"long": {"tests/test_some.py::test_long"}, "longest": {"tests/test_some.py::test_large"}}
+    monkeypatch.setattr(conftest, "read_names", names.__getitem__)
     larger = Item("test_long[3]", pytest.mark.slow)
     items = [
         Item("test_quick"),
-        Item("test_large", pytest.mark.slow),
+        Item("test_large[7]", pytest.mark.slow),
+        Item("test_large[9]", pytest.mark.slow),
         larger,
         Item("test_long[1]"),
         Item("test_long[2]"),
     ]
     conftest.pytest_collection_modifyitems(items)
-    names = [item.nodeid.split("::")[1] for item in items]
-    assert names == ["test_long[1]", "test_long[2]", "test_quick", "test_large", "test_long[3]"]
-    assert ["slow" in item.marks for item in items] == [True, True, False, True, True]
-    assert ["long" in item.marks for item in items] == [True, True, False, False, False]
+    assert [item.nodeid.split("::")[1] for item in items] == [
+        "test_long[1]", "test_long[2]", "test_quick", "test_long[3]", "test_large[7]", "test_large[9]",
+    ]  # fmt: skip
+    assert ["slow" in item.marks for item in items] == [True, True, False, True, True, True]
+    assert ["long" in item.marks for item in items] == [True, True, False, False, False, False]
 
 
 def test_a_test_takes_long_where_its_sets_of_parameters_do_in_the_mean() -> None:
     seconds = {"call     tests/test_a.py::test_one[x]": 1.5, "call     tests/test_a.py::test_one[y]": 0.6,
                "setup    tests/test_a.py::test_two": 9.0, "call     tests/test_a.py::test_two": 0.9}  # fmt: skip
-    table = [f"{factor * stages.LIMIT:.3f}s {name}" for name, factor in seconds.items()]
-    assert stages.choose([*table, "3 passed in 2.00s"]) == ["tests/test_a.py::test_one"]
+    for kind, limit in stages.LIMITS.items():
+        table = [f"{factor * limit:.3f}s {name}" for name, factor in seconds.items()]
+        assert stages.choose(kind, [*table, "3 passed in 2.00s"]) == ["tests/test_a.py::test_one"]
 
 
-def test_every_test_that_takes_long_is_there() -> None:
+@pytest.mark.parametrize("kind", stages.LIMITS)
+def test_every_test_that_takes_long_is_there(kind: str) -> None:
     """A test of another name would be one of the first stage again. Of a class the name of the class is looked for."""
+    names = stages.read_names(kind)
     defined = {
         f"{file.relative_to(ROOT).as_posix()}::{node.name}"
-        for file in {ROOT / name.partition("::")[0] for name in stages.read_names()}
+        for file in {ROOT / name.partition("::")[0] for name in names}
         if file.is_file()
         for node in ast.walk(ast.parse(file.read_text(encoding="utf-8")))
         if isinstance(node, ast.FunctionDef | ast.ClassDef)
     }
-    assert [name for name in stages.read_names() if "::".join(name.split("::")[:2]) not in defined] == []
+    assert [name for name in names if "::".join(name.split("::")[:2]) not in defined] == []
