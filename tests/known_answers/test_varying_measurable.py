@@ -484,5 +484,5 @@ def test_two_classes_are_refused_by_name_where_a_control_answers(tmp_path: Path)
     config: Problem = {"dictionaries": {"control": pieces(4)}, "observers": [], "policy": {"name": "affine"}}
     config["problem"] = {key: value for key, value in CART.items() if key != "disturbance_class"}
     of_two_classes(config)
-    with pytest.raises(sr.InputError, match="disturbance of the class piecewise_constant, not measurable and piecewise_constant"):
+    with pytest.raises(sr.InputError, match="class piecewise_constant, not measurable and piecewise_constant"):
         sr.run(config, out=tmp_path / "run", figures=False)
