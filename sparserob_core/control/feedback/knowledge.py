@@ -303,8 +303,8 @@ class OfOutputs(Knowledge):
         Returns
         -------
         OfOutputs or None
-            ``None`` where there is no noise, or where one of the sets, other than
-            the box of a disturbance or of initial states, has no half-spaces about its middle.
+            ``None`` where there is no noise, or where one of the sets, other than the box of a disturbance or of
+            initial states, has no half-spaces about its middle.
         """
         observer, sets, initial_count = loop.observer, loop.spread.sets, int(loop.begins.sum())
         if observer is None or not observer.noisy:

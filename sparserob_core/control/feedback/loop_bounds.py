@@ -50,9 +50,8 @@ class LoopBounds:
         heights, error_bounds = [self.loop.height(functional) for functional in along], ROUND_OFF * (sizes @ radii)
         error_bounds += (np.abs(H) @ rounding_errors[:, :, None])[:, :, 0]
         if self.loop.motion is not None:
-            error_bounds += (np.abs(H) @ self._bound_transition_errors(x, self.loop.motion)[pieces][:, :, None])[
-                :, :, 0
-            ]
+            transition_errors = self._bound_transition_errors(x, self.loop.motion)[pieces]
+            error_bounds += (np.abs(H) @ transition_errors[:, :, None])[:, :, 0]
         bounds = np.maximum(*heights) + chord_distances + error_bounds
         return np.where(np.isnan(bounds), np.inf, bounds), chord_distances
 

@@ -25,8 +25,7 @@ class LoopRows:
     def of_state(self, time: float, H: Array, h: Array, part: np.ndarray, factor: Array) -> UncertainRows:
         """Return the rows ``H x(t) <= h`` at one time as `UncertainRows`. The direction of row ``r`` is ``factor_r``
         times that of the first row of its part, ``part_r``."""
-        count = H.shape[0]
-        firsts = [int(np.flatnonzero(part == p)[0]) for p in range(int(part.max()) + 1)]
+        count, firsts = H.shape[0], _find_firsts(part)
         free, weights, on_noise = self.loop.functionals.response.weights(np.full(count, time), H, np.zeros((count, 0)))
         on_control = self.loop.functionals.on_decision(weights)  # (r, m K), channel-major
         offset = free @ self.loop.start + self.loop.functionals.given(weights)
@@ -57,8 +56,7 @@ class LoopRows:
         coordinates = (row, channel * K + pieces[row])
         g = csr_array(rows.g + csr_array((G[row, channel], coordinates), shape=rows.g.shape))
         matrices = []
-        for p, C in enumerate(rows.C):
-            first = int(np.flatnonzero(rows.part == p)[0])
+        for first, C in zip(_find_firsts(rows.part), rows.C, strict=True):
             position, variable, value = self.loop.answers.of_piece(int(pieces[first]))
             entry = position % Q - following * self.loop.begins.shape[0]
             response = csr_array(
@@ -70,7 +68,7 @@ class LoopRows:
     def of_control(self, piece: int, H: Array, h: Array, extra: Array | None = None) -> UncertainRows:
         """Return the rows ``H u_k <= h`` on one piece for every deviation; ``extra (r, n)`` is added on the left."""
         part, factor = shared(H, self.loop.spread)
-        firsts = [int(np.flatnonzero(part == p)[0]) for p in range(int(part.max()) + 1)]
+        firsts = _find_firsts(part)
         position, variable, value = self.loop.answers.of_piece(piece)
         Q, K = self.loop.spread.size, self.loop.functionals.dictionary.pieces
         channel, entry = position // Q, position % Q
@@ -89,6 +87,11 @@ class LoopRows:
         gains."""
         kept, shape = values != 0.0, (self.loop.spread.size, self.loop.variables)
         return table_of(entry[kept], self.loop.nominal_size + variable[kept], values[kept], shape)
+
+
+def _find_firsts(part: np.ndarray) -> list[int]:
+    """Return the first row of every part, of rows that belong to the parts ``part (r,)``."""
+    return [int(np.flatnonzero(part == number)[0]) for number in range(int(part.max()) + 1)]
 
 
 def shared(H: Array, spread: Spread) -> tuple[np.ndarray, Array]:

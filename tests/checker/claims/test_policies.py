@@ -234,6 +234,8 @@ def test_a_row_is_what_the_policy_makes_of_it_at_its_deviations(name: str) -> No
         entry = {"constraint": "path", "time": 1.0, "direction": [*DIRECTIONS[0], *BESIDE[0]], "piece": 1, **named}
         with pytest.raises(Broken):
             bounds.rows_of(case, {"multiplier": 1.0, **entry, **wrong})
+    with pytest.raises(Broken, match="expected"):
+        bounds.rows_of(case, "nothing")
 
 
 @pytest.mark.parametrize("name", ["box", "outputs"])
