@@ -22,7 +22,7 @@ class LandscapeOptions(sr.Options):
 
     share: float = Field(default=0.15, gt=0.0, le=1.0)
     """Share of the processor time of one core that it may take during the run, beside a first, coarse drawing for each
-    weight epsilon; finer grids take a third of it, a coarse one after a gain all."""
+    weight epsilon; finer grids take two thirds of it, a coarse one after a gain all."""
 
     patience: float = Field(default=2.0, ge=0.0, le=600.0)
     """Seconds that a run waits at its end for the landscape of its last tuple."""

@@ -83,11 +83,6 @@ def moments(chunks: list[Any]) -> np.ndarray:
     return np.array([int.from_bytes(row[:8], "big") for row in numbers]) / 1e9
 
 
-@pytest.mark.xfail(
-    strict=False,
-    reason="known, and open: the first finer map of the literal form takes 3 to 6 s, and is not given up for a map of a"
-    " better tuple; on an idle machine what is seen is then 5 to 7 s old, and 3 are promised",
-)
 @pytest.mark.slow
 @pytest.mark.parametrize("busy", [0, 4])
 def test_what_is_seen_of_a_search_is_of_this_moment(
@@ -151,21 +146,22 @@ def test_what_is_seen_of_a_search_is_of_this_moment(
 @pytest.mark.slow
 @pytest.mark.parametrize("busy", [0, 4])
 def test_a_short_exchange_is_hardly_longer_with_the_view(busy: int, tmp_path: Path) -> None:
-    clock = Clock()
+    clock, walls = Clock(), list[float]()
     with loops(busy):
-        began = time.perf_counter()
-        outcome = sr.run(
-            CONFIGS / "experiment1_repaired.yaml",
-            {"observers": [{"name": "rerun"}]},
-            tmp_path / "run",
-            quiet=True,
-            figures=False,
-            observers=[clock],
-        )
-        wall = time.perf_counter() - began
-    ending = clock.heard[-1][1]
-    assert isinstance(ending, sr.RunFinished)
-    assert wall - ending.seconds < ENDING * max(BUSY if busy or BESIDE else 1.0, clock.slowness)
-    found = read(tmp_path / "run" / "recording.rrd")
+        for observers in ([], [{"name": "rerun"}]):  # the first one imports what both need, and counts for neither
+            began = time.perf_counter()
+            outcome = sr.run(
+                CONFIGS / "experiment1_repaired.yaml",
+                {"observers": observers},
+                tmp_path / f"run{len(observers)}",
+                quiet=True,
+                figures=False,
+                observers=[clock],
+            )
+            ending = clock.heard[-1][1]
+            assert isinstance(ending, sr.RunFinished)
+            walls.append(time.perf_counter() - began - ending.seconds)
+    assert walls[1] < ENDING * max(BUSY if busy or BESIDE else 1.0, clock.slowness)
+    found = read(tmp_path / "run1" / "recording.rrd")
     assert {"/physics/plots/curve", "/landscape/map/g", "/verdict"} <= set(found)
     assert outcome.status == "certified"

@@ -502,8 +502,11 @@ def test_what_is_drawn_last_is_never_coarser_than_what_was_drawn_before_where_it
         assert len(found) == count + more
 
 
-def test_where_nothing_is_seen_on_a_coarse_grid_a_finer_one_comes_before_that_of_a_better_tuple() -> None:
+def test_where_nothing_is_seen_on_a_coarse_grid_a_finer_one_comes_before_that_of_a_better_tuple(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     from sparserob_rerun.options import LandscapeOptions
+    from sparserob_rerun.search import explorer as search
     from sparserob_rerun.search.explorer import Aim, Explorer
 
     spent: list[int] = []
@@ -528,6 +531,30 @@ def test_where_nothing_is_seen_on_a_coarse_grid_a_finer_one_comes_before_that_of
         return drawn
 
     assert levels(lambda slots: 3.0) == [(8, 1.0), (4, 1.0), (2, 1.0), (8, 2.0)]
+    with monkeypatch.context() as patch:  # unless what is seen is old by then
+        patch.setattr(search, "STALE", 0.0)
+        assert levels(lambda slots: 3.0)[:2] == [(8, 1.0), (8, 2.0)]
     assert levels(lambda slots: 3.0 + slots[0, 0])[1] == (8, 2.0)
     spent.clear()  # of a policy, each value of which is a robust program, a few come first
     assert levels(lambda slots: 3.0 + slots[0, 0], interchangeable=False)[0] == (16, 1.0) and spent[0] <= 16
+
+
+def test_the_first_map_of_a_weight_is_beside_the_share() -> None:
+    from sparserob_rerun.options import LandscapeOptions
+    from sparserob_rerun.search.explorer import Aim, Explorer
+
+    g = plain(lambda slots: 3.0 + slots[0, 0], ("time",))
+    view: Any = SimpleNamespace(relaxed_value=lambda count, epsilon: g)
+    drawn: list[float] = []
+    explorer = Explorer(lambda shown, aim: drawn.append(aim.epsilon), view, LandscapeOptions())
+    explorer.aim(Aim(np.array([[0.2], [0.7]]), 0.1, 1.0, ""))
+    explorer.used = 100.0
+    while not drawn:
+        explorer.step()
+    assert explorer.used < 1.0
+    explorer.used = 100.0
+    assert explorer.rest > 100.0  # finer ones are not
+    explorer.aim(Aim(np.array([[0.3], [0.8]]), 0.01, 1.0, ""))
+    while drawn[-1] != 0.01:
+        explorer.step()
+    assert explorer.used < 1.0

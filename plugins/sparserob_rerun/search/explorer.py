@@ -26,13 +26,14 @@ STALE = 1.0
 ago; with a tenth a landscape that a slow climb renews is never refined."""
 BETWEEN = 2
 """The stride to which a landscape is refined on which g is the same everywhere, before another one is begun of the same
-weight. On four times as coarse a grid what matters lies between two lines; on the finest, flat ones are seconds old."""
+weight, unless it is `STALE` by then. On four times as coarse a grid what matters lies between two lines; on the finest,
+flat ones are a second old."""
 HELD = 0.8
 """Seconds for which a new landscape may wait until it is as fine as the one that is shown, which is of the same weight
 and nearly as high. Ten times as many, and what is drawn is too old; a tenth, and fine drawings flicker."""
-REFINING = 1 / 3
+REFINING = 2 / 3
 """Part of the share of a core that finer grids may take; the rest is kept for the coarse one after the next gain. With
-a tenth of it no map of a short search is ever fine; with all of it, what is drawn after a gain is seconds old."""
+a third of it no map of a literal search is ever fine; with all of it, what is drawn after a gain is seconds old."""
 VISIBLE = 1e-6  # of g: what two solvers make of one value differs by less, and what is seen by more
 RESERVE = 0.25  # of the evaluations, for which landscapes stay coarse
 
@@ -175,6 +176,8 @@ class Explorer:
     def _draw(self) -> None:
         assert self.landscape is not None and self.aimed is not None
         self.wrong = ""
+        if self.drawn is None or self.drawn[0].epsilon != self.aimed.epsilon:  # the first is beside the share
+            self.began, self.used = time.monotonic(), 0.0
         self.fresh, self.drawn = False, (self.aimed, self.landscape)
         self.draw(self.landscape, self.aimed)
 
@@ -208,10 +211,10 @@ class Explorer:
             return self.aimed is None or self._finished
         if not self._coarse:
             return False
-        if self.landscape.flat and self.landscape.level > BETWEEN:
-            return False
         gain = _gain(waiting, self.aimed, self.landscape)
-        return not gain <= LARGE or (gain > SAME and time.monotonic() - self.since > STALE)
+        if gain > SAME and time.monotonic() - self.since > STALE:
+            return True
+        return not (gain <= LARGE or (self.landscape.flat and self.landscape.level > BETWEEN))
 
     def _worked(self, aim: Aim) -> Iterator[bool]:
         """Find the indices that decide, then fill the landscape; ``True`` where a level is complete."""

@@ -28,6 +28,9 @@ if TYPE_CHECKING:
     from sparserob_core.sip.program import ConstraintFamily, SemiInfiniteProgram
     from sparserob_core.sip.result import Result
 
+KEPT = 2**22
+"""Numbers of rows that are kept for a map, 32 MiB. With a tenth the rows of its lines are built again and again where
+the horizon has a thousand pieces; with ten times as many, watching takes the memory of another run."""
 CoordinateKind: TypeAlias = Literal["time", "parameter", "disturbance", "direction", "index"]
 LETTERS: Mapping[str, str] = {
     "time": "t",
@@ -267,6 +270,7 @@ class Inspection:
             program = replace(
                 program, families=[_substitute_worst(family, is_disturbance) for family in program.families]
             )
+        program = replace(program, families=[_remember_rows(family) for family in program.families])
         value = TupleValue(program, RelaxedProgram(program, quickest(tools.solver), tools.regulariser), count)
         value.epsilon = epsilon if tools.regulariser is not None and np.isfinite(epsilon) else 0.0
         width, cost = value.layout.slot.dimension, 1.0 if own is None else own.cost
@@ -386,6 +390,24 @@ def _substitute_worst(family: ConstraintFamily, coefficients: np.ndarray) -> Con
         if not at_worst.all():
             G[~at_worst], h[~at_worst] = literal(indices[~at_worst])
         return G, h
+
+    return replace(family, rows=rows)
+
+
+def _remember_rows(family: ConstraintFamily) -> ConstraintFamily:
+    """Return a family that keeps up to `KEPT` numbers of its rows: the indices of a map lie on a few lines."""
+    build, known = family.rows, dict[bytes, tuple[Array, Array]]()
+
+    def rows(indices: Array) -> tuple[Array, Array]:
+        keys = [index.tobytes() for index in indices]
+        size = next(iter(known.values()))[0].size if known else 0
+        if (len(known) + len(keys)) * size > KEPT:
+            known.clear()
+        fresh = [k for k, key in enumerate(keys) if key not in known]
+        if fresh:
+            known.update(zip([keys[k] for k in fresh], zip(*build(indices[fresh]), strict=True), strict=True))
+        G, h = zip(*(known[key] for key in keys), strict=True)
+        return np.array(G), np.array(h)
 
     return replace(family, rows=rows)
 

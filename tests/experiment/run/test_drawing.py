@@ -12,7 +12,7 @@ import pytest
 
 import sparserob_core as sr
 from sparserob_core.experiment.directory.finished import stored_run
-from sparserob_core.experiment.run import drawing
+from sparserob_core.experiment.run import drawing, inspection
 from sparserob_core.experiment.run.drawing import draw_run, drawings, drawn, landscape_of
 
 pytest.importorskip("matplotlib")
@@ -152,3 +152,25 @@ def test_a_search_that_met_no_finite_value_has_no_climb(searched: sr.Outcome, tm
     lost = replace(trace, value=np.full_like(trace.value, np.inf))
     result = replace(searched.result, trace=lost, decision=None, status="undecided")
     assert list(drawings(searched.experiment, result, tmp_path, {})) == []
+
+
+def test_the_rows_of_an_index_are_built_once_while_there_is_room(monkeypatch: pytest.MonkeyPatch) -> None:
+    built: list[float] = []
+
+    def rows(indices: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        built.extend(indices[:, 0].tolist())
+        return np.stack([indices, 2.0 * indices, 3.0 * indices], axis=2), indices**2
+
+    family = sr.ConstraintFamily(name="f", index_set=sr.Box([0.0], [1.0]), rows=rows)
+    kept = inspection._remember_rows(family)
+    for indices in ([[0.5], [0.25]], [[0.25], [0.75], [0.75]], [[0.5], [0.75], [0.25]]):
+        for got, wanted in zip(kept.rows(np.array(indices)), rows(np.array(indices)), strict=True):
+            assert np.array_equal(got, wanted)
+        del built[-len(indices) :]
+    assert set(built) == {0.5, 0.25, 0.75} and built.count(0.5) == built.count(0.25) == 1
+    monkeypatch.setattr(inspection, "KEPT", 6)  # two rows of three numbers
+    kept = inspection._remember_rows(family)
+    built.clear()
+    for index in (0.1, 0.2, 0.3, 0.1):
+        kept.rows(np.array([[index]]))
+    assert built == [0.1, 0.2, 0.3, 0.1]
