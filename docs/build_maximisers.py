@@ -54,7 +54,6 @@ NAMES = (
     "random_search",
 )
 SLOW = {"maxlipo", "nevergrad"}  # which have two seeds where others have five
-YARDSTICKS = ("sobol", "random_search")
 CASES: dict[str, tuple[tuple[int, Formulation, int], ...]] = {
     "g1": ((1, "reduced", 50), (1, "literal", 50), (1, "reduced", 250), (1, "literal", 250)),
     "g23": ((2, "reduced", 50), (3, "reduced", 50), (3, "literal", 50)),

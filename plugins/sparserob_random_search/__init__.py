@@ -1,5 +1,5 @@
-"""Searches that do not look at the values: independent uniform points, and Sobol's sequence. The measure of every other
-maximiser."""
+"""Searches that do not look at the values: independent uniform points, the measure of every other maximiser, and
+Sobol's sequence, whose best points a polish improves."""
 
 from __future__ import annotations
 
@@ -44,11 +44,6 @@ class Sobol(sr.Maximiser, sr.Options):
     scramble: bool = True
     """Randomise the sequence by the generator; without, it is the same in every run and begins in the lowest corner of
     the box."""
-
-    @property
-    def polished(self) -> float:
-        """Share of the budget for a local method: none, as this search is a yardstick."""
-        return 0.0
 
     def search(self, objective: sr.Objective, rng: np.random.Generator) -> float:
         """Search until the budget is spent and return ``inf``, as no upper bound is proven; see

@@ -70,7 +70,7 @@ def maximise(
         The seed of random numbers.
     polish : float, optional
         The last share of the budget. A local method spends it, from the best points. Unless given it is the maximiser's
-        own share (`Maximiser.polished`): a fifth, and nothing for ``lipo``, ``random_search`` and ``sobol``.
+        own share (`Maximiser.polished`): a fifth, and nothing for ``lipo`` and ``random_search``.
     gradient : callable, optional
         The gradient ``(d,)`` of ``f`` at a point ``(d,)``, for maximisers and a polish that use it.
     notify : callable, optional

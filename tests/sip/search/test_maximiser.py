@@ -253,7 +253,7 @@ def test_a_fifth_of_the_budget_polishes_unless_told_otherwise(name):
 
 def test_a_yardstick_and_a_proof_are_not_polished_unless_asked():
     box = sr.Box([0.0], [1.0])
-    for name, options in (("random_search", {}), ("sobol", {}), ("lipo", {"constant": 1.0})):
+    for name, options in (("random_search", {}), ("lipo", {"constant": 1.0})):
         report = sr.maximise(lambda p: p[:, 0], box, name, budget=30, **options)
         assert "polished" not in report.stopped
         assert "polished" in sr.maximise(lambda p: p[:, 0], box, name, budget=30, polish=0.5, **options).stopped
