@@ -5,27 +5,20 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from fractions import Fraction
 from functools import reduce
-from typing import TYPE_CHECKING
 
 import numpy as np
+from flint import arb, fmpq, fmpq_mat
 
 from sparserob_core.sip.convex_set import Array
-
-if TYPE_CHECKING:
-    from flint import arb, fmpq
 
 
 def ball(value: float) -> arb:
     """Return an exact number as a ball."""
-    from flint import arb
-
     return arb(float(value))
 
 
 def balls(vector: Sequence[float] | Array) -> list[arb]:
     """Return exact numbers as balls."""
-    from flint import arb
-
     return [arb(float(v)) for v in vector]
 
 
@@ -41,8 +34,6 @@ def smallest(values: Iterable[arb]) -> arb:
 
 def rational(value: Fraction) -> arb:
     """Return a ball that contains a fraction."""
-    from flint import arb, fmpq
-
     return arb(fmpq(value.numerator, value.denominator))
 
 
@@ -66,8 +57,6 @@ def difference(a: float, b: float) -> tuple[float, float]:
 
 def spanning(rows: Sequence[Sequence[fmpq]]) -> list[list[fmpq]]:
     """Return independent rows with the same span as the given rows."""
-    from flint import fmpq_mat
-
     if not rows:
         return []
     reduced, rank = fmpq_mat(rows).rref()

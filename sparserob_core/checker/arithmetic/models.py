@@ -5,16 +5,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, TypeAlias, final
+from typing import Any, TypeAlias, final
 
 import numpy as np
+from flint import arb, arb_poly, arb_series, ctx
 
 from sparserob_core.checker.arithmetic.balls import ball
 from sparserob_core.checker.arithmetic.monomials import Monomials
 from sparserob_core.checker.outcome import Unchecked
-
-if TYPE_CHECKING:
-    from flint import arb, arb_poly, arb_series
 
 LARGEST_POWER = 64  # the largest integer exponent for which a power is multiplied out
 ENOUGH = 2.0**-110  # the relative remainder of a function's series: a smaller one takes terms without a visible effect
@@ -45,16 +43,12 @@ class Frame:
 
     def parameter(self, place: int, middle: arb, half: arb) -> Model:
         """Return the model of ``middle + half s_place``, with the parameter ``s_place`` in ``[-1, 1]``."""
-        from flint import arb_poly
-
         model = self.number(middle)
         if not half.is_zero():
             model.parts[self.monomials.linear(place)] = arb_poly([half])
         return model
 
     def _build_model(self, coefficients: list[arb]) -> Model:
-        from flint import arb_poly
-
         return Model(self, [arb_poly(coefficients), *[None] * (self.monomials.size - 1)])
 
 
@@ -119,8 +113,6 @@ class Model:
 
     def _truncate(self, beyond: arb) -> Model:
         """Return the model up to its order in the time, with a remainder of at most ``beyond`` added."""
-        from flint import arb, arb_poly
-
         coefficients = list(self.parts)
         for k, coefficient in enumerate(coefficients):
             if coefficient is not None and coefficient.length() > self.frame.order + 1:
@@ -155,8 +147,6 @@ class Model:
     def _apply_function(self, function: Callable[[arb_series], Any]) -> Model:
         """Return a function of the model: its Taylor polynomial at an exact number in the middle, with Lagrange's
         remainder."""
-        from flint import arb, arb_series, ctx
-
         c = arb(self.constant.mid())
         deviation = self - self.frame.number(c)
         radius, count = deviation.size.upper(), self.frame.order + self.frame.monomials.degree + 1
@@ -230,8 +220,6 @@ def _bound_truncated_terms(monomials: Monomials, left: Sequence[Part], right: Se
 def _expand_tangent(argument: arb_series, value: arb, slope: arb, sign: int) -> arb_series:
     """Return the tangent of ``c + s``, or with the ``sign`` -1 the hyperbolic one, from value and slope at ``c``. With
     ``g' = h`` and ``h = 1 + sign g g`` it is ``h' = 2 sign g h``: for wide balls that is sharper than quotients."""
-    from flint import arb_series
-
     g, h = [value], [slope]
     for n in range(argument.prec - 1):
         h.append(2 * sign * sum((g[k] * h[n - k] for k in range(n + 1)), value * 0) / (n + 1))
@@ -242,8 +230,6 @@ def _expand_tangent(argument: arb_series, value: arb, slope: arb, sign: int) -> 
 def kepler_series(anomaly: arb_series, eccentricity: float, length: int) -> arb_series:
     """Return the first ``length`` terms of the ``E`` with ``E - e sin E`` equal to a series ``M``, by ``E' = M' + e E'
     cos E``."""
-    from flint import arb, arb_series
-
     e, M = arb(eccentricity), anomaly[0]
     E = [kepler_root(arb(M.lower()), e).union(kepler_root(arb(M.upper()), e))]  # E increases with M
     s, c = [E[0].sin()], [E[0].cos()]
@@ -273,8 +259,6 @@ def matrix_at(entry: Any, p: np.ndarray) -> np.ndarray:
 def kepler_root(anomaly: arb, e: arb) -> arb:
     """Return a ball that contains the ``E`` with ``E - e sin E = M`` for a number ``M``: at its ends the residual
     changes its sign. Newton's method finds the middle."""
-    from flint import arb, ctx
-
     E = anomaly
     low, high = anomaly - e, anomaly + e
     for _ in range(NEWTON):

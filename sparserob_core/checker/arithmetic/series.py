@@ -4,17 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import cached_property
-from typing import TYPE_CHECKING, final
+from typing import final
 
 import numpy as np
+from flint import arb, arb_mat
 
 from sparserob_core.checker.arithmetic.balls import balls
 from sparserob_core.checker.arithmetic.monomials import NONE, Monomials
 from sparserob_core.checker.outcome import Unchecked
 from sparserob_core.sip.convex_set import Array
-
-if TYPE_CHECKING:
-    from flint import arb, arb_mat
 
 OUTWARD = 1.0 + 1e-12  # factor on sums of a few hundred numbers, above their rounding error
 TINY = 1e-300  # bound of a positive number that is too small to be a float
@@ -110,8 +108,6 @@ class Series:
     @cached_property
     def _lifted(self) -> arb_mat:
         """The matrix whose product with the `_column` of another series is the column of the product."""
-        from flint import arb_mat
-
         (rows, columns), size = self.shape, self.monomials.size
         table: list[list[arb | int]] = [[0] * (size * columns) for _ in range(size * rows)]
         for part, pairs, is_nonzero in zip(self.parts, self.monomials.products_with, self.there, strict=True):
@@ -124,8 +120,6 @@ class Series:
     @cached_property
     def _column(self) -> arb_mat:
         """The coefficients, one above the other."""
-        from flint import arb_mat
-
         (rows, columns), size = self.shape, self.monomials.size
         return arb_mat(rows * size, columns, [x for part in self.parts for x in part.entries()])
 
@@ -145,15 +139,11 @@ class Series:
 
     def columns(self, first: int, last: int | None) -> Series:
         """Return the columns from ``first`` up to, but without, ``last``."""
-        from flint import arb_mat
-
         n, tables = self.shape[0], [[row[first:last] for row in coefficient.tolist()] for coefficient in self.parts]
         return Series(self.monomials, [arb_mat(n, len(rows[0]), [x for row in rows for x in row]) for rows in tables])
 
     def append_columns(self, other: Series) -> Series:
         """Return the series with the columns of another one at its right."""
-        from flint import arb_mat
-
         (n, p), q = self.shape, other.shape[1]
         pairs = [(a.tolist(), b.tolist()) for a, b in zip(self.parts, other.parts, strict=True)]
         tables = [
@@ -191,8 +181,6 @@ def sizes_of(series: Sequence[Series]) -> Array:
 
 def dot(left: Sequence[Series], right: Sequence[Series]) -> Series:
     """Return the sum of the products of some series with others."""
-    from flint import arb_mat
-
     pairs = [(a, b) for a, b in zip(left, right, strict=True) if any(a.there)] or [(left[0], right[0])]
     if left[0].monomials.size == 1:  # plain products are ten times as quick
         total = pairs[0][0].parts[0] * pairs[0][1].parts[0]
@@ -216,22 +204,16 @@ def dot(left: Sequence[Series], right: Sequence[Series]) -> Series:
 
 def identity(count: int) -> arb_mat:
     """Return the identity matrix."""
-    from flint import arb_mat
-
     return arb_mat(count, count, [int(i == j) for i in range(count) for j in range(count)])
 
 
 def zeros(rows: int, columns: int) -> arb_mat:
     """Return a matrix of zeros."""
-    from flint import arb_mat
-
     return arb_mat(rows, columns)
 
 
 def stacked(table: Sequence[Sequence[arb]]) -> arb_mat:
     """Return a ball matrix from its rows."""
-    from flint import arb_mat
-
     return arb_mat([list(row) for row in table])
 
 
@@ -242,8 +224,6 @@ def exactly(rows: Array | arb_mat) -> arb_mat:
 
 def around(off: Array) -> arb_mat:
     """Return balls around 0 with these radii; raise `Unchecked` where a radius is not finite."""
-    from flint import arb, arb_mat
-
     if not np.isfinite(off).all():
         raise Unchecked("the response grows beyond what numbers can hold")
     rows, columns = off.shape

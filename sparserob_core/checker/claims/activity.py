@@ -9,9 +9,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from flint import arb
 
 from sparserob_core.checker.arithmetic.balls import ball, smallest
 from sparserob_core.checker.claims.case import Case
@@ -19,9 +20,6 @@ from sparserob_core.checker.cost.duality import ConstraintRow
 from sparserob_core.checker.outcome import Broken
 from sparserob_core.checker.sets.known import known
 from sparserob_core.control.sets.curved import NormBall
-
-if TYPE_CHECKING:
-    from flint import arb
 
 ROUNDED = 1e-12  # relative to the terms of a value of the control: a smaller value counts as 0
 EQUAL = 1e-12  # counts that differ by no more are equal
@@ -243,8 +241,6 @@ def _bound_piece_in_part(
     case: Case, parts: Sequence[Part], counts: list[arb], slope: list[arb], sizes: Sequence[arb]
 ) -> arb:
     """Return a lower bound of the sum that one piece contributes, as `_bound_piece` does, over a part's controls."""
-    from flint import arb
-
     if case.problem.control.is_box or case.letters is not None:
         box, total = case.problem.control.bounding_box(), arb(0)
         for part, count, s, size, low, high in zip(parts, counts, slope, sizes, box.lower, box.upper, strict=True):

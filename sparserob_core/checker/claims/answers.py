@@ -9,9 +9,10 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, final
+from typing import Any, final
 
 import numpy as np
+from flint import arb, arb_mat
 
 from sparserob_core.checker.arithmetic.balls import ball, balls, below
 from sparserob_core.checker.arithmetic.remembered import remembered
@@ -25,9 +26,6 @@ from sparserob_core.checker.problem.timing import before
 from sparserob_core.checker.reach.closed_loop import VerifiedLoop
 from sparserob_core.checker.sets.known import known
 from sparserob_core.sip.convex_set import Array, ConvexSet
-
-if TYPE_CHECKING:
-    from flint import arb, arb_mat
 
 PEAK, WORST = "peak", "worst"
 
@@ -325,8 +323,6 @@ def _read_deviations(case: Case, loop: VerifiedLoop, entry: Mapping[str, Any], n
     """Return the deviations from the middles that an entry names, block by block: its ``disturbance (mw, blocks)``,
     ``noise (K, p)`` and ``deviation (d,)``. A point that rounding took out of a thin set is replaced by one of the
     set."""
-    from flint import arb
-
     points, loop_deviations = list[Array](), loop.deviations
     noises = loop_deviations.initial_block - loop_deviations.blocks
     if case.problem.disturbance is not None:

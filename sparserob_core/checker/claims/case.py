@@ -9,6 +9,7 @@ from itertools import chain, pairwise
 from typing import TYPE_CHECKING, Any, final, get_args
 
 import numpy as np
+from flint import arb, arb_mat
 
 from sparserob_core.checker.arithmetic.balls import balls
 from sparserob_core.checker.arithmetic.series import stacked
@@ -36,8 +37,6 @@ from sparserob_core.control.problem.terms.repeat import Return
 from sparserob_core.sip.convex_set import Array
 
 if TYPE_CHECKING:
-    from flint import arb_mat
-
     from sparserob_core.control.problem.terms.windows import MixedConstraint, PathConstraint
 
 
@@ -193,8 +192,6 @@ class Case:
     def on_pieces(self, coefficients: Array) -> list[arb_mat]:
         """Return the control ``(m, 1)`` on every piece of its dictionary, from its coefficients ``(m, N)``. Equal
         values are one object."""
-        from flint import arb, arb_mat
-
         if self.control.is_indicators:
             values, pieces_by_value = coefficients.T.tolist(), dict[tuple[float, ...], arb_mat]()
             for value in self.clock.each(map(tuple, values)):

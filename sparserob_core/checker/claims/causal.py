@@ -18,9 +18,10 @@ from __future__ import annotations
 from bisect import bisect_left
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
+from flint import arb
 
 from sparserob_core.checker.arithmetic.balls import ball, balls
 from sparserob_core.checker.claims.answers import PEAK, WORST
@@ -29,9 +30,6 @@ from sparserob_core.checker.cost.duality import ConstraintRow
 from sparserob_core.checker.outcome import Broken, Unchecked
 from sparserob_core.checker.sets.known import known, middle
 from sparserob_core.sip.convex_set import Array
-
-if TYPE_CHECKING:
-    from flint import arb
 
 MAX_MULTIPLIERS = 100_000  # multipliers that are checked
 WeightedRow: TypeAlias = (

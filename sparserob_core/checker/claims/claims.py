@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from flint import arb, arb_mat, ctx
 
 from sparserob_core.checker.arithmetic.balls import ball, below
 from sparserob_core.checker.arithmetic.series import exactly, stacked
@@ -32,9 +33,6 @@ from sparserob_core.control.problem.names import unit_of_row
 from sparserob_core.errors import InputError
 from sparserob_core.sip.convex_set import Array, ConvexSet
 
-if TYPE_CHECKING:
-    from flint import arb, arb_mat
-
 PRECISION = 96  # bits, where the numbers of a system are of one size
 MAX_PRECISION = 1024
 VARYING = 96  # further bits for trees of products, where radii grow at each level; half of it shows after ten orbits
@@ -49,8 +47,6 @@ ASIDE = ("fewest active", "causal")  # claims that the status does not rest on
 def check(case: Case, gap_tolerance: float | None) -> list[Finding]:
     """Return one verdict per claim of the certificate; nothing that the file says is believed. ``gap_tolerance`` is the
     relative gap up to which the config calls a control certified, or ``None``."""
-    from flint import ctx
-
     status = case.certificate.get("status")
     with ctx.workprec(precision_of(case)):
         if type(case.certificate.get("format")) is not int or case.certificate["format"] != 1:
@@ -86,8 +82,6 @@ def check(case: Case, gap_tolerance: float | None) -> list[Finding]:
 def derived_bound(case: Case) -> float:
     """Return the lower bound of the cost that the certificate's multipliers prove, rounded down. Raise `Broken` or
     `Unchecked` where the multipliers prove none."""
-    from flint import ctx
-
     with ctx.workprec(precision_of(case)):
         return below(multiplied(case, priced=True))
 
@@ -95,8 +89,6 @@ def derived_bound(case: Case) -> float:
 def derived_causal_bound(case: Case, data: Mapping[str, Any], priced: bool) -> float:
     """Return the lower bound that an entry ``causal`` proves for every causal policy, rounded down: of the cost where
     ``priced``, else of the weighted sum of the constraints."""
-    from flint import ctx
-
     from sparserob_core.checker.claims.causal import causal_bound
 
     with ctx.workprec(precision_of(case)):
@@ -262,8 +254,6 @@ def _verify_repeat(case: Case, verdicts: Mapping[str, str]) -> str:
 
 def _require_strict_return(case: Case, window: ConstraintWindow) -> None:
     """Raise `Unchecked` unless the set of initial states also holds what the proof of the return excuses."""
-    from flint import arb
-
     bound = case.original_problem.initial_set
     assert bound is not None
     window_facets, initial_facets = window.enclosed_set.facets, known(bound).facets

@@ -13,6 +13,7 @@ from itertools import groupby, pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
+from flint import arb, fmpq, fmpq_mat
 
 from sparserob_core.checker.arithmetic.balls import balls, below
 from sparserob_core.checker.arithmetic.remembered import remembered
@@ -38,8 +39,6 @@ from sparserob_core.sip.convex_set import Array, ConvexSet
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
-
-    from flint import arb
 
 TUBES_KEPT = 8
 WIDER = 1e-12  # of their whole extent, by which boxes are widened where the set of parameters is no box
@@ -114,8 +113,6 @@ def normals_of(window: ConstraintWindow, data: object) -> Array:
     normals = numbers(data, "normals")
     if normals.shape != (b, d) or not np.array_equal(shape.lifted(normals[:, :b]), normals):
         raise Broken(f"normals: expected {b} directions of the first {b} of {d} states, or of their sums with others")
-    from flint import fmpq, fmpq_mat
-
     if fmpq_mat([[fmpq(*v.as_integer_ratio()) for v in row] for row in normals[:, :b].tolist()]).det() == 0:
         raise Broken("normals: the directions lie in a plane")
     return normals

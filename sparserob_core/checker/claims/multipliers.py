@@ -7,9 +7,10 @@ from __future__ import annotations
 
 from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from flint import arb, arb_mat
 
 from sparserob_core.checker.arithmetic.balls import ball, balls
 from sparserob_core.checker.arithmetic.remembered import remembered
@@ -22,9 +23,6 @@ from sparserob_core.checker.outcome import Broken, Unchecked
 from sparserob_core.checker.problem.timing import before
 from sparserob_core.checker.sets.known import known
 from sparserob_core.sip.convex_set import Array
-
-if TYPE_CHECKING:
-    from flint import arb, arb_mat
 
 MAX_MULTIPLIERS = 100_000
 

@@ -9,6 +9,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
+from flint import arb, arb_mat
 
 from sparserob_core.checker.arithmetic.balls import ball, balls
 from sparserob_core.checker.arithmetic.series import exactly, stacked
@@ -27,8 +28,6 @@ from sparserob_core.checker.sets.shape import along, basis_of
 from sparserob_core.sip.convex_set import Array
 
 if TYPE_CHECKING:
-    from flint import arb, arb_mat
-
     from sparserob_core.checker.claims.window import ConstraintWindow
 
 # The rounding error that is allowed in a reported violation where rows are followed, per state and in a row's unit:

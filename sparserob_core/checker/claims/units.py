@@ -5,10 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property, partial
-from typing import TYPE_CHECKING, final
+from typing import final
 
 import numpy as np
 import numpy.typing as npt
+from flint import arb
 
 from sparserob_core.checker.arithmetic.remembered import remembered
 from sparserob_core.checker.claims.answers import feedback_of
@@ -23,9 +24,6 @@ from sparserob_core.checker.sets.shape import smallest, widths
 from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.control.sets.sets import ConvexSet
 from sparserob_core.sip.convex_set import Array
-
-if TYPE_CHECKING:
-    from flint import arb
 
 MAX_TIMES = 64  # times at which a window is examined
 MAX_WEIGHTS = 16_000_000  # weights of inputs on every piece that are in memory at once

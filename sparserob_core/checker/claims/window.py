@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, final
 
 import numpy as np
+from flint import arb, arb_mat
 
 from sparserob_core.checker.arithmetic.balls import above, ball
 from sparserob_core.checker.arithmetic.remembered import remembered
@@ -22,8 +23,6 @@ from sparserob_core.control.sets.sets import ConvexSet
 from sparserob_core.sip.convex_set import Array
 
 if TYPE_CHECKING:
-    from flint import arb, arb_mat
-
     from sparserob_core.checker.reach.tube import Around
     from sparserob_core.checker.sets.parameters import Corners
 

@@ -10,17 +10,14 @@ enough.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING
 
 import numpy as np
+from flint import arb
 
 from sparserob_core.checker.arithmetic.balls import ball, balls
 from sparserob_core.checker.arithmetic.series import stacked
 from sparserob_core.checker.outcome import Broken, Clock, Unchecked
 from sparserob_core.sip.convex_set import Array
-
-if TYPE_CHECKING:
-    from flint import arb
 
 MAX_PARTS = 200_000  # parts of the search that are examined at most
 TOGETHER = 200  # parts that are bounded by one product of matrices

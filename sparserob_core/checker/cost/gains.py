@@ -6,9 +6,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from functools import cached_property
-from typing import TYPE_CHECKING, final
+from typing import final
 
 import numpy as np
+from flint import arb, arb_mat
 
 from sparserob_core.checker.arithmetic.balls import ball, balls, largest, rational
 from sparserob_core.checker.arithmetic.remembered import remembered
@@ -19,9 +20,6 @@ from sparserob_core.checker.reach.preimages import MeasuredDeviations, Reachable
 from sparserob_core.checker.sets.known import known
 from sparserob_core.checker.sets.shape import width
 from sparserob_core.sip.convex_set import ConvexSet
-
-if TYPE_CHECKING:
-    from flint import arb, arb_mat
 
 
 @final

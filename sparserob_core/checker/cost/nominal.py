@@ -9,9 +9,10 @@ from dataclasses import dataclass
 from fractions import Fraction
 from functools import cached_property
 from itertools import pairwise
-from typing import TYPE_CHECKING, final
+from typing import final
 
 import numpy as np
+from flint import arb, arb_mat
 
 from sparserob_core.checker.arithmetic.balls import ball, balls, rational
 from sparserob_core.checker.arithmetic.remembered import remembered
@@ -21,9 +22,6 @@ from sparserob_core.checker.flow.segment import VerifiedSegment
 from sparserob_core.control.problem.cost import nominal_point
 from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.problem.problem import OptimalControlProblem
-
-if TYPE_CHECKING:
-    from flint import arb, arb_mat
 
 KEPT = 8  # tables of segments that are remembered, each as large as a hundred matrices
 
@@ -48,8 +46,6 @@ def evaluate_quadratic_terms(nominal: NominalMotion, control: Dictionary, pieces
     """Return the quadratic terms of the cost at a control ``(m, 1)`` on every piece, and their derivatives: ``z = (x,
     1, u)`` is propagated along the nominal trajectory, and the costates backwards. A control acts after the delay, and
     costs when it is commanded."""
-    from flint import arb, arb_mat
-
     problem, x, steps = nominal.problem, nominal.begin, []
     d, m = problem.system.states, problem.system.controls
     for start, stop, k in _list_acting_intervals(problem, control):
@@ -85,8 +81,6 @@ def evaluate_quadratic_terms(nominal: NominalMotion, control: Dictionary, pieces
 def nominal_states(nominal: NominalMotion, control: Dictionary, pieces: Sequence[arb_mat]) -> list[arb_mat]:
     """Return the nominal ``(x, 1, u)`` where every piece of the control begins to act, and at the end. ``u = 0`` before
     the first piece acts, and at the end."""
-    from flint import arb_mat
-
     x, zero_control, states = nominal.begin.tolist(), (nominal.before * 0).tolist(), []
     for start, stop, k in _list_acting_intervals(nominal.problem, control):
         u = nominal.before if k < 0 else pieces[k]
@@ -181,8 +175,6 @@ class NominalMotion:
     def _integrate(self, part: FlowPart) -> tuple[arb_mat, arb_mat]:
         """Return the square matrix of ``z`` over a share of a segment, and the cost of that time as a quadratic form.
         With ``M`` the cost per time, terms ``X_n x^n`` cost ``sum_ij X_i' M X_j x^(i + j) / (i + j + 1)`` per time."""
-        from flint import arb, arb_mat
-
         (terms, weighted_terms, error), share, M = self._tabulate(part.segment), part.share, self.running
         size, count = M.nrows(), terms.nrows()
         powers = arb_mat([[x**n for n in range(count)] for x in (share, arb(0).union(share))]) * terms
@@ -197,8 +189,6 @@ class NominalMotion:
     def _tabulate(self, segment: VerifiedSegment) -> tuple[arb_mat, arb_mat, arb_mat]:
         """Return the terms of a segment's flow on ``z``, their products with the cost per time, one row for each term,
         and the error of the terms."""
-        from flint import arb_mat
-
         terms = [self._lift(X.matrix, int(not n)) for n, X in enumerate(segment.terms)]
         table, weighted_terms = (
             [X.entries() for X in matrices] for matrices in (terms, [self.running * X for X in terms])

@@ -9,9 +9,10 @@ from dataclasses import dataclass, field
 from fractions import Fraction
 from functools import cached_property
 from itertools import pairwise
-from typing import TYPE_CHECKING, final
+from typing import final
 
 import numpy as np
+from flint import arb, arb_mat, ctx, fmpq
 
 from sparserob_core.checker.arithmetic.balls import ball, balls, rational
 from sparserob_core.checker.arithmetic.series import norm, stacked
@@ -22,9 +23,6 @@ from sparserob_core.checker.sets.known import known
 from sparserob_core.control.problem.cost import Quadratic
 from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.problem.problem import OptimalControlProblem
-
-if TYPE_CHECKING:
-    from flint import arb, arb_mat
 
 ENOUGH = 1e-20  # the largest relative radius of the quadratic terms and their slopes
 MAX_BITS = 512  # the largest working precision: the terms of a guess of the flow determine half of these bits
@@ -187,8 +185,6 @@ class Price:
     @property
     def _nominal_motion(self) -> NominalMotion:
         """The nominal motion, at the present working precision or a higher one."""
-        from flint import ctx
-
         if not any(bits >= ctx.prec for bits in self._motions_by_precision):
             flow = self.flow.sharper(2.0**-ctx.prec) if self._motions_by_precision else self.flow
             self._motions_by_precision[int(ctx.prec)] = NominalMotion(self.problem, flow)
@@ -212,8 +208,6 @@ class Price:
     def _evaluate_quadratic(self, pieces: Sequence[arb_mat]) -> QuadraticTerms:
         """Return the quadratic terms and their slopes, at the working precision that they need; the latest are
         remembered."""
-        from flint import ctx
-
         for control, bits, quadratic in self._latest_terms:
             if control is pieces and bits >= ctx.prec:
                 return quadratic
@@ -221,8 +215,6 @@ class Price:
         return self._latest_terms[-1][2]
 
     def _resolve_quadratic(self, pieces: Sequence[arb_mat], bits: int) -> QuadraticTerms:
-        from flint import ctx
-
         while True:
             with ctx.workprec(bits):
                 quadratic = evaluate_quadratic_terms(self._nominal_motion, self.control, pieces)
@@ -236,8 +228,6 @@ class Price:
 def _is_semidefinite(term: Quadratic) -> bool:
     """Return True where a matrix is positive semidefinite, by symmetric elimination in rational numbers: no pivot is
     negative, and the row of a zero pivot is zero."""
-    from flint import fmpq
-
     exact = [[Fraction(float(entry)) for entry in row] for row in term.Q]
     rows = [[fmpq(entry.numerator, entry.denominator) for entry in row] for row in exact]
     if any(rows[i][j] != rows[j][i] for i in range(len(rows)) for j in range(i)):

@@ -9,9 +9,10 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import pairwise
 from math import ceil
-from typing import TYPE_CHECKING, final
+from typing import final
 
 import numpy as np
+from flint import arb, arb_mat
 
 from sparserob_core.checker.arithmetic.balls import ball, difference
 from sparserob_core.checker.arithmetic.monomials import Monomials
@@ -22,9 +23,6 @@ from sparserob_core.checker.flow.plant import Plant, called, held_about
 from sparserob_core.checker.flow.segment import LONGER, ROUGH, SHARP, VerifiedSegment, solve
 from sparserob_core.checker.outcome import Unchecked
 from sparserob_core.sip.convex_set import Array
-
-if TYPE_CHECKING:
-    from flint import arb, arb_mat
 
 # From this number of states on, transitions that no claim rests on are computed in floats, unless the law may change
 # with time. With 348 states a transition in balls takes as long as the rest of a check. With few states balls cost

@@ -8,9 +8,10 @@ from fractions import Fraction
 from functools import cached_property
 from itertools import pairwise
 from math import ceil, floor, inf, log2
-from typing import TYPE_CHECKING, final
+from typing import final
 
 import numpy as np
+from flint import arb, arb_poly
 
 from sparserob_core.checker.arithmetic.models import Frame, Model
 from sparserob_core.checker.arithmetic.monomials import NONE, Monomials, monomials_of
@@ -21,9 +22,6 @@ from sparserob_core.checker.flow.units import balanced, pace
 from sparserob_core.checker.outcome import Unchecked
 from sparserob_core.control.problem.phase import Phase
 from sparserob_core.sip.convex_set import Array
-
-if TYPE_CHECKING:
-    from flint import arb_poly
 
 ORDER = 24  # of the law in time on a stretch; with a tenth of it stretches are a million times shorter
 LONG = 2.0  # the largest norm of a law times the length of a stretch or stride; ten times more exceeds `TERMS` terms
@@ -101,8 +99,6 @@ class Stretch:
         """Return ``A`` and ``[B c E]`` times the length of a part of the stretch, as one series for each power of the
         share of the part that has passed, or ``backwards`` of the share that is left. The last powers of ``A`` may be
         in the balls of the first."""
-        from flint import arb, arb_poly
-
         half, length = (arb(self.stop) - arb(self.start)) / 2, arb(stop) - arb(start)
         begin = (arb(stop if backwards else start) - (arb(self.start) + arb(self.stop)) / 2) / half
         shifted, d = arb_poly([begin, (-length if backwards else length) / half]), len(self.table[0])
@@ -295,8 +291,6 @@ class Law:
     ) -> tuple[Frame, list[list[list[arb_poly]]]]:
         """Return every entry of the law from ``start`` to ``stop``, one table ``(d, d + w)`` for each monomial, and the
         frame of these polynomials."""
-        from flint import arb, arb_poly
-
         frame = Frame(monomials, ORDER)
         p = np.empty(1 + len(self.box.middle), dtype=object)
         p[0] = frame.time((arb(start) + arb(stop)) / 2, (arb(stop) - arb(start)) / 2)

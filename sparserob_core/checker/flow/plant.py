@@ -5,9 +5,10 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, final
+from typing import final
 
 import numpy as np
+from flint import arb_mat
 
 from sparserob_core.checker.arithmetic.balls import ball
 from sparserob_core.checker.arithmetic.models import Frame, Model, matrix_at
@@ -18,9 +19,6 @@ from sparserob_core.control.problem.phase import Phase
 from sparserob_core.control.problem.system import System
 from sparserob_core.errors import InputError
 from sparserob_core.sip.convex_set import Array
-
-if TYPE_CHECKING:
-    from flint import arb_mat
 
 GOLDEN = 0.6180339887
 TERMS = 18  # of the power series of a transition in floats, at a norm of at most 1/2: further terms round away

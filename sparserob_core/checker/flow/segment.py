@@ -13,18 +13,16 @@ from dataclasses import dataclass, field
 from functools import cached_property, lru_cache, reduce
 from math import comb
 from operator import add
-from typing import TYPE_CHECKING, final
+from typing import final
 
 import numpy as np
+from flint import arb, arb_mat
 
 from sparserob_core.checker.arithmetic.balls import ball
 from sparserob_core.checker.arithmetic.series import OUTWARD, Series, dot, identity, sizes_of, zeros
 from sparserob_core.checker.flow.units import pace
 from sparserob_core.checker.outcome import Unchecked
 from sparserob_core.sip.convex_set import Array
-
-if TYPE_CHECKING:
-    from flint import arb, arb_mat
 
 SHARP = 2.0**-100  # relative truncation error of a guess; with a tenth of these bits it would show in the states
 ROUGH = 2.0**-70  # the same over a box of parameters, which is less sharp anyway, and of kernels, which become floats
@@ -47,8 +45,6 @@ class Powers:
     def within(self, start: arb, width: arb, order: int) -> tuple[list[Series], Array]:
         """Return the matrix on the shares from ``start`` to ``start + width``: at most ``order`` coefficients ``(d,
         n)`` in powers of the share of the ``width``, and the error bound of this polynomial."""
-        from flint import arb, arb_mat
-
         (d, columns), count, kept = self.off.shape, self.count, min(order, self.count)
         a, b = ([x**n for n in range(count)] for x in (start, width))
         weights = [[a[n - j] * b[j] * comb(n, j) if n >= j else arb(0) for n in range(count)] for j in range(kept)]
@@ -62,8 +58,6 @@ class Powers:
     @cached_property
     def _coefficient_table(self) -> arb_mat:
         """All entries of all coefficients, one row for each power."""
-        from flint import arb_mat
-
         entries, size = [matrix.entries() for matrix in self.stack.parts], self.off.size
         return arb_mat(
             [[x for values in entries for x in values[n * size : (n + 1) * size]] for n in range(self.count)]
@@ -109,8 +103,6 @@ class VerifiedSegment:
     @cached_property
     def powers(self) -> Powers:
         """The flow as a polynomial."""
-        from flint import arb_mat
-
         (rows, columns), first = self.terms[0].shape, self.terms[0]
         matrices = [
             arb_mat(rows * len(self.terms), columns, [x for term in self.terms for x in term.parts[k].entries()])

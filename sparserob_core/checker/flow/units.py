@@ -3,15 +3,11 @@ any units would be right."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
+from flint import arb_mat
 
 from sparserob_core.checker.arithmetic.series import stacked
 from sparserob_core.sip.convex_set import Array
-
-if TYPE_CHECKING:
-    from flint import arb_mat
 
 SWEEPS = 12  # of balancing
 # A source below this share of what a state receives through other states does not count. With 1 a state's own source

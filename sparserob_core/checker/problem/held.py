@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, final
 
 import numpy as np
+from flint import arb
 
 from sparserob_core.checker.arithmetic.balls import ball
 from sparserob_core.checker.outcome import Unchecked
@@ -17,8 +18,6 @@ from sparserob_core.control.sets.sets import Product
 from sparserob_core.sip.convex_set import Array
 
 if TYPE_CHECKING:
-    from flint import arb
-
     from sparserob_core.control.problem.problem import OptimalControlProblem
 
 SAME = 1e-12  # relative to the horizon: nearer breakpoints are one up to rounding, as in a problem's records

@@ -13,9 +13,10 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import accumulate
 from math import ceil, comb, factorial, floor, log2
-from typing import TYPE_CHECKING, final
+from typing import final
 
 import numpy as np
+from flint import arb, arb_mat
 
 from sparserob_core.checker.arithmetic.balls import ball, balls
 from sparserob_core.checker.arithmetic.series import Series, middles, stacked, zeros
@@ -27,9 +28,6 @@ from sparserob_core.checker.sets.known import known, middle, summands_of
 from sparserob_core.checker.sets.polynomials import HALF_ULP, OUTWARD, TINY, Enclosed, rounding
 from sparserob_core.checker.sets.summands import Summand
 from sparserob_core.sip.convex_set import Array, ConvexSet
-
-if TYPE_CHECKING:
-    from flint import arb, arb_mat
 
 ORDER = 13  # degree of the polynomials
 REST = 2e-15  # about their truncation error in parts of a row: more widens the bounds, less needs shorter steps
@@ -398,8 +396,6 @@ class Stopped:
     @staticmethod
     def integral(parts: Sequence[tuple[AdjointRow, float]], row: Array, begin: float, end: float) -> Stopped:
         """Return the sum for the integral of a ``row (d,)`` from ``begin`` to ``end``, whose ``parts`` are given."""
-        from flint import arb, arb_mat
-
         (first, _), motion = parts[0], parts[0][0].motion
         exact = arb_mat([[arb(float(v)) for v in row]])
         difference = exact * (motion.A * (arb(end) - arb(begin))).exp() - exact
@@ -559,16 +555,12 @@ class Worst:
 
     def compute_initial_weights(self, time: float) -> list[arb]:
         """Return the weights ``(d,)`` of the initial state in the row at a time."""
-        from flint import arb
-
         row = self.adjoint.at(np.array([time]))
         return [arb(m, r) for m, r in zip(row.mid[0].tolist(), row.rad[0].tolist(), strict=True)]
 
     def weights(self, time: float, starts: Array, stops: Array) -> list[list[arb]]:
         """Return the weights of inputs between ``starts (K,)`` and ``stops (K,)`` in the row at a time, ``(q,)`` for
         each."""
-        from flint import arb
-
         has_started, columns = starts < time, self.adjoint.motion.F.ncols()
         weights = [[arb(0)] * columns for _ in range(starts.size)]
         effects = self.adjoint.between(
@@ -582,8 +574,6 @@ class Worst:
 
     def compute_worst_effect(self, time: float) -> arb:
         """Return what the worst disturbance adds to the row at a time."""
-        from flint import arb
-
         assert self.disturbance_set is not None
         if self.changes is None:
             (value,), (rad,) = self._evaluate_measurable(np.array([time]))

@@ -12,9 +12,10 @@ from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
 from itertools import product as every_choice
-from typing import TYPE_CHECKING, final
+from typing import final
 
 import numpy as np
+from flint import arb_mat
 
 from sparserob_core.checker.arithmetic.remembered import remembered
 from sparserob_core.checker.arithmetic.series import Series, exactly, products
@@ -29,9 +30,6 @@ from sparserob_core.checker.sets.parameters import Corners
 from sparserob_core.checker.sets.polynomials import OUTWARD, Enclosed, rounding
 from sparserob_core.checker.sets.summands import Summand, integrate
 from sparserob_core.sip.convex_set import Array
-
-if TYPE_CHECKING:
-    from flint import arb_mat
 
 KEPT = 16  # marks whose transitions from all earlier marks are remembered; cells come one after another
 PLACES_KEPT = 128  # parameters whose inputs are remembered

@@ -18,6 +18,7 @@ from itertools import pairwise
 from typing import TYPE_CHECKING, final
 
 import numpy as np
+from flint import arb, arb_mat
 
 from sparserob_core.checker.arithmetic.balls import ball, balls
 from sparserob_core.checker.arithmetic.series import around, exactly, identity, stacked
@@ -30,8 +31,6 @@ from sparserob_core.control.sets.sets import ConvexSet
 from sparserob_core.sip.convex_set import Array
 
 if TYPE_CHECKING:
-    from flint import arb, arb_mat
-
     from sparserob_core.control.policies.measurements import Measurements
     from sparserob_core.control.problem.system import System
 

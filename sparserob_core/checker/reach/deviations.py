@@ -5,17 +5,15 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import accumulate
-from typing import TYPE_CHECKING, final
+from typing import final
 
 import numpy as np
+from flint import arb
 
 from sparserob_core.checker.arithmetic.balls import ball, balls
 from sparserob_core.checker.sets.known import known, middle
 from sparserob_core.checker.sets.polynomials import OUTWARD
 from sparserob_core.sip.convex_set import Array, ConvexSet
-
-if TYPE_CHECKING:
-    from flint import arb
 
 
 @final

@@ -9,6 +9,7 @@ from math import comb
 from typing import NamedTuple
 
 import numpy as np
+from flint import arb, arb_mat
 
 from sparserob_core.checker.arithmetic.series import exactly
 from sparserob_core.checker.flow.flow import VerifiedFlow
@@ -89,8 +90,6 @@ def compute_kernel(law: VerifiedFlow, start: float, stop: float, columns: slice)
     """Return the kernel of an interval without marks: its length times some ``columns`` of ``Phi(stop, s) [B c E](s)``.
     Coefficients ``(p + 1, M, d, m)`` are those of powers of ``u`` from -1 to 1; the remainder is in the radius of the
     first. ``(1 + u) / 2`` is the share of the interval that is left at ``s``."""
-    from flint import arb, arb_mat
-
     terms, remainder = law.kernel(start, stop)
     d, (count, size) = law.states, (len(terms), terms[0].shape[1])
     table = arb_mat([[x for matrix in term.parts for x in matrix.entries()] for term in terms])

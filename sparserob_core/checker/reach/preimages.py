@@ -15,19 +15,17 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from functools import cached_property
-from typing import TYPE_CHECKING, final
+from typing import final
 
 import numpy as np
 import numpy.typing as npt
+from flint import arb, arb_mat, ctx, fmpq, fmpq_mat
 
 from sparserob_core.checker.arithmetic.balls import ball, spanning
 from sparserob_core.checker.arithmetic.series import middles, stacked
 from sparserob_core.checker.flow.units import scaled
 from sparserob_core.checker.outcome import Unchecked
 from sparserob_core.sip.convex_set import Array
-
-if TYPE_CHECKING:
-    from flint import arb, arb_mat, fmpq_mat
 
 EVENED = 20  # steps of scaling rows and columns to one size; the first few do most, twice as many change nothing
 
@@ -64,8 +62,6 @@ class ReachableSubspace:
         """Return the reached states for a disturbance along ``vectors (q, mw)``, without rounding; `Unchecked` unless
         the entries of all systems ``A (d, d)``, ``E (d, mw)`` are floats. The reached subspace is the smallest one that
         holds the columns of every ``E`` along the vectors and that no ``A`` leaves. It is found within ``d`` steps."""
-        from flint import fmpq, fmpq_mat
-
         if not all(x.is_exact() for mode in modes for matrix in mode for x in matrix.entries()):
             raise Unchecked("the numbers of the system are not exact")
         systems = [_convert_to_rational(A.transpose().tolist()) for A, _ in modes]
@@ -93,8 +89,6 @@ class ReachableSubspace:
 
 
 def _convert_to_rational(rows: Sequence[Sequence[arb]]) -> fmpq_mat:
-    from flint import fmpq, fmpq_mat
-
     return fmpq_mat([[fmpq(*float(x).as_integer_ratio()) for x in row] for row in rows])
 
 
@@ -150,7 +144,6 @@ class MeasuredDeviations:
         """Return a matrix ``(c, r)`` that gives, for the innovations of any deviations, deviations with the same
         innovations, the shortest in units of powers of two near ``reach``. Raise `Unchecked` if balls do not show as
         many independent rows as there can be."""
-        from flint import ctx
         from scipy.linalg import qr
 
         r, c, rank = self.matrix.nrows(), self.matrix.ncols(), self.rank_bound

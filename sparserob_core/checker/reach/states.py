@@ -7,9 +7,10 @@ from bisect import bisect_right
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, final
+from typing import final
 
 import numpy as np
+from flint import arb_mat
 
 from sparserob_core.checker.arithmetic.balls import ball, balls
 from sparserob_core.checker.arithmetic.monomials import Monomials
@@ -23,9 +24,6 @@ from sparserob_core.checker.problem.held import HeldComponents
 from sparserob_core.checker.sets.known import known
 from sparserob_core.checker.sets.polynomials import OUTWARD, Enclosed, rounding
 from sparserob_core.sip.convex_set import Array, ConvexSet
-
-if TYPE_CHECKING:
-    from flint import arb_mat
 
 PATHS_KEPT = 256  # intervals whose states are remembered
 BOXES_KEPT = 8  # boxes of parameters whose states are remembered

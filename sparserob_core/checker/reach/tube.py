@@ -7,9 +7,10 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from math import comb
-from typing import TYPE_CHECKING, NamedTuple, final
+from typing import NamedTuple, final
 
 import numpy as np
+from flint import arb, arb_mat
 
 from sparserob_core.checker.arithmetic.balls import ball
 from sparserob_core.checker.arithmetic.bernstein import bernstein
@@ -23,9 +24,6 @@ from sparserob_core.checker.sets.known import known
 from sparserob_core.checker.sets.polynomials import OUTWARD, ROUNDING, Enclosed, lengths, rounding
 from sparserob_core.checker.sets.shape import Shape
 from sparserob_core.sip.convex_set import Array, ConvexSet
-
-if TYPE_CHECKING:
-    from flint import arb, arb_mat
 
 ORDER = 6  # terms of polynomials in the time on a cell: half of it needs shorter cells, twice it more time for each
 CELLS_KEPT = 20_000  # cells whose rows are remembered: the parts of a box need the rows of the box again

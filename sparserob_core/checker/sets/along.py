@@ -15,6 +15,7 @@ from math import comb
 from typing import NamedTuple, final
 
 import numpy as np
+from flint import arb, ctx
 
 from sparserob_core.checker.outcome import Unchecked
 from sparserob_core.checker.sets.polynomials import HALF_ULP, OUTWARD, TINY, rounding
@@ -138,8 +139,6 @@ class NormSummand:
 def rule() -> tuple[Array, Array]:
     """Return the nodes and weights of Gauss' rule, rounded once: those of NumPy have errors of several units in the
     last place."""
-    from flint import arb, ctx
-
     with ctx.workprec(128):
         pairs = [arb.legendre_p_root(NODES, k, weight=True) for k in range(NODES)]
         nodes, weights = ([float(x) for x in column] for column in zip(*pairs, strict=True))

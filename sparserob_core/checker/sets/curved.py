@@ -7,9 +7,10 @@ from collections.abc import Sequence
 from fractions import Fraction
 from functools import cached_property
 from itertools import pairwise, product
-from typing import TYPE_CHECKING, final
+from typing import final
 
 import numpy as np
+from flint import arb, arb_mat, ctx
 
 from sparserob_core.checker.arithmetic.balls import above, ball, balls, largest
 from sparserob_core.checker.arithmetic.series import exactly
@@ -20,9 +21,6 @@ from sparserob_core.checker.sets.shape import NEAR, Shape, along, total
 from sparserob_core.checker.sets.summands import Summand
 from sparserob_core.control.sets.sets import Cylinder, Ellipsoid, NormBall, Product
 from sparserob_core.sip.convex_set import Array
-
-if TYPE_CHECKING:
-    from flint import arb
 
 DIGITS = 4  # times the working precision, for the comparison of an ellipsoid with its factor
 LEAST = 2.0**-1000  # an error bound below this is rounded up: underflow has cost it digits
@@ -55,8 +53,6 @@ class Ellipsoidal(Shape):
         return self._compute_squared_gauge(offsets).nonnegative_part().sqrt()
 
     def _compute_squared_gauge(self, offsets: Sequence[arb]) -> arb:
-        from flint import arb_mat
-
         z = arb_mat([balls(row) for row in self.source.shape]).solve(arb_mat([[v] for v in offsets]))
         return total(v * z[i, 0] for i, v in enumerate(offsets))
 
@@ -78,8 +74,6 @@ class Ellipsoidal(Shape):
     def factor_residual(self) -> float:
         """The upper bound, in balls, of the difference between the matrix ``S`` and ``L L'`` relative to ``L L'``: of
         the norm of ``L^-1 S L'^-1 - 1``, with the rounded Cholesky factor ``L``."""
-        from flint import arb_mat, ctx
-
         L = self.source.factor
         with ctx.workprec(DIGITS * ctx.prec):  # in a long ellipsoid most digits cancel
             inverse = arb_mat(L.tolist()).inv()
@@ -285,8 +279,6 @@ class Joint(Shape):
 
 def _compute_power(value: arb, exponent: arb) -> arb:
     """Return ``|value|^exponent`` with ``exponent > 0``, also for a ball that contains 0, where Arb gives none."""
-    from flint import arb
-
     size = abs(value)
     return size**exponent if size > 0 else arb(0).union(arb(size.upper()) ** exponent)
 

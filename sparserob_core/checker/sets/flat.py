@@ -8,9 +8,10 @@ from fractions import Fraction
 from functools import cached_property, lru_cache
 from itertools import combinations, product
 from math import comb
-from typing import TYPE_CHECKING, final
+from typing import final
 
 import numpy as np
+from flint import arb, fmpq, fmpq_mat
 
 from sparserob_core.checker.arithmetic.balls import above, ball, balls, below, largest, rational, smallest, spanning
 from sparserob_core.checker.arithmetic.series import stacked
@@ -21,9 +22,6 @@ from sparserob_core.checker.sets.shape import NEAR, Facet, Shape, along, dot, fa
 from sparserob_core.checker.sets.summands import Summand
 from sparserob_core.control.sets.sets import Box, NormBall, Polytope, Zonotope
 from sparserob_core.sip.convex_set import Array
-
-if TYPE_CHECKING:
-    from flint import arb, fmpq
 
 MAX_CORNERS = 20_000  # intersections of facets that may be computed to list the corners of a polytope
 
@@ -279,8 +277,6 @@ class Segments(Flat):
     def _normals(self) -> list[tuple[Fraction, ...]]:
         """The exact normals, one for each pair of facets: the normals within the span of the segments, and some that
         span its orthogonal complement."""
-        from flint import fmpq, fmpq_mat
-
         d, normals = self.dimension, dict[tuple[str, ...], list[fmpq]]()
         rows = [[fmpq(*v.as_integer_ratio()) for v in g] for g in self.source.generators.tolist() if any(g)]
         complement = _compute_null_space(rows, d)
@@ -445,8 +441,6 @@ def _select_independent_rows(rows: Sequence[list[Fraction]]) -> list[list[Fracti
 
 def _compute_null_space(rows: Sequence[Sequence[fmpq]], d: int) -> list[list[fmpq]]:
     """Return vectors ``(d,)`` that span the orthogonal complement of the rows."""
-    from flint import fmpq
-
     basis = spanning(rows)
     leads = [next(i for i, v in enumerate(row) if v != 0) for row in basis]
     vectors = []
@@ -474,8 +468,6 @@ def _find_intersections(
 ) -> tuple[tuple[Fraction, ...], ...]:
     """Return the points of ``{x : H x <= h}``, rows ``(*H_i, h_i)``, where ``d`` of its facets and of the coordinate
     ``planes`` meet, in rational arithmetic; `Unchecked` where they are too many, or none."""
-    from flint import fmpq, fmpq_mat
-
     d = len(rows[0]) - 1
     if comb(len(rows) + len(planes), d) > MAX_CORNERS:
         raise Unchecked(f"a polytope with {len(rows)} facets in {d} dimensions has too many corners to be listed")

@@ -8,6 +8,7 @@ from types import MappingProxyType
 from typing import Any
 
 import numpy as np
+from flint import ctx
 
 from sparserob_core.checker.outcome import Unchecked
 from sparserob_core.checker.sets.along import NormSummand
@@ -43,8 +44,6 @@ KINDS: Mapping[type[ConvexSet], Callable[[Any], Shape]] = MappingProxyType(
 def known(source: ConvexSet) -> Shape:
     """Return the `Shape` of a set at the working precision; `Unchecked` for a kind whose data the checker cannot read.
     No claim rests on what the set's own class computes, nor on a subclass of a known kind."""
-    from flint import ctx
-
     if type(source) not in KINDS:
         raise Unchecked(f"the checker does not know sets of the kind {source.kind}")
     return _build_shape(source, ctx.prec)

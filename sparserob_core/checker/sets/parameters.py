@@ -4,16 +4,14 @@ there."""
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, TypeAlias, final
+from typing import TypeAlias, final
 
 import numpy as np
+from flint import arb
 
 from sparserob_core.checker.arithmetic.balls import above, ball, balls
 from sparserob_core.checker.sets.shape import Facet, Shape
 from sparserob_core.sip.convex_set import Array
-
-if TYPE_CHECKING:
-    from flint import arb
 
 Corners: TypeAlias = tuple[tuple[float, ...], tuple[float, ...]]
 """The lower and the upper corner of a box of parameters."""

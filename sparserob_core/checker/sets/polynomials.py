@@ -5,16 +5,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
-from typing import TYPE_CHECKING, final
+from typing import final
 
 import numpy as np
+from flint import arb_mat
 
 from sparserob_core.checker.arithmetic.monomials import Monomials
 from sparserob_core.checker.outcome import Unchecked
 from sparserob_core.sip.convex_set import Array
-
-if TYPE_CHECKING:
-    from flint import arb_mat
 
 HALF_ULP = 1.2e-16
 OUTWARD = 1.0 + 1e-12  # factor on computed error bounds, which are sums of at most a few thousand rounded numbers

@@ -7,9 +7,10 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Sequence
 from fractions import Fraction
 from functools import cached_property
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
+from flint import arb, ctx
 
 from sparserob_core.checker.arithmetic.balls import above, ball, balls, rational
 from sparserob_core.checker.arithmetic.balls import smallest as least_of
@@ -17,9 +18,6 @@ from sparserob_core.checker.outcome import RESOLVED, Broken, Unchecked
 from sparserob_core.checker.sets.along import Norm, NormSummand
 from sparserob_core.checker.sets.summands import Summand
 from sparserob_core.sip.convex_set import Array, ConvexSet
-
-if TYPE_CHECKING:
-    from flint import arb
 
 # Relative to the size of a set: a thinner direction counts as none, and a nearer point counts as one of the set. A
 # larger value makes no false claim hold, since such a point is replaced by one of the set. A run uses a tenth of it.
@@ -247,8 +245,6 @@ def basis_of(shape: Shape) -> tuple[Array, Array] | None:
 def find_inner_support_point(shape: Shape, direction: Array) -> list[arb]:
     """Return a point of the set far out in a direction, in exact numbers and proven to be in the set; the centre
     where none better is. A rounded point would be far outside a thin set that is oblique to the axes."""
-    from flint import arb, ctx
-
     middle, offset, spare = (
         balls(shape.centre),
         shape.compute_support_offset(balls(direction)),

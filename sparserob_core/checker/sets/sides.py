@@ -5,17 +5,15 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import product
-from typing import TYPE_CHECKING, final
+from typing import final
 
 import numpy as np
+from flint import arb
 
 from sparserob_core.checker.arithmetic.balls import below
 from sparserob_core.checker.outcome import TOLERANCE, Unchecked
 from sparserob_core.checker.sets.shape import Shape, along, dot, find_inner_support_point, total
 from sparserob_core.sip.convex_set import Array
-
-if TYPE_CHECKING:
-    from flint import arb
 
 
 @final

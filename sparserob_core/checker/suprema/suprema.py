@@ -5,9 +5,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, final
+from typing import Any, final
 
 import numpy as np
+from flint import arb, ctx
 
 from sparserob_core.checker.arithmetic.balls import above, ball, balls, below
 from sparserob_core.checker.claims.case import Case, listed, number, numbers, shaped
@@ -28,9 +29,6 @@ from sparserob_core.control.problem.disturbances import columns_of
 from sparserob_core.control.sets.sets import Box, Polytope
 from sparserob_core.sip.convex_set import Array
 
-if TYPE_CHECKING:
-    from flint import arb
-
 SHARE = 1e-3  # the unit of a row relative to its bound: the excused excess is a thousandth of the smallest gap
 OUTPUT, STATE = "output", "state"  # names of rows that belong to no constraint
 
@@ -48,8 +46,6 @@ class SupremumRow:
 
 def check_suprema(case: Case) -> list[Finding]:
     """Return one verdict per worst case in the certificate, and one on whether these are the rows of the problem."""
-    from flint import ctx
-
     with ctx.workprec(precision_of(case)):
         if type(case.certificate.get("format")) is not int or case.certificate["format"] != 1:
             return [Finding("bound", "fails", f"its format is {case.certificate.get('format')!r}, expected 1")]
