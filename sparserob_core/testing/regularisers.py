@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
+from scipy.sparse import csc_array, eye_array, issparse, kron
 
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.convexity import ControlImage, Regulariser
 from sparserob_core.sip.program import SemiInfiniteProgram
 from sparserob_core.testing.contract import Contract, broken, demand, same
-
-if TYPE_CHECKING:
-    from scipy.sparse import csc_array
 
 CURVATURE = 1e-10  # the smallest eigenvalue of P, as a share of the largest
 SIZES = (1e-9, 1e9)  # of the largest eigenvalue of P
@@ -22,8 +18,6 @@ VALUE = 0.4  # of `two_thrusters`
 def images() -> list[ControlImage]:
     """Return images of one to three channels, with pieces of equal and of different lengths, and with as many functions
     as pieces or fewer."""
-    from scipy.sparse import csc_array, eye_array, kron
-
     haar = np.array([[1, 1, 1, 1], [1, 1, -1, -1], [1, -1, 0, 0]], dtype=float)
     uneven = np.array([0.5, 0.1, 0.3, 0.1, 2.0])
     return [
@@ -52,8 +46,6 @@ class RegulariserContract(Contract[Regulariser], kind="regulariser"):
 
     def quadratic(self, regulariser: Regulariser, image: ControlImage) -> tuple[csc_array, Array]:
         """``P`` and ``q``; a broken contract where something else comes back, or something is raised."""
-        from scipy.sparse import issparse
-
         where = f"an image with {image.channels} channels of {image.pieces} pieces and {image.S.shape[1]} coefficients"
         try:
             answer: object = regulariser.quadratic(image)

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
+from scipy.sparse import csc_array, diags_array
 
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.finite import FiniteProgram, FiniteSolution
@@ -62,8 +63,6 @@ def double_integrator(pieces: int = 50, horizon: float = 5.0) -> tuple[Array, Ar
 
 def regularised(program: FiniteProgram, epsilon: float) -> FiniteProgram:
     """Return the program with ``epsilon/2 sum_k weights_k x_k^2`` added to its cost."""
-    from scipy.sparse import csc_array, diags_array
-
     return program if epsilon == 0 else replace(program, P=csc_array(diags_array(epsilon * program.weights)))
 
 
@@ -134,8 +133,6 @@ def by_linear_programming(name: str, program: FiniteProgram) -> Instance:
 def linear_instances() -> Iterator[Instance]:
     """Programs without a quadratic cost: feasible, degenerate, with duplicated rows, equalities, odd bounds, another
     image."""
-    from scipy.sparse import csc_array
-
     robust = robust_terminal()
     rows, h = robust.G, robust.h
     yield Instance("robust terminal", robust, 1.6, 1.6)
@@ -235,8 +232,6 @@ def coupled_instances() -> Iterator[Instance]:
 
     Each is made from its optimum: a decision, multipliers, and the linear cost for which they are optimal.
     """
-    from scipy.sparse import csc_array
-
     for seed in range(8):
         rng = np.random.default_rng(seed)
         n, rows, equalities = 6 + 2 * seed, 5, seed % 3
@@ -293,8 +288,6 @@ def question(
     """A program made from its optimum: rows of unit norm, every second one active; a third of the bounds reached.
     ``cones``: the sizes of those of the first variables; the optimum is on one, at the apex of the next, and inside of
     the third."""
-    from scipy.sparse import csc_array
-
     half = rng.normal(size=(n, n)) / np.sqrt(n)
     P = half @ half.T + 0.1 * np.eye(n) if curved else np.zeros((n, n))
     G, A = rng.normal(size=(rows, n)), rng.normal(size=(equalities, n))
@@ -353,8 +346,6 @@ def questions(conic: bool = False) -> Iterator[Question]:
 
 def hopeless() -> Iterator[Question]:
     """Programs without a solution: nothing is feasible, or the cost falls for ever."""
-    from scipy.sparse import csc_array
-
     for n, curved in ((2, True), (10, False)):
         eye, none = np.eye(n), np.zeros((0, n))
         P, q, free = csc_array(eye * curved), np.ones(n), np.full(n, np.inf)

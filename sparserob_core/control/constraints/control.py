@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, final
+from typing import final
 
 import numpy as np
+from scipy.sparse import csr_array, eye_array, hstack
 
 from sparserob_core.control.constraints.explanation import ConstraintSource, TimedExplanation, of_gauge
 from sparserob_core.control.constraints.local_maxima import climb
@@ -15,9 +16,6 @@ from sparserob_core.control.problem.units import Units
 from sparserob_core.control.sets.directions import across, on_surface, sampled, unit
 from sparserob_core.sip.convex_set import Array, Box, ConvexSet
 from sparserob_core.sip.program import ConstraintFamily, Explanation, Separation
-
-if TYPE_CHECKING:
-    from scipy.sparse import csr_array
 
 CLIMBED = 16  # pieces, those furthest outside, whose direction is refined per round
 
@@ -68,8 +66,6 @@ class Places:
     @staticmethod
     def of_values(breakpoints: Array, controls: int) -> Places:
         """Return the values ``u(t)`` on every piece."""
-        from scipy.sparse import csr_array, eye_array
-
         ends, pieces = breakpoints, breakpoints.size - 1
         table, offset = csr_array(eye_array(pieces)), np.zeros((pieces, controls))
         return Places(table, offset, ends[:-1], float(ends[-1]), (ends[:-1] + ends[1:]) / 2)
@@ -148,8 +144,6 @@ class ControlConstraint(ConstraintSource):
     ) -> ControlConstraint:
         """Return the constraint for a control in a ``dictionary``, whose coefficients are followed by ``extra_count``
         entries of the decision."""
-        from scipy.sparse import csr_array
-
         return ControlConstraint(name, convex, places, csr_array(dictionary.sparse @ places.table), extra_count)
 
     def family(self) -> ConstraintFamily:
@@ -226,8 +220,6 @@ class ControlConstraint(ConstraintSource):
 def differences(pieces: int, at_start: bool, seam: bool = False) -> csr_array:
     """Return the matrix ``(K, q)`` from values on pieces to their changes from one to the next; ``at_start``: from 0
     before the first too, ``seam``: from the last to the first too, after the others."""
-    from scipy.sparse import csr_array, eye_array, hstack
-
     changes = csr_array(eye_array(pieces) - eye_array(pieces, k=1))
     changes = changes if at_start else changes[:, 1:]
     if not seam:

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field, replace
 from typing import final
 
 import numpy as np
+from scipy.sparse import csr_array
 
 from sparserob_core.control.constraints.explanation import ConstraintSource, TimedExplanation
 from sparserob_core.control.constraints.feedback import describe_deviations, not_linear
@@ -83,8 +84,6 @@ class FeedbackEffort(ConstraintSource):
 
     def uncertain(self, index: Array) -> UncertainRows:
         """Return the rows of one sign of every entry."""
-        from scipy.sparse import csr_array
-
         loop, weight, count = self.loop, self.prices * index, self._row_signs.size
         position, variable, value = loop.answers.effect
         _, m, Q, _ = loop.answers.shape

@@ -14,6 +14,7 @@ from typing import TypeAlias
 
 import numpy as np
 import numpy.typing as npt
+from scipy.linalg import schur
 
 from sparserob_core.control.enclosures.matrix_exponential import (
     EPSILON,
@@ -175,8 +176,6 @@ def _generate_candidates(A: Array) -> Iterator[tuple[Array, np.ndarray, np.ndarr
     condition = np.linalg.cond(modal) if modal.shape[0] == modal.shape[1] else np.inf
     if condition < WELL_CONDITIONED:
         yield modal, np.array(starts), np.array(starts)
-    from scipy.linalg import schur
-
     form, basis = schur(A, output="real")
     values = _read_eigenvalues(form)
     for closeness in SEPARATED:

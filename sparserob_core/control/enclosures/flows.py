@@ -8,6 +8,7 @@ from functools import cached_property
 from typing import Protocol
 
 import numpy as np
+from scipy.sparse import csr_array
 
 from sparserob_core.control.enclosures.decoupling import Decoupling, balance
 from sparserob_core.control.enclosures.double_length import flows, product
@@ -40,8 +41,6 @@ def products(A: Array):  # type: ignore[no-untyped-def]  # an array, or one of s
     """Return the matrix in the form whose products take the least time: sparse where few of its entries are not 0."""
     if A.shape[0] < 1.0 / SPARSE or np.count_nonzero(A) > SPARSE * A.size:  # one entry of a short row is more
         return A
-    from scipy.sparse import csr_array
-
     return csr_array(A)
 
 

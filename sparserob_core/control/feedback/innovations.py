@@ -14,6 +14,7 @@ from functools import cached_property
 from typing import TYPE_CHECKING, final
 
 import numpy as np
+from scipy.linalg import qr
 
 from sparserob_core.control.response.response import Response
 from sparserob_core.sip.convex_set import Array
@@ -291,8 +292,6 @@ def _compute_coordinates(innovations: Array) -> tuple[np.ndarray, np.ndarray, Ar
     G : ndarray, shape (r, J d)
         Gains with these effects.
     """
-    from scipy.linalg import qr
-
     flat = innovations.reshape(-1, innovations.shape[2])
     sizes = np.linalg.norm(flat, axis=0)
     columns = np.flatnonzero(sizes > 0.0)

@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, final
+from typing import final
 
 import numpy as np
+from scipy.sparse import csr_array
 
 from sparserob_core.control.feedback.closed_loop import ClosedLoop
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.finite import Spread, UncertainRows, table_of
-
-if TYPE_CHECKING:
-    from scipy.sparse import csr_array
 
 
 @final
@@ -49,8 +47,6 @@ class LoopRows:
         Rows of one part have the same direction of the control, times their factors, and the same piece. ``following``
         says that the control is the first one of the next period, which responds to the initial state of that period.
         """
-        from scipy.sparse import csr_array
-
         K, Q = self.loop.functionals.dictionary.pieces, self.loop.spread.size
         row, channel = np.nonzero(G)
         coordinates = (row, channel * K + pieces[row])

@@ -13,6 +13,7 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
+from scipy.linalg import matrix_balance
 
 from sparserob_core.control.enclosures.cache import remember
 from sparserob_core.control.enclosures.comparison import block_norms, product
@@ -77,8 +78,6 @@ class _BalancedMatrix:
 
     @staticmethod
     def of(A: Array) -> _BalancedMatrix:
-        from scipy.linalg import matrix_balance
-
         balanced, (units, _) = matrix_balance(A, permute=False, separate=True)
         return _BalancedMatrix(balanced, units, float(np.linalg.norm(balanced, 2)), DoublingExponentials(balanced))
 

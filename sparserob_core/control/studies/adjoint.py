@@ -14,6 +14,7 @@ from itertools import pairwise
 from math import ceil, factorial, log2
 
 import numpy as np
+from scipy.linalg import matrix_balance
 
 from sparserob_core.control.enclosures.flows import products
 from sparserob_core.control.enclosures.matrix_exponential import exponential, rounding
@@ -68,8 +69,6 @@ class Adjoint:
         NotEnclosable
             If the system is too fast for its horizon.
         """
-        from scipy.linalg import matrix_balance
-
         balanced, (units, _) = matrix_balance(A, permute=False, separate=True)
         speed = float(np.linalg.norm(balanced, 2)) * horizon
         count = 2 ** max(6, ceil(log2(max(speed, 1e-300) / SHORT)))

@@ -10,9 +10,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, final
+from typing import final
 
 import numpy as np
+from scipy.sparse import block_diag, csc_array, csr_array, hstack
 
 from sparserob_core.control.constraints.explanation import TimedExplanation
 from sparserob_core.control.enclosures.cache import remember
@@ -33,9 +34,6 @@ from sparserob_core.sip.program import (
     Separation,
 )
 from sparserob_core.sip.result import Result
-
-if TYPE_CHECKING:
-    from scipy.sparse import csc_array
 
 PROGRAMS_KEPT = 4  # ordinary programs, each at one initial state, that are remembered
 
@@ -407,8 +405,6 @@ class _UncertainJointFamily(_PlaneFamily):
     def uncertain(self, index: Array) -> UncertainRows:
         """The rows at the centre, and two columns more. Of a system that changes with time they are wider by what steps
         may be off by, as without feedback, but for those that hold with equality (`InitialPlane.weakened`)."""
-        from scipy.sparse import csr_array, hstack
-
         at_centre, *at_ends = (
             family.uncertain for family in (self.base, *(end.family(self.base.name) for end in self.plane.ends))
         )
@@ -430,6 +426,4 @@ class _UncertainJointFamily(_PlaneFamily):
 def _append_identity(S: csc_array | None) -> csc_array | None:
     if S is None:
         return None
-    from scipy.sparse import block_diag, csc_array
-
     return csc_array(block_diag([S, np.eye(2)]))

@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
+from scipy.linalg import matrix_balance
 
 from sparserob_core.control.constraints.flat import INSIDE, MOST_INSIDE, SMOOTH
 from sparserob_core.control.enclosures.decoupling import decoupled, pace
@@ -221,8 +222,6 @@ def _compute_transitions(A: Array, lengths: Array) -> tuple[Array, Array]:
     """``e^{A r}`` and its integral for every distinct length, ``(q, d, d)``, or ``(q, d, d, n)`` for ``n`` matrices
     ``(d, d, n)``. A known system is taken in units in which it is small, powers of two: in metres and seconds an orbit
     is known a hundred times better so."""
-    from scipy.linalg import matrix_balance
-
     if A.ndim == 2:
         balanced, (units, _) = matrix_balance(A, permute=False, separate=True)
         back = units[:, None] / units

@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, TypedDict
+from typing import TypedDict
 
 import numpy as np
+from scipy.sparse import block_diag, csc_array
 
 from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.control.transcription.quadratic import quadratic_cost
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.convexity import convex_by_construction
-
-if TYPE_CHECKING:
-    from scipy.sparse import csc_array
 
 
 class Quadratics(TypedDict, total=False):
@@ -62,8 +60,6 @@ def quadratics(problem: OptimalControlProblem, dictionary: Dictionary, variables
     channel."""
     if not problem.cost.is_quadratic:
         return {}
-    from scipy.sparse import block_diag, csc_array
-
     on_pieces = quadratic_cost(problem, dictionary.breakpoints)
     terms, axes = on_pieces.on(dictionary), np.eye(problem.system.controls)
     reach = problem.control.reach(axes)

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, final
+from typing import final
 
 import numpy as np
+from scipy.sparse import block_array, csc_array, eye_array, kron, vstack
 
 from sparserob_core.control.constraints.control import ControlConstraint, held_at
 from sparserob_core.control.constraints.flat import FlatConstraint
@@ -37,9 +38,6 @@ from sparserob_core.control.transcription.telling import Telling
 from sparserob_core.errors import InputError, NotEnclosable
 from sparserob_core.sip.convex_set import Array, Box, ConvexSet
 from sparserob_core.sip.program import TOLERANCE, ConstraintFamily, EqualityErrors, Formulation, SemiInfiniteProgram
-
-if TYPE_CHECKING:
-    from scipy.sparse import csc_array
 
 SAME = 1e-11  # of the numbers that are added up, a difference that is rounding
 EQUALS = "equals"  # the name of the fixed final states
@@ -237,8 +235,6 @@ def _build_image(
     """Return the matrix of the image, and its bounds. The image is the control on every piece, then one entry per piece
     and side of a polytope, and one per step and side of the set of its changes. The matrix is ``None`` where it is the
     identity."""
-    from scipy.sparse import csc_array, eye_array, kron, vstack
-
     bound, channels = problem.control, problem.system.controls
     lower, upper = (np.repeat(ends, dictionary.pieces) for ends in ranges(bound))
     values = csc_array(dictionary.sparse.T)
@@ -270,8 +266,6 @@ def _append_sizes(
     """Return the images of `_build_image` for a decision that continues with a bound ``a`` of the size of every value
     ``s`` of the control. Further images hold ``0 <= a - s`` and ``0 <= a + s``. Both are at most twice the largest
     ``|s|``, which ``a = |s|`` never exceeds."""
-    from scipy.sparse import block_array, csc_array, eye_array
-
     assert functionals.execution is not None
     image = eye_array(functionals.coefficients, format="csc") if S is None else S
     values, sizes = image[: functionals.execution.size], eye_array(functionals.execution.size, format="csc")

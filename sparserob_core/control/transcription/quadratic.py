@@ -10,9 +10,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
+from scipy.linalg import expm
+from scipy.sparse import csc_array, diags_array, eye_array, kron
 
 from sparserob_core.control.problem.cost import nominal_point
 from sparserob_core.control.problem.dictionary import Dictionary
@@ -21,9 +22,6 @@ from sparserob_core.control.response.response import Propagator, TimeGrid
 from sparserob_core.control.transcription.grid import grid_of
 from sparserob_core.errors import InputError
 from sparserob_core.sip.convex_set import Array
-
-if TYPE_CHECKING:
-    from scipy.sparse import csc_array
 
 COUPLING_LIMIT = 5000  # values of a control that may be coupled: a matrix of their square
 POINTS = 16  # of Gauss' rule, on times on which the norm of A is at most 2: half of them leave a millionth of a digit
@@ -42,8 +40,6 @@ class QuadraticCost:
         """Return the same cost in the coefficients of a dictionary, ``(m N,)``."""
         if dictionary.is_indicators:
             return self
-        from scipy.sparse import csc_array, eye_array, kron
-
         V = csc_array(kron(eye_array(self.q.size // dictionary.pieces), dictionary.sparse))
         P = V @ self.P @ V.T
         return QuadraticCost(csc_array((P + P.T) / 2), np.asarray(V @ self.q), self.constant)
@@ -170,8 +166,6 @@ def _integrate_varying(
 def quadratic_cost(problem: OptimalControlProblem, breakpoints: Array) -> QuadraticCost:
     """Return the quadratic terms of a problem's cost as one quadratic function of the control's values on its
     pieces."""
-    from scipy.sparse import csc_array, diags_array, kron
-
     (state, control, final), m = problem.cost.terms, problem.system.controls
     size = m * (breakpoints.size - 1)
     P, q, constant = csc_array((size, size)), np.zeros(size), 0.0
@@ -229,8 +223,6 @@ def _condense_state_cost(pieces: NominalPieces, m: int, size: int) -> tuple[Arra
 
 def _integrate_weight(F: Array, M: Array, length: float) -> tuple[Array, Array]:
     """Return ``e^{F h}`` and ``int_0^h e^{F't} M e^{Ft} dt``."""
-    from scipy.linalg import expm
-
     size = F.shape[0]
     doublings = max(0, int(np.ceil(np.log2(max(np.abs(F).sum(axis=0).max() * length / SHORT, 1e-300)))))
     short = length / 2.0**doublings

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, final
+from typing import final
 
 import numpy as np
+from scipy.sparse import csc_array, kron
 
 from sparserob_core.control.constraints.control import before, differences
 from sparserob_core.control.enclosures.matrix_exponential import rounding
@@ -15,9 +16,6 @@ from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.control.problem.units import power_of_two
 from sparserob_core.errors import InputError
 from sparserob_core.sip.convex_set import Array, ConvexSet
-
-if TYPE_CHECKING:
-    from scipy.sparse import csc_array
 
 MOST_CUTS = 60  # rounds of tangents
 CLOSE = 1e-7  # of the control's range, a point that is as good as inside
@@ -66,8 +64,6 @@ class Steps:
     @cached_property
     def rows(self) -> csc_array:
         """Entries of the image as rows of the decision, ``(r q, m N)``."""
-        from scipy.sparse import csc_array, kron
-
         changes = self.dictionary.sparse @ differences(self.dictionary.pieces, self.before is not None, self.seam)
         return csc_array(kron(csc_array(self.H), changes.T))
 

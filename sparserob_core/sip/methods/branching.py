@@ -13,6 +13,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
+from scipy.sparse import csr_array, diags_array, eye_array, hstack, kron
 
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.evidence import NO_BOUND, Branch, Dual, Leaf
@@ -263,7 +264,6 @@ def proposed(
         The decision; ``None`` where HiGHS finds none in time.
     """
     from scipy.optimize import LinearConstraint
-    from scipy.sparse import csr_array, eye_array, hstack
 
     finite, prices = relaxed.finite(rows.G, rows.h, 0.0), prices_of(program)
     n, unit = program.n, prices[prices > 0.0].min()
@@ -288,7 +288,6 @@ def _couple_binaries(S: Any, finite: FiniteProgram, prices: Array, together: np.
     """``lower b <= s <= upper b`` with ``b`` 0 or 1, the same for all that count ``together (k,)``, and what every
     ``b`` costs."""
     from scipy.optimize import LinearConstraint
-    from scipy.sparse import csr_array, diags_array, hstack
 
     optional = np.flatnonzero((prices > 0.0) & (finite.lower <= 0.0) & (finite.upper >= 0.0))
     above, below = (diags_array(-side[optional]) for side in (finite.upper, finite.lower))
@@ -312,7 +311,6 @@ def _couple_binaries(S: Any, finite: FiniteProgram, prices: Array, together: np.
 def _couple_letters(S: Any, letters: Array, prices: Array) -> tuple[Array, list[Any]]:
     """``s = sum_j letters_j b_j`` with one ``b_j`` of each entry 1, and what every ``b`` costs."""
     from scipy.optimize import LinearConstraint
-    from scipy.sparse import csr_array, eye_array, hstack, kron
 
     size, width = letters.shape
     positions = (np.repeat(np.arange(size), width), np.arange(size * width))

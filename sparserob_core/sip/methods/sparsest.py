@@ -15,6 +15,7 @@ from typing import ClassVar
 
 import numpy as np
 from pydantic import Field, field_validator
+from scipy.sparse import csc_array, eye_array
 
 from sparserob_core.errors import InputError
 from sparserob_core.options import Options
@@ -416,6 +417,4 @@ def _report_infeasible(program: SemiInfiniteProgram, result: Result, letters: Se
 
 
 def _build_identity(size: int, columns: int) -> object:
-    from scipy.sparse import csc_array, eye_array
-
     return csc_array(eye_array(size, columns))

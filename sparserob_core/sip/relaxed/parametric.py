@@ -9,6 +9,7 @@ from functools import partial
 from typing import Literal, TypeAlias
 
 import numpy as np
+from scipy.sparse import block_diag
 
 from sparserob_core.sip.convex_set import Array, Box
 from sparserob_core.sip.program import ConstraintFamily, Enclosure, SemiInfiniteProgram, Separation
@@ -122,8 +123,6 @@ def _build_moving_bounds(program: SemiInfiniteProgram, slope_low: Array, slope_h
 def _extend_image(program: SemiInfiniteProgram) -> object:
     if program.finite.S is None:
         return None
-    from scipy.sparse import block_diag
-
     return block_diag([program.finite.S, [[1.0]]], format="csc")
 
 

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from typing import Any, TypeAlias, final
 
 import numpy as np
+from scipy.sparse import csr_array
 
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.finite import UncertainRows
@@ -114,7 +115,5 @@ class PolicyValue:
 
 def _make_certain_rows(G: Array, h: Array, deviations: int) -> UncertainRows:
     """Rows that no deviation changes."""
-    from scipy.sparse import csr_array
-
     nothing, still = csr_array((deviations, G.shape[1])), np.zeros((1, deviations))
     return UncertainRows(csr_array(G), h, np.zeros(h.size, dtype=int), np.zeros(h.size), (nothing,), still)

@@ -14,6 +14,7 @@ from functools import cache
 from typing import Any, Protocol, final
 
 import numpy as np
+from scipy.linalg import lapack
 
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.inner.central.layout import Block
@@ -246,8 +247,6 @@ def _eliminate_lean(block: Block, D: Array, weight: Array, lean: Array, left: Le
 @cache
 def _import_lapack() -> Any:
     """Return the routines of LAPACK, imported once: blocks ask for them ten thousand times in a step."""
-    from scipy.linalg import lapack
-
     return lapack
 
 

@@ -18,6 +18,8 @@ from dataclasses import dataclass, field
 from typing import cast, final
 
 import numpy as np
+from scipy.linalg import lapack
+from scipy.sparse import coo_array, csr_array, diags_array, hstack, vstack
 
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.finite import INTERIOR, FiniteProgram, Spread, UncertainRows
@@ -136,8 +138,6 @@ class Interior:
 
     def _initialise(self, margin: float) -> None:
         """Begin with joint variables, absolute values of those that cost, and the rows that bound them."""
-        from scipy.sparse import coo_array, csr_array
-
         program, joint = self.program, self._layout.joint
         n, low, high = joint.size, program.lower[joint], program.upper[joint]
         weights = program.weights[joint]
@@ -168,8 +168,6 @@ class Interior:
 
     def _extend_iterate(self, margin: float) -> None:
         """Give everything that is new a place, slacks and multipliers."""
-        from scipy.sparse import csr_array, hstack, vstack
-
         kept, L = self._layout.arrange(), self._layout
         if not (self._is_initialised and kept):
             self._initialise(margin)
@@ -312,9 +310,6 @@ class Interior:
 
     def _factorise(self) -> None:
         """Factorise the blocks, then what they leave of the rows, then the joint variables."""
-        from scipy.linalg import lapack
-        from scipy.sparse import diags_array
-
         L, first = self._layout, self._limits.size
         e, b = self._alpha / self._plus, self._beta / self._minus
         both = e + b
@@ -342,8 +337,6 @@ class Interior:
     def _compute_direction(self, rows: Array, over: Array, under: Array) -> Direction:
         """Return the Newton direction for these changes of the products of slacks and multipliers: of ``z``, ``f``, and
         the slacks and multipliers of rows and of both sides of absolute values."""
-        from scipy.linalg import lapack
-
         L, D, first = self._layout, self._D, self._limits.size
         k, kp, km = rows / self._s, over / self._plus, under / self._minus
         pull = -self._rt + kp + km

@@ -9,15 +9,13 @@ from __future__ import annotations
 
 import hashlib
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, final
+from typing import final
 
 import numpy as np
+from scipy.sparse import coo_array, csr_array, vstack
 
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.finite import FiniteProgram, Spread, UncertainRows
-
-if TYPE_CHECKING:
-    from scipy.sparse import csr_array
 
 ALIKE = 1.2  # times the parts of a block that its group may have
 WORTH = 3500  # answering variables from which this method is used; the simplex method is as fast up to 10 000
@@ -106,8 +104,6 @@ class Layout:
 
     def arrange(self) -> bool:
         """Bring what was added to its place; whether all that was there has kept its own."""
-        from scipy.sparse import csr_array, vstack
-
         self.entry, self.part, self.offset, self.radius = (
             np.concatenate(arrays) for arrays in zip(*self._values, strict=True)
         )
@@ -139,7 +135,6 @@ class Layout:
         )
 
     def _partition(self, row: np.ndarray, variable: np.ndarray) -> None:
-        from scipy.sparse import coo_array
         from scipy.sparse.csgraph import connected_components
 
         Q, n = self.spread.size, self.program.n

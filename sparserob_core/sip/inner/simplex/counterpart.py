@@ -17,9 +17,10 @@ from __future__ import annotations
 import time
 from collections import Counter
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, NamedTuple, final
+from typing import Any, NamedTuple, final
 
 import numpy as np
+from scipy.sparse import csc_array, csr_array, diags_array, vstack
 
 from sparserob_core.errors import PluginError, named
 from sparserob_core.sip.convex_set import Array
@@ -29,9 +30,6 @@ from sparserob_core.sip.inner.simplex.interruptible import run
 from sparserob_core.sip.inner.simplex.silence import silent
 from sparserob_core.sip.inner.simplex.tangents import Tangents
 from sparserob_core.sip.solver import AccountedSolver, QuadraticProgram
-
-if TYPE_CHECKING:
-    from scipy.sparse import csr_array
 
 ACCURACY = 1e-10  # of rows and reduced costs: the least that HiGHS takes
 # Residuals of an answer of somebody else, in rows of length 1. Ten times more, and a row that was imposed is violated
@@ -513,7 +511,6 @@ class Growing:
     def _ask_solver(self, asked: AccountedSolver) -> tuple[bool, str, Array, Array] | str:
         """Return the answer of who is asked, from nothing, where it holds; in words why it does not."""
         import highspy
-        from scipy.sparse import csc_array, csr_array, diags_array, vstack
 
         program = self.highs.getLp()
         matrix, (low, high) = program.a_matrix_, (np.array(program.row_lower_), np.array(program.row_upper_))

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from scipy.sparse import csr_array, vstack
 
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.inner.simplex.silence import silent
@@ -75,7 +76,6 @@ def with_integers(
     """Return a point ``(n,)`` of least ``cost (n,)`` up to a relative ``gap``, of which all entries but the first so
     many are whole numbers; the best that is known after ``seconds``, ``None`` where none is."""
     import highspy
-    from scipy.sparse import csr_array, vstack
 
     table = csr_array(vstack([csr_array(coupling.A) for coupling in couplings]))
     sides = [
