@@ -11,15 +11,15 @@ from pydantic import Field
 
 import sparserob_core as sr
 
-MOST_PIECES = 1_000_000
-MOST_OF_HAAR = 2**17  # pieces, on each of which log2 of them and one functions are not 0
+MAX_PIECES = 1_000_000
+MAX_OF_HAAR = 2**17  # pieces, on each of which log2 of them and one functions are not 0
 
 
 @final
 class PiecewiseConstant(sr.DictionaryFactory, sr.Options):
     """Indicator functions, one per piece; the pieces are equal, or as the breakpoints say."""
 
-    pieces: int | None = Field(default=None, ge=1, le=MOST_PIECES)
+    pieces: int | None = Field(default=None, ge=1, le=MAX_PIECES)
     """Number of equal pieces; 100 unless ``pieces``, ``step`` or ``breakpoints`` is given."""
 
     step: float | None = Field(default=None, gt=0.0)
@@ -28,7 +28,7 @@ class PiecewiseConstant(sr.DictionaryFactory, sr.Options):
     breakpoints: Annotated[list[float], Field(min_length=2)] | None = None
     """Ends of all pieces, increasing from 0 to the horizon."""
 
-    functions: int | None = Field(default=None, ge=1, le=MOST_PIECES)
+    functions: int | None = Field(default=None, ge=1, le=MAX_PIECES)
     """Number of functions, at most the number of pieces; fewer join neighbouring pieces as evenly as possible."""
 
     def build(self, horizon: float) -> sr.Dictionary:
@@ -47,9 +47,9 @@ class PiecewiseConstant(sr.DictionaryFactory, sr.Options):
         pieces = self.pieces or 100
         if self.step is not None:
             pieces = max(1, math.ceil(horizon / self.step * (1.0 - 1e-12)))
-            if pieces > MOST_PIECES:
+            if pieces > MAX_PIECES:
                 raise sr.InputError(
-                    f"step: expected at most {MOST_PIECES} pieces, got {pieces} on the horizon {horizon:g}"
+                    f"step: expected at most {MAX_PIECES} pieces, got {pieces} on the horizon {horizon:g}"
                 )
         return np.linspace(0.0, horizon, pieces + 1)
 
@@ -58,10 +58,10 @@ class PiecewiseConstant(sr.DictionaryFactory, sr.Options):
 class Haar(sr.DictionaryFactory, sr.Options):
     """The first Haar functions (Haar 1910) with values in -1, 0, 1: a constant, then ever shorter steps."""
 
-    pieces: int = Field(default=128, ge=1, le=MOST_OF_HAAR)
+    pieces: int = Field(default=128, ge=1, le=MAX_OF_HAAR)
     """Number of equal pieces, a power of two."""
 
-    functions: int | None = Field(default=None, ge=1, le=MOST_OF_HAAR)
+    functions: int | None = Field(default=None, ge=1, le=MAX_OF_HAAR)
     """Number of functions, at most the number of pieces; all unless given."""
 
     def build(self, horizon: float) -> sr.Dictionary:

@@ -11,7 +11,7 @@ from pydantic import Field
 
 import sparserob_core as sr
 
-MOST_SHOWN = 200  # rectangles
+MAX_SHOWN = 200  # rectangles
 NUMBERS_AT_ONCE: Final = 2**23  # coordinates of a batch: 64 MB, however many dimensions there are
 DEEPEST: Final = 33
 """Cuts of one side, at most: 3^-33 is the spacing of doubles near 1. With ten fewer the last digits are lost; with
@@ -98,7 +98,7 @@ class Division:
 
     def boxes(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the lower and upper corners ``(k, d)``, of the best rectangles first."""
-        order = np.argsort(self.losses[: self.count], kind="stable")[:MOST_SHOWN]
+        order = np.argsort(self.losses[: self.count], kind="stable")[:MAX_SHOWN]
         half = 0.5 / 3.0 ** self.levels[order].astype(float)
         return self._placed(self.centres[order] - half), self._placed(self.centres[order] + half)
 

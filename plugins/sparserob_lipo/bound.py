@@ -11,7 +11,7 @@ from sparserob_lipo.evaluated import Evaluated
 
 CELLS_AT_ONCE: Final = 64
 WORK: Final = 2**28  # differences of coordinates that may be computed
-MOST_ROUNDS: Final = 100
+MAX_ROUNDS: Final = 100
 ROUNDING: Final = 1e-12
 
 
@@ -31,7 +31,7 @@ def lipschitz_bound(evaluated: Evaluated, constant: float, sides: np.ndarray) ->
     best = float(evaluated.values[-1])
     centres, halves = 0.5 * sides[np.newaxis], 0.5 * sides[np.newaxis]
     bounds = _cell_bounds(evaluated, constant, centres, halves)
-    rounds = min(MOST_ROUNDS, WORK // (2 * CELLS_AT_ONCE * evaluated.count * max(4, sides.size)))
+    rounds = min(MAX_ROUNDS, WORK // (2 * CELLS_AT_ONCE * evaluated.count * max(4, sides.size)))
     for _ in range(rounds):
         top = bounds.max(initial=best)
         if top - best <= ROUNDING * max(abs(top), abs(best)):

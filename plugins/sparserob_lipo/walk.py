@@ -10,12 +10,12 @@ import numpy as np
 import sparserob_core as sr
 from sparserob_lipo.evaluated import Evaluated
 
-MOST_DRAWS: Final = 1024  # candidates per evaluation
+MAX_DRAWS: Final = 1024  # candidates per evaluation
 FAIR_DRAWS: Final = 64  # of which every other one is uniform; of the later ones every eighth
 FEWEST: Final = 8
-MOST_AT_ONCE: Final = 256
+MAX_AT_ONCE: Final = 256
 DRAWS_PER_HALVING: Final = 32  # candidates in boxes around the best point until these are half as large
-MOST_HALVINGS: Final = 40  # a box of 1e-12 of the sides; much smaller ones would repeat the best point
+MAX_HALVINGS: Final = 40  # a box of 1e-12 of the sides; much smaller ones would repeat the best point
 BLOCK_NUMBERS: Final = 2**17  # coordinates of the candidates that are drawn at once
 SHOWN_EVERY: Final = 16  # evaluations
 SHOWN: Final = 400  # balls, which is what a sketch keeps
@@ -51,9 +51,9 @@ class Walk:
             self.explore()
             return
         drawn, size = 0, self._last
-        max_draws = min(MOST_DRAWS, max(2 * FEWEST, WORK // (self.evaluated.count * self.dimension)))
+        max_draws = min(MAX_DRAWS, max(2 * FEWEST, WORK // (self.evaluated.count * self.dimension)))
         while True:
-            size = max(1, min(size, max_draws - drawn, MOST_AT_ONCE, BLOCK_NUMBERS // self.dimension))
+            size = max(1, min(size, max_draws - drawn, MAX_AT_ONCE, BLOCK_NUMBERS // self.dimension))
             points = self._candidates(drawn, size)
             scaled = self._scaled(points)
             first = self.evaluated.first_possible(scaled, constant)
@@ -88,7 +88,7 @@ class Walk:
             late_numbers = np.maximum(numbers - FAIR_DRAWS, 0)
             # candidates in boxes before this one
             steps = np.minimum(numbers, FAIR_DRAWS) // 2 + late_numbers - (late_numbers + 7) // 8
-            steps = np.minimum(steps + np.where(late_numbers > 0, self._skipped, 0), MOST_HALVINGS * DRAWS_PER_HALVING)
+            steps = np.minimum(steps + np.where(late_numbers > 0, self._skipped, 0), MAX_HALVINGS * DRAWS_PER_HALVING)
             reach = np.exp2(-steps[is_near] / DRAWS_PER_HALVING)[:, np.newaxis] * self.sides
             best = self.lower + self.scale * self.evaluated.best_point
             low, high = np.maximum(best - reach, self.lower), np.minimum(best + reach, self.upper)

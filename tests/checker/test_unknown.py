@@ -223,9 +223,9 @@ def test_disturbances_with_breakpoints_of_their_own_are_on_one_grid() -> None:
 
 def test_what_so_many_pieces_may_answer_is_no_array(monkeypatch: pytest.MonkeyPatch) -> None:
     """A million pieces, as a config may say in a few bytes, would be a terabyte of truth values."""
-    for most in (3, policy.MOST_ANSWERING):
-        monkeypatch.setattr(policy, "MOST_ANSWERING", most)
-        monkeypatch.setattr(case, "MOST_ANSWERING", most)
+    for most in (3, policy.MAX_ANSWERING):
+        monkeypatch.setattr(policy, "MAX_ANSWERING", most)
+        monkeypatch.setattr(case, "MAX_ANSWERING", most)
         ends = np.arange(most + 2.0)
         with pytest.raises(sr.InputError, match=f"at most {most} pieces of a control that answers, got {most + 1}"):
             policy.answers_of(AffinePolicy(), ends)
@@ -234,7 +234,7 @@ def test_what_so_many_pieces_may_answer_is_no_array(monkeypatch: pytest.MonkeyPa
         said = {"policy": {"cost": "peak", "answers": [[] for _ in ends[1:]]}}
         with pytest.raises(Broken, match=f"expected at most {most}"):
             case.written_policy(said, most + 1)
-    monkeypatch.setattr(policy, "MOST_ANSWERING", 3)
-    monkeypatch.setattr(case, "MOST_ANSWERING", 3)
+    monkeypatch.setattr(policy, "MAX_ANSWERING", 3)
+    monkeypatch.setattr(case, "MAX_ANSWERING", 3)
     assert policy.answers_of(AffinePolicy(), np.arange(4.0)).shape == (3, 3)
     assert case.written_policy({"policy": {"cost": "peak", "answers": [[], [], [[0, 1]]]}}, 3).mask.sum() == 2

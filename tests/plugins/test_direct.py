@@ -48,7 +48,7 @@ def test_the_rectangles_fill_the_box_without_overlap_and_each_has_its_point(bias
     while division.count < 150:
         division.divide(division.promising(1e-8))
     lower, upper = division.boxes()
-    assert len(lower) == min(division.count, sparserob_direct.MOST_SHOWN) >= 150
+    assert len(lower) == min(division.count, sparserob_direct.MAX_SHOWN) >= 150
     middles = (lower + upper) / 2
     assert (upper - lower).prod(axis=1).sum() == pytest.approx(2.0) or division.count > len(lower)
     inside = ((middles[:, None] > lower[None] + 1e-9) & (middles[:, None] < upper[None] - 1e-9)).all(axis=2)

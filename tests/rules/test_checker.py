@@ -10,7 +10,7 @@ from tests.support.places import ROOT
 
 CORE = ROOT / "sparserob_core"
 CHECKER = CORE / "checker"
-MOST_METHODS = 25
+MAX_METHODS = 25
 
 
 def classes(path: Path) -> Iterator[ast.ClassDef]:
@@ -36,5 +36,5 @@ def test_no_class_of_the_checker_is_called_as_one_elsewhere_in_the_core() -> Non
 
 
 def test_no_class_of_the_checker_has_more_than_twenty_five_methods() -> None:
-    large = [(path, node) for path in modules(CHECKER) for node in classes(path) if methods(node) > MOST_METHODS]
+    large = [(path, node) for path in modules(CHECKER) for node in classes(path) if methods(node) > MAX_METHODS]
     assert not [f"{node.name} in {path.relative_to(ROOT)}: {methods(node)}" for path, node in large]

@@ -43,7 +43,7 @@ ROUND = 5 * TOGETHER  # numbers of policies among whose sets of deviations there
 LARGER = 2.0  # times the disturbance that open loops are tested with
 PER_PIECE = 8
 AT_ONCE = 80  # rows that are imposed where they are violated
-MOST_ANSWERED = 7  # deviations that are answered, of which all corners are looked at
+MAX_ANSWERED = 7  # deviations that are answered, of which all corners are looked at
 MET = 1e-9  # a row that is violated by less is met
 
 
@@ -467,7 +467,7 @@ class _Policy:
     def _worst(self) -> None:
         """The largest effort, by every corner of what is answered."""
         answered = [z for z in np.flatnonzero(self.radii) if self.answers[z].nnz]
-        assert len(answered) <= MOST_ANSWERED
+        assert len(answered) <= MAX_ANSWERED
         (top,) = self.program.variables(1, 1.0, 0.0)
         for signs in product((1.0, -1.0), repeat=len(answered)):
             corner = sum(

@@ -14,7 +14,7 @@ from sparserob_core.checker.arithmetic.balls import ball
 from sparserob_core.checker.arithmetic.monomials import Monomials
 from sparserob_core.checker.outcome import Unchecked
 
-LARGEST_POWER = 64  # the largest integer exponent for which a power is multiplied out
+MAX_POWER = 64  # the largest integer exponent for which a power is multiplied out
 ENOUGH = 2.0**-110  # the relative remainder of a function's series: a smaller one takes terms without a visible effect
 NEWTON = 80  # steps of Newton's method, or halvings of an interval; with a tenth of them long ellipses get wide balls
 
@@ -132,7 +132,7 @@ class Model:
     def __pow__(self, other: object) -> Model:
         if isinstance(other, int | float | np.integer | np.floating) and float(other).is_integer():
             count = int(other)
-            if abs(count) <= LARGEST_POWER:
+            if abs(count) <= MAX_POWER:
                 power, base = self._convert_to_model(1.0), self
                 for _ in range(abs(count)):
                     power = power * base

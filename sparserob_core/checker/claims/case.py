@@ -28,7 +28,7 @@ from sparserob_core.checker.problem.timing import Timing, before
 from sparserob_core.checker.reach.followed import FollowedRows
 from sparserob_core.checker.reach.sources import Sources
 from sparserob_core.checker.reach.states import Scene, StatesOverBoxes
-from sparserob_core.control.policies.policy import MOST_ANSWERING, Charge, Cost, Policy, WrittenPolicy, answers_of
+from sparserob_core.control.policies.policy import MAX_ANSWERING, Charge, Cost, Policy, WrittenPolicy, answers_of
 from sparserob_core.control.problem.cost import nominal_point
 from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.problem.problem import OptimalControlProblem
@@ -322,8 +322,8 @@ def written_policy(certificate: Mapping[str, Any], pieces: int) -> WrittenPolicy
         raise Broken(f"policy: the cost is {written_cost!r}, expected one of {', '.join(get_args(Cost))}")
     if len(rows) != pieces:
         raise Broken(f"policy: answers of {len(rows)} pieces, expected {pieces}")
-    if pieces > MOST_ANSWERING:
-        raise Broken(f"policy: {pieces} pieces that answer, expected at most {MOST_ANSWERING}")
+    if pieces > MAX_ANSWERING:
+        raise Broken(f"policy: {pieces} pieces that answer, expected at most {MAX_ANSWERING}")
     mask = np.zeros((pieces, pieces), dtype=bool)
     for k, ranges in enumerate(rows):
         for indices in ranges if isinstance(ranges, list) else [ranges]:

@@ -40,7 +40,7 @@ if TYPE_CHECKING:
 SURE = 1e-8  # a vertex that is predicted to this accuracy is one
 NEARER, LOOKS = 8, 4  # an unsure vertex is predicted from samples so many times nearer, and so often
 ARRIVED = 1e-11  # what a vertex that was arrived at may still promise
-INSIDE, MOST_INSIDE = 3, 64  # times sampled inside every piece, beside its ends: more where the system moves on it
+INSIDE, MAX_INSIDE = 3, 64  # times sampled inside every piece, beside its ends: more where the system moves on it
 STENCIL = np.array([-1.0, 0.0, 1.0])
 SMOOTH = 0.1  # norm of A times the spacing of samples between which a parabola is a good guide
 CLIMBED = 10  # largest number of candidates that are climbed from, in parameters, or in time beside a kink
@@ -115,7 +115,7 @@ class Samples:
             return self.undivided[0].times
         grid, (start, stop) = self._response.grid, self.window
         pace = float(np.linalg.norm(self._response.steps(self.lattice[0]).A, axis=(2, 3)).max())
-        counts = np.clip(np.ceil(pace * grid.lengths / SMOOTH), INSIDE + 1, MOST_INSIDE).astype(int)
+        counts = np.clip(np.ceil(pace * grid.lengths / SMOOTH), INSIDE + 1, MAX_INSIDE).astype(int)
         sample_numbers = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
         inside = np.repeat(grid.breakpoints[:-1], counts) + sample_numbers * np.repeat(grid.lengths / counts, counts)
         inside = np.concatenate([inside[(inside > start) & (inside < stop)], self.cuts])

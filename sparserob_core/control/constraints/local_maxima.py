@@ -16,7 +16,7 @@ UNSURE = 4.0  # by how much the rise that a parabola predicts may be wrong
 CLOSE = 1e-6  # found maxima that are one, in times and on the cube of directions
 # Indices of a curved set that are found at once, and those told where nothing is violated. With ten times fewer of the
 # first, rounds grow with the length of a wall that is ridden; with ten times more, there are more than help.
-MOST_RETURNED, FEWEST_RETURNED = 64, 8
+MAX_RETURNED, FEWEST_RETURNED = 64, 8
 TURNS = 4  # directions at a time in which a curved set may be left
 # Of them and of times, from how many directions are climbed to. With ten times fewer, a violation beside a wall that is
 # ridden for long is left to the proof, which meets one a round.
@@ -164,17 +164,17 @@ def ridden(
     Returns
     -------
     indices : ndarray, shape (k, j)
-        Indices of the violations, at most `MOST_RETURNED`. The best `FEWEST_RETURNED` are returned even where nothing
+        Indices of the violations, at most `MAX_RETURNED`. The best `FEWEST_RETURNED` are returned even where nothing
         is violated.
     violations : ndarray, shape (k,)
         Violations, worst first; negative where there is a margin.
     """
     line, times = heights[None, None], held[:, 0]
-    peaks = local_maxima(line, (1,), MOST_RETURNED)
-    peaks = np.unique(np.vstack([peaks, find_kink_neighbours(line, times, kinks, MOST_RETURNED)]), axis=0)
+    peaks = local_maxima(line, (1,), MAX_RETURNED)
+    peaks = np.unique(np.vstack([peaks, find_kink_neighbours(line, times, kinks, MAX_RETURNED)]), axis=0)
     vertex_times, promised = vertices(line, peaks, times)
     promised = line[0, 0, peaks[:, 2]] + UNSURE * (promised - line[0, 0, peaks[:, 2]])
-    spans = along_spans(line, peaks, pieces, MOST_RETURNED)[:, 2]
+    spans = along_spans(line, peaks, pieces, MAX_RETURNED)[:, 2]
     points = held[peaks[:, 2]]
     points[:, 0] = vertex_times
     order = np.argsort(-promised, kind="stable")
@@ -185,7 +185,7 @@ def ridden(
     groups = [climbed(points[first]), nearer, (held[sample_positions], heights[sample_positions])]
     indices, violations = np.vstack([group[0] for group in groups]), np.concatenate([group[1] for group in groups])
     order = _select_distinct(indices, violations)
-    order = order[(violations[order] > 0.0) | (np.arange(order.size) < FEWEST_RETURNED)][:MOST_RETURNED]
+    order = order[(violations[order] > 0.0) | (np.arange(order.size) < FEWEST_RETURNED)][:MAX_RETURNED]
     return indices[order], violations[order]
 
 

@@ -26,10 +26,10 @@ Value: TypeAlias = Any
 """A float, or anything else with arithmetic, such as a `TaylorModel`."""
 Table: TypeAlias = "np.ndarray"
 Exponents: TypeAlias = tuple[int, ...]
-LARGEST_DEGREE = 8
+MAX_ENTRY_DEGREE = 8
 """The degree in all parameters together up to which an entry counts as a polynomial in them. With twice the degree an
 expansion of all terms is too large; beyond it an entry is a power series, of which only the terms that matter count."""
-LARGEST_CELL_DEGREE, NUMBERS_ON_CELL = 6, 80
+MAX_CELL_DEGREE, NUMBERS_ON_CELL = 6, 80
 """The degree on a cell of parameters, and the coefficients times states, at most: with twice as many a cell takes three
 times as long, with half as many there are three times as many cells."""
 Part: TypeAlias = "dict[Exponents, Value]"
@@ -68,7 +68,7 @@ class Dependent:
 
     value: Value
     others: Mapping[Exponents, Value]
-    degree: int = LARGEST_DEGREE
+    degree: int = MAX_ENTRY_DEGREE
     beyond: bool = False
 
     @property
@@ -334,7 +334,7 @@ class Split:
     nu: int
 
     @staticmethod
-    def of(entry: object, time: Value, centre: Array, units: Array, degree: int = LARGEST_DEGREE) -> Split:
+    def of(entry: object, time: Value, centre: Array, units: Array, degree: int = MAX_ENTRY_DEGREE) -> Split:
         """Return the expansion of an entry of a law in its parameters.
 
         Parameters
@@ -535,7 +535,7 @@ class ExpandedSystem:
         """
         nu = self.space.nu
         degrees = [
-            degree for degree in range(1, LARGEST_CELL_DEGREE + 1) if self.d * comb(nu + degree, nu) <= NUMBERS_ON_CELL
+            degree for degree in range(1, MAX_CELL_DEGREE + 1) if self.d * comb(nu + degree, nu) <= NUMBERS_ON_CELL
         ]
         space = taylor_space(nu, max([1, *degrees]))
         kept = np.flatnonzero(self.space.degrees <= space.degree)

@@ -17,7 +17,7 @@ from sparserob_core.sip.convex_set import Array
 Quantity: TypeAlias = Literal["state", "disturbance", "parameters"]
 Cost: TypeAlias = Literal["nominal", "peak", "worst"]
 
-MOST_ANSWERING = 2**13
+MAX_ANSWERING = 2**13
 """Pieces of a control that answers what is measured: what each of them may answer are so many squared, 67 million, of
 which a program has a variable each for every state."""
 
@@ -120,7 +120,7 @@ def answers_of(policy: Policy | None, breakpoints: Array, measured: Measurements
     Returns
     -------
     ndarray
-        Truth values ``(K, K)``; an empty array for more than `MOST_ANSWERING` pieces where nothing is answered.
+        Truth values ``(K, K)``; an empty array for more than `MAX_ANSWERING` pieces where nothing is answered.
 
     Raises
     ------
@@ -129,11 +129,11 @@ def answers_of(policy: Policy | None, breakpoints: Array, measured: Measurements
         measured or without being known.
     """
     K = len(breakpoints) - 1
-    if K > MOST_ANSWERING:
+    if K > MAX_ANSWERING:
         if policy is None or isinstance(policy, OpenLoop):
             return np.zeros((0, 0), dtype=bool)
         raise InputError(
-            path="policy.name", expected=f"at most {MOST_ANSWERING} pieces of a control that answers", got=f"{K}"
+            path="policy.name", expected=f"at most {MAX_ANSWERING} pieces of a control that answers", got=f"{K}"
         )
     if policy is None:
         return np.zeros((K, K), dtype=bool)

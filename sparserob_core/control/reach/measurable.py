@@ -37,7 +37,7 @@ ORDER = 12  # of the expansion that encloses a row; what is left of it on a shor
 SHORT = 0.5  # time times speed that such an interval takes: twice as much leaves 1e-10, half as much doubles the work
 TINY = float(np.finfo(float).tiny)
 TABLES_KEPT = 4096  # directions and parameters whose integrals are remembered
-MOST_INTERVALS = 4096  # intervals that one is cut into before any is halved
+MAX_INTERVALS = 4096  # intervals that one is cut into before any is halved
 # numbers of polynomials, or of remembered lengths, that are made at once, or of kernels that are remembered (32 MB)
 AT_ONCE = 4_000_000
 KEPT = 8  # tables of lengths at sampled times, one for each constraint
@@ -329,7 +329,7 @@ class MeasurableSupport:
     def _divide_intervals(self, A: Array, ages: Array) -> Array:
         """The ends ``(n + 1,)`` of short intervals, as many between all neighbours of ``ages (L + 1,)``."""
         pieces = np.diff(ages)
-        count = int(np.clip(np.ceil(self._balance_matrix(A).fastest * pieces.max() / SHORT), 1, MOST_INTERVALS))
+        count = int(np.clip(np.ceil(self._balance_matrix(A).fastest * pieces.max() / SHORT), 1, MAX_INTERVALS))
         return np.append((ages[:-1, None] + np.outer(pieces, np.arange(count) / count)).ravel(), ages[-1])
 
     def _balance_matrix(self, A: Array) -> _BalancedMatrix:

@@ -38,7 +38,7 @@ from sparserob_core.errors import NotEnclosable
 from sparserob_core.sip.convex_set import Array, ConvexSet
 
 KNOWN = TaylorSpace(0, 0)
-FEWEST_TERMS, MOST_TERMS = 8, 32
+FEWEST_TERMS, MAX_TERMS = 8, 32
 """Terms of an exponential of bounds, at least and at most. With half of them third derivatives count twice."""
 TAIL = 2.0**-60
 """Share of a norm that the terms beyond may be. They are bounded in the norm of all coefficients of a cell. With a
@@ -480,9 +480,9 @@ class VaryingMotion:
 
 
 def _count_terms(pace: float) -> int:
-    """Return the number of terms of ``e^pace`` whose tail is at most `TAIL`, within `FEWEST_TERMS` and `MOST_TERMS`."""
-    count, pace = FEWEST_TERMS, min(pace, float(MOST_TERMS))
-    while count < MOST_TERMS and pace**count > TAIL * factorial(count):
+    """Return the number of terms of ``e^pace`` whose tail is at most `TAIL`, within `FEWEST_TERMS` and `MAX_TERMS`."""
+    count, pace = FEWEST_TERMS, min(pace, float(MAX_TERMS))
+    while count < MAX_TERMS and pace**count > TAIL * factorial(count):
         count += 2
     return count
 

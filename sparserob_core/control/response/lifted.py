@@ -52,7 +52,7 @@ DEGREES = {0: 0, 1: 6, 2: 4, 3: 3}  # of the Taylor models, by the number of par
 KNOWN = np.zeros((1, 0))
 # growth of the comparison system times length of the parts that pieces are cut into for what is neglected, and how
 # many of a piece at most
-SHORT, MOST_CUTS = 0.5, 64
+SHORT, MAX_CUTS = 0.5, 64
 LONG_STEP = 1.0  # in norm times duration: longer steps are taken by matrix exponentials
 TAYLOR_TERMS = 1e-17  # relative size below which further terms of the exponential series are left out
 PATHS_KEPT, PATHS_SIZE = 4, 20_000_000  # paths that are remembered, and the numbers in all of them beyond the first
@@ -174,7 +174,7 @@ class LiftedSystem:
         if not self.space.nu:  # without truncation there is little to bound
             return self.grid
         growth = float(np.abs(np.linalg.eigvals(self.comparison.rising)).max())
-        counts = np.clip(np.ceil(growth * self.grid.lengths / SHORT), 1, MOST_CUTS).astype(int)
+        counts = np.clip(np.ceil(growth * self.grid.lengths / SHORT), 1, MAX_CUTS).astype(int)
         breaks = self.grid.breakpoints
         if counts.max() == 1:
             return self.grid

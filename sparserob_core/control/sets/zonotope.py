@@ -16,7 +16,7 @@ from sparserob_core.errors import InputError
 from sparserob_core.shapes import dense, sealed
 from sparserob_core.sip.convex_set import CLOSED, Array, ConvexSet, chords, continued_by_signs, finite
 
-MOST_SIDES = 500  # pairs of half-spaces that are listed; a set with more is described by its support function alone
+MAX_SIDES = 500  # pairs of half-spaces that are listed; a set with more is described by its support function alone
 ROUNDED = 1e-14  # relative rounding error of the sums along a generator
 PARALLEL = 1e-10  # singular value, relative to generators of length 1, below which these do not span a facet
 
@@ -151,7 +151,7 @@ class Zonotope(ConvexSet):
         generators = self.generators[sizes > 0] / sizes[sizes > 0, None]
         _, values, basis = np.linalg.svd(generators, full_matrices=True)
         rank = int((values > PARALLEL).sum())
-        if comb(len(generators), max(rank - 1, 0)) > MOST_SIDES:
+        if comb(len(generators), max(rank - 1, 0)) > MAX_SIDES:
             return None
         basis = np.where(np.abs(basis) > ROUNDED, basis, 0.0) if rank < d else np.eye(d)
         within = (

@@ -30,7 +30,7 @@ ROWS = 2**22  # numbers of rows that are expanded at once (32 MB)
 TIME_BITS = 46  # a power of 1/2 of the horizon: a witness loses rounding by it, and 53 bits hold sums of such times
 INWARDS = 1e-12  # of a set without axes, what corners and boundary points may be off: thousands of roundings
 HALVED = 44  # halvings of a step across a switch: what is left of it is rounding
-MOST_SWITCHES = 4096  # of a set without corners, whose best value changes all the time
+MAX_SWITCHES = 4096  # of a set without corners, whose best value changes all the time
 # Roundings of a transition over a step, for each of which the row at the end is off as often as there are steps; a beam
 # of 348 states, whose modes are far from normal, was off by 0.7 of them.
 ROUNDED = 4
@@ -438,7 +438,7 @@ class WorstRow:
             middle = (start + stop) / 2
             centre = best(middle)
             is_lower = (centre != left_values).any(axis=1)
-            is_double = is_lower & (centre != right_values).any(axis=1) & (start.size < MOST_SWITCHES)
+            is_double = is_lower & (centre != right_values).any(axis=1) & (start.size < MAX_SWITCHES)
             start, stop, left_values, right_values = (
                 np.concatenate([np.where(is_lower, start, middle), middle[is_double]]),
                 np.concatenate([np.where(is_lower, middle, stop), stop[is_double]]),

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Protocol
 import numpy as np
 from scipy.linalg import matrix_balance
 
-from sparserob_core.control.constraints.flat import INSIDE, MOST_INSIDE, SMOOTH
+from sparserob_core.control.constraints.flat import INSIDE, MAX_INSIDE, SMOOTH
 from sparserob_core.control.enclosures.decoupling import decoupled, pace
 from sparserob_core.control.enclosures.flows import Flows
 from sparserob_core.control.enclosures.matrix_exponential import transitions
@@ -37,7 +37,7 @@ def fine_times(response: Response, parameters: ParameterIndex, more: Array) -> A
     points = parameters.lattice()[0]
     rate = max(pace(A) for mode in response.system.modes for A in mode.matrices(points)[0])
     fewest = INSIDE + 1 if grid.pieces < MANY else 1
-    counts = np.clip(np.ceil(rate * grid.lengths / SMOOTH), fewest, MOST_INSIDE).astype(int)
+    counts = np.clip(np.ceil(rate * grid.lengths / SMOOTH), fewest, MAX_INSIDE).astype(int)
     index = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
     inside = np.repeat(grid.breakpoints[:-1], counts) + np.repeat(grid.lengths, counts) * index / np.repeat(
         counts, counts

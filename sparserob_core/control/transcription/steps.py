@@ -17,7 +17,7 @@ from sparserob_core.control.problem.units import power_of_two
 from sparserob_core.errors import InputError
 from sparserob_core.sip.convex_set import Array, ConvexSet
 
-MOST_CUTS = 60  # rounds of tangents
+MAX_CUTS = 60  # rounds of tangents
 CLOSE = 1e-7  # of the control's range, a point that is as good as inside
 
 
@@ -141,7 +141,7 @@ def _has_infeasible_tangents(held: list[tuple[ConvexSet, Array, Array]], reach: 
     m, n = held[0][0].dimension, reach.size
     axes = np.vstack([np.eye(m), -np.eye(m)])
     cuts = [(convex, M, offset, index, c) for convex, M, offset in held for index in range(len(M)) for c in axes]
-    for _ in range(MOST_CUTS):
+    for _ in range(MAX_CUTS):
         for convex, M, offset, index, c in cuts:
             height = float(convex.support(c[None])[0])
             if np.isfinite(height):

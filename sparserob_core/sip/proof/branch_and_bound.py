@@ -43,7 +43,7 @@ REST, TINY = 8, 1e-5
 # reports a larger bound than necessary, and decisions keep a larger distance; with a tenth, more cells are needed.
 FALLING = 0.06
 MOVES = 24  # largest number of steps of such an ascent
-MOST_CUT = 32  # largest number of open cells that are divided towards peaks
+MAX_CUT = 32  # largest number of open cells that are divided towards peaks
 SHARE, GROWN = 0.8, (1 / 16, 1.0)  # share of the allowed length of such parts; relative growth from part to part
 _NOWHERE = Separation(np.zeros((0, 1)), np.zeros(0, dtype=int), np.zeros(0))
 
@@ -546,7 +546,7 @@ def _divide_towards_peaks(
     ``b`` of the second derivative. Its bound is about ``v - c D^2 / 2 + b (g D)^2 / 8``. So ``g = 2 sqrt(c / b)``
     suffices.
     """
-    if not peaks.violations.size or lower.shape[0] > MOST_CUT:
+    if not peaks.violations.size or lower.shape[0] > MAX_CUT:
         return None
     starts, stops = list[Array](), list[Array]()
     reach = np.clip(peaks.indices[:, 0], lower, upper)

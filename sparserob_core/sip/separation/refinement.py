@@ -25,7 +25,7 @@ ACCURACY = 1e-14
 HOPELESS = 8.0
 """Times the variation of a model by which its maximum may lie above its best point. With an eighth of it narrow peaks
 are given up; with ten times as much nothing is."""
-LARGEST_DIMENSION_WITH_CROSS_TERMS = 8
+MAX_DIMENSION_WITH_CROSS_TERMS = 8
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,7 +134,7 @@ def _build_stencil(dimension: int) -> Array:
     """The middle, one step either way along every coordinate, and the four corners of every pair of coordinates."""
     unit = np.eye(dimension)
     offsets = [np.zeros(dimension), *unit, *-unit]
-    if dimension <= LARGEST_DIMENSION_WITH_CROSS_TERMS:
+    if dimension <= MAX_DIMENSION_WITH_CROSS_TERMS:
         offsets += [
             a * unit[i] + b * unit[j]
             for i, j in combinations(range(dimension), 2)

@@ -33,7 +33,7 @@ POINTS_PER_ASKED = 4
 MAXIMA_PER_KEPT = 4
 SAME = 1e-6
 """Maxima of one row that are closer than this share of the box are one maximum."""
-LARGEST_ARRAY = 2_000_000
+MAX_ARRAY = 2_000_000
 
 
 def separate(
@@ -194,7 +194,7 @@ class _Violation:
         self.family, self.x, self.box, self.deadline = family, x, box, deadline
         self.moves = np.flatnonzero(box.upper > box.lower)
         self.dimension = int(self.moves.size)
-        self.width = LARGEST_ARRAY
+        self.width = MAX_ARRAY
 
     def indices(self, unit: Array) -> Array:
         """Indices ``(k, d)`` of unit points ``(k, free)``; the faces of the unit box go to the faces of the index set
@@ -216,9 +216,9 @@ class _Violation:
         """Violations ``(k, r)`` at indices ``(k, d)``, in portions that fit into memory."""
         portions, start = [], 0
         while start < len(indices):
-            stop = start + (self.width if start or self.width < LARGEST_ARRAY else min(64, len(indices)))
+            stop = start + (self.width if start or self.width < MAX_ARRAY else min(64, len(indices)))
             portions.append(self._evaluate_portion(indices[start:stop]))
-            self.width, start = max(16, LARGEST_ARRAY // max(1, portions[-1].shape[1] * self.x.size)), stop
+            self.width, start = max(16, MAX_ARRAY // max(1, portions[-1].shape[1] * self.x.size)), stop
         return np.concatenate(portions) if len(portions) != 1 else portions[0]
 
     def _evaluate_portion(self, indices: Array) -> Array:

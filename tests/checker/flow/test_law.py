@@ -296,3 +296,18 @@ def test_the_size_of_a_law_counts_the_rounding_of_the_sum_of_its_coefficients() 
     exact = sum(map(Fraction, coefficients)), sum(n * Fraction(c) for n, c in enumerate(coefficients))
     for size, truth in zip(stretch.sizes, exact, strict=True):
         assert truth <= Fraction(size.item()) <= truth * (1 + Fraction(1, 10**11))
+
+
+def test_a_box_holds_what_lies_in_it_to_the_last_digit_and_nothing_on_either_side() -> None:
+    box = ParameterBox((1.0, -2.0), (0.5, 0.25))
+    assert box.holds(box)
+    for axis, half in enumerate(box.halves):
+        for sign in (-1.0, 1.0):
+            for share, expected in ((0.5, True), (0.75, False), (3.0, False)):
+                middle, halves = list(box.middle), list(box.halves)
+                middle[axis] += sign * share * half
+                halves[axis] = half / 2
+                assert box.holds(ParameterBox(tuple(middle), tuple(halves))) is expected, (axis, sign, share)
+    assert not box.holds(ParameterBox(box.middle, (np.nextafter(0.5, 1.0), 0.25)))
+    assert not box.holds(ParameterBox((1.0 + 2.0**-52, -2.0), box.halves))  # the sum of the floats is 1.5
+    assert not box.holds(ParameterBox((1.0 - 2.0**-53, -2.0), box.halves))

@@ -9,7 +9,7 @@ import pytest
 
 from sparserob_core.control.constraints.curved import CurvedConstraint
 from sparserob_core.control.constraints.feedback_curved import FeedbackCurved
-from sparserob_core.control.constraints.local_maxima import MOST_RETURNED, along_spans, find_kink_neighbours, ridden
+from sparserob_core.control.constraints.local_maxima import MAX_RETURNED, along_spans, find_kink_neighbours, ridden
 from sparserob_core.control.sets.directions import sampled
 from sparserob_core.sip.proof.branch_and_bound import prove_family
 from tests.known_answers.test_walls import ridden as problem
@@ -72,7 +72,7 @@ def test_what_is_climbed_to_roughly_is_told_exactly_and_is_hardly_below_dense_sa
 def test_a_set_that_is_left_is_imposed_all_along(curved: CurvedConstraint) -> None:
     x = np.zeros(curved.functionals.variables)  # the state falls to 0, and the ellipse is left for good
     found = curved.worst(x)
-    assert found.violations.size <= MOST_RETURNED
+    assert found.violations.size <= MAX_RETURNED
     left = found.indices[found.violations > 0.0, 0]
     pieces = np.arange(0.25, 4.0, 0.25)
     gone = pieces[(dense(curved, x, pieces) > 0.0) & (dense(curved, x, pieces + 0.25) > 0.0)]
@@ -150,7 +150,7 @@ def test_a_violation_that_rises_and_falls_beside_a_kink_is_met() -> None:
         return np.where(later >= 0.0, -0.001 + 0.08 * later - 0.5 * later**2, -0.001 * at)
 
     line = height(times)  # no sample is above 0, and neither the one at the kink nor those beside it are maxima
-    assert [0, 0, 5] in find_kink_neighbours(line[None, None], times, kinks, MOST_RETURNED).tolist()
+    assert [0, 0, 5] in find_kink_neighbours(line[None, None], times, kinks, MAX_RETURNED).tolist()
     held, pieces = np.hstack([times[:, None], np.ones((9, 1))]), np.repeat([0, 1, 2], [1, 4, 4])
 
     def turned(points: Any) -> Any:

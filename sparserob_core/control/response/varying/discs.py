@@ -33,8 +33,8 @@ hundredth of the box outside of it needs a degree of a thousand."""
 FIRST = 32  # cells of time to begin with
 AS_GOOD = 10.0  # times what a cell's middle leaves: a wider one is halved; with 2 there are as many cells as in a proof
 NOTHING = 1e-18  # of an entry's values, what may be left whatever the middle says
-MOST_CELLS = 4096  # in all; halving goes on where an entry is steep
-LARGEST_POWER = 64
+MAX_CELLS = 4096  # in all; halving goes on where an entry is steep
+MAX_POWER = 64
 SEARCHED = 4000  # parts of horizon and box that are looked through for a pole
 TINIEST = 2.0**-20  # of horizon and box, a part without an enclosure holds a pole
 OUTWARD = 1.0 + 1e-9
@@ -105,7 +105,7 @@ class Discs:
         if isinstance(other, Discs):
             return (other * self.log()).exp()
         power = float(other)  # type: ignore[arg-type]  # a number then
-        if not power.is_integer() or abs(power) > LARGEST_POWER:
+        if not power.is_integer() or abs(power) > MAX_POWER:
             return self._raise_to_power(power)
         product, base = Discs(np.ones(self.middle.shape), np.zeros(self.middle.shape)), self
         for _ in range(abs(int(power))):
@@ -308,7 +308,7 @@ class _Law:
                 for k in np.flatnonzero(~np.isfinite(middle_bounds).all(axis=1)):
                     self._require_no_pole(float(starts[k]), float(stops[k]), wanted)
                 is_good &= (cell_bounds <= AS_GOOD * middle_bounds + NOTHING * sizes[:, wanted]).all(axis=1)
-            is_good |= len(accepted) + 2 * starts.size > MOST_CELLS
+            is_good |= len(accepted) + 2 * starts.size > MAX_CELLS
             accepted += [(float(starts[k]), float(stops[k]), distances[k], sizes[k]) for k in np.flatnonzero(is_good)]
             halved = [(starts[~is_good], middles[~is_good]), (middles[~is_good], stops[~is_good])]
             starts, stops = (np.concatenate([pair[side] for pair in halved]) for side in range(2))

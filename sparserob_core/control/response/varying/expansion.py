@@ -40,7 +40,7 @@ BLUNTEST = 1e-10  # from which on a segment is halved even where that did not he
 SHORTEST = 2.0**-30  # of the horizon: a shorter segment without an enclosure holds a pole
 _CACHE: WeakKeyDictionary[Phase, dict[tuple[object, ...], Expansion]] = WeakKeyDictionary()
 FIRST = 8  # segments to begin with
-MOST_SEGMENTS = 100_000
+MAX_SEGMENTS = 100_000
 """Segments at most. Ten times as many take an hour and gigabytes; of a tenth systems would be refused that are solved
 in a minute."""
 LOOKED = 256  # segments after which the rest is estimated: a tenth of a second of work; ten times as many are a second
@@ -170,7 +170,7 @@ class Expansion:
             if segment.sharp:
                 ends.append(stop)
                 segments.append(segment)
-                if len(segments) in (LOOKED, MOST_SEGMENTS):
+                if len(segments) in (LOOKED, MAX_SEGMENTS):
                     _require_few_segments(system, look, ends)
             elif stop - start <= SHORTEST * horizon:
                 raise InputError(f"near t = {centre:.9g} the system {segment.why}", path="system")
@@ -750,10 +750,10 @@ def _require_few_segments(system: System, look: Look, ends: Sequence[float]) -> 
         for k in range(SAMPLED if step > 0.0 else 0):
             time = max(begin, end) + (k + 0.5) * step
             needed += step / look.length(law, time, step, SHORTEST * horizon)
-    if needed > MOST_SEGMENTS:
+    if needed > MAX_SEGMENTS:
         raise InputError(
             f"it changes so fast that it would take some {needed:.1g} segments of the horizon, each a polynomial of the"
-            f" time, and {MOST_SEGMENTS} can be followed; a shorter horizon takes fewer, or entries without what is so"
+            f" time, and {MAX_SEGMENTS} can be followed; a shorter horizon takes fewer, or entries without what is so"
             " fast",
             path="system",
         )

@@ -27,11 +27,11 @@ TRUNCATION_TOLERANCES = (1e-14, 1e-12, 1e-10)
 """Shares of the state, of which the first is taken that the estimated truncation error of the law reaches. A proof
 needs 1e-8."""
 NUMBERS = 400  # coefficients times states of a law; twice as many are matrices of 5 MB on each of its segments
-LARGEST_DEGREE = 30  # the degree where entries are no polynomials: what 40 of them leave less is below what is rounded
+MAX_EXPANSION_DEGREE = 30  # where entries are no polynomials: what 40 of them leave less is below what is rounded
 LOOKS = 17  # times at which coefficients are looked at; nothing is proven with them
 DEGREE = 4  # of the coefficients that are looked at then
-MOST_PARTS = 64  # of the box: each is proven alone
-LARGEST_EXPONENT = 700.0  # largest exponent by which parameters may move the state: its exponential is still a float
+MAX_PARTS = 64  # of the box: each is proven alone
+MAX_EXPONENT = 700.0  # largest exponent by which parameters may move the state: its exponential is still a float
 _CACHE: WeakKeyDictionary[Phase, dict[tuple[object, ...], ParameterParts]] = WeakKeyDictionary()
 
 
@@ -266,15 +266,15 @@ def _choose_parts(system: System) -> tuple[tuple[Array, ...], list[Cauchy | None
     nu, counts, lowest = box.dimension, np.ones(box.dimension, dtype=int), max(1, powers)
     scale = _choose_state_units(system)
     exponent = _estimate_exponent(system, scale)
-    if exponent > LARGEST_EXPONENT:
+    if exponent > MAX_EXPONENT:
         raise InputError(
             path="system.parameters",
             expected="a box, beside the time t and in A, over which the state has an expansion in double precision:"
             " smaller intervals, or a shorter horizon",
             got=f"parameters that move the state by up to e^{exponent:.2g}",
         )
-    degrees = [n for n in range(lowest, LARGEST_DEGREE + 1) if d * comb(nu + n, nu) <= NUMBERS]
-    while degrees and counts.prod() <= MOST_PARTS:
+    degrees = [n for n in range(lowest, MAX_EXPANSION_DEGREE + 1) if d * comb(nu + n, nu) <= NUMBERS]
+    while degrees and counts.prod() <= MAX_PARTS:
         edges, series_bounds = _bound_parts(system, counts)
         for tolerance, degree in product(TRUNCATION_TOLERANCES, degrees):
             if all(_estimate_truncation(series_bound, degree, scale) <= tolerance for series_bound in series_bounds):
@@ -290,7 +290,7 @@ def _choose_parts(system: System) -> tuple[tuple[Array, ...], list[Cauchy | None
     raise InputError(
         path="system.parameters",
         expected="a box, beside the time t, on which the entries are power series in the parameters of at most"
-        f" {NUMBERS} numbers times states, in at most {MOST_PARTS} parts: fewer parameters or states, or smaller"
+        f" {NUMBERS} numbers times states, in at most {MAX_PARTS} parts: fewer parameters or states, or smaller"
         " intervals",
         got="entries that turn too much for that" if degrees else f"{d * comb(nu + lowest, nu)} numbers at least",
     )
