@@ -311,3 +311,17 @@ def test_a_box_holds_what_lies_in_it_to_the_last_digit_and_nothing_on_either_sid
     assert not box.holds(ParameterBox(box.middle, (np.nextafter(0.5, 1.0), 0.25)))
     assert not box.holds(ParameterBox((1.0 + 2.0**-52, -2.0), box.halves))  # the sum of the floats is 1.5
     assert not box.holds(ParameterBox((1.0 - 2.0**-53, -2.0), box.halves))
+
+
+def test_a_wider_box_holds_all_that_was_asked_for_and_a_box_between_corners_holds_both() -> None:
+    draws = np.random.default_rng(5).uniform(0.01, 1.0, (50, 2))
+    for half, extra in draws:
+        (wide,) = ParameterBox((0.3,), (half,)).wider([extra]).halves
+        exact = Fraction(half) + Fraction(extra)
+        assert exact <= Fraction(wide) <= exact * (1 + Fraction(1, 2**51))
+        box = ParameterBox.between([-half], [extra])
+        for end in (-half, extra):
+            assert box.holds(ParameterBox((end,), (0.0,)))
+    still = ParameterBox((0.3, 0.5), (0.0, 0.25))
+    assert still.wider([0.0, 0.0]) is still
+    assert still.wider([0.0, 0.125]).halves[0] == 0.0
