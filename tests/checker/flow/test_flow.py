@@ -4,6 +4,7 @@ constant, switched, changes with time, is uncertain, stiff or small, also where 
 from __future__ import annotations
 
 from decimal import Decimal
+from fractions import Fraction
 from itertools import pairwise
 from types import SimpleNamespace
 
@@ -332,6 +333,25 @@ def test_what_a_kernel_leaves_out_is_said(enough: float, monkeypatch: pytest.Mon
                 found = sum((one.matrix[0, j] * arb(float(left)) ** n for n, one in enumerate(terms)), arb(0))
                 assert abs(found - truth) <= off[0, j] + 1e-30
     assert off.max() > 1e-9 if enough > 1e-9 else off.max() < 1e-17
+
+
+def test_what_a_kernel_leaves_out_is_rounded_upwards(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(flows, "ENOUGH", 1e30)  # all terms but the first
+    with ctx.workprec(BITS):
+        flow = of(FADING, 3.0)
+        part = flow.law.stretches[0]
+        for start in np.linspace(part.start, part.stop, 12)[:-1]:
+            A, F = part.between(start, part.stop, backwards=True)
+            moved, error = flow._solve_backwards(part, A, start, part.stop)
+            left, right = ([one.size for one in terms] for terms in (moved, F))
+            off = flow.kernel(start, part.stop)[1]
+            for i, j in np.ndindex(off.shape):
+                pairs = [(error, one) for one in right]
+                pairs += [(a, b) for n, a in enumerate(left) for k, b in enumerate(right) if n + k]
+                exact = sum(
+                    Fraction(float(a[i, m])) * Fraction(float(b[m, j])) for a, b in pairs for m in range(a.shape[1])
+                )
+                assert exact <= Fraction(float(off[i, j])) <= exact * (1 + Fraction(1, 10**9))
 
 
 def test_a_flow_at_one_parameter_is_that_of_the_known_system_and_is_remembered() -> None:
