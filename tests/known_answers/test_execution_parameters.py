@@ -210,7 +210,7 @@ def test_errors_at_one_parameter_and_over_cells_are_those_of_the_plant_there() -
         return of.added(control, np.repeat(times, 2), np.tile(rows, (4, 1))).reshape(4, 2)
 
     low, high = np.array([-0.02, 0.0]), np.array([0.06, 0.05])
-    (leg,) = functionals.legs(low, high)
+    (leg,) = functionals.over_cells.legs(low, high)
     support = execution.over(control, rows, leg)
     assert isinstance(support, SpreadExecutionSupport)
     excess, most = [], []

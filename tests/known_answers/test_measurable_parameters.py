@@ -262,7 +262,7 @@ def test_what_they_add_at_one_parameter_and_over_cells_is_that_of_the_plant_ther
         return of(*every, np.zeros((8, 0))).reshape(4, 2)
 
     low, high = np.array([-0.02]), np.array([0.05])
-    (leg,) = functionals.legs(low, high)
+    (leg,) = functionals.over_cells.legs(low, high)
     parts = support.over(ROWS, leg)
     for ends, shares, most in ((0.0, rng.uniform(-1.0, 1.0, size=4), 1e-3), (1.0, np.ones(1), 1e-11)):
         excess = []

@@ -455,7 +455,7 @@ def test_what_a_law_leaves_out_widens_the_rows_from_which_states_are_feasible() 
     plane = InitialPlane(model, (0, 1), np.array([0.5, -0.2]), np.array([1.0, 2.0]))
     for z in ([1.0, 1.0], [1.0, -1.0], [-1.0, -1.0], [0.3, 0.2]):
         begun = model.functionals.from_state(plane.point(np.array(z)))
-        assert (plane.beyond * (1 + 1e-12) >= begun.beyond(np.array([1.0]))).all()
+        assert (plane.beyond * (1 + 1e-12) >= begun.over_cells.truncation(np.array([1.0]))).all()
     assert (plane.beyond > 0.0).all()
     (family,) = plane._families
     index = np.array([[2.0, 0.4]])

@@ -23,7 +23,8 @@ from sparserob_core.control.constraints.state import StateConstraint
 from sparserob_core.control.enclosures.cache import remember
 from sparserob_core.control.enclosures.taylor import Combination, combination
 from sparserob_core.control.reach.enclosure import Bounded, CellEnclosure, enclose, kept, over_legs
-from sparserob_core.control.reach.functional import Leg, WorstFunctionals
+from sparserob_core.control.reach.functional import WorstFunctionals
+from sparserob_core.control.reach.over_cells import Leg
 from sparserob_core.control.reach.sizes import nominal_sizes
 from sparserob_core.control.response.parameters import ParameterIndex
 from sparserob_core.control.response.reference import STILL, MovingReference, Reference
@@ -299,7 +300,8 @@ class CurvedConstraint(StateConstraint):
             centre, radius = (low + high)[nu:] / 2, (high - low)[nu:] / 2
             free = np.flatnonzero(radius > 0)
             H = np.vstack([centre, np.diag(radius)[free]]) @ self.set.frame / self.unit
-            legs = self.functionals.legs(low[:nu], high[:nu])
+            over_cells = self.functionals.over_cells
+            legs = over_cells.legs(low[:nu], high[:nu])
             joined = self._build_combination(legs[0], free.size)
             rhs, looseness = self._compute_minorant(H, joined, nu)
             shortest = self._bound_extents(low[None, nu:], high[None, nu:])[0]
@@ -309,8 +311,8 @@ class CurvedConstraint(StateConstraint):
             moving = MovingReference(self.reference, H) if self.reference.moves else None
 
             def cell(leg: Leg) -> CellEnclosure:
-                supports = self.functionals.support_over(leg, H, joined)
-                sigma = self.functionals.delivered_over(supports, x, H, leg, joined)
+                supports = over_cells.support(leg, H, joined)
+                sigma = over_cells.with_execution(supports, control, H, leg, joined)
                 return CellEnclosure(leg, sigma, H, rhs, control, joined, looseness, lengthening, cuts, moving)
 
             remember(self._cell_enclosures, key, over_legs(legs, cell), kept(control))

@@ -24,7 +24,8 @@ from sparserob_core.control.constraints.state import StateConstraint
 from sparserob_core.control.enclosures.cache import remember
 from sparserob_core.control.problem.terms.windows import Flat
 from sparserob_core.control.reach.enclosure import Bounded, CellEnclosure, enclose, kept, over_legs
-from sparserob_core.control.reach.functional import LEGS_KEPT, Leg, WorstFunctionals
+from sparserob_core.control.reach.functional import WorstFunctionals
+from sparserob_core.control.reach.over_cells import LEGS_KEPT, Leg
 from sparserob_core.control.reach.sizes import row_sizes
 from sparserob_core.control.reach.support import Supports
 from sparserob_core.control.response.parameters import ParameterIndex
@@ -177,7 +178,7 @@ class Samples:
         ``legs``; results are kept."""
         key = low.tobytes() + high.tobytes()
         if key not in self._supports:
-            supports = [self.functionals.support_over(leg, self.H[: self.proven]) for leg in legs]
+            supports = [self.functionals.over_cells.support(leg, self.H[: self.proven]) for leg in legs]
             remember(self._supports, key, supports, LEGS_KEPT)
         return self._supports[key]
 
@@ -419,7 +420,7 @@ class FlatConstraint(StateConstraint):
     def _enclose_cell(self, x: Float[Array, " n"], low: Float[Array, " j"], high: Float[Array, " j"]) -> Bounded:
         key = x.tobytes() + low.tobytes() + high.tobytes()
         if key not in self._cell_enclosures:
-            legs = self.functionals.legs(low, high)
+            legs = self.functionals.over_cells.legs(low, high)
             control, cuts = self.functionals.control(x), self.parameters.cuts(low, high)
             rows = self.samples.proven
             rhs, H = np.zeros((rows, legs[0].space.size)), self.H[:rows]
@@ -428,7 +429,8 @@ class FlatConstraint(StateConstraint):
             direct = None if self.gains is None else Direct(self.gains[:rows], self.functionals.dictionary, control)
             supports = self.samples.support_over(legs, low, high)
             pairs = zip(supports, legs, strict=True)
-            delivered = iter([self.functionals.delivered_over(support, x, H, leg) for support, leg in pairs])
+            over_cells = self.functionals.over_cells
+            delivered = iter([over_cells.with_execution(support, control, H, leg) for support, leg in pairs])
             bounded = over_legs(
                 legs,
                 lambda leg: CellEnclosure(

@@ -100,8 +100,10 @@ class ClosedLoop:
     @cached_property
     def motion(self) -> VaryingMotion | None:
         """The system between all marks, where it changes with time."""
-        (first, *_) = self.functionals.legs(KNOWN[0], KNOWN[0]) if self.functionals.response.grid.varying else (None,)
-        return first if isinstance(first, VaryingMotion) else None
+        if not self.functionals.response.grid.varying:
+            return None
+        (motion,) = self.functionals.over_cells.legs(KNOWN[0], KNOWN[0])
+        return motion if isinstance(motion, VaryingMotion) else None
 
     @cached_property
     def grid(self) -> TimeGrid:

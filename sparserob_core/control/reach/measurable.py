@@ -29,9 +29,16 @@ from sparserob_core.control.reach.varying_motion import (
 from sparserob_core.control.response.lifted import LiftedSystem
 from sparserob_core.control.response.response import Response, TimeGrid, unique_rows
 from sparserob_core.control.sets.integrals import HALVINGS, integrated
+from sparserob_core.errors import NotEnclosable
 from sparserob_core.shapes import Float, shaped
 from sparserob_core.sip.convex_set import Array, Box, ConvexSet
 
+# said where it is met, and before anything is solved
+WITHOUT_PROOF = (
+    "measurable disturbances are proven only beside parameters in a box over which the state can be expanded in them,"
+    " and where it is no affine function of these only for sets with flat sides"
+)
+NOT_PROVEN = f"{WITHOUT_PROOF}; with disturbance_class piecewise_constant there is one"
 ACCURACY = 1e-14  # of an integral over one interval, relative to the largest integrand times the horizon
 ORDER = 12  # of the expansion that encloses a row; what is left of it on a short interval is 1e-14 of the row
 SHORT = 0.5  # time times speed that such an interval takes: twice as much leaves 1e-10, half as much doubles the work
@@ -170,6 +177,8 @@ class MeasurableSupport:
             The parts.
         """
         assert isinstance(leg, LiftedSystem)
+        if leg.space.nu:
+            raise NotEnclosable(NOT_PROVEN)
         return [over_directions(lambda functionals: MeasurableCellSupport(self, functionals, leg), rows, leg, joined)]
 
     def integrated_sizes(self, times: Array, directions: Array, parameters: Array) -> Array:

@@ -9,19 +9,18 @@ from typing import final
 import numpy as np
 
 from sparserob_core.control.enclosures.taylor import Combination
-from sparserob_core.control.reach.measurable import AT_ONCE, MeasurableSupport
+from sparserob_core.control.reach.measurable import AT_ONCE, NOT_PROVEN, MeasurableSupport
 from sparserob_core.control.reach.support import Support
 from sparserob_core.control.reach.varying_execution import UncertainExecution, VaryingExecution, followed
 from sparserob_core.control.reach.varying_motion import (
     SpreadMotion,
-    SpreadSupport,
     VaryingMotion,
-    VaryingSupport,
 )
 from sparserob_core.control.response.disturbance import DisturbanceModel
 from sparserob_core.control.response.lifted import LiftedSystem
 from sparserob_core.control.response.response import Response
 from sparserob_core.control.sets.sets import Polytope
+from sparserob_core.errors import NotEnclosable
 from sparserob_core.shapes import Float, shaped
 from sparserob_core.sip.convex_set import Array, Box, ConvexSet
 
@@ -108,12 +107,9 @@ class VaryingMeasurable:
     ) -> list[Support]:
         """`MeasurableSupport.over`, over a cell of parameters too."""
         assert not isinstance(leg, LiftedSystem)
-        supports = [self.errors.over(self.command, rows, leg, joined)]
-        if self.resting is not None and isinstance(leg, SpreadMotion):
-            supports.append(SpreadSupport.of_disturbance(leg, self.resting, rows, joined))
-        elif self.resting is not None and isinstance(leg, VaryingMotion):
-            supports.append(VaryingSupport.of_disturbance(leg, self.resting, rows, joined))
-        return supports
+        if joined is not None and leg.space.nu:
+            raise NotEnclosable(NOT_PROVEN)
+        return [self.errors.over(self.command, rows, leg, joined), *leg.supports(self.resting, None, rows, joined)]
 
     def integrated_sizes(self, times: Array, directions: Array, parameters: Array) -> Array:
         """Return the sum ``(k,)`` of the integrals of absolute values that enter ``sigma`` at each time."""

@@ -408,6 +408,15 @@ class VaryingMotion:
         """The numbers of all pieces."""
         return np.arange(self.origin.size)
 
+    def supports(
+        self, model: DisturbanceModel | None, initial: ConvexSet | None, rows: Array, joined: Combination | None
+    ) -> list[VaryingSupport]:
+        """Return the supports of a disturbance and of deviations of the initial state, as far as there are any."""
+        supports: list[VaryingSupport] = (
+            [] if model is None else [VaryingSupport.of_disturbance(self, model, rows, joined)]
+        )
+        return supports if initial is None else [*supports, VaryingSupport.of_initial(self, initial, rows, joined)]
+
     def _slice_inputs(self, m: int) -> slice:
         return slice(self.states, self.states + m)
 
@@ -815,6 +824,15 @@ class SpreadMotion:
             wide = "the state moves too far on a cell of parameters"
             raise NotEnclosable(wide, along=truncation.growing)
         return SpreadMotion(truncation)
+
+    def supports(
+        self, model: DisturbanceModel | None, initial: ConvexSet | None, rows: Array, joined: Combination | None
+    ) -> list[SpreadSupport]:
+        """`VaryingMotion.supports` over the cell."""
+        supports: list[SpreadSupport] = (
+            [] if model is None else [SpreadSupport.of_disturbance(self, model, rows, joined)]
+        )
+        return supports if initial is None else [*supports, SpreadSupport.of_initial(self, initial, rows, joined)]
 
     @property
     def motion(self) -> VaryingMotion:

@@ -272,7 +272,7 @@ class InitialPlane:
         magnitudes[list(self.states)] += np.abs(self.radius)
         control = self.model.problem.control
         reach = control.reach(np.eye(control.dimension))
-        return self.centred.functionals.from_state(magnitudes).beyond(reach)
+        return self.centred.functionals.from_state(magnitudes).over_cells.truncation(reach)
 
     def _build_initial_state(self, z: Array) -> Array:
         state = np.array(self.model.problem.initial_state, dtype=float)

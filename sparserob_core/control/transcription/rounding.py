@@ -132,7 +132,7 @@ def _sum_control_magnitudes(
 def _bound_law_truncation(model: Transcription, result: Result) -> float:
     """Return an upper bound of the truncation error of a law as a series in the parameters, over all rows with a
     multiplier."""
-    truncation, error = model.functionals.beyond(extent(model.problem.control)), 0.0
+    truncation, error = model.functionals.over_cells.truncation(extent(model.problem.control)), 0.0
     if truncation.any():
         for cut, explanation in zip(result.dual.cuts, model.explained(result.dual.cuts), strict=True):
             error += (

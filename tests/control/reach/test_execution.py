@@ -95,7 +95,7 @@ def constraint(found: Transcription) -> FlatConstraint:
 
 def test_it_is_nowhere_above_its_chord_by_more_than_is_said_and_hardly_less() -> None:
     functionals = model().functionals
-    legs, H = functionals.legs(np.zeros(0), np.zeros(0)), np.array([[1.0, -0.4], [0.3, 1.0]])
+    legs, H = functionals.over_cells.legs(np.zeros(0), np.zeros(0)), np.array([[1.0, -0.4], [0.3, 1.0]])
     assert functionals.execution is not None
     support = ExecutionCellSupport(functionals.execution, CONTROL, H, legs[0])
     share, ratios = np.linspace(0.0, 1.0, 41), []
@@ -180,7 +180,7 @@ def test_the_sum_over_jumps_allows_for_its_rounding(execution: Execution) -> Non
 
 def test_no_error_brings_a_state_further_than_is_said() -> None:
     functionals, H = model().functionals, np.array([[1.0, -0.4], [0.3, 1.0]])
-    leg = functionals.legs(np.zeros(0), np.zeros(0))[0]
+    leg = functionals.over_cells.legs(np.zeros(0), np.zeros(0))[0]
     assert functionals.execution is not None and isinstance(leg, LiftedSystem)
     full = np.ones_like(CONTROL)
     support = ExecutionCellSupport(functionals.execution, full, H, leg)

@@ -47,7 +47,7 @@ def made(kind: str, rows: np.ndarray) -> tuple[Supports, Any]:
         execution=[0.1, 0.2] if bound is None else None,
     )  # fmt: skip
     functionals: WorstFunctionals = prepare(problem, uniform(3, HORIZON), uniform(3, HORIZON)).functionals
-    (leg,) = functionals.legs(np.zeros(0), np.zeros(0))
+    (leg,) = functionals.over_cells.legs(np.zeros(0), np.zeros(0))
     joined = combination(leg.space, len(rows) - 1)
     if bound is not None:
         support = functionals.measurable

@@ -392,12 +392,12 @@ def test_what_a_law_leaves_out_of_its_series_is_in_no_state_more_than_is_said(
     functionals, points = constraint.functionals, np.linspace(-0.2, 0.3, 31)
     states = functionals.response.states(np.full((1, 4), -2.0), points[:, None])[:, :, 0]
     exact = closed(functionals.response.grid.breakpoints, points[:, None])
-    off, said = np.abs(states - exact).max(), functionals.beyond(np.array([2.0]))[0]
+    off, said = np.abs(states - exact).max(), functionals.over_cells.truncation(np.array([2.0]))[0]
     assert 1e-6 < off <= said <= 1e3 * off
-    least = functionals.beyond(np.array([0.0]))[0]
+    least = functionals.over_cells.truncation(np.array([0.0]))[0]
     assert (least > 0.0) == (law is RELAXING)
     assert least < said
-    wider = replace(functionals, initial=sr.Box([-1.0], [1.0])).beyond(np.array([2.0]))[0]
+    wider = replace(functionals, initial=sr.Box([-1.0], [1.0])).over_cells.truncation(np.array([2.0]))[0]
     assert (wider > said) == (law is not FILLING)
     cell = functionals.response.propagator.on_cell(np.array([-0.1]), np.array([0.2])).expansion
     assert cell is not None
@@ -412,7 +412,7 @@ def test_what_a_law_leaves_out_of_its_series_is_in_no_state_more_than_is_said(
         entry = cell.spread.remainder.sizes[0, 0, 0 if law is not FILLING else 1]
         assert abs(found - true) <= entry + 1e-14
     (polynomial,) = prepare(replace(problem, system=SYSTEM, horizon=3.0), pieces_of(3.0), pieces_of(3.0)).constraints
-    assert not polynomial.functionals.beyond(np.array([2.0])).any()
+    assert not polynomial.functionals.over_cells.truncation(np.array([2.0])).any()
 
 
 def pieces_of(horizon: float) -> sr.Dictionary:
@@ -437,19 +437,19 @@ def test_growth_is_asked_of_the_part_that_a_cell_is_in(monkeypatch: pytest.Monke
     assert laws is not None
     units = [Expansion.of(one).units[:2].tolist() for _, one in laws.every]
     edge = next(k for k in range(len(units) - 1) if units[k] != units[k + 1])
-    before = functionals.legs(*laws.ends(edge))[0]
+    before = functionals.over_cells.legs(*laws.ends(edge))[0]
     point = laws.ends(edge)[1]  # which is in the part after
-    after = functionals.legs(point, point)[0]
+    after = functionals.over_cells.legs(point, point)[0]
     assert isinstance(before, SpreadMotion)
     assert isinstance(after, SpreadMotion)
     assert after.truncation.known is None
     narrow = laws.ends(edge)[0], laws.ends(edge)[0] * 0.75 + point * 0.25
-    inside = functionals.legs(*narrow)[0]
+    inside = functionals.over_cells.legs(*narrow)[0]
     assert isinstance(inside, SpreadMotion)
     assert inside.truncation.growth == before.truncation.growth
     (other,) = prepare(problem, pieces_of(1.0), pieces_of(1.0)).constraints
-    other.functionals.legs(*narrow)
-    around = other.functionals.legs(*laws.ends(edge))[0]  # which is not inside of what is known
+    other.functionals.over_cells.legs(*narrow)
+    around = other.functionals.over_cells.legs(*laws.ends(edge))[0]  # which is not inside of what is known
     assert isinstance(around, SpreadMotion)
     assert around.truncation.known is None
 
@@ -463,7 +463,7 @@ def test_growth_is_the_largest_on_any_half_of_a_part() -> None:
     (constraint,) = prepare(problem, pieces_of(2.0), pieces_of(2.0)).constraints
     low, high = np.array([-1.0]), np.array([1.0])
     with pytest.raises(NotEnclosable):
-        constraint.functionals.legs(low, high)
+        constraint.functionals.over_cells.legs(low, high)
     found = constraint.functionals._bound_growth(low, high, 8)
     assert np.exp(4.0 * np.e) * (1.0 - 1e-9) <= found <= 100.0 * np.exp(4.0 * np.e)
     assert constraint.functionals._bound_growth(low, high, 0) == np.inf

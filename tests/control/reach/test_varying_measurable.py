@@ -180,6 +180,6 @@ def test_what_a_set_makes_of_states_is_bounded_by_the_box_around_it(bound: sr.Co
 def test_the_bound_of_a_constraint_holds_on_every_cell_and_closes() -> None:
     found = model(VaryingSystem.of(*MATHIEU[:2], HORIZON, MATHIEU[2]))
     one = found.constraints[0]
-    assert isinstance(one, FlatConstraint) and isinstance(one.functionals.legs(NONE, NONE)[0], VaryingMotion)
+    assert isinstance(one, FlatConstraint) and isinstance(one.functionals.over_cells.legs(NONE, NONE)[0], VaryingMotion)
     x = np.array([0.5, 0.0, -0.3, 0.8, 0.0, -1.0])
     assert_bounded_on_cells(one, x)

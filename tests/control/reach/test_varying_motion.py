@@ -199,7 +199,7 @@ def test_what_every_step_is_off_by_is_carried_on(monkeypatch):
         worst = WorstFunctionals(Response(system, grid, start), many, None, initial=begun)
         sides = np.array([[-1.0], [1.0]]), np.zeros(2)
         path = FlatConstraint("path", worst, *sides, 0.0, HORIZON, ParameterIndex(None))
-        legs = path.functionals.legs(np.zeros(0), np.zeros(0))
+        legs = path.functionals.over_cells.legs(np.zeros(0), np.zeros(0))
         support = path.samples.support_over(legs, np.zeros(0), np.zeros(0))[0]
         lost = legs[0].along(np.zeros((1, 50)), np.ones((1, 1)), np.zeros((1, 1)))[0, -1]
         lost = lost if support is None else support.neglected[0, -1]

@@ -129,7 +129,7 @@ def test_a_system_that_can_be_enclosed_on_small_cells_only_is_halved_until_it_ca
     )
     index = ParameterIndex(functionals.response.system.parameters)
     with pytest.raises(NotEnclosable):
-        functionals.legs(np.array([-1.0]), np.array([0.7]))
+        functionals.over_cells.legs(np.array([-1.0]), np.array([0.7]))
     made = (
         CurvedConstraint("path", functionals, Ellipsoid([0.0, 0.0], 9 * np.eye(2)), 0.5, 1.0, index)
         if curved_set
