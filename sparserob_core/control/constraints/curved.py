@@ -24,6 +24,7 @@ from sparserob_core.control.enclosures.cache import remember
 from sparserob_core.control.enclosures.taylor import Combination, combination
 from sparserob_core.control.reach.enclosure import Bounded, CellEnclosure, enclose, kept, over_legs
 from sparserob_core.control.reach.functional import WorstFunctionals
+from sparserob_core.control.reach.many_directions import ManyDirections
 from sparserob_core.control.reach.over_cells import Leg
 from sparserob_core.control.reach.sizes import nominal_sizes
 from sparserob_core.control.response.parameters import ParameterIndex
@@ -150,7 +151,7 @@ class CurvedConstraint(StateConstraint):
             return indices, np.zeros(0)
         indices, first = self._project_indices(indices), 1 + self.parameters.count
         times = indices[:, 0]
-        along = self.functionals.turning(x, times, self.parameters.clamp(indices[:, 1:first]))
+        along = ManyDirections(self.functionals).turning(x, times, self.parameters.clamp(indices[:, 1:first]))
         moves = self.reference.at(times)
 
         def height(z: Array, which: np.ndarray) -> Array:

@@ -25,6 +25,7 @@ from sparserob_core.control.enclosures.cache import remember
 from sparserob_core.control.problem.terms.windows import Flat
 from sparserob_core.control.reach.enclosure import Bounded, CellEnclosure, enclose, kept, over_legs
 from sparserob_core.control.reach.functional import WorstFunctionals
+from sparserob_core.control.reach.many_directions import ManyDirections
 from sparserob_core.control.reach.over_cells import LEGS_KEPT, Leg
 from sparserob_core.control.reach.sizes import row_sizes
 from sparserob_core.control.reach.support import Supports
@@ -142,7 +143,7 @@ class Samples:
         if not self.functionals.disturbed:
             return np.broadcast_to(self.h[None, :, None], (points.shape[0], self.h.size, self.times.size))
         H, copies = self.H[: self.proven], self.h.size // max(1, self.proven)
-        sigma = np.stack([self.functionals.profile(self.times, H, p).T for p in points])
+        sigma = np.stack([ManyDirections(self.functionals).profile(self.times, H, p).T for p in points])
         return self.h[None, :, None] - np.tile(sigma, (1, copies, 1))
 
     @cached_property

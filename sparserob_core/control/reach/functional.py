@@ -10,14 +10,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from sparserob_core.control.enclosures.cache import remember
 from sparserob_core.control.problem.cost import nominal_point
 from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.problem.names import UNNAMED, Names
-from sparserob_core.control.reach.disturbance_support import DisturbanceSupport
-from sparserob_core.control.reach.over_cells import LEGS_KEPT, FunctionalsOverCells
+from sparserob_core.control.reach.over_cells import FunctionalsOverCells
 from sparserob_core.control.response.disturbance import DisturbanceModel
-from sparserob_core.control.response.lifted import LiftedSystem, frozen
 from sparserob_core.control.response.response import Response, TimeGrid, Weights
 from sparserob_core.shapes import Float, shaped
 from sparserob_core.sip.convex_set import Array, ConvexSet
@@ -28,9 +25,6 @@ if TYPE_CHECKING:
     from sparserob_core.control.reach.varying_measurable import VaryingMeasurable
 
 CHUNK = 4_000_000  # entries of a gain array that are built at once (32 MB)
-# Numbers of a product over many directions that are made at once (2 MB), so that they stay near the processor. With
-# sixteen times as many a curved wall is sampled in up to twice the time; with a fourth part of them in no less.
-NEAR = 250_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -201,9 +195,7 @@ class WorstFunctionals:
 
         def compute_effect(part: slice, known: Weights) -> Array:
             free = known.free
-            initial_effect = (
-                self._evaluate_initial_support(free) if deviations is None else (free * deviations[part]).sum(axis=1)
-            )
+            initial_effect = self.initial_support(free) if deviations is None else (free * deviations[part]).sum(axis=1)
             return (
                 initial_effect
                 if disturbances is None
@@ -223,7 +215,7 @@ class WorstFunctionals:
         """Rows and offsets; ``compute_effect(part, weights)`` is what the uncertainty adds to the offsets of a part of
         the indices."""
         G, offset = np.empty((times.size, self.variables)), np.empty(times.size)
-        for chunk in self._divide_into_chunks(parameters):
+        for chunk in self.chunks(parameters):
             weights = self.response.weights(times[chunk], directions[chunk], parameters[chunk])
             G[chunk, : self.coefficients] = self.on_decision(weights.control)
             if self.execution is not None:
@@ -257,135 +249,28 @@ class WorstFunctionals:
         roughly: bool = False,
     ) -> Float[Array, " k"]:
         """``max_w c'x(t)`` at a decision, ``(k,)``, without building the rows; ``roughly`` where directions are many
-        and each is asked for once: with measurable disturbances and errors as in `turning`."""
+        and each is asked for once: with measurable disturbances and errors as in `ManyDirections.turning`."""
         control = self.on_grid(theta)
         result = np.empty(times.size)
-        for chunk in self._divide_into_chunks(parameters):
+        for chunk in self.chunks(parameters):
             weights = self.response.weights(times[chunk], directions[chunk], parameters[chunk])
             control_effect = np.einsum("klm,ml->k", weights.control, control)
             support = self._evaluate_support(weights, times[chunk], directions[chunk], parameters[chunk], roughly)
             result[chunk] = weights.free @ self.response.initial_state + control_effect + support
             if roughly:
                 result[chunk] += np.einsum(
-                    "klm,ml->k", np.abs(weights.control[..., : self.channels]), self._bound_execution_errors(control)
+                    "klm,ml->k", np.abs(weights.control[..., : self.channels]), self.bound_execution_errors(control)
                 )
             elif self.execution is not None:
                 error_directions = self.execution.extend_directions(directions[chunk], parameters[chunk])
                 result[chunk] += self.execution.added(self.control(theta), times[chunk], error_directions)
         return result
 
-    def turning(self, theta: Array, times: Array, parameters: Array) -> Callable[[Array, np.ndarray], Array]:
-        """Return ``max_w c'x(t)`` at a decision as a function of the direction alone, at ``times (k,)`` and
-        ``parameters (k, nu)``.
-
-        The function takes directions ``(j, d)`` and the indices ``(j,)`` of their times, in groups of equal size, and
-        returns values ``(j,)``. Weights are linear in the direction, so those of the axes are computed once. The
-        contributions of measurable disturbances and of errors of execution are approximations: of the errors only those
-        that are constant on pieces count.
-        """
-        weights, model, control = self._weigh_axes(times, parameters), self.disturbance, self.on_grid(theta)
-        states = weights.free @ self.response.initial_state + np.einsum("kdlm,ml->kd", weights.control, control)
-        by_block, measurable = None if model is None else model.on_blocks, self.measurable
-        blocks = np.zeros((*states.shape, 0, 0)) if by_block is None else by_block.blocks(weights.disturbance)
-        error_sizes = self._bound_execution_errors(control)
-        error_pieces = np.flatnonzero(error_sizes.any(axis=0))
-        error_weights = (weights.control[:, :, error_pieces, : self.channels] * error_sizes[:, error_pieces].T).reshape(
-            *states.shape, -1
-        )
-
-        def along(directions: Array, which: np.ndarray) -> Array:
-            places = which[np.flatnonzero(np.diff(which, prepend=-1))]
-            c = directions.reshape(places.size, -1, directions.shape[1])
-            values: Array = (c * states[places, None]).sum(axis=2)
-            for chunk in _divide_range(places.size, max(1, NEAR // max(1, c[:1, :, 0].size * blocks[:1, 0].size))):
-                indices, chunk_directions = places[chunk], c[chunk]
-                free = chunk_directions @ weights.free[indices]
-                values[chunk] += self._evaluate_initial_support(free.reshape(-1, free.shape[2])).reshape(free.shape[:2])
-                if by_block is not None:
-                    on_blocks = chunk_directions @ blocks[indices].reshape(*blocks[indices].shape[:2], -1)
-                    values[chunk] += by_block.support_from_blocks(on_blocks.reshape(*free.shape[:2], *blocks.shape[2:]))
-                if error_weights.shape[2]:
-                    values[chunk] += np.abs(chunk_directions @ error_weights[indices]).sum(axis=2)
-            if measurable is not None:
-                values += measurable.roughly(times[which], directions, parameters[which]).reshape(values.shape)
-            return values.reshape(-1)
-
-        return along
-
-    def _bound_execution_errors(self, control: Array) -> Array:
+    def bound_execution_errors(self, control: Array) -> Array:
         """Return the largest error of execution of every channel of a control on the pieces of the merged grid,
         ``(m, L)``."""
         commanded = np.abs(control[: self.channels])
         return 0.0 * commanded if self.execution is None else self.execution.shares[:, None] * commanded
-
-    @shaped
-    def profile(
-        self, times: Float[Array, " k"], directions: Float[Array, "r d"], parameter: Float[Array, " nu"]
-    ) -> Float[Array, "k r"]:
-        """Return ``sigma (k, r)`` at one parameter, for all ``times (k,)`` and ``directions (r, d)``; by the age of the
-        pieces where the grid allows."""
-        model, (k, r) = self.disturbance, (times.size, directions.shape[0])
-        changes = self.response.grid.mode is not None
-        by_block, measurable = None if model is None else model.on_blocks, self.measurable
-        aged = by_block is None or (self.response.uniform and by_block.by_piece)
-        if (changes or not aged) and r > directions.shape[1] and measurable is None:
-            return self._profile_by_axes(times, directions, parameter)
-        if changes or not aged:
-            repeated = np.broadcast_to(parameter, (k * r, parameter.size))
-            return self.offsets(np.repeat(times, r), np.tile(directions, (k, 1)), repeated).reshape(k, r)
-        sigma, chunk_size = np.zeros((k, r)), max(1, CHUNK // (r * directions.shape[1]))
-        if by_block is not None:
-            lifted = self._frozen_systems.get(parameter.tobytes())
-            if lifted is None:
-                arguments = (self.response.system.modes[0], self.response.grid, self.response.initial_state, parameter)
-                lifted = remember(self._frozen_systems, parameter.tobytes(), frozen(*arguments), LEGS_KEPT)
-            sigma = DisturbanceSupport(lifted, by_block, directions).at(times, np.zeros((k, r, 0)))[0][:, :, 0]
-        if measurable is not None:
-            for chunk in _divide_range(k, chunk_size):
-                pairs = np.repeat(times[chunk], r), np.tile(directions, (times[chunk].size, 1))
-                sigma[chunk] += measurable(*pairs, np.broadcast_to(parameter, (pairs[0].size, parameter.size))).reshape(
-                    -1, r
-                )
-        if self.initial is not None:
-            for chunk in _divide_range(k, chunk_size):
-                rows = self.response.propagator.backwards(times[chunk], directions, parameter)
-                sigma[chunk] += self.initial.support(rows)
-        return sigma
-
-    def _profile_by_axes(self, times: Array, directions: Array, parameter: Array) -> Array:
-        """`profile` of more directions than there are axes: what the axes give to the blocks of the disturbance does
-        for all directions, in which it is linear."""
-        (r, d), sigma, model = directions.shape, np.zeros((times.size, directions.shape[0])), self.disturbance
-        chunk_size = max(1, CHUNK // (d * self.response.numbers(parameter.size)))
-        for chunk in _divide_range(times.size if self.disturbed else 0, chunk_size):
-            weights = self._weigh_axes(times[chunk], np.broadcast_to(parameter, (times[chunk].size, parameter.size)))
-            k = weights.free.shape[0]
-            sigma[chunk] = self._evaluate_initial_support((directions @ weights.free).reshape(k * r, d)).reshape(k, r)
-            if model is None:
-                continue
-            blocks = model.blocks(weights.disturbance)
-            for inner_chunk in _divide_range(k, max(1, NEAR // (r * blocks[0, 0].size))):
-                active_blocks = blocks[inner_chunk][:, :, blocks[inner_chunk].any(axis=(0, 1, 3))]
-                projected = directions @ active_blocks.reshape(active_blocks.shape[0], d, active_blocks[0, 0].size)
-                sigma[chunk][inner_chunk] += model.support_from_blocks(
-                    projected.reshape(active_blocks.shape[0], r, *active_blocks.shape[2:])
-                )
-        return sigma
-
-    def _weigh_axes(self, times: Array, parameters: Array) -> Weights:
-        """The weights of the functionals along the axes at times ``(k,)``, with one dimension ``(k, d, ...)`` more."""
-        d = self.response.initial_state.size
-        axes = np.tile(np.eye(d), (times.size, 1))
-        repeated = [np.repeat(values, d, axis=0) for values in (times, parameters)]
-        chunks = [
-            self.response.weights(repeated[0][chunk], axes[chunk], repeated[1][chunk])
-            for chunk in self._divide_into_chunks(repeated[1])
-        ]
-        arrays = [
-            np.concatenate([getattr(weights, name) for weights in chunks])
-            for name in ("free", "control", "disturbance")
-        ]
-        return Weights(*(array.reshape(times.size, d, *array.shape[1:]) for array in arrays))
 
     @shaped
     def offsets(
@@ -396,7 +281,7 @@ class WorstFunctionals:
         if not self.disturbed:
             return np.zeros(times.size)
         result = np.empty(times.size)
-        for chunk in self._divide_into_chunks(parameters):
+        for chunk in self.chunks(parameters):
             weights = self.response.weights(times[chunk], directions[chunk], parameters[chunk])
             result[chunk] = self._evaluate_support(weights, times[chunk], directions[chunk], parameters[chunk])
         return result
@@ -409,7 +294,7 @@ class WorstFunctionals:
         return Contributions(
             float(weights.free[0] @ self.response.initial_state + self.given(weights.control)[0]),
             float(self._evaluate_support(weights, *index)[0]),
-            float(self._evaluate_initial_support(weights.free)[0]),
+            float(self.initial_support(weights.free)[0]),
             None if self.disturbance is None else self.disturbance.worst(weights.disturbance)[0],
             None if self.initial is None else self.initial.support_point(weights.free)[0],
         )
@@ -482,10 +367,6 @@ class WorstFunctionals:
             self.response, self.disturbance, self.initial, self.execution, self.measurable, self.known
         )
 
-    @cached_property
-    def _frozen_systems(self) -> dict[bytes, LiftedSystem]:
-        return {}
-
     @shaped
     def on_grid(self, theta: Float[Array, " n"]) -> Float[Array, "mc L"]:
         """Return the inputs through the columns of ``B`` on the pieces of the merged grid, ``(m + constants, L)``: the
@@ -502,7 +383,7 @@ class WorstFunctionals:
         roughly: bool = False,
     ) -> Float[Array, " k"]:
         total, by_block = (
-            self._evaluate_initial_support(known.free),
+            self.initial_support(known.free),
             None if self.disturbance is None else self.disturbance.on_blocks,
         )
         if by_block is not None:
@@ -513,7 +394,7 @@ class WorstFunctionals:
         return total + np.asarray(evaluate(times, directions, parameters))
 
     @shaped
-    def _evaluate_initial_support(self, free: Float[Array, "k d"]) -> Float[Array, " k"]:
+    def initial_support(self, free: Float[Array, "k d"]) -> Float[Array, " k"]:
         """Return the support value ``(k,)`` of the deviations of the initial state, for weights ``free (k, d)`` on
         it."""
         return np.zeros(free.shape[0]) if self.initial is None else self.initial.support(free)
@@ -522,14 +403,10 @@ class WorstFunctionals:
     def _has_known_inputs(self) -> bool:
         return bool(self.known.any())
 
-    def _divide_into_chunks(self, parameters: Array) -> list[slice]:
+    def chunks(self, parameters: Array) -> list[slice]:
+        """Return slices that divide indices with ``parameters (k, nu)`` into parts whose weights fit into memory."""
         count, numbers = parameters.shape[0], self.response.numbers(parameters.shape[1])
         size = max(1, CHUNK // numbers)
         if 0 < count <= size:
             return [slice(None)]
         return [slice(start, start + size) for start in range(0, count, size)]
-
-
-def _divide_range(count: int, several: int) -> list[slice]:
-    """Return slices that divide ``count`` numbers into parts of at most ``several``."""
-    return [slice(first, first + several) for first in range(0, count, several)]

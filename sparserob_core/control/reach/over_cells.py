@@ -14,7 +14,7 @@ from sparserob_core.control.reach.disturbance_support import DisturbanceSupport
 from sparserob_core.control.reach.support import InitialSupport, Support, Supports
 from sparserob_core.control.reach.varying_motion import SpreadMotion, VaryingMotion
 from sparserob_core.control.response.disturbance import DisturbanceModel
-from sparserob_core.control.response.lifted import LiftedSystem, lift_legs
+from sparserob_core.control.response.lifted import LiftedSystem, frozen, lift_legs
 from sparserob_core.control.response.response import Response
 from sparserob_core.errors import NotEnclosable
 from sparserob_core.shapes import Float, shaped
@@ -65,6 +65,15 @@ class FunctionalsOverCells:
                 legs = lift_legs(response.system, response.grid, response.initial_state, *cell)
             remember(self._cached_phases, key, legs, LEGS_KEPT)
         return self._cached_phases[key]
+
+    @shaped
+    def at(self, parameter: Float[Array, " nu"]) -> LiftedSystem:
+        """Return the lifted system of a system without phases at one parameter; it is remembered."""
+        lifted = self._frozen_systems.get(parameter.tobytes())
+        if lifted is None:
+            arguments = (self.response.system.modes[0], self.response.grid, self.response.initial_state, parameter)
+            lifted = remember(self._frozen_systems, parameter.tobytes(), frozen(*arguments), LEGS_KEPT)
+        return lifted
 
     def _expand_over_cell(self, low: Array, high: Array) -> SpreadMotion:
         """Return the motion over a cell of parameters; its growth bound is the least known one of the cells around it,
@@ -191,6 +200,10 @@ class FunctionalsOverCells:
             return known
         errors = self.execution.over(control, H, leg, joined)
         return Supports((*(() if known is None else known.parts), errors))
+
+    @cached_property
+    def _frozen_systems(self) -> dict[bytes, LiftedSystem]:
+        return {}
 
     @cached_property
     def _cached_phases(self) -> dict[bytes, tuple[Leg, ...]]:

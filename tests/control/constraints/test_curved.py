@@ -10,6 +10,7 @@ import pytest
 from sparserob_core.control.constraints.curved import CurvedConstraint
 from sparserob_core.control.constraints.feedback_curved import FeedbackCurved
 from sparserob_core.control.constraints.local_maxima import MAX_RETURNED, along_spans, find_kink_neighbours, ridden
+from sparserob_core.control.reach.many_directions import ManyDirections
 from sparserob_core.control.sets.directions import sampled
 from sparserob_core.sip.proof.branch_and_bound import prove_family
 from tests.known_answers.test_walls import ridden as problem
@@ -107,7 +108,7 @@ def test_what_a_direction_makes_of_the_worst_case_is_linear_in_weights_of_the_ax
     box = curved.index_set
     parameters = rng.uniform(box.lower[1:-2], box.upper[1:-2], (6, curved.parameters.count))
     which = np.array([5, 5, 0, 0, 3, 3])
-    found = functionals.turning(x, times, parameters)(c, which)
+    found = ManyDirections(functionals).turning(x, times, parameters)(c, which)
     np.testing.assert_allclose(found, functionals.values(x, times[which], c, parameters[which]), rtol=1e-12)
 
 

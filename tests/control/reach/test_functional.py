@@ -1,5 +1,5 @@
-"""Guards control/reach/functional, disturbance, response: what one functional is asked in several ways is the same,
-and what it says of worst disturbances is found by going through all of their corners."""
+"""Guards control/reach/functional, many_directions, disturbance, response: what one functional is asked in several ways
+is the same, and what it says of worst disturbances is found by going through all of their corners."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from scipy.linalg import expm
 from sparserob_core.control.problem.cost import nominal_point
 from sparserob_core.control.problem.system import LinearSystem, SwitchedSystem, VaryingSystem
 from sparserob_core.control.reach.functional import WorstFunctionals
+from sparserob_core.control.reach.many_directions import ManyDirections
 from sparserob_core.control.response.disturbance import disturbance_model
 from sparserob_core.control.response.response import OutputResponse, Response, TimeGrid, merge_grids
 from sparserob_core.control.sets.sets import Box, Ellipsoid, NormBall, Product
@@ -68,7 +69,7 @@ def test_rows_values_parts_and_turning_directions_agree(name: str, begun: bool) 
     free = functionals("none")
     assert offset - one.offsets(*at) == pytest.approx(free.rows(*at)[1], abs=1e-12)
     every = np.repeat(at[1], 2, axis=0) * np.tile([1.0, -0.7], 5)[:, None]
-    turned = one.turning(theta, at[0], at[2])(every, np.repeat(np.arange(5), 2))
+    turned = ManyDirections(one).turning(theta, at[0], at[2])(every, np.repeat(np.arange(5), 2))
     near = 0.05 if name in ("measurable", "of two classes") else 1e-11
     assert turned[::2] == pytest.approx(values, abs=near)
     rows = one.values(theta, at[0], -0.7 * at[1], at[2])
@@ -76,7 +77,7 @@ def test_rows_values_parts_and_turning_directions_agree(name: str, begun: bool) 
     for k in range(5):
         told = one.parts(float(at[0][k]), at[1][k], at[2][k])
         assert told.free + told.sigma == pytest.approx(offset[k], abs=1e-12)
-    profile = one.profile(at[0], at[1], np.zeros(0))
+    profile = ManyDirections(one).profile(at[0], at[1], np.zeros(0))
     assert np.diag(profile) == pytest.approx(one.offsets(*at), abs=1e-10)
     assert profile[3, 1] == pytest.approx(one.offsets(at[0][3:4], at[1][1:2], at[2][:1])[0], abs=1e-10)
     again = one.from_state(np.array([0.2, 0.1]))

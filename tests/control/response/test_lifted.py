@@ -19,6 +19,7 @@ from sparserob_core.control.enclosures.taylor import TaylorSpace
 from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.problem.system import LinearSystem
 from sparserob_core.control.reach.disturbance_support import DisturbanceSupport
+from sparserob_core.control.reach.many_directions import ManyDirections
 from sparserob_core.control.response import lifted as lifted_module
 from sparserob_core.control.response import response as response_module
 from sparserob_core.control.response.lifted import frozen, lift
@@ -173,7 +174,7 @@ def test_the_push_is_enclosed_over_the_cell(name, grid):
     neglected = sigma.neglected[:, functionals.response.grid.locate(times)].T
     for delta in deltas(rng, lifted.space.nu):
         p = np.array(centre) + np.array(radius) * delta
-        truth = functionals.profile(times, directions, p)
+        truth = ManyDirections(functionals).profile(times, directions, p)
         bound = coefficients @ lifted.space.monomials(delta[None])[0] + excess + neglected
         assert (truth <= bound + 1e-10 * np.maximum(1.0, np.abs(truth))).all()
 

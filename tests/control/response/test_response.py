@@ -16,8 +16,9 @@ from scipy.linalg import expm
 from sparserob_core.control.enclosures.matrix_exponential import exponential, transitions
 from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.problem.system import LinearSystem
-from sparserob_core.control.reach import functional
+from sparserob_core.control.reach import functional, many_directions
 from sparserob_core.control.reach.disturbance_support import DisturbanceSupport
+from sparserob_core.control.reach.many_directions import ManyDirections
 from sparserob_core.control.response.lifted import lift
 from sparserob_core.control.response.response import Propagator, Response, merge_grids
 from sparserob_core.sip.convex_set import Box
@@ -164,7 +165,7 @@ def test_the_profile_of_a_uniform_grid_equals_the_offsets(seed, pieces):
         rng.normal(size=(3, 3)),
         rng.uniform(-1, 1, 2),
     )
-    fast = functionals.profile(times, directions, parameter)
+    fast = ManyDirections(functionals).profile(times, directions, parameter)
     slow = functionals.offsets(np.repeat(times, 3), np.tile(directions, (7, 1)), np.tile(parameter, (21, 1)))
     assert np.allclose(fast.ravel(), slow, rtol=1e-10, atol=1e-11)
 
@@ -176,13 +177,14 @@ def test_the_profile_of_a_uniform_grid_equals_the_offsets(seed, pieces):
 def test_the_profile_of_many_directions_equals_the_offsets(disturbance, bound, begun, monkeypatch):
     """Few numbers at once, so that there are several parts of times and of those."""
     monkeypatch.setattr(functional, "CHUNK", 200)
-    monkeypatch.setattr(functional, "NEAR", 200)
+    monkeypatch.setattr(many_directions, "CHUNK", 200)
+    monkeypatch.setattr(many_directions, "NEAR", 200)
     rng = np.random.default_rng(6)
     functionals = worst_case(uncertain(rng), UNEVEN, DICTIONARIES[disturbance], bound)
     functionals = replace(functionals, initial=begun)
     times, directions = np.append(rng.uniform(0, HORIZON, 9), [0.0, 1.1, HORIZON]), rng.normal(size=(7, 3))
     parameter = rng.uniform(-1, 1, 2)
-    fast = functionals.profile(times, directions, parameter)
+    fast = ManyDirections(functionals).profile(times, directions, parameter)
     slow = functionals.offsets(np.repeat(times, 7), np.tile(directions, (12, 1)), np.tile(parameter, (84, 1)))
     np.testing.assert_allclose(fast.ravel(), slow, rtol=1e-12, atol=1e-13)
 
