@@ -150,6 +150,7 @@ def test_a_recording_costs_a_run_of_ten_thousand_evaluations_less_than_two_per_c
     assert 0.0 < peak[0] < 200.0
 
 
+@pytest.mark.benchmark
 def test_a_map_of_literal_tuples_builds_the_rows_of_its_lines_once(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -17,7 +17,7 @@ from scipy.optimize import linprog
 import sparserob_core as sr
 from sparserob_core.checker.flow import flows
 from sparserob_core.control.problem.expression import kepler
-from sparserob_core.control.reach.functional import WorstFunctionals
+from sparserob_core.control.reach.over_cells import FunctionalsOverCells
 from sparserob_core.control.studies.initial_states import InitialPlane
 from sparserob_core.control.transcription.rounding import rounded_down
 from sparserob_core.experiment.assemble import assemble
@@ -476,7 +476,7 @@ def test_what_a_law_leaves_out_lowers_the_bound_by_as_much_as_its_rows_weigh(
     outcome = sr.run(INSIDE, out=tmp_path / "run", quiet=True, figures=False)
     model = assemble(load_config(INSIDE)).transcription
     plain = rounded_down(model, outcome.result, None).lower_bound
-    monkeypatch.setattr(WorstFunctionals, "beyond", lambda *_: np.full(1, 1e-3))
+    monkeypatch.setattr(FunctionalsOverCells, "truncation", lambda *_: np.full(1, 1e-3))
     weighed = sum(
         abs(cut.multiplier) * float(np.abs(said.direction).sum())
         for cut, said in zip(outcome.result.dual.cuts, model.explained(outcome.result.dual.cuts), strict=True)

@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from scipy.sparse import csr_array
 
 _NUMBERS = (float, int, np.floating, np.integer)
-_LARGEST_POWER = 64
+_MAX_POWER = 64
 HALF = EPSILON / 2  # unit roundoff: bound of the error of an operation, as a share of its result
 OUTWARD = 1.0 + 1e-10  # for bounds that are sums of at most some hundred thousand numbers that are not negative
 
@@ -248,7 +248,7 @@ class TaylorModel:
         if not isinstance(exponent, _NUMBERS):
             return NotImplemented
         power = float(exponent)
-        if not power.is_integer() or abs(power) > _LARGEST_POWER:
+        if not power.is_integer() or abs(power) > _MAX_POWER:
             return self._compose(power_series(power, *self._describe_domain()))
         return self._raise_to_power(int(power)) if power >= 0 else self.reciprocal()._raise_to_power(int(-power))
 

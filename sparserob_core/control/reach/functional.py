@@ -362,7 +362,7 @@ class WorstFunctionals:
 
     @cached_property
     def over_cells(self) -> FunctionalsOverCells:
-        """The same functionals over cells of parameters."""
+        """Functionals over cells of parameters, of the same system and uncertainty."""
         return FunctionalsOverCells(
             self.response, self.disturbance, self.initial, self.execution, self.measurable, self.known
         )

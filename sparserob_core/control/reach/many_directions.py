@@ -99,8 +99,8 @@ class ManyDirections:
         return sigma
 
     def _profile_by_axes(self, times: Array, directions: Array, parameter: Array) -> Array:
-        """`profile` of more directions than there are axes: what the axes give to the blocks of the disturbance does
-        for all directions, in which it is linear."""
+        """Return the `profile` of more directions than there are axes: what the axes give to the blocks of the
+        disturbance does for all directions, in which it is linear."""
         functionals = self.functionals
         (r, d), model = directions.shape, functionals.disturbance
         sigma = np.zeros((times.size, r))
@@ -121,7 +121,8 @@ class ManyDirections:
         return sigma
 
     def _weigh_axes(self, times: Array, parameters: Array) -> Weights:
-        """The weights of the functionals along the axes at times ``(k,)``, with one dimension ``(k, d, ...)`` more."""
+        """Return the weights of the functionals along the axes at times ``(k,)``, with one dimension more, ``(k, d,
+        ...)``."""
         functionals = self.functionals
         d = functionals.response.initial_state.size
         axes = np.tile(np.eye(d), (times.size, 1))

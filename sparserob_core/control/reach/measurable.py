@@ -175,6 +175,11 @@ class MeasurableSupport:
         -------
         list of Support
             The parts.
+
+        Raises
+        ------
+        NotEnclosable
+            Over a cell of parameters.
         """
         assert isinstance(leg, LiftedSystem)
         if leg.space.nu:

@@ -105,7 +105,8 @@ class VaryingMeasurable:
     def over(
         self, rows: Array, leg: LiftedSystem | VaryingMotion | SpreadMotion, joined: Combination | None = None
     ) -> list[Support]:
-        """`MeasurableSupport.over`, over a cell of parameters too."""
+        """Return the supports as `MeasurableSupport.over` does, over a cell of parameters too; raise `NotEnclosable`
+        for directions that vary over it."""
         assert not isinstance(leg, LiftedSystem)
         if joined is not None and leg.space.nu:
             raise NotEnclosable(NOT_PROVEN)

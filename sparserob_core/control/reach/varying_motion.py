@@ -828,7 +828,7 @@ class SpreadMotion:
     def supports(
         self, model: DisturbanceModel | None, initial: ConvexSet | None, rows: Array, joined: Combination | None
     ) -> list[SpreadSupport]:
-        """`VaryingMotion.supports` over the cell."""
+        """Return `VaryingMotion.supports` over the cell."""
         supports: list[SpreadSupport] = (
             [] if model is None else [SpreadSupport.of_disturbance(self, model, rows, joined)]
         )

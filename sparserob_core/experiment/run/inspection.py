@@ -29,8 +29,8 @@ if TYPE_CHECKING:
     from sparserob_core.sip.result import Result
 
 KEPT = 2**22
-"""Numbers of rows that are kept for a map, 32 MiB. With a tenth the rows of its lines are built again and again where
-the horizon has a thousand pieces; with ten times as many, watching takes the memory of another run."""
+"""Numbers of rows that are kept for a map, by family, 32 MiB. With a tenth the rows of its lines are built again and
+again where the horizon has a thousand pieces; with ten times as many, watching takes the memory of another run."""
 CoordinateKind: TypeAlias = Literal["time", "parameter", "disturbance", "direction", "index"]
 LETTERS: Mapping[str, str] = {
     "time": "t",
@@ -396,18 +396,18 @@ def _substitute_worst(family: ConstraintFamily, coefficients: np.ndarray) -> Con
 
 def _remember_rows(family: ConstraintFamily) -> ConstraintFamily:
     """Return a family that keeps up to `KEPT` numbers of its rows: the indices of a map lie on a few lines."""
-    build, known = family.rows, dict[bytes, tuple[Array, Array]]()
+    build, by_index = family.rows, dict[bytes, tuple[Array, Array]]()
 
     def rows(indices: Array) -> tuple[Array, Array]:
         keys = [index.tobytes() for index in indices]
-        size = next(iter(known.values()))[0].size if known else 0
-        if (len(known) + len(keys)) * size > KEPT:
-            known.clear()
-        fresh = [k for k, key in enumerate(keys) if key not in known]
-        if fresh:
-            known.update(zip([keys[k] for k in fresh], zip(*build(indices[fresh]), strict=True), strict=True))
-        G, h = zip(*(known[key] for key in keys), strict=True)
-        return np.array(G), np.array(h)
+        size = next(iter(by_index.values()))[0].size if by_index else 0
+        if (len(by_index) + len(keys)) * size > KEPT:
+            by_index.clear()
+        places = {key: k for k, key in enumerate(keys) if key not in by_index}
+        if places:
+            G, h = build(indices[list(places.values())])
+            by_index.update({key: (G[k].copy(), h[k].copy()) for k, key in enumerate(places)})
+        return np.array([by_index[key][0] for key in keys]), np.array([by_index[key][1] for key in keys])
 
     return replace(family, rows=rows)
 

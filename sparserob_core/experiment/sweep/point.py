@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any, final
 
 import numpy as np
-from scipy.sparse import csc_array
 
 from sparserob_core.errors import SparseRobError, named
 from sparserob_core.experiment.assemble import build
@@ -140,6 +139,7 @@ def _import_packages(loaded: Loaded) -> None:
     Otherwise the column ``seconds`` of the first run in every process would be half a second larger.
     """
     import scipy.optimize
+    from scipy.sparse import csc_array
 
     assert scipy.optimize
     entry = loaded.config.solver

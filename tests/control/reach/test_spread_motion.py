@@ -464,9 +464,9 @@ def test_growth_is_the_largest_on_any_half_of_a_part() -> None:
     low, high = np.array([-1.0]), np.array([1.0])
     with pytest.raises(NotEnclosable):
         constraint.functionals.over_cells.legs(low, high)
-    found = constraint.functionals._bound_growth(low, high, 8)
+    found = constraint.functionals.over_cells._bound_growth(low, high, 8)
     assert np.exp(4.0 * np.e) * (1.0 - 1e-9) <= found <= 100.0 * np.exp(4.0 * np.e)
-    assert constraint.functionals._bound_growth(low, high, 0) == np.inf
+    assert constraint.functionals.over_cells._bound_growth(low, high, 0) == np.inf
 
 
 def test_what_steps_are_off_by_is_carried_to_all_coefficients(pushed: Propagator) -> None:

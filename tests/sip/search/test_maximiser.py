@@ -251,6 +251,15 @@ def test_a_fifth_of_the_budget_polishes_unless_told_otherwise(name):
     assert by_default.evaluations <= 200
 
 
+def test_sobol_polishes_unless_told_otherwise():
+    box = sr.Box([-2.0, -1.0], [1.5, 3.0])
+    by_default, none = (
+        sr.maximise(lambda p: -(p**2).sum(axis=1), box, "sobol", budget=100, **kind) for kind in ({}, {"polish": 0})
+    )
+    assert by_default.stopped.endswith("; then polished") and "polished" not in none.stopped
+    assert by_default.best_value > 1e-3 * none.best_value
+
+
 def test_a_yardstick_and_a_proof_are_not_polished_unless_asked():
     box = sr.Box([0.0], [1.0])
     for name, options in (("random_search", {}), ("lipo", {"constant": 1.0})):

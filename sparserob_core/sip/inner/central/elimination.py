@@ -10,8 +10,7 @@ about a quarter.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cache
-from typing import Any, Protocol, final
+from typing import Protocol, final
 
 import numpy as np
 from scipy.linalg import lapack
@@ -107,7 +106,6 @@ class Whole:
         return self._solve_with_factor(r - parts[block.mixed] @ self.rows)
 
     def _solve_with_factor(self, r: Array) -> Array:
-        lapack = _import_lapack()
         intermediate, _ = lapack.dtrtrs(self.factor, r, lower=1)
         u, _ = lapack.dtrtrs(self.factor, intermediate, lower=1, trans=1)
         return np.asarray(u)
@@ -134,7 +132,6 @@ class Lean:
 
     def forward(self, r: Array) -> tuple[State, Array]:
         """Return a right-hand side among the pivots, and what it makes of the parts."""
-        lapack = _import_lapack()
         block, u = self.block, self.inverse * r
         reduced_rhs = np.zeros(self.Q.shape[1])
         reduced_rhs[block.columns] = self.single * u[block.of]
@@ -152,7 +149,6 @@ class Lean:
 
     def back(self, state: State, parts: Array) -> Array:
         """Return the variables."""
-        lapack = _import_lapack()
         block = self.block
         r = state[0] - np.bincount(block.of, self.single * parts[block.columns], self.inverse.size)
         if not block.at.size:
@@ -176,7 +172,6 @@ def eliminate(block: Block, D: Array, weight: Array, lean: Array, left: Left) ->
 
 
 def _eliminate_whole(block: Block, D: Array, weight: Array, lean: Array, left: Left) -> Whole:
-    lapack = _import_lapack()
     n, A = D.size, block.A
     scaled = A * np.sqrt(weight[block.at])[:, None]
     M = scaled.T @ scaled
@@ -201,7 +196,6 @@ def _eliminate_lean(block: Block, D: Array, weight: Array, lean: Array, left: Le
     For a row of great weight the diagonal would leave a small difference of large numbers. Such a row takes a small
     right-hand side of its own instead, which leaves ``m^2 / w``; of the other rows ``m`` is ``kept``.
     """
-    lapack = _import_lapack()
     A, w, m = block.A, weight[block.at], lean[block.at]
     k, n = A.shape
     unsafe = np.flatnonzero(~block.alone | (SAFE * (w @ (A * A)) > D))
@@ -244,15 +238,8 @@ def _eliminate_lean(block: Block, D: Array, weight: Array, lean: Array, left: Le
     return Lean(block, inverse, single, kept, unsafe, T, Q, Z, H, R)
 
 
-@cache
-def _import_lapack() -> Any:
-    """Return the routines of LAPACK, imported once: blocks ask for them ten thousand times in a step."""
-    return lapack
-
-
 def cholesky(M: Array) -> Array:
     """Return the lower factor of a positive definite matrix, whose diagonal is enlarged until it is one."""
-    lapack = _import_lapack()
     diagonal, increase = M.reshape(-1)[:: M.shape[0] + 1], GREATER
     while increase < 1e-6:
         diagonal *= 1.0 + increase
