@@ -21,7 +21,7 @@ from sparserob_core.control.enclosures.flows import DoublingExponentials, produc
 from sparserob_core.control.enclosures.matrix_exponential import rounding
 from sparserob_core.control.enclosures.taylor import Combination
 from sparserob_core.control.reach.disturbance_support import PropagatedEffect, propagate_effect
-from sparserob_core.control.reach.support import InitialSupport, KnownCellSupport, Support, over_directions
+from sparserob_core.control.reach.support import NOT_PROVEN, InitialSupport, KnownCellSupport, Support, over_directions
 from sparserob_core.control.reach.varying_motion import (
     SpreadMotion,
     VaryingMotion,
@@ -33,12 +33,6 @@ from sparserob_core.errors import NotEnclosable
 from sparserob_core.shapes import Float, shaped
 from sparserob_core.sip.convex_set import Array, Box, ConvexSet
 
-# said where it is met, and before anything is solved
-WITHOUT_PROOF = (
-    "measurable disturbances are proven only beside parameters in a box over which the state can be expanded in them,"
-    " and where it is no affine function of these only for sets with flat sides"
-)
-NOT_PROVEN = f"{WITHOUT_PROOF}; with disturbance_class piecewise_constant there is one"
 ACCURACY = 1e-14  # of an integral over one interval, relative to the largest integrand times the horizon
 ORDER = 12  # of the expansion that encloses a row; what is left of it on a short interval is 1e-14 of the row
 SHORT = 0.5  # time times speed that such an interval takes: twice as much leaves 1e-10, half as much doubles the work

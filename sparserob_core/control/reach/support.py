@@ -24,6 +24,13 @@ from sparserob_core.control.response.lifted import KNOWN, LiftedSystem
 from sparserob_core.shapes import Float, shaped
 from sparserob_core.sip.convex_set import Array, ConvexSet
 
+# said where it is met, and before anything is solved
+WITHOUT_PROOF = (
+    "measurable disturbances are proven only beside parameters in a box over which the state can be expanded in them,"
+    " and where it is no affine function of these only for sets with flat sides"
+)
+NOT_PROVEN = f"{WITHOUT_PROOF}; with disturbance_class piecewise_constant there is one"
+
 
 class Support(Protocol):
     """A part of the uncertainty on functionals ``(r, d)`` over one cell, in the form of `DisturbanceSupport`."""

@@ -9,8 +9,8 @@ from typing import final
 import numpy as np
 
 from sparserob_core.control.enclosures.taylor import Combination
-from sparserob_core.control.reach.measurable import AT_ONCE, NOT_PROVEN, MeasurableSupport
-from sparserob_core.control.reach.support import Support
+from sparserob_core.control.reach.measurable import AT_ONCE, MeasurableSupport
+from sparserob_core.control.reach.support import NOT_PROVEN, Support
 from sparserob_core.control.reach.varying_execution import UncertainExecution, VaryingExecution, followed
 from sparserob_core.control.reach.varying_motion import (
     SpreadMotion,

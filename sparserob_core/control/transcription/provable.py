@@ -9,7 +9,7 @@ import numpy as np
 from sparserob_core.control.enclosures.taylor import TaylorSpace
 from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.control.problem.system import System
-from sparserob_core.control.reach.measurable import WITHOUT_PROOF
+from sparserob_core.control.reach.support import WITHOUT_PROOF
 from sparserob_core.control.response.parameters import ParameterIndex
 from sparserob_core.control.sets.strangers import strangers
 from sparserob_core.control.transcription.terms.in_time import within_reach
