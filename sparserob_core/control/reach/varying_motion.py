@@ -412,9 +412,7 @@ class VaryingMotion:
         self, model: DisturbanceModel | None, initial: ConvexSet | None, rows: Array, joined: Combination | None
     ) -> list[VaryingSupport]:
         """Return the supports of a disturbance and of deviations of the initial state, as far as there are any."""
-        supports: list[VaryingSupport] = (
-            [] if model is None else [VaryingSupport.of_disturbance(self, model, rows, joined)]
-        )
+        supports = [] if model is None else [VaryingSupport.of_disturbance(self, model, rows, joined)]
         return supports if initial is None else [*supports, VaryingSupport.of_initial(self, initial, rows, joined)]
 
     def _slice_inputs(self, m: int) -> slice:
@@ -829,9 +827,7 @@ class SpreadMotion:
         self, model: DisturbanceModel | None, initial: ConvexSet | None, rows: Array, joined: Combination | None
     ) -> list[SpreadSupport]:
         """Return `VaryingMotion.supports` over the cell."""
-        supports: list[SpreadSupport] = (
-            [] if model is None else [SpreadSupport.of_disturbance(self, model, rows, joined)]
-        )
+        supports = [] if model is None else [SpreadSupport.of_disturbance(self, model, rows, joined)]
         return supports if initial is None else [*supports, SpreadSupport.of_initial(self, initial, rows, joined)]
 
     @property
