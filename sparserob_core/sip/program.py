@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from itertools import product
+from types import MappingProxyType
 from typing import ClassVar, Literal, TypeAlias, final
 
 import numpy as np
@@ -17,6 +18,8 @@ from sparserob_core.errors import InputError
 from sparserob_core.shapes import Float, sealed, shaped
 from sparserob_core.sip.convex_set import Array, Box, as_bound
 from sparserob_core.sip.convexity import require_convex, sparse_matrix
+from sparserob_core.sip.expressions.rows import ExpressionRows
+from sparserob_core.sip.expressions.statements import Decisions, read_tables
 from sparserob_core.sip.finite import Blocks, FiniteProgram, Spread, UncertainRows
 
 Formulation: TypeAlias = Literal["reduced", "nominal", "literal", "sampled"]
@@ -29,6 +32,7 @@ TOLERANCE = 1e-9  # of a row's own unit: a violation of at most this counts as n
 OUTSIDE = 1e-9  # of the sides of an index set and its distance from 0: error by which rounding may put an index outside
 NARROW = 1e-12  # of the side of a box: a gap between two cells that is only rounding of their corners
 PARTS = 4_000_000  # largest number of parts of the grid between the corners of all cells: 32 MB
+ENCLOSED = 0.5 * TOLERANCE  # below it a bound need not be sharper: half of what a proof excuses
 EQUALITY = 1e-12  # of the numbers that are added up: an equality with at most this residual counts as met
 
 
@@ -270,6 +274,9 @@ class ConstraintFamily:
         ``scaled(factor)``: the same constraints with all deviations multiplied by ``factor``.
     formulation : Formulation, default "reduced"
         Meaning of the indices. A cut records it too, so that its index can be understood.
+    believed : str, default "encloses or separates"
+        Verb for what a proof takes from whoever states the family and cannot be seen from its rows; empty where the
+        proof needs nothing of the kind.
     source : object, optional
         Object from which the family was made. The core never reads it, and returns it to whoever made the family.
     """
@@ -301,10 +308,77 @@ class ConstraintFamily:
     defines: bool = False
     scaled: Callable[[float], ConstraintFamily] | None = None
     formulation: Formulation = "reduced"
+    believed: str = "encloses or separates"
     source: object = None
 
     def __post_init__(self) -> None:
         sealed(self)
+
+    @staticmethod
+    def from_expressions(
+        name: str,
+        *,
+        index: Mapping[str, Sequence[float]],
+        rows: Sequence[str] | str,
+        decision: Mapping[str, int | None],
+        tables: Mapping[str, npt.ArrayLike] = MappingProxyType({}),
+    ) -> ConstraintFamily:
+        """Return a family whose rows are arithmetic in the coordinates of its index, with the enclosure of a proof.
+
+        Parameters
+        ----------
+        name : str
+            Name of the family.
+        index : mapping from str to (float, float)
+            Interval of every coordinate of the index, by name.
+        rows : str or sequence of str
+            Statements such as ``"sum(a[k] * cos(2*pi*k*w) for k in range(10)) - 1 <= d"``, affine in the decision.
+            They know the language of the entries of a system, and also ``>=``, two comparisons in one, ``chebyshev(k,
+            x)``, and sums over ranges.
+        decision : mapping from str to int or None
+            Number of entries of every name of the decision, in order; ``None`` for a single entry without a number.
+        tables : mapping from str to array, optional
+            Lists of numbers, or matrices, whose entries rows may name: ``c[k]`` or ``F[i, k]``.
+
+        Returns
+        -------
+        ConstraintFamily
+            The family; its ``source`` are the parsed rows.
+
+        Raises
+        ------
+        InputError
+            If a text is no such statement, or a name, an interval or a table is wrong.
+
+        Examples
+        --------
+        >>> import sparserob_core as sr
+        >>> decision = {"a": 3, "d": None}
+        >>> rows = ["-d <= sum(a[k] * x^k for k in range(3)) - exp(x) <= d"]
+        >>> family = sr.ConstraintFamily.from_expressions("fit", index={"x": (-1, 1)}, rows=rows, decision=decision)
+        >>> result = sr.solve(sr.SemiInfiniteProgram(n=4, q=[0, 0, 0, 1], families=[family]))
+        >>> result.status, round(result.cost, 6)
+        ('certified', 0.045017)
+        """
+        return ConstraintFamily.of_rows(
+            name, ExpressionRows.parse(index, rows, Decisions(decision), read_tables(tables))
+        )
+
+    @staticmethod
+    def of_rows(name: str, expressions: ExpressionRows) -> ConstraintFamily:
+        """Return the family of parsed rows."""
+
+        def enclose(x: Array, lower: Array, upper: Array) -> Enclosure:
+            return Enclosure(*expressions.enclose(x, lower, upper, ENCLOSED))
+
+        return ConstraintFamily(
+            name=name,
+            index_set=expressions.box,
+            rows=expressions.evaluate,
+            enclosure=enclose,
+            believed="",
+            source=expressions,
+        )
 
     @property
     def provable(self) -> bool:

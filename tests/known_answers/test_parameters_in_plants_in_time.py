@@ -16,13 +16,13 @@ from scipy.optimize import linprog
 
 import sparserob_core as sr
 from sparserob_core.checker.flow import flows
-from sparserob_core.control.problem.expression import kepler
 from sparserob_core.control.reach.over_cells import FunctionalsOverCells
 from sparserob_core.control.studies.initial_states import InitialPlane
 from sparserob_core.control.transcription.rounding import rounded_down
 from sparserob_core.experiment.assemble import assemble
 from sparserob_core.experiment.check.check import check
 from sparserob_core.experiment.config.load import load_config
+from sparserob_core.sip.expressions.expression import kepler
 from tests.support import tampering
 
 Config = dict[str, Any]

@@ -21,7 +21,6 @@ from sparserob_core.control.constraints.local_maxima import (
 )
 from sparserob_core.control.constraints.state import StateConstraint
 from sparserob_core.control.enclosures.cache import remember
-from sparserob_core.control.enclosures.taylor import Combination, combination
 from sparserob_core.control.reach.enclosure import Bounded, CellEnclosure, enclose, kept, over_legs
 from sparserob_core.control.reach.functional import WorstFunctionals
 from sparserob_core.control.reach.many_directions import ManyDirections
@@ -32,6 +31,7 @@ from sparserob_core.control.response.reference import STILL, MovingReference, Re
 from sparserob_core.control.sets.directions import across, faces, neighbours, on_surface, sampled, shares, unit
 from sparserob_core.shapes import Float, Int, shaped
 from sparserob_core.sip.convex_set import Array, Box, ConvexSet
+from sparserob_core.sip.expressions.taylor import Combination, combination
 from sparserob_core.sip.program import Enclosure, Separation
 
 SAMPLED = 8  # samples in any direction that are climbed from, beside the maxima along time

@@ -11,8 +11,8 @@ from __future__ import annotations
 import numpy as np
 
 from sparserob_core.control.enclosures.matrix_exponential import COEFFICIENTS, exponential_rounding
-from sparserob_core.control.enclosures.taylor import TaylorSpace
 from sparserob_core.sip.convex_set import Array
+from sparserob_core.sip.expressions.taylor import TaylorSpace
 
 
 def lifted_matrix(space: TaylorSpace, coefficients: Array, rows: bool) -> Array:

@@ -16,13 +16,9 @@ import numpy as np
 import numpy.typing as npt
 from scipy.linalg import schur
 
-from sparserob_core.control.enclosures.matrix_exponential import (
-    EPSILON,
-    exponential_rounding,
-    rounding,
-    transitions,
-)
+from sparserob_core.control.enclosures.matrix_exponential import exponential_rounding, transitions
 from sparserob_core.sip.convex_set import Array
+from sparserob_core.sip.expressions.rounding import EPSILON, rounding
 
 LongArray: TypeAlias = npt.NDArray[np.longdouble]
 

@@ -16,11 +16,11 @@ from typing import Any, TypeAlias, final
 
 import numpy as np
 
-from sparserob_core.control.enclosures.elementary import eccentric_anomaly
-from sparserob_core.control.enclosures.matrix_exponential import EPSILON
-from sparserob_core.control.enclosures.taylor import OUTWARD, TaylorSpace, taylor_space
 from sparserob_core.errors import InputError
 from sparserob_core.sip.convex_set import Array
+from sparserob_core.sip.expressions.elementary import eccentric_anomaly
+from sparserob_core.sip.expressions.rounding import EPSILON
+from sparserob_core.sip.expressions.taylor import OUTWARD, TaylorSpace, taylor_space
 
 Value: TypeAlias = Any
 """A float, or anything else with arithmetic, such as a `TaylorModel`."""

@@ -6,8 +6,7 @@ import numpy as np
 
 from sparserob_core.shapes import Float, shaped
 from sparserob_core.sip.convex_set import Array
-
-EPSILON = float(np.finfo(float).eps)
+from sparserob_core.sip.expressions.rounding import rounding
 
 # 1 / k!; beyond degree 18 nothing is left on the unit ball (1 / 19! < 1e-17)
 COEFFICIENTS = 1.0 / np.cumprod([1.0, *range(1, 19)])
@@ -54,17 +53,6 @@ def transitions(A: Array, durations: Array) -> tuple[Array, Array]:
     block[..., :size, size:] = np.eye(size)
     both = exponential(block)
     return both[..., :size, :size], both[..., :size, size:] * durations[..., None, None]
-
-
-def rounding(terms: int) -> float:
-    """Return ``(n + 4) u``, a bound of the rounding error of a sum of ``n`` products, relative to the sum of their
-    absolute values.
-
-    The unit roundoff ``u`` is half of the machine's epsilon. Up to ``n = 1e8`` the result is above
-    ``gamma_n = n u / (1 - n u)`` (Higham 2002, section 3.1), and for few terms it has room for some operations around
-    the product.
-    """
-    return (terms + 4) * EPSILON / 2
 
 
 def exponential_rounding(terms: int, sizes: Array) -> Array:

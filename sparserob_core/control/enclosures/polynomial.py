@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from sparserob_core.control.enclosures.cache import remember
-from sparserob_core.control.enclosures.taylor import Face, TaylorSpace
 from sparserob_core.shapes import Bool, Float, Int, shaped
 from sparserob_core.sip.convex_set import Array
+from sparserob_core.sip.expressions.taylor import Face, TaylorSpace
 
 DEFINITE = 1e-12  # share of the largest eigenvalue below 0 to which those of a Hessian are lowered
 SLOPE = 1e-9  # slope inwards, relative to the Hessian, above which a variable leaves a side of the box again

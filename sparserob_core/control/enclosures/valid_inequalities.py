@@ -16,8 +16,8 @@ from typing import final
 import numpy as np
 
 from sparserob_core.control.enclosures.polynomial import polynomial_bound, quadratic_part
-from sparserob_core.control.enclosures.taylor import TaylorSpace
 from sparserob_core.sip.convex_set import Array, ConvexSet, bisect
+from sparserob_core.sip.expressions.taylor import TaylorSpace
 
 TOGETHER = 6  # cuts of one cell that are tried in all combinations; singly, beyond
 HALVINGS = 40  # of the interval of a trust region's multiplier

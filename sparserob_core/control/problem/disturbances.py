@@ -22,7 +22,6 @@ import numpy as np
 import numpy.typing as npt
 
 from sparserob_core.brief import noun
-from sparserob_core.control.problem.expression import Entries, join_columns
 from sparserob_core.control.problem.phase import Matrix, Phase
 from sparserob_core.control.problem.system import System
 from sparserob_core.control.sets.sets import Product, product
@@ -30,6 +29,7 @@ from sparserob_core.control.term import SAME_TIME
 from sparserob_core.errors import InputError
 from sparserob_core.shapes import sealed
 from sparserob_core.sip.convex_set import Array, Box, ConvexSet, as_bound
+from sparserob_core.sip.expressions.expression import Entries, join_columns
 
 DisturbanceClass: TypeAlias = Literal["piecewise_constant", "measurable", "l1_ball"]
 Classes: TypeAlias = DisturbanceClass | tuple[DisturbanceClass, ...]

@@ -14,14 +14,14 @@ import numpy as np
 import numpy.typing as npt
 
 from sparserob_core.brief import noun
-from sparserob_core.control.enclosures.taylor import TaylorModel, TaylorSpace
-from sparserob_core.control.problem.expression import ExpressionMatrix, above, join_columns
 from sparserob_core.control.problem.tracing import SAME
 from sparserob_core.control.sets.sets import Box
 from sparserob_core.control.sets.strangers import require_consistent
 from sparserob_core.errors import InputError, NotEnclosable
 from sparserob_core.shapes import Float, dense, shaped
 from sparserob_core.sip.convex_set import Array, ConvexSet
+from sparserob_core.sip.expressions.expression import ExpressionMatrix, above, join_columns
+from sparserob_core.sip.expressions.taylor import TaylorModel, TaylorSpace
 
 Matrix: TypeAlias = npt.ArrayLike | Callable[..., object] | ExpressionMatrix
 TIME = "t"

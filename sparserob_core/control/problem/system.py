@@ -13,12 +13,12 @@ import numpy as np
 
 from sparserob_core.brief import noun
 from sparserob_core.control.enclosures.dependence import Dependence, ExpandedSystem, Superposed, dependence
-from sparserob_core.control.problem.expression import parse_column, parse_definitions, parse_matrix
 from sparserob_core.control.problem.phase import PARTS, TIME, Matrix, Phase, PhaseInUnits, and_time, boxed
 from sparserob_core.control.term import SAME_TIME, over
 from sparserob_core.errors import InputError
 from sparserob_core.shapes import Float, shaped
 from sparserob_core.sip.convex_set import Array, Box, ConvexSet
+from sparserob_core.sip.expressions.expression import parse_column, parse_definitions, parse_matrix
 
 InTime: TypeAlias = tuple[
     Sequence[Sequence[str | float]],

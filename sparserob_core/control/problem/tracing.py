@@ -11,10 +11,10 @@ from typing import Any, final
 
 import numpy as np
 
-from sparserob_core.control.enclosures.elementary import FUNCTIONS
-from sparserob_core.control.problem.expression import ExpressionMatrix, parse_matrix
 from sparserob_core.errors import InputError
 from sparserob_core.sip.convex_set import Array
+from sparserob_core.sip.expressions.elementary import FUNCTIONS
+from sparserob_core.sip.expressions.expression import ExpressionMatrix, parse_matrix
 
 SAME = 1e-9
 """The relative difference between a function and its expressions that counts as rounding.

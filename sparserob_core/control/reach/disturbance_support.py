@@ -9,13 +9,13 @@ from functools import cached_property, partial
 import numpy as np
 
 from sparserob_core.control.enclosures.comparison import block_norms, product
-from sparserob_core.control.enclosures.matrix_exponential import rounding
 from sparserob_core.control.enclosures.polynomial import distinct_patterns, face_of
-from sparserob_core.control.enclosures.taylor import Combination, Face, TaylorSpace
 from sparserob_core.control.response.disturbance import DisturbanceModel
 from sparserob_core.control.response.lifted import LiftedSystem, Past
 from sparserob_core.control.response.response import Impulses
 from sparserob_core.sip.convex_set import Array, ConvexSet
+from sparserob_core.sip.expressions.rounding import rounding
+from sparserob_core.sip.expressions.taylor import Combination, Face, TaylorSpace
 
 AT_ONCE = 4_000_000  # numbers that are summed over all ages at once
 SAME = 1e-9  # of a piece: a time that is not as near to its end is inside

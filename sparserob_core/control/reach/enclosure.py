@@ -17,7 +17,6 @@ from typing import Protocol, TypeAlias, TypeVar
 import numpy as np
 
 from sparserob_core.control.enclosures.comparison import block_norms, product
-from sparserob_core.control.enclosures.matrix_exponential import rounding
 from sparserob_core.control.enclosures.polynomial import (
     distinct_patterns,
     face_of,
@@ -25,13 +24,14 @@ from sparserob_core.control.enclosures.polynomial import (
     polynomial_bound,
     quadratic_part,
 )
-from sparserob_core.control.enclosures.taylor import Combination, TaylorSpace
 from sparserob_core.control.enclosures.valid_inequalities import Cuts
 from sparserob_core.control.reach.support import Supports
 from sparserob_core.control.response.reference import Direct, MovingReference
 from sparserob_core.control.response.response import TimeGrid
 from sparserob_core.errors import NotEnclosable
 from sparserob_core.sip.convex_set import Array
+from sparserob_core.sip.expressions.rounding import rounding
+from sparserob_core.sip.expressions.taylor import Combination, TaylorSpace
 from sparserob_core.sip.program import Enclosure
 
 # times the numbers of a constraint: a larger distance from the chord on a short cell is not for halving the times

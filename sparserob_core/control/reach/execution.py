@@ -14,8 +14,6 @@ from typing import final
 import numpy as np
 
 from sparserob_core.control.enclosures.comparison import block_norms
-from sparserob_core.control.enclosures.matrix_exponential import rounding
-from sparserob_core.control.enclosures.taylor import Combination
 from sparserob_core.control.problem.system import LinearSystem
 from sparserob_core.control.reach.measurable import MeasurableSupport, _propagate_rows
 from sparserob_core.control.reach.support import KnownCellSupport, Support, over_directions
@@ -27,6 +25,8 @@ from sparserob_core.control.response.lifted import LiftedSystem
 from sparserob_core.control.response.response import Response, unique_rows
 from sparserob_core.shapes import Float, shaped
 from sparserob_core.sip.convex_set import Array, Box
+from sparserob_core.sip.expressions.rounding import rounding
+from sparserob_core.sip.expressions.taylor import Combination
 
 # Of the horizon: ages that differ by less are one where nothing is proven. Ten times as much would be seen in a
 # violation of 1e-9, a tenth of it is below what the difference of two times rounds to.

@@ -18,8 +18,6 @@ from scipy.linalg import matrix_balance
 from sparserob_core.control.enclosures.cache import remember
 from sparserob_core.control.enclosures.comparison import block_norms, product
 from sparserob_core.control.enclosures.flows import DoublingExponentials, products
-from sparserob_core.control.enclosures.matrix_exponential import rounding
-from sparserob_core.control.enclosures.taylor import Combination
 from sparserob_core.control.reach.disturbance_support import PropagatedEffect, propagate_effect
 from sparserob_core.control.reach.support import NOT_PROVEN, InitialSupport, KnownCellSupport, Support, over_directions
 from sparserob_core.control.reach.varying_motion import (
@@ -32,6 +30,8 @@ from sparserob_core.control.sets.integrals import HALVINGS, integrated
 from sparserob_core.errors import NotEnclosable
 from sparserob_core.shapes import Float, shaped
 from sparserob_core.sip.convex_set import Array, Box, ConvexSet
+from sparserob_core.sip.expressions.rounding import rounding
+from sparserob_core.sip.expressions.taylor import Combination
 
 ACCURACY = 1e-14  # of an integral over one interval, relative to the largest integrand times the horizon
 ORDER = 12  # of the expansion that encloses a row; what is left of it on a short interval is 1e-14 of the row

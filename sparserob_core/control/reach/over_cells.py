@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, TypeAlias, final
 import numpy as np
 
 from sparserob_core.control.enclosures.cache import remember
-from sparserob_core.control.enclosures.taylor import Combination
 from sparserob_core.control.reach.disturbance_support import DisturbanceSupport
 from sparserob_core.control.reach.support import InitialSupport, Support, Supports
 from sparserob_core.control.reach.varying_motion import SpreadMotion, VaryingMotion
@@ -19,6 +18,7 @@ from sparserob_core.control.response.response import Response
 from sparserob_core.errors import NotEnclosable
 from sparserob_core.shapes import Float, shaped
 from sparserob_core.sip.convex_set import Array, ConvexSet
+from sparserob_core.sip.expressions.taylor import Combination
 
 if TYPE_CHECKING:
     from sparserob_core.control.reach.execution import Execution

@@ -15,14 +15,14 @@ from typing import Protocol, final
 import numpy as np
 
 from sparserob_core.control.enclosures.comparison import block_norms, product
-from sparserob_core.control.enclosures.matrix_exponential import rounding
 from sparserob_core.control.enclosures.polynomial import distinct_patterns
-from sparserob_core.control.enclosures.taylor import Combination, TaylorSpace
 from sparserob_core.control.reach.disturbance_support import PropagatedEffect, over_faces, propagate_effect, summed
 from sparserob_core.control.reach.varying_motion import OUTWARD, VaryingMotion
 from sparserob_core.control.response.lifted import KNOWN, LiftedSystem
 from sparserob_core.shapes import Float, shaped
 from sparserob_core.sip.convex_set import Array, ConvexSet
+from sparserob_core.sip.expressions.rounding import rounding
+from sparserob_core.sip.expressions.taylor import Combination, TaylorSpace
 
 # said where it is met, and before anything is solved
 WITHOUT_PROOF = (

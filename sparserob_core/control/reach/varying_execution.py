@@ -16,9 +16,7 @@ import numpy as np
 
 from sparserob_core.control.enclosures.cache import remember
 from sparserob_core.control.enclosures.comparison import product
-from sparserob_core.control.enclosures.matrix_exponential import rounding
 from sparserob_core.control.enclosures.polynomial import distinct_patterns
-from sparserob_core.control.enclosures.taylor import Combination
 from sparserob_core.control.reach.execution import Execution
 from sparserob_core.control.reach.measurable import ACCURACY, AT_ONCE, KEPT, TINY
 from sparserob_core.control.reach.support import (
@@ -39,6 +37,8 @@ from sparserob_core.control.response.varying.expansion import Kernel
 from sparserob_core.control.sets.integrals import CUTS, HALVINGS, absolute, integrated
 from sparserob_core.shapes import Float, shaped
 from sparserob_core.sip.convex_set import Array, ConvexSet
+from sparserob_core.sip.expressions.rounding import rounding
+from sparserob_core.sip.expressions.taylor import Combination
 
 POINTS_KEPT = 256  # parameters whose errors are remembered: twice the points of a lattice of parameters
 CELLS_KEPT = 16  # cells of parameters whose errors are: those of all rows of a few constraints

@@ -8,7 +8,6 @@ from typing import final
 
 import numpy as np
 
-from sparserob_core.control.enclosures.taylor import Combination
 from sparserob_core.control.reach.measurable import AT_ONCE, MeasurableSupport
 from sparserob_core.control.reach.support import NOT_PROVEN, Support
 from sparserob_core.control.reach.varying_execution import UncertainExecution, VaryingExecution, followed
@@ -23,6 +22,7 @@ from sparserob_core.control.sets.sets import Polytope
 from sparserob_core.errors import NotEnclosable
 from sparserob_core.shapes import Float, shaped
 from sparserob_core.sip.convex_set import Array, Box, ConvexSet
+from sparserob_core.sip.expressions.taylor import Combination
 
 
 @final

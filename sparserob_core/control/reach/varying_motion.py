@@ -28,14 +28,14 @@ import numpy as np
 from sparserob_core.control.enclosures.cache import remember
 from sparserob_core.control.enclosures.comparison import product
 from sparserob_core.control.enclosures.dependence import ExpandedSystem
-from sparserob_core.control.enclosures.matrix_exponential import rounding
-from sparserob_core.control.enclosures.taylor import Combination, TaylorSpace
 from sparserob_core.control.reach.disturbance_support import over_faces, summed
 from sparserob_core.control.response.disturbance import DisturbanceModel
 from sparserob_core.control.response.response import Propagator, TimeGrid
 from sparserob_core.control.response.varying.expansion import Expansion, Flow
 from sparserob_core.errors import NotEnclosable
 from sparserob_core.sip.convex_set import Array, ConvexSet
+from sparserob_core.sip.expressions.rounding import rounding
+from sparserob_core.sip.expressions.taylor import Combination, TaylorSpace
 
 KNOWN = TaylorSpace(0, 0)
 FEWEST_TERMS, MAX_TERMS = 8, 32

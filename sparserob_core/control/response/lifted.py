@@ -41,12 +41,12 @@ from sparserob_core.control.enclosures.decoupling import (
     identity,
 )
 from sparserob_core.control.enclosures.flows import Flows
-from sparserob_core.control.enclosures.matrix_exponential import rounding
-from sparserob_core.control.enclosures.taylor import TaylorSpace, taylor_space
 from sparserob_core.control.problem.phase import Phase
 from sparserob_core.control.problem.system import LinearSystem, System
 from sparserob_core.control.response.response import TINY, Response, TimeGrid
 from sparserob_core.sip.convex_set import Array
+from sparserob_core.sip.expressions.rounding import rounding
+from sparserob_core.sip.expressions.taylor import TaylorSpace, taylor_space
 
 DEGREES = {0: 0, 1: 6, 2: 4, 3: 3}  # of the Taylor models, by the number of parameters; 2 beyond
 KNOWN = np.zeros((1, 0))

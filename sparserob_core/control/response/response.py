@@ -18,12 +18,13 @@ import numpy as np
 
 from sparserob_core.control.enclosures.cache import remember
 from sparserob_core.control.enclosures.flows import FEW_STATES, DoublingExponentials, Exponentials
-from sparserob_core.control.enclosures.matrix_exponential import EPSILON, transitions
+from sparserob_core.control.enclosures.matrix_exponential import transitions
 from sparserob_core.control.problem.system import System
 from sparserob_core.control.response.varying.expansion import Expansion
 from sparserob_core.control.response.varying.spread import ParameterParts, law_of
 from sparserob_core.shapes import Float, Int, shaped
 from sparserob_core.sip.convex_set import Array
+from sparserob_core.sip.expressions.rounding import EPSILON
 
 # Blocks in which states are computed, where they are of two pieces and more. With a tenth of them what a block adds
 # from 0 is made of more products; ten times as many are ten times the steps from block to block.

@@ -13,13 +13,13 @@ from functools import cached_property
 import numpy as np
 
 from sparserob_core.control.enclosures.cache import remember
-from sparserob_core.control.enclosures.taylor import TaylorSpace
 from sparserob_core.control.problem.phase import Phase
 from sparserob_core.control.problem.system import System
 from sparserob_core.control.response.parameters import ParameterIndex
 from sparserob_core.control.response.response import Response
 from sparserob_core.errors import NotEnclosable
 from sparserob_core.sip.convex_set import Array, Box
+from sparserob_core.sip.expressions.taylor import TaylorSpace
 from sparserob_core.sip.relaxed.index_gradient import differences
 
 # of the width of the parameters: the cell of the Taylor models, whose first coefficients do not depend on its size

@@ -17,11 +17,12 @@ import numpy as np
 from scipy.linalg import matrix_balance
 
 from sparserob_core.control.enclosures.flows import products
-from sparserob_core.control.enclosures.matrix_exponential import exponential, rounding
+from sparserob_core.control.enclosures.matrix_exponential import exponential
 from sparserob_core.control.reach.measurable import ORDER
 from sparserob_core.control.sets.integrals import integrated
 from sparserob_core.errors import NotEnclosable
 from sparserob_core.sip.convex_set import Array, ConvexSet
+from sparserob_core.sip.expressions.rounding import rounding
 
 SHORT = 0.5  # norm times length of a step: what is left of the expansion is then 1e-14 of the row
 BENDING = 7  # terms of the bounds of derivatives; what is left of them is 1e-6 of the row's size in balanced units

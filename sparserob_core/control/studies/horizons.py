@@ -16,7 +16,6 @@ from typing import final
 
 import numpy as np
 
-from sparserob_core.control.enclosures.matrix_exponential import rounding
 from sparserob_core.control.enclosures.polynomial import polynomial_bound
 from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.problem.phase import Phase
@@ -32,6 +31,7 @@ from sparserob_core.control.response.response import TimeGrid, merge_grids
 from sparserob_core.control.transcription.own_units import extent, rough_units
 from sparserob_core.errors import InputError, NotEnclosable
 from sparserob_core.sip.convex_set import Array, Box, ConvexSet
+from sparserob_core.sip.expressions.rounding import rounding
 
 
 @final

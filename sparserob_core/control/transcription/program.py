@@ -14,7 +14,6 @@ from sparserob_core.control.constraints.flat import FlatConstraint
 from sparserob_core.control.constraints.literal import LiteralConstraint
 from sparserob_core.control.constraints.sensitivity import Sensitivity
 from sparserob_core.control.constraints.state import StateConstraint
-from sparserob_core.control.enclosures.taylor import TaylorSpace
 from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.control.problem.units import Units, power_of_two, ratios
@@ -37,6 +36,7 @@ from sparserob_core.control.transcription.steps import Steps, paired
 from sparserob_core.control.transcription.telling import Telling
 from sparserob_core.errors import InputError, NotEnclosable
 from sparserob_core.sip.convex_set import Array, Box, ConvexSet
+from sparserob_core.sip.expressions.taylor import TaylorSpace
 from sparserob_core.sip.program import TOLERANCE, ConstraintFamily, EqualityErrors, Formulation, SemiInfiniteProgram
 
 SAME = 1e-11  # of the numbers that are added up, a difference that is rounding

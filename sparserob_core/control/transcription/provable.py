@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from sparserob_core.control.enclosures.taylor import TaylorSpace
 from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.control.problem.system import System
 from sparserob_core.control.reach.support import WITHOUT_PROOF
@@ -15,6 +14,7 @@ from sparserob_core.control.sets.strangers import strangers
 from sparserob_core.control.transcription.terms.in_time import within_reach
 from sparserob_core.control.transcription.terms.superposed import superposed
 from sparserob_core.errors import NotEnclosable
+from sparserob_core.sip.expressions.taylor import TaylorSpace
 from sparserob_core.sip.result import Result
 
 SECONDS = 30.0  # that the search takes for a problem that cannot be proven, unless a limit is given: for a witness

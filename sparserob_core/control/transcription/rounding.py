@@ -11,13 +11,13 @@ from dataclasses import replace
 import numpy as np
 
 from sparserob_core.control.enclosures.decoupling import pace
-from sparserob_core.control.enclosures.matrix_exponential import EPSILON
 from sparserob_core.control.response.response import Weights
 from sparserob_core.control.transcription.own_units import extent, fixed
 from sparserob_core.control.transcription.program import slanted
 from sparserob_core.control.transcription.record import Transcription
 from sparserob_core.control.transcription.steps import Steps
 from sparserob_core.sip.convex_set import Array
+from sparserob_core.sip.expressions.rounding import EPSILON
 from sparserob_core.sip.result import Result
 
 SHARE = 64 * 2.0**-52  # of the numbers that are added up to a row: products of a few matrices and sums of many terms

@@ -10,12 +10,12 @@ import numpy as np
 from scipy.sparse import csc_array, kron
 
 from sparserob_core.control.constraints.control import before, differences
-from sparserob_core.control.enclosures.matrix_exponential import rounding
 from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.control.problem.units import power_of_two
 from sparserob_core.errors import InputError
 from sparserob_core.sip.convex_set import Array, ConvexSet
+from sparserob_core.sip.expressions.rounding import rounding
 
 MAX_CUTS = 60  # rounds of tangents
 CLOSE = 1e-7  # of the control's range, a point that is as good as inside

@@ -11,19 +11,9 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import BeforeValidator, Discriminator, Field, Tag
 
-from sparserob_core.control.enclosures.elementary import FUNCTIONS
 from sparserob_core.control.policies.measurements import Measurements
 from sparserob_core.control.problem.cost import Cost
 from sparserob_core.control.problem.disturbances import Disturbance, DisturbanceClass
-from sparserob_core.control.problem.expression import (
-    CONSTANTS,
-    KEPLER,
-    Definitions,
-    ExpressionMatrix,
-    parse_column,
-    parse_definitions,
-    parse_matrix,
-)
 from sparserob_core.control.problem.names import Names
 from sparserob_core.control.problem.phase import TIME
 from sparserob_core.control.problem.problem import OptimalControlProblem, ProblemFactory
@@ -53,6 +43,16 @@ from sparserob_core.experiment.config.set_options import (
 )
 from sparserob_core.options import Options
 from sparserob_core.sip.convex_set import Array
+from sparserob_core.sip.expressions.elementary import FUNCTIONS
+from sparserob_core.sip.expressions.expression import (
+    CONSTANTS,
+    KEPLER,
+    Definitions,
+    ExpressionMatrix,
+    parse_column,
+    parse_definitions,
+    parse_matrix,
+)
 
 
 def _check_entry(value: object) -> object:

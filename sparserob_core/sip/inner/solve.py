@@ -365,20 +365,25 @@ def _solve_by_simplex(case: _Case) -> FiniteSolution | None:
     """Return the answer of the simplex method to a linear program, if it is believed and sharp. An interior-point
     method may lack digits, as with rows that are nearly parallel, or go in circles; a vertex is a system of equations.
     Nothing where a solver was named."""
-    program = case.program
-    if HIGHS not in case.solver.quick or program.P is not None or program.blocks is not None:
-        return None
-    corner = simplex(program, TURNS * (program.n + program.h.size + program.b.size))
-    if corner.status != "optimal":
-        return None
-    offers = [(corner.y, corner.mu)]
-    if program.S is None:
-        offers.append(vertex_multipliers(program, corner.x, corner.y, corner.mu))
-    for y, mu in offers:
-        believed = case.judge(measure(program, corner.x, y, mu, corner.z, message="simplex method"), "a vertex", HIGHS)
+    for solution in _list_corners(case.program) if HIGHS in case.solver.quick else ():
+        believed = case.judge(solution, "a vertex", HIGHS)
         if believed is not None:
             return believed
     return None
+
+
+def _list_corners(program: FiniteProgram) -> Iterator[FiniteSolution]:
+    """Yield the vertex of the simplex method with its multipliers, and with those of the vertex; of a program that is
+    not linear, none."""
+    if program.P is not None or program.blocks is not None:
+        return
+    corner = simplex(program, TURNS * (program.n + program.h.size + program.b.size))
+    if corner.status != "optimal":
+        return
+    yield measure(program, corner.x, corner.y, corner.mu, corner.z, message="simplex method")
+    if program.S is None:
+        y, mu = vertex_multipliers(program, corner.x, corner.y, corner.mu)
+        yield measure(program, corner.x, y, mu, corner.z, message="simplex method")
 
 
 def _refine_digits(case: _Case, claim: Claim | None) -> FiniteSolution | None:
@@ -444,6 +449,8 @@ def _list_cheap_answers(case: _Case, guess: FiniteSolution | None) -> Iterator[t
         if np.isfinite(x).all() and program.residual(x) <= case.tolerance:
             zero, none = np.zeros(program.h.size), np.zeros(program.b.size)
             yield CLOSED_FORM, measure(program, x, zero, none, message="no row is active")
+    if HIGHS in quick and program.S is None and not program.bounded:  # where others take long, and a vertex is exact
+        yield from ((HIGHS, solution) for solution in _list_corners(program))
     if HIGHS in quick and many(program):
         corner = sifted(program, *((None, None) if guess is None else (guess.y, guess.mu)))
         if corner.status == "optimal":

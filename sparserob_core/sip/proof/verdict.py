@@ -88,11 +88,16 @@ def remarked(program: SemiInfiniteProgram, result: Result) -> Result:
             dual=NO_BOUND,
             infeasible=None,
         )
-    names = [family.name for family in program.families if family.enclosure is not None or family.worst is not None]
+    provable = [family for family in program.families if family.enclosure is not None or family.worst is not None]
+    names: dict[str, list[str]] = {}
+    for family in provable:
+        names.setdefault(family.believed, []).append(family.name)
+    names.pop("", None)
     if not names or result.status not in ("certified", "verified"):
         return result
-    warning = (
-        f"what {', '.join(names[:NAMED])}{', ...' if len(names) > NAMED else ''} encloses or separates is believed"
+    warning = "; ".join(
+        f"what {', '.join(of[:NAMED])}{', ...' if len(of) > NAMED else ''} {what} is believed"
+        for what, of in names.items()
     )
     return replace(result, message=f"{result.message}; {warning}")
 

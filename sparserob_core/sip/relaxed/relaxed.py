@@ -165,8 +165,7 @@ def _choose_tangent_point(plain: FiniteProgram, y: Array, mu: Array, x: Array) -
     if plain.P is not None and plain.separable:
         slope = plain.q + np.maximum(y, 0.0) @ plain.G + mu @ plain.A
         own = minimisers(plain.weights, plain.curvature, slope, plain.lower, plain.upper)
-        if np.isfinite(own).all():
-            return own
+        x = np.where(np.isfinite(own), own, x)
     return np.where(np.isfinite(x), x, 0.0)
 
 
@@ -249,8 +248,12 @@ class RelaxedProgram:
 
     def _prove_bound(self, plain: FiniteProgram, solution: FiniteSolution, y: Array, mu: Array, z: Array) -> _Proven:
         """A lower bound, less its rounding, with the multipliers that prove it and where the cost is touched."""
-        at = _choose_tangent_point(plain, y, mu, solution.x)
-        bound, y, mu, z_proving = proving(plain.tangent(at), y, mu, z, at=at)
+        if plain.P is not None and plain.separable and not plain.bounded:  # of what has no bounds a tangent says nothing
+            bound, y, mu, z_proving = proving(plain, y, mu, z)
+            at = _choose_tangent_point(plain, y, mu, solution.x)
+        else:
+            at = _choose_tangent_point(plain, y, mu, solution.x)
+            bound, y, mu, z_proving = proving(plain.tangent(at), y, mu, z, at=at)
         if solution.value - bound > UNCLOSED * abs(solution.value) and self._curvature is not None:
             better, point = curved_bound(plain, self._curvature, y, mu, at)
             bound, at = (better, point) if better > bound else (bound, at)

@@ -53,7 +53,11 @@ def separate(
     for family in program.families:
         tools.deadline.check()
         answers[family.name] = search(family) if family.worst is None else family.separated(x)
-    searched = [answer for answer in answers.values() if isinstance(answer, _ViolationSearch)]
+    searched = [
+        answer
+        for answer in answers.values()
+        if isinstance(answer, _ViolationSearch) and answer.field.family.enclosure is None  # else a proof finds the rest
+    ]
     highest = max((float(answer.violations.max(initial=-np.inf)) for answer in answers.values()), default=-np.inf)
     _search_harder(searched, highest)
     separations = ((family, answers[family.name]) for family in program.families)

@@ -34,10 +34,10 @@ from sparserob_core.checker.sets.parameters import Parameters
 from sparserob_core.checker.sets.sides import Bounded
 from sparserob_core.control.policies.affine import AffinePolicy
 from sparserob_core.control.problem.cost import Quadratic
-from sparserob_core.control.problem.expression import parse_matrix
 from sparserob_core.control.problem.system import LinearSystem
 from sparserob_core.control.sets.polytope import Polytope
 from sparserob_core.control.sets.sets import Box, Ellipsoid, NormBall
+from sparserob_core.sip.expressions.expression import parse_matrix
 
 TOO_MUCH, NOTHING = 5e-9, 3e-10
 ONE = np.ones((1, 1))

@@ -21,9 +21,9 @@ from sparserob_core.checker.flow.plant import Plant
 from sparserob_core.checker.flow.segment import SHARP, VerifiedSegment
 from sparserob_core.checker.outcome import Unchecked
 from sparserob_core.control.problem.dictionary import Dictionary
-from sparserob_core.control.problem.expression import parse_matrix
 from sparserob_core.control.problem.system import LinearSystem, SwitchedSystem, VaryingSystem
 from sparserob_core.control.sets.sets import Box
+from sparserob_core.sip.expressions.expression import parse_matrix
 
 BITS, IN_TIME, EXACT = 96, 192, 600
 rng = np.random.default_rng(4)

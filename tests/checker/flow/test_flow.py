@@ -25,8 +25,8 @@ from sparserob_core.checker.flow.law import ParameterBox
 from sparserob_core.checker.flow.plant import Plant
 from sparserob_core.checker.outcome import Unchecked
 from sparserob_core.checker.reach.closed_loop import VerifiedLoop
-from sparserob_core.control.problem.expression import parse_matrix
 from sparserob_core.control.problem.system import LinearSystem, SwitchedSystem, VaryingSystem
+from sparserob_core.sip.expressions.expression import parse_matrix
 from tests.support.integration import mathieu
 
 FADING = VaryingSystem.of([["-1/(1 + t)"]], [["t", 1]], 3.0, [["2 - t"]], c=["3*t^2"])

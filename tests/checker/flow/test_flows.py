@@ -14,8 +14,8 @@ from sparserob_core.checker.flow import flows as several
 from sparserob_core.checker.flow.flows import VerifiedFlows
 from sparserob_core.checker.flow.law import ParameterBox
 from sparserob_core.checker.flow.plant import Plant
-from sparserob_core.control.problem.expression import parse_matrix
 from sparserob_core.control.problem.system import LinearSystem, VaryingSystem
+from sparserob_core.sip.expressions.expression import parse_matrix
 
 
 @pytest.fixture(autouse=True)

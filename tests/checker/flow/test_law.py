@@ -18,8 +18,8 @@ from sparserob_core.checker.flow import law as laws
 from sparserob_core.checker.flow.law import LONG, Law, ParameterBox, Stretch
 from sparserob_core.checker.flow.plant import Plant
 from sparserob_core.checker.outcome import Unchecked
-from sparserob_core.control.problem.expression import parse_matrix
 from sparserob_core.control.problem.system import LinearSystem, SwitchedSystem, VaryingSystem
+from sparserob_core.sip.expressions.expression import parse_matrix
 
 RNG = np.random.default_rng(3)
 ENTRIES = [

@@ -12,9 +12,9 @@ from sparserob_core.checker.arithmetic.series import middles
 from sparserob_core.checker.flow.plant import held_about, modes_at
 from sparserob_core.checker.flow.units import balanced, scaled
 from sparserob_core.checker.outcome import Unchecked
-from sparserob_core.control.problem.expression import parse_matrix
 from sparserob_core.control.problem.system import LinearSystem, SwitchedSystem
 from sparserob_core.control.sets.sets import Box
+from sparserob_core.sip.expressions.expression import parse_matrix
 
 
 def matrix(values):

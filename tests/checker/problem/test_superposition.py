@@ -14,8 +14,8 @@ import sparserob_core as sr
 from sparserob_core.checker.outcome import Unchecked
 from sparserob_core.checker.problem.superposition import ParameterExpansion, parted
 from sparserob_core.control.problem.cost import Quadratic
-from sparserob_core.control.problem.expression import parse_matrix
 from sparserob_core.control.sets.sets import Box, NormBall
+from sparserob_core.sip.expressions.expression import parse_matrix
 
 BOX, NAMES = Box([-0.1, 0.3, 2.0], [0.7, 0.8, 2.0]), ("p", "q", "r")
 A = [["-t", "0", "0"], ["p * (1 - t) + q / 2", "0", "0"], ["1 + 2*t - (3*t + q)", "3", "cos(t) ^ 2"]]

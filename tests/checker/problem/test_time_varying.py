@@ -9,8 +9,8 @@ import pytest
 
 import sparserob_core as sr
 from sparserob_core.checker.problem.time_varying import make_time_varying
-from sparserob_core.control.problem.expression import parse_matrix
 from sparserob_core.control.problem.system import LinearSystem, SwitchedSystem
+from sparserob_core.sip.expressions.expression import parse_matrix
 
 
 def system(text: str) -> LinearSystem:

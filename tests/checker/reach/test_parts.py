@@ -27,13 +27,13 @@ from sparserob_core.checker.reach.states import Scene, States
 from sparserob_core.checker.reach.tube import Polynomial, ProjectedStates, VerifiedTube
 from sparserob_core.checker.sets.known import known
 from sparserob_core.checker.sets.shape import excess, find_inner_support_point
-from sparserob_core.control.problem.expression import parse_matrix
 from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.control.problem.system import LinearSystem
 from sparserob_core.control.problem.terms.windows import PathConstraint
 from sparserob_core.control.response.response import merge_grids
 from sparserob_core.control.sets.sets import Box, ConvexSet, Cylinder, Ellipsoid, NormBall, Polytope
 from sparserob_core.control.transcription.transcribe import prepare
+from sparserob_core.sip.expressions.expression import parse_matrix
 from tests.support.plants import indicators, random_system, uniform, worst_case
 
 TRIANGLE = Polytope(np.array([[1.0, 1.0], [-1.0, 0.0], [0.0, -1.0]]), np.array([1.0, 0.5, 0.25]))

@@ -16,10 +16,10 @@ from sparserob_core.checker.flow.law import ParameterBox
 from sparserob_core.checker.flow.plant import Plant
 from sparserob_core.checker.reach.states import Scene, States
 from sparserob_core.checker.reach.tube import ProjectedStates, VerifiedTube
-from sparserob_core.control.problem.expression import parse_matrix
 from sparserob_core.control.problem.system import LinearSystem, SwitchedSystem
 from sparserob_core.control.sets.sets import ConvexSet, NormBall
 from sparserob_core.sip.convex_set import Array, Box
+from sparserob_core.sip.expressions.expression import parse_matrix
 
 SWITCHES, CHANGES, HORIZON = (0.7, 1.5), [0.0, 0.5, 1.0, 1.75], 2.0
 GRID = sorted({*SWITCHES, *CHANGES, 0.25, HORIZON})  # pieces of the disturbance go on over both switches

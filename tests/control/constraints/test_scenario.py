@@ -11,10 +11,10 @@ import sparserob_core as sr
 from sparserob_core.control.constraints import scenario
 from sparserob_core.control.constraints.flat import FlatConstraint, Samples
 from sparserob_core.control.constraints.scenario import ScenarioConstraint
-from sparserob_core.control.problem.expression import parse_matrix
 from sparserob_core.control.problem.system import LinearSystem
 from sparserob_core.control.response.parameters import ParameterIndex
 from sparserob_core.control.sets.sets import Box
+from sparserob_core.sip.expressions.expression import parse_matrix
 from tests.support.plants import uniform, worst_case
 
 ONE = np.ones((1, 1))

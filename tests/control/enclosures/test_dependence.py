@@ -10,7 +10,7 @@ import pytest
 from sparserob_core.checker.arithmetic.models import Frame, Model
 from sparserob_core.checker.arithmetic.monomials import NONE
 from sparserob_core.control.enclosures.dependence import Split
-from sparserob_core.control.problem.expression import parse_matrix
+from sparserob_core.sip.expressions.expression import parse_matrix
 
 flint = pytest.importorskip("flint")
 

@@ -13,12 +13,12 @@ from sparserob_core.control.constraints.curved import CurvedConstraint
 from sparserob_core.control.constraints.flat import FlatConstraint
 from sparserob_core.control.constraints.local_maxima import step_out
 from sparserob_core.control.enclosures.polynomial import polynomial_bound
-from sparserob_core.control.enclosures.taylor import TaylorSpace
 from sparserob_core.control.enclosures.valid_inequalities import cheapest_multipliers
 from sparserob_core.control.problem.system import LinearSystem
 from sparserob_core.control.response.parameters import ParameterIndex
 from sparserob_core.control.sets.sets import Ellipsoid, NormBall, Polytope
 from sparserob_core.sip.convex_set import Box
+from sparserob_core.sip.expressions.taylor import TaylorSpace
 from sparserob_core.sip.program import ConstraintFamily
 from sparserob_core.sip.proof.branch_and_bound import prove_family
 from tests.support.plants import uniform, worst_case

@@ -12,12 +12,12 @@ import pytest
 from scipy.linalg import expm
 from scipy.sparse import csr_matrix
 
-from sparserob_core.control.enclosures.taylor import TaylorSpace
-from sparserob_core.control.problem.expression import ExpressionMatrix, parse_column, parse_matrix
 from sparserob_core.control.problem.phase import Phase, PhaseInUnits, and_time, boxed
 from sparserob_core.control.sets.sets import Box, NormBall
 from sparserob_core.errors import InputError, NotEnclosable
 from sparserob_core.sip.convex_set import Array
+from sparserob_core.sip.expressions.expression import ExpressionMatrix, parse_column, parse_matrix
+from sparserob_core.sip.expressions.taylor import TaylorSpace
 
 RNG = np.random.default_rng(11)
 BOX = Box([0.5, -0.2], [1.5, 0.4])

@@ -14,13 +14,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.linalg import expm
 
-from sparserob_core.control.enclosures.taylor import TaylorSpace
-from sparserob_core.control.problem.expression import parse_matrix
 from sparserob_core.control.problem.phase import Phase
 from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.control.problem.system import LinearSystem, SwitchedSystem, System, VaryingSystem
 from sparserob_core.control.sets.sets import Box, NormBall, Polytope
 from sparserob_core.errors import InputError, NotEnclosable
+from sparserob_core.sip.expressions.expression import parse_matrix
+from sparserob_core.sip.expressions.taylor import TaylorSpace
 
 BOX = Box(np.array([0.5, -0.2]), np.array([1.5, 0.2]))
 

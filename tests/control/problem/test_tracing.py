@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 import sparserob_core as sr
-from sparserob_core.control.problem.expression import parse_matrix
 from sparserob_core.control.problem.tracing import traced
+from sparserob_core.sip.expressions.expression import parse_matrix
 
 NAMES = ("p1", "p2")
 PROBES = np.array([[0.3, 0.7], [0.9, 0.2]])

@@ -11,15 +11,15 @@ import numpy as np
 import pytest
 
 import sparserob_core as sr
-from sparserob_core.control.enclosures.taylor import TaylorSpace
 from sparserob_core.control.problem.cost import Quadratic
-from sparserob_core.control.problem.expression import parse_matrix
 from sparserob_core.control.problem.system import LinearSystem
 from sparserob_core.control.problem.terms.integral import Accumulated
 from sparserob_core.control.problem.terms.repeat import Return
 from sparserob_core.control.problem.units import Units, power_of_two
 from sparserob_core.control.sets.sets import Box, Cylinder, Ellipsoid, NormBall, Polytope
 from sparserob_core.control.term import TERMS, TIME, UNITLESS, Term, measured
+from sparserob_core.sip.expressions.expression import parse_matrix
+from sparserob_core.sip.expressions.taylor import TaylorSpace
 
 SETS = [
     Box(np.array([-1.0, 0.5]), np.array([2.0, 0.75])),

@@ -11,10 +11,10 @@ import pytest
 import sparserob_core as sr
 from sparserob_core.control.constraints.flat import FlatConstraint
 from sparserob_core.control.enclosures.comparison import block_norms
-from sparserob_core.control.enclosures.matrix_exponential import rounding
 from sparserob_core.control.reach.execution import Execution, ExecutionCellSupport
 from sparserob_core.control.response.lifted import LiftedSystem
 from sparserob_core.control.transcription.transcribe import Transcription, prepare
+from sparserob_core.sip.expressions.rounding import rounding
 from tests.support.enclosed import assert_bounded_on_cells
 
 A = np.array([[0.0, 1.0], [-4.0, -0.3]])

@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 
 from sparserob_core.control.enclosures.comparison import block_norms
-from sparserob_core.control.enclosures.taylor import TaylorSpace, combination
 from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.control.problem.system import LinearSystem, VaryingSystem
 from sparserob_core.control.reach.functional import WorstFunctionals
 from sparserob_core.control.reach.support import DirectionsCellSupport, Supports, between_corners
 from sparserob_core.control.sets.sets import Box, Ellipsoid
 from sparserob_core.control.transcription.transcribe import prepare
+from sparserob_core.sip.expressions.taylor import TaylorSpace, combination
 from tests.support.plants import uniform
 
 HORIZON, D = 2.0, 4

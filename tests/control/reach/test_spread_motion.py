@@ -14,7 +14,6 @@ from scipy.integrate import solve_ivp
 import sparserob_core as sr
 from sparserob_core.control.enclosures import dependence
 from sparserob_core.control.enclosures.dependence import ExpandedSystem
-from sparserob_core.control.enclosures.taylor import TaylorSpace
 from sparserob_core.control.reach.varying_motion import SpreadMotion, Truncation, VaryingMotion
 from sparserob_core.control.response.response import OutputResponse, Propagator, Response, merge_grids
 from sparserob_core.control.response.varying import spread as expansions
@@ -22,6 +21,7 @@ from sparserob_core.control.response.varying.discs import cauchy
 from sparserob_core.control.response.varying.expansion import Expansion
 from sparserob_core.control.transcription.transcribe import prepare
 from sparserob_core.errors import NotEnclosable
+from sparserob_core.sip.expressions.taylor import TaylorSpace
 
 BOX = sr.Box([-0.3], [0.6])
 SYSTEM = sr.VaryingSystem.of([["-0.5 - p*sin(2*t)"]], [["1 + p^2"]], 3.0, [[1]], parameters=BOX, names=["p"])

@@ -12,7 +12,6 @@ from hypothesis import strategies as st
 from scipy.optimize import linprog
 
 from sparserob_core.control.enclosures.polynomial import face_of
-from sparserob_core.control.enclosures.taylor import TaylorSpace, combination
 from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.reach.disturbance_support import summed
 from sparserob_core.control.response.disturbance import disturbance_model
@@ -20,6 +19,7 @@ from sparserob_core.control.response.response import merge_grids
 from sparserob_core.control.sets.sets import Ellipsoid, NormBall, Polytope
 from sparserob_core.errors import InputError
 from sparserob_core.sip.convex_set import Box
+from sparserob_core.sip.expressions.taylor import TaylorSpace, combination
 from tests.support.plants import indicators, random_system, uniform, walsh, weight_on_piece, worst_case
 
 HORIZON = 2.0

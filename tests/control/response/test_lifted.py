@@ -15,7 +15,6 @@ from scipy.linalg import expm
 
 from sparserob_core.control.enclosures.comparison import block_norms
 from sparserob_core.control.enclosures.polynomial import polynomial_bound
-from sparserob_core.control.enclosures.taylor import TaylorSpace
 from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.problem.system import LinearSystem
 from sparserob_core.control.reach.disturbance_support import DisturbanceSupport
@@ -24,6 +23,7 @@ from sparserob_core.control.response import lifted as lifted_module
 from sparserob_core.control.response import response as response_module
 from sparserob_core.control.response.lifted import frozen, lift
 from sparserob_core.sip.convex_set import Box
+from sparserob_core.sip.expressions.taylor import TaylorSpace
 from tests.support.plants import indicators, simulated, uniform, worst_case
 
 HORIZON = 3.0

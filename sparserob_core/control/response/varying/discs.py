@@ -17,13 +17,13 @@ from typing import final
 import numpy as np
 
 from sparserob_core.control.enclosures.dependence import AnyNumber, Split, TruncationBound
-from sparserob_core.control.enclosures.elementary import KEPLER_CIRCLES, eccentric_anomaly
-from sparserob_core.control.enclosures.matrix_exponential import EPSILON
-from sparserob_core.control.problem.expression import ExpressionMatrix
 from sparserob_core.control.problem.phase import Phase
 from sparserob_core.control.problem.system import System
 from sparserob_core.errors import InputError
 from sparserob_core.sip.convex_set import Array
+from sparserob_core.sip.expressions.elementary import KEPLER_CIRCLES, eccentric_anomaly
+from sparserob_core.sip.expressions.expression import ExpressionMatrix
+from sparserob_core.sip.expressions.rounding import EPSILON
 
 NAMES = ("A", "B", "c", "E")  # in the order of columns: a drift is one more column of B
 DEGREES = (4, 10, 20)  # at which a cell of time is judged; beyond one radius another one is the best

@@ -19,13 +19,13 @@ from weakref import WeakKeyDictionary, ref
 import numpy as np
 
 from sparserob_core.control.enclosures.dependence import ExpandedSystem, Superposed
-from sparserob_core.control.enclosures.matrix_exponential import EPSILON, rounding
-from sparserob_core.control.enclosures.taylor import TaylorSpace
 from sparserob_core.control.problem.phase import Phase, PhaseInUnits
 from sparserob_core.control.problem.system import System
 from sparserob_core.errors import InputError, NotEnclosable
 from sparserob_core.shapes import Float, shaped
 from sparserob_core.sip.convex_set import Array
+from sparserob_core.sip.expressions.rounding import EPSILON, rounding
+from sparserob_core.sip.expressions.taylor import TaylorSpace
 
 DEGREE = 14  # of the system in time; with a tenth segments are a hundred times shorter
 TERMS = 64  # of the solution on an interval; 40 of them leave 1e-10 where entries turn once in four segments

@@ -14,7 +14,6 @@ from weakref import WeakKeyDictionary, ref
 import numpy as np
 
 from sparserob_core.control.enclosures.dependence import ExpandedSystem, Split, TruncationBound
-from sparserob_core.control.enclosures.taylor import taylor_space
 from sparserob_core.control.problem.phase import Phase, PhaseInUnits
 from sparserob_core.control.problem.system import System
 from sparserob_core.control.response.varying.discs import NAMES, Cauchy, beyond, cauchy
@@ -22,6 +21,7 @@ from sparserob_core.control.response.varying.expansion import Expansion, balance
 from sparserob_core.control.sets.sets import Box
 from sparserob_core.errors import InputError, NotEnclosable
 from sparserob_core.sip.convex_set import Array
+from sparserob_core.sip.expressions.taylor import taylor_space
 
 TRUNCATION_TOLERANCES = (1e-14, 1e-12, 1e-10)
 """Shares of the state, of which the first is taken that the estimated truncation error of the law reaches. A proof

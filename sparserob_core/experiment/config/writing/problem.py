@@ -12,7 +12,6 @@ from typing import Any, cast
 import numpy as np
 
 from sparserob_core.control.problem.cost import Cost
-from sparserob_core.control.problem.expression import ExpressionMatrix
 from sparserob_core.control.problem.names import Names
 from sparserob_core.control.problem.phase import PARTS, Phase
 from sparserob_core.control.problem.problem import OptimalControlProblem
@@ -27,6 +26,7 @@ from sparserob_core.experiment.config.matrices.packed import pack
 from sparserob_core.experiment.plugins.hookspecs import SetPlugin
 from sparserob_core.experiment.plugins.registry import load_registry
 from sparserob_core.sip.convex_set import Array, ConvexSet
+from sparserob_core.sip.expressions.expression import ExpressionMatrix
 
 WRITTEN = {
     "system", "horizon", "initial_state", "control", "initial_set", "weights", "disturbance", "disturbance_class",

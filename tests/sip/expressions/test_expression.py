@@ -10,8 +10,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sparserob_core.control.problem.expression import parse_expression, parse_matrix
 from sparserob_core.errors import InputError
+from sparserob_core.sip.expressions.expression import parse_expression, parse_matrix
 
 NAMES = ("p1", "p2", "mass")
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sparserob_core.control.enclosures.elementary import eccentric_anomaly
-from sparserob_core.control.enclosures.taylor import TaylorSpace
-from sparserob_core.control.problem.expression import parse_expression
 from sparserob_core.errors import InputError, NotEnclosable
+from sparserob_core.sip.expressions.elementary import eccentric_anomaly
+from sparserob_core.sip.expressions.expression import parse_expression
+from sparserob_core.sip.expressions.taylor import TaylorSpace
 
 
 @pytest.mark.parametrize("e", [0.0, 0.2, 0.9, 0.999])

@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 
 from sparserob_core.control.enclosures.algebra import flows_rounding, lifted_matrix, lifted_transitions
 from sparserob_core.control.enclosures.matrix_exponential import exponential_rounding, transitions
-from sparserob_core.control.enclosures.taylor import TaylorModel, TaylorSpace
-from sparserob_core.control.problem.expression import parse_expression
 from sparserob_core.errors import NotEnclosable
+from sparserob_core.sip.expressions.expression import parse_expression
+from sparserob_core.sip.expressions.taylor import TaylorModel, TaylorSpace
 
 EXPRESSIONS = [
     "p1*p2 - p1**3",

@@ -17,7 +17,10 @@ from typing import TYPE_CHECKING, NoReturn, final
 import numpy as np
 import numpy.typing as npt
 
-from sparserob_core.control.enclosures.elementary import (
+from sparserob_core.errors import InputError, NotEnclosable
+from sparserob_core.shapes import Float, shaped
+from sparserob_core.sip.convex_set import Array
+from sparserob_core.sip.expressions.elementary import (
     Series,
     cos_series,
     exp_series,
@@ -28,10 +31,7 @@ from sparserob_core.control.enclosures.elementary import (
     tanh_series,
     undefined,
 )
-from sparserob_core.control.enclosures.matrix_exponential import EPSILON, rounding
-from sparserob_core.errors import InputError, NotEnclosable
-from sparserob_core.shapes import Float, shaped
-from sparserob_core.sip.convex_set import Array
+from sparserob_core.sip.expressions.rounding import EPSILON, rounding
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_array

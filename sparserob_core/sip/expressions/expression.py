@@ -13,9 +13,9 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from sparserob_core.control.enclosures.elementary import FUNCTIONS, eccentric_anomaly
 from sparserob_core.errors import InputError
 from sparserob_core.sip.convex_set import Array
+from sparserob_core.sip.expressions.elementary import FUNCTIONS, eccentric_anomaly
 
 Value: TypeAlias = Any
 """A float, an array, or anything else with arithmetic, such as a `TaylorModel`."""
@@ -89,6 +89,12 @@ def parse_expression(source: str | float, names: Sequence[str]) -> Expression:
         at fault and the known parameters.
     """
     text = str(source)
+    tree = parse_tree(text)
+    return Parser(text, tuple(names)).expression(tree)
+
+
+def parse_tree(text: str) -> ast.expr:
+    """Return the syntax tree of a text of arithmetic; raise `InputError` for one that is too long or no expression."""
     if len(text) > _LENGTH:
         raise InputError(f"expression {text[:40] + '...'!r}: longer than {_LENGTH} characters")
     try:
@@ -98,10 +104,10 @@ def parse_expression(source: str | float, names: Sequence[str]) -> Expression:
         raise InputError(f"expression {text!r}: cannot be read as arithmetic, such as '-2 + 3*p1' ({error})") from error
     if nodes > _NODES:
         raise InputError(f"expression {text!r}: more than {_NODES} terms")
-    return _Parser(text, tuple(names)).expression(tree)
+    return tree
 
 
-class _Parser:
+class Parser:
     """A parser that visits each node of a syntax tree once; a node that is not on the whitelist is an error."""
 
     def __init__(self, text: str, names: tuple[str, ...]) -> None:

@@ -1,0 +1,1 @@
+"""Expressions in named variables: parsed, evaluated, and enclosed on boxes."""

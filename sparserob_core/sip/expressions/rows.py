@@ -1,0 +1,129 @@
+"""Rows of a constraint family that are stated by expressions: their values, and proven bounds over cells."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import final
+
+import numpy as np
+
+from sparserob_core.errors import InputError
+from sparserob_core.shapes import Float, shaped
+from sparserob_core.sip.convex_set import Array, Box
+from sparserob_core.sip.expressions.cell_models import CellModels, bound_polynomials
+from sparserob_core.sip.expressions.forms import AffineForm, Numbers, add_columns
+from sparserob_core.sip.expressions.rounding import rounding
+from sparserob_core.sip.expressions.statements import Decisions, Row, Tables, Words, parse_rows
+from sparserob_core.sip.expressions.taylor import TaylorSpace, taylor_space
+
+DEGREES = {1: 10, 2: 6, 3: 4, 4: 3}
+"""Degree of the polynomials on a cell for so many coordinates of an index; 2 for more. With half of it ten times as
+many cells are needed; with twice as much a cell takes four times as long, and rounds more."""
+MAX_NUMBERS = 4_000_000  # in an array of products: 32 MB; of ten times as many nothing is faster
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class ExpressionRows:
+    """Rows of a family as expressions in the coordinates of its index.
+
+    Parameters
+    ----------
+    words : Words
+        The names.
+    rows : tuple of Row
+        The rows, each ``form(index) <= 0``.
+    box : Box
+        The index set.
+    """
+
+    words: Words
+    rows: tuple[Row, ...]
+    box: Box
+
+    @staticmethod
+    def parse(
+        index: Mapping[str, Sequence[float]],
+        rows: Sequence[str] | str,
+        decision: Decisions,
+        tables: Tables,
+    ) -> ExpressionRows:
+        """Return the rows that texts state; raise `InputError`, with its key, for a text that is none."""
+        lower, upper = read_intervals(index)
+        words = Words(decision, tuple(index), tables)
+        texts = [rows] if isinstance(rows, str) else list(rows)
+        if not texts:
+            raise InputError(path="rows", expected="at least one row", got="none")
+        parsed = [row for text in texts for row in parse_rows(text, words)]
+        found = ExpressionRows(words, tuple(parsed), Box(lower, upper))
+        found.evaluate(found.box.interior_point()[None])  # whatever cannot be evaluated is told at once
+        return found
+
+    @shaped
+    def evaluate(self, indices: Float[Array, "k d"]) -> tuple[Float[Array, "k r n"], Float[Array, "k r"]]:
+        """Return rows ``G`` and right-hand sides ``h`` of ``G x <= h`` at indices."""
+        values = {name: indices[:, [i]] for i, name in enumerate(self.words.indices)}
+        G = np.zeros((len(indices), len(self.rows), self.words.decisions.n))
+        h = np.zeros((len(indices), len(self.rows)))
+        for i, row in enumerate(self.rows):
+            form = row.form(values)
+            h[:, i] = -form.constant[:, 0]
+            np.add.at(G[:, i].T, form.position, np.broadcast_to(form.coefficient, (len(indices), form.position.size)).T)
+        return G, h
+
+    @shaped
+    def enclose(
+        self, x: Float[Array, " n"], lower: Float[Array, "k d"], upper: Float[Array, "k d"], limit: float
+    ) -> tuple[Float[Array, " k"], Numbers]:
+        """Return proven upper bounds ``(k,)`` of the violation over cells, and the coordinates ``(k,)`` to halve.
+
+        Bounds below the ``limit`` are as sharp as they need to be.
+        """
+        space = taylor_space(self.box.dimension, DEGREES.get(self.box.dimension, 2))
+        bounds, split = np.full(len(lower), -np.inf), (upper - lower).argmax(axis=1)
+        for row in self.rows:
+            terms = row.form(self._variables(space, lower[:1], upper[:1])).owner.size
+            size = max(1, MAX_NUMBERS // (space.products[0].size * (terms + 1)))
+            for start in range(0, len(lower), size):
+                part = slice(start, start + size)
+                form = row.form(self._variables(space, lower[part], upper[part]))
+                over, steepest = _bound_form(form, space, x, limit)
+                moves = (upper[part] - lower[part])[np.arange(over.size), steepest] > 0.0
+                split[part] = np.where((over > bounds[part]) & moves, steepest, split[part])
+                bounds[part] = np.maximum(bounds[part], over)
+        return bounds, split
+
+    def _variables(self, space: TaylorSpace, lower: Array, upper: Array) -> Mapping[str, CellModels]:
+        return dict(zip(self.words.indices, CellModels.variables(space, lower, upper), strict=True))
+
+
+def _bound_form(form: AffineForm, space: TaylorSpace, x: Array, limit: float) -> tuple[Array, Numbers]:
+    """Return upper bounds ``(k,)`` of one row at a decision over cells, and the coordinates in which it varies most."""
+    weights, zero = x[form.position], np.zeros(form.position.size, dtype=int)
+    constant, coefficient = (_as_models(value, space) for value in (form.constant, form.coefficient))
+    terms = coefficient.coefficients * weights[None, :, None]
+    total = constant.coefficients[:, 0] + terms.sum(axis=1)
+    sizes = np.abs(constant.coefficients[:, 0]).sum(axis=1) + np.abs(terms).sum(axis=(1, 2))
+    error = constant.remainder[:, 0] + add_columns(coefficient.remainder * np.abs(weights), zero, 1)[:, 0]
+    error = (error + rounding(zero.size + 1) * sizes) * (1.0 + 1e-10)
+    return bound_polynomials(space, total, error, limit)
+
+
+def _as_models(value: object, space: TaylorSpace) -> CellModels:
+    if isinstance(value, CellModels):
+        return value
+    array = np.atleast_2d(np.asarray(value, dtype=float))
+    return CellModels.constant(space, array)
+
+
+def read_intervals(index: Mapping[str, Sequence[float]]) -> tuple[Array, Array]:
+    """Return the ends of the intervals of an index; raise `InputError` with the name of one that is none."""
+    if not index:
+        raise InputError(path="index", expected="at least one coordinate with its interval", got="none")
+    for name, interval in index.items():
+        ends = np.asarray(interval, dtype=float) if len(interval) == 2 else np.zeros(0)
+        if ends.shape != (2,) or not np.isfinite(ends).all() or ends[0] > ends[1]:
+            raise InputError(path=f"index.{name}", expected="an interval [lower, upper]", got=repr(list(interval)))
+    table = np.array([[float(end) for end in interval] for interval in index.values()])
+    return table[:, 0].copy(), table[:, 1].copy()

@@ -1,0 +1,282 @@
+"""Semi-infinite programs that are stated as text: decisions, an objective, rows, and families of rows."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import final
+
+import numpy as np
+import numpy.typing as npt
+
+from sparserob_core.errors import InputError
+from sparserob_core.sip.convex_set import Array, as_bound
+from sparserob_core.sip.expressions.forms import AffineForm, ConvexCost
+from sparserob_core.sip.expressions.rows import ExpressionRows
+from sparserob_core.sip.expressions.statements import Decisions, Row, Words, parse_cost, parse_rows, read_tables
+from sparserob_core.sip.program import ConstraintFamily, SemiInfiniteProgram
+
+MAX_ENTRIES = 100_000  # of a decision with its residuals: ten times as many take a matrix of gigabytes
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class StatedDecision:
+    """Entries of the decision with one name.
+
+    Parameters
+    ----------
+    size : int, optional
+        Number of entries; without it the name is a single number.
+    lower, upper : array_like, scalar or shape (size,), default -inf and inf
+        Bounds.
+    """
+
+    size: int | None = None
+    lower: npt.ArrayLike = -np.inf
+    upper: npt.ArrayLike = np.inf
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class StatedFamily:
+    """Rows that hold for every index of a box.
+
+    Parameters
+    ----------
+    name : str
+        Name of the family.
+    index : mapping from str to (float, float)
+        Interval of every coordinate.
+    rows : sequence of str
+        Statements, affine in the decision (`ConstraintFamily.from_expressions`).
+    """
+
+    name: str
+    index: Mapping[str, Sequence[float]]
+    rows: Sequence[str]
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Term:
+    """Affine function ``constant + coefficients x[positions]`` of a decision, in numbers."""
+
+    constant: float
+    positions: np.ndarray
+    coefficients: Array
+
+    @staticmethod
+    def list_terms(form: AffineForm) -> list[Term]:
+        """Return every affine function of a form of numbers."""
+        count = int(form.constant.shape[1])
+        constants = np.asarray(form.constant, dtype=float)[0]
+        order = np.argsort(form.owner, kind="stable")
+        ends = np.searchsorted(form.owner[order], np.arange(count + 1))
+        coefficients = np.asarray(form.coefficient, dtype=float)[0] if form.owner.size else np.zeros(0)
+        terms = []
+        for j in range(count):
+            part = order[ends[j] : ends[j + 1]]
+            positions, inverse = np.unique(form.position[part], return_inverse=True)
+            sums = np.zeros(positions.size)
+            np.add.at(sums, inverse.reshape(-1), coefficients[part])
+            terms.append(Term(float(constants[j]), positions[sums != 0.0], sums[sums != 0.0]))
+        return terms
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Objective:
+    """Cost ``constant + linear + sum weight left right + sum weight |inner|``, term by term."""
+
+    linear: Term
+    products: tuple[tuple[float, Term, Term], ...]
+    absolutes: tuple[tuple[float, Term], ...]
+
+    @staticmethod
+    def of(cost: ConvexCost) -> Objective:
+        """Return the terms of a parsed cost."""
+        products = list[tuple[float, Term, Term]]()
+        for block in cost.products:
+            left = Term.list_terms(block.left)
+            right = left if block.right is block.left else Term.list_terms(block.right)
+            products += [(float(weight), a, b) for weight, a, b in zip(block.weight, left, right, strict=True)]
+        absolutes = [
+            (float(weight), inner)
+            for block in cost.absolutes
+            for weight, inner in zip(block.weight, Term.list_terms(block.form), strict=True)
+        ]
+        return Objective(Term.list_terms(cost.affine)[0], tuple(products), tuple(absolutes))
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class StatedProgram:
+    """A semi-infinite program as text.
+
+    Parameters
+    ----------
+    decision : mapping from str to StatedDecision
+        Names of the decision, in order.
+    minimise : str
+        Objective: affine terms, squares and products of affine terms, and absolute values, with sums as in rows. It is
+        convex.
+    families : sequence of StatedFamily
+        Rows that hold for every index.
+    rows : sequence of str, default ()
+        Rows without an index, with ``<=``, ``>=`` or ``==``.
+    tables : mapping from str to array, optional
+        Lists of numbers, or matrices, whose entries the texts may name.
+
+    Raises
+    ------
+    InputError
+        If a text cannot be read, or is no such statement; the error names its key.
+    """
+
+    decision: Mapping[str, StatedDecision]
+    minimise: str
+    families: Sequence[StatedFamily]
+    rows: Sequence[str] = ()
+    tables: Mapping[str, npt.ArrayLike] = field(default_factory=dict)
+
+    @cached_property
+    def _words(self) -> Words:
+        sizes = {name: entry.size for name, entry in self.decision.items()}
+        return Words(Decisions(sizes), (), read_tables(self.tables))
+
+    @cached_property
+    def objective(self) -> Objective:
+        """The objective, term by term."""
+        try:
+            return Objective.of(parse_cost(self.minimise, self._words))
+        except InputError as error:
+            raise error.under("minimise") from None
+
+    @cached_property
+    def residuals(self) -> tuple[Term, ...]:
+        """Affine functions of which the objective takes squares or absolute values, and that are more than one entry:
+        each is a further entry of the decision, so that no condition is squared."""
+        objective = self.objective
+        terms = [term for _, left, right in objective.products for term in (left, right)]
+        terms += [inner for _, inner in objective.absolutes]
+        distinct = {id(term): term for term in terms if not _is_entry(term)}
+        if self._words.decisions.n + len(distinct) > MAX_ENTRIES:
+            raise InputError(path="minimise", expected=f"at most {MAX_ENTRIES} terms", got=f"{len(distinct)}")
+        return tuple(distinct.values())
+
+    @cached_property
+    def finite_rows(self) -> tuple[Row, ...]:
+        """Rows without an index."""
+        rows: list[Row] = []
+        for i, text in enumerate(self.rows):
+            try:
+                rows += parse_rows(text, self._words, equalities=True)
+            except InputError as error:
+                raise error.under("rows", i) from None
+        return tuple(rows)
+
+    @cached_property
+    def finite_terms(self) -> tuple[tuple[Term, bool], ...]:
+        """Rows without an index, in numbers, and whether each is an equality."""
+        return tuple((Term.list_terms(row.form({}))[0], row.is_equality) for row in self.finite_rows)
+
+    @cached_property
+    def decisions(self) -> Decisions:
+        """Names of the decision, with as many entries without a name as there are `residuals`."""
+        return Decisions(self._words.decisions.sizes, len(self.residuals))
+
+    @cached_property
+    def bounds(self) -> tuple[Array, Array]:
+        """Bounds of all entries of the decision."""
+        sides: list[list[Array]] = [[], []]
+        for name, entry in self.decision.items():
+            for side, key, given in zip(sides, ("lower", "upper"), (entry.lower, entry.upper), strict=True):
+                try:
+                    side.append(as_bound(key, given, entry.size or 1))
+                except InputError as error:
+                    raise error.under("decision", name) from None
+        count = len(self.residuals)
+        return (
+            np.concatenate([*sides[0], np.full(count, -np.inf)]),
+            np.concatenate([*sides[1], np.full(count, np.inf)]),
+        )
+
+    @cached_property
+    def parsed(self) -> tuple[tuple[str, ExpressionRows], ...]:
+        """Names and rows of all families."""
+        tables, found = self._words.tables, list[tuple[str, ExpressionRows]]()
+        for i, family in enumerate(self.families):
+            try:
+                found.append((family.name, ExpressionRows.parse(family.index, family.rows, self.decisions, tables)))
+            except InputError as error:
+                raise error.under("families", i) from None
+        return tuple(found)
+
+    def build(self) -> SemiInfiniteProgram:
+        """Return the program, whose `origin` is this statement."""
+        n, objective, residuals = self.decisions.n, self.objective, self.residuals
+        first = n - len(residuals)
+        places = {id(term): first + k for k, term in enumerate(residuals)}
+        q, weights = np.zeros(n), np.zeros(n)
+        q[objective.linear.positions] = objective.linear.coefficients
+        entries: list[tuple[int, int, float]] = []
+        for weight, left, right in objective.products:
+            (i, a), (j, b) = _locate(left, places), _locate(right, places)
+            entries += [(i, j, weight * a * b), (j, i, weight * a * b)]
+        for weight, inner in objective.absolutes:
+            if weight < 0.0:
+                raise InputError(path="minimise", expected="absolute values with weights of at least 0", got=f"{weight:g}")
+            place, factor = _locate(inner, places)
+            weights[place] += weight * abs(factor)
+        inequalities = [term for term, is_equality in self.finite_terms if not is_equality]
+        equalities = [term for term, is_equality in self.finite_terms if is_equality]
+        equalities += [_subtract_entry(term, first + k) for k, term in enumerate(residuals)]
+        lower, upper = self.bounds
+        program = SemiInfiniteProgram(
+            n=n,
+            q=q,
+            P=_build_quadratic(entries, n) if entries else None,
+            weights=weights,
+            lower=lower,
+            upper=upper,
+            **_build_table("G", "h", inequalities, n),
+            **_build_table("A", "b", equalities, n),
+            constant=objective.linear.constant,
+            families=[ConstraintFamily.of_rows(name, rows) for name, rows in self.parsed],
+        )
+        vars(program)["origin"] = self
+        return program
+
+
+def _is_entry(term: Term) -> bool:
+    """Return whether an affine function is a multiple of one entry of the decision."""
+    return term.positions.size == 1 and term.constant == 0.0
+
+
+def _locate(term: Term, places: Mapping[int, int]) -> tuple[int, float]:
+    """Return the entry of the decision whose multiple an affine function is, and the factor."""
+    return (int(term.positions[0]), float(term.coefficients[0])) if _is_entry(term) else (places[id(term)], 1.0)
+
+
+def _subtract_entry(term: Term, place: int) -> Term:
+    """Return an affine function minus an entry of the decision."""
+    return Term(term.constant, np.append(term.positions, place), np.append(term.coefficients, -1.0))
+
+
+def _build_quadratic(entries: Sequence[tuple[int, int, float]], n: int) -> object:
+    from scipy.sparse import csc_array
+
+    rows, columns, values = (np.array(numbers) for numbers in zip(*entries, strict=True))
+    return csc_array((values, (rows, columns)), shape=(n, n))
+
+
+def _build_table(left: str, right: str, terms: Sequence[Term], n: int) -> dict[str, Array]:
+    """Return the matrix and the right-hand side of rows ``term(x) <= 0``; nothing where there are none."""
+    if not terms:
+        return {}
+    matrix = np.zeros((len(terms), n))
+    for i, term in enumerate(terms):
+        matrix[i, term.positions] = term.coefficients
+    return {left: matrix, right: np.array([-term.constant for term in terms])}
