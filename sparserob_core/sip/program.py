@@ -376,6 +376,7 @@ class ConstraintFamily:
             index_set=expressions.box,
             rows=expressions.evaluate,
             enclosure=enclose,
+            excess=expressions.violations,
             believed="",
             source=expressions,
         )

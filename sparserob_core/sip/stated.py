@@ -227,7 +227,9 @@ class StatedProgram:
             entries += [(i, j, weight * a * b), (j, i, weight * a * b)]
         for weight, inner in objective.absolutes:
             if weight < 0.0:
-                raise InputError(path="minimise", expected="absolute values with weights of at least 0", got=f"{weight:g}")
+                raise InputError(
+                    path="minimise", expected="absolute values with weights of at least 0", got=f"{weight:g}"
+                )
             place, factor = _locate(inner, places)
             weights[place] += weight * abs(factor)
         inequalities = [term for term, is_equality in self.finite_terms if not is_equality]

@@ -117,7 +117,6 @@ class CellModels(Operand):
         remainder = (result.remainder + error) * OUTWARD
         return CellModels(self.space, result.coefficients, np.where(np.isfinite(remainder), remainder, np.inf))
 
-
     def _sum_powers(self, terms: Sequence[Array], reach: Array) -> CellModels:
         """Return ``sum_k terms_k y^k`` of models ``y`` of modulus at most ``reach``: by Horner's rule, or at once where
         one variable alone occurs, and linearly."""
@@ -216,7 +215,8 @@ def _raise_to_power(left: Any, right: Any) -> CellModels:
         return columns[0] if np.size(right) == 1 else columns[0][:, np.zeros(np.size(right), dtype=int)]
     places = np.searchsorted(powers, np.asarray(right, dtype=float))[0]
     picked = [
-        columns[place][:, np.array([j if columns[place].shape[1] > 1 else 0])] for j, place in enumerate(places.tolist())
+        columns[place][:, np.array([j if columns[place].shape[1] > 1 else 0])]
+        for j, place in enumerate(places.tolist())
     ]
     return picked[0].join(picked)
 

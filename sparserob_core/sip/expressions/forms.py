@@ -107,9 +107,7 @@ class AffineForm(Operand):
         hits = [np.flatnonzero(self.owner == column) for column in columns.tolist()]
         terms = np.concatenate(hits) if hits else np.zeros(0, dtype=int)
         owner = np.repeat(np.arange(columns.size), [hit.size for hit in hits])
-        return AffineForm(
-            take_columns(self.constant, columns), owner, self.position[terms], self.coefficient[:, terms]
-        )
+        return AffineForm(take_columns(self.constant, columns), owner, self.position[terms], self.coefficient[:, terms])
 
     def add_columns(self, groups: Numbers, count: int) -> AffineForm:
         """Return the sums of the forms of every group."""
@@ -228,9 +226,7 @@ class ConvexCost(Operand):
     def of_absolute(form: AffineForm) -> ConvexCost:
         """Return the absolute values of forms."""
         count = _size(form)
-        return ConvexCost(
-            AffineForm.of(np.zeros((1, count))), (), (Absolutes(np.arange(count), np.ones(count), form),)
-        )
+        return ConvexCost(AffineForm.of(np.zeros((1, count))), (), (Absolutes(np.arange(count), np.ones(count), form),))
 
     @property
     def shape(self) -> tuple[int, int]:

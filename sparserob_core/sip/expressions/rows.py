@@ -12,8 +12,7 @@ from sparserob_core.errors import InputError
 from sparserob_core.shapes import Float, shaped
 from sparserob_core.sip.convex_set import Array, Box
 from sparserob_core.sip.expressions.cell_models import CellModels, bound_polynomials
-from sparserob_core.sip.expressions.forms import AffineForm, Numbers, add_columns
-from sparserob_core.sip.expressions.rounding import rounding
+from sparserob_core.sip.expressions.forms import Numbers
 from sparserob_core.sip.expressions.statements import Decisions, Row, Tables, Words, parse_rows
 from sparserob_core.sip.expressions.taylor import TaylorSpace, taylor_space
 
@@ -82,39 +81,29 @@ class ExpressionRows:
         """
         space = taylor_space(self.box.dimension, DEGREES.get(self.box.dimension, 2))
         bounds, split = np.full(len(lower), -np.inf), (upper - lower).argmax(axis=1)
+        size = max(1, MAX_NUMBERS // (space.products[0].size * (x.size + 1)))
         for row in self.rows:
-            terms = row.form(self._variables(space, lower[:1], upper[:1])).owner.size
-            size = max(1, MAX_NUMBERS // (space.products[0].size * (terms + 1)))
             for start in range(0, len(lower), size):
                 part = slice(start, start + size)
-                form = row.form(self._variables(space, lower[part], upper[part]))
-                over, steepest = _bound_form(form, space, x, limit)
+                models = self._as_models(row.value(self._variables(space, lower[part], upper[part]), x), space)
+                over, steepest = bound_polynomials(space, models.coefficients[:, 0], models.remainder[:, 0], limit)
                 moves = (upper[part] - lower[part])[np.arange(over.size), steepest] > 0.0
                 split[part] = np.where((over > bounds[part]) & moves, steepest, split[part])
                 bounds[part] = np.maximum(bounds[part], over)
         return bounds, split
 
+    @shaped
+    def violations(self, x: Float[Array, " n"], indices: Float[Array, "k d"]) -> Float[Array, "k r"]:
+        """Return the violations of the rows at a decision and at indices."""
+        values = {name: indices[:, [i]] for i, name in enumerate(self.words.indices)}
+        columns = [np.broadcast_to(row.value(values, x), (len(indices), 1)) for row in self.rows]
+        return np.concatenate(columns, axis=1)
+
+    def _as_models(self, value: object, space: TaylorSpace) -> CellModels:
+        return value if isinstance(value, CellModels) else CellModels.constant(space, np.asarray(value, dtype=float))
+
     def _variables(self, space: TaylorSpace, lower: Array, upper: Array) -> Mapping[str, CellModels]:
         return dict(zip(self.words.indices, CellModels.variables(space, lower, upper), strict=True))
-
-
-def _bound_form(form: AffineForm, space: TaylorSpace, x: Array, limit: float) -> tuple[Array, Numbers]:
-    """Return upper bounds ``(k,)`` of one row at a decision over cells, and the coordinates in which it varies most."""
-    weights, zero = x[form.position], np.zeros(form.position.size, dtype=int)
-    constant, coefficient = (_as_models(value, space) for value in (form.constant, form.coefficient))
-    terms = coefficient.coefficients * weights[None, :, None]
-    total = constant.coefficients[:, 0] + terms.sum(axis=1)
-    sizes = np.abs(constant.coefficients[:, 0]).sum(axis=1) + np.abs(terms).sum(axis=(1, 2))
-    error = constant.remainder[:, 0] + add_columns(coefficient.remainder * np.abs(weights), zero, 1)[:, 0]
-    error = (error + rounding(zero.size + 1) * sizes) * (1.0 + 1e-10)
-    return bound_polynomials(space, total, error, limit)
-
-
-def _as_models(value: object, space: TaylorSpace) -> CellModels:
-    if isinstance(value, CellModels):
-        return value
-    array = np.atleast_2d(np.asarray(value, dtype=float))
-    return CellModels.constant(space, array)
 
 
 def read_intervals(index: Mapping[str, Sequence[float]]) -> tuple[Array, Array]:

@@ -15,10 +15,19 @@ from sparserob_core.errors import InputError
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.expressions.elementary import FUNCTIONS
 from sparserob_core.sip.expressions.expression import CONSTANTS, KEPLER, Evaluation, Parser, parse_tree
-from sparserob_core.sip.expressions.forms import AffineForm, ConvexCost, Numbers, Value, add_columns, join_columns, take_columns
+from sparserob_core.sip.expressions.forms import (
+    AffineForm,
+    ConvexCost,
+    Numbers,
+    Value,
+    add_columns,
+    join_columns,
+    take_columns,
+)
 
 CHEBYSHEV = "chebyshev"
 SPECIAL = (*FUNCTIONS, *CONSTANTS, KEPLER, CHEBYSHEV, "sum", "range", "abs", "for", "in")
+AT = " at"  # key of a decision at which a row is evaluated as a number
 TURNS = " turns"  # key of the number of turns of the sums around an expression; no name of a user has a space
 MAX_TURNS = 1_000_000  # of all sums around an expression: ten times as many take gigabytes, a tenth refuses long tables
 MAX_DEGREE = 4096  # of a Chebyshev polynomial: ten times as many lose three more digits
@@ -119,7 +128,9 @@ class Words:
             for name in names:
                 if owners.setdefault(name, group) != group or list(names).count(name) > 1:
                     raise InputError(
-                        path=f"{group}.{name}", expected="a name that stands for one thing", got=f"one of {owners[name]}"
+                        path=f"{group}.{name}",
+                        expected="a name that stands for one thing",
+                        got=f"one of {owners[name]}",
                     )
 
 
@@ -154,6 +165,12 @@ class Row:
         if isinstance(form, ConvexCost):
             raise InputError(f"row {self.text!r}: it is not affine in the decisions")
         return AffineForm.of(form)
+
+    def value(self, values: Mapping[str, Value], x: Array) -> Value:
+        """Return ``left - right`` at values of the indices and a decision ``(n,)``; the row has a `form`."""
+        scope = {**values, TURNS: 1, AT: x}
+        with np.errstate(all="ignore"):
+            return np.subtract(self.left(scope), self.right(scope))
 
 
 def parse_rows(text: str, words: Words, equalities: bool = False) -> list[Row]:
@@ -234,8 +251,8 @@ class _Statement(Parser):
         if name in sizes:
             if sizes[name] is not None:
                 raise self.fault(f"{name} has {sizes[name]} entries; expected one of them, such as {name}[0]")
-            form = AffineForm.variables(np.array(self.words.decisions.positions(name)))
-            return lambda values: form
+            positions = np.array(self.words.decisions.positions(name))
+            return lambda values: _pick_entries(positions, values)
         if name in tables:
             raise self.fault(f"{name} is a table; expected an entry of it, such as {name}[0]")
         evaluation = super().name(name)
@@ -294,7 +311,7 @@ class _Statement(Parser):
 
         if size is not None:
             first = self.words.decisions.positions(name).start
-            return lambda values: AffineForm.variables(first + locate(values)[0])
+            return lambda values: _pick_entries(first + locate(values)[0], values)
         table = self.words.tables[name]
         return lambda values: table[tuple(locate(values))][None]
 
@@ -337,9 +354,7 @@ class _Statement(Parser):
 
         return evaluate
 
-    def loop(
-        self, turn: ast.comprehension, depth: int
-    ) -> tuple[str, list[Callable[[Mapping[str, Value]], Numbers]]]:
+    def loop(self, turn: ast.comprehension, depth: int) -> tuple[str, list[Callable[[Mapping[str, Value]], Numbers]]]:
         """Return the variable of a sum, and the evaluations of what its range is made of."""
         call, target = turn.iter, turn.target
         is_range = isinstance(call, ast.Call) and isinstance(call.func, ast.Name) and call.func.id == "range"
@@ -349,7 +364,9 @@ class _Statement(Parser):
         if target.id in (*self.names, *self.turning, *SPECIAL):
             raise self.fault(f"the variable {target.id!r} of a sum means something else already")
         if not 1 <= len(call.args) <= 3 or call.keywords:
-            raise self.fault(f"{ast.unparse(call)}: expected range(stop), range(start, stop) or range(start, stop, step)")
+            raise self.fault(
+                f"{ast.unparse(call)}: expected range(stop), range(start, stop) or range(start, stop, step)"
+            )
         return target.id, [self.whole(argument, depth) for argument in call.args]
 
     def nearest(self, name: str) -> str:
@@ -357,6 +374,11 @@ class _Statement(Parser):
         text = super().nearest(name)
         self.names = names
         return text
+
+
+def _pick_entries(positions: Numbers, values: Mapping[str, Value]) -> Value:
+    """Return entries of the decision: numbers where it is given, else affine forms."""
+    return values[AT][positions][None] if AT in values else AffineForm.variables(positions)
 
 
 def _unroll(scope: dict[str, Value], name: str, bounds: Sequence[Numbers]) -> tuple[dict[str, Value], Numbers]:
@@ -371,10 +393,11 @@ def _unroll(scope: dict[str, Value], name: str, bounds: Sequence[Numbers]) -> tu
     turned = {
         key: value[:, owner] if isinstance(value, np.ndarray) and value.shape[1] == count and count > 1 else value
         for key, value in scope.items()
-        if key != TURNS
+        if key not in (TURNS, AT)
     }
     variable = np.concatenate([np.asarray(one, dtype=float) for one in ranges]) if ranges else np.zeros(0)
-    return {**turned, name: variable[None], TURNS: total}, owner
+    kept = {AT: scope[AT]} if AT in scope else {}
+    return {**turned, **kept, name: variable[None], TURNS: total}, owner
 
 
 def _make_range(*arguments: int) -> range:
@@ -397,10 +420,8 @@ def _evaluate_chebyshev(degrees: Numbers, x: Value) -> Value:
 
     if x.shape[1] > 1:  # the argument turns with the sums
         columns = [
-            take_columns(polynomial(k), np.array([j])) if k else np.ones((1, 1))
-            for j, k in enumerate(degrees.tolist())
+            take_columns(polynomial(k), np.array([j])) if k else np.ones((1, 1)) for j, k in enumerate(degrees.tolist())
         ]
         return join_columns(columns)
     table = join_columns([polynomial(k) for k in distinct.tolist()])
     return table[:, inverse.reshape(-1)]
-

@@ -115,7 +115,7 @@ class PlainRows(Working):
                 answer = self._solve_regularised(ledger)
                 continue
             assert self.close is not None
-            ray, fresh = bounding_rows(self.program, ledger.tools, self.close)
+            ray, fresh = bounding_rows(self.program, ledger.tools, self.close, self.rows.cuts)
             if ray is not None:
                 return falls_for_ever(ledger, self.close, prover, ray)
             if not self.impose(fresh):

@@ -18,12 +18,19 @@ import numpy as np
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.events import ignore
 from sparserob_core.sip.evidence import Cut
+from sparserob_core.sip.inner.vertex import simplex
 from sparserob_core.sip.method import Tools
 from sparserob_core.sip.program import ConstraintFamily, SemiInfiniteProgram
+from sparserob_core.sip.relaxed.relaxed import Rows, rows_at
 from sparserob_core.sip.result import Result, Status
-from sparserob_core.sip.working.ledger import Ledger, Prover, unproven
+from sparserob_core.sip.separation.separation import separate
+from sparserob_core.sip.working.ledger import ALLOWED, Ledger, Prover, Violated, above, unproven
 
-Close: TypeAlias = Callable[[SemiInfiniteProgram, Tools, Prover], Result]  # an exchange that closes the gap
+Close: TypeAlias = Callable[..., Result]  # an exchange that closes the gap of (program, tools, prover, start)
+NO_FALL = 1e-12  # of the largest coefficient: fall of the cost per unit of a direction that is certainly rounding
+ROUNDS = (
+    200  # of collecting rows that bound a program; a fifth of them are enough for quadratic forms in three coordinates
+)
 FALLS = 1e-7  # of the largest coefficient: fall of the cost per unit of a direction that is no rounding
 # Largest number of moving coordinates for which the first rows are on a grid: two points along each of ten coordinates
 # are a thousand indices.
@@ -64,7 +71,12 @@ def _make_homogeneous(family: ConstraintFamily) -> ConstraintFamily:
         G, h = family.rows(indices)
         return G, np.zeros_like(h)
 
-    return ConstraintFamily(name=family.name, index_set=family.index_set, rows=rows)
+
+    def excess(x: Array, indices: Array) -> Array:
+        return family.violations(x, indices) - family.violations(np.zeros_like(x), indices)
+
+    offered = None if family.excess is None else excess
+    return ConstraintFamily(name=family.name, index_set=family.index_set, rows=rows, excess=offered)
 
 
 def _has_bounds(program: SemiInfiniteProgram) -> bool:
@@ -96,7 +108,7 @@ def first_rows(program: SemiInfiniteProgram) -> list[tuple[Array, np.ndarray, st
 
 
 def bounding_rows(
-    program: SemiInfiniteProgram, tools: Tools, close: Close
+    program: SemiInfiniteProgram, tools: Tools, close: Close, start: Sequence[Cut] = ()
 ) -> tuple[Array | None, list[tuple[Array, np.ndarray, str]]]:
     """Return a ray along which the cost falls without bound, or rows that exclude such rays.
 
@@ -108,6 +120,8 @@ def bounding_rows(
         Components of the run.
     close : Close
         Exchange that closes the gap of the recession program.
+    start : sequence of Cut, default ()
+        Constraints that are imposed already.
 
     Returns
     -------
@@ -119,12 +133,44 @@ def bounding_rows(
     base = program.finite
     if _has_bounds(program):
         return None, []
-    steps = replace(tools, regulariser=None, notify=ignore)
-    result = close(recession_program(program), steps, unproven)
+    steps, recession = replace(tools, regulariser=None, notify=ignore), recession_program(program)
     coefficient = max(float(np.abs(base.q).max(initial=0.0)), float(base.weights.max(initial=0.0)))
+    rows, is_bounded = _collect_rows(recession, steps, _group_by_family(start), NO_FALL * coefficient)
+    if is_bounded:
+        return None, rows
+    result = close(recession, steps, unproven, rows)
     if result.decision is not None and not result.stopped and result.cost < -FALLS * coefficient:
         return result.decision / np.abs(result.decision).max(), []
     return None, _group_by_family(result.history[-1].imposed if result.history else ())
+
+
+def _collect_rows(
+    recession: SemiInfiniteProgram, tools: Tools, start: Violated, fall: float
+) -> tuple[list[tuple[Array, np.ndarray, str]], bool]:
+    """Return rows with which the cost of a recession program falls by at most ``fall``, beginning with those of
+    ``start``, and whether they were found: by vertices, each of which is left by the rows that it violates most."""
+    chosen = list(start)
+    if recession.finite.blocks is not None:
+        return chosen, False
+    rows = Rows.none(recession.n)
+    for indices, numbers, name in chosen:
+        rows = rows.joined(rows_at(recession, name, indices, numbers))
+    for number in range(ROUNDS):
+        tools.deadline.check()
+        base = recession.finite
+        corner = simplex(replace(base, G=np.vstack([base.G, rows.G]), h=np.concatenate([base.h, rows.h])))
+        if corner.status != "optimal":
+            return chosen, False
+        if recession.cost(corner.x) >= -fall:
+            return chosen, True
+        violated = [above(*pair) for pair in separate(recession, corner.x, replace(tools, budget=0), ALLOWED, number)]
+        fresh = [entry for entry in violated if entry[1].size]
+        if not fresh:
+            return chosen, False
+        for indices, numbers, name in fresh:
+            rows = rows.joined(rows_at(recession, name, indices, numbers))
+        chosen += fresh
+    return chosen, False
 
 
 def _group_by_family(cuts: Sequence[Cut]) -> list[tuple[Array, np.ndarray, str]]:
