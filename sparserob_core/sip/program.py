@@ -32,7 +32,6 @@ TOLERANCE = 1e-9  # of a row's own unit: a violation of at most this counts as n
 OUTSIDE = 1e-9  # of the sides of an index set and its distance from 0: error by which rounding may put an index outside
 NARROW = 1e-12  # of the side of a box: a gap between two cells that is only rounding of their corners
 PARTS = 4_000_000  # largest number of parts of the grid between the corners of all cells: 32 MB
-ENCLOSED = 0.5 * TOLERANCE  # below it a bound need not be sharper: half of what a proof excuses
 EQUALITY = 1e-12  # of the numbers that are added up: an equality with at most this residual counts as met
 
 
@@ -369,7 +368,7 @@ class ConstraintFamily:
         """Return the family of parsed rows."""
 
         def enclose(x: Array, lower: Array, upper: Array) -> Enclosure:
-            return Enclosure(*expressions.enclose(x, lower, upper, ENCLOSED))
+            return Enclosure(*expressions.enclose(x, lower, upper))
 
         return ConstraintFamily(
             name=name,

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import final
+from typing import TypeAlias, final
 
 import numpy as np
 import numpy.typing as npt
@@ -17,6 +17,8 @@ from sparserob_core.sip.expressions.rows import ExpressionRows
 from sparserob_core.sip.expressions.statements import Decisions, Row, Words, parse_cost, parse_rows, read_tables
 from sparserob_core.sip.program import ConstraintFamily, SemiInfiniteProgram
 
+Multiple: TypeAlias = tuple[int, float]
+"""An entry of the decision, and the factor before it."""
 MAX_ENTRIES = 100_000  # of a decision with its residuals: ten times as many take a matrix of gigabytes
 
 
@@ -214,27 +216,46 @@ class StatedProgram:
                 raise error.under("families", i) from None
         return tuple(found)
 
+    @cached_property
+    def _places(self) -> Mapping[int, int]:
+        first = self.decisions.n - len(self.residuals)
+        return {id(term): first + k for k, term in enumerate(self.residuals)}
+
+    @property
+    def products(self) -> list[tuple[float, Multiple, Multiple]]:
+        """Products of the objective: weights, and the multiples of entries of the decision that are multiplied."""
+        return [
+            (weight, _locate(left, self._places), _locate(right, self._places))
+            for weight, left, right in self.objective.products
+        ]
+
+    @property
+    def absolutes(self) -> list[tuple[float, Multiple]]:
+        """Absolute values of the objective: weights, and multiples of entries of the decision."""
+        return [(weight, _locate(inner, self._places)) for weight, inner in self.objective.absolutes]
+
+    @property
+    def definitions(self) -> list[Term]:
+        """Affine functions that are 0: the `residuals`, each minus its entry of the decision."""
+        return [_subtract_entry(term, self._places[id(term)]) for term in self.residuals]
+
     def build(self) -> SemiInfiniteProgram:
         """Return the program, whose `origin` is this statement."""
-        n, objective, residuals = self.decisions.n, self.objective, self.residuals
-        first = n - len(residuals)
-        places = {id(term): first + k for k, term in enumerate(residuals)}
+        n, objective = self.decisions.n, self.objective
         q, weights = np.zeros(n), np.zeros(n)
         q[objective.linear.positions] = objective.linear.coefficients
         entries: list[tuple[int, int, float]] = []
-        for weight, left, right in objective.products:
-            (i, a), (j, b) = _locate(left, places), _locate(right, places)
+        for weight, (i, a), (j, b) in self.products:
             entries += [(i, j, weight * a * b), (j, i, weight * a * b)]
-        for weight, inner in objective.absolutes:
+        for weight, (place, factor) in self.absolutes:
             if weight < 0.0:
                 raise InputError(
                     path="minimise", expected="absolute values with weights of at least 0", got=f"{weight:g}"
                 )
-            place, factor = _locate(inner, places)
             weights[place] += weight * abs(factor)
         inequalities = [term for term, is_equality in self.finite_terms if not is_equality]
         equalities = [term for term, is_equality in self.finite_terms if is_equality]
-        equalities += [_subtract_entry(term, first + k) for k, term in enumerate(residuals)]
+        equalities += self.definitions
         lower, upper = self.bounds
         program = SemiInfiniteProgram(
             n=n,
@@ -243,8 +264,10 @@ class StatedProgram:
             weights=weights,
             lower=lower,
             upper=upper,
-            **_build_table("G", "h", inequalities, n),
-            **_build_table("A", "b", equalities, n),
+            G=_build_matrix(inequalities, n),
+            h=_list_right_sides(inequalities),
+            A=_build_matrix(equalities, n),
+            b=_list_right_sides(equalities),
             constant=objective.linear.constant,
             families=[ConstraintFamily.of_rows(name, rows) for name, rows in self.parsed],
         )
@@ -257,7 +280,7 @@ def _is_entry(term: Term) -> bool:
     return term.positions.size == 1 and term.constant == 0.0
 
 
-def _locate(term: Term, places: Mapping[int, int]) -> tuple[int, float]:
+def _locate(term: Term, places: Mapping[int, int]) -> Multiple:
     """Return the entry of the decision whose multiple an affine function is, and the factor."""
     return (int(term.positions[0]), float(term.coefficients[0])) if _is_entry(term) else (places[id(term)], 1.0)
 
@@ -274,11 +297,16 @@ def _build_quadratic(entries: Sequence[tuple[int, int, float]], n: int) -> objec
     return csc_array((values, (rows, columns)), shape=(n, n))
 
 
-def _build_table(left: str, right: str, terms: Sequence[Term], n: int) -> dict[str, Array]:
-    """Return the matrix and the right-hand side of rows ``term(x) <= 0``; nothing where there are none."""
+def _build_matrix(terms: Sequence[Term], n: int) -> Array | None:
+    """Return the matrix of rows ``term(x) <= 0``; ``None`` where there are none."""
     if not terms:
-        return {}
+        return None
     matrix = np.zeros((len(terms), n))
     for i, term in enumerate(terms):
         matrix[i, term.positions] = term.coefficients
-    return {left: matrix, right: np.array([-term.constant for term in terms])}
+    return matrix
+
+
+def _list_right_sides(terms: Sequence[Term]) -> Array | None:
+    """Return the right-hand sides of rows ``term(x) <= 0``; ``None`` where there are none."""
+    return np.array([-term.constant for term in terms]) if terms else None

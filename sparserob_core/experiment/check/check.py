@@ -22,7 +22,9 @@ if TYPE_CHECKING:
     from sparserob_core.control.policies.policy import Policy
     from sparserob_core.control.problem.dictionary import Dictionary
     from sparserob_core.experiment.config.load import Loaded
+    from sparserob_core.experiment.directory.finished import StoredRun
     from sparserob_core.experiment.run.given import GivenRun
+    from sparserob_core.sip.program import SemiInfiniteProgram
 
 REPEATED = 16  # bytes of arrays for each character of the files: true runs need 7; a larger limit only costs memory
 SPARE = 2**20  # bytes for numbers that stand in neither certificate nor config, which are some kB
@@ -92,7 +94,8 @@ def check(directory: GivenRun, plugins: Iterable[str | Path] = (), seconds: floa
     """
     from sparserob_core.checker.claims.case import Case
     from sparserob_core.checker.claims.claims import check as derive
-    from sparserob_core.experiment.assemble import control_problem_of, counting, dictionaries_of, gap_tolerance
+    from sparserob_core.experiment.assemble import counting, dictionaries_of, gap_tolerance, problem_of
+    from sparserob_core.sip.program import SemiInfiniteProgram
 
     if type(seconds) not in (int, float) or not seconds > 0:
         raise InputError(path="seconds", expected="a positive number", got=repr(seconds))
@@ -104,7 +107,10 @@ def check(directory: GivenRun, plugins: Iterable[str | Path] = (), seconds: floa
         raise InputError(f"{path}: expected the directory of a finished run, got one without certificate.json")
     data, summary = read_json(path / "certificate.json"), read_json(path / "result.json")
     loaded = stored.config(plugins)
-    problem = control_problem_of(loaded, f"{path}: expected the run of a control problem, whose certificate is checked")
+    stated = problem_of(loaded)
+    if isinstance(stated, SemiInfiniteProgram):
+        return _check_program(stored, loaded, stated, data, summary, clock, started)
+    problem = stated
     control, disturbance = dictionaries_of(loaded, problem.horizon)
     policy = _find_policy(loaded, data, control, problem.measurements)
     title = loaded.config.title or path.name
@@ -115,6 +121,30 @@ def check(directory: GivenRun, plugins: Iterable[str | Path] = (), seconds: floa
     derived = derive(case, gap_tolerance(loaded))
     files = compared(replace(stored, largest=_bound_array_bytes(path, case)), loaded, case, summary)
     claims = (_check_config(loaded, data, summary), *derived, *files.claims)
+    return Check(title, claims, time.perf_counter() - started, files.not_compared)
+
+
+def _check_program(
+    stored: StoredRun,
+    loaded: Loaded,
+    program: SemiInfiniteProgram,
+    data: Mapping[str, Any],
+    summary: Mapping[str, Any],
+    clock: Clock,
+    started: float,
+) -> Check:
+    """Return the verdicts on the run of a program that was stated as text."""
+    from sparserob_core.checker.program.claims import ProgramCase, check_program
+    from sparserob_core.experiment.assemble import gap_tolerance
+    from sparserob_core.experiment.check.files import compare_program
+    from sparserob_core.sip.stated import StatedProgram
+
+    if not isinstance(program.origin, StatedProgram):
+        raise InputError(f"{stored.directory}: expected a problem that is stated as data, got a program of a plugin")
+    derived = check_program(ProgramCase(program.origin, data, clock), gap_tolerance(loaded))
+    files = compare_program(stored, data, summary, program.n)
+    claims = (_check_config(loaded, data, summary), *derived, *files.claims)
+    title = loaded.config.title or stored.directory.name
     return Check(title, claims, time.perf_counter() - started, files.not_compared)
 
 

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Any, final
 
 import numpy as np
 
-from sparserob_core.checker.outcome import CANCELLED, Broken, Finding, Unchecked
+from sparserob_core.checker.claims.case import shaped
+from sparserob_core.checker.outcome import CANCELLED, Broken, Finding, Unchecked, Verdict
 from sparserob_core.checker.outcome import FIGURES as AGREED
 from sparserob_core.checker.sets.known import known
 from sparserob_core.checker.sets.shape import excess
@@ -66,6 +67,30 @@ def compared(stored: StoredRun, loaded: Loaded, case: Case, summary: Mapping[str
 
     with ctx.workprec(precision_of(case)):
         return _compare_files(stored, loaded, case, summary)
+
+
+def compare_program(stored: StoredRun, data: Mapping[str, Any], summary: Mapping[str, Any], n: int) -> Compared:
+    """Compare ``result.json`` and ``solution.npz`` of a stated program with its certificate ``data``.
+
+    ``n`` is the number of entries of its decision.
+    """
+    comparison = Compared()
+    lower = summary.get("lower_bound")
+    pairs = {key: (summary.get(key), data.get(key)) for key in ("status", "cost")}
+    pairs["lower_bound"] = (None if lower == -np.inf else lower, data.get("lower_bound"))
+    different = [
+        f"{key} is {one!r}, the certificate says {other!r}" for key, (one, other) in pairs.items() if one != other
+    ]
+    text = "status, cost and lower bound are those of the certificate"
+    comparison.claims.append(Finding("result.json", "fails" if different else "holds", "; ".join(different) or text))
+    decision = stored.solution.get("decision", np.zeros(0))
+    written = np.zeros(0) if data.get("decision") is None else shaped(data, "decision", (n,))
+    is_same = decision.shape == written.shape and bool((decision == written).all())
+    verdict: Verdict = "holds" if is_same else "fails"
+    text = f"the decision is {'that' if is_same else 'not that'} of the certificate"
+    comparison.claims.append(Finding("solution.npz", verdict, text))
+    comparison.left |= {path.name: [] for path in sorted(stored.directory.iterdir()) if path.name not in READ}
+    return comparison
 
 
 def _compare_files(stored: StoredRun, loaded: Loaded, case: Case, summary: Mapping[str, Any]) -> Compared:

@@ -19,6 +19,7 @@ from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.evidence import Activity, Branch, Dual, Proof
 from sparserob_core.sip.program import TOLERANCE, SemiInfiniteProgram
 from sparserob_core.sip.result import Result
+from sparserob_core.sip.stated import StatedProgram
 
 if TYPE_CHECKING:
     from sparserob_core.control.studies.causal import CausalBound
@@ -73,12 +74,14 @@ def certificate(experiment: Experiment, result: Result) -> dict[str, Any] | None
     Returns
     -------
     dict or None
-        The certificate; ``None`` for a program that is no control problem, and for a run that failed. A run that was
+        The certificate; ``None`` for a program that was not stated as text, and for a run that failed. A run that was
         stopped before it was transcribed has the lower bound alone (`bare_certificate`). So has a run that was stopped
         before there was a decision.
     """
-    if isinstance(experiment, PlainExperiment) or result.status == "failed":
+    if result.status == "failed":
         return None
+    if isinstance(experiment, PlainExperiment):
+        return _certify_program(experiment, result)
     if not isinstance(experiment, ControlExperiment):
         return bare_certificate(experiment, result)
     program = experiment.program
@@ -111,6 +114,46 @@ def certificate(experiment: Experiment, result: Result) -> dict[str, Any] | None
         **({} if causal is None else {"causal": causal_data(causal)}),
         "proof": _write_proofs(experiment, result.proofs),
         "witness": _write_witness(experiment, result) if result.status == "refuted" else None,
+    }
+
+
+def _certify_program(experiment: PlainExperiment, result: Result) -> dict[str, Any] | None:
+    """Return the certificate of a program that was stated as text; ``None`` for another one, whose rows nobody knows.
+
+    ``multipliers`` are those of ``constraints``, each a row of a family at an index, of the ``rows`` without an index,
+    and of the ``equalities``, to which those that define residuals belong; ``tangent`` is the point at which products
+    of the objective are replaced by their tangent. A ``decision`` ends with the residuals.
+    """
+    if not isinstance(experiment.program.origin, StatedProgram):
+        return None
+    dual, worst = result.dual, result.worst
+    has_multipliers = dual.mu.size == experiment.program.finite.b.size
+    rows = dual.fixed if dual.fixed.size else np.zeros(experiment.program.finite.h.size)
+    witness = (
+        None
+        if result.status != "refuted" or worst is None
+        else {"family": worst.constraint, "index": worst.index, "row": worst.row, "violation": worst.violation}
+    )
+    return {
+        "format": FORMAT,
+        "config": experiment.loaded.config.digest(),
+        "status": result.status,
+        "cost": result.cost,
+        "lower_bound": result.lower_bound if np.isfinite(result.lower_bound) else None,
+        "gap_tolerance": experiment.gap_tolerance,
+        "decision": result.decision,
+        "multipliers": None
+        if not has_multipliers
+        else {
+            "constraints": [
+                {"family": cut.family, "index": cut.index, "row": cut.row, "multiplier": cut.multiplier}
+                for cut in dual.cuts
+            ],
+            "rows": rows,
+            "equalities": dual.mu,
+            "tangent": dual.at,
+        },
+        "witness": witness,
     }
 
 

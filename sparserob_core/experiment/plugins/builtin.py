@@ -110,9 +110,14 @@ def sparserob_rules() -> Iterator[RulePlugin]:
 
 @hookimpl
 def sparserob_problems() -> Iterator[ProblemPlugin]:
-    """Yield the general linear problem."""
+    """Yield the general linear problem, and the semi-infinite program that is stated as text."""
     yield ProblemPlugin(
         name="linear",
         factory="sparserob_core.experiment.config.problems:LinearProblem",
         summary="Sparse robust control of x' = A(p) x + B(p) u + E w from an initial state to a terminal set.",
+    )
+    yield ProblemPlugin(
+        name="program",
+        factory="sparserob_core.experiment.config.programs:ProgramProblem",
+        summary="A convex semi-infinite program as text: decisions, an objective, and rows for every index.",
     )

@@ -14,12 +14,12 @@ from typing import Any, ClassVar, TypeAlias, final
 import numpy as np
 
 from sparserob_core.sip.convex_set import Array
-from sparserob_core.sip.expressions.forms import Numbers, Operand
+from sparserob_core.sip.expressions.forms import Numbers, Operand, take_columns
 from sparserob_core.sip.expressions.rounding import EPSILON, rounding
 from sparserob_core.sip.expressions.taylor import OUTWARD, TaylorSpace
 
 Series: TypeAlias = "tuple[list[Array], Array]"
-"""Coefficients ``f_0, ..., f_n`` at the constants of models, and bounds of the modulus of ``f_{n+1}`` on their values."""
+"""Coefficients ``f_0, ..., f_n`` at the constants of models, and bounds of ``|f_{n+1}|`` on their values."""
 MAX_POWER = 64  # the largest exponent for which a power is multiplied out; ten times more take as many products
 MAX_EXPONENT = 700.0  # of the exponential: beyond it doubles overflow
 TANGENT_RADII = np.pi / 4 * (1.0 + 0.05 * np.arange(19))  # circles for Cauchy's bound, below the pole at pi/2
@@ -124,7 +124,7 @@ class CellModels(Operand):
         if monomials.size != 1 or self.space.degrees[monomials[0]] != 1:
             result = self._constant(terms[-1])
             for term in reversed(terms[:-1]):
-                result = np.add(np.multiply(result, self), term)
+                result = _add(_multiply(result, self), term)
             return result
         slope, power = self.coefficients[..., monomials[0]], self.space.exponents[monomials[0]]
         coefficients, error = np.zeros(self.coefficients.shape), np.zeros(self.shape)
@@ -214,10 +214,7 @@ def _raise_to_power(left: Any, right: Any) -> CellModels:
     if powers.size == 1:
         return columns[0] if np.size(right) == 1 else columns[0][:, np.zeros(np.size(right), dtype=int)]
     places = np.searchsorted(powers, np.asarray(right, dtype=float))[0]
-    picked = [
-        columns[place][:, np.array([j if columns[place].shape[1] > 1 else 0])]
-        for j, place in enumerate(places.tolist())
-    ]
+    picked: list[CellModels] = [take_columns(columns[place], np.array([j])) for j, place in enumerate(places.tolist())]
     return picked[0].join(picked)
 
 
@@ -267,7 +264,7 @@ def _power(power: float, degree: int, centre: Array, low: Array, high: Array) ->
 def _tanh(degree: int, centre: Array, low: Array, high: Array) -> Series:
     terms = [np.tanh(centre)]
     for k in range(degree):
-        square = sum(terms[i] * terms[k - i] for i in range(k + 1))
+        square = sum((terms[i] * terms[k - i] for i in range(k + 1)), np.zeros(centre.shape))
         terms.append(((1.0 if k == 0 else 0.0) - square) / (k + 1))
     bound = (np.maximum(1.0, np.tan(TANGENT_RADII)) / TANGENT_RADII ** (degree + 1)).min()
     return terms, np.full(centre.shape, bound)
@@ -358,7 +355,8 @@ def _conversion(degree: int) -> Array:
         [comb(j, i) * 2.0**i * (-1.0) ** (j - i) if i <= j else 0.0 for j in range(degree + 1)]
         for i in range(degree + 1)
     ]
-    return np.array(scaled) @ np.array(shift)
+    matrix: Array = np.array(scaled) @ np.array(shift)
+    return matrix
 
 
 def _halve(forms: Array) -> Array:

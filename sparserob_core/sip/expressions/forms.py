@@ -173,7 +173,7 @@ AffineForm.operations = {
     np.multiply: _multiply_forms,
     np.true_divide: _divide_form,
     np.power: _raise_form,
-    np.absolute: lambda form: ConvexCost.of_absolute(form),
+    np.absolute: ConvexCost.of_absolute,
 }
 
 

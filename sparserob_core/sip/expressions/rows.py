@@ -73,11 +73,11 @@ class ExpressionRows:
 
     @shaped
     def enclose(
-        self, x: Float[Array, " n"], lower: Float[Array, "k d"], upper: Float[Array, "k d"], limit: float
+        self, x: Float[Array, " n"], lower: Float[Array, "k d"], upper: Float[Array, "k d"]
     ) -> tuple[Float[Array, " k"], Numbers]:
         """Return proven upper bounds ``(k,)`` of the violation over cells, and the coordinates ``(k,)`` to halve.
 
-        Bounds below the ``limit`` are as sharp as they need to be.
+        A bound of 0 or less is as sharp as it needs to be.
         """
         space = taylor_space(self.box.dimension, DEGREES.get(self.box.dimension, 2))
         bounds, split = np.full(len(lower), -np.inf), (upper - lower).argmax(axis=1)
@@ -86,7 +86,7 @@ class ExpressionRows:
             for start in range(0, len(lower), size):
                 part = slice(start, start + size)
                 models = self._as_models(row.value(self._variables(space, lower[part], upper[part]), x), space)
-                over, steepest = bound_polynomials(space, models.coefficients[:, 0], models.remainder[:, 0], limit)
+                over, steepest = bound_polynomials(space, models.coefficients[:, 0], models.remainder[:, 0], 0.0)
                 moves = (upper[part] - lower[part])[np.arange(over.size), steepest] > 0.0
                 split[part] = np.where((over > bounds[part]) & moves, steepest, split[part])
                 bounds[part] = np.maximum(bounds[part], over)

@@ -6,7 +6,7 @@ import ast
 import keyword
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import final
+from typing import cast, final
 
 import numpy as np
 import numpy.typing as npt
@@ -54,7 +54,7 @@ class Decisions:
     def __post_init__(self) -> None:
         for name, size in self.sizes.items():
             check_name("decision", name)
-            if size is not None and (isinstance(size, bool) or not isinstance(size, int) or size < 1):
+            if size is not None and (type(size) is not int or size < 1):
                 raise InputError(path=f"decision.{name}", expected="a number of entries, at least 1", got=repr(size))
         if not self.sizes:
             raise InputError(path="decision", expected="at least one name with its number of entries", got="none")
@@ -287,10 +287,10 @@ class _Statement(Parser):
 
     def entry(self, node: ast.Subscript, depth: int) -> Evaluation:
         """Return the evaluation of an entry of a decision or of a table, such as ``a[k]`` or ``F[i, k]``."""
-        places, base = list[ast.expr](), node
+        places, base = list[ast.expr](), cast("ast.expr", node)
         while isinstance(base, ast.Subscript):
             inside = base.slice.elts if isinstance(base.slice, ast.Tuple) else [base.slice]
-            places, base = [*inside, *places], base.value  # type: ignore[assignment]
+            places, base = [*inside, *places], base.value
         name = base.id if isinstance(base, ast.Name) else ast.unparse(base)
         size = self.words.decisions.sizes.get(name)
         shape = (size,) if size is not None else getattr(self.words.tables.get(name), "shape", None)

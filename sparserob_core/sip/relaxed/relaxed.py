@@ -248,9 +248,7 @@ class RelaxedProgram:
 
     def _prove_bound(self, plain: FiniteProgram, solution: FiniteSolution, y: Array, mu: Array, z: Array) -> _Proven:
         """A lower bound, less its rounding, with the multipliers that prove it and where the cost is touched."""
-        if (
-            plain.P is not None and plain.separable and not plain.bounded
-        ):  # of what has no bounds a tangent says nothing
+        if plain.P is not None and plain.separable and not plain.bounded:  # where a tangent says nothing
             bound, y, mu, z_proving = proving(plain, y, mu, z)
             at = _choose_tangent_point(plain, y, mu, solution.x)
         else:

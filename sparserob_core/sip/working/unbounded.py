@@ -28,9 +28,7 @@ from sparserob_core.sip.working.ledger import ALLOWED, Ledger, Prover, Violated,
 
 Close: TypeAlias = Callable[..., Result]  # an exchange that closes the gap of (program, tools, prover, start)
 NO_FALL = 1e-12  # of the largest coefficient: fall of the cost per unit of a direction that is certainly rounding
-ROUNDS = (
-    200  # of collecting rows that bound a program; a fifth of them are enough for quadratic forms in three coordinates
-)
+ROUNDS = 200  # of collecting rows that bound a program; a fifth serve quadratic forms in three coordinates
 FALLS = 1e-7  # of the largest coefficient: fall of the cost per unit of a direction that is no rounding
 # Largest number of moving coordinates for which the first rows are on a grid: two points along each of ten coordinates
 # are a thousand indices.
@@ -70,7 +68,6 @@ def _make_homogeneous(family: ConstraintFamily) -> ConstraintFamily:
     def rows(indices: Array) -> tuple[Array, Array]:
         G, h = family.rows(indices)
         return G, np.zeros_like(h)
-
 
     def excess(x: Array, indices: Array) -> Array:
         return family.violations(x, indices) - family.violations(np.zeros_like(x), indices)

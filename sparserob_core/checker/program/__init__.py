@@ -1,0 +1,1 @@
+"""Certificates of semi-infinite programs that are stated as text."""

@@ -1,0 +1,130 @@
+"""Rows of a stated program in ball arithmetic: their largest violation over a box, and their coefficients at a point.
+
+Numbers in a text, entries of tables, and arithmetic on these alone are what double precision makes of them. Everything
+that depends on an index or on the decision is enclosed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from itertools import count
+
+import numpy as np
+from flint import arb
+
+from sparserob_core.checker.arithmetic.balls import above, ball
+from sparserob_core.checker.arithmetic.bernstein import highest
+from sparserob_core.checker.arithmetic.models import Frame, Model
+from sparserob_core.checker.arithmetic.monomials import Monomials
+from sparserob_core.checker.outcome import Broken, Clock, Unchecked
+from sparserob_core.sip.convex_set import Array
+from sparserob_core.sip.expressions.expression import Value
+from sparserob_core.sip.expressions.rows import ExpressionRows
+from sparserob_core.sip.expressions.statements import Row
+
+DEGREES = {1: (14, 0), 2: (7, 7), 3: (4, 4)}
+"""Orders in the first coordinate and in the others, for so many of them; 2 for more. Half of them need ten times as
+many cells, twice as many take four times as long for each."""
+MAX_CELLS = 20_000  # of one row: ten times as many take hours, a tenth refuses filters of a thousand taps
+
+
+def bound_violation(rows: ExpressionRows, row: Row, x: Array, limit: float, clock: Clock) -> float:
+    """Return a proven upper bound of the violation of a row at a decision, over all indices.
+
+    Raises `Broken` where an index violates it by more than the ``limit``, and `Unchecked` where too many cells are
+    needed.
+    """
+    work, worst = [(rows.box.lower, rows.box.upper)], -np.inf
+    frame = _make_frame(rows.box.dimension)
+    decision = np.array([frame.number(ball(value)) for value in x] or [frame.number(ball(0.0))], dtype=object)
+    for number in count():
+        if not work:
+            return worst
+        if number > MAX_CELLS:
+            raise Unchecked(f"more than {MAX_CELLS} cells of {row.text!r} are needed")
+        clock.check()
+        lower, upper = work.pop()
+        bound = _bound_cell(rows, row, frame, decision, lower, upper)
+        if bound <= limit:
+            worst = max(worst, bound)
+            continue
+        middle = lower + (upper - lower) / 2
+        _require_kept(rows, row, x, middle, limit)
+        shares = (upper - lower) / np.maximum(rows.box.upper - rows.box.lower, np.finfo(float).tiny)
+        axis = int(shares.argmax())
+        if not lower[axis] < middle[axis] < upper[axis]:
+            raise Unchecked(f"no cell around the index {middle.tolist()} is short enough for {row.text!r}")
+        for side, corner in ((0, middle[axis]), (1, middle[axis])):
+            low, high = lower.copy(), upper.copy()
+            (high if side == 0 else low)[axis] = corner
+            work.append((low, high))
+    return worst
+
+
+def _make_frame(dimension: int) -> Frame:
+    order, degree = DEGREES.get(dimension, (2, 2))
+    return Frame(Monomials(dimension - 1, degree), order)
+
+
+def _bound_cell(
+    rows: ExpressionRows, row: Row, frame: Frame, decision: np.ndarray, lower: Array, upper: Array
+) -> float:
+    """Return an upper bound of the violation over one cell; infinite where the row has no enclosure there."""
+    values: dict[str, Value] = {}
+    for i, name in enumerate(rows.words.indices):
+        low, high = ball(float(lower[i])), ball(float(upper[i]))
+        middle, half = (low + high) / 2, (high - low) / 2
+        model = frame.time(middle, half) if i == 0 else frame.parameter(i - 1, middle, half)
+        values[name] = np.array([[model]], dtype=object)
+    try:
+        violation = row.value(values, decision)[0, 0]
+    except (Unchecked, ValueError, ZeroDivisionError):
+        return np.inf
+    coefficients, error = _separate_errors(frame, violation)
+    if not np.isfinite(coefficients).all() or not np.isfinite(error):
+        return np.inf
+    return float(highest(coefficients[None], [True] * (lower.size), np.array([error]), 0.0)[0])
+
+
+def _separate_errors(frame: Frame, value: Value) -> tuple[Array, float]:
+    """Return the middles of the coefficients of a model, and a bound of what they leave out."""
+    variables, degree = frame.monomials.count, frame.monomials.degree
+    coefficients = np.zeros((frame.order + 1, *([degree + 1] * variables)))
+    model = value if isinstance(value, Model) else frame.number(arb(value))
+    error = arb(0)
+    for exponents, part in zip(frame.monomials.exponents, model.parts, strict=True):
+        for power, coefficient in enumerate([] if part is None else part.coeffs()):
+            middle = float(coefficient.mid())
+            coefficients[(power, *exponents)] = middle
+            error = error + abs(coefficient - middle)
+    return coefficients, above(error)
+
+
+def _require_kept(rows: ExpressionRows, row: Row, x: Array, index: Array, limit: float) -> None:
+    """Raise `Broken` where a row is violated by more than the ``limit`` at one index."""
+    violation = evaluate_row(rows, row, x, index)
+    if violation > limit:
+        at = ", ".join(f"{name} = {value:.9g}" for name, value in zip(rows.words.indices, index.tolist(), strict=True))
+        raise Broken(f"{row.text!r} is violated by {float(violation):.3g} at {at}")
+
+
+def evaluate_row(rows: ExpressionRows, row: Row, x: Array, index: Array) -> arb:
+    """Return a ball with the violation of a row at a decision and an index."""
+    decision = np.array([ball(value) for value in x], dtype=object)
+    return arb(row.value(_list_values(rows, index), decision)[0, 0])
+
+
+def coefficients_at(rows: ExpressionRows, row: Row, index: Array, n: int) -> tuple[list[arb], arb]:
+    """Return balls with the coefficients ``(n,)`` of a row at an index, and its constant."""
+    form = row.form(_list_values(rows, index))
+    coefficients = [ball(0.0)] * n
+    for position, value in zip(form.position.tolist(), form.coefficient[0] if form.position.size else (), strict=True):
+        coefficients[position] = coefficients[position] + arb(value)
+    return coefficients, arb(form.constant[0, 0])
+
+
+def _list_values(rows: ExpressionRows, index: Array) -> Mapping[str, Value]:
+    return {
+        name: np.array([[ball(float(value))]], dtype=object)
+        for name, value in zip(rows.words.indices, index, strict=True)
+    }

@@ -1,0 +1,91 @@
+"""The keys of the problem ``program``, a convex semi-infinite program as text, as a config writes them."""
+
+from __future__ import annotations
+
+from typing import Annotated, TypeAlias, final
+
+from pydantic import Field
+
+from sparserob_core.control.problem.problem import ProblemFactory
+from sparserob_core.experiment.config.option_kinds import OneOrMore
+from sparserob_core.experiment.config.problems import Interval
+from sparserob_core.options import Options
+from sparserob_core.sip.program import SemiInfiniteProgram
+from sparserob_core.sip.stated import StatedDecision, StatedFamily, StatedProgram
+
+Bound: TypeAlias = OneOrMore | None
+
+
+@final
+class DecisionOptions(Options):
+    """Entries of the decision with one name."""
+
+    size: int | None = Field(default=None, ge=1)
+    """Number of entries, which texts name ``a[0]``, ``a[1]``, ...; null: a single number without brackets."""
+
+    lower: Bound = None
+    """Lower bound of every entry, or one number for each; none unless given."""
+
+    upper: Bound = None
+    """Upper bound of every entry, or one number for each; none unless given."""
+
+    def stated(self) -> StatedDecision:
+        """Return the entries as the core states them."""
+        bounds = {name: value for name in ("lower", "upper") if (value := getattr(self, name)) is not None}
+        return StatedDecision(self.size, **bounds)
+
+
+@final
+class FamilyOptions(Options):
+    """Rows that hold for every index."""
+
+    name: str = Field(min_length=1)
+    """Name of the family, in tables and messages."""
+
+    index: dict[str, Interval] | list[dict[str, Interval]]
+    """Interval ``[lower, upper]`` of every coordinate of the index, by name; or a list of such boxes, in each of which
+    the rows hold."""
+
+    rows: Annotated[list[str], Field(min_length=1)]
+    """Rows such as ``sum(a[k]*cos(k*w) for k in range(9)) <= d``: affine in the decision, arithmetic in the index."""
+
+    def stated(self) -> list[StatedFamily]:
+        """Return one family for every box of the index."""
+        if not isinstance(self.index, list):
+            return [StatedFamily(self.name, self.index, self.rows)]
+        return [StatedFamily(f"{self.name} {i + 1}", box, self.rows) for i, box in enumerate(self.index)]
+
+
+@final
+class ProgramProblem(ProblemFactory, Options):
+    """The least value of a convex objective under rows that hold for every index of a box, all of it stated as text."""
+
+    decision: Annotated[dict[str, DecisionOptions], Field(min_length=1)]
+    """Entries that are chosen, by name, in order."""
+
+    minimise: str | float
+    """Objective: a sum of affine terms, of squares and products of affine terms, and of absolute values; convex. It
+    knows the names of the decision and the tables, and sums: ``sum(abs(a[k]) for k in range(9))``."""
+
+    rows: list[str] = Field(default_factory=list)
+    """Rows without an index, with ``<=``, ``>=`` or ``==``."""
+
+    families: list[FamilyOptions] = Field(default_factory=list)
+    """Rows that hold for every index."""
+
+    tables: dict[str, list[float] | list[list[float]]] = Field(default_factory=dict)
+    """Lists of numbers, or matrices, whose entries the texts may name: ``c[k]``, ``F[i, k]``."""
+
+    def build(self) -> SemiInfiniteProgram:
+        """Return the program; raises `InputError` that begins with the key at fault."""
+        return self.stated().build()
+
+    def stated(self) -> StatedProgram:
+        """Return the program as text."""
+        return StatedProgram(
+            {name: entry.stated() for name, entry in self.decision.items()},
+            str(self.minimise),
+            [family for entry in self.families for family in entry.stated()],
+            self.rows,
+            self.tables,
+        )
