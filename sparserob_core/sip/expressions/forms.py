@@ -166,17 +166,6 @@ def _raise_form(left: Value, right: Value) -> Value:
     return ConvexCost.of_product(left, left)
 
 
-AffineForm.operations = {
-    np.add: _add_forms,
-    np.subtract: lambda left, right: _add_forms(left, np.negative(right)),
-    np.negative: lambda form: form.scale(np.full((1, 1), -1.0)),
-    np.multiply: _multiply_forms,
-    np.true_divide: _divide_form,
-    np.power: _raise_form,
-    np.absolute: ConvexCost.of_absolute,
-}
-
-
 @final
 @dataclass(frozen=True, eq=False)
 class Products:
@@ -270,7 +259,7 @@ def _multiply_cost(left: Value, right: Value) -> ConvexCost:
     cost, factor = (left, right) if isinstance(left, ConvexCost) else (right, left)
     if isinstance(factor, Operand):
         raise InputError("a product of more than two decisions, or of an absolute value with a decision")
-    return cost.scale(factor)  # type: ignore[no-any-return]
+    return cost.scale(factor)
 
 
 def _divide_cost(left: Value, right: Value) -> ConvexCost:
@@ -285,4 +274,14 @@ ConvexCost.operations = {
     np.negative: lambda cost: cost.scale(np.full((1, 1), -1.0)),
     np.multiply: _multiply_cost,
     np.true_divide: _divide_cost,
+}
+
+AffineForm.operations = {
+    np.add: _add_forms,
+    np.subtract: lambda left, right: _add_forms(left, np.negative(right)),
+    np.negative: lambda form: form.scale(np.full((1, 1), -1.0)),
+    np.multiply: _multiply_forms,
+    np.true_divide: _divide_form,
+    np.power: _raise_form,
+    np.absolute: ConvexCost.of_absolute,
 }
