@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import TypeAlias, final
 
@@ -86,6 +86,14 @@ class Term:
             terms.append(Term(float(constants[j]), positions[sums != 0.0], sums[sums != 0.0]))
         return terms
 
+    def plus(self, other: Term, factor: float) -> Term:
+        """Return the sum of this function and a multiple of another one."""
+        positions = np.union1d(self.positions, other.positions).astype(int)
+        coefficients = np.zeros(positions.size)
+        coefficients[np.searchsorted(positions, self.positions)] = self.coefficients
+        coefficients[np.searchsorted(positions, other.positions)] += factor * other.coefficients
+        return Term(self.constant + factor * other.constant, positions, coefficients)
+
 
 @final
 @dataclass(frozen=True, eq=False)
@@ -98,18 +106,26 @@ class Objective:
 
     @staticmethod
     def of(cost: ConvexCost) -> Objective:
-        """Return the terms of a parsed cost."""
+        """Return the terms of a parsed cost; products with numbers, and absolute values of numbers, are affine."""
+        linear = Term.list_terms(cost.affine)[0]
         products = list[tuple[float, Term, Term]]()
         for block in cost.products:
             left = Term.list_terms(block.left)
             right = left if block.right is block.left else Term.list_terms(block.right)
-            products += [(float(weight), a, b) for weight, a, b in zip(block.weight, left, right, strict=True)]
-        absolutes = [
-            (float(weight), inner)
-            for block in cost.absolutes
-            for weight, inner in zip(block.weight, Term.list_terms(block.form), strict=True)
-        ]
-        return Objective(Term.list_terms(cost.affine)[0], tuple(products), tuple(absolutes))
+            for weight, a, b in zip(block.weight.tolist(), left, right, strict=True):
+                if a.positions.size and b.positions.size:
+                    products.append((weight, a, b))
+                else:
+                    number, other = (b.constant, a) if a.positions.size else (a.constant, b)
+                    linear = linear.plus(other, weight * number)
+        absolutes = list[tuple[float, Term]]()
+        for absolute in cost.absolutes:
+            for weight, inner in zip(absolute.weight.tolist(), Term.list_terms(absolute.form), strict=True):
+                if inner.positions.size:
+                    absolutes.append((weight, inner))
+                else:
+                    linear = replace(linear, constant=linear.constant + weight * abs(inner.constant))
+        return Objective(linear, tuple(products), tuple(absolutes))
 
 
 @final

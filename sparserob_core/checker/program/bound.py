@@ -210,17 +210,18 @@ class Lagrangian:
 
 
 def _choose_columns(matrix: Array, sizes: Array) -> list[int]:
-    """Return columns that are independent, the largest first, by elimination in doubles: it decides nothing."""
-    rest = matrix * sizes
-    order: list[int] = []
-    scale = np.abs(rest).max(initial=0.0)
+    """Return columns that are independent, those of large multipliers first, by elimination in doubles: a wrong choice
+    proves nothing, and does no harm."""
+    rest, order = matrix.copy(), list[int]()
+    scale = np.abs(rest).max(axis=0, initial=0.0)
     remaining = np.ones(matrix.shape[0], dtype=bool)
-    for _ in range(matrix.shape[0]):
-        part = np.abs(rest[remaining])
-        if not part.size or part.max() <= INDEPENDENT * scale:
+    while remaining.any():
+        pivots = np.abs(rest[remaining])
+        is_independent = pivots > INDEPENDENT * scale
+        if not is_independent.any():
             break
-        row_in_part, column = np.unravel_index(int(part.argmax()), part.shape)
-        row = np.flatnonzero(remaining)[row_in_part]
+        place, column = np.unravel_index(int(np.where(is_independent, pivots * sizes, -1.0).argmax()), pivots.shape)
+        row = np.flatnonzero(remaining)[place]
         order.append(int(column))
         rest = rest - np.outer(rest[:, column] / rest[row, column], rest[row])
         rest[:, column] = 0.0

@@ -20,6 +20,7 @@ from sparserob_core.sip.evidence import Activity, Branch, Dual, Proof
 from sparserob_core.sip.program import TOLERANCE, SemiInfiniteProgram
 from sparserob_core.sip.result import Result
 from sparserob_core.sip.stated import StatedProgram
+from sparserob_core.sip.working.unbounded import complete_multipliers
 
 if TYPE_CHECKING:
     from sparserob_core.control.studies.causal import CausalBound
@@ -126,7 +127,7 @@ def _certify_program(experiment: PlainExperiment, result: Result) -> dict[str, A
     """
     if not isinstance(experiment.program.origin, StatedProgram):
         return None
-    dual, worst = result.dual, result.worst
+    dual, worst = complete_multipliers(experiment.program, result.dual, result.status != "infeasible"), result.worst
     has_multipliers = dual.mu.size == experiment.program.finite.b.size
     rows = dual.fixed if dual.fixed.size else np.zeros(experiment.program.finite.h.size)
     witness = (

@@ -17,7 +17,7 @@ import numpy as np
 
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.events import ignore
-from sparserob_core.sip.evidence import Cut
+from sparserob_core.sip.evidence import Cut, Dual
 from sparserob_core.sip.inner.vertex import simplex
 from sparserob_core.sip.method import Tools
 from sparserob_core.sip.program import ConstraintFamily, SemiInfiniteProgram
@@ -27,6 +27,7 @@ from sparserob_core.sip.separation.separation import separate
 from sparserob_core.sip.working.ledger import ALLOWED, Ledger, Prover, Violated, above, unproven
 
 Close: TypeAlias = Callable[..., Result]  # an exchange that closes the gap of (program, tools, prover, start)
+SPENT = 1e-12  # of a bound: what it loses for multipliers of rows without one; ten times less is lost in rounding
 NO_FALL = 1e-12  # of the largest coefficient: fall of the cost per unit of a direction that is certainly rounding
 ROUNDS = 200  # of collecting rows that bound a program; a fifth serve quadratic forms in three coordinates
 FALLS = 1e-7  # of the largest coefficient: fall of the cost per unit of a direction that is no rounding
@@ -168,6 +169,78 @@ def _collect_rows(
             rows = rows.joined(rows_at(recession, name, indices, numbers))
         chosen += fresh
     return chosen, False
+
+
+def complete_multipliers(program: SemiInfiniteProgram, dual: Dual, is_priced: bool) -> Dual:
+    """Return multipliers that can be moved so that every entry without bounds has exactly the slope that it needs.
+
+    As many of them as there are such entries have to be positive, and their rows independent. Where they are fewer,
+    small multiples of a positive combination of rows are added, in which those entries cancel. It exists where the rows
+    bound these entries (Stiemke 1915). The bound then loses the share `SPENT` of itself.
+
+    Parameters
+    ----------
+    program : SemiInfiniteProgram
+        The program, without an image ``S`` and without blocks.
+    dual : Dual
+        Its multipliers.
+    is_priced : bool
+        Whether they prove a bound of the cost; otherwise they prove that nothing is feasible.
+    """
+    base = program.finite
+    free = np.isinf(base.lower) | np.isinf(base.upper)
+    if is_priced and base.P is not None:
+        bent = base.curvature if base.curvature is not None else base.P.diagonal()
+        free &= bent == 0.0
+    if not free.any() or dual.mu.size != base.b.size:
+        return dual
+    own = rows_of(program, dual.cuts)
+    fixed = dual.fixed if dual.fixed.size else np.zeros(base.h.size)
+    used = np.vstack([own.G, base.G[fixed > 0.0], base.A])[:, free]
+    if np.linalg.matrix_rank(used) == int(free.sum()):
+        return dual
+    rows = own
+    for indices, numbers, name in first_rows(program):
+        rows = rows.joined(rows_at(program, name, indices, numbers))
+    finite = np.isfinite(base.h)
+    table = np.vstack([rows.G, base.G[finite]])
+    right, count = np.concatenate([rows.h, base.h[finite]]), len(table)
+    from scipy.optimize import linprog
+
+    found = linprog(
+        np.concatenate([np.zeros(count + base.b.size), [-1.0]]),
+        A_ub=np.vstack(
+            [
+                np.hstack([-np.eye(count), np.zeros((count, base.b.size)), np.ones((count, 1))]),
+                np.concatenate([np.ones(count), np.zeros(base.b.size + 1)])[None],
+            ]
+        ),
+        b_ub=np.concatenate([np.zeros(count), [float(count)]]),
+        A_eq=np.hstack([table[:, free].T, base.A[:, free].T, np.zeros((int(free.sum()), 1))]),
+        b_eq=np.zeros(int(free.sum())),
+        bounds=[(0.0, None)] * count + [(None, None)] * base.b.size + [(0.0, 1.0)],
+        method="highs",
+    )
+    if found.status != 0 or not found.x[-1] > 0.0:
+        return dual
+    added, moved = found.x[:count], found.x[count:-1]
+    size = abs(dual.bound) if is_priced else float(sum(cut.multiplier for cut in dual.cuts))
+    loss = float(np.abs(added) @ np.abs(right) + np.abs(moved) @ np.abs(base.b)) or 1.0
+    share = SPENT * (size or 1.0) / loss
+    y = np.concatenate([[cut.multiplier for cut in dual.cuts], np.zeros(rows.h.size - own.h.size)])
+    y = y + share * added[: rows.h.size]
+    fixed = fixed.copy()
+    fixed[finite] += share * added[rows.h.size :]
+    cuts = tuple(replace(cut, multiplier=float(value)) for cut, value in zip(rows.cuts, y, strict=True))
+    return replace(dual, cuts=cuts, fixed=fixed, mu=dual.mu + share * moved)
+
+
+def rows_of(program: SemiInfiniteProgram, cuts: Sequence[Cut]) -> Rows:
+    """Return the rows of cuts, in their order."""
+    rows = Rows.none(program.n)
+    for cut in cuts:
+        rows = rows.joined(rows_at(program, cut.family, cut.index[None], np.array([cut.row])))
+    return rows
 
 
 def _group_by_family(cuts: Sequence[Cut]) -> list[tuple[Array, np.ndarray, str]]:
