@@ -19,6 +19,7 @@ from sparserob_core.shapes import Float, sealed, shaped
 from sparserob_core.sip.convex_set import Array, Box, as_bound
 from sparserob_core.sip.convexity import require_convex, sparse_matrix
 from sparserob_core.sip.expressions.rows import ExpressionRows
+from sparserob_core.sip.expressions.slopes import BoundedSlopes
 from sparserob_core.sip.expressions.statements import Decisions, read_tables
 from sparserob_core.sip.finite import Blocks, FiniteProgram, Spread, UncertainRows
 
@@ -32,6 +33,7 @@ TOLERANCE = 1e-9  # of a row's own unit: a violation of at most this counts as n
 OUTSIDE = 1e-9  # of the sides of an index set and its distance from 0: error by which rounding may put an index outside
 NARROW = 1e-12  # of the side of a box: a gap between two cells that is only rounding of their corners
 PARTS = 4_000_000  # largest number of parts of the grid between the corners of all cells: 32 MB
+EXPRESSED = 0.01  # sharpness of expressions: with 1, excuses cost as much as a gap; a tenth of it is rounding
 EQUALITY = 1e-12  # of the numbers that are added up: an equality with at most this residual counts as met
 
 
@@ -221,6 +223,8 @@ class ConstraintFamily:
         ``scale(x)``: factor of `TOLERANCE` that a proof allows at a decision, in the numbers of the rows (`allowed`).
         Without it the factor is 1. The factor matters for a row that is smaller than 1, and for an equality in a finer
         unit.
+    sharpness : float, default 1
+        Share of what a proof may count as none up to which it bounds violations, as long as it has found none.
     chosen : callable, optional
         ``chosen(indices (k, d), rows (k,))``: one row of each index, ``(G (k, n), h (k,))``, where all rows would take
         longer.
@@ -284,6 +288,7 @@ class ConstraintFamily:
     index_set: Box
     rows: Callable[[Array], tuple[Array, Array]]
     scale: Callable[[Array], float] | None = None
+    sharpness: float = 1.0
     chosen: Callable[[Array, np.ndarray], tuple[Array, Array]] | None = None
     worst: Callable[[Array], Separation] | None = None
     enclosure: Callable[[Array, Array, Array], Enclosure] | None = None
@@ -376,9 +381,68 @@ class ConstraintFamily:
             rows=expressions.evaluate,
             enclosure=enclose,
             excess=expressions.violations,
+            sharpness=EXPRESSED,
             believed="",
             source=expressions,
         )
+
+    @staticmethod
+    def from_function(
+        name: str,
+        *,
+        index_set: Box,
+        rows: Callable[[Array], tuple[Array, Array]],
+        lipschitz: npt.ArrayLike | None = None,
+        curvature: npt.ArrayLike | None = None,
+    ) -> ConstraintFamily:
+        """Return a family whose rows are a function of Python, with one number that makes a proof possible.
+
+        The number is believed: a result that rests on it says so. It is compared with differences of the rows at some
+        indices. A proof by curvatures needs far fewer cells than one by slopes.
+
+        Parameters
+        ----------
+        name : str
+            Name of the family.
+        index_set : Box
+            Set of all indices, in ``d`` dimensions.
+        rows : callable
+            Maps indices ``(k, d)`` to ``(G (k, r, n), h (k, r))``, the rows and the right-hand sides.
+        lipschitz : array_like, scalar or shape (d,), optional
+            Bound of the modulus of the derivative of every entry of ``G`` and ``h`` in each coordinate of the index.
+        curvature : array_like, scalar or shape (d,), optional
+            Bound of the modulus of their second derivative in each coordinate; instead of ``lipschitz``.
+
+        Returns
+        -------
+        ConstraintFamily
+            The family.
+
+        Raises
+        ------
+        InputError
+            If not one of the two bounds is given, if it is negative, or if samples of the rows contradict it.
+
+        Examples
+        --------
+        >>> import numpy as np
+        >>> import sparserob_core as sr
+        >>> def rows(t):
+        ...     return np.hstack([-np.ones_like(t), -t])[:, None], -np.exp(t)
+        >>> family = sr.ConstraintFamily.from_function(
+        ...     "above", index_set=sr.Box([0.0], [1.0]), rows=rows, curvature=np.e
+        ... )
+        >>> result = sr.solve(sr.SemiInfiniteProgram(n=2, q=[1.0, 0.5], families=[family]))
+        >>> result.status, round(result.cost, 5)
+        ('certified', 1.85914)
+        """
+        slopes = BoundedSlopes.of(rows, index_set, lipschitz, curvature)
+
+        def enclose(x: Array, lower: Array, upper: Array) -> Enclosure:
+            return Enclosure(*slopes.enclose(x, lower, upper))
+
+        what = "states of its slopes" if curvature is None else "states of its curvature"
+        return ConstraintFamily(name=name, index_set=index_set, rows=rows, enclosure=enclose, believed=what)
 
     @property
     def provable(self) -> bool:

@@ -33,6 +33,7 @@ from sparserob_core.sip.working.ledger import (
     Prover,
     Violated,
     above,
+    found_by,
     prover_of,
     witnesses,
 )
@@ -143,6 +144,8 @@ class Rounds:
         # may do, where it alone keeps a proof open, is allowed for like the solver's accuracy.
         proofs, imposed = proofs_of(working, ledger, prover, answer, separations)
         again = imposed or working.exchange(answer, witnesses(program, proofs), number)
+        if not again and ledger.is_excuse_dear(answer.solution.x, proofs):
+            again = bool(working.exchange(answer, found_by(proofs), number))
         again = again or working.allow_for(ledger, answer, proofs)
         if again and not last and not tools.deadline.passed:
             return None

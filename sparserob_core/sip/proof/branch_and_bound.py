@@ -192,7 +192,7 @@ def _prove(family: ConstraintFamily, x: Array, notify: Notify, cells: int, deadl
             return _prove_by_separation(family, x)
         try:
             course = Course(family, notify, cells, deadline)
-            return _branch_and_bound(family, x, course, NoViolation(family.allowed(x)))[0]
+            return _branch_and_bound(family, x, course, NoViolation(family.allowed(x), family.sharpness))[0]
         except NotEnclosable as error:
             if deadline.passed:
                 return Proof(family.name, "undecided", np.inf, reason=f"{family.name}: {error}")
@@ -315,14 +315,17 @@ class NoViolation:
     """Goal of a proof: to decide whether anything is violated by more than ``allowed``.
 
     Cells are closed where nothing is, and a violation of more than `TOLERANCE` ends the search. A violation between the
-    two may be rounding.
+    two may be rounding. As long as no violation above the share ``sharpness`` of ``allowed`` is found, cells are closed
+    below it.
     """
 
     allowed: float = TOLERANCE
+    sharpness: float = 1.0
 
     def closes(self, best: float) -> float:
         """Return the bound up to which a cell is closed, where ``best`` is the largest violation found."""
-        return self.allowed
+        sharp = self.sharpness * self.allowed
+        return sharp if best <= sharp / 2 else self.allowed
 
     def ends(self, best: float) -> bool:
         """Return whether the largest violation found decides the question."""

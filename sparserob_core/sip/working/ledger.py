@@ -151,13 +151,32 @@ class Ledger:
         """Return the relative gap between the lower bound and the cost of ``x (n,)``."""
         return relative_gap(self.lower, self.program.cost(x), self.program.added(x))
 
-    def _compute_resolved_gap(self, x: Array) -> float:
-        """Return the relative gap at ``x (n,)`` with the cost increased by its possible rounding error.
+    def _compute_resolved_gap(self, x: Array, excused: float = 0.0) -> float:
+        """Return the relative gap at ``x (n,)`` with the cost increased by its possible rounding error, and by what the
+        ``excused`` violations may be worth.
 
         Where squares cancel, nearly all of the cost may be rounding. Then the gap is not known to be closed.
         """
         rounded = np.finfo(float).eps * self.program.finite.magnitude(x)
-        return relative_gap(self.lower, self.program.cost(x) + rounded, self.program.added(x))
+        return relative_gap(
+            min(self.lower, self.program.cost(x)), self.program.cost(x) + rounded + excused, self.program.added(x)
+        )
+
+    def is_excuse_dear(self, x: Array, proofs: Sequence[Proof]) -> bool:
+        """Return whether what proofs at ``x (n,)`` excuse is all that keeps the gap open."""
+        excused = self._price_excuses(proofs)
+        return self._compute_resolved_gap(x) <= self.tolerance < self._compute_resolved_gap(x, excused)
+
+    def _price_excuses(self, proofs: Sequence[Proof]) -> float:
+        """Return how much the cost would rise, to first order, if nothing were excused, for rows in units of their own.
+
+        The rows of a control have the unit of their set, to which an excuse is relative. Other rows are excused by a
+        number, which may be as large as a small cost.
+        """
+        if self.program.lengths is not None:
+            return 0.0
+        excused = {proof.family: max(proof.bound, 0.0) for proof in proofs if proof.verdict == "proven"}
+        return sum(cut.multiplier * excused.get(cut.family, 0.0) for cut in self.dual.cuts)
 
     def tell(self, number: int, answer: CheckedAnswer, found: Found, upper: float, kept: int) -> None:
         """Record a round, and send its event.
@@ -266,7 +285,7 @@ class Ledger:
             The result.
         """
         x, deadline = answer.solution.x, self.tools.deadline
-        status, message = verdict(proofs, self._compute_resolved_gap(x), self.tolerance)
+        status, message = verdict(proofs, self._compute_resolved_gap(x, self._price_excuses(proofs)), self.tolerance)
         for name, excess, limit in self._list_residuals(x, strictly=status in ("certified", "verified")):
             if excess > limit:
                 status, message = "failed", f"the decision misses {name} by {excess:.1e} of what they compare; {ADVICE}"
@@ -533,6 +552,15 @@ def above(family: ConstraintFamily, found: Separation) -> tuple[Array, np.ndarra
     """
     violated = found.violations > ALLOWED
     return found.indices[violated], found.rows[violated], family.name
+
+
+def found_by(proofs: Sequence[Proof]) -> Violated:
+    """Return the largest violations that proofs have found and excuse."""
+    return [
+        (proof.index[None], np.array([proof.row]), proof.family)
+        for proof in proofs
+        if proof.index is not None and proof.violation > 0.0
+    ]
 
 
 def witnesses(program: SemiInfiniteProgram, proofs: Sequence[Proof]) -> Violated:

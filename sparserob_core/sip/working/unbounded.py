@@ -34,6 +34,7 @@ FALLS = 1e-7  # of the largest coefficient: fall of the cost per unit of a direc
 # Largest number of moving coordinates for which the first rows are on a grid: two points along each of ten coordinates
 # are a thousand indices.
 FEW = 8
+DENSE = 4  # first rows of a family for every variable: with one, filters take twice as many rounds, eight are slow
 SHOWN = 6  # largest number of entries of a ray in the message
 
 
@@ -85,8 +86,8 @@ def _has_bounds(program: SemiInfiniteProgram) -> bool:
 def first_rows(program: SemiInfiniteProgram) -> list[tuple[Array, np.ndarray, str]]:
     """Return rows that usually make an unbounded relaxed program bounded.
 
-    A family gets at least one index more than the decision has variables, if at most `FEW` coordinates of its index can
-    move, and some do; otherwise it gets one index. The indices are dense at the faces of the index set, where
+    A family gets at least `DENSE` indices for every variable of the decision, and as many more, if at most `FEW`
+    coordinates of its index can move; otherwise it gets one index. They are dense at the faces of the index set, where
     polynomials and cosines grow most (nodes of Chebyshev). Nothing is returned where the decision has bounds.
     """
     rows: list[tuple[Array, np.ndarray, str]] = []
@@ -95,7 +96,8 @@ def first_rows(program: SemiInfiniteProgram) -> list[tuple[Array, np.ndarray, st
     for family in program.families:
         box = family.index_set
         free_axes = np.flatnonzero(box.upper > box.lower)
-        side = int(np.ceil((program.n + 1) ** (1.0 / max(1, free_axes.size)) - 1e-9)) if free_axes.size <= FEW else 1
+        count = DENSE * (program.n + 1) if free_axes.size <= FEW else 1
+        side = int(np.ceil(count ** (1.0 / max(1, free_axes.size)) - 1e-9))
         share = 0.5 - 0.5 * np.cos(np.pi * np.arange(side) / max(1, side - 1)) if side > 1 else np.array([0.5])
         lines = [share if i in free_axes else np.zeros(1) for i in range(box.dimension)]
         unit = np.stack(np.meshgrid(*lines, indexing="ij"), axis=-1).reshape(-1, box.dimension)

@@ -358,7 +358,10 @@ class Working(ABC):
         """
         if any(proof.verdict == "refuted" for proof in proofs) or not self.slater:
             return False
-        distances = [self.distance(violation) for violation in left_open(self.program, proofs)]
+        violations = left_open(self.program, proofs)
+        if not violations and ledger.is_excuse_dear(answer.solution.x, proofs):
+            violations = [_make_excuse(proof) for proof in proofs if proof.bound > 0.0 and proof.index is not None]
+        distances = [self.distance(violation) for violation in violations]
         floor = self.margin + 1.25 * max(distances, default=np.inf)
         if (floor > self.ceiling and not self._is_affordable(ledger, answer, floor)) or self.allowed >= ALLOWANCES:
             return False
@@ -405,6 +408,12 @@ def size_of(program: SemiInfiniteProgram, answer: CheckedAnswer) -> float:
     """Return the size to which a gap at an answer is relative."""
     x = answer.solution.x
     return max(SMALL_COST * program.added(x), abs(program.cost(x)))
+
+
+def _make_excuse(proof: Proof) -> LargestViolation:
+    """Return the violation that a proof excuses."""
+    assert proof.index is not None
+    return LargestViolation(proof.bound, proof.family, proof.index[None], np.array([proof.row]))
 
 
 def left_open(program: SemiInfiniteProgram, proofs: Sequence[Proof]) -> list[LargestViolation]:

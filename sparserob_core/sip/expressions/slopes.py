@@ -1,0 +1,110 @@
+"""Bounds of rows that are functions of Python over cells, from numbers that bound their slopes or their curvature."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from itertools import product
+from typing import final
+
+import numpy as np
+import numpy.typing as npt
+
+from sparserob_core.errors import InputError
+from sparserob_core.sip.convex_set import Array, Box
+
+SAMPLES = 64  # indices at which a stated bound is compared with the rows; a tenth misses what turns a few times
+SLACK = 1e-6  # of a bound: differences of rows round, so that a bound that is met exactly may seem exceeded
+STEP = 1e-4  # of a side: distance of the indices that are compared; with a tenth of it rounding grows a hundredfold
+OUTWARD = 1.0 + 1e-9
+MAX_COORDINATES = 8  # of an index with a bound of curvatures: a cell has 256 corners then
+
+Rows = Callable[[Array], tuple[Array, Array]]
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class BoundedSlopes:
+    """Rows ``rows(xi) x <= rhs(xi)`` whose entries, and right-hand sides, have bounded derivatives in the index.
+
+    Parameters
+    ----------
+    rows : callable
+        Maps indices ``(k, d)`` to ``(G (k, r, n), h (k, r))``.
+    box : Box
+        Index set.
+    bounds : array (d,)
+        Bound of the modulus of every entry's derivative in each coordinate of the index, of the first ``order``, or of
+        the second.
+    order : int
+        1 for slopes, 2 for curvatures.
+    """
+
+    rows: Rows
+    box: Box
+    bounds: Array
+    order: int
+
+    @staticmethod
+    def of(rows: Rows, box: Box, lipschitz: npt.ArrayLike | None, curvature: npt.ArrayLike | None) -> BoundedSlopes:
+        """Return the rows with the bound that is given, after a look at samples; raise `InputError` where these
+        contradict it."""
+        given = {"lipschitz": lipschitz, "curvature": curvature}
+        named = [name for name, bound in given.items() if bound is not None]
+        if len(named) != 1:
+            raise InputError(path="lipschitz", expected="one of lipschitz and curvature", got=f"{len(named)} of them")
+        name = named[0]
+        try:
+            bounds = np.broadcast_to(np.asarray(given[name], dtype=float), (box.dimension,)).copy()
+        except ValueError:
+            bounds = np.full(1, np.nan)
+        if not (np.isfinite(bounds).all() and (bounds >= 0.0).all()):
+            expected = f"a number that is not negative, or {box.dimension} of them"
+            raise InputError(path=name, expected=expected, got=repr(given[name]))
+        if name == "curvature" and box.dimension > MAX_COORDINATES:
+            raise InputError(path=name, expected=f"an index of at most {MAX_COORDINATES} coordinates", got="more")
+        found = BoundedSlopes(rows, box, bounds, 1 if name == "lipschitz" else 2)
+        found._require_plausible(name)
+        return found
+
+    def enclose(self, x: Array, lower: Array, upper: Array) -> tuple[Array, np.ndarray]:
+        """Return upper bounds ``(k,)`` of the violation at a decision over cells, and the coordinates to halve."""
+        widths = np.maximum(upper - lower, 0.0)
+        entries = (
+            float(np.abs(x).sum()) + 1.0
+        )  # every entry of a row, and its right-hand side, moves by at most so much
+        if self.order == 1:
+            parts = entries * self.bounds * widths / 2
+            values = self._evaluate(x, lower + widths / 2)
+        else:  # a function is below its multilinear interpolant but for its curvatures in single coordinates
+            parts = entries * self.bounds * widths**2 / 8
+            corners = product(*([0.0, 1.0] if width else [0.0] for width in (widths > 0.0).any(axis=0)))
+            values = np.max([self._evaluate(x, lower + np.array(corner) * widths) for corner in corners], axis=0)
+        rounded = 1e-14 * (np.abs(values) + entries)
+        bounds = values + rounded + parts.sum(axis=1) * OUTWARD
+        return bounds, np.where(parts.any(axis=1, keepdims=True), parts, widths).argmax(axis=1)
+
+    def _evaluate(self, x: Array, indices: Array) -> Array:
+        """Return the largest violation of all rows at each index."""
+        G, h = self.rows(np.clip(indices, self.box.lower, self.box.upper))
+        return np.asarray((G @ x - h).max(axis=1), dtype=float)
+
+    def _require_plausible(self, name: str) -> None:
+        """Raise `InputError` where differences of the rows at samples exceed the bound."""
+        sides, rng = self.box.upper - self.box.lower, np.random.default_rng(0)
+        for axis in np.flatnonzero(sides > 0.0).tolist():
+            step = STEP * sides[axis]
+            room = sides.copy()
+            room[axis] -= 2.0 * step
+            first = self.box.lower + rng.random((SAMPLES, self.box.dimension)) * room
+            points = [first + k * step * np.eye(self.box.dimension)[axis] for k in range(3)]
+            tables = [np.concatenate([G, h[..., None]], axis=2) for G, h in map(self.rows, points)]
+            change = tables[1] - tables[0] if self.order == 1 else tables[2] - 2.0 * tables[1] + tables[0]
+            size = max(float(np.abs(table).max(initial=0.0)) for table in tables)
+            largest = (float(np.abs(change).max(initial=0.0)) - 8.0 * np.finfo(float).eps * size) / step**self.order
+            if largest > self.bounds[axis] * (1.0 + SLACK):
+                at = first[int(np.abs(change).max(axis=(1, 2)).argmax())].tolist()
+                what = "slope" if self.order == 1 else "curvature"
+                expected = f"a bound of every {what} in coordinate {axis + 1} of the index"
+                got = f"{self.bounds[axis]:.6g}, though an entry has {largest:.6g} near {at}"
+                raise InputError(path=name, expected=expected, got=got)
