@@ -12,6 +12,7 @@ import numpy.typing as npt
 
 from sparserob_core.errors import InputError
 from sparserob_core.sip.convex_set import Array, Box
+from sparserob_core.sip.expressions.rounding import rounding
 
 SAMPLES = 64  # indices at which a stated bound is compared with the rows; a tenth misses what turns a few times
 SLACK = 1e-6  # of a bound: differences of rows round, so that a bound that is met exactly may seem exceeded
@@ -80,14 +81,14 @@ class BoundedSlopes:
             parts = entries * self.bounds * widths**2 / 8
             corners = product(*([0.0, 1.0] if width else [0.0] for width in (widths > 0.0).any(axis=0)))
             values = np.max([self._evaluate(x, lower + np.array(corner) * widths) for corner in corners], axis=0)
-        rounded = 1e-14 * (np.abs(values) + entries)
-        bounds = values + rounded + parts.sum(axis=1) * OUTWARD
+        bounds = values + parts.sum(axis=1) * OUTWARD
         return bounds, np.where(parts.any(axis=1, keepdims=True), parts, widths).argmax(axis=1)
 
     def _evaluate(self, x: Array, indices: Array) -> Array:
-        """Return the largest violation of all rows at each index."""
+        """Return the largest violation of all rows at each index, with the rounding of the sums added."""
         G, h = self.rows(np.clip(indices, self.box.lower, self.box.upper))
-        return np.asarray((G @ x - h).max(axis=1), dtype=float)
+        rounded = rounding(x.size + 1) * (np.abs(G) @ np.abs(x) + np.abs(h))
+        return np.asarray((G @ x - h + rounded).max(axis=1), dtype=float)
 
     def _require_plausible(self, name: str) -> None:
         """Raise `InputError` where differences of the rows at samples exceed the bound."""
