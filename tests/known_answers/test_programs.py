@@ -186,7 +186,6 @@ VALUES: dict[str, Callable[[], float]] = {
 }
 """Values of the configs, by other means."""
 PUBLISHED = {"camel": 1.031628453, "one_sided_tangent": 0.616085, "watson8": 2.4356434882}
-LIGHT = "convex_fit"
 
 
 @pytest.mark.slow
@@ -195,9 +194,8 @@ def test_the_value_is_the_published_one(name: str) -> None:
     assert VALUES[name]() == pytest.approx(PUBLISHED[name], rel=1e-6)
 
 
-@pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=pytest.mark.slow if name != LIGHT else ()) for name in VALUES]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("name", VALUES)
 def test_a_stated_program_has_its_known_value_with_a_proof_that_is_checked(name: str, tmp_path: Path) -> None:
     result = sr.run(CONFIGS / f"{name}.yaml", {"observers": []}, out=tmp_path / "run", figures=False).result
     assert result.status == "certified", result.message
