@@ -93,6 +93,13 @@ class Model:
     def __pos__(self) -> Model:
         return self
 
+    def __abs__(self) -> Model:
+        """Return the absolute value: the model with the sign of its middle; where its values have the other sign, up to
+        ``w``, they differ from that by ``2 w`` at most."""
+        middle = arb(self.constant.mid())
+        other = (self - self.frame.number(middle)).size.upper() - abs(middle)
+        return (-self if middle < 0 else self)._truncate(2 * other if other > 0 else arb(0))
+
     def __sub__(self, other: object) -> Model:
         return self + -self._convert_to_model(other)
 

@@ -271,11 +271,12 @@ def _tanh(degree: int, centre: Array, low: Array, high: Array) -> Series:
 
 
 def _absolute(model: CellModels) -> CellModels:
+    """Return the absolute values: models whose values are mostly negative with the other sign; where some values have
+    the other sign, up to ``w``, they differ from that by ``2 w`` at most."""
     low, high = model.bounds()
-    flipped = CellModels(
-        model.space, np.where((high < 0.0)[..., None], -model.coefficients, model.coefficients), model.remainder
-    )
-    return CellModels(model.space, flipped.coefficients, np.where((low < 0.0) & (high > 0.0), np.inf, model.remainder))
+    sign = np.where(low + high < 0.0, -1.0, 1.0)
+    other = np.maximum(np.where(sign < 0.0, high, -low), 0.0)
+    return CellModels(model.space, sign[..., None] * model.coefficients, (model.remainder + 2.0 * other) * OUTWARD)
 
 
 CellModels.operations = {

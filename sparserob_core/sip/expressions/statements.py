@@ -348,6 +348,8 @@ class _Statement(Parser):
             for name, calls in loops:
                 scope, turn_owner = _unroll(scope, name, [call(scope) for call in calls])
                 owner = owner[turn_owner]
+            if not owner.size:
+                return np.zeros((1, count))
             value = body(scope)
             value = value if value.shape[1] == owner.size else value[:, np.zeros(owner.size, dtype=int)]
             return add_columns(value, owner, count)

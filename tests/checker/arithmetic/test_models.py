@@ -74,6 +74,7 @@ FUNCTIONS = {
     "sqrt": (lambda x: x.sqrt(), lambda x: x.sqrt()),
     "tanh": (lambda x: x.tanh(), lambda x: x.tanh()),
     "kepler": (lambda x: x.kepler(0.3), kepler),
+    "absolute": (lambda x: abs(x - 9) - abs(x), lambda x: 9 - x - abs(x)),
     "negative": (lambda x: (x - 9) ** 3 * (x - 9) ** -1, lambda x: (x - 9) ** 2),
 }  # fmt: skip
 CLOSE = (1e-15, 2e-11, 5e-7)  # in 0, 1, 2 parameters, relative to 1 and the value
@@ -113,6 +114,16 @@ def test_what_is_beyond_a_small_frame_is_not_lost(name: str, frame: Frame, width
     with ctx.workprec(600):
         for point in POINTS:
             assert at(model, point).contains(true(number(frame, point, width)))
+
+
+@pytest.mark.parametrize("share", [-1.0, -0.4, 0.3, 1.0])
+def test_an_absolute_value_with_a_kink_holds_both_sides_and_no_more_than_the_shorter_one(share: float) -> None:
+    frame, half = Frame(NONE, 3), 0.5
+    model = abs(frame.time(arb(share * half), arb(half)))
+    for point in np.linspace(-1.0, 1.0, 41).tolist():
+        assert at(model, (point,)).contains(abs(arb(half) * (arb(point) + arb(share))))
+    shorter = half * (1.0 - abs(share))
+    assert abs(float(at(model, (0.0,)).rad()) - 2.0 * shorter) <= 1e-8
 
 
 @pytest.mark.parametrize("frame", [Frame(NONE, 2), Frame(Monomials(1, 2), 0), Frame(Monomials(2, 2), 2)], ids=str)

@@ -1,4 +1,4 @@
-"""Guards control/enclosures/elementary: coefficients and Lagrange's bounds of series about any point of an interval,
+"""Guards sip/expressions/elementary: coefficients and Lagrange's bounds of series about any point of an interval,
 against the series of a library of ball arithmetic at many places of it."""
 
 from __future__ import annotations
@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from flint import arb, arb_series, ctx
 
-from sparserob_core.control.enclosures import elementary
 from sparserob_core.errors import NotEnclosable
+from sparserob_core.sip.expressions import elementary
 
 # the function in double precision, that of the library, where intervals may lie, and how far above the largest of the
 # next coefficients on the interval its bound may be
