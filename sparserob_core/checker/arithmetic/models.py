@@ -93,6 +93,15 @@ class Model:
     def __pos__(self) -> Model:
         return self
 
+    def __abs__(self) -> Model:
+        """Return the absolute value; where the sign may change it is a ball from 0 to the largest one."""
+        middle = self.constant
+        deviation = (self - self.frame.number(middle)).size
+        if middle >= deviation or -middle >= deviation:
+            return self if middle >= deviation else -self
+        half = self.size.upper() / 2
+        return self.frame.number(arb(half, half))
+
     def __sub__(self, other: object) -> Model:
         return self + -self._convert_to_model(other)
 

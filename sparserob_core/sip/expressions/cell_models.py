@@ -271,11 +271,13 @@ def _tanh(degree: int, centre: Array, low: Array, high: Array) -> Series:
 
 
 def _absolute(model: CellModels) -> CellModels:
+    """Return absolute values; where the sign may change they are only known to be from 0 to the largest one."""
     low, high = model.bounds()
-    flipped = CellModels(
-        model.space, np.where((high < 0.0)[..., None], -model.coefficients, model.coefficients), model.remainder
-    )
-    return CellModels(model.space, flipped.coefficients, np.where((low < 0.0) & (high > 0.0), np.inf, model.remainder))
+    crosses, half = (low < 0.0) & (high > 0.0), np.maximum(-low, high) / 2
+    coefficients = np.where((high <= 0.0)[..., None], -model.coefficients, model.coefficients)
+    coefficients[crosses] = 0.0
+    coefficients[..., 0][crosses] = half[crosses]
+    return CellModels(model.space, coefficients, np.where(crosses, half, model.remainder))
 
 
 CellModels.operations = {
