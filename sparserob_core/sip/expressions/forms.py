@@ -31,8 +31,10 @@ class Operand(NDArrayOperatorsMixin):
     def __array_ufunc__(self, ufunc: np.ufunc, method: str, *inputs: Any, **options: Any) -> Any:
         operation = type(self).operations.get(ufunc)
         is_outranked = any(isinstance(value, Operand) and value.rank > self.rank for value in inputs)
-        if operation is None or method != "__call__" or options or is_outranked:
+        if method != "__call__" or options or is_outranked:
             return NotImplemented
+        if operation is None:
+            raise InputError(f"the decision stands in {ufunc.__name__}, which is not known of decisions there")
         return operation(*inputs)
 
 
