@@ -221,7 +221,8 @@ def parse_cost(text: str | float, words: Words) -> ConvexCost:
     parser = _Statement(str(text), words)
     evaluation = parser.parse(parse_tree(str(text)), 0)
     try:
-        cost = ConvexCost.of(evaluation({TURNS: 1}))
+        with np.errstate(all="ignore"):
+            cost = ConvexCost.of(evaluation({TURNS: 1}))
     except InputError as error:
         raise InputError(f"objective {str(text)!r}: {error.sentence}") from None
     return cost
