@@ -69,6 +69,11 @@ class Term:
     positions: np.ndarray
     coefficients: Array
 
+    @property
+    def key(self) -> tuple[float, tuple[int, ...], tuple[float, ...]]:
+        """Numbers that two equal functions have in common."""
+        return self.constant, tuple(self.positions.tolist()), tuple(self.coefficients.tolist())
+
     @staticmethod
     def list_terms(form: AffineForm) -> list[Term]:
         """Return every affine function of a form of numbers."""
@@ -99,15 +104,20 @@ class Objective:
     @staticmethod
     def of(cost: ConvexCost) -> Objective:
         """Return the terms of a parsed cost."""
+        known: dict[object, Term] = {}
+
+        def list_terms(form: AffineForm) -> list[Term]:  # functions that are equal are one, however they are written
+            return [known.setdefault(term.key, term) for term in Term.list_terms(form)]
+
         products = list[tuple[float, Term, Term]]()
         for block in cost.products:
-            left = Term.list_terms(block.left)
-            right = left if block.right is block.left else Term.list_terms(block.right)
+            left = list_terms(block.left)
+            right = left if block.right is block.left else list_terms(block.right)
             products += [(float(weight), a, b) for weight, a, b in zip(block.weight, left, right, strict=True)]
         absolutes = [
             (float(weight), inner)
             for block in cost.absolutes
-            for weight, inner in zip(block.weight, Term.list_terms(block.form), strict=True)
+            for weight, inner in zip(block.weight, list_terms(block.form), strict=True)
         ]
         return Objective(Term.list_terms(cost.affine)[0], tuple(products), tuple(absolutes))
 
