@@ -69,6 +69,11 @@ class Term:
     positions: np.ndarray
     coefficients: Array
 
+    @property
+    def key(self) -> tuple[float, tuple[int, ...], tuple[float, ...]]:
+        """Numbers that two equal functions have in common."""
+        return self.constant, tuple(self.positions.tolist()), tuple(self.coefficients.tolist())
+
     @staticmethod
     def list_terms(form: AffineForm) -> list[Term]:
         """Return every affine function of a form of numbers."""
@@ -107,11 +112,16 @@ class Objective:
     @staticmethod
     def of(cost: ConvexCost) -> Objective:
         """Return the terms of a parsed cost; products with numbers, and absolute values of numbers, are affine."""
+        known: dict[object, Term] = {}
+
+        def list_terms(form: AffineForm) -> list[Term]:  # functions that are equal are one, however they are written
+            return [known.setdefault(term.key, term) for term in Term.list_terms(form)]
+
         linear = Term.list_terms(cost.affine)[0]
         products = list[tuple[float, Term, Term]]()
         for block in cost.products:
-            left = Term.list_terms(block.left)
-            right = left if block.right is block.left else Term.list_terms(block.right)
+            left = list_terms(block.left)
+            right = left if block.right is block.left else list_terms(block.right)
             for weight, a, b in zip(block.weight.tolist(), left, right, strict=True):
                 if a.positions.size and b.positions.size:
                     products.append((weight, a, b))
@@ -120,7 +130,7 @@ class Objective:
                     linear = linear.plus(other, weight * number)
         absolutes = list[tuple[float, Term]]()
         for absolute in cost.absolutes:
-            for weight, inner in zip(absolute.weight.tolist(), Term.list_terms(absolute.form), strict=True):
+            for weight, inner in zip(absolute.weight.tolist(), list_terms(absolute.form), strict=True):
                 if inner.positions.size:
                     absolutes.append((weight, inner))
                 else:

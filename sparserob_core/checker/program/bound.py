@@ -108,15 +108,15 @@ class Lagrangian:
         """Return a ball whose lower end is the bound."""
         self.require_convex()
         slope = self._sum_slopes()
-        free = [j for j in range(self.n) if self._needs_correction(j, slope[j])]
-        if free:
-            self._correct(free, slope)
+        corrected: set[int] = set()
+        while free := [j for j in range(self.n) if j not in corrected and self._needs_correction(j, slope[j])]:
+            corrected |= set(free)  # a correction moves other slopes too, so that they are looked at again
+            self._correct(sorted(corrected), slope)
             slope = self._sum_slopes()
         total = self.constant + sum((row.multiplier * row.constant for row in self.rows), ball(0.0))
         if not self.is_diagonal:
             entries = ((value, self.tangent[i], self.tangent[j]) for (i, j), value in self.quadratic.items())
             total = total - sum((value * a * b for value, a, b in entries), ball(0.0)) / 2
-        corrected = set(free)
         return total + sum(
             (ball(0.0) if j in corrected else self._least_value(j, slope[j]) for j in range(self.n)), ball(0.0)
         )
@@ -177,7 +177,7 @@ class Lagrangian:
 
     def _choose_target(self, j: int, slope: arb) -> arb:
         """Return the slope nearest to the one of an entry with which it does not fall for ever."""
-        weight, target = self.weights[j], slope
+        weight, target = self.weights[j].abs_lower(), slope
         if np.isposinf(self.upper[j]):
             target = largest([target, -weight])
         if np.isneginf(self.lower[j]):

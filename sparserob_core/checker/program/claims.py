@@ -114,6 +114,8 @@ def _list_rows(case: ProgramCase) -> tuple[list[WeightedRow], Array | None]:
     n = program.decisions.n
     rows: list[WeightedRow] = []
     for entry in listed(data, "constraints"):
+        if not isinstance(entry, Mapping):
+            raise Broken("constraints: expected a list of multipliers with their families and indices")
         family = case.family(entry.get("family"))
         place, multiplier = entry.get("row"), number(entry, "multiplier")
         if type(place) is not int or not 0 <= place < len(family.rows):

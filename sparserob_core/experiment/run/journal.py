@@ -250,6 +250,8 @@ def _list_component_notes(loaded: Loaded, slot: Path, note: str) -> Iterator[Map
     not the default.
     """
     location, written = loaded.place(slot), loaded.config.plain()
+    if not written[str(slot[0])]:
+        return  # the config says that there is none
     if set(written) <= set(loaded.source.data) and written[str(slot[0])]["name"] == _find_default(slot):
         location = None
     if location is not None:

@@ -319,7 +319,8 @@ def bound_polynomials(space: TaylorSpace, coefficients: Array, errors: Array, li
         The coordinate in which each polynomial varies most.
     """
     count, nu = coefficients.shape[0], space.nu
-    steepness = np.abs(coefficients) @ space.exponents
+    with np.errstate(over="ignore", invalid="ignore"):
+        steepness = np.abs(coefficients) @ space.exponents
     table = np.zeros((count, *([space.degree + 1] * nu)))
     table[(slice(None), *space.exponents.T)] = coefficients
     matrix = _conversion(space.degree)

@@ -34,7 +34,7 @@ class Operand(NDArrayOperatorsMixin):
         if method != "__call__" or options or is_outranked:
             return NotImplemented
         if operation is None:
-            raise InputError(f"a decision stands in {ufunc.__name__}, where numbers and indices alone may stand")
+            raise InputError(f"the decision stands in {ufunc.__name__}, which is not known of decisions there")
         return operation(*inputs)
 
 

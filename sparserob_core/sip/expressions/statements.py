@@ -221,7 +221,8 @@ def parse_cost(text: str | float, words: Words) -> ConvexCost:
     parser = _Statement(str(text), words)
     evaluation = parser.parse(parse_tree(str(text)), 0)
     try:
-        cost = ConvexCost.of(evaluation({TURNS: 1}))
+        with np.errstate(all="ignore"):
+            cost = ConvexCost.of(evaluation({TURNS: 1}))
     except InputError as error:
         raise InputError(f"objective {str(text)!r}: {error.sentence}") from None
     return cost
@@ -275,11 +276,14 @@ class _Statement(Parser):
         """Return the evaluation of ``chebyshev(k, x)``, the polynomial ``T_k`` at ``x``."""
         if len(node.args) != 2 or node.keywords:
             raise self.fault("chebyshev takes two arguments, as in chebyshev(k, x)")
+        for part in ast.walk(node.args[1]):
+            if isinstance(part, ast.Name) and part.id in self.words.decisions.sizes:
+                raise self.fault(f"{ast.unparse(node)!r}: the argument depends on {part.id}, which is a decision")
         degree, argument = self.whole(node.args[0], depth), self.parse(node.args[1], depth + 1)
 
         def evaluate(values: Mapping[str, Value]) -> Value:
             degrees = np.broadcast_to(degree(values), (1, values[TURNS]))[0]
-            if degrees.min() < 0 or degrees.max() > MAX_DEGREE:
+            if degrees.min(initial=0) < 0 or degrees.max(initial=0) > MAX_DEGREE:
                 raise InputError(f"the degree of chebyshev(k, x) must be from 0 to {MAX_DEGREE}")
             return _evaluate_chebyshev(degrees, argument(values))
 
@@ -304,7 +308,7 @@ class _Statement(Parser):
         def locate(values: Mapping[str, Value]) -> list[Numbers]:
             positions = [np.broadcast_to(evaluate(values), (1, values[TURNS]))[0] for evaluate in evaluations]
             for position, count in zip(positions, shape, strict=True):
-                if position.min() < 0 or position.max() >= count:
+                if position.min(initial=0) < 0 or position.max(initial=0) >= count:
                     outside = position.min() if position.min() < 0 else position.max()
                     raise InputError(f"{text}: expected a number from 0 to {count - 1}, got {outside}")
             return positions
@@ -411,6 +415,8 @@ def _make_range(*arguments: int) -> range:
 def _evaluate_chebyshev(degrees: Numbers, x: Value) -> Value:
     """Return ``T_k(x)`` for degrees ``(K,)``, by ``T_{a+b} = 2 T_a T_b - T_{a-b}`` with halves, so that errors grow
     with the square of the degree and no faster."""
+    if not degrees.size:
+        return np.zeros((1, 0))
     distinct, inverse = np.unique(degrees, return_inverse=True)
     cache: dict[int, Value] = {0: np.ones((1, 1)), 1: x}
 

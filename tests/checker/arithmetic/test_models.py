@@ -75,6 +75,7 @@ FUNCTIONS = {
     "tanh": (lambda x: x.tanh(), lambda x: x.tanh()),
     "kepler": (lambda x: x.kepler(0.3), kepler),
     "absolute": (lambda x: abs(x - 9) - abs(x), lambda x: 9 - x - abs(x)),
+    "modulus": (lambda x: abs(-x) + abs(x), lambda x: 2 * x),
     "negative": (lambda x: (x - 9) ** 3 * (x - 9) ** -1, lambda x: (x - 9) ** 2),
 }  # fmt: skip
 CLOSE = (1e-15, 2e-11, 5e-7)  # in 0, 1, 2 parameters, relative to 1 and the value
@@ -150,6 +151,17 @@ def test_degrees_beyond_are_counted_once_each_and_all() -> None:
         assert beyond <= float(first[0].rad()) <= beyond * (1 + 1e-6)
     none = Model(frame, [None, None, None, arb_poly([1])])
     assert float((none * none).parts[0][0].rad()) >= 1.0
+
+
+@pytest.mark.parametrize("frame", FRAMES, ids=["0", "1", "2"])
+def test_the_modulus_of_values_of_both_signs_is_a_ball_from_0_to_the_largest(frame: Frame) -> None:
+    with ctx.workprec(160):
+        shifts = [argument(frame) - frame.number(number(frame, point)) for point in POINTS]
+    with ctx.workprec(600):
+        for place, shifted in zip(POINTS, shifts, strict=True):
+            for point in POINTS:
+                assert at(abs(shifted), point).contains(abs(number(frame, point) - number(frame, place)))
+            assert abs(shifted).size.upper() <= 1.000001 * shifted.size.upper()
 
 
 def test_the_size_of_a_model_is_the_most_that_it_can_be() -> None:
