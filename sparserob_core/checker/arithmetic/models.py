@@ -94,10 +94,13 @@ class Model:
         return self
 
     def __abs__(self) -> Model:
-        """Return the absolute value: the model with the sign of its middle; where its values have the other sign, up to
-        ``w``, they differ from that by ``2 w`` at most."""
+        """Return the absolute value. A model of which few values have the other sign than its middle, up to ``w``,
+        differs from it by ``2 w`` at most; of another it is a ball from 0 to the largest one."""
         middle = arb(self.constant.mid())
         other = (self - self.frame.number(middle)).size.upper() - abs(middle)
+        half = self.size.upper() / 2
+        if 2 * other > half:
+            return self.frame.number(arb(half, half))
         return (-self if middle < 0 else self)._truncate(2 * other if other > 0 else arb(0))
 
     def __sub__(self, other: object) -> Model:

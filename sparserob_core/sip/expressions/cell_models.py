@@ -271,12 +271,16 @@ def _tanh(degree: int, centre: Array, low: Array, high: Array) -> Series:
 
 
 def _absolute(model: CellModels) -> CellModels:
-    """Return the absolute values: models whose values are mostly negative with the other sign; where some values have
-    the other sign, up to ``w``, they differ from that by ``2 w`` at most."""
+    """Return absolute values. Models of which few values have the other sign, up to ``w``, differ from them by ``2 w``
+    at most; of others it is only known that they are from 0 to the largest one."""
     low, high = model.bounds()
     sign = np.where(low + high < 0.0, -1.0, 1.0)
-    other = np.maximum(np.where(sign < 0.0, high, -low), 0.0)
-    return CellModels(model.space, sign[..., None] * model.coefficients, (model.remainder + 2.0 * other) * OUTWARD)
+    other, half = np.maximum(np.where(sign < 0.0, high, -low), 0.0), np.maximum(-low, high) / 2
+    crosses = 2.0 * other > half
+    coefficients = sign[..., None] * model.coefficients
+    coefficients[crosses] = 0.0
+    coefficients[..., 0][crosses] = half[crosses]
+    return CellModels(model.space, coefficients, np.where(crosses, half, model.remainder + 2.0 * other) * OUTWARD)
 
 
 CellModels.operations = {

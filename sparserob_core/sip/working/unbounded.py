@@ -207,6 +207,8 @@ def complete_multipliers(program: SemiInfiniteProgram, dual: Dual, is_priced: bo
     finite = np.isfinite(base.h)
     table = np.vstack([rows.G, base.G[finite]])
     right, count = np.concatenate([rows.h, base.h[finite]]), len(table)
+    if np.linalg.matrix_rank(np.vstack([table, base.A])[:, free]) < int(free.sum()):
+        return dual
     from scipy.optimize import linprog
 
     found = linprog(
