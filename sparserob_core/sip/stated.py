@@ -12,6 +12,7 @@ import numpy.typing as npt
 
 from sparserob_core.errors import InputError
 from sparserob_core.sip.convex_set import Array, as_bound
+from sparserob_core.sip.convexity import require_convex
 from sparserob_core.sip.expressions.forms import AffineForm, ConvexCost
 from sparserob_core.sip.expressions.rows import ExpressionRows
 from sparserob_core.sip.expressions.statements import Decisions, Row, Words, parse_cost, parse_rows, read_tables
@@ -225,6 +226,12 @@ class StatedProgram:
                     side.append(as_bound(key, given, entry.size or 1))
                 except InputError as error:
                     raise error.under("decision", name) from None
+            if (sides[0][-1] > sides[1][-1]).any():
+                raise InputError(
+                    path=f"decision.{name}.lower",
+                    expected="numbers that are not above those of upper",
+                    got=f"{sides[0][-1].tolist()} and {sides[1][-1].tolist()}",
+                )
         count = len(self.residuals)
         return (
             np.concatenate([*sides[0], np.full(count, -np.inf)]),
@@ -286,7 +293,7 @@ class StatedProgram:
         program = SemiInfiniteProgram(
             n=n,
             q=q,
-            P=_build_quadratic(entries, n) if entries else None,
+            P=require_convex("minimise", _build_quadratic(entries, n), n) if entries else None,
             weights=weights,
             lower=lower,
             upper=upper,

@@ -105,6 +105,10 @@ FAULTS: dict[str, tuple[dict[str, Any], str]] = {
     "a bound": ({"decision": {"x": StatedDecision(None, "low")}}, "decision.x.lower"),
     "bounds of another length": ({"decision": {"x": StatedDecision(2, [1.0, 2.0, 3.0])}, "minimise": "x[0]",
                                   "families": []}, "decision.x.lower"),
+    "a bound above the other": (
+        {"decision": {"x": StatedDecision(2, [0.0, 2.0], 1.0)}, "minimise": "x[0]", "families": []},
+        "decision.x.lower: expected numbers that are not above those of upper",
+    ),
     "a name": ({"decision": {"sum": StatedDecision()}}, "decision.sum: expected a name"),
     "no decision": ({"decision": {}}, "decision: expected at least one name"),
 }  # fmt: skip
@@ -121,7 +125,7 @@ def test_a_fault_is_told_with_its_key(fault: str) -> None:
 
 @pytest.mark.parametrize("objective", ["-x**2", "x*y", "x**2 + 3*x*y + y**2", "(x + y)**2 - 3*(x - y)**2"])
 def test_an_objective_that_is_not_convex_is_refused(objective: str) -> None:
-    with pytest.raises(InputError, match="positive semidefinite"):
+    with pytest.raises(InputError, match="minimise: expected a positive semidefinite matrix"):
         state({"x": (None, -1.0, 1.0), "y": (None, -1.0, 1.0)}, objective, "x >= -t").build()
 
 

@@ -42,7 +42,7 @@ class FamilyOptions(Options):
     name: str = Field(min_length=1)
     """Name of the family, in tables and messages."""
 
-    index: dict[str, Interval] | list[dict[str, Interval]]
+    index: dict[str, Interval] | Annotated[list[dict[str, Interval]], Field(min_length=1)]
     """Interval ``[lower, upper]`` of every coordinate of the index, by name; or a list of such boxes, in each of which
     the rows hold."""
 
