@@ -10,7 +10,7 @@ import numpy as np
 import sparserob_core as sr
 from sparserob_core.checker.outcome import Clock, Finding
 from sparserob_core.checker.program.claims import ProgramCase, check_program
-from sparserob_core.sip.stated import StatedDecision, StatedFamily, StatedProgram
+from sparserob_core.sip.stated.statement import StatedDecision, StatedFamily, StatedProgram
 
 GAP = 1e-7
 

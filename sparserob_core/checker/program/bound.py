@@ -21,7 +21,8 @@ from flint import arb, arb_mat
 from sparserob_core.checker.arithmetic.balls import ball, largest, smallest
 from sparserob_core.checker.outcome import Broken, Unchecked
 from sparserob_core.sip.convex_set import Array
-from sparserob_core.sip.stated import StatedProgram, Term
+from sparserob_core.sip.stated.statement import StatedProgram
+from sparserob_core.sip.stated.terms import Term
 
 MAX_ENTRIES = 300  # in products with each other: twice as many take eight times as long, a minute
 INDEPENDENT = 1e-11  # of the largest entry: a smaller pivot is rounding, and a larger one gives wide balls at worst

@@ -17,7 +17,8 @@ from sparserob_core.checker.program.bound import Lagrangian, WeightedRow, row_of
 from sparserob_core.checker.program.rows import bound_violation, coefficients_at, evaluate_row
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.expressions.rows import ExpressionRows
-from sparserob_core.sip.stated import StatedProgram, Term
+from sparserob_core.sip.stated.statement import StatedProgram
+from sparserob_core.sip.stated.terms import Term
 
 CLAIMS = ("certified", "verified")
 EQUALITY = 1e-12  # of the terms of an equality: the largest residual that double precision may leave

@@ -137,7 +137,7 @@ def _check_program(
     from sparserob_core.checker.program.claims import ProgramCase, check_program
     from sparserob_core.experiment.assemble import gap_tolerance
     from sparserob_core.experiment.check.files import compare_program
-    from sparserob_core.sip.stated import StatedProgram
+    from sparserob_core.sip.stated.statement import StatedProgram
 
     if not isinstance(program.origin, StatedProgram):
         raise InputError(f"{stored.directory}: expected a problem that is stated as data, got a program of a plugin")

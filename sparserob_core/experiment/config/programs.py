@@ -11,7 +11,7 @@ from sparserob_core.experiment.config.option_kinds import OneOrMore
 from sparserob_core.experiment.config.problems import Interval
 from sparserob_core.options import Options
 from sparserob_core.sip.program import SemiInfiniteProgram
-from sparserob_core.sip.stated import StatedDecision, StatedFamily, StatedProgram
+from sparserob_core.sip.stated.statement import StatedDecision, StatedFamily, StatedProgram
 
 Bound: TypeAlias = OneOrMore | None
 

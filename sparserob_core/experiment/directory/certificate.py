@@ -19,7 +19,7 @@ from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.evidence import Activity, Branch, Dual, Proof
 from sparserob_core.sip.program import TOLERANCE, SemiInfiniteProgram
 from sparserob_core.sip.result import Result
-from sparserob_core.sip.stated import StatedProgram
+from sparserob_core.sip.stated.statement import StatedProgram
 from sparserob_core.sip.working.unbounded import complete_multipliers
 
 if TYPE_CHECKING:

@@ -9,7 +9,7 @@ from flint import arb, ctx
 
 from sparserob_core.checker.outcome import Broken, Unchecked
 from sparserob_core.checker.program.bound import Lagrangian, row_of_term
-from sparserob_core.sip.stated import StatedProgram
+from sparserob_core.sip.stated.statement import StatedProgram
 from tests.support.stated import state
 
 UP = (None, 0.0)  # a single entry that is not negative

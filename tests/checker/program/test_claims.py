@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sparserob_core.sip.stated import StatedDecision, StatedFamily, StatedProgram
+from sparserob_core.sip.stated.statement import StatedDecision, StatedFamily, StatedProgram
 from tests.support.stated import GAP, certify, judge, state
 
 Data = dict[str, Any]

@@ -17,7 +17,7 @@ from sparserob_core.sip.expressions.statements import (
     parse_rows,
     read_tables,
 )
-from sparserob_core.sip.stated import Objective
+from sparserob_core.sip.stated.terms import Objective
 
 DECISIONS = Decisions({"a": 4, "x": None})
 TABLES = read_tables({"c": [1.0, 2.0, 3.0, 4.0], "F": [[1.0, 2.0], [3.0, 4.0], [5.0, 6.0]]})

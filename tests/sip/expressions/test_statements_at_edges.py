@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import sparserob_core as sr
-from sparserob_core.sip.stated import StatedDecision, StatedProgram
+from sparserob_core.sip.stated.statement import StatedDecision, StatedProgram
 
 DECISION = {"a": 3, "d": None}
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TypeAlias, final
 
@@ -13,10 +13,10 @@ import numpy.typing as npt
 from sparserob_core.errors import InputError
 from sparserob_core.sip.convex_set import Array, as_bound
 from sparserob_core.sip.convexity import require_convex
-from sparserob_core.sip.expressions.forms import AffineForm, ConvexCost
 from sparserob_core.sip.expressions.rows import ExpressionRows
 from sparserob_core.sip.expressions.statements import Decisions, Row, Words, parse_cost, parse_rows, read_tables
 from sparserob_core.sip.program import ConstraintFamily, SemiInfiniteProgram
+from sparserob_core.sip.stated.terms import Objective, Term
 
 Multiple: TypeAlias = tuple[int, float]
 """An entry of the decision, and the factor before it."""
@@ -59,84 +59,6 @@ class StatedFamily:
     name: str
     index: Mapping[str, Sequence[float]]
     rows: Sequence[str]
-
-
-@final
-@dataclass(frozen=True, eq=False)
-class Term:
-    """Affine function ``constant + coefficients x[positions]`` of a decision, in numbers."""
-
-    constant: float
-    positions: np.ndarray
-    coefficients: Array
-
-    @property
-    def key(self) -> tuple[float, tuple[int, ...], tuple[float, ...]]:
-        """Numbers that two equal functions have in common."""
-        return self.constant, tuple(self.positions.tolist()), tuple(self.coefficients.tolist())
-
-    @staticmethod
-    def list_terms(form: AffineForm) -> list[Term]:
-        """Return every affine function of a form of numbers."""
-        count = int(form.constant.shape[1])
-        constants = np.asarray(form.constant, dtype=float)[0]
-        order = np.argsort(form.owner, kind="stable")
-        ends = np.searchsorted(form.owner[order], np.arange(count + 1))
-        coefficients = np.asarray(form.coefficient, dtype=float)[0] if form.owner.size else np.zeros(0)
-        terms = []
-        for j in range(count):
-            part = order[ends[j] : ends[j + 1]]
-            positions, inverse = np.unique(form.position[part], return_inverse=True)
-            sums = np.zeros(positions.size)
-            np.add.at(sums, inverse.reshape(-1), coefficients[part])
-            terms.append(Term(float(constants[j]), positions[sums != 0.0], sums[sums != 0.0]))
-        return terms
-
-    def plus(self, other: Term, factor: float) -> Term:
-        """Return the sum of this function and a multiple of another one."""
-        positions = np.union1d(self.positions, other.positions).astype(int)
-        coefficients = np.zeros(positions.size)
-        coefficients[np.searchsorted(positions, self.positions)] = self.coefficients
-        coefficients[np.searchsorted(positions, other.positions)] += factor * other.coefficients
-        return Term(self.constant + factor * other.constant, positions, coefficients)
-
-
-@final
-@dataclass(frozen=True, eq=False)
-class Objective:
-    """Cost ``constant + linear + sum weight left right + sum weight |inner|``, term by term."""
-
-    linear: Term
-    products: tuple[tuple[float, Term, Term], ...]
-    absolutes: tuple[tuple[float, Term], ...]
-
-    @staticmethod
-    def of(cost: ConvexCost) -> Objective:
-        """Return the terms of a parsed cost; products with numbers, and absolute values of numbers, are affine."""
-        known: dict[object, Term] = {}
-
-        def list_terms(form: AffineForm) -> list[Term]:  # functions that are equal are one, however they are written
-            return [known.setdefault(term.key, term) for term in Term.list_terms(form)]
-
-        linear = Term.list_terms(cost.affine)[0]
-        products = list[tuple[float, Term, Term]]()
-        for block in cost.products:
-            left = list_terms(block.left)
-            right = left if block.right is block.left else list_terms(block.right)
-            for weight, a, b in zip(block.weight.tolist(), left, right, strict=True):
-                if a.positions.size and b.positions.size:
-                    products.append((weight, a, b))
-                else:
-                    number, other = (b.constant, a) if a.positions.size else (a.constant, b)
-                    linear = linear.plus(other, weight * number)
-        absolutes = list[tuple[float, Term]]()
-        for absolute in cost.absolutes:
-            for weight, inner in zip(absolute.weight.tolist(), list_terms(absolute.form), strict=True):
-                if inner.positions.size:
-                    absolutes.append((weight, inner))
-                else:
-                    linear = replace(linear, constant=linear.constant + weight * abs(inner.constant))
-        return Objective(linear, tuple(products), tuple(absolutes))
 
 
 @final

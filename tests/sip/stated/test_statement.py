@@ -12,7 +12,7 @@ from flint import arb_mat, ctx
 import sparserob_core as sr
 from sparserob_core.errors import InputError
 from sparserob_core.sip import stated
-from sparserob_core.sip.stated import StatedDecision, StatedFamily, StatedProgram
+from sparserob_core.sip.stated.statement import StatedDecision, StatedFamily, StatedProgram
 from tests.support.stated import state
 
 UNIT = {"t": (0.0, 1.0)}

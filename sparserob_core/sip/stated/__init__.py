@@ -1,0 +1,1 @@
+"""Semi-infinite programs that are stated as text."""
