@@ -105,10 +105,10 @@ class Objective:
     @staticmethod
     def of(cost: ConvexCost) -> Objective:
         """Return the terms of a parsed cost."""
-        known: dict[object, Term] = {}
+        terms: dict[object, Term] = {}
 
         def list_terms(form: AffineForm) -> list[Term]:  # functions that are equal are one, however they are written
-            return [known.setdefault(term.key, term) for term in Term.list_terms(form)]
+            return [terms.setdefault(term.key, term) for term in Term.list_terms(form)]
 
         products = list[tuple[float, Term, Term]]()
         for block in cost.products:
