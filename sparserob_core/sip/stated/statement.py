@@ -63,6 +63,71 @@ class StatedFamily:
 
 @final
 @dataclass(frozen=True, eq=False)
+<<<<<<< HEAD:sparserob_core/sip/stated/statement.py
+=======
+class Term:
+    """Affine function ``constant + coefficients x[positions]`` of a decision, in numbers."""
+
+    constant: float
+    positions: np.ndarray
+    coefficients: Array
+
+    @property
+    def key(self) -> tuple[float, tuple[int, ...], tuple[float, ...]]:
+        """Numbers that two equal functions have in common."""
+        return self.constant, tuple(self.positions.tolist()), tuple(self.coefficients.tolist())
+
+    @staticmethod
+    def list_terms(form: AffineForm) -> list[Term]:
+        """Return every affine function of a form of numbers."""
+        count = int(form.constant.shape[1])
+        constants = np.asarray(form.constant, dtype=float)[0]
+        order = np.argsort(form.owner, kind="stable")
+        ends = np.searchsorted(form.owner[order], np.arange(count + 1))
+        coefficients = np.asarray(form.coefficient, dtype=float)[0] if form.owner.size else np.zeros(0)
+        terms = []
+        for j in range(count):
+            part = order[ends[j] : ends[j + 1]]
+            positions, inverse = np.unique(form.position[part], return_inverse=True)
+            sums = np.zeros(positions.size)
+            np.add.at(sums, inverse.reshape(-1), coefficients[part])
+            terms.append(Term(float(constants[j]), positions[sums != 0.0], sums[sums != 0.0]))
+        return terms
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Objective:
+    """Cost ``constant + linear + sum weight left right + sum weight |inner|``, term by term."""
+
+    linear: Term
+    products: tuple[tuple[float, Term, Term], ...]
+    absolutes: tuple[tuple[float, Term], ...]
+
+    @staticmethod
+    def of(cost: ConvexCost) -> Objective:
+        """Return the terms of a parsed cost."""
+        terms: dict[object, Term] = {}
+
+        def list_terms(form: AffineForm) -> list[Term]:  # functions that are equal are one, however they are written
+            return [terms.setdefault(term.key, term) for term in Term.list_terms(form)]
+
+        products = list[tuple[float, Term, Term]]()
+        for block in cost.products:
+            left = list_terms(block.left)
+            right = left if block.right is block.left else list_terms(block.right)
+            products += [(float(weight), a, b) for weight, a, b in zip(block.weight, left, right, strict=True)]
+        absolutes = [
+            (float(weight), inner)
+            for block in cost.absolutes
+            for weight, inner in zip(block.weight, list_terms(block.form), strict=True)
+        ]
+        return Objective(Term.list_terms(cost.affine)[0], tuple(products), tuple(absolutes))
+
+
+@final
+@dataclass(frozen=True, eq=False)
+>>>>>>> work/tests:sparserob_core/sip/stated.py
 class StatedProgram:
     """A semi-infinite program as text.
 

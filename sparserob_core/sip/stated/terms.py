@@ -63,10 +63,10 @@ class Objective:
     @staticmethod
     def of(cost: ConvexCost) -> Objective:
         """Return the terms of a parsed cost; products with numbers, and absolute values of numbers, are affine."""
-        known: dict[object, Term] = {}
+        distinct: dict[object, Term] = {}
 
         def list_terms(form: AffineForm) -> list[Term]:  # functions that are equal are one, however they are written
-            return [known.setdefault(term.key, term) for term in Term.list_terms(form)]
+            return [distinct.setdefault(term.key, term) for term in Term.list_terms(form)]
 
         linear = Term.list_terms(cost.affine)[0]
         products = list[tuple[float, Term, Term]]()
