@@ -71,15 +71,14 @@ class BoundedSlopes:
     def enclose(self, x: Array, lower: Array, upper: Array) -> tuple[Array, np.ndarray]:
         """Return upper bounds ``(k,)`` of the violation at a decision over cells, and the coordinates to halve."""
         widths = np.maximum(upper - lower, 0.0)
-        entries = (
-            float(np.abs(x).sum()) + 1.0
-        )  # every entry of a row, and its right-hand side, moves by at most so much
+        entries = float(np.abs(x).sum()) + 1.0  # how far a row moves where all its entries and the right side move by 1
         if self.order == 1:
             parts = entries * self.bounds * widths / 2
             values = self._evaluate(x, lower + widths / 2)
         else:  # a function is below its multilinear interpolant but for its curvatures in single coordinates
             parts = entries * self.bounds * widths**2 / 8
-            corners = product(*([0.0, 1.0] if width else [0.0] for width in (widths > 0.0).any(axis=0)))
+            moves = np.any(widths > 0.0, axis=0).tolist()
+            corners = product(*([0.0, 1.0] if axis_moves else [0.0] for axis_moves in moves))
             values = np.max([self._evaluate(x, lower + np.array(corner) * widths) for corner in corners], axis=0)
         bounds = values + parts.sum(axis=1) * OUTWARD
         return bounds, np.where(parts.any(axis=1, keepdims=True), parts, widths).argmax(axis=1)
