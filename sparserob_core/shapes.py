@@ -11,10 +11,12 @@ from __future__ import annotations
 
 import os
 from dataclasses import fields
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar
 
 import numpy as np
+import numpy.typing as npt
 
+Array: TypeAlias = npt.NDArray[np.float64]
 CHECKED = bool(os.environ.get("SPARSEROB_SHAPES"))
 F = TypeVar("F")
 

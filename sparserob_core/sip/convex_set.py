@@ -9,16 +9,15 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 
 from sparserob_core.brief import noun
 from sparserob_core.errors import InputError
+from sparserob_core.shapes import Array as Array  # noqa: PLC0414  where the rest of the core takes it from
 from sparserob_core.shapes import Bool, Float, sealed, shaped
-
-Array: TypeAlias = npt.NDArray[np.float64]
 
 HALVINGS = 60
 RELATIVE = 1e-12  # accuracy of a gauge that is computed from the support function alone

@@ -377,7 +377,7 @@ class ConstraintFamily:
 
         return ConstraintFamily(
             name=name,
-            index_set=expressions.box,
+            index_set=Box(expressions.lower, expressions.upper),
             rows=expressions.evaluate,
             enclosure=enclose,
             excess=expressions.violations,
@@ -436,7 +436,7 @@ class ConstraintFamily:
         >>> result.status, round(result.cost, 5)
         ('certified', 1.85914)
         """
-        slopes = BoundedSlopes.of(rows, index_set, lipschitz, curvature)
+        slopes = BoundedSlopes.of(rows, index_set.lower, index_set.upper, lipschitz, curvature)
 
         def enclose(x: Array, lower: Array, upper: Array) -> Enclosure:
             return Enclosure(*slopes.enclose(x, lower, upper))

@@ -123,8 +123,8 @@ def _list_rows(case: ProgramCase) -> tuple[list[WeightedRow], Array | None]:
             raise Broken(f"the family {entry.get('family')!r} has no row {place!r}")
         if multiplier < 0.0:
             raise Broken(f"a multiplier is {multiplier!r}, expected a number that is not negative")
-        index = shaped(entry, "index", (family.box.dimension,))
-        if (index < family.box.lower).any() or (index > family.box.upper).any():
+        index = shaped(entry, "index", (family.dimension,))
+        if (index < family.lower).any() or (index > family.upper).any():
             raise Broken(f"the index {index.tolist()} is outside of the index set")
         coefficients, constant = coefficients_at(family, family.rows[place], index, n)
         rows.append(WeightedRow(coefficients, constant, ball(multiplier)))
@@ -212,8 +212,8 @@ def _verify_witness(case: ProgramCase) -> str:
     place = witness.get("row")
     if type(place) is not int or not 0 <= place < len(family.rows):
         raise Broken(f"the family has no row {place!r}")
-    index = shaped(witness, "index", (family.box.dimension,))
-    if (index < family.box.lower).any() or (index > family.box.upper).any():
+    index = shaped(witness, "index", (family.dimension,))
+    if (index < family.lower).any() or (index > family.upper).any():
         raise Broken(f"the index {index.tolist()} is outside of the index set")
     violation = evaluate_row(family, family.rows[place], case.decision, index)
     if not violation > TOLERANCE:

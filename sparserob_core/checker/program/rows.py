@@ -34,8 +34,8 @@ def bound_violation(rows: ExpressionRows, row: Row, x: Array, limit: float, cloc
     Raises `Broken` where an index violates it by more than the ``limit``, and `Unchecked` where too many cells are
     needed.
     """
-    work, worst = [(rows.box.lower, rows.box.upper)], -np.inf
-    frame = _make_frame(rows.box.dimension)
+    work, worst = [(rows.lower, rows.upper)], -np.inf
+    frame = _make_frame(rows.dimension)
     decision = np.array([frame.number(ball(value)) for value in x] or [frame.number(ball(0.0))], dtype=object)
     for number in count():
         if not work:
@@ -50,7 +50,7 @@ def bound_violation(rows: ExpressionRows, row: Row, x: Array, limit: float, cloc
             continue
         middle = lower + (upper - lower) / 2
         _require_kept(rows, row, x, middle, limit)
-        shares = (upper - lower) / np.maximum(rows.box.upper - rows.box.lower, np.finfo(float).tiny)
+        shares = (upper - lower) / np.maximum(rows.upper - rows.lower, np.finfo(float).tiny)
         axis = int(shares.argmax())
         if not lower[axis] < middle[axis] < upper[axis]:
             raise Unchecked(f"no cell around the index {middle.tolist()} is short enough for {row.text!r}")

@@ -13,7 +13,7 @@ from typing import Any, ClassVar, TypeAlias, final
 
 import numpy as np
 
-from sparserob_core.sip.convex_set import Array
+from sparserob_core.shapes import Array
 from sparserob_core.sip.expressions.forms import Numbers, Operand, take_columns
 from sparserob_core.sip.expressions.rounding import EPSILON, rounding
 from sparserob_core.sip.expressions.taylor import OUTWARD, TaylorSpace

@@ -14,7 +14,7 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from sparserob_core.errors import InputError
-from sparserob_core.sip.convex_set import Array
+from sparserob_core.shapes import Array
 from sparserob_core.sip.expressions.elementary import FUNCTIONS, eccentric_anomaly
 
 Value: TypeAlias = Any

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.lib.mixins import NDArrayOperatorsMixin
 
 from sparserob_core.errors import InputError
-from sparserob_core.sip.convex_set import Array
+from sparserob_core.shapes import Array
 
 Value: TypeAlias = Any
 """An array ``(k, K)``, or anything that stands for one."""

@@ -9,8 +9,7 @@ from typing import final
 import numpy as np
 
 from sparserob_core.errors import InputError
-from sparserob_core.shapes import Float, shaped
-from sparserob_core.sip.convex_set import Array, Box
+from sparserob_core.shapes import Array, Float, shaped
 from sparserob_core.sip.expressions.cell_models import CellModels, bound_polynomials
 from sparserob_core.sip.expressions.forms import Numbers
 from sparserob_core.sip.expressions.statements import Decisions, Row, Tables, Words, parse_rows
@@ -33,13 +32,14 @@ class ExpressionRows:
         The names.
     rows : tuple of Row
         The rows, each ``form(index) <= 0``.
-    box : Box
-        The index set.
+    lower, upper : array (d,)
+        Corners of the index set.
     """
 
     words: Words
     rows: tuple[Row, ...]
-    box: Box
+    lower: Array
+    upper: Array
 
     @staticmethod
     def parse(
@@ -55,9 +55,14 @@ class ExpressionRows:
         if not texts:
             raise InputError(path="rows", expected="at least one row", got="none")
         parsed = [row for text in texts for row in parse_rows(text, words)]
-        found = ExpressionRows(words, tuple(parsed), Box(lower, upper))
-        found.evaluate(found.box.interior_point()[None])  # whatever cannot be evaluated is told at once
+        found = ExpressionRows(words, tuple(parsed), lower, upper)
+        found.evaluate((lower + (upper - lower) / 2)[None])  # whatever cannot be evaluated is told at once
         return found
+
+    @property
+    def dimension(self) -> int:
+        """Number of coordinates of an index."""
+        return int(self.lower.size)
 
     @shaped
     def evaluate(self, indices: Float[Array, "k d"]) -> tuple[Float[Array, "k r n"], Float[Array, "k r"]]:
@@ -79,7 +84,7 @@ class ExpressionRows:
 
         A bound of 0 or less is as sharp as it needs to be.
         """
-        space = taylor_space(self.box.dimension, DEGREES.get(self.box.dimension, 2))
+        space = taylor_space(self.dimension, DEGREES.get(self.dimension, 2))
         bounds, split = np.full(len(lower), -np.inf), (upper - lower).argmax(axis=1)
         size = max(1, MAX_NUMBERS // (space.products[0].size * (x.size + 1)))
         for row in self.rows:

@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from sparserob_core.errors import InputError
-from sparserob_core.sip.convex_set import Array, Box
+from sparserob_core.shapes import Array
 from sparserob_core.sip.expressions.rounding import rounding
 
 SAMPLES = 64  # indices at which a stated bound is compared with the rows; a tenth misses what turns a few times
@@ -32,8 +32,8 @@ class BoundedSlopes:
     ----------
     rows : callable
         Maps indices ``(k, d)`` to ``(G (k, r, n), h (k, r))``.
-    box : Box
-        Index set.
+    lower, upper : array (d,)
+        Corners of the index set.
     bounds : array (d,)
         Bound of the modulus of every entry's derivative in each coordinate of the index, of the first ``order``, or of
         the second.
@@ -42,12 +42,15 @@ class BoundedSlopes:
     """
 
     rows: Rows
-    box: Box
+    lower: Array
+    upper: Array
     bounds: Array
     order: int
 
     @staticmethod
-    def of(rows: Rows, box: Box, lipschitz: npt.ArrayLike | None, curvature: npt.ArrayLike | None) -> BoundedSlopes:
+    def of(
+        rows: Rows, lower: Array, upper: Array, lipschitz: npt.ArrayLike | None, curvature: npt.ArrayLike | None
+    ) -> BoundedSlopes:
         """Return the rows with the bound that is given, after a look at samples; raise `InputError` where these
         contradict it."""
         given = {"lipschitz": lipschitz, "curvature": curvature}
@@ -56,15 +59,15 @@ class BoundedSlopes:
             raise InputError(path="lipschitz", expected="one of lipschitz and curvature", got=f"{len(named)} of them")
         name = named[0]
         try:
-            bounds = np.broadcast_to(np.asarray(given[name], dtype=float), (box.dimension,)).copy()
+            bounds = np.broadcast_to(np.asarray(given[name], dtype=float), (lower.size,)).copy()
         except ValueError:
             bounds = np.full(1, np.nan)
         if not (np.isfinite(bounds).all() and (bounds >= 0.0).all()):
-            expected = f"a number that is not negative, or {box.dimension} of them"
+            expected = f"a number that is not negative, or {lower.size} of them"
             raise InputError(path=name, expected=expected, got=repr(given[name]))
-        if name == "curvature" and box.dimension > MAX_COORDINATES:
+        if name == "curvature" and lower.size > MAX_COORDINATES:
             raise InputError(path=name, expected=f"an index of at most {MAX_COORDINATES} coordinates", got="more")
-        found = BoundedSlopes(rows, box, bounds, 1 if name == "lipschitz" else 2)
+        found = BoundedSlopes(rows, lower, upper, bounds, 1 if name == "lipschitz" else 2)
         found._require_plausible(name)
         return found
 
@@ -85,19 +88,19 @@ class BoundedSlopes:
 
     def _evaluate(self, x: Array, indices: Array) -> Array:
         """Return the largest violation of all rows at each index, with the rounding of the sums added."""
-        G, h = self.rows(np.clip(indices, self.box.lower, self.box.upper))
+        G, h = self.rows(np.clip(indices, self.lower, self.upper))
         rounded = rounding(x.size + 1) * (np.abs(G) @ np.abs(x) + np.abs(h))
         return np.asarray((G @ x - h + rounded).max(axis=1), dtype=float)
 
     def _require_plausible(self, name: str) -> None:
         """Raise `InputError` where differences of the rows at samples exceed the bound."""
-        sides, rng = self.box.upper - self.box.lower, np.random.default_rng(0)
+        sides, rng = self.upper - self.lower, np.random.default_rng(0)
         for axis in np.flatnonzero(sides > 0.0).tolist():
             step = STEP * sides[axis]
             room = sides.copy()
             room[axis] -= 2.0 * step
-            first = self.box.lower + rng.random((SAMPLES, self.box.dimension)) * room
-            points = [first + k * step * np.eye(self.box.dimension)[axis] for k in range(3)]
+            first = self.lower + rng.random((SAMPLES, self.lower.size)) * room
+            points = [first + k * step * np.eye(self.lower.size)[axis] for k in range(3)]
             tables = [np.concatenate([G, h[..., None]], axis=2) for G, h in map(self.rows, points)]
             change = tables[1] - tables[0] if self.order == 1 else tables[2] - 2.0 * tables[1] + tables[0]
             size = max(float(np.abs(table).max(initial=0.0)) for table in tables)

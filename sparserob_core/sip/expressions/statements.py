@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from sparserob_core.errors import InputError
-from sparserob_core.sip.convex_set import Array
+from sparserob_core.shapes import Array
 from sparserob_core.sip.expressions.elementary import FUNCTIONS
 from sparserob_core.sip.expressions.expression import CONSTANTS, KEPLER, Evaluation, Parser, parse_tree
 from sparserob_core.sip.expressions.forms import (

@@ -18,8 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from sparserob_core.errors import InputError, NotEnclosable
-from sparserob_core.shapes import Float, shaped
-from sparserob_core.sip.convex_set import Array
+from sparserob_core.shapes import Array, Float, shaped
 from sparserob_core.sip.expressions.elementary import (
     Series,
     cos_series,
