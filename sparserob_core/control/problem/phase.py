@@ -543,7 +543,7 @@ class Phase:
                 else _make_read_only(entry[None])
             )
         shape = self._shape(name)
-        if isinstance(entry, ExpressionMatrix):
+        if isinstance(entry, ExpressionMatrix) or (isinstance(entry, Through) and entry.takes_arrays):
             values = entry.evaluate(points)
         else:
             rows = [self._call_function(name, point) for point in points]
@@ -659,6 +659,25 @@ class Through:
         """Return the matrix at other arguments ``(n,)``."""
         matrix = self.entry(self.arguments(p))
         return matrix if self.factor is None else np.asarray(matrix, dtype=object) * self.factor
+
+    @property
+    def takes_arrays(self) -> bool:
+        """True where the entry is made of expressions, which `evaluate` takes at many points together."""
+        entry = self.entry
+        return isinstance(entry, ExpressionMatrix) or (isinstance(entry, Through) and entry.takes_arrays)
+
+    def evaluate(self, points: Array) -> Array:
+        """Return the matrices ``(k, rows, columns)`` at other arguments ``(k, n)``."""
+        assert isinstance(self.entry, ExpressionMatrix | Through)
+        columns = np.empty(points.shape[1], dtype=object)
+        for i, column in enumerate(points.T):
+            columns[i] = column
+        arguments = self.arguments(columns)
+        inner = np.empty((len(points), len(arguments)))
+        for i, column in enumerate(arguments):
+            inner[:, i] = column
+        matrices = self.entry.evaluate(inner)
+        return matrices if self.factor is None else matrices * self.factor
 
 
 def through(entry: _Entry | None, arguments: Callable[[_Arguments], _Arguments]) -> _Entry | None:

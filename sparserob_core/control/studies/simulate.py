@@ -35,7 +35,8 @@ def fine_times(response: Response, parameters: ParameterIndex, more: Array) -> A
     on it, and fewer where there are many pieces; ``(T,)``."""
     grid = response.grid
     points = parameters.lattice()[0]
-    rate = max(pace(A) for mode in response.system.modes for A in mode.matrices(points)[0])
+    matrices = np.concatenate([mode.matrices(points)[0] for mode in response.system.modes])
+    rate = max(pace(A) for A in np.unique(matrices, axis=0))
     fewest = INSIDE + 1 if grid.pieces < MANY else 1
     counts = np.clip(np.ceil(rate * grid.lengths / SMOOTH), fewest, MAX_INSIDE).astype(int)
     index = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)

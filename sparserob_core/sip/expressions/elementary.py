@@ -127,8 +127,10 @@ def eccentric_anomaly(anomaly: npt.ArrayLike, eccentricity: float) -> Any:
     for _ in range(KEPLER_STEPS):
         residual = E - eccentricity * np.sin(E) - M
         low, high = np.where(residual < 0.0, E, low), np.where(residual > 0.0, E, high)
-        iterate = E - residual / (1.0 - eccentricity * np.cos(E))
+        iterate, before = E - residual / (1.0 - eccentricity * np.cos(E)), E
         E = np.where((iterate >= low) & (iterate <= high), iterate, (low + high) / 2)
+        if np.array_equal(E, before):  # no further step changes anything
+            break
     return E if M.ndim else np.float64(E)
 
 

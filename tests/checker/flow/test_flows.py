@@ -11,6 +11,7 @@ from flint import arb, ctx
 
 import sparserob_core as sr
 from sparserob_core.checker.flow import flows as several
+from sparserob_core.checker.flow.flow import VerifiedFlow
 from sparserob_core.checker.flow.flows import VerifiedFlows
 from sparserob_core.checker.flow.law import ParameterBox
 from sparserob_core.checker.flow.plant import Plant
@@ -111,6 +112,30 @@ def test_what_does_not_change_with_time_has_a_flow_for_every_box() -> None:
     assert every.holding(box) is flow and every.over(box, 3) is not flow
     known = VerifiedFlows(Plant.of(LinearSystem(np.eye(1), np.ones((1, 1))), 1.0), 1.0)
     assert known.holding(ParameterBox()) is known.at(()) and known.degree == 0
+
+
+def test_a_flow_that_is_a_polynomial_in_the_parameters_is_expanded_to_its_degree_and_no_further() -> None:
+    box, names = sr.Box([-0.5, 0.5], [0.5, 1.5]), ["p", "q"]
+    for A, B, degree in (
+        ([[0, "t"], [0, 0]], [["p"], ["q"]], 1),  # only inputs depend on parameters
+        ([[0, "t*p"], [0, 0]], [[0], ["q^2"]], 3),  # a chain of two states: p times q^2
+        ([[0, "t"], ["p", 0]], [[0], [1]], 5),  # a circle: no polynomial
+        ([[0, "t"], [-1, 0]], [["exp(p)"], ["q"]], 5),
+        ([[0, "t"], [-1, 0]], [[1], [0]], 1),  # nothing depends on them
+    ):  # fmt: skip
+        system = VaryingSystem.of(A, B, 2.0, [[1, 0], [0, 1]], parameters=box, names=names)
+        every = VerifiedFlows(Plant.of(system, 2.0), 2.0, ParameterBox.between([-0.5, 0.5], [0.5, 1.5]))
+        limit = every.over(every.box, 5)
+        assert limit.degree == degree, A
+        for point in ([-0.5, 0.5], [0.25, 1.375]):
+            s = [(arb(x) - m) / h for x, m, h in zip(point, every.box.middle, every.box.halves, strict=True)]
+            known = VerifiedFlow(every.plant, 2.0).at(point).over(0.0, 2.0)
+            for mine, wide, other in zip(every.at(point).over(0.0, 2.0), limit.over(0.0, 2.0), known, strict=True):
+                powers = [s[0] ** m * s[1] ** n for m, n in wide.monomials.exponents]
+                total = sum((part * power for part, power in zip(wide.parts, powers, strict=True)), wide.parts[0] * 0)
+                for a, b, c in zip(mine.matrix.entries(), total.entries(), other.matrix.entries(), strict=True):
+                    assert a.overlaps(c) and b.overlaps(c)
+                    assert float(a.rad()) < 1e-25 and float(b.rad()) < (1e-15 if degree < 5 else 0.1)
 
 
 def test_the_parameter_that_matters_most_is_halved() -> None:

@@ -386,6 +386,22 @@ def test_during_one_time_it_is_a_phase_of_its_parameters():
     enclosed(still, np.array([0.1]), np.array([0.2]))
 
 
+@pytest.mark.parametrize("units", [False, True])
+def test_expressions_of_other_arguments_are_evaluated_at_many_points_together(units, monkeypatch):
+    entries = [parse_matrix("A", [["k*sin(t)", "2"], ["t - k", "k^2"]], ("t", "k"))] * 3
+    phase = Phase(*entries, BOX, ("t", "k"), None, 0.5, 1.5, True)
+    if units:
+        phase = phase.in_units(UNITS["A"], UNITS["A"], UNITS["A"], np.array([4.0, 8.0]), 1.0, 4.0)
+    still, points = phase.during(0.7 / (4.0 if units else 1.0), Box([-0.02], [0.04])), np.linspace(-0.02, 0.04, 9)
+    one_by_one = [np.array(still.entry("A")(np.array([k])), dtype=float) for k in points]
+    monkeypatch.setattr(ExpressionMatrix, "__call__", lambda *_: pytest.fail("a point was evaluated alone"))
+    for table in still.matrices(points[:, None]):
+        np.testing.assert_allclose(table, one_by_one, rtol=1e-14)
+    k = points[3] * (8.0 if units else 1.0)
+    wanted = np.array([[k * np.sin(0.7), 2.0], [0.7 - k, k**2]]) * (UNITS["A"] if units else 1.0)
+    np.testing.assert_allclose(still.matrices(points[3:4, None])[0][0], wanted, rtol=1e-14)
+
+
 def test_later_its_clock_begins_again():
     phase = timed()
     late = phase.later(0.0, 0.5, 1.0)

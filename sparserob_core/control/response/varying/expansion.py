@@ -18,6 +18,7 @@ from weakref import WeakKeyDictionary, ref
 
 import numpy as np
 
+from sparserob_core.control.enclosures.cache import remember
 from sparserob_core.control.enclosures.dependence import ExpandedSystem, Superposed
 from sparserob_core.control.problem.phase import Phase, PhaseInUnits
 from sparserob_core.control.problem.system import System
@@ -39,6 +40,7 @@ SHARPEST = 1e-13  # remainder on a segment, as a share of the numbers: ten times
 BLUNTEST = 1e-10  # from which on a segment is halved even where that did not help: else what a state misses shows
 SHORTEST = 2.0**-30  # of the horizon: a shorter segment without an enclosure holds a pole
 _CACHE: WeakKeyDictionary[Phase, dict[tuple[object, ...], Expansion]] = WeakKeyDictionary()
+RESPONSES_KEPT = 4  # sets of intervals whose responses are remembered: those of pieces, and of the times of three grids
 FIRST = 8  # segments to begin with
 MAX_SEGMENTS = 100_000
 """Segments at most. Ten times as many take an hour and gigabytes; of a tenth systems would be refused that are solved
@@ -231,6 +233,11 @@ class Expansion:
             The transitions ``(v, k, d, d)``; and the responses to constant inputs, those to the disturbance after the
             others, ``(v, k, d, n)``.
         """
+        if (by_monomial := self._inputs_by_monomial) is not None:
+            state, inputs = by_monomial._respond_once(starts, stops)
+            inputs = inputs.reshape(starts.size, self.own, -1, sum(self.channels))
+            powers = np.broadcast_to(powers, (len(powers), starts.size, powers.shape[2]))[..., self._nonzero_monomials]
+            return np.broadcast_to(state, (len(powers), *state.shape)), np.einsum("vka,kiaj->vkij", powers, inputs)
         own, shape = self.own, (len(powers), starts.size)
         state, inputs = np.tile(np.eye(own), (*shape, 1, 1)), np.zeros((*shape, own, sum(self.channels)))
         first = self.segment_of(starts)
@@ -270,6 +277,36 @@ class Expansion:
         terms, _ = _bound_tail(sizes, shares)
         responses = self._sum_series(law[..., :own], law[..., own:], terms, DEGREE, 1)
         return responses.reshape(*shape[:2], own, -1)
+
+    @cached_property
+    def _inputs_by_monomial(self) -> Expansion | None:
+        """The known system whose inputs are those of every monomial in the parameters, side by side; ``None`` where
+        ``A`` depends on parameters. Its responses are those at any parameters but for sums over monomials."""
+        if self.spread is None:
+            return None
+        own, count = self.own, sum(self.channels)
+        law = self._own_coefficients.reshape(*self._own_coefficients.shape[:2], -1, own, own + count)
+        if law[:, :, 1:, :, :own].any():
+            return None
+        inputs = law[:, :, self._nonzero_monomials, :, own:].swapaxes(2, 3).reshape(*law.shape[:2], own, -1)
+        coefficients = np.concatenate([law[:, :, 0, :, :own], inputs], axis=3)
+        unbounded, ones = np.full(coefficients[:, 0].shape, np.inf), np.ones((len(law), own))
+        return Expansion(self.ends, coefficients, unbounded, self.units[:own], ones, (inputs.shape[3], 0), self.turns)
+
+    def _respond_once(self, starts: Array, stops: Array) -> tuple[Array, Array]:
+        """Return the responses of a known system over intervals, ``(k, d, d)`` and ``(k, d, n)``, without bounds of
+        their error. Equal intervals are followed once, and the last few sets of intervals are remembered."""
+        intervals, indices = np.unique(np.stack([starts, stops]), axis=1, return_inverse=True)
+        key = intervals.tobytes()
+        if key not in self._responses:
+            responses = self.at_parameters(intervals[0], intervals[1], np.ones((1, 1, 1)))
+            remember(self._responses, key, responses, RESPONSES_KEPT)
+        state, inputs = self._responses[key]
+        return state[0, indices.reshape(-1)], inputs[0, indices.reshape(-1)]
+
+    @cached_property
+    def _responses(self) -> dict[bytes, tuple[Array, Array]]:
+        return {}
 
     @cached_property
     def _nonzero_monomials(self) -> np.ndarray:

@@ -13,6 +13,8 @@ import sparserob_core.control.response.varying.expansion as varying
 from sparserob_core.control.problem.system import VaryingSystem
 from sparserob_core.control.response.response import Response, merge_grids
 from sparserob_core.control.response.varying.expansion import Expansion, Flow, balanced, steadied
+from sparserob_core.control.response.varying.spread import law_of
+from sparserob_core.control.sets.sets import Box
 from sparserob_core.errors import InputError
 from sparserob_core.sip.convex_set import Array
 from tests.support.integration import mathieu
@@ -40,6 +42,34 @@ def test_a_flow_is_the_closed_form() -> None:
     for mine, other in zip(found[:3], exact[:3], strict=True):
         np.testing.assert_allclose(mine, other, rtol=1e-13, atol=1e-15)
     assert (found.error < SHARP).all() and found.error[4] == 0.0
+
+
+def test_parameters_of_inputs_alone_share_one_series(monkeypatch: pytest.MonkeyPatch) -> None:
+    system = VaryingSystem.of(
+        [[0, "1 + t"], ["-(1 + t)", 0]], [["p^2", "q*t"], [1, "2 - p"]], 4.0, [["q"], ["p*q"]],
+        parameters=Box([-0.5, 1.0], [0.5, 3.0]), names=["p", "q"],
+    )  # fmt: skip
+    law, summed = law_of(system), list[int]()
+    points = np.random.default_rng(1).uniform([-0.5, 1.0], [0.5, 3.0], (7, 2))
+    known = [Expansion.of(system.at(point)).flow(STARTS, STOPS) for point in points]
+    sum_series = Expansion._sum_series
+    monkeypatch.setattr(
+        Expansion, "_sum_series", lambda self, A, *rest: summed.append(len(A)) or sum_series(self, A, *rest)
+    )
+    state, inputs = law.over(STARTS, STOPS, points)
+    np.testing.assert_allclose(state, [flow.state for flow in known], atol=2e-14)
+    np.testing.assert_allclose(
+        inputs, [np.concatenate([flow.control, flow.disturbance], axis=2) for flow in known], rtol=0, atol=2e-13
+    )
+    solved = sum(summed)
+    assert solved <= STARTS.size * (law.expansions[0].ends.size - 1)  # as for one parameter
+    rows = np.array([2, 0, 1])
+    along = law.along(STARTS[rows], STOPS[rows], points[rows])
+    for mine, every in zip(along, (state, inputs), strict=True):
+        np.testing.assert_allclose(mine, every[rows, rows], atol=1e-14)
+    assert sum(summed) - solved <= rows.size * (law.expansions[0].ends.size - 1)
+    law.over(STARTS, STOPS, points[:2] + 0.01)
+    assert sum(summed) - solved <= rows.size * (law.expansions[0].ends.size - 1)  # nothing more
 
 
 def test_a_rotation_of_growing_speed_turns_by_its_integral() -> None:
