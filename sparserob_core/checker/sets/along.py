@@ -60,6 +60,11 @@ class NormSummand:
         """The number of coordinates, ``mw``."""
         return self.before + self.offset.size + self.after
 
+    @property
+    def is_symmetric(self) -> bool:
+        """True where the middle is 0."""
+        return not self.offset.any()
+
     def widened(self, before: int, after: int) -> NormSummand:
         """Return the set with 0 in further coordinates before and after its own."""
         return replace(self, before=self.before + before, after=self.after + after)

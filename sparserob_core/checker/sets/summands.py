@@ -41,6 +41,11 @@ class Summand:
         """The upper bound of the absolute value of every coordinate on the set, ``(mw,)``."""
         return np.asarray((np.abs(self.corners) + self.rad).max(axis=0) * OUTWARD)
 
+    @property
+    def is_symmetric(self) -> bool:
+        """True where the corners are opposite in pairs, the first to the last."""
+        return all(np.array_equal(values, sign * values[::-1]) for values, sign in ((self.corners, -1), (self.rad, 1)))
+
     def widened(self, before: int, after: int) -> Summand:
         """Return the set with 0 in further coordinates before and after its own."""
         return Summand(*(np.pad(table, ((0, 0), (before, after))) for table in (self.corners, self.rad)))
