@@ -255,7 +255,9 @@ class AdjointRow:
         rad = (
             self.step * np.einsum("kjq,j->kq", self.driven.rad, self._integration_weights) + rounding(ORDER + 2) * size
         )
-        return Enclosed(accumulate_exactly(increments), accumulate_bounds(rad) * OUTWARD)
+        return Enclosed(
+            accumulate_exactly(increments), np.vstack([np.zeros((1, rad.shape[1])), np.cumsum(rad, axis=0)]) * OUTWARD
+        )
 
     def placed(self, times: Array) -> tuple[np.ndarray, Array]:
         """Return the step that holds each time, and the share of the step that has passed, both exact."""
@@ -382,11 +384,6 @@ def accumulate_exactly(values: Array) -> Array:
     to a float once."""
     sums = [accumulate(balls(column), initial=ball(0.0)) for column in values.T]
     return np.array([[float(x) for x in column] for column in sums]).reshape(-1, len(values) + 1).T
-
-
-def accumulate_bounds(values: Array) -> Array:
-    """Return the sums of the first ``0, 1, ..., N`` of ``values (N, q)`` in floats, ``(N + 1, q)``."""
-    return np.vstack([np.zeros((1, values.shape[1])), np.cumsum(values, axis=0)])
 
 
 @final

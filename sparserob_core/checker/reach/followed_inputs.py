@@ -24,14 +24,13 @@ from sparserob_core.checker.reach.adjoint import (
     AdjointRow,
     AdjointSpan,
     Stopped,
-    accumulate_bounds,
     accumulate_exactly,
 )
 from sparserob_core.checker.reach.bounded_inputs import SizedInput
 from sparserob_core.checker.reach.kernels import BoundedInputHere
 from sparserob_core.checker.sets.along import NormSummand
 from sparserob_core.checker.sets.polynomials import HALF_ULP, OUTWARD, rounding
-from sparserob_core.checker.sets.summands import Summand
+from sparserob_core.checker.sets.summands import Summand, integrate
 from sparserob_core.sip.convex_set import Array
 
 # from powers of the share ``v`` of a step to powers of ``u = 2 v - 1``: ``v^j = (1 + u)^j / 2^j``
@@ -63,7 +62,7 @@ class FollowedInput(BoundedInputHere):
             ages, rounded = (v.ravel() for v in difference(np.minimum(times, span.until)[:, None], points))
             clipped = np.clip(ages, 0.0, span.length)
             added = support_integrals.at(clipped, np.maximum(np.abs(rounded), span.rounded))
-            bounds += np.where(ages[:, None] > 0.0, np.array(added), 0.0)
+            bounds += np.where(ages[:, None] > 0.0, added, 0.0)
         error = (len(pairs) - 1) * HALF_ULP * np.abs(bounds).max(axis=0)
         shape = times.size, points.size, self.input.shares.size
         return (bounds[0] - error).reshape(shape), (bounds[1] + error).reshape(shape)
@@ -119,58 +118,49 @@ class SupportIntegrals:
     summands: Sequence[Summand | NormSummand]
 
     @cached_property
-    def _polynomials(self) -> tuple[Array, Array, Array]:
-        """The columns of ``l'F`` on every step in powers of ``u`` from -1 to 1, ``(N, p + 1, w)``; their error bounds,
-        which allow for rounding errors in the sum of two of their values; and bounds of their absolute values,
-        ``(N, w)`` each."""
+    def _polynomials(self) -> tuple[Array, Array]:
+        """The columns of ``l'F`` on every step in powers of ``u`` from -1 to 1, ``(N, p + 1, w)``, and their error
+        bounds, ``(N, w)``."""
         mid, rad = (values[:, :, self.columns] for values in (self.row.driven.mid, self.row.driven.rad))
-        size = np.abs(mid).sum(axis=1) * OUTWARD  # no larger in powers of ``u``, since ``|v| <= (1 + |u|) / 2``
-        errors = rad.sum(axis=1) + (rounding(2 * ORDER) + rounding(size.shape[1] + 2 * ORDER)) * size
-        return np.einsum("ij,kjw->kiw", CENTRED, mid), errors * OUTWARD, size
+        # in powers of ``u`` the sizes are no larger, since ``|v| <= (1 + |u|) / 2``
+        errors = rad.sum(axis=1) + rounding(2 * ORDER) * np.abs(mid).sum(axis=1)
+        return np.einsum("ij,kjw->kiw", CENTRED, mid), errors * OUTWARD
 
     @cached_property
     def _support_bounds(self) -> Array:
         """The upper bounds of the absolute values of the support functions on every step and its neighbours,
         ``(N, S)``."""
-        _, errors, size = self._polynomials
-        heights = (size + errors) @ np.array([summand.radii for summand in self.summands]).T * OUTWARD
+        polynomials, errors = self._polynomials
+        sizes = np.abs(polynomials).sum(axis=1) * OUTWARD + errors
+        heights = sizes @ np.array([summand.radii for summand in self.summands]).T * OUTWARD
         padded = np.pad(heights, ((1, 1), (0, 0)), mode="edge")
         return np.asarray(np.maximum(heights, np.maximum(padded[:-2], padded[2:])))
 
-    def _integrate_steps(self, steps: np.ndarray, shares: Array) -> tuple[Array, Array, Array]:
-        """Return the integrals over the first ``shares (k,)`` of ``steps (k,)``, and how much more and how much less
-        they may be, ``(k, S)`` each."""
-        P, errors, size = (values[steps] for values in self._polynomials)
-        integrals = []
-        for summand in self.summands:
-            value, excess, deficit, tops = summand.integrate_support(P, errors, size, 2.0 * shares - 1.0)
-            rounded = rounding(4 * ORDER) * 2.0 * tops
-            integrals.append((value, (excess + rounded) * OUTWARD, (deficit + rounded) * OUTWARD))
-        value, excess, deficit = (
-            np.stack(values, axis=1) * (self.row.step / 2.0) for values in zip(*integrals, strict=True)
-        )
-        return value, excess, deficit
+    def _integrate_steps(self, steps: np.ndarray, shares: Array) -> Array:
+        """Return lower and upper bounds ``(2, k, S)`` of the integrals over the first ``shares (k,)`` of ``steps
+        (k,)``, whose length is a power of two."""
+        polynomials, errors = (values[steps] for values in self._polynomials)
+        bounds = np.array(integrate(self.summands, polynomials, errors, 2.0 * shares - 1.0))
+        # the end of a part is rounded as one of the whole step, however short the part is
+        rounded = rounding(4 * ORDER) * self._support_bounds[steps] * (shares < 1.0)[:, None]
+        return np.asarray(self.row.step * (bounds + np.array([-1.0, 1.0])[:, None, None] * rounded * OUTWARD))
 
     @cached_property
-    def _end_integrals(self) -> tuple[Array, Array, Array]:
-        """The integrals from 0 to the ends of all steps, 0 itself first, and how much more and how much less they may
-        be, ``(N + 1, S)`` each."""
-        value, excess, deficit = self._integrate_steps(np.arange(self.row.count), np.ones(self.row.count))
-        outward = OUTWARD * (1.0 + rounding(self.row.count))
-        return accumulate_exactly(value), accumulate_bounds(excess) * outward, accumulate_bounds(deficit) * outward
+    def _end_integrals(self) -> Array:
+        """Lower and upper bounds of the integrals from 0 to the ends of all steps, 0 itself first, ``(2, N + 1, S)``,
+        up to the rounding of each."""
+        bounds = self._integrate_steps(np.arange(self.row.count), np.ones(self.row.count))
+        return np.array([accumulate_exactly(bound) for bound in bounds])
 
-    def at(self, times: Array, rounded: Array | float = 0.0) -> tuple[Array, Array]:
-        """Return lower and upper bounds, ``(k, S)`` each, of the integrals from 0 to ``times (k,)``. The given times
-        may differ from the true ones by at most ``rounded``."""
+    def at(self, times: Array, rounded: Array | float = 0.0) -> Array:
+        """Return lower and upper bounds, ``(2, k, S)``, of the integrals from 0 to ``times (k,)``. The given times may
+        differ from the true ones by at most ``rounded``."""
         steps, shares = self.row.placed(times)
-        value, excess, deficit = (values[steps] for values in self._end_integrals)
-        partial, is_inside = np.zeros((3, *value.shape)), shares > 0.0
-        partial[:, is_inside] = self._integrate_steps(steps[is_inside], shares[is_inside])
-        total = value + partial[0]
-        error = np.asarray(rounded)[..., None] * self._support_bounds[steps] + 4.0 * HALF_ULP * (
-            np.abs(value) + np.abs(total)
-        )
-        return total - (deficit + partial[2] + error) * OUTWARD, total + (excess + partial[1] + error) * OUTWARD
+        bounds, is_inside = self._end_integrals[:, steps], shares > 0.0
+        error = 4.0 * HALF_ULP * np.abs(bounds)
+        bounds[:, is_inside] += self._integrate_steps(steps[is_inside], shares[is_inside])
+        error += 4.0 * HALF_ULP * np.abs(bounds) + np.asarray(rounded)[..., None] * self._support_bounds[steps]
+        return np.asarray(bounds + np.array([-1.0, 1.0])[:, None, None] * error * OUTWARD)
 
 
 def _find_largest(values: Array, first: np.ndarray, last: np.ndarray) -> Array:
