@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from fractions import Fraction
 from functools import reduce
+from typing import Any
 
 import numpy as np
 from flint import arb, fmpq, fmpq_mat
@@ -47,9 +48,9 @@ def below(ball: arb) -> float:
     return float(ball) if ball.is_exact() and float(ball) == ball else float(np.nextafter(float(ball.lower()), -np.inf))
 
 
-def difference(a: float, b: float) -> tuple[float, float]:
-    """Return ``a - b`` exactly, as the nearest float and the remainder (Knuth 1997, section 4.2.2, theorem B). Two
-    differences are equal where the pairs are equal."""
+def difference(a: Any, b: Any) -> tuple[Any, Any]:
+    """Return ``a - b``, of floats or arrays, exactly: as the nearest floats and the remainders (Knuth 1997, section
+    4.2.2, theorem B). Two differences are equal where the pairs are equal."""
     nearest = a - b
     negative_b = nearest - a
     return nearest, (a - (nearest - negative_b)) - (b + negative_b)

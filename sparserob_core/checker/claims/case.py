@@ -167,7 +167,7 @@ class Case:
     def sources(self) -> Sources:
         """The inputs that act at any time and of which only the size is known."""
         pieces = lambda: [] if self.certificate.get("decision") is None else self.pieces  # noqa: E731
-        return Sources(self.problem, self.timing, self.flows, pieces, self.followed.still is not None)
+        return Sources(self.problem, self.timing, self.flows, pieces, self.followed)
 
     @cached_property
     def flows(self) -> VerifiedFlows:
@@ -238,7 +238,7 @@ class Case:
     ) -> AddedTerms | None:
         """Return the terms that are added to the state in the rows ``basis (b, d)`` on the state and ``gains (b, m)``
         on the control, ``None`` where there are none; at one ``parameter (nu,)``, or at all of them."""
-        entering = self.sources.entering(parameter)
+        entering = self.sources.entering if parameter is None else self.sources.entering_at(parameter)
         if window.reference is None and not window.is_mixed and not entering:
             return None
         return AddedTerms(window, basis, gains, self.control.breakpoints.tolist(), self.pieces, entering)
@@ -262,7 +262,7 @@ class Case:
             self.problem,
             self.control,
             disturbances.changes,
-            self.flows,
+            self.followed if self.followed.are_best else self.flows,
             disturbances.held,
             disturbances.held_components,
         )

@@ -13,7 +13,7 @@ from sparserob_core.checker.claims.case import Case
 from sparserob_core.checker.claims.window import ConstraintWindow
 from sparserob_core.checker.outcome import Broken, Unchecked
 from sparserob_core.checker.reach.adjoint import Worst
-from sparserob_core.checker.reach.execution import FollowedExecution
+from sparserob_core.checker.reach.kernels import BoundedInputHere
 from sparserob_core.checker.sets.known import known
 from sparserob_core.checker.sets.polynomials import HALF_ULP
 from sparserob_core.sip.convex_set import Array
@@ -75,35 +75,38 @@ class FollowedRow:
             total = total + sum((a * v for a, v in zip(balls(gains), u, strict=True)), 0 * total)
         return below(total), above(total)
 
-    @property
-    def _execution(self) -> FollowedExecution | None:
-        """The errors of execution of the control; ``None`` where there are none."""
-        execution = self.case.sources.execution
-        assert execution is None or isinstance(execution, FollowedExecution)  # one system acts all along
-        return execution
+    @cached_property
+    def _inputs(self) -> list[BoundedInputHere]:
+        """The inputs of which only the size is known."""
+        return self.case.sources.entering_at([])
 
-    def erring(self, times: Array) -> tuple[Array, Array]:
-        """Return bounds, ``(k,)`` below and above, of what the worst errors of execution add at ``times (k,)``."""
-        execution, zeros = self._execution, np.zeros(times.size)
-        return (zeros, zeros) if execution is None else execution.added_at(self.window.split(self.direction)[0], times)
+    def add_inputs(self, times: Array) -> tuple[Array, Array]:
+        """Return bounds, ``(k,)`` below and above, of what the worst bounded inputs add at ``times (k,)``."""
+        c, low, high = self.window.split(self.direction)[0], np.zeros(times.size), np.zeros(times.size)
+        for entering in self._inputs:
+            least, most = entering.added_at(c, times)
+            low, high = low + least, high + most
+            rounding_error = HALF_ULP * (np.abs(low) + np.abs(high))
+            low, high = low - rounding_error, high + rounding_error
+        return low, high
 
     def _bound_added_terms(self, start: Array, stop: Array) -> Array:
         """Return upper bounds ``(2, k)``, at both ends of cells, of the terms that are added to the state; among them
-        the worst errors of execution, with how far they may lie above their chord."""
-        bounds, execution = np.zeros((2, start.size)), self._execution
+        the worst bounded inputs, with how far they may lie above their chord."""
+        bounds, c = np.zeros((2, start.size)), self.window.split(self.direction)[0]
         if self.window.reference is not None or self.window.is_mixed:
             cells = self.case.clock.each(zip(start.tolist(), stop.tolist(), strict=True))
             bounds = np.array([[self.enclose_added_terms(t, (a + b) / 2)[1] for t in (a, b)] for a, b in cells]).T
-        if execution is not None:
-            chord_distances = execution.bound_chord_errors(self.window.split(self.direction)[0], start, stop)
-            execution_bounds = np.stack([self.erring(times)[1] for times in (start, stop)]) + chord_distances
-            bounds = bounds + execution_bounds + HALF_ULP * 4.0 * (np.abs(bounds) + execution_bounds)
+        for entering in self._inputs:
+            chord_errors = entering.bound_chord_errors(c, start, stop)
+            input_bounds = np.stack([entering.added_at(c, times)[1] for times in (start, stop)]) + chord_errors
+            bounds = bounds + input_bounds + HALF_ULP * 4.0 * (np.abs(bounds) + np.abs(input_bounds))
         return bounds
 
     def _refute(self, start: Array, stop: Array, limit: float) -> None:
         """Raise `Broken` where the row is certainly above ``limit`` in the middle of a cell; never where a set of
         deviations is curved, because its computed support function need not be sharp."""
-        sets = (self.case.problem.initial_set, self.case.problem.disturbance)
+        sets = (self.worst.initial_set, self.worst.disturbance_set)
         if any(deviation_set is not None and known(deviation_set).facets is None for deviation_set in sets):
             return
         middles = (start + stop) / 2
@@ -112,7 +115,7 @@ class FollowedRow:
         if self.window.reference is not None or self.window.is_mixed:
             lower_bounds = [self.enclose_added_terms(t, t)[0] for t in middles.tolist()]
             least = least + np.array(lower_bounds) - HALF_ULP * 8.0 * np.abs(lower_bounds)
-        errors, _ = self.erring(middles)
+        errors, _ = self.add_inputs(middles)
         least = least + errors - HALF_ULP * 8.0 * np.abs(errors)
         index = int(least.argmax())
         if least[index] > limit:

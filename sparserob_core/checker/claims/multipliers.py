@@ -20,7 +20,6 @@ from sparserob_core.checker.claims.constraints import compute_middle_effect
 from sparserob_core.checker.claims.window import ConstraintWindow
 from sparserob_core.checker.cost.duality import EFFORT, ConstraintRow
 from sparserob_core.checker.outcome import Broken, Unchecked
-from sparserob_core.checker.problem.timing import before
 from sparserob_core.checker.sets.known import known
 from sparserob_core.sip.convex_set import Array
 
@@ -53,7 +52,7 @@ def weighted(case: Case, data: object) -> tuple[list[tuple[float, ConstraintRow]
         raise Broken(f"{nu.size} multipliers of equalities, expected {len(case.equalities)}")
     for multiplier, (state, value) in zip(nu.tolist(), case.equalities, strict=False):
         direction = np.eye(case.problem.system.states)[state]
-        row = _derive_row(case, direction, case.problem.horizon, case.nominal_parameter, ball(value), disturbed=False)
+        row = case.duality.row(direction, case.problem.horizon, case.nominal_parameter, ball(value), disturbed=False)
         # a disturbance of one point counts; where none may reach the state, any member of its set may stand for it
         rows.append((multiplier, replace(row, constant=row.constant + compute_middle_effect(case, state))))
     if case.control.functions >= case.control.pieces:  # every piece has a function of its own
@@ -146,8 +145,8 @@ def _derive_base_row(
     _, direction, time, parameter = said
     c, gain = np.split(direction, [case.problem.system.states])
     limit = fixed_limit(case, direction, time) if window is None else window.limit(direction, time)
-    row = _derive_row(case, c, time, parameter.tolist(), limit, disturbed=not case.answering)
-    measurable_input = None if case.followed.are_best else case.sources.measurable_input_at(parameter.tolist())
+    row = case.duality.row(c, time, parameter.tolist(), limit, disturbed=not case.answering)
+    measurable_input = case.sources.measurable_input_at(parameter.tolist())
     if measurable_input is not None:
         row = replace(row, constant=row.constant + ball(measurable_input.added(c, time)[0]))
     sizes, early_bound = case.sources.erring(c, time, parameter.tolist())
@@ -156,30 +155,6 @@ def _derive_base_row(
         piece = piece_of(case, window, entry, time)
         row.slope[piece] = [a + b for a, b in zip(row.slope[piece], balls(gain), strict=True)]
     return row
-
-
-def _derive_row(
-    case: Case, c: Array, time: float, parameter: Sequence[float], limit: arb, disturbed: bool
-) -> ConstraintRow:
-    """Return the constraint ``c'x(t) <= limit`` for the worst deviations or without them. By the adjoint of its row no
-    transition matrix is computed; each would take a minute for hundreds of states."""
-    if not case.followed.are_best:
-        return case.duality.row(c, time, parameter, limit, disturbed)
-    worst, problem, delay = case.followed.worst(c, None), case.problem, case.problem.system.delay
-    m, starts = problem.system.controls, np.append(case.control.breakpoints[:-1] + delay, np.inf)
-    initial_weights, input_weights = worst.compute_initial_weights(time), worst.weights(time, starts[:-1], starts[1:])
-    initial_state = balls(np.asarray(problem.initial_state, dtype=float))
-    constant = sum((w * x for w, x in zip(initial_weights, initial_state, strict=True)), ball(0)) - limit
-    if problem.system.drifts:  # a drift is an input that is 1
-        constant = constant + worst.weights(time, np.zeros(1), np.full(1, np.inf))[0][m]
-    if delay > 0.0:
-        (early_weights,) = worst.weights(time, np.zeros(1), starts[:1])
-        constant = sum((w * u for w, u in zip(early_weights[:m], balls(before(problem)), strict=True)), constant)
-    if disturbed and problem.initial_set is not None:
-        constant = constant + known(problem.initial_set).support(initial_weights)
-    if disturbed and problem.disturbance is not None:
-        constant = constant + worst.compute_worst_effect(time)
-    return ConstraintRow(constant, [weights[:m] for weights in input_weights])
 
 
 def _derive_control_row(

@@ -4,12 +4,13 @@ The excess is that of a witness, or that of the worst disturbance."""
 
 from __future__ import annotations
 
+from bisect import bisect_right
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
-from flint import arb, arb_mat
+from flint import arb
 
 from sparserob_core.checker.arithmetic.balls import ball, balls
 from sparserob_core.checker.arithmetic.series import exactly, stacked
@@ -37,30 +38,31 @@ if TYPE_CHECKING:
 ROUNDED = 1e-11
 
 
-def compute_state(case: Case, time: float, parameter: Array, signal: object, deviation: object = None) -> list[arb]:
-    """Return the state ``(d,)`` at a time and a parameter ``(nu,)`` under the control of the case. The disturbance is a
-    ``signal (mw, pieces)`` on the common grid, the initial state has a ``deviation (d,)``; neither is read where the
-    problem has none.
-
-    Raise `Broken` where they are not shown to be admissible, and `Unchecked` where the disturbance is given on another
-    grid."""
-    w = _read_disturbance(case, signal) if case.problem.disturbance is not None else None
-    weights = case.flows.at(parameter.tolist()).weights([0.0, *(t for t in case.timing.grid[1:-1] if t < time), time])
-    x = weights.free * _enclose_initial_state(case, deviation)
-    for k, (control_weight, disturbance_weight) in enumerate(zip(weights.control, weights.disturbance, strict=True)):
-        x = x + control_weight * case.scene.control[k]
-        if w is not None:
-            x = x + disturbance_weight * stacked([[v] for v in balls(w[:, k])])
-    state: list[arb] = x.entries()
-    return state
-
-
-def _enclose_initial_state(case: Case, deviation: object) -> arb_mat:
-    """Return the initial state ``(d, 1)`` that a deviation leads to."""
-    state = balls(np.asarray(case.problem.initial_state))
-    if case.problem.initial_set is not None:
-        state = [v + z for v, z in zip(state, balls(_read_initial_deviation(case, deviation)), strict=True)]
-    return stacked([[v] for v in state])
+def compute_value(
+    case: Case,
+    c: Array,
+    time: float,
+    parameter: Array,
+    deviation: Array | None,
+    signal: Array | None,
+    changes: Sequence[float] | None = None,
+) -> arb:
+    """Return ``c'x(t)``, ``c (d,)``, at a parameter ``(nu,)`` under the control of the case. The initial state has a
+    ``deviation (d,)``, the disturbance is a ``signal (mw, M)`` that jumps at ``changes``, by default at the grid's
+    breakpoints. Both are admissible, or ``None`` where the problem has none."""
+    breaks = case.timing.grid
+    changes = breaks if changes is None else changes
+    grid = [0.0, *sorted({t for t in (*breaks, *changes) if 0.0 < t < time}), time]
+    weights, value = case.duality.flows.weigh(c, parameter.tolist(), grid), ball(0.0)
+    for state in (case.problem.initial_state, deviation):
+        if state is not None:
+            value = value + sum(w * x for w, x in zip(weights.free.entries(), balls(np.asarray(state)), strict=True))
+    for start, of_control, of_disturbance in zip(grid, weights.control, weights.disturbance, strict=False):
+        value = value + (of_control * case.scene.control[bisect_right(breaks, start) - 1])[0, 0]
+        if signal is not None:
+            w = signal[:, bisect_right(changes, start) - 1]
+            value = value + (of_disturbance * stacked([[v] for v in balls(w)]))[0, 0]
+    return value
 
 
 def witnessed(case: Case, data: Mapping[str, Any]) -> tuple[arb, float]:
@@ -105,12 +107,15 @@ def witnessed(case: Case, data: Mapping[str, Any]) -> tuple[arb, float]:
             value = _project_onto_direction(
                 direction, named, rows if piece is None else rows + feedback.commands[piece].tolist()
             )
-        elif case.sources.measurable_input is not None:
-            value = _enclose_largest_value(case, window.split(direction), time, parameter.tolist(), piece)
         else:
-            state = compute_state(case, time, parameter, data.get("disturbance"), data.get("deviation"))
-            state += [] if piece is None else case.pieces[piece].entries()
-            value = _project_onto_direction(direction, None, [[x] for x in state])
+            (c, gain), is_measurable = window.split(direction), case.sources.measurable_input is not None
+            value = (
+                _enclose_largest_value(case, c, time, parameter.tolist())
+                if is_measurable
+                else compute_value(case, c, time, parameter, *_read_deviations(case, data))
+            )
+            if piece is not None:
+                value = value + along(gain, case.pieces[piece].entries())
         execution = case.sources.delivered_at(parameter.tolist())
         if execution is not None:
             low, high = execution.added(window.split(direction)[0], time)
@@ -128,21 +133,16 @@ def excused(case: Case, data: Mapping[str, Any], slack: float) -> float:
     return min(slack, units_of(case, window).excused(direction, window.limit(direction, number(data, "time"))))
 
 
-def _enclose_largest_value(
-    case: Case, direction: tuple[Array, Array], time: float, parameter: Sequence[float], piece: int | None
-) -> arb:
-    """Return a ball that holds the largest ``c'x(t) + gain'u`` under measurable disturbances, at a parameter, for a
-    ``direction`` ``(c, gain)`` and the control ``u`` on a ``piece``, where there is one."""
-    (c, gain), zero, measurable_input = direction, ball(0.0), case.sources.measurable_input_at(parameter)
+def _enclose_largest_value(case: Case, c: Array, time: float, parameter: Sequence[float]) -> arb:
+    """Return a ball that holds the largest ``c'x(t)``, ``c (d,)``, under measurable disturbances, at a parameter."""
+    measurable_input = case.sources.measurable_input_at(parameter)
     assert measurable_input is not None
-    row = case.duality.row(c, time, parameter, zero)
+    row = case.duality.row(c, time, parameter, ball(0.0))
     low, high = measurable_input.added(c, time)
     total = row.constant + ball(low).union(ball(high))
     for slope, control in zip(row.slope, case.pieces, strict=True):
-        total = total + sum((a * u for a, u in zip(slope, control.entries(), strict=True)), zero)
-    if piece is None:
-        return total
-    return total + sum((a * u for a, u in zip(balls(gain), case.pieces[piece].entries(), strict=True)), zero)
+        total = total + sum((a * u for a, u in zip(slope, control.entries(), strict=True)), ball(0.0))
+    return total
 
 
 def _project_onto_direction(direction: Array, named: NamedDeviations | None, rows: Sequence[list[arb]]) -> arb:
@@ -212,7 +212,7 @@ def _compute_excess_by_adjoints(
             worst = row.worst if initial_state is None else replace(row.worst, centre=initial_state, initial_set=None)
             (top,), (overestimate,) = worst.bound_largest_value(np.array([time]))
             low, high = row.enclose_added_terms(time, (breaks[k] + breaks[k + 1]) / 2)
-            (error_low,), (error_high,) = row.erring(np.array([time]))
+            (error_low,), (error_high,) = row.add_inputs(np.array([time]))
             low, high = low + error_low, high + error_high
             over.append(float(top - overestimate / 3.0 + (low + high) / 2.0) - float(b))
             slack = max(slack, float(overestimate + high - low))
@@ -241,14 +241,15 @@ def _build_tube(case: Case, parameter: Array, initial_state: Array | None, basis
     return VerifiedTube(ProjectedStates(States(flow, scene), basis), flow.box)
 
 
-def _read_initial_deviation(case: Case, data: object) -> Array:
-    """Return the deviation ``(d,)`` of the initial state; raise `Broken` unless it is shown to be in its set."""
-    bound = case.problem.initial_set
-    assert bound is not None
-    deviation = shaped({"deviation": data}, "deviation", (bound.dimension,))
-    if not known(bound).contains(deviation):
-        raise Broken(f"the deviation {deviation.tolist()} of the initial state is not shown to be in its set")
-    return deviation
+def _read_deviations(case: Case, data: Mapping[str, Any]) -> tuple[Array | None, Array | None]:
+    """Return the deviation ``(d,)`` of the initial state and the disturbance on the grid, as far as there are any;
+    raise `Broken` unless they are shown to be admissible."""
+    bound, deviation = case.problem.initial_set, None
+    if bound is not None:
+        deviation = shaped(data, "deviation", (bound.dimension,))
+        if not known(bound).contains(deviation):
+            raise Broken(f"the deviation {deviation.tolist()} of the initial state is not shown to be in its set")
+    return deviation, None if case.problem.disturbance is None else _read_disturbance(case, data.get("disturbance"))
 
 
 def _read_disturbance(case: Case, signal: object) -> Array:

@@ -24,6 +24,7 @@ from sparserob_core.checker.flow.flows import VerifiedFlows
 from sparserob_core.checker.outcome import Broken
 from sparserob_core.checker.problem.held import HeldComponents, summed
 from sparserob_core.checker.problem.timing import before
+from sparserob_core.checker.reach.followed import FollowedRows
 from sparserob_core.checker.sets.known import known
 from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.problem.problem import OptimalControlProblem
@@ -57,14 +58,14 @@ class Duality:
     """The data from which lower bounds are derived.
 
     ``changes`` are the times at which the disturbance may jump, ``None`` without a disturbance. ``held`` is the set of
-    the disturbances that are constant between these times. ``flows`` are those of the system. ``held_components``
+    the disturbances that are constant between these times. ``flows`` weigh the rows. ``held_components``
     says which components are held over several intervals.
     """
 
     problem: OptimalControlProblem
     control: Dictionary
     changes: list[float] | None
-    flows: VerifiedFlows
+    flows: VerifiedFlows | FollowedRows
     held: ConvexSet | None = None
     held_components: HeldComponents | None = None
 
@@ -106,50 +107,45 @@ class Duality:
         """Return the row of ``c'x(t) <= limit`` at one parameter: of the worst disturbance and initial state, or of
         none."""
         m, problem = self.problem.system.controls, self.problem
-        delay, jumps = problem.system.delay, self.changes or []
+        delay = problem.system.delay
         piece_starts = [float(s) + delay for s in self.control.breakpoints[:-1]]  # times at which a piece begins to act
-        starts = sorted({0.0, *(s for s in (*piece_starts, *jumps) if s < time)})
-        weights = self.flows.at(parameter).weights([*starts, time])
-        row, initial_state = exactly(direction[None]), np.asarray(problem.initial_state)
-        initial_slope = (row * weights.free).entries()
+        starts = sorted({0.0, *(s for s in piece_starts if s < time)})
+        weights = self.flows.weigh(direction, parameter, [*starts, time])
+        initial_slope, initial_state = weights.free.entries(), np.asarray(problem.initial_state)
         constant = sum((w * ball(x) for w, x in zip(initial_slope, initial_state, strict=True)), ball(0.0)) - limit
         slope = [[ball(0.0)] * m for _ in range(self.control.pieces)]
-        block_slopes = [[ball(0.0)] * problem.system.disturbances for _ in jumps]
-        for start, control_weight, disturbance_weight in zip(starts, weights.control, weights.disturbance, strict=True):
-            coefficients, k = (row * control_weight).entries(), bisect_right(piece_starts, start) - 1
+        for start, control_weight in zip(starts, weights.control, strict=True):
+            coefficients, k = control_weight.entries(), bisect_right(piece_starts, start) - 1
             if k < 0:
                 constant = sum((w * ball(u) for w, u in zip(coefficients[:m], before(problem), strict=True)), constant)
             else:
                 slope[k] = [a + b for a, b in zip(slope[k], coefficients[:m], strict=True)]
             constant = sum(coefficients[m:], constant)  # a drift, whose input is 1
-            if jumps:
-                block = bisect_right(jumps, start) - 1
-                block_slopes[block] = [
-                    a + b for a, b in zip(block_slopes[block], (row * disturbance_weight).entries(), strict=True)
-                ]
         if disturbed and problem.initial_set is not None:
             constant = constant + known(problem.initial_set).support(initial_slope)
         if disturbed and self.held is not None:
+            block_slopes = self.compute_disturbance_weights(direction, time, parameter)
             for block_slope in summed(self.held_components, block_slopes):
                 constant = constant + known(self.held).support(block_slope)
         return ConstraintRow(constant, slope)
 
-    def compute_disturbance_weights(self, direction: Array, time: float) -> list[list[arb]]:
-        """Return the coefficients ``(mw,)`` of every block of the disturbance in ``c'x(t)``, for a known system. The
+    def compute_disturbance_weights(
+        self, direction: Array, time: float, parameter: Sequence[float] = ()
+    ) -> list[list[arb]]:
+        """Return the coefficients ``(mw,)`` of every block of the disturbance in ``c'x(t)``, at one parameter. The
         blocks begin at the `changes` of the problem."""
         jumps = self.changes
         if not jumps:
             return []
         starts = sorted({0.0, *(s for s in jumps if s < time)})
-        weights, row = self.flows.at(()).weights([*starts, time]), exactly(direction[None])
-        slopes = {s: (row * weight).entries() for s, weight in zip(starts, weights.disturbance, strict=True)}
+        weights = self.flows.weigh(direction, parameter, [*starts, time])
+        slopes = {s: weight.entries() for s, weight in zip(starts, weights.disturbance, strict=True)}
         zero_slope = [ball(0.0)] * self.problem.system.disturbances
         return [slopes[s] if s < time else zero_slope for s in jumps]
 
     def compute_initial_weights(self, direction: Array, time: float) -> list[arb]:
         """Return the coefficients ``(d,)`` of the initial state in ``c'x(t)``, for a known system."""
-        row = exactly(direction[None])
-        return list((row * self.flows.at(()).weights([0.0, time]).free).entries())
+        return list(self.flows.weigh(direction, (), [0.0, time]).free.entries())
 
     def bound(
         self,

@@ -40,8 +40,8 @@ ENOUGH = 2.0**-64
 @final
 @dataclass(frozen=True, eq=False)
 class StateWeights:
-    """The matrices that make up the state at a time: the state is ``free`` times the state at 0, plus ``control`` and
-    ``disturbance`` times the inputs on every piece of a grid."""
+    """The matrices that make up the state at a time, or a row of it: it is ``free`` times the state at 0, plus
+    ``control`` and ``disturbance`` times the inputs on every piece of a grid."""
 
     free: arb_mat
     control: list[arb_mat]

@@ -10,12 +10,14 @@ from typing import final
 import numpy as np
 
 from sparserob_core.checker.arithmetic.remembered import remembered
-from sparserob_core.checker.flow.flow import POINTS_KEPT, VerifiedFlow
+from sparserob_core.checker.arithmetic.series import exactly
+from sparserob_core.checker.flow.flow import POINTS_KEPT, StateWeights, VerifiedFlow
 from sparserob_core.checker.flow.law import Law, ParameterBox, bound_entries
 from sparserob_core.checker.flow.plant import Plant
 from sparserob_core.checker.flow.units import pace
 from sparserob_core.checker.outcome import Unchecked
 from sparserob_core.control.problem.system import System
+from sparserob_core.sip.convex_set import Array
 
 DEGREES = {0: 0, 1: 8, 2: 6, 3: 4, 4: 3}  # the degree of an expansion by the number of parameters; 2 for more
 WIDE = {1: 16, 2: 8, 3: 5, 4: 3}  # the degree of an expansion that serves many boxes
@@ -52,6 +54,14 @@ class VerifiedFlows:
     def _follow_point(self, box: ParameterBox) -> VerifiedFlow:
         """Return the flow at the one parameter of a box, whose law is that over the box of all parameters."""
         return VerifiedFlow(self.plant, self.until, box, 0, self._wide_law)
+
+    def weigh(self, c: Array, parameter: Sequence[float], grid: Sequence[float]) -> StateWeights:
+        """Return the weights of ``c'x``, ``c (d,)``, at the end of a grid, which begins at 0, at one parameter."""
+        row, weights = exactly(c[None]), self.at(parameter).weights(grid)
+        control, disturbance = (
+            [row * of_piece for of_piece in part] for part in (weights.control, weights.disturbance)
+        )
+        return StateWeights(row * weights.free, control, disturbance)
 
     @cached_property
     def _point_flow(self) -> VerifiedFlow:

@@ -17,7 +17,7 @@ import numpy as np
 from sparserob_core.control.policies.measurements import Measurements
 from sparserob_core.control.problem.cost import Quadratic
 from sparserob_core.control.problem.names import Names
-from sparserob_core.control.problem.phase import PARTS, Phase
+from sparserob_core.control.problem.phase import Phase
 from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.control.problem.system import System
 from sparserob_core.control.problem.terms.integral import Accumulated, IntegralConstraint
@@ -169,19 +169,6 @@ class RunningIntegrals:
         phase = _extend_phase(system.phases[0], [(coordinate.h, coordinate.g) for coordinate in coordinates])
         windows = np.array([[coordinate.begin, coordinate.end] for coordinate in coordinates])
         return RunningIntegrals(System((phase,), None, system.delay), *windows.T)
-
-    def agrees_with(self, phase: Phase, d: int) -> bool:
-        """Return True where a phase agrees with this system in the first ``d`` states, whatever is integrated with
-        them."""
-        pairs = [(phase.entry(name), self.system.phases[0].entry(name)) for name in PARTS]
-        if phase.domain is not None or any(
-            (entry is None) != (running_entry is None) for entry, running_entry in pairs
-        ):
-            return False
-        return all(
-            entry is None or np.array_equal(np.asarray(entry)[:d], np.asarray(running_entry)[:d])
-            for entry, running_entry in pairs
-        )
 
     def parts(self, c: Array) -> list[tuple[Array, float]]:
         """Return rows ``(d + k,)`` of that system, each with the time when it ends, which add up to a row ``c (d +

@@ -10,23 +10,22 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, reduce
 from itertools import accumulate
-from math import ceil, comb, factorial, floor, log2
-from typing import final
+from math import ceil, factorial, floor, log2
+from operator import add
+from typing import NamedTuple, final
 
 import numpy as np
 from flint import arb, arb_mat
 
-from sparserob_core.checker.arithmetic.balls import ball, balls
+from sparserob_core.checker.arithmetic.balls import ball, balls, difference
 from sparserob_core.checker.arithmetic.series import Series, middles, stacked, zeros
 from sparserob_core.checker.flow.segment import VerifiedSegment, solve
 from sparserob_core.checker.flow.units import balanced
 from sparserob_core.checker.outcome import Clock, Unchecked
-from sparserob_core.checker.sets.along import NormSummand
-from sparserob_core.checker.sets.known import known, middle, summands_of
-from sparserob_core.checker.sets.polynomials import HALF_ULP, OUTWARD, TINY, Enclosed, rounding
-from sparserob_core.checker.sets.summands import Summand
+from sparserob_core.checker.sets.known import known
+from sparserob_core.checker.sets.polynomials import HALF_ULP, OUTWARD, TINY, Enclosed, multiply_rows, rounding
 from sparserob_core.sip.convex_set import Array, ConvexSet
 
 ORDER = 13  # degree of the polynomials
@@ -44,10 +43,6 @@ APART = 16
 DEAR = 2**29
 MAX_ENTRIES = 2**27  # entries of the rows of all steps, at most
 AT_ONCE = 2**22  # entries of rows that are computed at once
-# Terms of a product of floats in one partial sum; the partial sums are added up then. With 348 states an entry is
-# rounded 43 times instead of 348. With half of it products take a fourth longer, and with twice as much bounds along
-# modes that are far from normal are twice as wide.
-SUMMED = 32
 
 
 @final
@@ -160,6 +155,17 @@ def choose_step(A: Array, horizon: float) -> float:
     return 2.0 ** floor(log2(min(horizon / 64.0, min(share, LONGEST) / size)))
 
 
+class AdjointSpan(NamedTuple):
+    """An adjoint ``row`` that meets a bounded input: at a time ``t``, what enters at ``s`` meets it at the age ``min(t,
+    until) - s``, or not at all where that is not between 0 and ``length``. The length may be off by ``rounded``. A
+    finite time ``until`` is before all times ``t``."""
+
+    row: AdjointRow
+    until: float = np.inf
+    length: float = np.inf
+    rounded: float = 0.0
+
+
 @final
 @dataclass(frozen=True, eq=False)
 class AdjointRow:
@@ -194,14 +200,29 @@ class AdjointRow:
         nodes[0][:, 0], nodes[1][:, 0] = mid, rad
         for j in range(1, motion.apart):
             motion.clock.check()
-            for node, product in zip(nodes, _multiply_rows(Enclosed(mid, rad), motion.between[j - 1]), strict=True):
-                node[:, j] = product[:, 0]
+            product = multiply_rows(Enclosed(mid, rad), motion.between[j - 1])
+            nodes[0][:, j], nodes[1][:, j] = product.mid[:, 0], product.rad[:, 0]
         return AdjointRow(motion, Enclosed(*(node.reshape(-1, len(c))[: motion.count + 1] for node in nodes)))
 
     @property
     def step(self) -> float:
         """The length of a step."""
         return self.motion.step
+
+    @property
+    def single(self) -> AdjointRow:
+        """The row itself, which is known at all times."""
+        return self
+
+    @property
+    def ends(self) -> Array:
+        """The ends of the steps, 0 first, ``(N + 1,)``."""
+        return np.asarray(np.arange(self.count + 1) * self.step)
+
+    @property
+    def spans(self) -> list[AdjointSpan]:
+        """The adjoints that a bounded input meets: this one, at any age."""
+        return [AdjointSpan(self)]
 
     def reversed(self) -> AdjointRow:
         """Return the adjoint of the row ``-c``."""
@@ -216,7 +237,7 @@ class AdjointRow:
     def driven(self) -> Enclosed:
         """The terms of ``l'F`` on every step in powers of its share, ``(N, p + 1, q)``; the remainder is in the radius
         of the first."""
-        return Enclosed(*_multiply_rows(Enclosed(self.nodes.mid[:-1], self.nodes.rad[:-1]), self.motion.inputs))
+        return multiply_rows(self.nodes[:-1], self.motion.inputs)
 
     @cached_property
     def _integration_weights(self) -> Array:
@@ -234,7 +255,9 @@ class AdjointRow:
         rad = (
             self.step * np.einsum("kjq,j->kq", self.driven.rad, self._integration_weights) + rounding(ORDER + 2) * size
         )
-        return Enclosed(accumulate_exactly(increments), _accumulate_bounds(rad) * OUTWARD)
+        return Enclosed(
+            accumulate_exactly(increments), np.vstack([np.zeros((1, rad.shape[1])), np.cumsum(rad, axis=0)]) * OUTWARD
+        )
 
     def placed(self, times: Array) -> tuple[np.ndarray, Array]:
         """Return the step that holds each time, and the share of the step that has passed, both exact."""
@@ -253,13 +276,10 @@ class AdjointRow:
         for start in range(0, indices.size, batch_size):
             batch = indices[start : start + batch_size]
             distinct, positions = np.unique(steps[batch], return_inverse=True)
-            terms, errors = _multiply_rows(
-                Enclosed(self.nodes.mid[distinct], self.nodes.rad[distinct]), self.motion.rows
-            )
+            terms = multiply_rows(self.nodes[distinct], self.motion.rows)[positions]
             powers = shares[batch][:, None] ** np.arange(ORDER + 1)
-            chosen = terms[positions]
-            mid[batch] = np.einsum("kjd,kj->kd", chosen, powers)
-            error = np.einsum("kjd,kj->kd", errors[positions] + rounding(3 * ORDER) * np.abs(chosen), powers)
+            mid[batch] = np.einsum("kjd,kj->kd", terms.mid, powers)
+            error = np.einsum("kjd,kj->kd", terms.rad + rounding(3 * ORDER) * np.abs(terms.mid), powers)
             rad[batch] = error * OUTWARD
         return Enclosed(mid, rad)
 
@@ -278,11 +298,11 @@ class AdjointRow:
     def between(self, times: Array, start: Array | float, stop: Array | float) -> Enclosed:
         """Return what an input of 1 by every column of ``F``, from ``start`` to ``stop``, adds to the row at exact
         times, ``(..., q)``. The radius allows for the rounding of differences of times."""
-        (since, since_rounding), (until, until_rounding) = subtract_times(times, start), subtract_times(times, stop)
+        (since, since_rounding), (until, until_rounding) = difference(times, start), difference(times, stop)
         (late, late_rounding), (early, early_rounding) = self.integrals(since), self.integrals(until)
         mid = late.mid - early.mid
         rad = np.abs(late.rad - early.rad) + (OUTWARD - 1.0) * (late.rad + early.rad) + late_rounding + early_rounding
-        rad = rad + HALF_ULP * np.abs(mid) + (since_rounding + until_rounding)[..., None] * self.fastest
+        rad = rad + HALF_ULP * np.abs(mid) + (np.abs(since_rounding) + np.abs(until_rounding))[..., None] * self.fastest
         return Enclosed(mid, rad * OUTWARD)
 
     @cached_property
@@ -301,108 +321,49 @@ class AdjointRow:
         batch_size = max(1, AT_ONCE // (d + 2 * q))
         for start in range(0, self.count, batch_size):
             steps = slice(start, min(start + batch_size, self.count))
-            for term in zip(terms.mid[:, None], terms.rad[:, None], strict=True):
-                mid, rad = _multiply_rows(Enclosed(self.nodes.mid[steps], self.nodes.rad[steps]), Enclosed(*term))
-                bounds[steps] += np.abs(mid[:, 0]) + rad[:, 0]
+            for k in range(len(terms.mid)):
+                product = multiply_rows(self.nodes[steps], terms[k : k + 1])
+                bounds[steps] += (np.abs(product.mid) + product.rad)[:, 0]
         bounds *= OUTWARD
         return bounds[:, :d], bounds[:, d : d + q], bounds[:, d + q :]
 
 
 @final
 @dataclass(frozen=True, eq=False)
-class SupportIntegrals:
-    """The integrals, from 0 on, of the support functions of ``summands`` at some ``columns`` of ``l'F`` for one
-    ``row``: one integral for every summand."""
-
-    row: AdjointRow
-    columns: slice
-    summands: Sequence[Summand | NormSummand]
-
-    @cached_property
-    def _polynomials(self) -> tuple[Array, Array, Array]:
-        """The columns of ``l'F`` on every step in powers of ``u`` from -1 to 1, ``(N, p + 1, w)``; their error bounds,
-        which allow for rounding errors in the sum of two of their values; and bounds of their absolute values,
-        ``(N, w)`` each."""
-        mid, rad = (values[:, :, self.columns] for values in (self.row.driven.mid, self.row.driven.rad))
-        size = np.abs(mid).sum(axis=1) * OUTWARD  # no larger in powers of ``u``, since ``|v| <= (1 + |u|) / 2``
-        errors = rad.sum(axis=1) + (rounding(2 * ORDER) + rounding(size.shape[1] + 2 * ORDER)) * size
-        return np.einsum("ij,kjw->kiw", CENTRED, mid), errors * OUTWARD, size
-
-    @cached_property
-    def _support_bounds(self) -> Array:
-        """The upper bounds of the absolute values of the support functions on every step and its neighbours,
-        ``(N, S)``."""
-        _, errors, size = self._polynomials
-        heights = (size + errors) @ np.array([summand.radii for summand in self.summands]).T * OUTWARD
-        padded = np.pad(heights, ((1, 1), (0, 0)), mode="edge")
-        return np.asarray(np.maximum(heights, np.maximum(padded[:-2], padded[2:])))
-
-    def _integrate_steps(self, steps: np.ndarray, shares: Array) -> tuple[Array, Array, Array]:
-        """Return the integrals over the first ``shares (k,)`` of ``steps (k,)``, and how much more and how much less
-        they may be, ``(k, S)`` each."""
-        P, errors, size = (values[steps] for values in self._polynomials)
-        integrals = []
-        for summand in self.summands:
-            value, excess, deficit, tops = summand.integrate_support(P, errors, size, 2.0 * shares - 1.0)
-            rounded = rounding(4 * ORDER) * 2.0 * tops
-            integrals.append((value, (excess + rounded) * OUTWARD, (deficit + rounded) * OUTWARD))
-        value, excess, deficit = (
-            np.stack(values, axis=1) * (self.row.step / 2.0) for values in zip(*integrals, strict=True)
-        )
-        return value, excess, deficit
-
-    @cached_property
-    def _end_integrals(self) -> tuple[Array, Array, Array]:
-        """The integrals from 0 to the ends of all steps, 0 itself first, and how much more and how much less they may
-        be, ``(N + 1, S)`` each."""
-        value, excess, deficit = self._integrate_steps(np.arange(self.row.count), np.ones(self.row.count))
-        outward = OUTWARD * (1.0 + rounding(self.row.count))
-        return accumulate_exactly(value), _accumulate_bounds(excess) * outward, _accumulate_bounds(deficit) * outward
-
-    def at(self, times: Array, rounded: Array | float = 0.0) -> tuple[Array, Array]:
-        """Return lower and upper bounds, ``(k, S)`` each, of the integrals from 0 to ``times (k,)``. The given times
-        may differ from the true ones by at most ``rounded``."""
-        steps, shares = self.row.placed(times)
-        (value, excess, deficit), partial = (
-            (values[steps] for values in self._end_integrals),
-            self._integrate_steps(steps, shares),
-        )
-        total = value + partial[0]
-        error = np.asarray(rounded)[..., None] * self._support_bounds[steps] + 4.0 * HALF_ULP * (
-            np.abs(value) + np.abs(total)
-        )
-        return total - (deficit + partial[2] + error) * OUTWARD, total + (excess + partial[1] + error) * OUTWARD
-
-
-@final
-@dataclass(frozen=True, eq=False)
 class Stopped:
-    """A sum of adjoints, each of which stays constant from a time of its own on. It replaces an `AdjointRow` at single
-    times.
-
-    Attributes
-    ----------
-    parts
-        The adjoints, and the time from which each is constant.
-    segments
-        For an integral of a row from ``a`` to ``b``, the adjoints that a measurable disturbance meets, backwards in
-        time: that of the row over the length ``b - a``, then over the length ``a`` that of ``r(b - a) - r(0)``, where
-        ``r(s)`` is the adjoint of the row after ``s``. With each, its length and the rounding error of this length.
-    """
+    """A sum of adjoints, the ``parts``, each with a time from which it is constant. It replaces an `AdjointRow` at
+    single times."""
 
     parts: Sequence[tuple[AdjointRow, float]]
-    segments: Sequence[tuple[AdjointRow, float, float]] = ()
 
-    @staticmethod
-    def integral(parts: Sequence[tuple[AdjointRow, float]], row: Array, begin: float, end: float) -> Stopped:
-        """Return the sum for the integral of a ``row (d,)`` from ``begin`` to ``end``, whose ``parts`` are given."""
-        (first, _), motion = parts[0], parts[0][0].motion
-        exact = arb_mat([[arb(float(v)) for v in row]])
-        difference = exact * (motion.A * (arb(end) - arb(begin))).exp() - exact
-        length, rounded = (value.item() for value in subtract_times(np.array([end]), begin))
-        return Stopped(
-            parts, [(first, length, rounded), (AdjointRow.of_balls(motion, difference.tolist()[0]), begin, 0.0)]
-        )
+    @property
+    def single(self) -> AdjointRow:
+        """The one adjoint of the row, which a sum does not have."""
+        raise Unchecked("a sum of rows that stop is known at single times alone")
+
+    @property
+    def ends(self) -> Array:
+        """The ends of the steps, of which a sum has none."""
+        return np.zeros(0)
+
+    @cached_property
+    def spans(self) -> list[AdjointSpan]:
+        """The adjoints that a bounded input meets. For the integral of a row from ``a`` to ``b`` they are that of the
+        row over the length ``b - a``, and before ``a`` that of ``r(b - a) - r(0)``, where ``r(s)`` is the adjoint after
+        ``s``."""
+        (row, end), *further_parts = self.parts
+        if not further_parts:
+            return [AdjointSpan(row, end)]
+        (opposite, begin), *further_parts = further_parts
+        if further_parts or (row.nodes.mid[0] + opposite.nodes.mid[0]).any():
+            raise Unchecked("of measurable disturbances one integral at a time is followed")
+        exact = arb_mat([[arb(v) for v in row.nodes.mid[0].tolist()]])
+        change = exact * (self.motion.A * (arb(end) - arb(begin))).exp() - exact
+        length, rounded = difference(end, begin)
+        return [
+            AdjointSpan(row, end, length, abs(rounded)),
+            AdjointSpan(AdjointRow.of_balls(self.motion, change.tolist()[0]), begin),
+        ]
 
     @property
     def motion(self) -> AdjointFlow:
@@ -411,19 +372,11 @@ class Stopped:
 
     def at(self, times: Array) -> Enclosed:
         """Return the sum of the adjoints at exact ``times (k,)``, ``(k, d)``."""
-        return _sum_enclosures([row.at(np.minimum(times, until)) for row, until in self.parts])
+        return reduce(add, [row.at(np.minimum(times, until)) for row, until in self.parts])
 
     def between(self, times: Array, start: Array | float, stop: Array | float) -> Enclosed:
         """Return what an input of 1 from ``start`` to ``stop`` adds to the sum at exact times, ``(..., q)``."""
-        return _sum_enclosures([row.between(np.minimum(times, until), start, stop) for row, until in self.parts])
-
-
-def _sum_enclosures(parts: Sequence[Enclosed]) -> Enclosed:
-    mid, rad = parts[0].mid, parts[0].rad
-    for summand in parts[1:]:
-        mid = mid + summand.mid
-        rad = rad + summand.rad + HALF_ULP * np.abs(mid)
-    return Enclosed(mid, rad * OUTWARD)
+        return reduce(add, [row.between(np.minimum(times, until), start, stop) for row, until in self.parts])
 
 
 def accumulate_exactly(values: Array) -> Array:
@@ -431,33 +384,6 @@ def accumulate_exactly(values: Array) -> Array:
     to a float once."""
     sums = [accumulate(balls(column), initial=ball(0.0)) for column in values.T]
     return np.array([[float(x) for x in column] for column in sums]).reshape(-1, len(values) + 1).T
-
-
-def _accumulate_bounds(values: Array) -> Array:
-    return np.vstack([np.zeros((1, values.shape[1])), np.cumsum(values, axis=0)])
-
-
-def subtract_times(times: Array, others: Array | float) -> tuple[Array, Array]:
-    """Return the differences of times as floats, and the absolute values of their rounding errors (Knuth 1997, section
-    4.2.2, theorem B)."""
-    nearest = times - np.asarray(others, dtype=float)
-    opposite = nearest - times
-    return nearest, np.abs((times - (nearest - opposite)) - (others + opposite))
-
-
-def _multiply_rows(left: Enclosed, right: Enclosed) -> tuple[Array, Array]:
-    """Return the products ``(k, j, n)`` of rows ``(k, d)`` with matrices ``(j, d, n)``, and their error bounds. The
-    rounding error grows with the number of terms of one partial sum plus the number of these sums (Higham 2002, section
-    4.2)."""
-    j, d, n = right.mid.shape
-    flat, flat_rad = (matrices.transpose(1, 0, 2).reshape(d, j * n) for matrices in (right.mid, right.rad))
-    size = np.abs(left.mid)
-    mid = left.mid[:, :SUMMED] @ flat[:SUMMED]
-    for start in range(SUMMED, d, SUMMED):
-        mid += left.mid[:, start : start + SUMMED] @ flat[start : start + SUMMED]
-    operations = min(d, SUMMED) + (d - 1) // SUMMED
-    rad = size @ (flat_rad + rounding(operations) * np.abs(flat)) + left.rad @ (np.abs(flat) + flat_rad)
-    return mid.reshape(-1, j, n), rad.reshape(-1, j, n) * OUTWARD
 
 
 @final
@@ -474,10 +400,9 @@ class Worst:
     grid, drives
         Times ``(L + 1,)``, and the known inputs between them, ``(q', L)``, which enter by the first inputs of the
         adjoint.
-    disturbance_set
-        The set of the disturbance, which enters by the last inputs.
-    changes
-        The times ``(M + 1,)`` between which the disturbance is constant; ``None`` where it is measurable.
+    disturbance_set, changes
+        The set of the disturbance that is constant between the times ``changes (M + 1,)``, or ``None``. It enters by
+        the last inputs.
     """
 
     adjoint: AdjointRow | Stopped
@@ -486,41 +411,12 @@ class Worst:
     grid: Array
     drives: Enclosed
     disturbance_set: ConvexSet | None
-    changes: Array | None
-
-    @property
-    def _single_adjoint(self) -> AdjointRow:
-        """The one adjoint of the row, where it is known at all times."""
-        if isinstance(self.adjoint, Stopped):
-            raise Unchecked("a sum of rows that stop is known at single times alone")
-        return self.adjoint
+    changes: Array
 
     @property
     def _disturbance_columns(self) -> slice:
         """The inputs of the adjoint by which the disturbance enters."""
         return slice(self.drives.mid.shape[0], None)
-
-    def along(self, time: float, deviation: Array, changes: Array, signal: Array | None) -> tuple[float, float]:
-        """Return a lower and an upper bound of ``c'x(t)`` at a time along one trajectory: with an initial ``deviation
-        (d,)`` from the centre, and a disturbance ``signal (mw, M)`` between ``changes (M + 1,)``, or ``None``."""
-        times = np.array([time])
-        row = self.adjoint.at(times)
-        value, rad = self._evaluate_inputs(times)
-        for state in (self.centre, deviation):
-            value = value + row.mid @ state
-            rad = rad + row.rad @ np.abs(state) + rounding(state.size) * (np.abs(row.mid) @ np.abs(state))
-            rad = rad + 2.0 * HALF_ULP * np.abs(value)
-        if signal is not None:
-            starts, stops = np.append(changes[:-1], time)[:-1], np.minimum(changes[1:], time)
-            effects = self.adjoint.between(np.full(starts.size, time), starts, stops)
-            gains, gain_errors = (
-                effects.mid[:, self._disturbance_columns] * signal.T,
-                effects.rad[:, self._disturbance_columns] * np.abs(signal.T),
-            )
-            value = value + gains.sum()
-            rad = rad + gain_errors.sum() + rounding(gains.size) * np.abs(gains).sum()
-        error = float(rad[0] + 4.0 * HALF_ULP * abs(value[0])) * OUTWARD
-        return float(value[0]) - error, float(value[0]) + error
 
     def _evaluate_inputs(self, times: Array) -> tuple[Array, Array]:
         """Return what the known inputs add to the row at ``times (k,)``, and the error bounds, ``(k,)`` each."""
@@ -545,104 +441,31 @@ class Worst:
         rad = rad + rows.rad @ np.abs(self.centre) + rounding(self.centre.size) * size
         supports = [] if self.initial_set is None else [_evaluate_support(self.initial_set, rows)]
         if self.disturbance_set is not None:
-            supports.append(
-                self._evaluate_held(times) if self.changes is not None else self._evaluate_measurable(times)
-            )
+            supports.append(self._evaluate_disturbance(times))
         for support, error in supports:
             top, rad, size = top + support, rad + error, size + np.abs(support)
         rad = (rad + 8.0 * HALF_ULP * (np.abs(top) + size)) * OUTWARD
         return top + rad, 3.0 * rad
 
-    def compute_initial_weights(self, time: float) -> list[arb]:
-        """Return the weights ``(d,)`` of the initial state in the row at a time."""
-        row = self.adjoint.at(np.array([time]))
-        return [arb(m, r) for m, r in zip(row.mid[0].tolist(), row.rad[0].tolist(), strict=True)]
-
-    def weights(self, time: float, starts: Array, stops: Array) -> list[list[arb]]:
-        """Return the weights of inputs between ``starts (K,)`` and ``stops (K,)`` in the row at a time, ``(q,)`` for
+    def _evaluate_disturbance(self, times: Array) -> tuple[Array, Array]:
+        """Return what the worst disturbance adds to the row at ``times (k,)``, and how much more it may be, ``(k,)``
         each."""
-        has_started, columns = starts < time, self.adjoint.motion.F.ncols()
-        weights = [[arb(0)] * columns for _ in range(starts.size)]
-        effects = self.adjoint.between(
-            np.full(has_started.sum(), time), starts[has_started], np.minimum(stops[has_started], time)
-        )
-        for k, mid, rad in zip(
-            np.flatnonzero(has_started).tolist(), effects.mid.tolist(), effects.rad.tolist(), strict=True
-        ):
-            weights[k] = [arb(m, r) for m, r in zip(mid, rad, strict=True)]
-        return weights
-
-    def compute_worst_effect(self, time: float) -> arb:
-        """Return what the worst disturbance adds to the row at a time."""
         assert self.disturbance_set is not None
-        if self.changes is None:
-            (value,), (rad,) = self._evaluate_measurable(np.array([time]))
-            return arb(float(value), float(2.0 * rad))
-        weights = self.weights(time, self.changes[:-1], self.changes[1:])
-        return sum(
-            (known(self.disturbance_set).support(weight[self._disturbance_columns]) for weight in weights), arb(0)
-        )
-
-    def _evaluate_held(self, times: Array) -> tuple[Array, Array]:
-        """Return what the worst disturbance that is constant between ``changes`` adds to the row at ``times (k,)``, and
-        how much more it may be, ``(k,)`` each."""
-        assert self.disturbance_set is not None and self.changes is not None
         top, rad = np.zeros(times.size), np.zeros(times.size)
         for start, stop in zip(self.changes[:-1], self.changes[1:], strict=True):
             effects = self.adjoint.between(times, float(start), float(stop))
             support, error = _evaluate_support(
                 self.disturbance_set,
-                Enclosed(effects.mid[:, self._disturbance_columns], effects.rad[:, self._disturbance_columns]),
+                effects[:, self._disturbance_columns],
             )
             top, rad = top + support, rad + error + HALF_ULP * np.abs(top)
         return top, rad
 
     @cached_property
-    def _disturbance_middle(self) -> Array:
-        """The middle of the set of a measurable disturbance, ``(mw,)``."""
-        assert self.disturbance_set is not None
-        return middle(self.disturbance_set)
-
-    @cached_property
-    def _disturbance_integrals(self) -> SupportIntegrals:
-        """The integrals of the support functions of a measurable disturbance about the middle of its set."""
-        assert self.disturbance_set is not None
-        return SupportIntegrals(self._single_adjoint, self._disturbance_columns, summands_of(self.disturbance_set))
-
-    def _evaluate_measurable(self, times: Array) -> tuple[Array, Array]:
-        """Return what the worst measurable disturbance adds to the row at ``times (k,)``, and error bounds, ``(k,)``
-        each."""
-        if isinstance(self.adjoint, Stopped):
-            return self._evaluate_stopped(self.adjoint, times)
-        low, high = (bound.sum(axis=1) for bound in self._disturbance_integrals.at(times))
-        linear, rounded = self._single_adjoint.integrals(times)
-        mid, mid_errors = linear.mid[:, self._disturbance_columns], (linear.rad + rounded)[:, self._disturbance_columns]
-        top = (low + high) / 2.0 + mid @ self._disturbance_middle
-        size = np.abs(mid) @ np.abs(self._disturbance_middle) + np.abs(low) + np.abs(high)
-        rounding_error = rounding(len(self._disturbance_integrals.summands) + self._disturbance_middle.size + 2) * size
-        return top, (high - low) / 2.0 + mid_errors @ np.abs(self._disturbance_middle) + rounding_error
-
-    def _evaluate_stopped(self, stopped: Stopped, times: Array) -> tuple[Array, Array]:
-        """Return what the worst measurable disturbance adds to an integral that has ended at all ``times (k,)``, and
-        error bounds, ``(k,)`` each."""
-        assert self.disturbance_set is not None
-        if not stopped.segments or (times < stopped.parts[0][1]).any():
-            raise Unchecked("of measurable disturbances one integral at a time is followed")
-        top, rad = np.zeros(times.size), np.zeros(times.size)
-        radius: Array = np.abs(self._disturbance_middle) + np.array(known(self.disturbance_set).radius)
-        for row, length, rounded in stopped.segments:
-            value, error = replace(self, adjoint=row)._evaluate_measurable(np.full(times.size, length))
-            top = top + value
-            rad = (
-                rad + error + HALF_ULP * np.abs(top) + rounded * float(row.fastest[self._disturbance_columns] @ radius)
-            )
-        return top, rad * OUTWARD
-
-    @cached_property
     def _curvature_bounds(self) -> Array:
         """The upper bounds ``(N,)`` of the downward curvature of the largest value on every step. Times an eighth of
         the square of the width of a cell, they bound how far the largest value lies above its chord."""
-        states, once, twice = self._single_adjoint.derivative_bounds
+        states, once, twice = self.adjoint.single.derivative_bounds
         state_bound = np.abs(self.centre) + (
             0.0 if self.initial_set is None else np.array(known(self.initial_set).radius)
         )
@@ -651,14 +474,10 @@ class Worst:
         used = self.drives.mid.shape[0]
         inputs[:used] = (np.abs(self.drives.mid) + self.drives.rad).max(axis=1, initial=0.0)
         if self.disturbance_set is not None:
-            radius = np.array(known(self.disturbance_set).radius)
-            if self.changes is None:  # an integral of a support function, whose argument changes at the rate l'AE
-                curvature = curvature + once[:, self._disturbance_columns] @ radius
-            else:
-                inputs[self._disturbance_columns] = radius
+            inputs[self._disturbance_columns] = known(self.disturbance_set).radius
         # an input on a piece has a difference of l'AF as second derivative: all together the total variation of l'AF,
         # and one value for the piece that acts
-        total = self._single_adjoint.step * float((twice @ inputs).sum()) + float((once @ inputs).max(initial=0.0))
+        total = self.adjoint.single.step * float((twice @ inputs).sum()) + float((once @ inputs).max(initial=0.0))
         return np.asarray((curvature + total) * OUTWARD)
 
     def over(self, start: Array, stop: Array, added_values: Array | float = 0.0) -> Array:
@@ -670,7 +489,7 @@ class Worst:
         tops = np.concatenate(bounds)[positions]
         width, curvature = (stop - start) * OUTWARD, np.zeros(start.size)
         if width.any():
-            step, last = self._single_adjoint.step, self._single_adjoint.count - 1
+            step, last = self.adjoint.single.step, self.adjoint.single.count - 1
             curvature = np.maximum(
                 *(self._curvature_bounds[np.clip((t / step).astype(int), 0, last)] for t in (start, stop))
             )
@@ -681,11 +500,9 @@ class Worst:
     def cuts(self, more: Sequence[float]) -> Array:
         """Return increasing times, among them ``more``, between which no input jumps. They are at most a step apart,
         except for a `Stopped` adjoint, of which only values at single times are known."""
-        times = [np.asarray(more, dtype=float)]
-        if isinstance(self.adjoint, AdjointRow):
-            times.append(np.arange(self.adjoint.count + 1) * self.adjoint.step)
+        times = [np.asarray(more, dtype=float), self.adjoint.ends]
         times += [self.grid] if self.drives.mid.any() or self.drives.rad.any() else []
-        times += [self.changes] if self.disturbance_set is not None and self.changes is not None else []
+        times += [self.changes] if self.disturbance_set is not None else []
         return np.unique(np.concatenate(times))
 
 
@@ -696,7 +513,3 @@ def _evaluate_support(bound: ConvexSet, rows: Enclosed) -> tuple[Array, Array]:
     size = (np.abs(w) * np.abs(rows.mid)).sum(axis=1)
     error = (np.abs(w) * rows.rad).sum(axis=1) + rounding(rows.mid.shape[1]) * size
     return (w * rows.mid).sum(axis=1), (error + np.abs(excess)) * OUTWARD
-
-
-# from powers of the share ``v`` of a step to powers of ``u = 2 v - 1``: ``v^j = (1 + u)^j / 2^j``
-CENTRED = np.array([[comb(j, i) / 2.0**j for j in range(ORDER + 1)] for i in range(ORDER + 1)])

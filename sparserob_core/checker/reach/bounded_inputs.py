@@ -27,7 +27,7 @@ from sparserob_core.checker.reach.states import enclosed, ring
 from sparserob_core.checker.reach.tube import Around
 from sparserob_core.checker.sets.along import NormSummand
 from sparserob_core.checker.sets.parameters import Corners
-from sparserob_core.checker.sets.polynomials import OUTWARD, Enclosed, rounding
+from sparserob_core.checker.sets.polynomials import OUTWARD, Enclosed, multiply_rows, rounding
 from sparserob_core.checker.sets.summands import Summand, integrate
 from sparserob_core.sip.convex_set import Array
 
@@ -93,8 +93,14 @@ class SizedInput:
         return np.asarray((self.sizes.mid[piece] + self.sizes.rad[piece]) @ self.radii)
 
     def reaching(self, rows: Array) -> Array:
-        """Return ``rows (n, d)`` with 0 for the states that the input does not reach."""
-        return np.where(np.isin(np.arange(rows.shape[1]), list(self.numb)), 0.0, rows)
+        """Return ``rows (..., d)`` with 0 for the states that the input does not reach."""
+        return np.where(np.isin(np.arange(rows.shape[-1]), list(self.numb)), 0.0, rows)
+
+    def sort_direction(self, c: Array) -> bytes:
+        """Return a key of a direction ``c (d,)``, the same for the opposite direction where the input does as much."""
+        is_symmetric = all(summand.is_symmetric for summand in self.summands)
+        same = (c + 0.0, 0.0 - c) if is_symmetric else (c + 0.0,)  # -0 becomes 0, so that equal rows have equal bytes
+        return min(row.tobytes() for row in same)
 
 
 @final
@@ -123,17 +129,19 @@ class BoundedInputAt(BoundedInputHere):
         np.add.at(bounds, self.owner[indices], np.maximum(low[:, 0], 0.0))
         return bounds * self.input.shares * (1.0 - rounding(indices.size))
 
-    def added(self, c: Array, time: float) -> tuple[float, float]:
-        """Return a lower and an upper bound of what the worst input adds to ``c'x(t)``."""
-        low, high = self._bound_effects(c[None], time)
-        return float(low[0]), float(high[0])
+    def added_at(self, c: Array, times: Array) -> tuple[Array, Array]:
+        """Return lower and upper bounds of what the worst input adds to ``c'x`` at ``times (k,)``, ``(k,)`` each."""
+        low, high = np.hstack([self._bound_effects(c[None], time) for time in times.tolist()])
+        return low, high
 
-    def bound_chord_error(self, c: Array, start: float, stop: float) -> float:
-        """Return an upper bound of how far `added` lies above its chord on ``[start, stop]``."""
-        axes = np.eye(c.size)
-        start_bounds = self._bound_effects(np.vstack([axes, -axes]), start)[1].reshape(2, -1).max(axis=0)
-        size = self.input.largest(self.input.piece_at(start))
-        return float(above_chord(self.law, c[None], start, stop, start_bounds, size, self.input.first)[0])
+    def bound_chord_errors(self, c: Array, start: Array, stop: Array) -> Array:
+        """Return upper bounds ``(k,)`` of how far `added` lies above its chord on cells from ``start`` to ``stop``."""
+        axes, bounds = np.vstack([np.eye(c.size), -np.eye(c.size)]), np.zeros(start.size)
+        for i, (a, b) in enumerate(zip(start.tolist(), stop.tolist(), strict=True)):
+            start_bounds = self._bound_effects(axes, a)[1].reshape(2, -1).max(axis=0)
+            size = self.input.largest(self.input.piece_at(a))
+            bounds[i] = above_chord(self.law, c[None], a, b, start_bounds, size, self.input.first)[0]
+        return bounds
 
     @remembered(lambda: TIMES_KEPT, lambda self, rows, time: (time, rows.tobytes()))
     def _bound_effects(self, rows: Array, time: float) -> tuple[Array, Array]:
@@ -163,9 +171,9 @@ class BoundedInputAt(BoundedInputHere):
             transition = self.law.over(self.marks[last], time)[0].matrix
             last_rows = Enclosed.of(exactly(rows) * transition)
             past, transitions = indices[indices < last], self._compute_transitions(last)
-            propagated = _propagate_rows(last_rows, Enclosed(transitions.mid[past], transitions.rad[past]))
+            propagated = multiply_rows(last_rows, transitions[past])
             kernels += [self._compute_kernel(self.marks[k], self.marks[k + 1]) for k in past]
-            lines.append(propagated)
+            lines.append(propagated.swapped(0, 1))
         if indices[-1] == last:
             kernels.append(self._compute_kernel(self.marks[last], time))
             lines.append(Enclosed(rows[None], np.zeros((1, *rows.shape))))
@@ -187,14 +195,12 @@ class BoundedInputAt(BoundedInputHere):
     @remembered(lambda: TIMES_KEPT)
     def _compute_kernel(self, start: float, stop: float) -> Enclosed:
         """Return the kernel of an interval in powers of ``u`` from -1 to 1, ``(p + 1, d, m)``, by `compute_kernel`."""
-        kernel = compute_kernel(self.law, start, stop, self.input.columns)
-        return Enclosed(kernel.mid[:, 0], kernel.rad[:, 0])
+        return compute_kernel(self.law, start, stop, self.input.columns)[:, 0]
 
     @remembered(lambda: KEPT)
     def _compute_transitions(self, node: int) -> Enclosed:
         """Return the transitions to a mark from the end of every interval before it, ``(node, d, d)``."""
-        transitions = enclosed(products(self._interval_transitions[:node])[1:])
-        return Enclosed(transitions.mid[:, 0], transitions.rad[:, 0])
+        return enclosed(products(self._interval_transitions[:node])[1:])[:, 0]
 
     @cached_property
     def _interval_transitions(self) -> list[Series]:
@@ -281,7 +287,7 @@ class BoundedInputOver(BoundedInput):
             along = Enclosed(
                 np.swapaxes(rows @ transitions.mid[q], 1, 2), np.swapaxes(np.abs(rows) @ transition_errors[q], 1, 2)
             )
-            kernel = Enclosed(np.swapaxes(kernels.mid[q], 2, 3), np.swapaxes(kernels.rad[q], 2, 3))
+            kernel = kernels[q].swapped(2, 3)
             entering = self.input.largest(piece) * OUTWARD
             product = ring(flow.monomials, kernel, along)  # (p + 1, M, m, n)
             size += np.einsum("pkjn,j,p->nk", np.abs(product.mid), entering, MEANS[: len(product.mid)])
@@ -313,11 +319,3 @@ class BoundedInputOver(BoundedInput):
         ]
         owner = np.searchsorted(self.input.breakpoints, np.array(marks[:-1]), side="right") - 1
         return enclosed(products(steps)[1:]), Enclosed(*(np.array(arrays) for arrays in zip(*pad, strict=True))), owner
-
-
-def _propagate_rows(rows: Enclosed, steps: Enclosed) -> Enclosed:
-    """Return ``rows (n, d)`` times every one of ``steps (q, d, d)``, ``(q, n, d)``."""
-    row_size, step_size = np.abs(rows.mid), np.abs(steps.mid)
-    rad = np.einsum("nd,qde->qne", row_size, steps.rad + rounding(row_size.shape[1]) * step_size)
-    rad = (rad + np.einsum("nd,qde->qne", rows.rad, step_size + steps.rad)) * OUTWARD
-    return Enclosed(np.einsum("nd,qde->qne", rows.mid, steps.mid), rad)

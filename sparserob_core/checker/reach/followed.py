@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import final
@@ -10,6 +11,7 @@ import numpy as np
 
 from sparserob_core.checker.arithmetic.remembered import remembered
 from sparserob_core.checker.arithmetic.series import stacked
+from sparserob_core.checker.flow.flow import StateWeights
 from sparserob_core.checker.flow.plant import modes_at
 from sparserob_core.checker.problem.disturbances import Disturbances
 from sparserob_core.checker.problem.integrals import RunningIntegrals, spelt
@@ -44,15 +46,8 @@ class FollowedRows:
     def running(self) -> RunningIntegrals | None:
         """The integrals that the problem bounds, where the system changes with time only because they begin and end;
         else ``None``."""
-        system = self.problem.system
-        if not system.switches:
-            return None
-        integrals, d = RunningIntegrals.of(spelt(self.original_problem)), self.original_problem.system.states
-        return (
-            integrals
-            if integrals is not None and all(integrals.agrees_with(phase, d) for phase in system.phases)
-            else None
-        )
+        # a constant system without parameters is divided by its integrals alone
+        return RunningIntegrals.of(spelt(self.original_problem)) if self.problem.system.switches else None
 
     @property
     def still(self) -> System | None:
@@ -85,37 +80,39 @@ class FollowedRows:
             B = stacked([[*b, *e] for b, e in zip(B.tolist(), E.tolist(), strict=True)])
         return AdjointFlow.of(A, B, self.timing.grid[-1], self.timing.clock)
 
-    def worst(self, c: Array, scene: Scene | None) -> Worst:
-        """Return the worst case of the row ``c'x``, ``c (d,)``, under the control of a ``scene``, or without a
-        control."""
+    def worst(self, c: Array, scene: Scene) -> Worst:
+        """Return the worst case of the row ``c'x``, ``c (d,)``, under the control of a ``scene``."""
         problem = self.problem
-        inputs = problem.system.controls + problem.system.drifts
-        table = Enclosed(*np.zeros((2, inputs, len(self.timing.grid) - 1)))
-        if scene is not None:
-            on_grid = [u.entries() for u in scene.control]
-            table = Enclosed.of(stacked([list(row) for row in zip(*on_grid, strict=True)]))
-        jumps = None if problem.measurable is not None else self.disturbances.changes
+        on_grid = [u.entries() for u in scene.control]
+        table = Enclosed.of(stacked([list(row) for row in zip(*on_grid, strict=True)]))
+        is_constant = problem.measurable is not None  # the middle of the set, and a bounded input beside it
+        changes = [0.0] if is_constant else self.disturbances.changes or [0.0]
         return Worst(
-            self._choose_adjoint(c),
+            self.choose_adjoint(c),
             np.asarray(problem.initial_state, dtype=float),
             problem.initial_set,
             np.array(self.timing.grid),
             table,
-            problem.disturbance,
-            None if jumps is None else np.append(jumps, problem.horizon),
+            self.disturbances.held,
+            np.append(changes, problem.horizon),
         )
 
-    def _choose_adjoint(self, c: Array) -> AdjointRow | Stopped:
+    def weigh(self, c: Array, parameter: Sequence[float], grid: Sequence[float]) -> StateWeights:
+        """Return the weights of ``c'x`` at the end of a grid, as `VerifiedFlows.weigh` does."""
+        row, time, m = self.choose_adjoint(c), np.array([grid[-1]]), self.problem.system.controls
+        effects, m = row.between(time, np.array(grid[:-1]), np.array(grid[1:])), m + self.problem.system.drifts
+        pieces, columns = range(len(grid) - 1), (slice(m), slice(m, None))
+        control, disturbance = ([effects[k : k + 1, part].matrix for k in pieces] for part in columns)
+        return StateWeights(row.at(time).matrix, control, disturbance)
+
+    def choose_adjoint(self, c: Array) -> AdjointRow | Stopped:
         """Return the adjoint of a row ``c (d,)``. An integral over a window is a sum of two rows, one that stops at the
         end of the window and an opposite one that stops at its beginning."""
         if self.running is not None:
             terms = self.running.parts(c)
             rows = [(self._remember_adjoint(row), until) for row, until in terms]
-            if self.problem.measurable is not None and len(terms) == 2 and not (terms[0][0] + terms[1][0]).any():
-                (row, end), (_, begin) = terms
-                return Stopped.integral(rows, row, begin, end)
             if len(terms) > 1 or terms[0][1] < np.inf:
-                return Stopped(rows, [(*rows[0], 0.0)] if len(terms) == 1 else ())
+                return Stopped(rows)
         return self._remember_adjoint(c)
 
     @remembered(key=lambda self, c: (c + 0.0).tobytes())  # -0 becomes 0, so that equal rows have equal bytes

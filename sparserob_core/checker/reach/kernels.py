@@ -61,8 +61,9 @@ class BoundedInputHere(BoundedInput):
     """A `BoundedInput` of a known system."""
 
     @abstractmethod
-    def added(self, c: Array, time: float) -> tuple[float, float]:
-        """Return a lower and an upper bound of what the worst input adds to ``c'x(t)``, ``c (d,)``."""
+    def added_at(self, c: Array, times: Array) -> tuple[Array, Array]:
+        """Return lower and upper bounds, ``(k,)`` each, of what the worst input adds to ``c'x``, ``c (d,)``, at
+        ``times (k,)``."""
 
     @abstractmethod
     def least(self, c: Array, time: float) -> Array:
@@ -70,9 +71,18 @@ class BoundedInputHere(BoundedInput):
         piece in one channel."""
 
     @abstractmethod
+    def bound_chord_errors(self, c: Array, start: Array, stop: Array) -> Array:
+        """Return upper bounds ``(k,)`` of how far `added_at` lies above its chord on every interval from ``start (k,)``
+        to ``stop (k,)``, each within one piece of the command and one segment of the system."""
+
+    def added(self, c: Array, time: float) -> tuple[float, float]:
+        """Return a lower and an upper bound of what the worst input adds to ``c'x(t)``, ``c (d,)``."""
+        (low,), (high,) = self.added_at(c, np.array([time]))
+        return float(low), float(high)
+
     def bound_chord_error(self, c: Array, start: float, stop: float) -> float:
-        """Return an upper bound of how far `added` lies above its chord on ``[start, stop]``, which lies within one
-        piece of the command and one segment of the system."""
+        """Return `bound_chord_errors` on one interval."""
+        return float(self.bound_chord_errors(c, np.array([start]), np.array([stop]))[0])
 
     def at(self, parameter: Sequence[float]) -> BoundedInputHere:
         """Return the input itself, since the system is known."""
@@ -80,10 +90,10 @@ class BoundedInputHere(BoundedInput):
 
     def over(self, c: Array, times: Sequence[float], within: tuple[Corners, Around] | None) -> Added:
         """Return the mean of both bounds at every time, and an error bound that includes the curvature in time."""
-        ends = np.array([self.added(c, time) for time in times])
-        gap = float((ends[:, 1] - ends[:, 0]).max())
+        ends = np.array(self.added_at(c, np.array(times)))
+        gap = float((ends[1] - ends[0]).max())
         chord_error = self.bound_chord_error(c, times[0], times[-1]) if times[-1] > times[0] else 0.0
-        return Added(ends.mean(axis=1)[:, None], gap + chord_error, 0.0, np.zeros(0))
+        return Added(ends.mean(axis=0)[:, None], gap + chord_error, 0.0, np.zeros(0))
 
 
 def compute_kernel(law: VerifiedFlow, start: float, stop: float, columns: slice) -> Enclosed:
@@ -96,7 +106,7 @@ def compute_kernel(law: VerifiedFlow, start: float, stop: float, columns: slice)
     weights = arb_mat([[arb(comb(n, j)) / 2**n for n in range(count)] for j in range(count)])
     kernel = Enclosed.all([weights * table], (count, law.monomials.size, d, size))
     kernel.rad[0, 0] += remainder
-    return Enclosed(kernel.mid[..., columns], kernel.rad[..., columns])
+    return kernel[..., columns]
 
 
 def above_chord(

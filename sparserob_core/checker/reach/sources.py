@@ -17,7 +17,8 @@ from sparserob_core.checker.flow.flows import VerifiedFlows
 from sparserob_core.checker.outcome import Unchecked
 from sparserob_core.checker.problem.timing import Timing, before
 from sparserob_core.checker.reach.bounded_inputs import BoundedInputAt, BoundedInputOver, SizedInput
-from sparserob_core.checker.reach.execution import FollowedExecution
+from sparserob_core.checker.reach.followed import FollowedRows
+from sparserob_core.checker.reach.followed_inputs import FollowedInput
 from sparserob_core.checker.reach.kernels import BoundedInput, BoundedInputHere
 from sparserob_core.checker.sets.known import summands_of
 from sparserob_core.checker.sets.summands import channels
@@ -28,14 +29,13 @@ from sparserob_core.sip.convex_set import Array
 @final
 @dataclass(frozen=True, eq=False)
 class Sources:
-    """The bounded inputs of a ``problem``. ``pieces`` makes the pieces of the control, of which there may be none;
-    ``is_still`` says that one known system acts all the time."""
+    """The bounded inputs of a ``problem``. ``pieces`` makes the pieces of the control, of which there may be none."""
 
     problem: OptimalControlProblem
     timing: Timing
     flows: VerifiedFlows
     pieces: Callable[[], Sequence[arb_mat]]
-    is_still: bool
+    followed: FollowedRows
 
     @cached_property
     def measurable_input(self) -> BoundedInput | None:
@@ -54,6 +54,8 @@ class Sources:
         """Return a bounded input of this size at every parameter of the system."""
         if self.flows.box.middle:
             return BoundedInputOver(self.flows, entering)
+        if self.followed.still is not None:
+            return FollowedInput(self.followed.choose_adjoint, entering)
         return BoundedInputAt(self.flows.at(()), entering)
 
     def measurable_input_at(self, parameter: Sequence[float]) -> BoundedInputHere | None:
@@ -76,8 +78,6 @@ class Sources:
             pieces = [stacked([[v] for v in balls(before(self.problem))]), *pieces][
                 : breakpoints.size - 1 if pieces else 0
             ]
-        if self.is_still:
-            return FollowedExecution(self.problem, shares, breakpoints, pieces, self.timing.clock)
         summands = channels(shares.size)
         return self._build_bounded_input(SizedInput(shares, breakpoints, pieces, summands, numb=self.problem.commanded))
 
@@ -85,10 +85,14 @@ class Sources:
         """Return `execution` at one parameter."""
         return None if self.execution is None else self.execution.at(parameter)
 
-    def entering(self, parameter: Sequence[float] | None) -> list[BoundedInput]:
-        """Return all bounded inputs, at one parameter where it is given."""
-        sources = (self.execution, self.measurable_input)
-        return [source if parameter is None else source.at(parameter) for source in sources if source is not None]
+    @property
+    def entering(self) -> list[BoundedInput]:
+        """All bounded inputs."""
+        return [source for source in (self.execution, self.measurable_input) if source is not None]
+
+    def entering_at(self, parameter: Sequence[float]) -> list[BoundedInputHere]:
+        """Return all bounded inputs at one parameter."""
+        return [source.at(parameter) for source in self.entering]
 
     def erring(self, c: Array, time: float, parameter: Sequence[float]) -> tuple[Array | None, arb]:
         """Return lower bounds of what errors of execution add to ``c'x(t)`` at a parameter, for a command of size 1 on

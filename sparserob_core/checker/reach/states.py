@@ -177,7 +177,7 @@ class States:
         state = enclosed([term.along(rows) for term in terms])
         state.rad[0, 0] += np.abs(basis) @ remainder * OUTWARD
         lines = self._project_flow(segment, basis).shifted(float(first), float(width), order)
-        propagated_rows, effects = Enclosed(lines.mid[..., :d], lines.rad[..., :d]), list[tuple[ConvexSet, Enclosed]]()
+        propagated_rows, effects = lines[..., :d], list[tuple[ConvexSet, Enclosed]]()
         if scene.disturbance is not None and stop > 0.0:
             past = ring(flow.monomials, propagated_rows, self.effect(place)[1])
             shape = (*past.mid.shape[:3], place, -1) if place else (*past.mid.shape[:3], 0, lines.mid.shape[-1] - d - m)
@@ -196,10 +196,8 @@ class States:
             effects.append((scene.disturbance, Enclosed(mid, rad)))
         if scene.initial_set is not None:
             initial = ring(flow.monomials, propagated_rows, self.effect(place)[0])
-            effects.append(
-                (scene.initial_set, Enclosed(*(np.swapaxes(p, 2, 3)[None] for p in (initial.mid, initial.rad))))
-            )
-        return Enclosed(state.mid[..., 0], state.rad[..., 0]), effects
+            effects.append((scene.initial_set, initial.swapped(2, 3)[None]))
+        return state[..., 0], effects
 
     @remembered(lambda: PATHS_KEPT)
     def _compute_path(self, place: int) -> Powers:
@@ -297,8 +295,7 @@ def enclosed(series: Sequence[Series]) -> Enclosed:
 
 def single(series: Series) -> Enclosed:
     """Return the coefficients of one series as floats with radii, ``(M, rows, columns)``."""
-    enclosure = enclosed([series])
-    return Enclosed(enclosure.mid[0], enclosure.rad[0])
+    return enclosed([series])[0]
 
 
 def ring(monomials: Monomials, left: Enclosed, right: Enclosed) -> Enclosed:

@@ -294,5 +294,4 @@ def _combine_rows(z: Array, basis: Array) -> Array | arb_mat:
 
 def _convert_balls(heights: Sequence[arb]) -> Enclosed:
     """Return balls as floats with radii, ``(k,)`` each."""
-    enclosure = Enclosed.of(stacked([[height] for height in heights]))
-    return Enclosed(enclosure.mid[:, 0], enclosure.rad[:, 0])
+    return Enclosed.of(stacked([[height] for height in heights]))[:, 0]

@@ -60,6 +60,11 @@ class NormSummand:
         """The number of coordinates, ``mw``."""
         return self.before + self.offset.size + self.after
 
+    @property
+    def is_symmetric(self) -> bool:
+        """True where the middle is 0."""
+        return not self.offset.any()
+
     def widened(self, before: int, after: int) -> NormSummand:
         """Return the set with 0 in further coordinates before and after its own."""
         return replace(self, before=self.before + before, after=self.after + after)
@@ -76,22 +81,20 @@ class NormSummand:
         """The upper bounds ``(mw,)`` of the distance from the point to the set's ends along every coordinate."""
         return np.pad(self._radii, (self.before, self.after))
 
-    def integrate_support(
-        self, plain: Array, off: Array, sizes: Array, ends: Array
-    ) -> tuple[Array, Array, Array, Array]:
+    def integrate_support(self, plain: Array, off: Array, sizes: Array, ends: Array) -> tuple[Array, Array, Array]:
         """Return the integrals of the support function along polynomials, as `Summand.integrate_support` does;
         ``sizes`` are not used."""
         own = plain[:, :, self.before : self.before + self.offset.size]
-        outputs = [np.zeros(0)] * 3
+        outputs = [np.zeros(0)] * 2
         for first in range(0, len(plain), AT_ONCE):
             batch = slice(first, first + AT_ONCE)
             batch_outputs = self._integrate(own[batch], ends[batch])
             outputs = [np.concatenate(pair) for pair in zip(outputs, batch_outputs, strict=True)]
-        value, errors, tops = outputs
+        value, errors = outputs
         errors = (errors + (ends + 1.0) * (off @ self.radii)) * OUTWARD
-        return value, errors, errors, tops
+        return value, errors, errors
 
-    def _integrate(self, plain: Array, ends: Array) -> tuple[Array, Array, Array]:
+    def _integrate(self, plain: Array, ends: Array) -> tuple[Array, Array]:
         count = plain.shape[1]
         owner, radii = np.arange(len(plain)), self._radii
         value, errors, length = np.zeros(len(plain)), np.zeros(len(plain)), (ends + 1.0) / 2.0
@@ -132,7 +135,7 @@ class NormSummand:
             a, owner = a[~is_done], np.tile(owner[~is_done], 2)
             coefficient_error = coefficient_error + step_error
             a = np.concatenate([np.einsum("kn,mnw->mkw", half, a) for half in _compute_halving_matrices(count)])
-        return value, errors + rounding(2 * ROUNDS) * np.abs(value), tops
+        return value, errors + rounding(2 * ROUNDS) * np.abs(value)
 
 
 @cache

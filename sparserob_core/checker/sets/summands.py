@@ -41,19 +41,22 @@ class Summand:
         """The upper bound of the absolute value of every coordinate on the set, ``(mw,)``."""
         return np.asarray((np.abs(self.corners) + self.rad).max(axis=0) * OUTWARD)
 
+    @property
+    def is_symmetric(self) -> bool:
+        """True where the corners are opposite in pairs, the first to the last."""
+        return all(np.array_equal(values, sign * values[::-1]) for values, sign in ((self.corners, -1), (self.rad, 1)))
+
     def widened(self, before: int, after: int) -> Summand:
         """Return the set with 0 in further coordinates before and after its own."""
         return Summand(*(np.pad(table, ((0, 0), (before, after))) for table in (self.corners, self.rad)))
 
-    def integrate_support(
-        self, plain: Array, off: Array, sizes: Array, ends: Array
-    ) -> tuple[Array, Array, Array, Array]:
+    def integrate_support(self, plain: Array, off: Array, sizes: Array, ends: Array) -> tuple[Array, Array, Array]:
         """Return the integrals of the support function over ``u`` from -1 to ``ends (n,)``, along polynomials ``plain
-        (n, p + 1, mw)`` with error bounds ``off`` and sums of absolute values ``sizes``. They are values, how much more
-        and how much less they may be, and bounds of the absolute support values without their errors."""
+        (n, p + 1, mw)`` with error bounds ``off`` and sums of absolute values ``sizes``; and how much more and how much
+        less they may be."""
         P = np.einsum("npw,vw->npv", plain, self.corners)
         e = (off @ (np.abs(self.corners) + self.rad).T + sizes @ self.rad.T) * OUTWARD
-        return *integrate_maximum(P, e, ends), np.abs(P).sum(axis=1).max(axis=1)
+        return integrate_maximum(P, e, ends)
 
 
 def channels(count: int) -> list[Summand]:
@@ -61,12 +64,15 @@ def channels(count: int) -> list[Summand]:
     return [Summand(np.stack([axis, -axis]), np.zeros((2, count))) for axis in np.eye(count)]
 
 
-def integrate(summands: Sequence[Summand | NormSummand], plain: Array, off: Array) -> tuple[Array, Array]:
-    """Return lower and upper bounds ``(n, S)`` of the means, over ``u`` from -1 to 1, of the support functions of
-    ``summands`` along polynomials ``plain (n, p + 1, mw)`` with error bounds ``off (n, mw)``."""
+def integrate(
+    summands: Sequence[Summand | NormSummand], plain: Array, off: Array, ends: Array | float = 1.0
+) -> tuple[Array, Array]:
+    """Return lower and upper bounds ``(n, S)`` of half the integrals, over ``u`` from -1 to ``ends (n,)``, of the
+    support functions of ``summands`` along polynomials ``plain (n, p + 1, mw)`` with error bounds ``off (n, mw)``. Up
+    to 1 they are means."""
     (count, order, mw), sizes = plain.shape, np.abs(plain).sum(axis=1)
     errors = off + rounding(4 * order + 32 + mw) * sizes
-    integrals = [summand.integrate_support(plain, errors, sizes, np.ones(count))[:3] for summand in summands]
+    integrals = [summand.integrate_support(plain, errors, sizes, np.broadcast_to(ends, count)) for summand in summands]
     value, excess, deficit = (np.stack(columns, axis=1) / 2.0 for columns in zip(*integrals, strict=True))
     rounded = rounding(4) * (np.abs(value) + excess)
     return value - deficit - rounded, value + excess + rounded

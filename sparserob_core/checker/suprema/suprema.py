@@ -10,21 +10,20 @@ from typing import Any, final
 import numpy as np
 from flint import arb, ctx
 
-from sparserob_core.checker.arithmetic.balls import above, ball, balls, below
+from sparserob_core.checker.arithmetic.balls import above, ball, below
 from sparserob_core.checker.claims.case import Case, listed, number, numbers, shaped
 from sparserob_core.checker.claims.cells import Work
 from sparserob_core.checker.claims.claims import judged, precision_of
 from sparserob_core.checker.claims.constraints import covered, cut_times, prove_on_cells
 from sparserob_core.checker.claims.followed import FollowedRow
 from sparserob_core.checker.claims.multipliers import admissible
-from sparserob_core.checker.claims.replay import compute_state
+from sparserob_core.checker.claims.replay import compute_value
 from sparserob_core.checker.claims.window import ConstraintWindow
 from sparserob_core.checker.outcome import FIGURES, TOLERANCE, Broken, Finding, Unchecked
 from sparserob_core.checker.sets.known import known
 from sparserob_core.checker.sets.polynomials import HALF_ULP, OUTWARD
 from sparserob_core.checker.sets.shape import basis_of
 from sparserob_core.checker.sets.sides import Bounded, Sides
-from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.problem.disturbances import columns_of
 from sparserob_core.control.sets.sets import Box, Polytope
 from sparserob_core.sip.convex_set import Array
@@ -176,14 +175,9 @@ def _enclose_witness_value(
         errors = execution.added(window.split(asked.direction)[0], time)
         slack = 2.0 * HALF_ULP * (abs(low) + abs(high) + abs(errors[1]))
         low, high = low + errors[0] - slack, high + errors[1] + slack
-    if case.followed.are_possible:
-        value = row.worst.along(time, deviation, changes, signal)
-        return value[0] + low - 4.0 * HALF_ULP * (abs(value[0]) + abs(low)), value[1] + high
-    fine, on_grid = _refine_grid(case, changes, signal)
-    state = compute_state(fine, time, parameter, on_grid, entry.get("deviation"))
-    direction = window.split(asked.direction)[0]
-    total = sum((a * x for a, x in zip(balls(direction), state, strict=True)), ball(0.0))
-    return below(total + low), above(total + high)
+    c = window.split(asked.direction)[0]
+    value = compute_value(case, c, time, parameter, deviation, signal, changes[:-1].tolist())
+    return below(value + low), above(value + high)
 
 
 def _read_signal(case: Case, entry: Mapping[str, Any]) -> tuple[Array, Array | None]:
@@ -210,18 +204,6 @@ def _read_signal(case: Case, entry: Mapping[str, Any]) -> tuple[Array, Array | N
             raise Broken(f"the disturbance {list(value)} is not shown to be in its set")
         shown_values.add(value)
     return changes, signal
-
-
-def _refine_grid(case: Case, changes: Array, signal: Array | None) -> tuple[Case, object]:
-    """Return the case whose grid has the ``changes`` of a signal, and the signal on the pieces of that grid. A
-    measurable signal that is constant between the changes is one of a dictionary with these pieces."""
-    if signal is None:
-        return case, None
-    if case.measurable:
-        problem = replace(case.problem, disturbance_class="piecewise_constant")
-        case = replace(case, problem=problem, disturbance=Dictionary.indicators(changes))
-    starts = np.array(case.timing.grid[:-1])
-    return case, signal[:, np.searchsorted(changes, starts, side="right") - 1].tolist()
 
 
 def _prove_row_on_cells(case: Case, asked: SupremumRow, limit: float) -> int:

@@ -23,15 +23,15 @@ FAR = np.array([2.0, 0.5, 3.0])
 class Erring(BoundedInputHere):
     """What is added is ``FAR'|c|`` and as much again by a time of 1, and a little more for ``c`` below 0."""
 
-    def added(self, c: np.ndarray, time: float) -> tuple[float, float]:
-        size = float(FAR @ (np.abs(c) + 0.1 * np.maximum(-c, 0.0))) * (1.0 + time)
-        return size, size
+    def added_at(self, c: np.ndarray, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        sizes = float(FAR @ (np.abs(c) + 0.1 * np.maximum(-c, 0.0))) * (1.0 + times)
+        return sizes, sizes
 
     def least(self, c: np.ndarray, time: float) -> np.ndarray:
         raise NotImplementedError
 
-    def bound_chord_error(self, c: np.ndarray, start: float, stop: float) -> float:
-        return 0.01 * float(FAR @ np.abs(c))
+    def bound_chord_errors(self, c: np.ndarray, start: np.ndarray, stop: np.ndarray) -> np.ndarray:
+        return np.full(start.size, 0.01 * float(FAR @ np.abs(c)))
 
 
 @pytest.fixture(autouse=True)

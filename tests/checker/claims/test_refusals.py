@@ -123,7 +123,7 @@ REFUSED: dict[str, tuple[Callable[[], object], type[Exception], str]] = {
         "on another grid",
     ),
     "a deviation of another size": (
-        lambda: replay._read_initial_deviation(case_of(initial_set=Box([-0.1], [0.1])), [0.0, 0.0]),
+        lambda: replay._read_deviations(case_of(initial_set=Box([-0.1], [0.1])), {"deviation": [0.0, 0.0]}),
         Broken,
         r"deviation: shape \(2,\), expected \(1,\)",
     ),

@@ -38,15 +38,15 @@ class Told(BoundedInputHere):
     high: np.ndarray
     start: float
 
-    def added(self, c: np.ndarray, time: float) -> tuple[float, float]:
-        place = int(time > self.start)
-        return self.low[place], self.high[place]
+    def added_at(self, c: np.ndarray, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        places = (times > self.start).astype(int)
+        return self.low[places], self.high[places]
 
     def least(self, c: np.ndarray, time: float) -> np.ndarray:
         raise NotImplementedError
 
-    def bound_chord_error(self, c: np.ndarray, start: float, stop: float) -> float:
-        return 0.0
+    def bound_chord_errors(self, c: np.ndarray, start: np.ndarray, stop: np.ndarray) -> np.ndarray:
+        return np.zeros(start.size)
 
 
 def exact(values: Any) -> list[Fraction]:

@@ -12,13 +12,15 @@ import pytest
 from flint import arb, ctx
 
 import sparserob_core as sr
-from sparserob_core.checker.claims import cells, claims, constraints, multipliers, replay, units
+from sparserob_core.checker.claims import cells, claims, constraints, replay, units
 from sparserob_core.checker.claims.case import Case
 from sparserob_core.checker.cost.duality import ConstraintRow, Duality
 from sparserob_core.checker.flow.flows import VerifiedFlows
 from sparserob_core.checker.outcome import Broken, Unchecked
 from sparserob_core.checker.reach import followed as followed_rows
+from sparserob_core.checker.reach.bounded_inputs import BoundedInputAt
 from sparserob_core.checker.reach.followed import FollowedRows
+from sparserob_core.checker.reach.followed_inputs import FollowedInput
 from sparserob_core.checker.reach.tube import Polynomial
 from sparserob_core.control.problem.system import VaryingSystem
 from sparserob_core.control.problem.terms.integral import IntegralConstraint
@@ -78,17 +80,20 @@ def test_a_row_along_its_adjoint_is_the_one_that_exponentials_give(name: str, mo
         cases.append(replace(case, problem=replace(problem, disturbance_class="measurable")))
     for time in (0.0, 0.25, 0.7, 1.25, 1.3, 2.0):
         for one in cases:
-            row, limit = DIRECTIONS[2], arb(0.375)
-            found = multipliers._derive_row(one, row, time, [], limit, disturbed=True)
-            exact = one.duality.row(row, time, [], limit)
-            strayed = one.sources.measurable_input
-            low, high = (0.0, 0.0) if strayed is None else strayed.added(row, time)
-            constant = exact.constant + arb((low + high) / 2.0, (high - low) / 2.0 * (1.0 + 1e-9))
-            pairs = [(found.constant, constant)]
+            row, pairs = DIRECTIONS[2], list[tuple[arb, arb]]()
+            for along in one.sources.entering_at([]):
+                assert isinstance(along, FollowedInput)
+                ends = [x.added(row, time) for x in (along, BoundedInputAt(one.flows.at(()), along.input))]
+                pairs.append(tuple(arb(low).union(arb(high)) for low, high in ends))
+            grid = [0.0, *(t for t in one.timing.grid[1:] if t < time), time]
+            weights = [rows.weigh(row, [], grid) for rows in (one.duality.flows, one.flows)]
+            assert one.duality.flows is one.followed
+            disturbed = problem.disturbance is not None
+            matrices = [[part.free, *part.control, *part.disturbance * disturbed] for part in weights]
             pairs += [
-                (a, b)
-                for mine, its in zip(found.slope, exact.slope, strict=True)
-                for a, b in zip(mine, its, strict=True)
+                pair
+                for mine, its in zip(*matrices, strict=True)
+                for pair in zip(mine.entries(), its.entries(), strict=True)
             ]
             assert all(a.overlaps(b) and float(a.rad()) < 1e-12 for a, b in pairs), (time, one.measurable)
 
@@ -101,8 +106,9 @@ def test_a_replayed_state_is_that_of_its_disturbance(name: str) -> None:
     deviation = np.array([0.05, -0.1])
     at_blocks = np.searchsorted(CHANGES, case.timing.grid[:-1], side="right") - 1
     for time in (0.0, 0.3, 1.0, 1.75, 2.0):
-        said = None if made.bound is None else signal[:, at_blocks].tolist()
-        found = replay.compute_state(case, time, np.zeros(0), said, None if made.begun is None else deviation.tolist())
+        on_grid = None if made.bound is None else signal[:, at_blocks]
+        start = None if made.begun is None else deviation
+        found = [replay.compute_value(case, c, time, np.zeros(0), start, on_grid) for c in np.eye(2)]
         w = made.motion.weights(np.eye(2), time)
         exact = w.free @ START + (w.control * made.u.T).sum(axis=(1, 2)) + w.before @ BEFORE + w.drift
         if made.bound is not None:
@@ -199,7 +205,7 @@ def test_an_integral_that_begins_later_is_the_one_of_pieces_where_rows_are_follo
         monkeypatch.setattr(followed_rows, "FOLLOWED", followed)
         assert case.followed.are_best == (followed == 1)
         numbers = [x for state in (None, begun) for x in replay.exceeded(case, said, state)[0]]
-        row = multipliers._derive_row(case, c, window.start, [], arb(0.25), disturbed=True)
+        row = case.duality.row(c, window.start, [], arb(0.25), disturbed=True)
         found.append(numbers + [float(x.mid()) for part in ([row.constant], *row.slope) for x in part])
     assert found[1] == pytest.approx(found[0], abs=1e-12)
     assert len(set(np.round(found[0], 6))) > 6  # of other states, rows and pieces others
@@ -225,7 +231,7 @@ def test_measurable_disturbances_of_an_integral_are_those_of_pieces(
         assert slack < 1e-7
     assert found[1] == pytest.approx(found[0], abs=1e-9)
     with pytest.raises(Unchecked, match="one integral at a time"):
-        case.followed.worst(np.array([0.0, 0.0, 1.0, 1.0]), case.scene).bound_largest_value(np.array([1.8]))
+        case.sources.measurable_input_at([]).added(np.array([0.0, 0.0, 1.0, 1.0]), 1.8)
 
 
 def test_a_quadratic_cost_of_a_system_in_time_is_an_integral_by_hand() -> None:

@@ -331,8 +331,9 @@ def test_a_witness_leads_to_what_it_says():
         "violation": 0.25,
     }  # fmt: skip
     assert "exceeded by 0.25 at t = 1" in claims._verify_witness(case_of(wall, certificate={"witness": data}))
-    assert float(replay.compute_state(case_of(wall), 2.0, np.zeros(0), [[0.25, -0.1]])[0].mid()) == pytest.approx(1.15)
-    assert float(replay.compute_state(case_of(wall), 0.5, np.zeros(0), [[0.2, -0.1]])[0].mid()) == pytest.approx(1.35)
+    for time, signal, state in ((2.0, [[0.25, -0.1]], 1.15), (0.5, [[0.2, -0.1]], 1.35)):
+        value = replay.compute_value(case_of(wall), np.ones(1), time, np.zeros(0), None, np.array(signal))
+        assert float(value.mid()) == pytest.approx(state)
     for wrong in (
         {"violation": 0.25 + 1e-6},
         {"violation": 0.25 - 1e-6},

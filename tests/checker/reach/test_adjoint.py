@@ -4,21 +4,19 @@ witness that is neither more nor less than it is."""
 from __future__ import annotations
 
 from dataclasses import replace
-from itertools import pairwise
 from types import SimpleNamespace
 from typing import cast
 
 import numpy as np
 import pytest
 from flint import arb, arb_mat, ctx
-from scipy.integrate import quad
 
 from sparserob_core.checker.flow.segment import VerifiedSegment
 from sparserob_core.checker.outcome import Clock, Unchecked
 from sparserob_core.checker.reach import adjoint as module
-from sparserob_core.checker.reach.adjoint import DEAR, AdjointFlow, AdjointRow, SupportIntegrals, Worst
+from sparserob_core.checker.reach.adjoint import DEAR, AdjointFlow, AdjointRow, Worst
+from sparserob_core.checker.sets import polynomials
 from sparserob_core.checker.sets.polynomials import Enclosed
-from sparserob_core.checker.sets.summands import Summand
 from sparserob_core.control.sets.sets import Box, Polytope
 
 A = [[0.0, 1.0, 0.0], [-9.0, -0.4, 2.0], [0.3, 0.0, -1.5]]
@@ -32,11 +30,10 @@ def adjoint() -> AdjointRow:
     return AdjointRow.of(AdjointFlow.of(arb_mat(A), arb_mat(F), HORIZON, Clock()), C)
 
 
-def worst(kind: str) -> Worst:
-    changes = None if kind == "measurable" else GRID
+def worst() -> Worst:
     drives = Enclosed(np.array([[0.3, -1.0, 0.0, 0.8]]), np.zeros((1, 4)))
     begun = Polytope([[1, 1, 0], [-1, 0, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]], [0.1, 0.1, 0.1, 0.05, 0.05])
-    return Worst(adjoint(), np.array([0.2, -1.0, 0.4]), begun, GRID, drives, Box([-0.2], [0.5]), changes)
+    return Worst(adjoint(), np.array([0.2, -1.0, 0.4]), begun, GRID, drives, Box([-0.2], [0.5]), GRID)
 
 
 def exact(t: float) -> tuple[list[float], list[float]]:
@@ -71,9 +68,8 @@ def test_what_an_input_adds_between_two_times_is_known_better_than_the_sums() ->
     assert (off.rad >= known.between(np.array([0.5]), 0.25, 0.375).rad * 0.1).all()
 
 
-@pytest.mark.parametrize("kind", ["constant", "measurable"])
-def test_cells_bound_every_value_in_them_closely(kind: str) -> None:
-    row = worst(kind)
+def test_cells_bound_every_value_in_them_closely() -> None:
+    row = worst()
     times = row.cuts([])
     times = times[times <= HORIZON]
     bounds = row.over(times[:-1], times[1:])
@@ -86,51 +82,6 @@ def test_cells_bound_every_value_in_them_closely(kind: str) -> None:
     chords = np.maximum(values[:, 0], values[:, -1])
     above = values.max(axis=1) - chords
     assert above.max() > 0.1 * (bounds - chords)[above.argmax()]
-
-
-@pytest.mark.parametrize("kind", ["constant", "measurable"])
-def test_a_signal_reaches_no_more_than_the_worst_and_its_value_is_known(kind: str) -> None:
-    row, rng = worst(kind), np.random.default_rng(0)
-    best = -np.inf
-    for _ in range(40):
-        signal = rng.choice([-0.2, 0.5], size=(1, 4))
-        deviation = np.array([0.0, 0.1, 0.05]) * rng.choice([-1.0, 1.0])
-        low, high = row.along(3.5, deviation, GRID, signal)
-        assert high - low < 1e-12
-        best = max(best, low)
-    assert best <= row.bound_largest_value(np.array([3.5]))[0][0]
-
-
-def test_the_measurable_worst_is_that_of_ever_shorter_pieces() -> None:
-    whole = worst("measurable").bound_largest_value(np.array([HORIZON]))[0][0]
-    row = worst("constant")
-    short = [
-        Worst(
-            row.adjoint,
-            row.centre,
-            row.initial_set,
-            GRID,
-            row.drives,
-            row.disturbance_set,
-            np.linspace(0.0, HORIZON, n + 1),
-        ).bound_largest_value(np.array([HORIZON]))[0][0]
-        for n in (4, 64, 512)
-    ]
-    assert all(a < b for a, b in pairwise(short))
-    assert short[-1] <= whole <= short[-1] + 1e-4
-
-
-def test_products_of_many_terms_hold_the_truth_and_round_as_sums_of_sums() -> None:
-    rng = np.random.default_rng(5)
-    for d in (1, 31, 32, 33, 300):
-        left, right = rng.normal(size=(3, d)), rng.normal(size=(2, d, 4))
-        found = module._multiply_rows(Enclosed(left, 0.0 * left), Enclosed(right, 0.0 * right))
-        for j, part in enumerate(right):
-            exact = (arb_mat(left.tolist()) * arb_mat(part.tolist())).tolist()
-            pairs = zip(found[0][:, j].tolist(), exact, strict=True)
-            off = [[abs(arb(m) - x) for m, x in zip(*pair, strict=True)] for pair in pairs]
-            assert (np.array([[float(x.upper()) for x in row] for row in off]) <= found[1][:, j]).all()
-        assert (found[1] <= 6e-15 * np.einsum("kd,jdn->kjn", np.abs(left), np.abs(right))).all()
 
 
 def test_a_system_that_is_too_fast_is_not_followed() -> None:
@@ -204,8 +155,7 @@ def test_steps_are_as_long_as_powers_of_the_system_allow_and_not_its_norm() -> N
 
 def test_what_rows_are_off_by_is_in_every_bound_and_counts_once() -> None:
     """Rows and integrals that are moved by as much as they may be off, to the corners that matter."""
-    plain, off = worst("constant"), 1e-3
-    deviation, signal = np.array([0.02, -0.05, 0.03]), np.array([[0.5, -0.2, 0.4, -0.1]])
+    plain, off = worst(), 1e-3
     times = np.array([0.3, 2.2, 4.0])
 
     def moved(of_state: np.ndarray, of_input: np.ndarray, wide: float) -> Worst:
@@ -217,24 +167,15 @@ def test_what_rows_are_off_by_is_in_every_bound_and_counts_once() -> None:
 
         def between(t: np.ndarray, start: np.ndarray | float, stop: np.ndarray | float) -> Enclosed:
             part = known.between(t, start, stop)
-            sign = np.ones((len(part.mid), 2))  # of what is driven and signalled on each piece, so that nothing cancels
-            if np.ndim(start):
-                sign[:, 1] = np.sign(signal[0])
-            else:
-                sign[:, 0] = np.sign(plain.drives.mid[0, np.searchsorted(GRID, start)])
+            sign = np.ones((len(part.mid), 2))  # of what is driven on each piece, so that nothing cancels
+            sign[:, 0] = np.sign(plain.drives.mid[0, np.searchsorted(GRID, start)])
             return Enclosed(part.mid + of_input * sign, part.rad + wide)
 
         stub = SimpleNamespace(at=at, between=between, step=known.step, count=known.count)
         return replace(plain, adjoint=cast(AdjointRow, stub))
 
     sides = np.sign(plain.centre)
-    up, down = (moved(side * off * sides, side * off * np.ones(2), 0.0) for side in (1.0, -1.0))
-    blurred = moved(np.zeros(3), np.zeros(2), off)
-    for t in times.tolist():
-        low, high = blurred.along(t, deviation, GRID, signal)
-        assert low <= down.along(t, deviation, GRID, signal)[0] + 1e-12
-        assert high >= up.along(t, deviation, GRID, signal)[1] - 1e-12
-        assert high - low <= up.along(t, deviation, GRID, signal)[1] - down.along(t, deviation, GRID, signal)[0] + 1e-9
+    up, blurred = moved(off * sides, off * np.ones(2), 0.0), moved(np.zeros(3), np.zeros(2), off)
     # with sets, whose support functions may be more than is met; and without
     for some, slack in (
         (lambda one: one, 8e-3),
@@ -246,22 +187,22 @@ def test_what_rows_are_off_by_is_in_every_bound_and_counts_once() -> None:
 
 
 def told(monkeypatch: pytest.MonkeyPatch, unit: float, half: float, outward: float) -> None:
-    """Let the module believe that its arithmetic is as coarse as it is told."""
-    monkeypatch.setattr(module, "rounding", lambda count: count * unit)
-    monkeypatch.setattr(module, "HALF_ULP", half)
-    monkeypatch.setattr(module, "OUTWARD", outward)
+    """Let the module, and what it multiplies with, believe that its arithmetic is as coarse as it is told."""
+    for one in (module, polynomials):
+        monkeypatch.setattr(one, "rounding", lambda count: count * unit)
+        monkeypatch.setattr(one, "HALF_ULP", half)
+        monkeypatch.setattr(one, "OUTWARD", outward)
 
 
 COARSE = 1e-6
 
 
-def radii(kind: str) -> dict[str, np.ndarray]:
+def radii() -> dict[str, np.ndarray]:
     """Every radius that is told of one row, in a name each."""
-    row = worst(kind)
+    row = worst()
     known, times = row.adjoint, np.array([0.3, 2.2, 3.99])
     sums, rounded = known.integrals(times)
-    low, high = row.along(2.2, np.array([0.05, 0.02, -0.01]), GRID, np.array([[0.5, -0.2, 0.1, 0.3]]))
-    found = {
+    return {
         "at": known.at(times).rad,
         "driven": known.driven.rad,
         "sums": known.sums.rad[1:],
@@ -270,28 +211,16 @@ def radii(kind: str) -> dict[str, np.ndarray]:
         "between": known.between(times, 0.1, 0.2).rad,
         "drives": row._evaluate_inputs(times)[1],
         "most": row.bound_largest_value(times)[1],
-        "along": np.array([high - low]),
         "supported": module._evaluate_support(Box([-0.2], [0.5]), Enclosed(np.array([[0.7]]), np.array([[1e-9]])))[1],
     }
-    if kind == "measurable":
-        steps, shares = np.array([3, 9]), np.array([0.25, 0.75])
-        for name, (_, over, less) in (
-            ("ends", row._disturbance_integrals._end_integrals),
-            ("parts", row._disturbance_integrals._integrate_steps(steps, shares)),
-        ):
-            found |= {f"{name} above": over[1:], f"{name} below": less[1:]}
-        found["swept"] = np.subtract(*row._disturbance_integrals.at(times)[::-1])
-        found["measurable"] = row._evaluate_measurable(times)[1]
-    return found
 
 
-@pytest.mark.parametrize("kind", ["constant", "measurable"])
-def test_what_rounding_may_lose_is_in_every_radius(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_rounding_may_lose_is_in_every_radius(monkeypatch: pytest.MonkeyPatch) -> None:
     """A sum of ``n`` products is off by at most ``n u`` of the sum of their sizes (Higham 2002, section 3.1): with a
     unit that is told, every radius is at least that, of the sizes that are summed up."""
     with monkeypatch.context() as patched:
         told(patched, 0.0, 0.0, 1.0)
-        plain, row = radii(kind), worst(kind)
+        plain, row = radii(), worst()
         known, times = row.adjoint, np.array([0.3, 2.2, 3.99])
         steps, shares = known.placed(times)
         d, order = 3, module.ORDER
@@ -308,7 +237,7 @@ def test_what_rounding_may_lose_is_in_every_radius(kind: str, monkeypatch: pytes
         states = np.abs(known.at(times).mid) @ np.abs(row.centre)
     with monkeypatch.context() as patched:
         told(patched, COARSE, 0.0, 1.0)
-        rough = radii(kind)
+        rough = radii()
     more = {name: (rough[name] - plain[name]) / COARSE for name in plain}
     share = 1.0 - 1e-6
     assert (more["at"] >= share * d * at).all()
@@ -318,34 +247,31 @@ def test_what_rounding_may_lose_is_in_every_radius(kind: str, monkeypatch: pytes
     assert (more["integrals"] >= share * (order + 2) * np.cumsum(moved, axis=0)[np.maximum(steps - 1, 0)]).all()
     assert (more["drives"][1:] >= share * (1 + GRID.size) * used).all()
     assert (more["most"] >= 3.0 * share * d * states).all()
-    assert (more["along"] >= 2.0 * share * d * states[1]).all()
     assert more["supported"] == pytest.approx([0.7 * 0.5], rel=1e-6)
     for name, each in more.items():
         assert (each[..., :1] > 0.0).any(), name
 
 
-@pytest.mark.parametrize("kind", ["constant", "measurable"])
-def test_every_radius_is_enlarged_by_what_its_own_sum_may_round(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_every_radius_is_enlarged_by_what_its_own_sum_may_round(monkeypatch: pytest.MonkeyPatch) -> None:
     with monkeypatch.context() as patched:
         told(patched, COARSE, 0.0, 1.0)
-        plain = radii(kind)
+        plain = radii()
     with monkeypatch.context() as patched:
         told(patched, COARSE, 0.0, 2.0)
-        outward = radii(kind)
+        outward = radii()
     for name in plain:
-        if name in ("drives", "measurable"):  # whoever adds these up enlarges their sum
+        if name == "drives":  # whoever adds these up enlarges their sum
             continue
         larger = plain[name] > 0.0
         assert larger.any() and (outward[name][larger] >= 1.999 * plain[name][larger]).all(), name
     with monkeypatch.context() as patched:
         told(patched, 0.0, 0.0, 1.0)
-        plain = radii(kind)
+        plain = radii()
     with monkeypatch.context() as patched:
         told(patched, 0.0, COARSE, 1.0)
-        half = radii(kind)
-    values = np.abs(worst(kind).bound_largest_value(np.array([0.3, 2.2, 3.99]))[0])
+        half = radii()
+    values = np.abs(worst().bound_largest_value(np.array([0.3, 2.2, 3.99]))[0])
     assert (half["most"] - plain["most"] >= 3.0 * 8.0 * COARSE * values * 0.99).all()
-    assert (half["along"] > plain["along"]).all()
     assert (half["rounded"] > plain["rounded"]).all() and (half["between"] > plain["between"]).all()
 
 
@@ -361,55 +287,6 @@ def test_what_is_left_of_the_expansion_of_a_bend_is_in_its_bound(rate: float, mo
         assert (bound <= rate**power * ends * (1.0 + 1e-9)).all()
 
 
-def swept(mid: list[list[float]], rad: float, sides: list[list[float]], step: float = 0.5) -> SupportIntegrals:
-    """Of a row of which ``l'F`` on every step has these first terms in each of two columns, of which the second is the
-    one that counts."""
-    table = np.zeros((len(mid), module.ORDER + 1, 2))
-    table[:, : len(mid[0]), 1] = mid
-    off = np.zeros_like(table)
-    off[:, 0, 1] = rad
-    row = SimpleNamespace(driven=Enclosed(table, off), count=len(mid), step=step)
-    row.placed = lambda times: AdjointRow.placed(cast(AdjointRow, row), times)
-    every = [Summand(np.array(side)[:, None], np.zeros((len(side), 1))) for side in sides]
-    return SupportIntegrals(cast(AdjointRow, row), slice(1, None), every)
-
-
-TERMS = [[-1.0, 3.0, 0.5], [2.0, -0.5, -4.0], [0.3, 1.0, 0.0]]
-
-
-def height(time: float, corners: list[float], moved: float) -> float:
-    step = min(int(time / 0.5), 2)
-    value = np.polynomial.polynomial.polyval(time / 0.5 - step, TERMS[step])
-    return float(max(corner * (value + moved * np.sign(corner)) for corner in corners))
-
-
-@pytest.mark.parametrize("rad", [0.0, 1e-3])
-def test_integrals_of_support_functions_hold_the_least_and_the_most_and_hardly_more(rad: float) -> None:
-    sides = [[1.0, -1.0], [0.5, -2.0]]
-    known, times = swept(TERMS, rad, sides), np.array([0.0, 0.2, 0.5, 0.8, 1.3, 1.5])
-    low, high = known.at(times)
-    for j, corners in enumerate(sides):
-        for i, time in enumerate(times.tolist()):
-            ends = [0.0, *(t for t in (0.5, 1.0) if t < time), time]
-            most, least = (
-                sum(quad(height, a, b, (corners, moved), epsabs=1e-13, limit=200)[0] for a, b in pairwise(ends))
-                for moved in (rad, -rad)
-            )
-            assert low[i, j] <= least + 1e-9 and most <= high[i, j] + 1e-9
-            assert high[i, j] <= most + 6.0 * rad * time + 1e-9 and low[i, j] >= least - 6.0 * rad * time - 1e-9
-            assert rad or high[i, j] - low[i, j] <= 1e-12
-
-
-def test_a_time_that_is_rounded_counts_as_much_as_the_support_function_is_high_near_it() -> None:
-    """Also where the step beside is the higher one."""
-    times, off = np.arange(5) / 2 + 0.1, 1e-3
-    known = swept([[1.0], [4.0], [1.0], [1.0], [0.5]], 0.25, [[1.0, -1.0], [2.0]])
-    plain, rough = known.at(times), known.at(times, np.full(5, off))
-    heights = np.array([4.25, 4.25, 4.25, 1.25, 1.25])[:, None] * [1.0, 2.0]
-    np.testing.assert_allclose(rough[1] - plain[1], off * heights, rtol=1e-8)
-    np.testing.assert_allclose(plain[0] - rough[0], off * heights, rtol=1e-8)
-
-
 def test_sums_of_many_numbers_are_rounded_once() -> None:
     values = np.array([[1e16, 0.1], [1.0, 0.1], [-1e16, 0.1], [1.0, -0.3]])
     with ctx.workprec(128):
@@ -417,64 +294,3 @@ def test_sums_of_many_numbers_are_rounded_once() -> None:
         assert abs(arb(found[4, 1]) - (3 * arb(0.1) - arb(0.3))) < 1e-30
     assert found[:, 0].tolist() == [0.0, 1e16, 1e16 + 1.0, 1.0, 2.0]
     assert module.accumulate_exactly(np.zeros((3, 0))).shape == (4, 0)
-
-
-def test_every_term_of_a_polynomial_counts_in_what_it_is_off_by_and_what_rounding_makes_of_it(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    def polynomials(unit: float, outward: float) -> tuple[np.ndarray, np.ndarray]:
-        known = swept(TERMS, 0.0, [[1.0]])
-        known.row.driven.rad[:, 1:4, 1] = 1e-3
-        with monkeypatch.context() as patched:
-            told(patched, unit, 0.0, outward)
-            _, off, size = known._polynomials
-        return off[:, 0], size[:, 0]
-
-    sizes = np.abs(TERMS).sum(axis=1)
-    off, size = polynomials(0.0, 1.0)
-    np.testing.assert_allclose(off, 3e-3)
-    np.testing.assert_allclose(size, sizes)
-    np.testing.assert_allclose(polynomials(COARSE, 1.0)[0], 3e-3 + COARSE * (4 * module.ORDER + 1) * sizes)
-    np.testing.assert_allclose(polynomials(0.0, 2.0)[0], 2.0 * off)
-
-
-def test_integrals_are_off_by_what_all_steps_are_and_by_what_their_sum_is_rounded(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """The side tells what it will of every step: a value, how much more and less, and how large it is."""
-    each, outward, half = np.array([1e17, 1.0, -1e17, 1.0]), 1.5, 1e-7
-
-    def found(P: np.ndarray, *_: np.ndarray) -> tuple[np.ndarray, ...]:
-        count = len(P)
-        values = each if count == each.size else np.ones(count)
-        return values, np.full(count, 0.1), np.full(count, 0.2), np.full(count, 3.0)
-
-    known = swept([[1.0]] * 4, 0.0, [[1.0]])
-    known = replace(known, summands=[cast(Summand, SimpleNamespace(integrate_support=found, radii=np.ones(1)))])
-    with monkeypatch.context() as patched, ctx.workprec(128):
-        told(patched, COARSE, half, outward)
-        value, more, less = (part[:, 0] for part in known._end_integrals)
-        low, high = (part[:, 0] for part in known.at(np.array([1.75])))
-        _, over, less_here = (part[:, 0] for part in known._integrate_steps(np.array([3]), np.array([0.5])))
-    assert value[-1] == 0.5 and value[-2] == 0.25
-    rounded, steps = 4 * module.ORDER * COARSE * 6.0, np.arange(5)
-    np.testing.assert_allclose([over[0], less_here[0]], (np.array([0.1, 0.2]) + rounded) * outward * 0.25)
-    np.testing.assert_allclose(more, steps * over[0] * outward * (1.0 + 4 * COARSE))
-    np.testing.assert_allclose(less, steps * less_here[0] * outward * (1.0 + 4 * COARSE))
-    lost = 4.0 * half * (0.25 + 0.5)
-    assert high[0] == pytest.approx(0.5 + (more[3] + over[0] + lost) * outward, rel=1e-12)
-    assert low[0] == pytest.approx(0.5 - (less[3] + less_here[0] + lost) * outward, rel=1e-12)
-
-
-def test_a_measurable_worst_is_off_by_what_its_integrals_are(monkeypatch: pytest.MonkeyPatch) -> None:
-    linear = Enclosed(np.array([[9.0, 2.0]]), np.array([[9.0, 0.3]]))
-    stub = SimpleNamespace(integrals=lambda times: (linear, np.array([[9.0, 0.05]])))
-    row = replace(worst("measurable"), adjoint=cast(AdjointRow, stub))
-    integrals = (np.array([[1.0, 2.0]]), np.array([[1.5, 2.25]]))
-    row.__dict__["_disturbance_integrals"] = SimpleNamespace(at=lambda times: integrals, summands=[None, None])
-    about = 0.15  # the middle of the set
-    with monkeypatch.context() as patched:
-        told(patched, COARSE, 0.0, 1.0)
-        (top,), (rad,) = row._evaluate_measurable(np.array([1.0]))
-    assert top == pytest.approx(3.375 + 2.0 * about)
-    assert rad == pytest.approx(0.375 + 0.35 * about + 5 * COARSE * (2.0 * about + 3.0 + 3.75), rel=1e-12)

@@ -21,8 +21,10 @@ import sparserob_core.checker.flow.segment as segments
 from sparserob_core.checker.arithmetic.series import stacked
 from sparserob_core.checker.flow.flow import VerifiedFlow
 from sparserob_core.checker.flow.plant import Plant
+from sparserob_core.checker.outcome import Clock
+from sparserob_core.checker.reach.adjoint import AdjointFlow, AdjointRow
 from sparserob_core.checker.reach.bounded_inputs import BoundedInputAt, SizedInput
-from sparserob_core.checker.reach.execution import FollowedExecution
+from sparserob_core.checker.reach.followed_inputs import FollowedInput
 from sparserob_core.checker.sets.known import middle, summands_of
 from sparserob_core.checker.sets.summands import Summand, channels
 from sparserob_core.control.problem.system import VaryingSystem
@@ -45,12 +47,10 @@ def made(system: VaryingSystem, control: Array = CONTROL) -> BoundedInputAt:
 
 def test_a_constant_that_is_dressed_is_the_constant() -> None:
     with ctx.workprec(192):
-        known = sr.OptimalControlProblem(
-            system=sr.LinearSystem(A, B), horizon=3.0, initial_state=[0, 0], control=sr.Box([-1.0, -1.0], [1.0, 1.0])
-        )
         system = VaryingSystem.of(*([[f"{x} + 0*t" for x in row] for row in part] for part in (A, B)), 3.0)
         found = made(system)
-        plain = FollowedExecution(known, SHARES, POINTS, found.input.pieces)
+        flow = AdjointFlow.of(arb_mat(A.tolist()), arb_mat(B.tolist()), 3.0, Clock())
+        plain = FollowedInput(lambda c: AdjointRow.of(flow, c), found.input)
         for time in (0.0, 0.3, 1.7, 3.0):
             one, other = found.added(C, time), plain.added(C, time)
             assert one[0] <= other[1] and other[0] <= one[1] <= one[0] + 1e-12

@@ -10,7 +10,15 @@ from flint import arb, arb_mat, ctx
 
 from sparserob_core.checker.arithmetic.monomials import Monomials
 from sparserob_core.checker.outcome import Unchecked
-from sparserob_core.checker.sets.polynomials import HALF_ULP, NEAR, Enclosed, Truncated, lengths, rounding
+from sparserob_core.checker.sets.polynomials import (
+    HALF_ULP,
+    NEAR,
+    Enclosed,
+    Truncated,
+    lengths,
+    multiply_rows,
+    rounding,
+)
 
 KNOWN = Monomials(2, 2)
 
@@ -204,3 +212,26 @@ def test_an_exact_0_alone_has_no_radius_however_small_a_number_is() -> None:
     assert (found.rad[0, 1:] > 0.0).all() and found.rad[0, 1] >= 1e-299
     for x, mid, rad in zip(entries, found.mid[0].tolist(), found.rad[0].tolist(), strict=True):
         assert abs(x - mid) <= arb(rad)
+
+
+def test_products_of_many_terms_hold_the_truth_and_round_as_sums_of_sums() -> None:
+    rng = np.random.default_rng(5)
+    for d in (1, 31, 32, 33, 300):
+        left, right = rng.normal(size=(3, d)), rng.normal(size=(2, d, 4))
+        found = multiply_rows(Enclosed(left, 0.0 * left), Enclosed(right, 0.0 * right))
+        for j, part in enumerate(right):
+            exact = (arb_mat(left.tolist()) * arb_mat(part.tolist())).tolist()
+            pairs = zip(found.mid[:, j].tolist(), exact, strict=True)
+            off = [[abs(arb(m) - x) for m, x in zip(*pair, strict=True)] for pair in pairs]
+            assert (np.array([[float(x.upper()) for x in row] for row in off]) <= found.rad[:, j]).all()
+        assert (found.rad <= 6e-15 * np.einsum("kd,jdn->kjn", np.abs(left), np.abs(right))).all()
+
+
+def test_sums_and_matrices_of_enclosed_arrays_hold_what_their_parts_do() -> None:
+    one, other = (Enclosed(np.array([[0.1, -3.0]]), np.array([[1e-3, 0.5]])) for _ in range(2))
+    total = (one + other).matrix.tolist()[0]
+    for entry, low, high in zip(total, (0.198, -7.0), (0.202, -5.0), strict=True):
+        assert entry.lower() <= low and high <= entry.upper() and entry.rad() <= 0.5001 * (high - low)
+    third = Enclosed(np.array([1.0]), np.zeros(1)) + Enclosed(np.array([2.0**-54]), np.zeros(1))
+    assert third.mid[0] + third.rad[0] >= 1.0 + 2.0**-52 / 4
+    assert one[..., 1:].swapped(0, 1).mid.tolist() == [[-3.0]]

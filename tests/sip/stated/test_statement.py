@@ -11,6 +11,7 @@ from flint import arb_mat, ctx
 
 import sparserob_core as sr
 from sparserob_core.errors import InputError
+from sparserob_core.sip.stated import statement
 from sparserob_core.sip.stated.statement import StatedDecision, StatedFamily, StatedProgram
 from tests.support.stated import state
 
