@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import final
+from typing import NamedTuple, final
 
 import numpy as np
 
@@ -45,6 +45,47 @@ CELLS_KEPT = 16  # cells of parameters whose errors are: those of all rows of a 
 STEP = 1e-6  # of the horizon, over which a slope is a difference: a tenth of it shows what integrals are rounded to
 
 
+class Integrands(NamedTuple):
+    """Integrands of errors through ``m`` columns on intervals, as polynomials in the share that remains of an interval.
+
+    ``terms (..., p + 1, m)``: the coefficients. ``sizes (..., m)``: sums of the absolute numbers that are added up to
+    them. ``errors (..., m)``: error bounds of the integrals.
+    """
+
+    terms: Array
+    sizes: Array
+    errors: Array
+
+    def chosen(self, mask: np.ndarray) -> Integrands:
+        """Return the integrands of the intervals in a mask, one after another."""
+        return Integrands(self.terms[mask], self.sizes[mask], self.errors[mask])
+
+
+class InputKernel(NamedTuple):
+    """`Kernel` of ``m`` columns of inputs on ``k`` intervals, as matrices by which rows are multiplied.
+
+    ``terms (k, d, (p + 1) m)``: the coefficients. ``sizes (k, d, m)``: the sums of their absolute values. ``errors
+    (k, d, m)``: error bounds of the entries.
+    """
+
+    terms: Array
+    sizes: Array
+    errors: Array
+
+    @staticmethod
+    def of(kernel: Kernel, columns: np.ndarray, units: Array) -> InputKernel:
+        """Return a kernel for inputs through some columns; ``units (d,)`` are those of its errors."""
+        terms = np.moveaxis(kernel.terms[..., columns], 1, 2)  # (k, d, p + 1, m)
+        errors = kernel.sizes[..., columns] * units[:, None] * kernel.error[:, None, None]
+        return InputKernel(terms.reshape(*terms.shape[:2], -1), np.abs(terms).sum(axis=2), errors)
+
+    def along(self, which: np.ndarray, rows: Array) -> Integrands:
+        """Return the integrands along rows ``(q, n, d)`` at the ends of intervals ``which (q,)``."""
+        terms, sizes, m = rows @ self.terms[which], np.abs(rows), self.sizes.shape[2]
+        shape = (*rows.shape[:2], self.terms.shape[2] // m, m)
+        return Integrands(terms.reshape(shape), sizes @ self.sizes[which], sizes @ self.errors[which])
+
+
 @final
 @dataclass(frozen=True, eq=False)
 class VaryingExecution(Execution):
@@ -60,7 +101,7 @@ class VaryingExecution(Execution):
     bound: ConvexSet | None = None
     through: np.ndarray | None = None
     _lengths: dict[bytes, Array] = field(default_factory=dict, repr=False)
-    _transitions: dict[bytes, tuple[Array, Kernel]] = field(default_factory=dict, repr=False)
+    _transitions: dict[bytes, tuple[Array, InputKernel]] = field(default_factory=dict, repr=False)
     _cell_supports: dict[bytes, VaryingExecutionCellSupport] = field(default_factory=dict, repr=False)
 
     def none(self) -> VaryingExecution:
@@ -138,10 +179,10 @@ class VaryingExecution(Execution):
         return 0 if self.disturbing else super().late
 
     @cached_property
-    def kernel(self) -> Kernel:
+    def kernel(self) -> InputKernel:
         """Kernel of the pieces between all marks."""
         marks = self.motion.grid.breakpoints
-        return self.motion.expansion.kernel(marks[:-1], marks[1:])
+        return self._compute_kernel(marks[:-1], marks[1:])
 
     @shaped
     def lengths(self, times: Float[Array, " k"], directions: Float[Array, "k d"]) -> Float[Array, "k n"]:
@@ -209,21 +250,22 @@ class VaryingExecution(Execution):
         if not pieces.size or not times.size:
             return contributions
         directions = directions * self.error_mask
-        chunk_size = max(1, AT_ONCE // (pieces.size * self.kernel.terms[0].size + acting.size * directions.shape[1]))
+        (_, d, numbers), count = self.kernel.terms.shape, self.motion.grid.pieces
+        chunk_size = max(1, AT_ONCE // (count * (numbers + d) + numbers * d))
         for begin in range(0, times.size, chunk_size):
             chunk = slice(begin, begin + chunk_size)
-            for time_indices, piece, bounds in self._bound_pieces(times[chunk], directions[chunk], pieces, is_active):
+            for time_indices, piece, integrands in self._build_integrands(times[chunk], directions[chunk], pieces):
+                bounds = self._bound_errors(integrands, is_active[:, acting[piece]])
                 np.add.at(contributions.swapaxes(1, 2), (begin + time_indices, acting[piece]), bounds)
         return contributions
 
-    def _bound_pieces(
-        self, times: Array, directions: Array, pieces: np.ndarray, asked: np.ndarray
-    ) -> Iterator[tuple[np.ndarray, np.ndarray, Array]]:
-        """Yield bounds of the errors on ``pieces`` between marks, for every one of ``times (k,)`` after their
-        beginning.
+    def _build_integrands(
+        self, times: Array, directions: Array, pieces: np.ndarray
+    ) -> Iterator[tuple[np.ndarray, np.ndarray, Integrands]]:
+        """Yield the integrands on ``pieces`` between marks, for every one of ``times (k,)`` after their beginning.
 
-        Each item has the indices ``(q,)`` of the times, the pieces ``(q,)``, and the bounds ``(q, m, 2)``. The first
-        item is for pieces that have ended at their time, the second for pieces that have not.
+        Each item has the indices ``(q,)`` of the times, the pieces ``(q,)``, and the integrands. The first item is for
+        pieces that have ended at their time, the second for pieces that have not.
         """
         motion, grid = self.motion, self.motion.grid
         steps = motion.flow.state
@@ -233,28 +275,21 @@ class VaryingExecution(Execution):
         )
         distinct_indices = distinct_indices.reshape(-1)
         transitions, kernel = self._compute_transitions(distinct)
-        row, rows = np.zeros(directions.shape), np.empty((times.size, *directions.shape[1:], grid.pieces))
-        first = np.einsum("ki,kij->kj", directions, transitions[distinct_indices])
+        row, rows = np.zeros(directions.shape), np.empty((grid.pieces, *directions.shape))
+        first = (directions[:, None] @ transitions[distinct_indices])[:, 0]
         for k in range(int(last_pieces.max()) - 1, int(pieces[0]) - 1, -1):  # rows on the end of every piece
             row = np.where((last_pieces == k + 1)[:, None], first, row)
-            rows[:, :, k] = row
+            rows[k] = row
             row = row @ steps[k]
-        indices, piece_positions = np.nonzero(pieces < last_pieces[:, None])
-        piece = pieces[piece_positions]
-        yield (
-            indices,
-            piece,
-            self._bound_intervals(self.kernel, piece, rows[indices, :, piece], asked[:, self.acting[piece]]),
-        )
+        ended = pieces[pieces < last_pieces.max()]
+        has_ended = ended[:, None] < last_pieces
+        positions, indices = np.nonzero(has_ended)
+        yield indices, ended[positions], self.kernel.along(ended, rows[ended]).chosen(has_ended)
         inside = np.flatnonzero(np.isin(last_pieces, pieces) & np.greater(times, grid.breakpoints[last_pieces]))
-        piece = last_pieces[inside]
-        yield (
-            inside,
-            piece,
-            self._bound_intervals(kernel, distinct_indices[inside], directions[inside], asked[:, self.acting[piece]]),
-        )
+        integrands = kernel.along(distinct_indices[inside], directions[inside, None])
+        yield inside, last_pieces[inside], integrands.chosen(np.ones((inside.size, 1), dtype=bool))
 
-    def _compute_transitions(self, distinct: Array) -> tuple[Array, Kernel]:
+    def _compute_transitions(self, distinct: Array) -> tuple[Array, InputKernel]:
         """Return the transitions ``(k, d, d)`` from the breakpoint before each time to the time, and the kernel between
         them.
 
@@ -263,44 +298,43 @@ class VaryingExecution(Execution):
         """
         key = distinct.tobytes()
         if key not in self._transitions:
-            until, expansion = np.maximum(*distinct), self.motion.expansion
-            entry = expansion.flow(distinct[1], until).state, expansion.kernel(distinct[1], until)
+            until = np.maximum(*distinct)
+            entry = self.motion.expansion.flow(distinct[1], until).state, self._compute_kernel(distinct[1], until)
             remember(self._transitions, key, entry, max(1, AT_ONCE // (entry[0].size + entry[1].terms.size)))
         return self._transitions[key]
 
-    def _bound_intervals(self, kernel: Kernel, which: np.ndarray, rows: Array, asked: np.ndarray) -> Array:
-        """Return lower and upper bounds ``(q, m, 2)`` of the errors on intervals ``which (q,)`` of a kernel.
+    def _compute_kernel(self, starts: Array, stops: Array) -> InputKernel:
+        """Return the kernel of intervals ``(k,)`` within one segment each, of the columns through which errors
+        enter."""
+        expansion = self.motion.expansion
+        return InputKernel.of(expansion.kernel(starts, stops), self.columns, expansion.units)
 
-        ``rows (q, d)`` are the functionals at the ends of the intervals. Channels that are not ``asked (m, q)`` have 0.
+    def _bound_errors(self, integrands: Integrands, asked: np.ndarray) -> Array:
+        """Return lower and upper bounds ``(q, m, 2)`` of the errors on intervals with ``integrands``.
+
+        Channels that are not ``asked (m, q)`` have 0.
         """
-        m, units, columns = self.shares.size, self.motion.expansion.units, self.columns
         if self.bound is not None:
-            return self._bound_joint_inputs(self.bound, kernel, which, rows)
-        sizes = np.einsum("qd,qdm->qm", np.abs(rows), np.abs(kernel.terms[..., columns]).sum(axis=1)[which])
-        errors = np.einsum("qd,qdm->qm", np.abs(rows) * units, kernel.sizes[which][..., columns])
-        errors = errors * kernel.error[which, None]
+            return self._bound_joint_inputs(self.bound, integrands)
+        (count, order, m), sizes = integrands.terms.shape, integrands.sizes
         # a cut rounds every coefficient four times for every order; halves, of half the length each, twice in all
-        errors = errors + rounding(rows.shape[1] + (2 + 4 * CUTS) * kernel.terms.shape[1] + HALVINGS) * sizes
-        bounds = np.zeros((which.size, m, 2))
+        errors = integrands.errors + rounding(self.motion.states + (2 + 4 * CUTS) * order + HALVINGS) * sizes
+        bounds = np.zeros((count, m, 2))
         for j, share in enumerate(self.shares):
             members = np.flatnonzero(asked[j])
-            terms = np.einsum("qd,qpd->qp", rows[members], kernel.terms[which[members], :, :, columns[j]])
             accuracy = np.maximum(ACCURACY * self.motion.grid.pieces * sizes[members, j], TINY)
-            integrals = absolute(terms, accuracy)
+            integrals = absolute(integrands.terms[members, :, j], accuracy)
             integrals = integrals + errors[members, j, None] * [-1.0, 1.0]
             bounds[members, j] = share * np.maximum(integrals, 0.0) * [1.0 / OUTWARD, OUTWARD]
         return bounds
 
-    def _bound_joint_inputs(self, bound: ConvexSet, kernel: Kernel, which: np.ndarray, rows: Array) -> Array:
-        """Return `_bound_intervals` for a set of inputs through all columns together, ``(q, 1, 2)``."""
-        columns, radii = self.columns, self.error_radii
-        sizes = np.einsum("qd,qdm->qm", np.abs(rows), np.abs(kernel.terms[..., columns]).sum(axis=1)[which]) @ radii
-        units = np.abs(rows) * self.motion.expansion.units
-        errors = np.einsum("qd,qdm->qm", units, kernel.sizes[which][..., columns]) @ radii * kernel.error[which]
-        errors = errors + rounding(rows.shape[1] + 2 * kernel.terms.shape[1] + HALVINGS + 2 * radii.size) * sizes
-        terms = np.einsum("qd,qpdm->qpm", rows, kernel.terms[which][..., columns])
+    def _bound_joint_inputs(self, bound: ConvexSet, integrands: Integrands) -> Array:
+        """Return `_bound_errors` for a set of inputs through all columns together, ``(q, 1, 2)``."""
+        (count, order, m), sizes = integrands.terms.shape, integrands.sizes @ self.error_radii
+        terms = rounding(self.motion.states + 2 * order + HALVINGS + 2 * m)
+        errors = integrands.errors @ self.error_radii + terms * sizes
         accuracy = np.maximum(ACCURACY * self.motion.grid.pieces * sizes, TINY)
-        integrals = integrated(bound, terms, np.ones(which.size), accuracy)
+        integrals = integrated(bound, integrands.terms, np.ones(count), accuracy)
         return np.asarray(integrals + OUTWARD * errors[:, None] * [-1.0, 1.0])[:, None]
 
 
