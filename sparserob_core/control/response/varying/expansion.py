@@ -254,10 +254,11 @@ class Expansion:
     def _compute_parameter_responses(self, segments: np.ndarray, starts: Array, stops: Array, powers: Array) -> Array:
         """Return the responses of `at_parameters` over intervals within one segment each, side by side, ``(v, k, d, d +
         n)``."""
-        size, own, nonzero, length = powers.shape[2], self.own, self._nonzero_monomials, stops - starts
+        size, own, orders = powers.shape[2], self.own, self.orders
+        nonzero, length = self._nonzero_monomials, stops - starts
         distinct, indices = np.unique(segments, return_inverse=True)
-        coefficients = self._own_coefficients[distinct].reshape(distinct.size, self.orders, size, own, -1)[:, :, nonzero]
-        shape = (len(powers), starts.size, self.orders, own, coefficients.shape[4])
+        coefficients = self._own_coefficients[distinct].reshape(distinct.size, orders, size, own, -1)[:, :, nonzero]
+        shape = (len(powers), starts.size, orders, own, coefficients.shape[4])
         if powers.shape[1] == 1:
             values = np.einsum("va,snaij->vsnij", powers[:, 0, nonzero], coefficients)[:, indices.reshape(-1)]
         else:
@@ -270,7 +271,7 @@ class Expansion:
         totals = forcing.sum(axis=1).max(axis=1)
         shares = (forcing / np.where(totals > 0.0, totals, np.inf)[:, None, None]).max(axis=(2, 3), initial=0.0)
         terms, _ = _bound_tail(sizes, shares)
-        responses = self._sum_series(law[..., :own], law[..., own:], terms, self.orders - 1, 1)
+        responses = self._sum_series(law[..., :own], law[..., own:], terms, orders - 1, 1)
         return responses.reshape(*shape[:2], own, -1)
 
     @cached_property
