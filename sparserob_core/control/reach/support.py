@@ -10,7 +10,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import product as every_choice
-from typing import Protocol, final
+from typing import Protocol, TypeAlias, final
 
 import numpy as np
 
@@ -19,11 +19,13 @@ from sparserob_core.control.enclosures.matrix_exponential import rounding
 from sparserob_core.control.enclosures.polynomial import distinct_patterns
 from sparserob_core.control.enclosures.taylor import Combination, TaylorSpace
 from sparserob_core.control.reach.disturbance_support import PropagatedEffect, over_faces, propagate_effect, summed
-from sparserob_core.control.reach.varying_motion import OUTWARD, VaryingMotion
+from sparserob_core.control.reach.varying_motion import OUTWARD, SpreadMotion, VaryingMotion
 from sparserob_core.control.response.lifted import KNOWN, LiftedSystem
 from sparserob_core.shapes import Float, shaped
 from sparserob_core.sip.convex_set import Array, ConvexSet
 
+Leg: TypeAlias = LiftedSystem | VaryingMotion | SpreadMotion
+"""A system over a cell of parameters, or one of its phases, in each of the forms that bounds are derived from."""
 # said where it is met, and before anything is solved
 WITHOUT_PROOF = (
     "measurable disturbances are proven only beside parameters in a box over which the state can be expanded in them,"

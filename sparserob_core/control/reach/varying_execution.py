@@ -19,21 +19,20 @@ from sparserob_core.control.enclosures.comparison import product
 from sparserob_core.control.enclosures.matrix_exponential import rounding
 from sparserob_core.control.enclosures.polynomial import distinct_patterns
 from sparserob_core.control.enclosures.taylor import Combination
-from sparserob_core.control.reach.execution import Execution
+from sparserob_core.control.reach.execution import ConstantExecution, Execution
 from sparserob_core.control.reach.measurable import ACCURACY, AT_ONCE, KEPT, TINY
 from sparserob_core.control.reach.support import (
     KnownCellSupport,
+    Leg,
     Support,
     _list_corners,
     between_corners,
-    over_directions,
 )
 from sparserob_core.control.reach.varying_motion import (
     OUTWARD,
     SpreadMotion,
     VaryingMotion,
 )
-from sparserob_core.control.response.lifted import LiftedSystem
 from sparserob_core.control.response.response import Propagator, Response, unique_rows
 from sparserob_core.control.response.varying.expansion import Kernel
 from sparserob_core.control.sets.integrals import CUTS, HALVINGS, absolute, integrated
@@ -42,7 +41,6 @@ from sparserob_core.sip.convex_set import Array, ConvexSet
 
 POINTS_KEPT = 256  # parameters whose errors are remembered: twice the points of a lattice of parameters
 CELLS_KEPT = 16  # cells of parameters whose errors are: those of all rows of a few constraints
-STEP = 1e-6  # of the horizon, over which a slope is a difference: a tenth of it shows what integrals are rounded to
 
 
 class Integrands(NamedTuple):
@@ -100,32 +98,18 @@ class VaryingExecution(Execution):
     disturbing: bool = False
     bound: ConvexSet | None = None
     through: np.ndarray | None = None
-    _lengths: dict[bytes, Array] = field(default_factory=dict, repr=False)
     _transitions: dict[bytes, tuple[Array, InputKernel]] = field(default_factory=dict, repr=False)
-    _cell_supports: dict[bytes, VaryingExecutionCellSupport] = field(default_factory=dict, repr=False)
-
-    def none(self) -> VaryingExecution:
-        """Return the execution without errors; remembered results that depend on the shares are dropped."""
-        return replace(self, shares=np.zeros(self.shares.size), _lengths={}, _cell_supports={})
 
     def following(self, propagator: Propagator, initial_state: Array) -> VaryingExecution:
         """Return the errors along states ``(d,)`` or their coefficients ``(M d,)``, that a propagator moves."""
         response = Response(propagator.system, propagator.grid, initial_state, shared=propagator)
         error_mask = np.tile(self.error_mask, initial_state.size // self.error_mask.size)
-        return replace(self, response=response, error_mask=error_mask, _lengths={}, _transitions={}, _cell_supports={})
+        return replace(self, response=response, error_mask=error_mask, _transitions={})
 
-    def over(
-        self,
-        control: Array,
-        rows: Array,
-        leg: LiftedSystem | VaryingMotion | SpreadMotion,
-        joined: Combination | None = None,
-    ) -> Support:
-        """`Execution.over`."""
+    def on_functionals(self, control: Array, rows: Array, leg: Leg) -> VaryingExecutionCellSupport:
+        """`Execution.on_functionals`."""
         assert isinstance(leg, VaryingMotion)
-        return over_directions(
-            lambda functionals: VaryingExecutionCellSupport(self, control, functionals, leg), rows, leg, joined
-        )
+        return VaryingExecutionCellSupport(self, control, rows, leg)
 
     def reaching(self, control: Array) -> VaryingExecutionCellSupport:
         """Return the support of the errors of a ``control (m, K)`` without functionals, for the bounds of the states.
@@ -137,6 +121,10 @@ class VaryingExecution(Execution):
             support = VaryingExecutionCellSupport(self, control, np.zeros((0, self.motion.states)), self.motion)
             remember(self._cell_supports, key, support, KEPT)
         return self._cell_supports[key]
+
+    @cached_property
+    def _cell_supports(self) -> dict[bytes, VaryingExecutionCellSupport]:
+        return {}
 
     @cached_property
     def motion(self) -> VaryingMotion:
@@ -162,7 +150,7 @@ class VaryingExecution(Execution):
         """The errors of the box around the set, where there is one."""
         if self.bound is None:
             return self
-        return replace(self, shares=self.error_radii, bound=None, _lengths={}, _cell_supports={})
+        return replace(self, shares=self.error_radii, bound=None)
 
     @cached_property
     def acting(self) -> np.ndarray:
@@ -185,58 +173,20 @@ class VaryingExecution(Execution):
         return self._compute_kernel(marks[:-1], marks[1:])
 
     @shaped
-    def lengths(self, times: Float[Array, " k"], directions: Float[Array, "k d"]) -> Float[Array, "k n"]:
-        """`Execution.lengths`."""
-        lengths = self._integrate_unit_errors(times, directions)[:, :, self.late :]
-        return lengths.reshape(times.size, self.shares.size * (self.breakpoints.size - 1))
-
-    def _integrate_unit_errors(self, times: Array, directions: Array) -> Array:
-        """Return the middle of the bounds of the contribution of errors for size 1 of each entry of `acts`,
-        ``(k, m, late + K)``."""
+    def unit_errors(self, times: Float[Array, " k"], directions: Float[Array, "k d"]) -> Float[Array, "k m n"]:
+        """Return `Execution.unit_errors`: the middle of the bounds."""
         wanted = np.ones((self.shares.size, self.late + self.breakpoints.size - 1), dtype=bool)
         return np.asarray(self._bound_integrals(times, directions, wanted).mean(axis=3))
-
-    @shaped
-    def added(
-        self, control: Float[Array, "m K"], times: Float[Array, " k"], directions: Float[Array, "k d"]
-    ) -> Float[Array, " k"]:
-        """Return `Execution.added`: the middle of its bounds, without the error of the transitions."""
-        return np.asarray(self._bound_contribution(control, times, directions).mean(axis=1))
-
-    def sampled(self, control: Array, times: Array, directions: Array) -> Array:
-        """`Execution.sampled`: where that is not too much, from the lengths, which are the same for every control."""
-        if times.size * self.size > AT_ONCE:
-            return self.added(control, times, directions)
-        key = times.tobytes() + directions.tobytes()
-        if key not in self._lengths:
-            lengths = self._integrate_unit_errors(times, directions)
-            remember(self._lengths, key, lengths.reshape(times.size, lengths.shape[1] * lengths.shape[2]), KEPT)
-        return np.asarray(self._lengths[key] @ self.acts(control).ravel())
-
-    @shaped
-    def slope(
-        self, control: Float[Array, "m K"], times: Float[Array, " k"], directions: Float[Array, "k d"]
-    ) -> Float[Array, " k"]:
-        """`Execution.slope`, as a difference over a little time before; nothing is proven by it."""
-        before = np.maximum(times - STEP * float(self.breakpoints[-1]), 0.0)
-        now, then = (self.added(control, at, directions) for at in (times, before))
-        return np.asarray((now - then) / np.where(times > before, times - before, 1.0))
 
     @shaped
     def enclosed(
         self, control: Float[Array, "m K"], times: Float[Array, " k"], directions: Float[Array, "k d"]
     ) -> Float[Array, "k 2"]:
         """Return `Execution.enclosed`, without the error of the transitions."""
-        bounds = self._bound_contribution(control, times, directions)
+        size = self.acts(control)
+        bounds = np.einsum("kjpe,jp->ke", self._bound_integrals(times, directions, np.asarray(size > 0.0)), size)
         rounding_errors = rounding(self.size + 8) * np.abs(bounds).max(axis=1)
         return np.asarray(bounds + rounding_errors[:, None] * [-1.0, 1.0])
-
-    def _bound_contribution(self, control: Array, times: Array, directions: Array) -> Array:
-        """Return lower and upper bounds of the contribution of errors of a control, ``(k, 2)``, without the error of
-        the transitions and the rounding of the sum."""
-        size = self.acts(control)
-        bounds: Array = self._bound_integrals(times, directions, np.asarray(size > 0.0))
-        return np.asarray(np.einsum("kjpe,jp->ke", bounds, size))
 
     def _bound_integrals(self, times: Array, directions: Array, wanted: np.ndarray) -> Array:
         """Return bounds of ``share_j int |c'Phi(t, s) B_j(s)| ds`` for each entry of `acts`, ``(k, m, late + K, 2)``.
@@ -348,24 +298,21 @@ class UncertainExecution(Execution):
     """
 
     known: VaryingExecution
-    _point_executions: dict[bytes, VaryingExecution] = field(default_factory=dict, repr=False)
-    _cell_executions: dict[bytes, tuple[SpreadMotion, VaryingExecution]] = field(default_factory=dict, repr=False)
 
     def none(self) -> UncertainExecution:
         """`Execution.none`."""
-        return replace(
-            self, shares=np.zeros(self.shares.size), known=self.known.none(), _point_executions={}, _cell_executions={}
-        )
+        return replace(self, shares=np.zeros(self.shares.size), known=self.known.none())
+
+    @property
+    def late(self) -> int:
+        """`Execution.late`."""
+        return self.known.late
 
     @property
     def around(self) -> UncertainExecution:
         """`VaryingExecution.around`."""
         around = self.known.around
-        return (
-            self
-            if around is self.known
-            else replace(self, shares=around.shares, known=around, _point_executions={}, _cell_executions={})
-        )
+        return self if around is self.known else replace(self, shares=around.shares, known=around)
 
     def extend_directions(self, directions: Array, parameters: Array) -> Array:
         """Return directions ``(k, d)`` with the parameters ``(k, nu)`` as further columns, ``(k, d + nu)``."""
@@ -381,16 +328,22 @@ class UncertainExecution(Execution):
             remember(self._point_executions, key, execution, POINTS_KEPT)
         return self._point_executions[key]
 
-    def over(
-        self,
-        control: Array,
-        rows: Array,
-        leg: LiftedSystem | VaryingMotion | SpreadMotion,
-        joined: Combination | None = None,
-    ) -> Support:
+    @cached_property
+    def _point_executions(self) -> dict[bytes, VaryingExecution]:
+        return {}
+
+    @cached_property
+    def _cell_executions(self) -> dict[bytes, tuple[SpreadMotion, VaryingExecution]]:
+        return {}
+
+    def over(self, control: Array, rows: Array, leg: Leg, joined: Combination | None = None) -> Support:
         """`Execution.over`."""
-        assert isinstance(leg, SpreadMotion)
         assert joined is None  # refused beside curved sets
+        return self.on_functionals(control, rows, leg)
+
+    def on_functionals(self, control: Array, rows: Array, leg: Leg) -> SpreadExecutionSupport:
+        """`Execution.on_functionals`."""
+        assert isinstance(leg, SpreadMotion)
         key = id(leg).to_bytes(8)  # of a leg that is kept beside
         if key not in self._cell_executions:
             execution = self.known.following(leg.motion.propagator, leg.motion.initial_state)
@@ -409,37 +362,15 @@ class UncertainExecution(Execution):
         return found
 
     @shaped
-    def lengths(self, times: Float[Array, " k"], directions: Float[Array, "k d"]) -> Float[Array, "k n"]:
-        """`Execution.lengths`."""
-        values = np.empty((times.size, self.size))
-        return self._each(directions, values, lambda errors, indices, c: errors.lengths(times[indices], c))
-
-    def given(self, times: Array, directions: Array) -> Array:
-        """`Execution.given`."""
-        return self._each(directions, np.empty(times.size), lambda errors, indices, c: errors.given(times[indices], c))
-
-    @shaped
-    def added(
-        self, control: Float[Array, "m K"], times: Float[Array, " k"], directions: Float[Array, "k d"]
-    ) -> Float[Array, " k"]:
-        """`Execution.added`."""
-        return self._each(
-            directions, np.empty(times.size), lambda errors, indices, c: errors.added(control, times[indices], c)
-        )
+    def unit_errors(self, times: Float[Array, " k"], directions: Float[Array, "k d"]) -> Float[Array, "k m n"]:
+        """`Execution.unit_errors`."""
+        values = np.empty((times.size, self.shares.size, self.late + self.breakpoints.size - 1))
+        return self._each(directions, values, lambda errors, indices, c: errors.unit_errors(times[indices], c))
 
     def sampled(self, control: Array, times: Array, directions: Array) -> Array:
-        """`Execution.sampled`."""
+        """Return `Execution.sampled`, remembered at every parameter by itself."""
         return self._each(
             directions, np.empty(times.size), lambda errors, indices, c: errors.sampled(control, times[indices], c)
-        )
-
-    @shaped
-    def slope(
-        self, control: Float[Array, "m K"], times: Float[Array, " k"], directions: Float[Array, "k d"]
-    ) -> Float[Array, " k"]:
-        """`Execution.slope`."""
-        return self._each(
-            directions, np.empty(times.size), lambda errors, indices, c: errors.slope(control, times[indices], c)
         )
 
     @shaped
@@ -456,6 +387,12 @@ def followed(errors: VaryingExecution) -> VaryingExecution | UncertainExecution:
     if errors.response.propagator.laws is None:
         return errors
     return UncertainExecution(errors.response, errors.breakpoints, errors.shares, errors.error_mask, errors)
+
+
+def execution_of(response: Response, breakpoints: Array, shares: Array, error_mask: Array) -> Execution:
+    """Return the errors of execution of a system, with the fields of `Execution`."""
+    arguments = response, breakpoints, shares, error_mask
+    return followed(VaryingExecution(*arguments)) if response.system.varies else ConstantExecution(*arguments)
 
 
 @final
