@@ -299,7 +299,7 @@ class DirectionsCellSupport:
 
     made: Callable[[Array], Support]
     rows: Array
-    leg: LiftedSystem | VaryingMotion
+    leg: Leg
     joined: Combination
 
     @shaped
@@ -366,9 +366,7 @@ class DirectionsCellSupport:
         return coefficients[..., 0], error_bounds
 
 
-def over_directions(
-    made: Callable[[Array], Support], rows: Array, leg: LiftedSystem | VaryingMotion, joined: Combination | None
-) -> Support:
+def over_directions(made: Callable[[Array], Support], rows: Array, leg: Leg, joined: Combination | None) -> Support:
     """Return the support on functionals, or on the direction that they make up where they are ``joined``.
 
     Parameters
@@ -377,7 +375,7 @@ def over_directions(
         The support as a function of functionals ``(r, d)``.
     rows : Array
         Functionals ``(r, d)``.
-    leg : LiftedSystem or VaryingMotion
+    leg : Leg
         The system, or a phase of a switched system.
     joined : Combination or None
         How the rows make up one direction that varies over a cell.
