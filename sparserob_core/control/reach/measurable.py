@@ -250,7 +250,8 @@ class MeasurableSupport:
             key = parameter.tobytes() + number.to_bytes(4)
             total[last] += self._integrate_until(A, E, ages, times[last], rows[last], key)
             if through.size:
-                total[through] += self._integrate_whole_phase(A, E, length, rows[through])
+                tables = self._make_tables(A, E, np.array([0.0, length]), rows[through])  # different at every time
+                total[through] += [table.sums[-1] + table.late * np.array([-1.0, 1.0]) for table in tables]
             if number:
                 members = np.flatnonzero(legs >= number)
                 durations = np.where(legs[members] == number, times[members], length)
@@ -285,15 +286,6 @@ class MeasurableSupport:
         errors = shares * errors + np.where(times > 0.0, late, 0.0)
         partial = integrated(self.bound, terms, within, accuracy) + errors[:, None] * [-1.0, 1.0]
         return np.asarray(before + partial)
-
-    def _integrate_whole_phase(self, A: Array, E: Array, length: float, directions: Array) -> Array:
-        """Return bounds ``(k, 2)`` of the contribution of one mode over a whole phase of this ``length``, for rows
-        ``directions (k, d)`` at its end.
-
-        Nothing is remembered, since the rows are different at every time.
-        """
-        tables = self._make_tables(A, E, np.array([0.0, length]), directions)
-        return np.array([table.sums[-1] + table.late * np.array([-1.0, 1.0]) for table in tables])
 
     def _look_up_tables(self, A: Array, E: Array, ages: Array, directions: Array, key: bytes) -> list[_IntegralTable]:
         """Return the table of each of ``directions (k, d)``, made where none is remembered."""
