@@ -24,8 +24,8 @@ from sparserob_core.control.enclosures.cache import remember
 from sparserob_core.control.reach.enclosure import Bounded, CellEnclosure, enclose, kept, over_legs
 from sparserob_core.control.reach.functional import WorstFunctionals
 from sparserob_core.control.reach.many_directions import ManyDirections
-from sparserob_core.control.reach.over_cells import Leg
 from sparserob_core.control.reach.sizes import nominal_sizes
+from sparserob_core.control.reach.support import Leg
 from sparserob_core.control.response.parameters import ParameterIndex
 from sparserob_core.control.response.reference import STILL, MovingReference, Reference
 from sparserob_core.control.sets.directions import across, faces, neighbours, on_surface, sampled, shares, unit

@@ -26,9 +26,9 @@ from sparserob_core.control.problem.terms.windows import Flat
 from sparserob_core.control.reach.enclosure import Bounded, CellEnclosure, enclose, kept, over_legs
 from sparserob_core.control.reach.functional import WorstFunctionals
 from sparserob_core.control.reach.many_directions import ManyDirections
-from sparserob_core.control.reach.over_cells import LEGS_KEPT, Leg
+from sparserob_core.control.reach.over_cells import LEGS_KEPT
 from sparserob_core.control.reach.sizes import row_sizes
-from sparserob_core.control.reach.support import Supports
+from sparserob_core.control.reach.support import Leg, Supports
 from sparserob_core.control.response.parameters import ParameterIndex
 from sparserob_core.control.response.reference import STILL, Direct, MovingReference, Reference
 from sparserob_core.control.response.response import OutputResponse, Response, distinct_times

@@ -294,7 +294,7 @@ class Sensitivity:
         if grid.mode is None:
             in_time = support.bound.support((at.free[:, :1] @ at.W[:, 0])[:, 0])[:, None]
         else:  # of what earlier systems did there is no closed form
-            from sparserob_core.control.reach.varying_execution import STEP
+            from sparserob_core.control.reach.execution import STEP
 
             ends, step = grid.breakpoints[[at.now, at.now + 1]], STEP * float(grid.breakpoints[-1])
             low, high = np.clip([times - step, times + step], *ends)

@@ -22,8 +22,77 @@ SAME = 1e-9  # of a piece: a time that is not as near to its end is inside
 KEPT = 8_000_000  # numbers of sums over all ages, up to which they are remembered
 
 
+class LiftedSupport:
+    """A part of the uncertainty that acts in blocks, on functionals ``rows (r, d)`` in the coordinates of a ``lifted``
+    system; with a ``combination`` they make up one direction that varies over a cell."""
+
+    lifted: LiftedSystem
+    rows: Array
+    combination: Combination | None
+
+    @property
+    def _space(self) -> TaylorSpace:
+        return (self.combination or self.lifted).space
+
+    @cached_property
+    def _lifted_rows(self) -> Array:
+        rows = np.zeros((self.rows.shape[0], self.lifted.row_matrix.shape[0]))
+        rows[:, : self.lifted.states] = self.rows
+        return rows
+
+    @cached_property
+    def _curvature_terms(self) -> tuple[Array, Array, Array, Array, Array]:
+        """Quantities of `deviation` that do not depend on time: the lifted functionals times the square of the matrix;
+        the block norms ``(r, q)`` of their first derivative, of their second derivative, and of the functionals
+        themselves; and the square of the block sizes."""
+        lifted, rows = self.lifted, self._lifted_rows
+        slope_rows, curvature_rows = rows @ lifted.row_matrix, rows @ lifted.row_matrix @ lifted.row_matrix
+        slope_norms, curvature_norms = (
+            block_norms(derivative.reshape(*derivative.shape[:-1], -1, lifted.states), lifted.starts).sum(axis=-2)
+            for derivative in (slope_rows, curvature_rows)
+        )
+        sizes = lifted.comparison.sizes
+        return curvature_rows, slope_norms, curvature_norms, block_norms(self.rows, lifted.starts), sizes @ sizes
+
+    def _bound_chords(self, start: Array, widths: Array, sizes: Array, ended_bounds: Array, drive: Array) -> Array:
+        """Return bounds ``(k, r)`` of the distance of the support function from its chord on
+        ``[start, start + width]``, inside one piece.
+
+        A block that has ended has ``y(r) = c e^{A r} z``, the one that lasts ``y' = c e^{A r} W``. The distance is at
+        most ``width^2 / 8`` of the largest second derivative, and mode by mode at most twice the total change. The
+        latter bound serves fast modes, which have died away long before a cell is as short as they are.
+
+        Given are bounds ``sizes (k, r)`` of the second derivative at the start, from the blocks that have ended, norm
+        bounds ``ended_bounds (L + 1, q)`` of their effect until each breakpoint, and norm bounds ``drive (q,)`` of the
+        rate at which the block that lasts drives the coordinates.
+        """
+        grid, comparison = self.lifted.grid, self.lifted.comparison
+        _, slope_norms, curvature_norms, norms, squared = self._curvature_terms
+        pieces = np.minimum(np.maximum(grid.breakpoints.searchsorted(start, side="right") - 1, 0), grid.pieces - 1)
+        flow = comparison.over(start - grid.breakpoints[pieces], cells=True).flow
+        reach = comparison.over(widths, cells=True)
+        current_sizes = flow.on(np.broadcast_to(drive, (start.size, drive.size)))
+        ended_sizes = flow.on(ended_bounds[pieces])
+        square = (widths**2 / 8)[:, None]
+        exact = square * (
+            sizes
+            + product(curvature_norms, reach.departure.on(ended_sizes).T).T
+            + product(slope_norms, reach.peak.on(current_sizes).T).T
+        )
+        ended = np.minimum(
+            square * product(reach.peak.on(ended_sizes), squared.T),
+            2.0 * product(reach.integral.on(ended_sizes), comparison.sizes.T),
+        )
+        current = np.minimum(
+            square * product(reach.peak.on(current_sizes), comparison.sizes.T),
+            2.0 * reach.integral.on(current_sizes),
+        )
+        by_mode = product(norms, (ended + current).T).T
+        return np.asarray(np.minimum(exact, by_mode))
+
+
 @dataclass(frozen=True, eq=False)
-class DisturbanceSupport:
+class DisturbanceSupport(LiftedSupport):
     """The support function ``sigma(t) = sum_b h_D(y_b(t))`` of functionals ``rows (r, d)`` (in the lifted system's
     coordinates) over one cell.
 
@@ -65,51 +134,13 @@ class DisturbanceSupport:
         ``[start, start + width]`` inside one piece.
 
         The height is at most the distance of the weights ``y`` on the blocks from their chords, times any disturbance,
-        summed over blocks and Taylor coefficients. A block that has ended has ``y(r) = c e^{A r} z``, the one that
-        lasts ``y' = c e^{A r} W``. The distance is at most ``width^2 / 8`` of the largest second derivative, and mode
-        by mode at most twice the total change. The latter bound serves fast modes, which have died away long before a
-        cell is as short as they are.
+        summed over blocks and Taylor coefficients.
         """
-        grid, comparison = self.lifted.grid, self.lifted.comparison
-        curvature_rows, slope_norms, curvature_norms, norms, squared = self._curvature_terms
+        curvature_rows = self._curvature_terms[0]
         sizes = self._sum_over_blocks(
             start, self._bound_coefficients, curvature_rows, plain=True, kept="curvature"
         ).sum(axis=2)
-        pieces = np.minimum(np.maximum(grid.breakpoints.searchsorted(start, side="right") - 1, 0), grid.pieces - 1)
-        flow = comparison.over(start - grid.breakpoints[pieces], cells=True).flow
-        reach = comparison.over(widths, cells=True)
-        current_sizes = flow.on(np.broadcast_to(self._drive, (start.size, self._drive.size)))
-        ended_sizes = flow.on(self._breakpoint_bounds[pieces])
-        square = (widths**2 / 8)[:, None]
-        exact = square * (
-            sizes
-            + product(curvature_norms, reach.departure.on(ended_sizes).T).T
-            + product(slope_norms, reach.peak.on(current_sizes).T).T
-        )
-        ended = np.minimum(
-            square * product(reach.peak.on(ended_sizes), squared.T),
-            2.0 * product(reach.integral.on(ended_sizes), comparison.sizes.T),
-        )
-        current = np.minimum(
-            square * product(reach.peak.on(current_sizes), comparison.sizes.T),
-            2.0 * reach.integral.on(current_sizes),
-        )
-        by_mode = product(norms, (ended + current).T).T
-        return np.asarray(np.minimum(exact, by_mode))
-
-    @cached_property
-    def _curvature_terms(self) -> tuple[Array, Array, Array, Array, Array]:
-        """Quantities of `deviation` that do not depend on time: the lifted functionals times the square of the matrix;
-        the block norms ``(r, q)`` of their first derivative, of their second derivative, and of the functionals
-        themselves; and the square of the block sizes."""
-        lifted, rows = self.lifted, self._lifted_rows
-        slope_rows, curvature_rows = rows @ lifted.row_matrix, rows @ lifted.row_matrix @ lifted.row_matrix
-        slope_norms, curvature_norms = (
-            block_norms(derivative.reshape(*derivative.shape[:-1], -1, lifted.states), lifted.starts).sum(axis=-2)
-            for derivative in (slope_rows, curvature_rows)
-        )
-        sizes = lifted.comparison.sizes
-        return curvature_rows, slope_norms, curvature_norms, block_norms(self.rows, lifted.starts), sizes @ sizes
+        return self._bound_chords(start, widths, sizes, self._breakpoint_bounds, self._drive)
 
     @cached_property
     def neglected(self) -> Array:
@@ -139,10 +170,6 @@ class DisturbanceSupport:
         """Norm bounds ``(L, q)`` of the effect of any disturbance on every block of the coordinates until the end of
         every piece."""
         return self._breakpoint_bounds[1:]
-
-    @property
-    def _space(self) -> TaylorSpace:
-        return (self.combination or self.lifted).space
 
     @property
     def _has_uniform_blocks(self) -> bool:
@@ -298,12 +325,6 @@ class DisturbanceSupport:
     def before(self) -> Array:
         """Norm bounds ``(q,)`` of the effect of any disturbance before time 0 on every block of the coordinates."""
         return np.zeros(self.lifted.starts.size) if self._earlier_effect is None else self._earlier_effect.effect_bounds
-
-    @cached_property
-    def _lifted_rows(self) -> Array:
-        rows = np.zeros((self.rows.shape[0], self.lifted.row_matrix.shape[0]))
-        rows[:, : self.lifted.states] = self.rows
-        return rows
 
     @cached_property
     def _drive(self) -> Array:

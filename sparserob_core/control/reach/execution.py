@@ -7,20 +7,18 @@ sum is convex in the command, and 0 where the command is 0.
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import final
+from typing import Self, final
 
 import numpy as np
 
+from sparserob_core.control.enclosures.cache import remember
 from sparserob_core.control.enclosures.comparison import block_norms
 from sparserob_core.control.problem.system import LinearSystem
-from sparserob_core.control.reach.measurable import MeasurableSupport, _propagate_rows
-from sparserob_core.control.reach.support import KnownCellSupport, Support, over_directions
-from sparserob_core.control.reach.varying_motion import (
-    SpreadMotion,
-    VaryingMotion,
-)
+from sparserob_core.control.reach.measurable import AT_ONCE, KEPT, MeasurableSupport, _propagate_rows, bound_chords
+from sparserob_core.control.reach.support import KnownCellSupport, Leg, Support, over_directions
 from sparserob_core.control.response.lifted import LiftedSystem
 from sparserob_core.control.response.response import Response, unique_rows
 from sparserob_core.shapes import Float, shaped
@@ -31,15 +29,15 @@ from sparserob_core.sip.expressions.taylor import Combination
 # Of the horizon: ages that differ by less are one where nothing is proven. Ten times as much would be seen in a
 # violation of 1e-9, a tenth of it is below what the difference of two times rounds to.
 ALIKE = 1e-14
+STEP = 1e-6  # of the horizon, over which a slope is a difference: a tenth of it shows what integrals are rounded to
 
 
 @dataclass(frozen=True, eq=False)
-class Execution:
+class Execution(ABC):
     """Errors of execution: the delivered control may differ from the commanded one by ``shares (m,)`` of it.
 
-    ``breakpoints (K + 1,)`` are those of the command, and ``response`` is the response of a known system, on which
-    commands may act with a delay. ``error_mask (d,)`` is 0 for states that add up what is commanded, and do nothing
-    else, and 1 for others.
+    ``breakpoints (K + 1,)`` are those of the command, on which commands may act with a delay. ``error_mask (d,)`` is 0
+    for states that add up what is commanded, and do nothing else, and 1 for others.
     """
 
     response: Response
@@ -47,18 +45,7 @@ class Execution:
     shares: Array
     error_mask: Array
 
-    def extend_directions(self, directions: Array, parameters: Array) -> Array:
-        """Return directions ``(k, d)`` at parameters ``(k, nu)`` as directions on the states along which errors are
-        followed."""
-        return directions
-
-    def over(
-        self,
-        control: Array,
-        rows: Array,
-        leg: LiftedSystem | VaryingMotion | SpreadMotion,
-        joined: Combination | None = None,
-    ) -> Support:
+    def over(self, control: Array, rows: Array, leg: Leg, joined: Combination | None = None) -> Support:
         """Return the support of the worst errors of a control on functionals over cells of time.
 
         Parameters
@@ -67,7 +54,7 @@ class Execution:
             Command ``(m, K)``.
         rows : Array
             Functionals ``(r, d)``.
-        leg : LiftedSystem, VaryingMotion or SpreadMotion
+        leg : Leg
             The system, or a phase of a switched system.
         joined : Combination, optional
             How the rows make up one direction that varies over a cell; without it each row is a functional.
@@ -77,18 +64,60 @@ class Execution:
         Support
             Support of the errors.
         """
-        assert isinstance(leg, LiftedSystem)
-        return over_directions(
-            lambda functionals: ExecutionCellSupport(self, control, functionals, leg), rows, leg, joined
-        )
+        return over_directions(lambda functionals: self.on_functionals(control, functionals, leg), rows, leg, joined)
 
-    def sampled(self, control: Array, times: Array, directions: Array) -> Array:
-        """`added` at times and directions that are asked for again and again."""
-        return self.added(control, times, directions)
+    @abstractmethod
+    def on_functionals(self, control: Array, rows: Array, leg: Leg) -> Support:
+        """Return the support of `over` on functionals ``(r, d)``, each of which is the same on the whole cell."""
 
-    def none(self) -> Execution:
+    @abstractmethod
+    def unit_errors(self, times: Array, directions: Array) -> Array:
+        """Return the largest contribution of errors to ``c'x(t)`` for size 1 of each entry of `acts`,
+        ``(k, m, late + K)``, at ``times (k,)`` in ``directions``. It is not enclosed."""
+
+    @abstractmethod
+    def enclosed(self, control: Array, times: Array, directions: Array) -> Array:
+        """Return lower and upper bounds of `added`, ``(k, 2)``."""
+
+    def extend_directions(self, directions: Array, parameters: Array) -> Array:
+        """Return directions ``(k, d)`` at parameters ``(k, nu)`` as directions on the states along which errors are
+        followed."""
+        return directions
+
+    def none(self) -> Self:
         """Return the execution without errors: the control is delivered as it is commanded."""
         return replace(self, shares=np.zeros(self.shares.size))
+
+    @shaped
+    def lengths(self, times: Float[Array, " k"], directions: Float[Array, "k d"]) -> Float[Array, "k n"]:
+        """Return the largest contribution of errors to ``c'x(t)`` for a command of size 1, on every piece of every
+        channel.
+
+        The result ``(k, m K)`` is ordered channel by channel. It is not enclosed.
+        """
+        return self.unit_errors(times, directions)[:, :, self.late :].reshape(times.size, self.size)
+
+    @shaped
+    def added(
+        self, control: Float[Array, "m K"], times: Float[Array, " k"], directions: Float[Array, "k d"]
+    ) -> Float[Array, " k"]:
+        """Return the largest contribution ``(k,)`` of errors of a command to ``c'x(t)``, at ``times (k,)`` in
+        ``directions (k, d)``: the middle of its bounds."""
+        return np.asarray(self.enclosed(control, times, directions).mean(axis=1))
+
+    def sampled(self, control: Array, times: Array, directions: Array) -> Array:
+        """`added` at times and directions that are asked for again and again: where these are not too many, from the
+        errors of commands of size 1, which are remembered."""
+        if times.size * self.size > AT_ONCE:
+            return self.added(control, times, directions)
+        key = times.tobytes() + directions.tobytes()
+        if key not in self._cached_errors:
+            remember(self._cached_errors, key, self.unit_errors(times, directions).reshape(times.size, -1), KEPT)
+        return np.asarray(self._cached_errors[key] @ self.acts(control).ravel())
+
+    @cached_property
+    def _cached_errors(self) -> dict[bytes, Array]:
+        return {}
 
     def given(self, times: Array, directions: Array) -> Array:
         """Return the contribution ``(k,)`` to ``c'x(t)`` of errors of the control before the first piece, where
@@ -96,6 +125,16 @@ class Execution:
         if not self.late:
             return np.zeros(times.size)
         return self.added(np.zeros((self.shares.size, self.breakpoints.size - 1)), times, directions)
+
+    @shaped
+    def slope(
+        self, control: Float[Array, "m K"], times: Float[Array, " k"], directions: Float[Array, "k d"]
+    ) -> Float[Array, " k"]:
+        """Return the derivative ``(k,)`` of `added` in the time, from the left, as a difference over a little time;
+        nothing is proven by it."""
+        before = np.maximum(times - STEP * float(self.breakpoints[-1]), 0.0)
+        now, then = (self.added(control, at, directions) for at in (times, before))
+        return np.asarray((now - then) / np.where(times > before, times - before, 1.0))
 
     @property
     def late(self) -> int:
@@ -107,6 +146,22 @@ class Execution:
         size, before = np.abs(control), self.response.grid.before
         return size if before is None or not self.late else np.column_stack([np.abs(before), size])
 
+    @property
+    def size(self) -> int:
+        """Number ``m K`` of absolute values, one for every channel and piece."""
+        return int(self.shares.size * (self.breakpoints.size - 1))
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class ConstantExecution(Execution):
+    """`Execution` of a known constant system: errors depend on the age of a command alone."""
+
+    def on_functionals(self, control: Array, rows: Array, leg: Leg) -> ExecutionCellSupport:
+        """`Execution.on_functionals`."""
+        assert isinstance(leg, LiftedSystem)
+        return ExecutionCellSupport(self, control, rows, leg)
+
     @cached_property
     def begins(self) -> Array:
         """Times ``(late + K + 1,)`` at which what acts changes, on the grid of the response; the horizon for pieces
@@ -114,11 +169,6 @@ class Execution:
         grid = self.response.grid
         first = np.searchsorted(grid.control_piece, np.arange(-self.late, self.breakpoints.size - 1))
         return np.append(grid.breakpoints[first], grid.breakpoints[-1])
-
-    @property
-    def size(self) -> int:
-        """Number ``m K`` of absolute values, one for every channel and piece."""
-        return int(self.shares.size * (self.breakpoints.size - 1))
 
     @cached_property
     def matrices(self) -> tuple[Array, Array]:
@@ -138,36 +188,27 @@ class Execution:
         ]
 
     @shaped
-    def lengths(self, times: Float[Array, " k"], directions: Float[Array, "k d"]) -> Float[Array, "k n"]:
-        """Return the largest contribution of errors to ``c'x(t)`` for a command of size 1, on every piece of every
-        channel.
-
-        The result ``(k, m K)`` is ordered channel by channel. It is not enclosed.
-        """
-        ages = np.clip(times[:, None] - self.begins[self.late :], 0.0, None)
-        contributions = np.zeros((times.size, self.shares.size, self.breakpoints.size - 1))
-        for j, integral in enumerate(self._integrate_responses(ages, directions)):
-            contributions[:, j] = self.shares[j] * np.maximum(integral[:, :-1] - integral[:, 1:], 0.0)
-        return contributions.reshape(times.size, self.shares.size * (self.breakpoints.size - 1))
-
-    @shaped
-    def added(
-        self, control: Float[Array, "m K"], times: Float[Array, " k"], directions: Float[Array, "k d"]
-    ) -> Float[Array, " k"]:
-        """Return the largest contribution ``(k,)`` of errors of a command to ``c'x(t)``, at ``times (k,)`` in
-        ``directions (k, d)``; `enclosed` has its bounds."""
-        pieces, jumps = self.jumps(control)
-        if not pieces.size:
-            return np.zeros(times.size)
-        ages = np.clip(times[:, None] - self.begins[pieces], 0.0, None)
-        pairs = zip(self._integrate_responses(ages, directions), jumps, strict=True)
-        return np.asarray(sum(integral @ change for integral, change in pairs))
+    def unit_errors(self, times: Float[Array, " k"], directions: Float[Array, "k d"]) -> Float[Array, "k m n"]:
+        """Return `Execution.unit_errors`, from integrals up to ages; ages that differ by less than the share `ALIKE` of
+        the horizon are one."""
+        ages = np.clip(times[:, None] - self.begins, 0.0, None)
+        c, owner = unique_rows(directions)
+        rounded, age_indices = np.unique(np.rint(ages / (ALIKE * self.breakpoints[-1])), return_inverse=True)
+        numbers = owner[:, None] * rounded.size + age_indices.reshape(ages.shape)
+        pairs, first, pair_indices = np.unique(numbers, return_index=True, return_inverse=True)
+        distinct_ages, rows, nothing = ages.ravel()[first], c[pairs // rounded.size], np.zeros((pairs.size, 0))
+        contributions = np.zeros((times.size, self.shares.size, self.begins.size - 1))
+        for j, support in enumerate(self._supports):
+            if support is not None:
+                integrals = support(distinct_ages, rows, nothing)[pair_indices.reshape(ages.shape)]
+                contributions[:, j] = self.shares[j] * np.maximum(integrals[:, :-1] - integrals[:, 1:], 0.0)
+        return contributions
 
     @shaped
     def slope(
         self, control: Float[Array, "m K"], times: Float[Array, " k"], directions: Float[Array, "k d"]
     ) -> Float[Array, " k"]:
-        """The derivative ``(k,)`` of `added` in the time, from the left where that jumps."""
+        """Return `Execution.slope` in closed form."""
         (A, B), (pieces, jumps) = self.matrices, self.jumps(control)
         ages = times[:, None] - self.begins[pieces]
         impulse_responses = _propagate_rows(A, directions, ages) @ B
@@ -181,30 +222,11 @@ class Execution:
         pieces = np.flatnonzero(jumps.any(axis=0))
         return pieces, jumps[:, pieces]
 
-    def _integrate_responses(self, ages: Array, directions: Array) -> list[Array]:
-        """Return ``int_0^age |c'e^{A s} B_j| ds`` for ages ``(k, q)`` of directions ``(k, d)``, an array ``(k, q)`` for
-        every channel.
-
-        Ages that differ by less than the share `ALIKE` of the horizon are computed once.
-        """
-        tolerance = ALIKE * float(self.breakpoints[-1])
-        c, owner = unique_rows(directions)
-        keys = np.stack([np.repeat(owner.reshape(-1), ages.shape[1]), np.rint(ages.ravel() / tolerance)])
-        (direction_indices, _), first, pair_indices = np.unique(keys, axis=1, return_index=True, return_inverse=True)
-        times, rows = ages.ravel()[first], c[direction_indices.astype(int)]
-        no_parameters = np.zeros((times.size, 0))
-        return [
-            np.zeros(ages.shape)
-            if support is None
-            else support(times, rows, no_parameters)[pair_indices.reshape(-1)].reshape(ages.shape)
-            for support in self._supports
-        ]
-
     @shaped
     def enclosed(
         self, control: Float[Array, "m K"], times: Float[Array, " k"], directions: Float[Array, "k d"]
     ) -> Float[Array, "k 2"]:
-        """Return lower and upper bounds of `added`, ``(k, 2)``."""
+        """`Execution.enclosed`."""
         pieces, jumps = self.jumps(control)
         total, size = np.zeros((times.size, 2)), np.zeros(times.size)
         ages = np.clip(times[:, None] - self.begins[pieces], 0.0, None).ravel()
@@ -231,7 +253,7 @@ class ExecutionCellSupport(KnownCellSupport):
     The form is that of `MeasurableCellSupport`; ``lifted`` is the known system.
     """
 
-    execution: Execution
+    execution: ConstantExecution
     control: Array
     rows: Array
     lifted: LiftedSystem
@@ -248,31 +270,24 @@ class ExecutionCellSupport(KnownCellSupport):
         """Return bounds ``(k, r)`` of the distance of the support function from its chord on
         ``[start, start + width]``.
 
-        Each interval is inside one piece. The slope is a sum of ``|c'e^{A s} B_j|`` at the ages of the jumps, each of
-        which changes no faster than ``|c'e^{A s} A B_j|``.
+        Each interval is inside one piece. The support function is a sum of integrals up to the ages of the jumps.
         """
         pieces, jumps = self.execution.jumps(self.control)
         if not pieces.size:
             return np.zeros((start.size, self.rows.shape[0]))
-        comparison, lifted = self.lifted.comparison, self.lifted
-        ages = start[:, None] - self.execution.begins[pieces]
+        lifted, sizes = self.lifted, np.tile(np.abs(jumps).T, (start.size, 1))  # (k q, m)
+        ages, drive = start[:, None] - self.execution.begins[pieces], lifted.B[0][:, : jumps.shape[0]]
         is_active = ages + widths[:, None] > 0.0  # the others begin after the cell
-        ages, width = np.where(is_active, np.maximum(ages, 0.0), 0.0).ravel(), np.repeat(widths, pieces.size)
-        rows, drive = self.rows @ lifted.transform, lifted.B[0][:, : jumps.shape[0]]
-        slopes = lifted.flown(np.broadcast_to(rows, (ages.size, *rows.shape)), ages)[0] @ lifted.A[0]  # (k q, r, d)
-        departure = comparison.over(width).departure
-        curvatures = np.abs(slopes @ drive)  # (k q, r, m)
-        norms = block_norms(slopes, lifted.starts)
-        for j in range(drive.shape[1]):
-            drive_norms = np.broadcast_to(block_norms(np.abs(drive[:, j]), lifted.starts), (width.size, norms.shape[2]))
-            curvatures[..., j] += np.einsum("nrq,nq->nr", norms, departure.on(drive_norms))
-        total = np.einsum(
-            "kqrj,jq,kq->kr",
-            curvatures.reshape(start.size, pieces.size, *curvatures.shape[1:]),
-            np.abs(jumps),
-            is_active,
+        bounds = bound_chords(
+            lifted,
+            self.rows @ lifted.transform,
+            np.where(is_active, np.maximum(ages, 0.0), 0.0).ravel(),
+            np.repeat(widths, pieces.size),
+            block_norms(sizes @ np.abs(drive).T, lifted.starts),
+            lambda slopes: np.einsum("nrm,nm->nr", np.abs(slopes @ drive), sizes),
         )
-        return np.asarray((widths**2 / 8)[:, None] * total * (1.0 + rounding(16 * (lifted.states + pieces.size))))
+        total = (bounds.reshape(start.size, pieces.size, -1) * is_active[..., None]).sum(axis=1)
+        return np.asarray(total * (1.0 + rounding(16 * (lifted.states + pieces.size))))
 
     @property
     def neglected(self) -> Array:

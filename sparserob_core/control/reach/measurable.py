@@ -8,7 +8,7 @@ the set of states in which the phase begins.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -19,10 +19,13 @@ from sparserob_core.control.enclosures.cache import remember
 from sparserob_core.control.enclosures.comparison import block_norms, product
 from sparserob_core.control.enclosures.flows import DoublingExponentials, products
 from sparserob_core.control.reach.disturbance_support import PropagatedEffect, propagate_effect
-from sparserob_core.control.reach.support import NOT_PROVEN, InitialSupport, KnownCellSupport, Support, over_directions
-from sparserob_core.control.reach.varying_motion import (
-    SpreadMotion,
-    VaryingMotion,
+from sparserob_core.control.reach.support import (
+    NOT_PROVEN,
+    InitialSupport,
+    KnownCellSupport,
+    Leg,
+    Support,
+    over_directions,
 )
 from sparserob_core.control.response.lifted import LiftedSystem
 from sparserob_core.control.response.response import Response, TimeGrid, unique_rows
@@ -150,9 +153,7 @@ class MeasurableSupport:
         middles = np.broadcast_to(starts + lengths / 2, (A.shape[0], starts.size))
         return starts, lengths, _propagate_rows(A, np.eye(A.shape[0]), middles) @ E
 
-    def over(
-        self, rows: Array, leg: LiftedSystem | VaryingMotion | SpreadMotion, joined: Combination | None = None
-    ) -> list[Support]:
+    def over(self, rows: Array, leg: Leg, joined: Combination | None = None) -> list[Support]:
         """Return the parts of the support of measurable disturbances on functionals over cells of time; the parts add
         up.
 
@@ -249,7 +250,8 @@ class MeasurableSupport:
             key = parameter.tobytes() + number.to_bytes(4)
             total[last] += self._integrate_until(A, E, ages, times[last], rows[last], key)
             if through.size:
-                total[through] += self._integrate_whole_phase(A, E, length, rows[through])
+                tables = self._make_tables(A, E, np.array([0.0, length]), rows[through])  # different at every time
+                total[through] += [table.sums[-1] + table.late * np.array([-1.0, 1.0]) for table in tables]
             if number:
                 members = np.flatnonzero(legs >= number)
                 durations = np.where(legs[members] == number, times[members], length)
@@ -271,36 +273,19 @@ class MeasurableSupport:
         intervals = np.clip(np.searchsorted(starts, times, side="right") - 1, 0, starts.size - 2)
         within = np.clip(times - starts[intervals], 0.0, None)
         before, terms, errors = (
-            np.array([getattr(tables[i], name)[j] for i, j in zip(table_indices, intervals, strict=True)])
-            for name in ("sums", "terms", "error_bounds")
+            np.empty((times.size, *getattr(tables[0], name).shape[1:])) for name in ("sums", "terms", "error_bounds")
         )
+        order = np.argsort(table_indices, kind="stable")
+        for table, members in zip(tables, np.split(order, np.bincount(table_indices).cumsum()[:-1]), strict=True):
+            places = intervals[members]
+            before[members], terms[members] = table.sums[places], table.terms[places]
+            errors[members] = table.error_bounds[places]
         accuracy, late = np.array([(table.accuracy, table.late) for table in tables])[table_indices].T
         shares = within / np.diff(starts)[intervals]
         terms = terms * (shares[:, None] ** np.arange(ORDER + 1))[..., None]
         errors = shares * errors + np.where(times > 0.0, late, 0.0)
         partial = integrated(self.bound, terms, within, accuracy) + errors[:, None] * [-1.0, 1.0]
         return np.asarray(before + partial)
-
-    def _integrate_whole_phase(self, A: Array, E: Array, length: float, directions: Array) -> Array:
-        """Return bounds ``(k, 2)`` of the contribution of one mode over a whole phase of this ``length``, for rows
-        ``directions (k, d)`` at its end.
-
-        Nothing is remembered, since the rows are different at every time.
-        """
-        starts = self._divide_intervals(A, np.array([0.0, length]))
-        lengths, values = np.diff(starts), np.empty((len(directions), 2))
-        chunk_size = max(1, AT_ONCE // (lengths.size * (ORDER + 1) * max(E.shape)))
-        for first in range(0, len(directions), chunk_size):
-            chunk = slice(first, first + chunk_size)
-            terms, errors, tallest = self._expand_rows(A, E, directions[chunk], starts)
-            accuracy = ACCURACY * np.maximum(tallest * length, TINY)
-            intervals = np.tile(lengths, len(terms)), np.repeat(accuracy, lengths.size)
-            bounds = integrated(self.bound, terms.reshape(-1, *terms.shape[2:]), *intervals)
-            size = rounding(lengths.size) * np.abs(bounds).max(axis=1).reshape(errors.shape).sum(axis=1)
-            errors = errors.sum(axis=1) * (1.0 + rounding(lengths.size)) + size
-            late = rounding(8) * float(self.response.grid.breakpoints[-1]) * tallest
-            values[chunk] = bounds.reshape(*errors.shape, -1, 2).sum(axis=1) + (errors + late)[:, None] * [-1.0, 1.0]
-        return values
 
     def _look_up_tables(self, A: Array, E: Array, ages: Array, directions: Array, key: bytes) -> list[_IntegralTable]:
         """Return the table of each of ``directions (k, d)``, made where none is remembered."""
@@ -324,13 +309,14 @@ class MeasurableSupport:
         chunk_size = max(1, AT_ONCE // (lengths.size * (ORDER + 1) * max(E.shape)))
         for first in range(0, len(directions), chunk_size):
             terms, errors, tallest = self._expand_rows(A, E, directions[first : first + chunk_size], starts)
-            accuracy = ACCURACY * np.maximum(tallest * horizon, TINY)
+            accuracy = ACCURACY * np.maximum(tallest * float(ages[-1]), TINY)
             intervals = np.tile(lengths, len(terms)), np.repeat(accuracy, lengths.size)
             bounds = integrated(self.bound, terms.reshape(-1, *terms.shape[2:]), *intervals).reshape(*errors.shape, 2)
             bounds = bounds + errors[..., None] * [-1.0, 1.0]
             late = rounding(8) * horizon * tallest
             for number, interval_bounds in enumerate(bounds):
-                sums = np.vstack([np.zeros(2), np.cumsum(interval_bounds, axis=0)])
+                sizes = rounding(starts.size) * np.cumsum(np.abs(interval_bounds).max(axis=1))[:, None]
+                sums = np.vstack([np.zeros(2), np.cumsum(interval_bounds, axis=0) + sizes * [-1.0, 1.0]])
                 own = float(accuracy[number]), float(late[number])
                 yield _IntegralTable(starts, sums, terms[number], errors[number], *own)
 
@@ -391,6 +377,46 @@ def _propagate_rows(A: Array, rows: Array, durations: Array) -> Array:
     return DoublingExponentials(A).rows(repeated, durations.ravel())[0].reshape(*durations.shape, -1)
 
 
+def bound_chords(
+    lifted: LiftedSystem, rows: Array, start: Array, widths: Array, drives: Array, reach: Callable[[Array], Array]
+) -> Array:
+    """Return bounds of the distance of ``int_0^t h(E' e^{A' s} c) ds`` from its chord on ``[start, start + width]``.
+
+    They are the smaller of two: from the slope of ``h(E' e^{A' s} c)`` in ``s``, and mode by mode from that slope or
+    twice the integral of ``h``.
+
+    Parameters
+    ----------
+    lifted : LiftedSystem
+        The known system.
+    rows : Array
+        Functionals ``c``, ``(r, d)``, in its coordinates.
+    start, widths : Array
+        Cells ``(k,)`` of time.
+    drives : Array
+        Norm bounds ``(k, q)`` of the rate at which ``E w`` drives every block of the coordinates.
+    reach : Callable
+        Bounds ``(k, r)`` of ``|v'E w|`` over all ``w``, from directions ``v (k, r, d)``.
+
+    Returns
+    -------
+    Array
+        The bounds ``(k, r)``.
+    """
+    comparison = lifted.comparison
+    slopes = lifted.flown(np.broadcast_to(rows, (start.size, *rows.shape)), start)[0] @ lifted.A[0]  # (k, r, d)
+    effect = comparison.over(widths)
+    square = (widths**2 / 8)[:, None]
+    change = product(block_norms(slopes, lifted.starts), effect.departure.on(drives)[..., None])[..., 0]
+    exact = square * (reach(slopes) + change)
+    current_drive = comparison.over(start).flow.on(drives)
+    by_mode = np.minimum(
+        square * product(effect.peak.on(current_drive), comparison.sizes.T),
+        2.0 * effect.integral.on(current_drive),
+    )
+    return np.minimum(exact, product(block_norms(rows, lifted.starts), by_mode.T).T)
+
+
 @dataclass(frozen=True, eq=False)
 class MeasurableCellSupport(KnownCellSupport):
     """The support function of measurable disturbances on functionals ``rows (r, d)`` of a *known* system, in the form
@@ -414,25 +440,16 @@ class MeasurableCellSupport(KnownCellSupport):
 
     @shaped
     def deviation(self, start: Float[Array, " k"], widths: Float[Array, " k"]) -> Float[Array, "k r"]:
-        """Return bounds ``(k, r)`` of the height of ``sigma`` above its chord on ``[start, start + width]``.
-
-        They are the smaller of two: from the slope of ``h(E' e^{A' s} c)`` in ``s``, and mode by mode from that slope
-        or twice the integral of ``h``.
-        """
-        bound, lifted, comparison = self.support.bound, self.lifted, self.lifted.comparison
-        rows, W = self.rows @ lifted.transform, lifted.W[0]
-        slopes = lifted.flown(np.broadcast_to(rows, (start.size, *rows.shape)), start)[0] @ lifted.A[0]  # (k, r, d)
-        reach = comparison.over(widths)
-        drive = np.broadcast_to(self._drive, (start.size, self._drive.size))
-        square = (widths**2 / 8)[:, None]
-        change = product(block_norms(slopes, lifted.starts), reach.departure.on(drive)[..., None])[..., 0]
-        exact = square * (bound.reach(slopes @ W) + change)
-        current_drive = comparison.over(start).flow.on(drive)
-        by_mode = np.minimum(
-            square * product(reach.peak.on(current_drive), comparison.sizes.T),
-            2.0 * reach.integral.on(current_drive),
+        """Return bounds ``(k, r)`` of the height of ``sigma`` above its chord on ``[start, start + width]``."""
+        lifted, W = self.lifted, self.lifted.W[0]
+        bounds = bound_chords(
+            lifted,
+            self.rows @ lifted.transform,
+            start,
+            widths,
+            np.broadcast_to(self._drive, (start.size, self._drive.size)),
+            lambda slopes: self.support.bound.reach(slopes @ W),
         )
-        bounds = np.minimum(exact, product(block_norms(rows, lifted.starts), by_mode.T).T)
         return np.asarray(
             bounds if self._earlier_support is None else bounds + self._earlier_support.deviation(start, widths)
         )

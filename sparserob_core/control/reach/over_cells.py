@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, TypeAlias, final
+from typing import TYPE_CHECKING, final
 
 import numpy as np
 
 from sparserob_core.control.enclosures.cache import remember
 from sparserob_core.control.reach.disturbance_support import DisturbanceSupport
-from sparserob_core.control.reach.support import InitialSupport, Support, Supports
+from sparserob_core.control.reach.support import InitialSupport, Leg, Support, Supports
 from sparserob_core.control.reach.varying_motion import SpreadMotion, VaryingMotion
 from sparserob_core.control.response.disturbance import DisturbanceModel
 from sparserob_core.control.response.lifted import LiftedSystem, frozen, lift_legs
@@ -27,7 +27,6 @@ if TYPE_CHECKING:
 
 HALVINGS = 8  # of a part of the parameters, after which states that still have no bound on a cell have none
 LEGS_KEPT = 256  # cells of parameters whose lifted systems are kept
-Leg: TypeAlias = LiftedSystem | VaryingMotion | SpreadMotion
 
 
 @final

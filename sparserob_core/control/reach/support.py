@@ -10,20 +10,28 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import product as every_choice
-from typing import Protocol, final
+from typing import Protocol, TypeAlias, final
 
 import numpy as np
 
 from sparserob_core.control.enclosures.comparison import block_norms, product
 from sparserob_core.control.enclosures.polynomial import distinct_patterns
-from sparserob_core.control.reach.disturbance_support import PropagatedEffect, over_faces, propagate_effect, summed
-from sparserob_core.control.reach.varying_motion import OUTWARD, VaryingMotion
+from sparserob_core.control.reach.disturbance_support import (
+    LiftedSupport,
+    PropagatedEffect,
+    over_faces,
+    propagate_effect,
+    summed,
+)
+from sparserob_core.control.reach.varying_motion import OUTWARD, SpreadMotion, VaryingMotion
 from sparserob_core.control.response.lifted import KNOWN, LiftedSystem
 from sparserob_core.shapes import Float, shaped
 from sparserob_core.sip.convex_set import Array, ConvexSet
 from sparserob_core.sip.expressions.rounding import rounding
 from sparserob_core.sip.expressions.taylor import Combination, TaylorSpace
 
+Leg: TypeAlias = LiftedSystem | VaryingMotion | SpreadMotion
+"""A system over a cell of parameters, or one of its phases, in each of the forms that bounds are derived from."""
 # said where it is met, and before anything is solved
 WITHOUT_PROOF = (
     "measurable disturbances are proven only beside parameters in a box over which the state can be expanded in them,"
@@ -85,7 +93,7 @@ class Supports:
 
 
 @dataclass(frozen=True, eq=False)
-class InitialSupport:
+class InitialSupport(LiftedSupport):
     """Support function ``h(e^{A't} c)`` of a set of deviations from the initial state, for functionals ``rows (r, d)``
     (in the lifted system's coordinates) over one cell.
 
@@ -121,26 +129,9 @@ class InitialSupport:
         Each interval is inside one piece. Distances are summed over the Taylor coefficients, as in
         `DisturbanceSupport.deviation`.
         """
-        lifted, grid = self.lifted, self.lifted.grid
-        comparison, starts = lifted.comparison, lifted.starts
-        pieces = np.clip(np.searchsorted(grid.breakpoints, start, side="right") - 1, 0, grid.pieces - 1)
-        flow = comparison.over(start - grid.breakpoints[pieces], cells=True).flow
-        ended_sizes, reach = flow.on(self._breakpoint_bounds[pieces]), comparison.over(widths, cells=True)
-        curvature_rows = self._propagate_rows(start) @ lifted.row_matrix @ lifted.row_matrix
+        curvature_rows = self._propagate_rows(start) @ self.lifted.row_matrix @ self.lifted.row_matrix
         sizes = self._bound_coefficients(self._weigh_deviation(curvature_rows)).sum(axis=2)
-        square = (widths**2 / 8)[:, None]
-        lifted_rows = np.zeros((self.rows.shape[0], lifted.row_matrix.shape[0]))
-        lifted_rows[:, : lifted.states] = self.rows
-        initial_curvature = lifted_rows @ lifted.row_matrix @ lifted.row_matrix
-        norms = block_norms(initial_curvature.reshape(*initial_curvature.shape[:-1], -1, lifted.states), starts).sum(
-            axis=-2
-        )
-        exact = square * (sizes + product(norms, reach.departure.on(ended_sizes).T).T)
-        ended = np.minimum(
-            square * product(reach.peak.on(ended_sizes), (comparison.sizes @ comparison.sizes).T),
-            2.0 * product(reach.integral.on(ended_sizes), comparison.sizes.T),
-        )
-        return np.asarray(np.minimum(exact, product(block_norms(self.rows, starts), ended.T).T))
+        return self._bound_chords(start, widths, sizes, self._breakpoint_bounds, np.zeros(self.lifted.starts.size))
 
     @cached_property
     def neglected(self) -> Array:
@@ -157,10 +148,6 @@ class InitialSupport:
         """Norm bounds ``(L, q)`` of the effect of any deviation on every block of the coordinates on every piece."""
         peak = self.lifted.comparison.over(self.lifted.grid.lengths).peak
         return peak.on(self._breakpoint_bounds[:-1])
-
-    @property
-    def _space(self) -> TaylorSpace:
-        return (self.combination or self.lifted).space
 
     def _apply_combination(self, blocks: Array) -> Array:
         return blocks if self.combination is None else self.combination.apply(blocks)
@@ -219,8 +206,8 @@ class InitialSupport:
         """The lifted functionals at the breakpoints of the grid, ``(L + 1, r, M d)``."""
         backward = self.lifted.backward
         steps, pieces = backward.steps(KNOWN), self.lifted.grid.pieces
-        rows = np.zeros((pieces + 1, self.rows.shape[0], self.lifted.row_matrix.shape[0]))
-        rows[0, :, : self.lifted.states] = self.rows
+        rows = np.empty((pieces + 1, *self._lifted_rows.shape))
+        rows[0] = self._lifted_rows
         for piece, length in enumerate(backward.which.tolist()):
             rows[piece + 1] = rows[piece] @ steps.Phi[0, length]
         return rows
@@ -297,7 +284,7 @@ class DirectionsCellSupport:
 
     made: Callable[[Array], Support]
     rows: Array
-    leg: LiftedSystem | VaryingMotion
+    leg: Leg
     joined: Combination
 
     @shaped
@@ -364,9 +351,7 @@ class DirectionsCellSupport:
         return coefficients[..., 0], error_bounds
 
 
-def over_directions(
-    made: Callable[[Array], Support], rows: Array, leg: LiftedSystem | VaryingMotion, joined: Combination | None
-) -> Support:
+def over_directions(made: Callable[[Array], Support], rows: Array, leg: Leg, joined: Combination | None) -> Support:
     """Return the support on functionals, or on the direction that they make up where they are ``joined``.
 
     Parameters
@@ -375,7 +360,7 @@ def over_directions(
         The support as a function of functionals ``(r, d)``.
     rows : Array
         Functionals ``(r, d)``.
-    leg : LiftedSystem or VaryingMotion
+    leg : Leg
         The system, or a phase of a switched system.
     joined : Combination or None
         How the rows make up one direction that varies over a cell.

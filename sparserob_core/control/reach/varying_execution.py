@@ -10,28 +10,27 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import final
+from typing import NamedTuple, final
 
 import numpy as np
 
 from sparserob_core.control.enclosures.cache import remember
 from sparserob_core.control.enclosures.comparison import product
 from sparserob_core.control.enclosures.polynomial import distinct_patterns
-from sparserob_core.control.reach.execution import Execution
+from sparserob_core.control.reach.execution import ConstantExecution, Execution
 from sparserob_core.control.reach.measurable import ACCURACY, AT_ONCE, KEPT, TINY
 from sparserob_core.control.reach.support import (
     KnownCellSupport,
+    Leg,
     Support,
     _list_corners,
     between_corners,
-    over_directions,
 )
 from sparserob_core.control.reach.varying_motion import (
     OUTWARD,
     SpreadMotion,
     VaryingMotion,
 )
-from sparserob_core.control.response.lifted import LiftedSystem
 from sparserob_core.control.response.response import Propagator, Response, unique_rows
 from sparserob_core.control.response.varying.expansion import Kernel
 from sparserob_core.control.sets.integrals import CUTS, HALVINGS, absolute, integrated
@@ -42,7 +41,47 @@ from sparserob_core.sip.expressions.taylor import Combination
 
 POINTS_KEPT = 256  # parameters whose errors are remembered: twice the points of a lattice of parameters
 CELLS_KEPT = 16  # cells of parameters whose errors are: those of all rows of a few constraints
-STEP = 1e-6  # of the horizon, over which a slope is a difference: a tenth of it shows what integrals are rounded to
+
+
+class Integrands(NamedTuple):
+    """Integrands of errors through ``m`` columns on intervals, as polynomials in the share that remains of an interval.
+
+    ``terms (..., p + 1, m)``: the coefficients. ``sizes (..., m)``: sums of the absolute numbers that are added up to
+    them. ``errors (..., m)``: error bounds of the integrals.
+    """
+
+    terms: Array
+    sizes: Array
+    errors: Array
+
+    def chosen(self, mask: np.ndarray) -> Integrands:
+        """Return the integrands of the intervals in a mask, one after another."""
+        return Integrands(self.terms[mask], self.sizes[mask], self.errors[mask])
+
+
+class InputKernel(NamedTuple):
+    """`Kernel` of ``m`` columns of inputs on ``k`` intervals, as matrices by which rows are multiplied.
+
+    ``terms (k, d, (p + 1) m)``: the coefficients. ``sizes (k, d, m)``: the sums of their absolute values. ``errors
+    (k, d, m)``: error bounds of the entries.
+    """
+
+    terms: Array
+    sizes: Array
+    errors: Array
+
+    @staticmethod
+    def of(kernel: Kernel, columns: np.ndarray, units: Array) -> InputKernel:
+        """Return a kernel for inputs through some columns; ``units (d,)`` are those of its errors."""
+        terms = np.moveaxis(kernel.terms[..., columns], 1, 2)  # (k, d, p + 1, m)
+        errors = kernel.sizes[..., columns] * units[:, None] * kernel.error[:, None, None]
+        return InputKernel(terms.reshape(*terms.shape[:2], -1), np.abs(terms).sum(axis=2), errors)
+
+    def along(self, which: np.ndarray, rows: Array) -> Integrands:
+        """Return the integrands along rows ``(q, n, d)`` at the ends of intervals ``which (q,)``."""
+        terms, sizes, m = rows @ self.terms[which], np.abs(rows), self.sizes.shape[2]
+        shape = (*rows.shape[:2], self.terms.shape[2] // m, m)
+        return Integrands(terms.reshape(shape), sizes @ self.sizes[which], sizes @ self.errors[which])
 
 
 @final
@@ -59,32 +98,18 @@ class VaryingExecution(Execution):
     disturbing: bool = False
     bound: ConvexSet | None = None
     through: np.ndarray | None = None
-    _lengths: dict[bytes, Array] = field(default_factory=dict, repr=False)
-    _transitions: dict[bytes, tuple[Array, Kernel]] = field(default_factory=dict, repr=False)
-    _cell_supports: dict[bytes, VaryingExecutionCellSupport] = field(default_factory=dict, repr=False)
-
-    def none(self) -> VaryingExecution:
-        """Return the execution without errors; remembered results that depend on the shares are dropped."""
-        return replace(self, shares=np.zeros(self.shares.size), _lengths={}, _cell_supports={})
+    _transitions: dict[bytes, tuple[Array, InputKernel]] = field(default_factory=dict, repr=False)
 
     def following(self, propagator: Propagator, initial_state: Array) -> VaryingExecution:
         """Return the errors along states ``(d,)`` or their coefficients ``(M d,)``, that a propagator moves."""
         response = Response(propagator.system, propagator.grid, initial_state, shared=propagator)
         error_mask = np.tile(self.error_mask, initial_state.size // self.error_mask.size)
-        return replace(self, response=response, error_mask=error_mask, _lengths={}, _transitions={}, _cell_supports={})
+        return replace(self, response=response, error_mask=error_mask, _transitions={})
 
-    def over(
-        self,
-        control: Array,
-        rows: Array,
-        leg: LiftedSystem | VaryingMotion | SpreadMotion,
-        joined: Combination | None = None,
-    ) -> Support:
-        """`Execution.over`."""
+    def on_functionals(self, control: Array, rows: Array, leg: Leg) -> VaryingExecutionCellSupport:
+        """`Execution.on_functionals`."""
         assert isinstance(leg, VaryingMotion)
-        return over_directions(
-            lambda functionals: VaryingExecutionCellSupport(self, control, functionals, leg), rows, leg, joined
-        )
+        return VaryingExecutionCellSupport(self, control, rows, leg)
 
     def reaching(self, control: Array) -> VaryingExecutionCellSupport:
         """Return the support of the errors of a ``control (m, K)`` without functionals, for the bounds of the states.
@@ -96,6 +121,10 @@ class VaryingExecution(Execution):
             support = VaryingExecutionCellSupport(self, control, np.zeros((0, self.motion.states)), self.motion)
             remember(self._cell_supports, key, support, KEPT)
         return self._cell_supports[key]
+
+    @cached_property
+    def _cell_supports(self) -> dict[bytes, VaryingExecutionCellSupport]:
+        return {}
 
     @cached_property
     def motion(self) -> VaryingMotion:
@@ -121,7 +150,7 @@ class VaryingExecution(Execution):
         """The errors of the box around the set, where there is one."""
         if self.bound is None:
             return self
-        return replace(self, shares=self.error_radii, bound=None, _lengths={}, _cell_supports={})
+        return replace(self, shares=self.error_radii, bound=None)
 
     @cached_property
     def acting(self) -> np.ndarray:
@@ -138,64 +167,26 @@ class VaryingExecution(Execution):
         return 0 if self.disturbing else super().late
 
     @cached_property
-    def kernel(self) -> Kernel:
+    def kernel(self) -> InputKernel:
         """Kernel of the pieces between all marks."""
         marks = self.motion.grid.breakpoints
-        return self.motion.expansion.kernel(marks[:-1], marks[1:])
+        return self._compute_kernel(marks[:-1], marks[1:])
 
     @shaped
-    def lengths(self, times: Float[Array, " k"], directions: Float[Array, "k d"]) -> Float[Array, "k n"]:
-        """`Execution.lengths`."""
-        lengths = self._integrate_unit_errors(times, directions)[:, :, self.late :]
-        return lengths.reshape(times.size, self.shares.size * (self.breakpoints.size - 1))
-
-    def _integrate_unit_errors(self, times: Array, directions: Array) -> Array:
-        """Return the middle of the bounds of the contribution of errors for size 1 of each entry of `acts`,
-        ``(k, m, late + K)``."""
+    def unit_errors(self, times: Float[Array, " k"], directions: Float[Array, "k d"]) -> Float[Array, "k m n"]:
+        """Return `Execution.unit_errors`: the middle of the bounds."""
         wanted = np.ones((self.shares.size, self.late + self.breakpoints.size - 1), dtype=bool)
         return np.asarray(self._bound_integrals(times, directions, wanted).mean(axis=3))
-
-    @shaped
-    def added(
-        self, control: Float[Array, "m K"], times: Float[Array, " k"], directions: Float[Array, "k d"]
-    ) -> Float[Array, " k"]:
-        """Return `Execution.added`: the middle of its bounds, without the error of the transitions."""
-        return np.asarray(self._bound_contribution(control, times, directions).mean(axis=1))
-
-    def sampled(self, control: Array, times: Array, directions: Array) -> Array:
-        """`Execution.sampled`: where that is not too much, from the lengths, which are the same for every control."""
-        if times.size * self.size > AT_ONCE:
-            return self.added(control, times, directions)
-        key = times.tobytes() + directions.tobytes()
-        if key not in self._lengths:
-            lengths = self._integrate_unit_errors(times, directions)
-            remember(self._lengths, key, lengths.reshape(times.size, lengths.shape[1] * lengths.shape[2]), KEPT)
-        return np.asarray(self._lengths[key] @ self.acts(control).ravel())
-
-    @shaped
-    def slope(
-        self, control: Float[Array, "m K"], times: Float[Array, " k"], directions: Float[Array, "k d"]
-    ) -> Float[Array, " k"]:
-        """`Execution.slope`, as a difference over a little time before; nothing is proven by it."""
-        before = np.maximum(times - STEP * float(self.breakpoints[-1]), 0.0)
-        now, then = (self.added(control, at, directions) for at in (times, before))
-        return np.asarray((now - then) / np.where(times > before, times - before, 1.0))
 
     @shaped
     def enclosed(
         self, control: Float[Array, "m K"], times: Float[Array, " k"], directions: Float[Array, "k d"]
     ) -> Float[Array, "k 2"]:
         """Return `Execution.enclosed`, without the error of the transitions."""
-        bounds = self._bound_contribution(control, times, directions)
+        size = self.acts(control)
+        bounds = np.einsum("kjpe,jp->ke", self._bound_integrals(times, directions, np.asarray(size > 0.0)), size)
         rounding_errors = rounding(self.size + 8) * np.abs(bounds).max(axis=1)
         return np.asarray(bounds + rounding_errors[:, None] * [-1.0, 1.0])
-
-    def _bound_contribution(self, control: Array, times: Array, directions: Array) -> Array:
-        """Return lower and upper bounds of the contribution of errors of a control, ``(k, 2)``, without the error of
-        the transitions and the rounding of the sum."""
-        size = self.acts(control)
-        bounds: Array = self._bound_integrals(times, directions, np.asarray(size > 0.0))
-        return np.asarray(np.einsum("kjpe,jp->ke", bounds, size))
 
     def _bound_integrals(self, times: Array, directions: Array, wanted: np.ndarray) -> Array:
         """Return bounds of ``share_j int |c'Phi(t, s) B_j(s)| ds`` for each entry of `acts`, ``(k, m, late + K, 2)``.
@@ -209,21 +200,22 @@ class VaryingExecution(Execution):
         if not pieces.size or not times.size:
             return contributions
         directions = directions * self.error_mask
-        chunk_size = max(1, AT_ONCE // (pieces.size * self.kernel.terms[0].size + acting.size * directions.shape[1]))
+        (_, d, numbers), count = self.kernel.terms.shape, self.motion.grid.pieces
+        chunk_size = max(1, AT_ONCE // (count * (numbers + d) + numbers * d))
         for begin in range(0, times.size, chunk_size):
             chunk = slice(begin, begin + chunk_size)
-            for time_indices, piece, bounds in self._bound_pieces(times[chunk], directions[chunk], pieces, is_active):
+            for time_indices, piece, integrands in self._build_integrands(times[chunk], directions[chunk], pieces):
+                bounds = self._bound_errors(integrands, is_active[:, acting[piece]])
                 np.add.at(contributions.swapaxes(1, 2), (begin + time_indices, acting[piece]), bounds)
         return contributions
 
-    def _bound_pieces(
-        self, times: Array, directions: Array, pieces: np.ndarray, asked: np.ndarray
-    ) -> Iterator[tuple[np.ndarray, np.ndarray, Array]]:
-        """Yield bounds of the errors on ``pieces`` between marks, for every one of ``times (k,)`` after their
-        beginning.
+    def _build_integrands(
+        self, times: Array, directions: Array, pieces: np.ndarray
+    ) -> Iterator[tuple[np.ndarray, np.ndarray, Integrands]]:
+        """Yield the integrands on ``pieces`` between marks, for every one of ``times (k,)`` after their beginning.
 
-        Each item has the indices ``(q,)`` of the times, the pieces ``(q,)``, and the bounds ``(q, m, 2)``. The first
-        item is for pieces that have ended at their time, the second for pieces that have not.
+        Each item has the indices ``(q,)`` of the times, the pieces ``(q,)``, and the integrands. The first item is for
+        pieces that have ended at their time, the second for pieces that have not.
         """
         motion, grid = self.motion, self.motion.grid
         steps = motion.flow.state
@@ -233,28 +225,21 @@ class VaryingExecution(Execution):
         )
         distinct_indices = distinct_indices.reshape(-1)
         transitions, kernel = self._compute_transitions(distinct)
-        row, rows = np.zeros(directions.shape), np.empty((times.size, *directions.shape[1:], grid.pieces))
-        first = np.einsum("ki,kij->kj", directions, transitions[distinct_indices])
+        row, rows = np.zeros(directions.shape), np.empty((grid.pieces, *directions.shape))
+        first = (directions[:, None] @ transitions[distinct_indices])[:, 0]
         for k in range(int(last_pieces.max()) - 1, int(pieces[0]) - 1, -1):  # rows on the end of every piece
             row = np.where((last_pieces == k + 1)[:, None], first, row)
-            rows[:, :, k] = row
+            rows[k] = row
             row = row @ steps[k]
-        indices, piece_positions = np.nonzero(pieces < last_pieces[:, None])
-        piece = pieces[piece_positions]
-        yield (
-            indices,
-            piece,
-            self._bound_intervals(self.kernel, piece, rows[indices, :, piece], asked[:, self.acting[piece]]),
-        )
+        ended = pieces[pieces < last_pieces.max()]
+        has_ended = ended[:, None] < last_pieces
+        positions, indices = np.nonzero(has_ended)
+        yield indices, ended[positions], self.kernel.along(ended, rows[ended]).chosen(has_ended)
         inside = np.flatnonzero(np.isin(last_pieces, pieces) & np.greater(times, grid.breakpoints[last_pieces]))
-        piece = last_pieces[inside]
-        yield (
-            inside,
-            piece,
-            self._bound_intervals(kernel, distinct_indices[inside], directions[inside], asked[:, self.acting[piece]]),
-        )
+        integrands = kernel.along(distinct_indices[inside], directions[inside, None])
+        yield inside, last_pieces[inside], integrands.chosen(np.ones((inside.size, 1), dtype=bool))
 
-    def _compute_transitions(self, distinct: Array) -> tuple[Array, Kernel]:
+    def _compute_transitions(self, distinct: Array) -> tuple[Array, InputKernel]:
         """Return the transitions ``(k, d, d)`` from the breakpoint before each time to the time, and the kernel between
         them.
 
@@ -263,44 +248,43 @@ class VaryingExecution(Execution):
         """
         key = distinct.tobytes()
         if key not in self._transitions:
-            until, expansion = np.maximum(*distinct), self.motion.expansion
-            entry = expansion.flow(distinct[1], until).state, expansion.kernel(distinct[1], until)
+            until = np.maximum(*distinct)
+            entry = self.motion.expansion.flow(distinct[1], until).state, self._compute_kernel(distinct[1], until)
             remember(self._transitions, key, entry, max(1, AT_ONCE // (entry[0].size + entry[1].terms.size)))
         return self._transitions[key]
 
-    def _bound_intervals(self, kernel: Kernel, which: np.ndarray, rows: Array, asked: np.ndarray) -> Array:
-        """Return lower and upper bounds ``(q, m, 2)`` of the errors on intervals ``which (q,)`` of a kernel.
+    def _compute_kernel(self, starts: Array, stops: Array) -> InputKernel:
+        """Return the kernel of intervals ``(k,)`` within one segment each, of the columns through which errors
+        enter."""
+        expansion = self.motion.expansion
+        return InputKernel.of(expansion.kernel(starts, stops), self.columns, expansion.units)
 
-        ``rows (q, d)`` are the functionals at the ends of the intervals. Channels that are not ``asked (m, q)`` have 0.
+    def _bound_errors(self, integrands: Integrands, asked: np.ndarray) -> Array:
+        """Return lower and upper bounds ``(q, m, 2)`` of the errors on intervals with ``integrands``.
+
+        Channels that are not ``asked (m, q)`` have 0.
         """
-        m, units, columns = self.shares.size, self.motion.expansion.units, self.columns
         if self.bound is not None:
-            return self._bound_joint_inputs(self.bound, kernel, which, rows)
-        sizes = np.einsum("qd,qdm->qm", np.abs(rows), np.abs(kernel.terms[..., columns]).sum(axis=1)[which])
-        errors = np.einsum("qd,qdm->qm", np.abs(rows) * units, kernel.sizes[which][..., columns])
-        errors = errors * kernel.error[which, None]
+            return self._bound_joint_inputs(self.bound, integrands)
+        (count, order, m), sizes = integrands.terms.shape, integrands.sizes
         # a cut rounds every coefficient four times for every order; halves, of half the length each, twice in all
-        errors = errors + rounding(rows.shape[1] + (2 + 4 * CUTS) * kernel.terms.shape[1] + HALVINGS) * sizes
-        bounds = np.zeros((which.size, m, 2))
+        errors = integrands.errors + rounding(self.motion.states + (2 + 4 * CUTS) * order + HALVINGS) * sizes
+        bounds = np.zeros((count, m, 2))
         for j, share in enumerate(self.shares):
             members = np.flatnonzero(asked[j])
-            terms = np.einsum("qd,qpd->qp", rows[members], kernel.terms[which[members], :, :, columns[j]])
             accuracy = np.maximum(ACCURACY * self.motion.grid.pieces * sizes[members, j], TINY)
-            integrals = absolute(terms, accuracy)
+            integrals = absolute(integrands.terms[members, :, j], accuracy)
             integrals = integrals + errors[members, j, None] * [-1.0, 1.0]
             bounds[members, j] = share * np.maximum(integrals, 0.0) * [1.0 / OUTWARD, OUTWARD]
         return bounds
 
-    def _bound_joint_inputs(self, bound: ConvexSet, kernel: Kernel, which: np.ndarray, rows: Array) -> Array:
-        """Return `_bound_intervals` for a set of inputs through all columns together, ``(q, 1, 2)``."""
-        columns, radii = self.columns, self.error_radii
-        sizes = np.einsum("qd,qdm->qm", np.abs(rows), np.abs(kernel.terms[..., columns]).sum(axis=1)[which]) @ radii
-        units = np.abs(rows) * self.motion.expansion.units
-        errors = np.einsum("qd,qdm->qm", units, kernel.sizes[which][..., columns]) @ radii * kernel.error[which]
-        errors = errors + rounding(rows.shape[1] + 2 * kernel.terms.shape[1] + HALVINGS + 2 * radii.size) * sizes
-        terms = np.einsum("qd,qpdm->qpm", rows, kernel.terms[which][..., columns])
+    def _bound_joint_inputs(self, bound: ConvexSet, integrands: Integrands) -> Array:
+        """Return `_bound_errors` for a set of inputs through all columns together, ``(q, 1, 2)``."""
+        (count, order, m), sizes = integrands.terms.shape, integrands.sizes @ self.error_radii
+        terms = rounding(self.motion.states + 2 * order + HALVINGS + 2 * m)
+        errors = integrands.errors @ self.error_radii + terms * sizes
         accuracy = np.maximum(ACCURACY * self.motion.grid.pieces * sizes, TINY)
-        integrals = integrated(bound, terms, np.ones(which.size), accuracy)
+        integrals = integrated(bound, integrands.terms, np.ones(count), accuracy)
         return np.asarray(integrals + OUTWARD * errors[:, None] * [-1.0, 1.0])[:, None]
 
 
@@ -314,24 +298,21 @@ class UncertainExecution(Execution):
     """
 
     known: VaryingExecution
-    _point_executions: dict[bytes, VaryingExecution] = field(default_factory=dict, repr=False)
-    _cell_executions: dict[bytes, tuple[SpreadMotion, VaryingExecution]] = field(default_factory=dict, repr=False)
 
     def none(self) -> UncertainExecution:
         """`Execution.none`."""
-        return replace(
-            self, shares=np.zeros(self.shares.size), known=self.known.none(), _point_executions={}, _cell_executions={}
-        )
+        return replace(self, shares=np.zeros(self.shares.size), known=self.known.none())
+
+    @property
+    def late(self) -> int:
+        """`Execution.late`."""
+        return self.known.late
 
     @property
     def around(self) -> UncertainExecution:
         """`VaryingExecution.around`."""
         around = self.known.around
-        return (
-            self
-            if around is self.known
-            else replace(self, shares=around.shares, known=around, _point_executions={}, _cell_executions={})
-        )
+        return self if around is self.known else replace(self, shares=around.shares, known=around)
 
     def extend_directions(self, directions: Array, parameters: Array) -> Array:
         """Return directions ``(k, d)`` with the parameters ``(k, nu)`` as further columns, ``(k, d + nu)``."""
@@ -347,16 +328,22 @@ class UncertainExecution(Execution):
             remember(self._point_executions, key, execution, POINTS_KEPT)
         return self._point_executions[key]
 
-    def over(
-        self,
-        control: Array,
-        rows: Array,
-        leg: LiftedSystem | VaryingMotion | SpreadMotion,
-        joined: Combination | None = None,
-    ) -> Support:
+    @cached_property
+    def _point_executions(self) -> dict[bytes, VaryingExecution]:
+        return {}
+
+    @cached_property
+    def _cell_executions(self) -> dict[bytes, tuple[SpreadMotion, VaryingExecution]]:
+        return {}
+
+    def over(self, control: Array, rows: Array, leg: Leg, joined: Combination | None = None) -> Support:
         """`Execution.over`."""
-        assert isinstance(leg, SpreadMotion)
         assert joined is None  # refused beside curved sets
+        return self.on_functionals(control, rows, leg)
+
+    def on_functionals(self, control: Array, rows: Array, leg: Leg) -> SpreadExecutionSupport:
+        """`Execution.on_functionals`."""
+        assert isinstance(leg, SpreadMotion)
         key = id(leg).to_bytes(8)  # of a leg that is kept beside
         if key not in self._cell_executions:
             execution = self.known.following(leg.motion.propagator, leg.motion.initial_state)
@@ -375,37 +362,15 @@ class UncertainExecution(Execution):
         return found
 
     @shaped
-    def lengths(self, times: Float[Array, " k"], directions: Float[Array, "k d"]) -> Float[Array, "k n"]:
-        """`Execution.lengths`."""
-        values = np.empty((times.size, self.size))
-        return self._each(directions, values, lambda errors, indices, c: errors.lengths(times[indices], c))
-
-    def given(self, times: Array, directions: Array) -> Array:
-        """`Execution.given`."""
-        return self._each(directions, np.empty(times.size), lambda errors, indices, c: errors.given(times[indices], c))
-
-    @shaped
-    def added(
-        self, control: Float[Array, "m K"], times: Float[Array, " k"], directions: Float[Array, "k d"]
-    ) -> Float[Array, " k"]:
-        """`Execution.added`."""
-        return self._each(
-            directions, np.empty(times.size), lambda errors, indices, c: errors.added(control, times[indices], c)
-        )
+    def unit_errors(self, times: Float[Array, " k"], directions: Float[Array, "k d"]) -> Float[Array, "k m n"]:
+        """`Execution.unit_errors`."""
+        values = np.empty((times.size, self.shares.size, self.late + self.breakpoints.size - 1))
+        return self._each(directions, values, lambda errors, indices, c: errors.unit_errors(times[indices], c))
 
     def sampled(self, control: Array, times: Array, directions: Array) -> Array:
-        """`Execution.sampled`."""
+        """Return `Execution.sampled`, remembered at every parameter by itself."""
         return self._each(
             directions, np.empty(times.size), lambda errors, indices, c: errors.sampled(control, times[indices], c)
-        )
-
-    @shaped
-    def slope(
-        self, control: Float[Array, "m K"], times: Float[Array, " k"], directions: Float[Array, "k d"]
-    ) -> Float[Array, " k"]:
-        """`Execution.slope`."""
-        return self._each(
-            directions, np.empty(times.size), lambda errors, indices, c: errors.slope(control, times[indices], c)
         )
 
     @shaped
@@ -422,6 +387,12 @@ def followed(errors: VaryingExecution) -> VaryingExecution | UncertainExecution:
     if errors.response.propagator.laws is None:
         return errors
     return UncertainExecution(errors.response, errors.breakpoints, errors.shares, errors.error_mask, errors)
+
+
+def execution_of(response: Response, breakpoints: Array, shares: Array, error_mask: Array) -> Execution:
+    """Return the errors of execution of a system, with the fields of `Execution`."""
+    arguments = response, breakpoints, shares, error_mask
+    return followed(VaryingExecution(*arguments)) if response.system.varies else ConstantExecution(*arguments)
 
 
 @final

@@ -9,12 +9,8 @@ from typing import final
 import numpy as np
 
 from sparserob_core.control.reach.measurable import AT_ONCE, MeasurableSupport
-from sparserob_core.control.reach.support import NOT_PROVEN, Support
+from sparserob_core.control.reach.support import NOT_PROVEN, Leg, Support
 from sparserob_core.control.reach.varying_execution import UncertainExecution, VaryingExecution, followed
-from sparserob_core.control.reach.varying_motion import (
-    SpreadMotion,
-    VaryingMotion,
-)
 from sparserob_core.control.response.disturbance import DisturbanceModel
 from sparserob_core.control.response.lifted import LiftedSystem
 from sparserob_core.control.response.response import Response
@@ -102,9 +98,7 @@ class VaryingMeasurable:
         point, pieces = Box(self.middle, self.middle), np.arange(self.response.grid.pieces)
         return DisturbanceModel("piecewise_constant", point, point, self.response.grid, starts=pieces)
 
-    def over(
-        self, rows: Array, leg: LiftedSystem | VaryingMotion | SpreadMotion, joined: Combination | None = None
-    ) -> list[Support]:
+    def over(self, rows: Array, leg: Leg, joined: Combination | None = None) -> list[Support]:
         """Return the supports as `MeasurableSupport.over` does, over a cell of parameters too; raise `NotEnclosable`
         for directions that vary over it."""
         assert not isinstance(leg, LiftedSystem)

@@ -1169,8 +1169,10 @@ def unique_rows(rows: Float[Array, "k n"]) -> tuple[Float[Array, "u n"], Int[np.
 def _find_distinct_rows(rows: Array) -> tuple[Array, np.ndarray]:
     """Return the distinct rows in the order of their first occurrence, and the index of every row among them."""
     index_of: dict[bytes, int] = {}
+    is_new = np.append(True, (rows[1:] != rows[:-1]).any(axis=1))  # a repeated row is looked at once
     # adding 0 turns -0 into 0
-    indices = np.array([index_of.setdefault(row.tobytes(), len(index_of)) for row in rows + 0.0], dtype=int)
+    indices = np.array([index_of.setdefault(row.tobytes(), len(index_of)) for row in rows[is_new] + 0.0], dtype=int)
+    indices = indices[np.cumsum(is_new) - 1]
     if len(index_of) == len(rows):
         return rows, indices
     first = np.empty(len(index_of), dtype=int)

@@ -168,15 +168,13 @@ def _build_functionals(
         bound, breakpoints = problem.disturbance, problem.disturbance_breakpoints
         model = disturbance_model(problem.disturbance_class, bound, disturbance, grid, breakpoints)
     response, initial_set = Response(system, grid, np.asarray(problem.initial_state, dtype=float)), problem.initial_set
-    execution: Execution | None = None
+    execution = None
     if problem.execution is not None:
-        from sparserob_core.control.reach.execution import Execution
-        from sparserob_core.control.reach.varying_execution import VaryingExecution, followed
+        from sparserob_core.control.reach.varying_execution import execution_of
 
         shares, error_mask = np.asarray(problem.execution), np.ones(problem.system.states)
         error_mask[list(problem.commanded)] = 0.0
-        arguments = response, control.breakpoints, shares, error_mask
-        execution = followed(VaryingExecution(*arguments)) if system.varies else Execution(*arguments)
+        execution = execution_of(response, control.breakpoints, shares, error_mask)
     functionals = WorstFunctionals(
         response, control, model, names=problem.names, initial=initial_set, execution=execution
     )

@@ -11,7 +11,7 @@ import pytest
 import sparserob_core as sr
 from sparserob_core.control.constraints.flat import FlatConstraint
 from sparserob_core.control.enclosures.comparison import block_norms
-from sparserob_core.control.reach.execution import Execution, ExecutionCellSupport
+from sparserob_core.control.reach.execution import ConstantExecution, ExecutionCellSupport
 from sparserob_core.control.response.lifted import LiftedSystem
 from sparserob_core.control.transcription.transcribe import Transcription, prepare
 from sparserob_core.sip.expressions.rounding import rounding
@@ -42,9 +42,9 @@ def model(**changes: object) -> Transcription:
 
 
 @pytest.fixture(scope="module")
-def execution() -> Execution:
+def execution() -> ConstantExecution:
     found = model().functionals.execution
-    assert found is not None
+    assert isinstance(found, ConstantExecution)
     return found
 
 
@@ -64,7 +64,7 @@ def by_sums(c: np.ndarray, time: float, count: int = 6000) -> np.ndarray:
 
 
 @pytest.mark.parametrize("time", [0.0, 0.5, 1.23, 3.0])
-def test_what_a_command_adds_is_the_integral_of_an_absolute_value(execution: Execution, time: float) -> None:
+def test_what_a_command_adds_is_the_integral_of_an_absolute_value(execution: ConstantExecution, time: float) -> None:
     c = np.array([1.0, -0.4])
     weights = by_sums(c, time) * SHARES[:, None]
     at = np.array([time]), c[None]
@@ -77,12 +77,12 @@ def test_what_a_command_adds_is_the_integral_of_an_absolute_value(execution: Exe
     assert low <= execution.added(CONTROL, *at)[0] <= high <= low + 1e-12
 
 
-def test_nothing_is_missing_of_nothing(execution: Execution) -> None:
+def test_nothing_is_missing_of_nothing(execution: ConstantExecution) -> None:
     assert execution.added(np.zeros((2, PIECES)), np.array([2.0]), np.ones((1, 2)))[0] == 0.0
     assert not execution.none().lengths(np.array([2.0]), np.ones((1, 2))).any()
 
 
-def test_its_slope_is_a_difference(execution: Execution) -> None:
+def test_its_slope_is_a_difference(execution: ConstantExecution) -> None:
     times, c, h = np.array([0.3, 1.1, 2.6]), np.tile([0.3, 1.0], (3, 1)), 1e-6
     about = [execution.added(CONTROL, times + sign * h, c) for sign in (1.0, -1.0)]
     np.testing.assert_allclose(execution.slope(CONTROL, times, c), (about[0] - about[1]) / (2 * h), rtol=1e-5)
@@ -96,7 +96,7 @@ def constraint(found: Transcription) -> FlatConstraint:
 def test_it_is_nowhere_above_its_chord_by_more_than_is_said_and_hardly_less() -> None:
     functionals = model().functionals
     legs, H = functionals.over_cells.legs(np.zeros(0), np.zeros(0)), np.array([[1.0, -0.4], [0.3, 1.0]])
-    assert functionals.execution is not None
+    assert isinstance(functionals.execution, ConstantExecution)
     support = ExecutionCellSupport(functionals.execution, CONTROL, H, legs[0])
     share, ratios = np.linspace(0.0, 1.0, 41), []
     for start, width in [(0.0, 0.5), (0.6, 0.2), (1.0, 0.1), (2.05, 0.4), (2.5, 0.01)]:
@@ -143,7 +143,7 @@ def test_a_late_command_adds_what_a_system_followed_in_time_says() -> None:
         model(system=system, initial_control=[0.4, -0.9]).functionals.execution
         for system in (delayed, delayed.in_time(HORIZON))
     )
-    assert late is not None and in_time is not None and type(late) is Execution is not type(in_time)
+    assert late is not None and in_time is not None and type(late) is ConstantExecution is not type(in_time)
     times = np.array([0.0, 0.1, 0.3, 0.5, 0.8, 1.23, 2.2, HORIZON])
     at = times, np.tile([1.0, -0.4], (times.size, 1))
     np.testing.assert_allclose(late.given(*at), in_time.given(*at), atol=1e-12)
@@ -161,7 +161,7 @@ def test_a_late_command_adds_what_a_system_followed_in_time_says() -> None:
 def test_pieces_that_begin_beside_others_begin_with_them() -> None:
     """A delay of a piece and 3e-12: the grid has one time for both, and so have the errors."""
     late = model(system=sr.LinearSystem(A, B, delay=0.5 + 2.9e-12), initial_control=[0.4, -0.9]).functionals
-    assert late.execution is not None
+    assert isinstance(late.execution, ConstantExecution)
     grid = late.response.grid.breakpoints
     assert np.isin(late.execution.begins, grid).all() and late.execution.begins[1] == 0.5
     assert late.execution.begins.size == PIECES + 2 and late.execution.begins[-1] == HORIZON
@@ -172,7 +172,7 @@ def test_late_bounds_hold_on_every_cell_and_close() -> None:
     assert_bounded_on_cells(one, np.concatenate([CONTROL.ravel(), np.abs(CONTROL).ravel()]), halvings=3, near=0.02)
 
 
-def test_the_sum_over_jumps_allows_for_its_rounding(execution: Execution) -> None:
+def test_the_sum_over_jumps_allows_for_its_rounding(execution: ConstantExecution) -> None:
     at = np.array([2.9]), np.array([[1.0, -0.4]])
     low, high = execution.enclosed(CONTROL, *at)[0]
     assert high - low >= 1e-14 * execution.added(CONTROL, *at)[0]
@@ -181,7 +181,7 @@ def test_the_sum_over_jumps_allows_for_its_rounding(execution: Execution) -> Non
 def test_no_error_brings_a_state_further_than_is_said() -> None:
     functionals, H = model().functionals, np.array([[1.0, -0.4], [0.3, 1.0]])
     leg = functionals.over_cells.legs(np.zeros(0), np.zeros(0))[0]
-    assert functionals.execution is not None and isinstance(leg, LiftedSystem)
+    assert isinstance(functionals.execution, ConstantExecution) and isinstance(leg, LiftedSystem)
     full = np.ones_like(CONTROL)
     support = ExecutionCellSupport(functionals.execution, full, H, leg)
     ends = leg.grid.breakpoints[1:]
@@ -189,7 +189,7 @@ def test_no_error_brings_a_state_further_than_is_said() -> None:
     assert (made <= support.effect_bounds @ block_norms(H @ leg.transform, leg.starts).T * (1 + 1e-12)).all()
 
 
-def test_ages_and_their_sum_are_rounded_outwards(execution: Execution) -> None:
+def test_ages_and_their_sum_are_rounded_outwards(execution: ConstantExecution) -> None:
     class Exact:
         """An integral that is its age, without an error."""
 

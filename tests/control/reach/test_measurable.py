@@ -21,6 +21,7 @@ from sparserob_core.control.sets.sets import Ellipsoid, NormBall, Polytope
 from sparserob_core.sip.convex_set import Box
 from tests.support.plants import indicators, random_system, uniform, worst_case
 
+EPSILON = float(np.finfo(float).eps)
 HORIZON = 2.0
 UNEVEN = indicators([0.0, 0.3, 1.4, HORIZON])
 BOUNDS = {
@@ -244,3 +245,15 @@ def test_a_rough_support_is_near_the_support(name):
         exact, rough = support(times, directions, none), support.roughly(times, directions, none)
         assert np.abs(rough - exact).max() <= share * np.abs(exact).max()
         assert (rough != exact).any()
+
+
+def test_sums_of_a_table_count_the_rounding_of_all_its_intervals():
+    system = LinearSystem([[0.0]], [[1.0]], [[1.0]])
+    ends = np.array([0.0, HORIZON])
+    grid = merge_grids(ends, ends)
+    support = measurable.MeasurableSupport(Response(system, grid, np.zeros(1)), Box([-0.1], [0.1]))
+    with patch.object(measurable, "SHORT", 1e-3), patch.object(measurable._BalancedMatrix, "fastest", 1.0):
+        (table,) = support._make_tables(np.zeros((1, 1)), np.eye(1), ends, np.ones((1, 1)))
+    count, (low, high) = table.starts.size - 1, table.sums[-1]
+    assert count == 2000 and low <= 0.1 * HORIZON <= high
+    assert 2.0 * count * EPSILON / 2.0 * 0.1 * HORIZON <= high - low <= 1e-12

@@ -256,5 +256,5 @@ def test_what_is_remembered_of_times_is_what_was_made_of_them() -> None:
     assert isinstance(execution, VaryingExecution)
     for c in ([1.0, 0.0], [0.0, 1.0], [1.0, 0.0]):
         at = TIMES, np.tile(c, (TIMES.size, 1))
-        again = replace(execution, _transitions={}, _lengths={})
+        again = replace(execution, _transitions={})
         assert (execution.lengths(*at) == again.lengths(*at)).all()

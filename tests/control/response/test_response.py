@@ -20,7 +20,7 @@ from sparserob_core.control.reach import functional, many_directions
 from sparserob_core.control.reach.disturbance_support import DisturbanceSupport
 from sparserob_core.control.reach.many_directions import ManyDirections
 from sparserob_core.control.response.lifted import lift
-from sparserob_core.control.response.response import Propagator, Response, merge_grids
+from sparserob_core.control.response.response import Propagator, Response, merge_grids, unique_rows
 from sparserob_core.sip.convex_set import Box
 from tests.support.plants import indicators, random_system, simulated, uniform, walsh, worst_case
 
@@ -343,3 +343,10 @@ def test_a_known_system_at_a_parameter_keeps_all_that_is_remembered_of_it():
     times, rows, none = np.array([0.75]), np.ones((1, 1)), np.zeros((1, 0))
     assert there.weights(times, rows, none).free[0, 0] == pytest.approx(np.exp(-1.5), rel=1e-14)
     assert there.at(np.zeros(0)) is there
+
+
+def test_rows_are_told_apart_wherever_their_copies_stand():
+    rows = np.array([[0.0, 1.0], [-0.0, 1.0], [2.0, 1.0], [0.0, 1.0], [2.0, 1.0], [2.0, 1.0], [-1.0, 0.0]])
+    distinct, indices = unique_rows(rows)
+    np.testing.assert_array_equal(distinct, [[-1.0, 0.0], [0.0, 1.0], [2.0, 1.0]])
+    np.testing.assert_array_equal(indices, [1, 1, 2, 1, 2, 2, 0])

@@ -96,8 +96,8 @@ class Majorant(NamedTuple):
 class Expansion:
     """System as polynomials on segments of time between ``ends (s + 1,)``.
 
-    ``coefficients (s, DEGREE + 1, d, d + m + mw)``: those of ``[A B E]`` in powers of the time from -1 to 1 over each
-    segment. ``remainder (s, d, d + m + mw)``: the bounds of their error.
+    ``coefficients (s, p + 1, d, d + m + mw)``: those of ``[A B E]`` in powers of the time from -1 to 1 over each
+    segment, up to the highest one that any entry has. ``remainder (s, d, d + m + mw)``: the bounds of their error.
 
     ``units (d,)``: units of the states, in which no entry of ``A`` is much larger than the others. ``ratios (s, d)``:
     the units of a segment over these, at least 1 (`steadied`). ``turns``: the indices of the ends at which another law
@@ -183,6 +183,8 @@ class Expansion:
         coefficients, remainders, ratios = (
             np.array(arrays) for arrays in zip(*(segment.parts for segment in segments), strict=True)
         )
+        highest = int(np.flatnonzero(coefficients.any(axis=(0, 2, 3))).max(initial=0))  # 0 for a constant system
+        coefficients = coefficients[:, : highest + 1]
         return Expansion(np.array(ends), coefficients, remainders, units, ratios, channels, turns, spread)
 
     @shaped
@@ -259,10 +261,11 @@ class Expansion:
     def _compute_parameter_responses(self, segments: np.ndarray, starts: Array, stops: Array, powers: Array) -> Array:
         """Return the responses of `at_parameters` over intervals within one segment each, side by side, ``(v, k, d, d +
         n)``."""
-        size, own, nonzero, length = powers.shape[2], self.own, self._nonzero_monomials, stops - starts
+        size, own, orders = powers.shape[2], self.own, self.orders
+        nonzero, length = self._nonzero_monomials, stops - starts
         distinct, indices = np.unique(segments, return_inverse=True)
-        coefficients = self._own_coefficients[distinct].reshape(distinct.size, DEGREE + 1, size, own, -1)[:, :, nonzero]
-        shape = (len(powers), starts.size, DEGREE + 1, own, coefficients.shape[4])
+        coefficients = self._own_coefficients[distinct].reshape(distinct.size, orders, size, own, -1)[:, :, nonzero]
+        shape = (len(powers), starts.size, orders, own, coefficients.shape[4])
         if powers.shape[1] == 1:
             values = np.einsum("va,snaij->vsnij", powers[:, 0, nonzero], coefficients)[:, indices.reshape(-1)]
         else:
@@ -275,7 +278,7 @@ class Expansion:
         totals = forcing.sum(axis=1).max(axis=1)
         shares = (forcing / np.where(totals > 0.0, totals, np.inf)[:, None, None]).max(axis=(2, 3), initial=0.0)
         terms, _ = _bound_tail(sizes, shares)
-        responses = self._sum_series(law[..., :own], law[..., own:], terms, DEGREE, 1)
+        responses = self._sum_series(law[..., :own], law[..., own:], terms, orders - 1, 1)
         return responses.reshape(*shape[:2], own, -1)
 
     @cached_property
@@ -347,7 +350,7 @@ class Expansion:
         """
         segments, d = self.segment_of(times), self.own
         begin, end = self.ends[segments], self.ends[segments + 1]
-        powers = ((2.0 * times - begin - end) / (end - begin))[:, None] ** np.arange(DEGREE + 1)
+        powers = ((2.0 * times - begin - end) / (end - begin))[:, None] ** np.arange(self.orders)
         law = np.einsum("kn,knij->kij", powers, self._own_coefficients[segments])
         return law[..., :d], law[..., d:]
 
@@ -374,7 +377,7 @@ class Expansion:
         shares = (forcing / divisors[:, None]).max(axis=(2, 3), initial=0.0)
         r = (remainder[..., :d] * scale).sum(axis=2).max(axis=1)
         input_errors = (input_errors / divisors).max(axis=(1, 2), initial=0.0)
-        orders, terms, tail = np.arange(DEGREE + 1.0), TERMS, np.zeros(length.size)
+        orders, terms, tail = np.arange(float(self.orders)), TERMS, np.zeros(length.size)
         for terms in (*(count for count in FEWER if count < TERMS), TERMS):
             tail = np.full(length.size, np.inf)
             for R in CIRCLES:
@@ -386,16 +389,16 @@ class Expansion:
         kernel_terms = self._compute_kernel_terms(A, F, terms)
         a, a_full = sizes.sum(axis=1), bulk_sizes.sum(axis=1)
         forced = (bulk_forcing.sum(axis=1) / divisors).max(axis=(1, 2), initial=0.0)
-        rounded = rounding((DEGREE + 1) * (d + 4)) * (2.0 + a_full) * np.exp(a_full) * forced
+        rounded = rounding(self.orders * (d + 4)) * (2.0 + a_full) * np.exp(a_full) * forced
         error = (tail + (r + input_errors * (1.0 + r)) * np.exp(a + r) + rounded) * self.ratios[segments].max(axis=1)
         return Kernel(kernel_terms, error * (1.0 + 1e-9), inputs)
 
     def _compute_kernel_terms(self, A: Array, F: Array, terms: int) -> Array:
         """Return the terms ``(k, terms + 1, d, m + mw)`` of ``Psi F`` with ``Psi' = Psi A``, ``Psi(0) = I``, from those
-        of ``A (k, DEGREE + 1, d, own)`` and ``F``. Where the states are coefficients of polynomials, products are as in
+        of ``A (k, p + 1, d, own)`` and ``F``. Where the states are coefficients of polynomials, products are as in
         `_sum_series`."""
-        count, own = len(A), self.own
-        A, F = (table.reshape(count, DEGREE + 1, -1, own, table.shape[3]) for table in (A, F))
+        (count, orders), own = A.shape[:2], self.own
+        A, F = (table.reshape(count, orders, -1, own, table.shape[3]) for table in (A, F))
         size = A.shape[2]
         left_factor, right_factor, target = NUMBERS if self.spread is None else self.spread.space.products
         # the latest term comes first, so that those that meet one another lie side by side
@@ -404,11 +407,11 @@ class Expansion:
 
         def factors(other: Array) -> list[tuple[np.ndarray, np.ndarray, Array]]:
             nonzero = np.flatnonzero(other.any(axis=(0, 1, 3, 4)))
-            table = other.swapaxes(1, 2).reshape(count, size, 1, (DEGREE + 1) * own, -1)
+            table = other.swapaxes(1, 2).reshape(count, size, 1, orders * own, -1)
             return [(left_factor[right_factor == b], target[right_factor == b], table[:, b]) for b in nonzero]
 
         def times(n: int, others: list[tuple[np.ndarray, np.ndarray, Array]], columns: int) -> Array:
-            last, product = min(n, DEGREE) + 1, np.zeros((count, size, own, columns))
+            last, product = min(n + 1, orders), np.zeros((count, size, own, columns))
             earlier = solution[:, :, :, terms + 1 - n : terms + 1 - n + last].reshape(count, size, own, last * own)
             for sources, targets, table in others:
                 product[:, targets] += earlier[:, sources] @ table[:, :, : last * own]
@@ -424,24 +427,29 @@ class Expansion:
         self, segments: np.ndarray, times: Array, steps: Array, length: Array
     ) -> tuple[Array, Array]:
         """Return the coefficients of ``[A F]`` times a ``length (k,)`` in powers of the share of ``steps (k,)`` from
-        ``times (k,)``, ``(k, DEGREE + 1, d, d + m + mw)``; and the sums of absolute numbers from which they are
+        ``times (k,)``, ``(k, p + 1, d, d + m + mw)``; and the sums of absolute numbers from which they are
         computed."""
         recentring, coefficients = self._build_recentring(segments, times, steps), self._own_coefficients
-        values = coefficients[segments].reshape(times.size, DEGREE + 1, -1)
+        values = coefficients[segments].reshape(times.size, self.orders, -1)
         shape, factor = (times.size, *coefficients.shape[1:]), length[:, None, None, None]
         return (recentring @ values).reshape(shape) * factor, (np.abs(recentring) @ np.abs(values)).reshape(
             shape
         ) * factor
 
     def _build_recentring(self, segments: np.ndarray, times: Array, steps: Array) -> Array:
-        """Return the matrices ``(k, DEGREE + 1, DEGREE + 1)`` that turn coefficients on segments into those in powers
+        """Return the matrices ``(k, p + 1, p + 1)`` that turn coefficients on segments into those in powers
         of the share of ``steps (k,)`` from ``times (k,)``."""
         centre = (self.ends[segments] + self.ends[segments + 1]) / 2
         radius = (self.ends[segments + 1] - self.ends[segments]) / 2
         at, share = (times - centre) / radius, steps / radius
-        orders, binomials = _compute_binomials(DEGREE)
+        orders, binomials = _compute_binomials(self.orders - 1)
         exponents = np.maximum(orders - orders[:, None], 0)
         return np.asarray(binomials * (at[:, None] ** orders)[:, exponents] * (share[:, None] ** orders)[:, :, None])
+
+    @property
+    def orders(self) -> int:
+        """Number of powers of the time in the coefficients, 1 for a constant system."""
+        return int(self.coefficients.shape[1])
 
     @property
     def own(self) -> int:
@@ -665,7 +673,7 @@ class Expansion:
         bulk_size += (self._bound_forcing(bulk[..., own:]).sum(axis=1) / divisors).max(axis=(1, 2), initial=0.0)
         growth = np.exp(a + r)
         rounded = rounding((degree + 1) * own * self._nonzero_monomials.size + terms) * np.minimum(a, 1.0)
-        rounded += rounding(DEGREE) * bulk_size
+        rounded += rounding(self.orders) * bulk_size
         error = tail + (r + share) * growth + (rounded * (1.0 + a) + EPSILON) * growth
         return Majorant(terms, degree, error * self.ratios[segments].max(axis=1) * (1.0 + 1e-9), inputs)
 

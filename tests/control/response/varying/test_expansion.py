@@ -3,6 +3,7 @@ integrator in fifty digits, and the bound of their error where the series are cu
 
 from __future__ import annotations
 
+from dataclasses import replace
 from decimal import Decimal
 
 import numpy as np
@@ -254,3 +255,21 @@ def integrated(system: VaryingSystem, start: float, stop: float) -> Array:
     first = np.column_stack([np.eye(2), np.zeros((2, 2))]).ravel()
     found = solve_ivp(rates, (start, stop), first, method="DOP853", rtol=1e-13, atol=1e-13)
     return np.asarray(found.y[:, -1].reshape(2, -1))
+
+
+def test_orders_of_time_that_no_entry_has_are_left_out_and_change_nothing() -> None:
+    squared = VaryingSystem.of([["-1", "t^2"], [0, "0*t"]], [[1], ["t"]], 3.0)
+    expansion, constant = Expansion.of(squared), Expansion.of(VaryingSystem.of([["0*t - 1"]], [[1]], 3.0))
+    assert (constant.orders, expansion.orders, Expansion.of(FADING).orders) == (1, 3, varying.DEGREE + 1)
+    padding = [(0, 0), (0, varying.DEGREE + 1 - expansion.orders), (0, 0), (0, 0)]
+    padded = replace(expansion, coefficients=np.pad(expansion.coefficients, padding))
+    starts, stops = expansion.ends[:-1], expansion.ends[1:]
+    for short, long in (
+        (expansion.flow(starts, stops), padded.flow(starts, stops)),
+        (expansion.kernel(starts, stops), padded.kernel(starts, stops)),
+    ):
+        assert (short.error <= long.error).all()  # fewer operations round less
+        for mine, other in zip(short._replace(error=0.0), long._replace(error=0.0), strict=True):
+            np.testing.assert_allclose(mine, other, rtol=1e-12, atol=1e-14)
+    for mine, other in zip(expansion.at(starts), padded.at(starts), strict=True):
+        np.testing.assert_allclose(mine, other, atol=1e-15)
