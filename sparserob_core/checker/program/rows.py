@@ -25,6 +25,8 @@ from sparserob_core.sip.expressions.statements import Row
 DEGREES = {1: (14, 0), 2: (7, 7), 3: (4, 4)}
 """Orders in the first coordinate and in the others, for so many of them; 2 for more. Half of them need ten times as
 many cells, twice as many take four times as long for each."""
+SHARP = 0.01  # of a limit: bounds above it are sharpened, since what is excused is priced; with a tenth it is rounding
+SHARPENED = 5  # halvings for that: ten times as many follow what really violates to the last digit, two are too few
 MAX_CELLS = 20_000  # of one row: ten times as many take hours, a tenth refuses filters of a thousand taps
 
 
@@ -34,7 +36,7 @@ def bound_violation(rows: ExpressionRows, row: Row, x: Array, limit: float, cloc
     Raises `Broken` where an index violates it by more than the ``limit``, and `Unchecked` where too many cells are
     needed.
     """
-    work, worst = [(rows.lower, rows.upper)], -np.inf
+    work, worst = [(rows.lower, rows.upper, 0)], -np.inf
     frame = _make_frame(rows.dimension)
     decision = np.array([frame.number(ball(value)) for value in x] or [frame.number(ball(0.0))], dtype=object)
     for number in count():
@@ -43,11 +45,12 @@ def bound_violation(rows: ExpressionRows, row: Row, x: Array, limit: float, cloc
         if number > MAX_CELLS:
             raise Unchecked(f"more than {MAX_CELLS} cells of {row.text!r} are needed")
         clock.check()
-        lower, upper = work.pop()
+        lower, upper, sharpened = work.pop()
         bound = _bound_cell(rows, row, frame, decision, lower, upper)
-        if bound <= limit:
+        if bound <= (SHARP * limit if sharpened < SHARPENED else limit):
             worst = max(worst, bound)
             continue
+        sharpened += bound <= limit
         middle = lower + (upper - lower) / 2
         _require_kept(rows, row, x, middle, limit)
         shares = (upper - lower) / np.maximum(rows.upper - rows.lower, np.finfo(float).tiny)
@@ -57,7 +60,7 @@ def bound_violation(rows: ExpressionRows, row: Row, x: Array, limit: float, cloc
         for side, corner in ((0, middle[axis]), (1, middle[axis])):
             low, high = lower.copy(), upper.copy()
             (high if side == 0 else low)[axis] = corner
-            work.append((low, high))
+            work.append((low, high, sharpened))
     return worst
 
 

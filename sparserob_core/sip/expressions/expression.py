@@ -9,7 +9,7 @@ import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, TypeAlias
+from typing import Any, ClassVar, TypeAlias
 
 import numpy as np
 
@@ -110,6 +110,8 @@ def parse_tree(text: str) -> ast.expr:
 class Parser:
     """A parser that visits each node of a syntax tree once; a node that is not on the whitelist is an error."""
 
+    functions: ClassVar[tuple[str, ...]] = (*FUNCTIONS, KEPLER)
+
     def __init__(self, text: str, names: tuple[str, ...]) -> None:
         self.text, self.names = text, names
         self.used_names: set[str] = set()
@@ -175,7 +177,7 @@ class Parser:
         if name == KEPLER:
             return self.kepler(node, depth)
         if name not in FUNCTIONS:
-            raise self.fault(f"unknown function {name!r}; known functions: {', '.join([*FUNCTIONS, KEPLER])}")
+            raise self.fault(f"unknown function {name!r}; known functions: {', '.join(self.functions)}")
         if len(node.args) != 1 or node.keywords or isinstance(node.args[0], ast.Starred):
             raise self.fault(f"{name} takes one argument, as in {name}(p1)")
         function, argument = FUNCTIONS[name], self.parse(node.args[0], depth + 1)

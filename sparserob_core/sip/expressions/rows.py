@@ -74,7 +74,15 @@ class ExpressionRows:
             form = row.form(values)
             h[:, i] = -form.constant[:, 0]
             np.add.at(G[:, i].T, form.position, np.broadcast_to(form.coefficient, (len(indices), form.position.size)).T)
+            self._require_values(row, indices, np.isfinite(G[:, i]).all(axis=1) & np.isfinite(h[:, i]))
         return G, h
+
+    def _require_values(self, row: Row, indices: Array, has_value: np.ndarray) -> None:
+        """Raise `InputError` where a row has no finite value at an index."""
+        if not has_value.all():
+            index = indices[int(np.argmin(has_value))].tolist()
+            at = ", ".join(f"{name} = {value:g}" for name, value in zip(self.words.indices, index, strict=True))
+            raise InputError(f"row {row.text!r}: it has no finite value at {at}")
 
     @shaped
     def enclose(
@@ -102,6 +110,8 @@ class ExpressionRows:
         """Return the violations of the rows at a decision and at indices."""
         values = {name: indices[:, [i]] for i, name in enumerate(self.words.indices)}
         columns = [np.broadcast_to(row.value(values, x), (len(indices), 1)) for row in self.rows]
+        for row, column in zip(self.rows, columns, strict=True):
+            self._require_values(row, indices, np.isfinite(column[:, 0]))
         return np.concatenate(columns, axis=1)
 
     def _as_models(self, value: object, space: TaylorSpace) -> CellModels:

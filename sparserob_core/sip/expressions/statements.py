@@ -6,7 +6,7 @@ import ast
 import keyword
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import cast, final
+from typing import ClassVar, cast, final
 
 import numpy as np
 import numpy.typing as npt
@@ -231,6 +231,8 @@ def parse_cost(text: str | float, words: Words) -> ConvexCost:
 @final
 class _Statement(Parser):
     """A parser of statements, with sums, tables and decisions beside the arithmetic of entries."""
+
+    functions: ClassVar[tuple[str, ...]] = (*FUNCTIONS, "abs", CHEBYSHEV, "sum")
 
     def __init__(self, text: str, words: Words) -> None:
         self.words, self.turning = words, list[str]()

@@ -169,6 +169,18 @@ def _choose_tangent_point(plain: FiniteProgram, y: Array, mu: Array, x: Array) -
     return np.where(np.isfinite(x), x, 0.0)
 
 
+def _bound_free_slopes(plain: FiniteProgram, y: Array, mu: Array, x: Array) -> float:
+    """Return what slopes of entries without bounds and without curvature, which should be 0, may be worth at decisions
+    of up to twice the size of ``x (n,)``."""
+    assert plain.curvature is not None
+    free = (np.isinf(plain.lower) | np.isinf(plain.upper)) & (plain.curvature == 0.0) & (plain.weights == 0.0)
+    used = np.where(np.isfinite(plain.h), np.maximum(y, 0.0), 0.0)
+    slope = plain.q + used @ plain.G + mu @ plain.A
+    noise = np.abs(plain.q) + used @ np.abs(plain.G) + np.abs(mu) @ np.abs(plain.A)
+    size = np.where(np.isfinite(x), np.abs(x), 0.0)
+    return float((2.0 * (np.abs(slope) + ROUNDING * noise) * size)[free].sum())
+
+
 @dataclass(eq=False)
 class RelaxedProgram:
     """``g(epsilon; indices)``: minimise ``J + epsilon rho`` over the finite constraints and the imposed indices.
@@ -250,6 +262,7 @@ class RelaxedProgram:
         """A lower bound, less its rounding, with the multipliers that prove it and where the cost is touched."""
         if plain.P is not None and plain.separable and not plain.bounded:  # where a tangent says nothing
             bound, y, mu, z_proving = proving(plain, y, mu, z)
+            bound -= _bound_free_slopes(plain, y, mu, solution.x)
             at = _choose_tangent_point(plain, y, mu, solution.x)
         else:
             at = _choose_tangent_point(plain, y, mu, solution.x)

@@ -106,10 +106,13 @@ class PlainRows(Working):
         Without enough rows the cost may fall without bound. Then rows that prevent this are imposed, where there are
         any.
         """
+        from sparserob_core.sip.working.unbounded import bounding_rows, falls_for_ever, first_rows
+
+        base = self.program.finite
+        if not self.size and base.S is None and base.P is None and not base.bounded:
+            self.impose(first_rows(self.program))
         answer = self._solve_regularised(ledger)
         while answer.solution.status == "failed" and not usable(answer.solution) and not last:
-            from sparserob_core.sip.working.unbounded import bounding_rows, falls_for_ever, first_rows
-
             self.sheds = self.sheds and not self.size  # a dropped row may be the one that bounds the program
             if self.impose(first_rows(self.program)):
                 answer = self._solve_regularised(ledger)
