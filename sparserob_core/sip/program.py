@@ -263,6 +263,8 @@ class ConstraintFamily:
         Name of the unit of every row, where it is known.
     along : str, optional
         Name of the unit of the first coordinate of an index, where it is known.
+    coordinates : sequence of str, length d, optional
+        Name of every coordinate of an index, where it is known.
     uncertain : callable, optional
         ``uncertain(index (d,))``: the `UncertainRows` at an index, which must hold for every deviation in the program's
         `Spread`. Such a family is not linear in the decision: ``rows`` refuses, and ``excess`` is offered.
@@ -306,6 +308,7 @@ class ConstraintFamily:
     index_units: Array | None = None
     measured: Sequence[str] = ()
     along: str = ""
+    coordinates: Sequence[str] = ()
     uncertain: Callable[[Array], UncertainRows] | None = None
     excess: Callable[[Array, Array], Array] | None = None
     start: Array | None = None
@@ -382,6 +385,7 @@ class ConstraintFamily:
             enclosure=enclose,
             excess=expressions.violations,
             sharpness=EXPRESSED,
+            coordinates=expressions.words.indices,
             believed="",
             source=expressions,
         )

@@ -19,7 +19,11 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from sparserob_core.sip.convex_set import Array
+    from sparserob_core.sip.program import ConstraintFamily, SemiInfiniteProgram
+    from sparserob_core.sip.result import Result
 
+MAX_FAMILIES = 6  # in one figure: with twice as many panels it is longer than a page
+SLACK_POINTS = 2001  # of a curve: with a tenth peaks of long filters are corners, ten times as many are a megabyte
 MAX_GAINS = 16  # pictures of gains in one figure
 FLAT = 1.5  # half the least height of a switching function, in prices: at 15 the band is a line, at 1 it hides its edge
 HEADROOM = 1.15  # of the largest value, above it: at 1 it is on the frame, at 10 the band is a line
@@ -275,6 +279,45 @@ def _make_grid(count: int, across: int) -> tuple[Figure, list[Axes]]:
     for ax in axes[count:]:
         ax.set_visible(False)
     return figure, list(axes[:count])
+
+
+def draw_slacks(program: SemiInfiniteProgram, result: Result, title: str) -> Figure | None:
+    """Draw the slack of the rows of every family whose index is one number, and the indices with a multiplier.
+
+    ``None`` where no family is of that kind.
+    """
+    from matplotlib.figure import Figure
+
+    families = [family for family in program.families if int((np.ptp(_corners(family), axis=0) > 0.0).sum()) == 1]
+    families = families[:MAX_FAMILIES]
+    if not families or result.decision is None:
+        return None
+    figure = Figure(figsize=(look.WIDTH, 1.7 * len(families) + 0.75), layout="constrained")
+    for ax, family in zip(figure.subplots(len(families), 1, squeeze=False)[:, 0], families, strict=True):
+        corners = _corners(family)
+        axis = int(np.ptp(corners, axis=0).argmax())
+        indices = np.linspace(corners[0], corners[1], SLACK_POINTS)
+        slack = -family.violations(result.decision, indices)
+        for place, row in enumerate(slack.T):
+            color = (look.BLUE, look.VERMILLION, look.GREEN, look.PURPLE)[place % 4]
+            ax.plot(indices[:, axis], row, color=color, linewidth=1.0, label=f"row {place + 1}")
+        places = [cut.index[axis] for cut in result.indices if cut.family == family.name and cut.multiplier > 0.0]
+        mark = {"color": look.INK, "markersize": 3.5, "label": "index with a multiplier", "zorder": 3}
+        ax.plot(places, [0.0] * len(places), "o", **mark)
+        ax.axhline(0.0, color=look.GREY, linewidth=0.7)
+        name = family.coordinates[axis] if family.coordinates else f"index {axis + 1}"
+        ax.set_xlabel(f"${name}$" if len(name) == 1 else name)
+        ax.set_ylabel("slack")
+        ax.set_title(family.name, fontsize=10.0)
+    pairs = [pair for ax in figure.axes for pair in zip(*ax.get_legend_handles_labels()[::-1], strict=True)]
+    distinct = dict(pairs)
+    figure.legend(distinct.values(), distinct.keys(), loc="outside lower center", ncols=4)
+    figure.suptitle(title, x=0.01, ha="left", fontsize=11.5)
+    return figure
+
+
+def _corners(family: ConstraintFamily) -> Array:
+    return np.stack([family.index_set.lower, family.index_set.upper])
 
 
 def draw_convergence(data: FigureData) -> Figure:

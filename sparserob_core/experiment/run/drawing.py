@@ -83,7 +83,7 @@ def draw_run(directory: Path, plugins: Iterable[str | Path] = (), notify: Notify
         finished = read_finished(directory, plugins)
         experiment: Experiment = finished.experiment
         worst = adversaries(experiment, finished.decision)
-    elif run.summary["status"] == "infeasible" or run.evaluations is not None:
+    elif run.summary["status"] == "infeasible" or run.evaluations is not None or run.solution["decision"].size:
         experiment = assemble(run.config(plugins))
     else:
         status, message = run.summary["status"], run.summary["message"]
@@ -145,12 +145,15 @@ def _list_groups(
     """
     from sparserob_core.experiment.figures.clash import clash_figure
     from sparserob_core.experiment.figures.climb_figure import draw_climb
+    from sparserob_core.experiment.figures.run_figures import draw_slacks
 
     model, trace = experiment.model, result.trace
     if model is not None and result.status == "infeasible":
         yield lambda: {"clash": partial(clash_figure, experiment, result)}
     elif model is not None and result.decision is not None:
         yield lambda: _prepare_decision_figures(experiment, result, worst)
+    elif experiment.program.families and experiment.problem is None and result.decision is not None:
+        yield lambda: {"slacks": partial(draw_slacks, experiment.program, result, plain(experiment.title))}
     if trace is not None and np.isfinite(trace.value).any():
         yield lambda: {
             "climb": lambda: draw_climb(
