@@ -12,6 +12,7 @@ operations is at most `ROUNDING` times the absolute values (Higham 2002, section
 from __future__ import annotations
 
 from collections.abc import Sequence
+from fractions import Fraction
 from functools import lru_cache
 from math import comb
 
@@ -27,20 +28,13 @@ MAX_BOXES = 20_000
 @lru_cache(maxsize=32)
 def _compute_conversion(degree: int, symmetric: bool) -> Array:
     """Return the matrix ``(degree + 1, degree + 1)`` from powers to Bernstein coefficients on ``[0, 1]``; with
-    ``symmetric`` from powers on ``[-1, 1]``."""
-    rows = np.array(
-        [[comb(i, j) / comb(degree, j) if j <= i else 0.0 for j in range(degree + 1)] for i in range(degree + 1)]
-    )
-    if not symmetric:
-        return rows
-    shift = np.array(
-        [
-            [comb(j, i) * 2.0**i * (-1.0) ** (j - i) if i <= j else 0.0 for j in range(degree + 1)]
-            for i in range(degree + 1)
-        ]
-    )
-    conversion: Array = rows @ shift
-    return conversion
+    ``symmetric`` from powers on ``[-1, 1]``. Its entries are rounded once: sums in doubles would lose digits."""
+    orders = range(degree + 1)
+    rows = [[Fraction(comb(i, k), comb(degree, k)) for k in orders] for i in orders]
+    if symmetric:
+        shift = [[comb(j, k) * 2**k * (-1) ** (j - k) if k <= j else 0 for j in orders] for k in orders]
+        rows = [[sum((row[k] * shift[k][j] for k in orders), Fraction(0)) for j in orders] for row in rows]
+    return np.array([[float(entry) for entry in row] for row in rows])
 
 
 def bernstein(coefficients: Array, symmetric: Sequence[bool], absolute: bool = False) -> Array:

@@ -97,11 +97,11 @@ class Model:
         """Return the absolute value. A model of which few values have the other sign than its middle, up to ``w``,
         differs from it by ``2 w`` at most; of another it is a ball from 0 to the largest one."""
         middle = arb(self.constant.mid())
-        other = (self - self.frame.number(middle)).size.upper() - abs(middle)
+        excess = (self - self.frame.number(middle)).size.upper() - abs(middle)
         half = self.size.upper() / 2
-        if 2 * other > half:
+        if 2 * excess > half:
             return self.frame.number(arb(half, half))
-        return (-self if middle < 0 else self)._truncate(2 * other if other > 0 else arb(0))
+        return (-self if middle < 0 else self)._truncate(arb(0) if excess <= 0 else 2 * abs(excess))
 
     def __sub__(self, other: object) -> Model:
         return self + -self._convert_to_model(other)

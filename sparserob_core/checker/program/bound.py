@@ -82,6 +82,8 @@ class Lagrangian:
         for position, value in zip(linear.positions.tolist(), linear.coefficients.tolist(), strict=True):
             self.slope[position] = ball(value)
         for weight, (i, a), (j, b) in program.products:
+            if weight == 0.0:
+                continue
             product = ball(weight) * ball(a) * ball(b)
             for key in ((i, j), (j, i)):
                 self.quadratic[key] = self.quadratic.get(key, ball(0.0)) + product

@@ -80,7 +80,7 @@ def _bound_cell(
         model = frame.time(middle, half) if i == 0 else frame.parameter(i - 1, middle, half)
         values[name] = np.array([[model]], dtype=object)
     try:
-        violation = row.value(values, decision)[0, 0]
+        violation = row.value(values, decision[None])[0, 0]
     except (Unchecked, ValueError, ZeroDivisionError):
         return np.inf
     coefficients, error = _separate_errors(frame, violation)
@@ -114,12 +114,12 @@ def _require_kept(rows: ExpressionRows, row: Row, x: Array, index: Array, limit:
 def evaluate_row(rows: ExpressionRows, row: Row, x: Array, index: Array) -> arb:
     """Return a ball with the violation of a row at a decision and an index."""
     decision = np.array([ball(value) for value in x], dtype=object)
-    return arb(row.value(_list_values(rows, index), decision)[0, 0])
+    return arb(row.value(_list_values(rows, index), decision[None])[0, 0])
 
 
 def coefficients_at(rows: ExpressionRows, row: Row, index: Array, n: int) -> tuple[list[arb], arb]:
     """Return balls with the coefficients ``(n,)`` of a row at an index, and its constant."""
-    form = row.form(_list_values(rows, index))
+    form = row.form(_list_values(rows, index), ball(1.0))
     coefficients = [ball(0.0)] * n
     for position, value in zip(form.position.tolist(), form.coefficient[0] if form.position.size else (), strict=True):
         coefficients[position] = coefficients[position] + arb(value)

@@ -7,6 +7,7 @@ the same arithmetic for all; here it is done once. Every operation adds a bound 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from fractions import Fraction
 from functools import lru_cache
 from math import comb, factorial
 from typing import Any, ClassVar, TypeAlias, final
@@ -61,6 +62,11 @@ class CellModels(Operand):
             coefficients[:, 0, space.index[tuple(int(i == j) for j in range(space.nu))]] = radius[:, i]
             models.append(CellModels(space, coefficients, np.zeros((len(lower), 1))))
         return models
+
+    @property
+    def is_number(self) -> bool:
+        """True where all functions are constants without a remainder."""
+        return not (self.remainder.any() or self.coefficients[..., 1:].any())
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -149,35 +155,38 @@ def _sorted_products(space: TaylorSpace) -> tuple[Numbers, Numbers, Numbers, Arr
 
 
 def _add(left: Any, right: Any) -> CellModels:
-    model, other = (left, right) if isinstance(left, CellModels) else (right, left)
-    if isinstance(other, CellModels):
-        coefficients = model.coefficients + other.coefficients
-        error = model.remainder + other.remainder
+    model, operand = (left, right) if isinstance(left, CellModels) else (right, left)
+    if isinstance(operand, CellModels):
+        coefficients = model.coefficients + operand.coefficients
+        error = model.remainder + operand.remainder
     else:
-        number = np.atleast_2d(np.asarray(other, dtype=float))
+        number = np.atleast_2d(np.asarray(operand, dtype=float))
         coefficients = model.coefficients + model._constant(number).coefficients
         error = model.remainder + np.zeros(number.shape)
     return CellModels(model.space, coefficients, (error + EPSILON * np.abs(coefficients).sum(axis=2)) * OUTWARD)
 
 
 def _multiply(left: Any, right: Any) -> CellModels:
-    model, other = (left, right) if isinstance(left, CellModels) else (right, left)
-    if not isinstance(other, CellModels):
-        number = np.atleast_2d(np.asarray(other, dtype=float))
+    model, operand = (left, right) if isinstance(left, CellModels) else (right, left)
+    if isinstance(operand, CellModels) and model.is_number:
+        model, operand = operand, model
+    if not isinstance(operand, CellModels) or operand.is_number:
+        plain = operand.coefficients[..., 0] if isinstance(operand, CellModels) else operand
+        number = np.atleast_2d(np.asarray(plain, dtype=float))
         coefficients = model.coefficients * number[..., None]
         with np.errstate(invalid="ignore"):
             error = np.where(number == 0.0, 0.0, model.remainder * np.abs(number))
         return CellModels(model.space, coefficients, (error + EPSILON * np.abs(coefficients).sum(axis=2)) * OUTWARD)
     space = model.space
     first, second, begins, rounded = _sorted_products(space)
-    a, b = model.coefficients, other.coefficients
+    a, b = model.coefficients, operand.coefficients
     products = a[..., first] * b[..., second]
     coefficients = np.add.reduceat(products, begins, axis=-1)
     sizes, others = np.abs(a), np.abs(b)
     error = _bound_overflow(space, sizes, others) + np.abs(products) @ (rounded + EPSILON)
-    total, other_total = sizes.sum(axis=2), others.sum(axis=2)
+    total, operand_total = sizes.sum(axis=2), others.sum(axis=2)
     with np.errstate(invalid="ignore"):
-        error = error + total * other.remainder + model.remainder * (other_total + other.remainder)
+        error = error + total * operand.remainder + model.remainder * (operand_total + operand.remainder)
     error = np.where(np.isnan(error), np.inf, error)
     return CellModels(space, coefficients, error * OUTWARD)
 
@@ -186,8 +195,8 @@ def _bound_overflow(space: TaylorSpace, a: Array, b: Array) -> Array:
     """Return bounds ``(k, K)`` of the terms of products of polynomials of these moduli that leave the space."""
     degrees = np.zeros((space.size, space.degree + 1))
     degrees[np.arange(space.size), space.degrees] = 1.0
-    by_degree, other = a @ degrees, b @ degrees
-    tails = np.cumsum(other[..., ::-1], axis=-1)  # tails[j]: of degree at least n - j
+    by_degree, operand = a @ degrees, b @ degrees
+    tails = np.cumsum(operand[..., ::-1], axis=-1)  # tails[j]: of degree at least n - j
     return np.asarray((by_degree[..., 1:] * tails[..., : space.degree]).sum(axis=-1))
 
 
@@ -207,12 +216,12 @@ def _divide(left: Any, right: Any) -> CellModels:
 
 def _raise_to_power(left: Any, right: Any) -> CellModels:
     if isinstance(right, CellModels):
-        logarithm = left.compose(_log) if isinstance(left, CellModels) else np.log(left)
-        return _multiply(right, logarithm).compose(_exp)
+        base = left if isinstance(left, CellModels) else right._constant(left)
+        return _multiply(right, base.compose(_log)).compose(_exp)
     powers = np.unique(np.asarray(right, dtype=float))
     columns = [_raise_to_number(left, float(power)) for power in powers]
     if powers.size == 1:
-        return columns[0] if np.size(right) == 1 else columns[0][:, np.zeros(np.size(right), dtype=int)]
+        return columns[0] if np.size(right) == 1 else take_columns(columns[0], np.arange(np.size(right)))
     places = np.searchsorted(powers, np.asarray(right, dtype=float))[0]
     picked: list[CellModels] = [take_columns(columns[place], np.array([j])) for j, place in enumerate(places.tolist())]
     return picked[0].join(picked)
@@ -275,12 +284,12 @@ def _absolute(model: CellModels) -> CellModels:
     at most; of others it is only known that they are from 0 to the largest one."""
     low, high = model.bounds()
     sign = np.where(low + high < 0.0, -1.0, 1.0)
-    other, half = np.maximum(np.where(sign < 0.0, high, -low), 0.0), np.maximum(-low, high) / 2
-    crosses = 2.0 * other > half
+    excess, half = np.maximum(np.where(sign < 0.0, high, -low), 0.0), np.maximum(-low, high) / 2
+    crosses = 2.0 * excess > half
     coefficients = sign[..., None] * model.coefficients
     coefficients[crosses] = 0.0
     coefficients[..., 0][crosses] = half[crosses]
-    return CellModels(model.space, coefficients, np.where(crosses, half, model.remainder + 2.0 * other) * OUTWARD)
+    return CellModels(model.space, coefficients, np.where(crosses, half, model.remainder + 2.0 * excess) * OUTWARD)
 
 
 CellModels.operations = {
@@ -355,14 +364,14 @@ def bound_polynomials(space: TaylorSpace, coefficients: Array, errors: Array, li
 
 @lru_cache(maxsize=16)
 def _conversion(degree: int) -> Array:
-    """Return the matrix from powers on ``[-1, 1]`` to coefficients of Bernstein's form."""
-    scaled = [[comb(i, j) / comb(degree, j) if j <= i else 0.0 for j in range(degree + 1)] for i in range(degree + 1)]
-    shift = [
-        [comb(j, i) * 2.0**i * (-1.0) ** (j - i) if i <= j else 0.0 for j in range(degree + 1)]
-        for i in range(degree + 1)
-    ]
-    matrix: Array = np.array(scaled) @ np.array(shift)
-    return matrix
+    """Return the matrix from powers on ``[-1, 1]`` to coefficients of Bernstein's form, each entry rounded once."""
+    orders = range(degree + 1)
+
+    def entry(i: int, j: int) -> float:
+        terms = (Fraction(comb(i, k) * comb(j, k) * 2**k * (-1) ** (j + k), comb(degree, k)) for k in orders)
+        return float(sum(terms, Fraction(0)))
+
+    return np.array([[entry(i, j) for j in orders] for i in orders])
 
 
 def _halve(forms: Array) -> Array:

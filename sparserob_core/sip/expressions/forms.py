@@ -91,11 +91,10 @@ class AffineForm(Operand):
         return AffineForm(value, empty, empty, np.zeros((1, 0)))
 
     @staticmethod
-    def variables(positions: Numbers) -> AffineForm:
-        """Return entries of the decision, at ``positions (K,)``."""
-        return AffineForm(
-            np.zeros((1, positions.size)), np.arange(positions.size), positions, np.ones((1, positions.size))
-        )
+    def variables(positions: Numbers, unit: Value = 1.0) -> AffineForm:
+        """Return entries of the decision, at ``positions (K,)``, with coefficients that are a ``unit``."""
+        coefficient = np.full((1, positions.size), unit)
+        return AffineForm(np.zeros((1, positions.size)), np.arange(positions.size), positions, coefficient)
 
     @property
     def shape(self) -> tuple[int, int]:

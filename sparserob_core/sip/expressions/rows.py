@@ -51,9 +51,9 @@ class ExpressionRows:
         """Return the rows that texts state; raise `InputError`, with its key, for a text that is none."""
         lower, upper = read_intervals(index)
         words = Words(decision, tuple(index), tables)
-        texts = [rows] if isinstance(rows, str) else list(rows)
-        if not texts:
-            raise InputError(path="rows", expected="at least one row", got="none")
+        texts: object = [rows] if isinstance(rows, str) else rows
+        if not isinstance(texts, Sequence) or not texts or not all(isinstance(text, str) for text in texts):
+            raise InputError(path="rows", expected="at least one row, as text", got=repr(rows))
         parsed = [row for text in texts for row in parse_rows(text, words)]
         found = ExpressionRows(words, tuple(parsed), lower, upper)
         found.evaluate((lower + (upper - lower) / 2)[None])  # whatever cannot be evaluated is told at once
@@ -94,11 +94,14 @@ class ExpressionRows:
         """
         space = taylor_space(self.dimension, DEGREES.get(self.dimension, 2))
         bounds, split = np.full(len(lower), -np.inf), (upper - lower).argmax(axis=1)
-        size = max(1, MAX_NUMBERS // (space.products[0].size * (x.size + 1)))
+        size, decision = (
+            max(1, MAX_NUMBERS // (space.products[0].size * (x.size + 1))),
+            CellModels.constant(space, x[None]),
+        )
         for row in self.rows:
             for start in range(0, len(lower), size):
                 part = slice(start, start + size)
-                models = self._as_models(row.value(self._variables(space, lower[part], upper[part]), x), space)
+                models = self._as_models(row.value(self._variables(space, lower[part], upper[part]), decision), space)
                 over, steepest = bound_polynomials(space, models.coefficients[:, 0], models.remainder[:, 0], 0.0)
                 moves = (upper[part] - lower[part])[np.arange(over.size), steepest] > 0.0
                 split[part] = np.where((over > bounds[part]) & moves, steepest, split[part])
@@ -109,7 +112,7 @@ class ExpressionRows:
     def violations(self, x: Float[Array, " n"], indices: Float[Array, "k d"]) -> Float[Array, "k r"]:
         """Return the violations of the rows at a decision and at indices."""
         values = {name: indices[:, [i]] for i, name in enumerate(self.words.indices)}
-        columns = [np.broadcast_to(row.value(values, x), (len(indices), 1)) for row in self.rows]
+        columns = [np.broadcast_to(row.value(values, x[None]), (len(indices), 1)) for row in self.rows]
         for row, column in zip(self.rows, columns, strict=True):
             self._require_values(row, indices, np.isfinite(column[:, 0]))
         return np.concatenate(columns, axis=1)
@@ -123,11 +126,15 @@ class ExpressionRows:
 
 def read_intervals(index: Mapping[str, Sequence[float]]) -> tuple[Array, Array]:
     """Return the ends of the intervals of an index; raise `InputError` with the name of one that is none."""
-    if not index:
-        raise InputError(path="index", expected="at least one coordinate with its interval", got="none")
+    given: object = index
+    if not isinstance(given, Mapping) or not given:
+        raise InputError(path="index", expected="at least one coordinate with its interval", got=repr(index))
     for name, interval in index.items():
-        ends = np.asarray(interval, dtype=float) if len(interval) == 2 else np.zeros(0)
+        try:
+            ends = np.asarray(interval, dtype=float)
+        except (TypeError, ValueError):
+            ends = np.zeros(0)
         if ends.shape != (2,) or not np.isfinite(ends).all() or ends[0] > ends[1]:
-            raise InputError(path=f"index.{name}", expected="an interval [lower, upper]", got=repr(list(interval)))
+            raise InputError(path=f"index.{name}", expected="an interval [lower, upper]", got=repr(interval))
     table = np.array([[float(end) for end in interval] for interval in index.values()])
     return table[:, 0].copy(), table[:, 1].copy()

@@ -35,10 +35,9 @@ class BoundedSlopes:
     lower, upper : array (d,)
         Corners of the index set.
     bounds : array (d,)
-        Bound of the modulus of every entry's derivative in each coordinate of the index, of the first ``order``, or of
-        the second.
+        Bound of the derivative of every entry, in absolute value, in each coordinate of the index.
     order : int
-        1 for slopes, 2 for curvatures.
+        Order of that derivative: 1 for slopes, 2 for curvatures.
     """
 
     rows: Rows
@@ -58,15 +57,18 @@ class BoundedSlopes:
         if len(named) != 1:
             raise InputError(path="lipschitz", expected="one of lipschitz and curvature", got=f"{len(named)} of them")
         name = named[0]
+        if isinstance(given[name], bool | str):
+            raise InputError(path=name, expected="a number that is not negative", got=repr(given[name]))
         try:
             bounds = np.broadcast_to(np.asarray(given[name], dtype=float), (lower.size,)).copy()
-        except ValueError:
+        except (TypeError, ValueError):
             bounds = np.full(1, np.nan)
         if not (np.isfinite(bounds).all() and (bounds >= 0.0).all()):
             expected = f"a number that is not negative, or {lower.size} of them"
             raise InputError(path=name, expected=expected, got=repr(given[name]))
         if name == "curvature" and lower.size > MAX_COORDINATES:
             raise InputError(path=name, expected=f"an index of at most {MAX_COORDINATES} coordinates", got="more")
+        _require_shapes(rows, lower, upper)
         found = BoundedSlopes(rows, lower, upper, bounds, 1 if name == "lipschitz" else 2)
         found._require_plausible(name)
         return found
@@ -111,3 +113,19 @@ class BoundedSlopes:
                 expected = f"a bound of every {what} in coordinate {axis + 1} of the index"
                 got = f"{self.bounds[axis]:.6g}, though an entry has {largest:.6g} near {at}"
                 raise InputError(path=name, expected=expected, got=got)
+
+
+def _require_shapes(rows: Rows, lower: Array, upper: Array) -> None:
+    """Raise `InputError` unless rows and right-hand sides at two indices are finite numbers of their shapes."""
+    indices = np.stack([lower + (upper - lower) / 2, lower])
+    try:
+        G, h = (np.asarray(table, dtype=float) for table in rows(indices))
+    except (TypeError, ValueError) as error:
+        expected = "a function of indices that returns rows and right-hand sides"
+        raise InputError(path="rows", expected=expected, got=str(error)) from None
+    if G.ndim != 3 or G.shape[:2] != h.shape or len(G) != len(indices):
+        raise InputError(
+            path="rows", expected="rows of shape (k, r, n) and right-hand sides (k, r)", got=f"{G.shape} and {h.shape}"
+        )
+    if not (np.isfinite(G).all() and np.isfinite(h).all()):
+        raise InputError(path="rows", expected="finite numbers", got=f"others at the index {indices[0].tolist()}")

@@ -27,9 +27,11 @@ from sparserob_core.sip.expressions.forms import (
 
 CHEBYSHEV = "chebyshev"
 SPECIAL = (*FUNCTIONS, *CONSTANTS, KEPLER, CHEBYSHEV, "sum", "range", "abs", "for", "in")
+UNIT = " unit"  # key of the number 1 from which coefficients of the decision are made
 AT = " at"  # key of a decision at which a row is evaluated as a number
 TURNS = " turns"  # key of the number of turns of the sums around an expression; no name of a user has a space
 MAX_TURNS = 1_000_000  # of all sums around an expression: ten times as many take gigabytes, a tenth refuses long tables
+MAX_WHOLE = 2**53  # beyond it not every whole number is a double
 MAX_DEGREE = 4096  # of a Chebyshev polynomial: ten times as many lose three more digits
 Tables = Mapping[str, Array]
 
@@ -52,6 +54,9 @@ class Decisions:
     hidden: int = 0
 
     def __post_init__(self) -> None:
+        sizes: object = self.sizes
+        if not isinstance(sizes, Mapping):
+            raise InputError(path="decision", expected="names with their numbers of entries", got=repr(self.sizes))
         for name, size in self.sizes.items():
             check_name("decision", name)
             if size is not None and (type(size) is not int or size < 1):
@@ -67,8 +72,8 @@ class Decisions:
     def positions(self, name: str) -> range:
         """Return the places of the entries of one name in the decision."""
         start = 0
-        for other, size in self.sizes.items():
-            if other == name:
+        for entry, size in self.sizes.items():
+            if entry == name:
                 return range(start, start + (size or 1))
             start += size or 1
         raise KeyError(name)
@@ -85,7 +90,8 @@ class Decisions:
 
 def check_name(path: str, name: str) -> None:
     """Raise `InputError` unless a name is one word that means nothing else."""
-    if not name.isidentifier() or keyword.iskeyword(name) or name in SPECIAL:
+    given: object = name
+    if not isinstance(given, str) or not name.isidentifier() or keyword.iskeyword(name) or name in SPECIAL:
         raise InputError(
             path=f"{path}.{name}",
             expected="a name of letters, digits and underscores that means nothing else",
@@ -96,6 +102,9 @@ def check_name(path: str, name: str) -> None:
 def read_tables(given: Mapping[str, npt.ArrayLike]) -> Tables:
     """Return tables as arrays of one or two dimensions; raise `InputError` with the name of one that is none."""
     tables: dict[str, Array] = {}
+    data: object = given
+    if not isinstance(data, Mapping):
+        raise InputError(path="tables", expected="names with their numbers", got=repr(given))
     for name, entries in given.items():
         check_name("tables", name)
         try:
@@ -113,7 +122,7 @@ def read_tables(given: Mapping[str, npt.ArrayLike]) -> Tables:
 @final
 @dataclass(frozen=True, eq=False)
 class Words:
-    """What the names in a statement stand for."""
+    """Meaning of the names in a statement."""
 
     decisions: Decisions
     indices: tuple[str, ...] = ()
@@ -154,9 +163,12 @@ class Row:
     right: Evaluation
     is_equality: bool = False
 
-    def form(self, values: Mapping[str, Value]) -> AffineForm:
-        """Return ``left - right`` at values of the indices: arrays ``(k, 1)``, or what stands for them."""
-        scope = {**values, TURNS: 1}
+    def form(self, values: Mapping[str, Value], unit: Value = 1.0) -> AffineForm:
+        """Return ``left - right`` at values of the indices: arrays ``(k, 1)``, or what stands for them.
+
+        Coefficients of the decision are multiples of a ``unit``: of a float, or of a number that is never rounded.
+        """
+        scope = {**values, TURNS: 1, UNIT: unit}
         with np.errstate(all="ignore"):
             try:
                 form = np.subtract(self.left(scope), self.right(scope))
@@ -166,8 +178,8 @@ class Row:
             raise InputError(f"row {self.text!r}: it is not affine in the decisions")
         return AffineForm.of(form)
 
-    def value(self, values: Mapping[str, Value], x: Array) -> Value:
-        """Return ``left - right`` at values of the indices and a decision ``(n,)``; the row has a `form`."""
+    def value(self, values: Mapping[str, Value], x: Value) -> Value:
+        """Return ``left - right`` at values of the indices and a decision ``(1, n)``; the row has a `form`."""
         scope = {**values, TURNS: 1, AT: x}
         with np.errstate(all="ignore"):
             return np.subtract(self.left(scope), self.right(scope))
@@ -198,9 +210,9 @@ def parse_rows(text: str, words: Words, equalities: bool = False) -> list[Row]:
         If the text is no such statement; the error names the part at fault.
     """
     tree = parse_tree(text)
-    known = "<=, >= or ==" if equalities else "<= or >="
+    comparisons = "<=, >= or ==" if equalities else "<= or >="
     if not isinstance(tree, ast.Compare):
-        raise InputError(f"row {text!r}: expected {known} between two expressions")
+        raise InputError(f"row {text!r}: expected {comparisons} between two expressions")
     parser = _Statement(text, words)
     sides = [parser.parse(side, 0) for side in (tree.left, *tree.comparators)]
     rows = []
@@ -212,7 +224,7 @@ def parse_rows(text: str, words: Words, equalities: bool = False) -> list[Row]:
         elif isinstance(operator, ast.Eq) and equalities:
             rows.append(Row(text, left, right, True))
         else:
-            raise InputError(f"row {text!r}: expected {known} between its expressions")
+            raise InputError(f"row {text!r}: expected {comparisons} between its expressions")
     return rows
 
 
@@ -222,7 +234,7 @@ def parse_cost(text: str | float, words: Words) -> ConvexCost:
     evaluation = parser.parse(parse_tree(str(text)), 0)
     try:
         with np.errstate(all="ignore"):
-            cost = ConvexCost.of(evaluation({TURNS: 1}))
+            cost = ConvexCost.of(evaluation({TURNS: 1, UNIT: 1.0}))
     except InputError as error:
         raise InputError(f"objective {str(text)!r}: {error.sentence}") from None
     return cost
@@ -332,6 +344,8 @@ class _Statement(Parser):
             numbers = np.asarray(evaluation(values), dtype=float)
             if not (np.isfinite(numbers).all() and (numbers == np.rint(numbers)).all()):
                 raise InputError(f"{text!r}: expected a whole number, got {numbers.ravel()[0]:g}")
+            if np.abs(numbers).max(initial=0.0) > MAX_WHOLE:
+                raise InputError(f"{text!r}: expected a whole number up to {MAX_WHOLE}, got {numbers.ravel()[0]:g}")
             return numbers.astype(int)
 
         return evaluate
@@ -386,7 +400,7 @@ class _Statement(Parser):
 
 def _pick_entries(positions: Numbers, values: Mapping[str, Value]) -> Value:
     """Return entries of the decision: numbers where it is given, else affine forms."""
-    return values[AT][positions][None] if AT in values else AffineForm.variables(positions)
+    return values[AT][:, positions] if AT in values else AffineForm.variables(positions, values[UNIT])
 
 
 def _unroll(scope: dict[str, Value], name: str, bounds: Sequence[Numbers]) -> tuple[dict[str, Value], Numbers]:
@@ -397,14 +411,14 @@ def _unroll(scope: dict[str, Value], name: str, bounds: Sequence[Numbers]) -> tu
     total = sum(map(len, ranges))
     if total > MAX_TURNS:
         raise InputError(f"sums of {total} turns; expected at most {MAX_TURNS}")
-    owner = np.repeat(np.arange(count), [len(one) for one in ranges])
+    owner = np.repeat(np.arange(count), [len(turns) for turns in ranges])
     turned = {
         key: value[:, owner] if isinstance(value, np.ndarray) and value.shape[1] == count and count > 1 else value
         for key, value in scope.items()
-        if key not in (TURNS, AT)
+        if key not in (TURNS, AT, UNIT)
     }
-    variable = np.concatenate([np.asarray(one, dtype=float) for one in ranges]) if ranges else np.zeros(0)
-    kept = {AT: scope[AT]} if AT in scope else {}
+    variable = np.concatenate([np.asarray(turns, dtype=float) for turns in ranges]) if ranges else np.zeros(0)
+    kept = {key: scope[key] for key in (AT, UNIT) if key in scope}
     return {**turned, **kept, name: variable[None], TURNS: total}, owner
 
 

@@ -130,7 +130,9 @@ def simplex(program: FiniteProgram, turns: int | None = None) -> Corner:
         y[is_finite] = answer.y
         return replace(answer, y=y)
     n, k, r = program.n, program.weights.size, program.h.size
-    columns = _build_separable_columns(program) if program.S is None else _build_image_columns(program)
+    is_plain = program.S is None and not (program.bounded or program.weights.any())
+    by_parts = _build_separable_columns if program.S is None else _build_image_columns
+    columns = (_build_plain_columns if is_plain else by_parts)(program)
     answer = linprog(
         columns["c"],
         A_ub=columns["rows"] if r else None,
@@ -148,7 +150,8 @@ def simplex(program: FiniteProgram, turns: int | None = None) -> Corner:
     y = -np.asarray(answer.ineqlin.marginals) if r else np.zeros(0)
     mu = -np.asarray(answer.eqlin.marginals)[-program.b.size :] if program.b.size else np.zeros(0)
     if program.S is None:
-        x = np.clip(answer.x[:k] - answer.x[k:], program.lower, program.upper)
+        image = answer.x if is_plain else answer.x[:k] - answer.x[k:]
+        x = np.clip(image, program.lower, program.upper)
         return Corner("optimal", x, np.maximum(y, 0.0), mu)
     return Corner("optimal", np.asarray(answer.x[:n]), np.maximum(y, 0.0), mu, -np.asarray(answer.eqlin.marginals)[:k])
 
@@ -158,6 +161,17 @@ def _split_bounds(program: FiniteProgram) -> tuple[list[Array], list[Array]]:
     lower, upper = program.lower, program.upper
     plus = [np.maximum(lower, 0.0), np.maximum(upper, 0.0)]
     return plus, [np.maximum(-upper, 0.0), np.maximum(-lower, 0.0)]
+
+
+def _build_plain_columns(program: FiniteProgram) -> dict[str, Any]:
+    """Return the columns of the linear program itself, where no absolute value costs anything."""
+    return {
+        "c": program.q,
+        "rows": program.G,
+        "equal": program.A if program.b.size else None,
+        "right": program.b if program.b.size else None,
+        "bounds": np.column_stack([program.lower, program.upper]),
+    }
 
 
 def _build_separable_columns(program: FiniteProgram) -> dict[str, Any]:

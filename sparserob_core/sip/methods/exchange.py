@@ -33,7 +33,7 @@ from sparserob_core.sip.working.ledger import (
     Prover,
     Violated,
     above,
-    found_by,
+    list_violated,
     prover_of,
     witnesses,
 )
@@ -145,7 +145,7 @@ class Rounds:
         proofs, imposed = proofs_of(working, ledger, prover, answer, separations)
         again = imposed or working.exchange(answer, witnesses(program, proofs), number)
         if not again and ledger.is_excuse_dear(answer.solution.x, proofs):
-            again = bool(working.exchange(answer, found_by(proofs), number))
+            again = bool(working.exchange(answer, list_violated(separations), number))
         again = again or working.allow_for(ledger, answer, proofs)
         if again and not last and not tools.deadline.passed:
             return None

@@ -36,6 +36,7 @@ OFTEN = 1.0  # seconds between events within a round of bounding
 STALLED, ADVANCED = 30.0, 0.99  # a proof is stuck if its worst bound has not fallen to this share within these seconds
 MORE = "more seconds (limits.seconds) would help"
 ADVICE = "a larger method.tolerance would help, as it keeps decisions farther away, or narrower index sets"
+SHARPENED = 3  # rounds for sharper bounds than a proof needs: ten more follow violations to their last digits
 # Halvings without progress after which the difference between bound and violation counts as rounding, and the largest
 # such difference, or such bound, in the units of the rows.
 REST, TINY = 8, 1e-5
@@ -315,17 +316,17 @@ class NoViolation:
     """Goal of a proof: to decide whether anything is violated by more than ``allowed``.
 
     Cells are closed where nothing is, and a violation of more than `TOLERANCE` ends the search. A violation between the
-    two may be rounding. As long as no violation above the share ``sharpness`` of ``allowed`` is found, cells are closed
-    below it.
+    two may be rounding. Cells are closed at the share ``sharpness`` of ``allowed``, until that alone has kept cells
+    open for `SHARPENED` rounds.
     """
 
     allowed: float = TOLERANCE
     sharpness: float = 1.0
 
-    def closes(self, best: float) -> float:
-        """Return the bound up to which a cell is closed, where ``best`` is the largest violation found."""
-        sharp = self.sharpness * self.allowed
-        return sharp if best <= sharp / 2 else self.allowed
+    def closes(self, best: float, rounds: int = 0) -> float:
+        """Return the bound up to which a cell is closed, after so many ``rounds`` in which only sharpness was missing;
+        ``best`` is the largest violation found."""
+        return self.sharpness * self.allowed if rounds < SHARPENED else self.allowed
 
     def ends(self, best: float) -> bool:
         """Return whether the largest violation found decides the question."""
@@ -340,7 +341,7 @@ class Within:
     tolerance: float
     least: float
 
-    def closes(self, best: float) -> float:
+    def closes(self, best: float, rounds: int = 0) -> float:
         """Return the bound up to which a cell is closed, where ``best`` is the largest violation found."""
         return best + self.tolerance * max(abs(best), self.least)
 
@@ -391,13 +392,15 @@ def _branch_and_bound(
     best, parent_bounds = (-np.inf, lower[0], 0), np.full(lower.shape[0], np.inf)
     leaves: list[tuple[Array, Array, Array]] = []  # one entry per halving
     slacks: list[float] = []
+    rest = 0  # rounds in which bounds were good enough, and not sharp
 
     while True:
         # Bound every cell, and close those where no violation is left.
         bounds, split, bend = _bound_cells(course, x, lower, upper)
         bounds = np.minimum(bounds, parent_bounds)  # a part violates no more than the whole
         course.examined += bounds.size
-        open_ = bounds > goal.closes(best[0])
+        rest += int(bounds.max(initial=-np.inf) <= goal.closes(best[0], SHARPENED))
+        open_ = bounds > goal.closes(best[0], rest)
 
         # Search for a witness: where separation finds the largest violations, and in the worst cells.
         first, peaks = not leaves, _NOWHERE
@@ -410,7 +413,7 @@ def _branch_and_bound(
         if open_.any() and not goal.ends(best[0]) and len(leaves) + 1 in CLIMBED and box.dimension > 1:
             worst_cell = (corner[bounds.argmax()] for corner in (lower, upper))
             best = max(best, _climb(family, x, *worst_cell), key=lambda witness: witness[0])
-        open_ = bounds > goal.closes(best[0])
+        open_ = bounds > goal.closes(best[0], rest)
         leaves.append((lower[~open_], upper[~open_], bounds[~open_]))
         if goal.ends(best[0]):
             return _form_answers(course, "refuted", best, leaves)
@@ -435,7 +438,7 @@ def _branch_and_bound(
         slacks.append(worst - best[0])
         is_spent = children is None or course.examined + children[0].shape[0] > course.budget or course.deadline.passed
         is_rounding = (
-            box.dimension == 1 and bend is not None and _is_rounding(worst, float(bend[at]), goal.closes(best[0]))
+            box.dimension == 1 and bend is not None and _is_rounding(worst, float(bend[at]), goal.closes(best[0], rest))
         )
         if children is None or is_spent or is_rounding or _is_stalled(slacks):
             hindrance = course.hindrance(worst, lower[at], upper[at])

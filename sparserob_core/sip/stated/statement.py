@@ -18,6 +18,8 @@ from sparserob_core.sip.expressions.statements import Decisions, Row, Words, par
 from sparserob_core.sip.program import ConstraintFamily, SemiInfiniteProgram
 from sparserob_core.sip.stated.terms import Objective, Term
 
+RESERVED = ("config", "objective", "lower bound", "bounds and rows", "infeasibility", "violation", "status")
+"""Names of claims about a program, which no family may have."""
 Multiple: TypeAlias = tuple[int, float]
 """An entry of the decision, and the factor before it."""
 MAX_ENTRIES = 100_000  # of a decision with its residuals: ten times as many take a matrix of gigabytes
@@ -113,6 +115,10 @@ class StatedProgram:
         terms = [term for _, left, right in objective.products for term in (left, right)]
         terms += [inner for _, inner in objective.absolutes]
         distinct = {id(term): term for term in terms if not _is_entry(term)}
+        if self._words.decisions.n > MAX_ENTRIES:
+            raise InputError(
+                path="decision", expected=f"at most {MAX_ENTRIES} entries", got=f"{self._words.decisions.n}"
+            )
         if self._words.decisions.n + len(distinct) > MAX_ENTRIES:
             raise InputError(path="minimise", expected=f"at most {MAX_ENTRIES} terms", got=f"{len(distinct)}")
         return tuple(distinct.values())
@@ -165,6 +171,10 @@ class StatedProgram:
         """Names and rows of all families."""
         tables, found = self._words.tables, list[tuple[str, ExpressionRows]]()
         for i, family in enumerate(self.families):
+            if family.name in RESERVED:
+                raise InputError(
+                    path=f"families.{i}.name", expected="a name that no claim of a check has", got=family.name
+                )
             try:
                 found.append((family.name, ExpressionRows.parse(family.index, family.rows, self.decisions, tables)))
             except InputError as error:

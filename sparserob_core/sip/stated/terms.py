@@ -42,13 +42,13 @@ class Term:
             terms.append(Term(float(constants[j]), positions[sums != 0.0], sums[sums != 0.0]))
         return terms
 
-    def plus(self, other: Term, factor: float) -> Term:
+    def plus(self, term: Term, factor: float) -> Term:
         """Return the sum of this function and a multiple of another one."""
-        positions = np.union1d(self.positions, other.positions).astype(int)
+        positions = np.union1d(self.positions, term.positions).astype(int)
         coefficients = np.zeros(positions.size)
         coefficients[np.searchsorted(positions, self.positions)] = self.coefficients
-        coefficients[np.searchsorted(positions, other.positions)] += factor * other.coefficients
-        return Term(self.constant + factor * other.constant, positions, coefficients)
+        coefficients[np.searchsorted(positions, term.positions)] += factor * term.coefficients
+        return Term(self.constant + factor * term.constant, positions, coefficients)
 
 
 @final
@@ -77,8 +77,8 @@ class Objective:
                 if a.positions.size and b.positions.size:
                     products.append((weight, a, b))
                 else:
-                    number, other = (b.constant, a) if a.positions.size else (a.constant, b)
-                    linear = linear.plus(other, weight * number)
+                    number, affine = (b.constant, a) if a.positions.size else (a.constant, b)
+                    linear = linear.plus(affine, weight * number)
         absolutes = list[tuple[float, Term]]()
         for absolute in cost.absolutes:
             for weight, inner in zip(absolute.weight.tolist(), list_terms(absolute.form), strict=True):

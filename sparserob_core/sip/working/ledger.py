@@ -164,10 +164,10 @@ class Ledger:
 
     def is_excuse_dear(self, x: Array, proofs: Sequence[Proof]) -> bool:
         """Return whether what proofs at ``x (n,)`` excuse is all that keeps the gap open."""
-        excused = self._price_excuses(proofs)
+        excused = self._price_excuses(x, proofs)
         return self._compute_resolved_gap(x) <= self.tolerance < self._compute_resolved_gap(x, excused)
 
-    def _price_excuses(self, proofs: Sequence[Proof]) -> float:
+    def _price_excuses(self, x: Array, proofs: Sequence[Proof]) -> float:
         """Return how much the cost would rise, to first order, if nothing were excused, for rows in units of their own.
 
         The rows of a control have the unit of their set, to which an excuse is relative. Other rows are excused by a
@@ -176,7 +176,17 @@ class Ledger:
         if self.program.lengths is not None:
             return 0.0
         excused = {proof.family: max(proof.bound, 0.0) for proof in proofs if proof.verdict == "proven"}
-        return sum(cut.multiplier * excused.get(cut.family, 0.0) for cut in self.dual.cuts)
+        return sum(cut.multiplier * excused.get(cut.family, 0.0) for cut in self.dual.cuts) + self._price_rows(x)
+
+    def _price_rows(self, x: Array) -> float:
+        """Return the same for the rows and equalities without an index, at ``x (n,)``."""
+        base, dual = self.program.finite, self.dual
+        if dual.mu.size != base.b.size or dual.fixed.size not in (0, base.h.size):
+            return 0.0
+        fixed = dual.fixed if dual.fixed.size else np.zeros(base.h.size)
+        used = fixed > 0.0
+        over = np.maximum(base.G[used] @ x - base.h[used], 0.0)
+        return float(fixed[used] @ over + np.abs(dual.mu) @ np.abs(base.A @ x - base.b))
 
     def tell(self, number: int, answer: CheckedAnswer, found: Found, upper: float, kept: int) -> None:
         """Record a round, and send its event.
@@ -285,7 +295,7 @@ class Ledger:
             The result.
         """
         x, deadline = answer.solution.x, self.tools.deadline
-        status, message = verdict(proofs, self._compute_resolved_gap(x, self._price_excuses(proofs)), self.tolerance)
+        status, message = verdict(proofs, self._compute_resolved_gap(x, self._price_excuses(x, proofs)), self.tolerance)
         for name, excess, limit in self._list_residuals(x, strictly=status in ("certified", "verified")):
             if excess > limit:
                 status, message = "failed", f"the decision misses {name} by {excess:.1e} of what they compare; {ADVICE}"
@@ -554,12 +564,11 @@ def above(family: ConstraintFamily, found: Separation) -> tuple[Array, np.ndarra
     return found.indices[violated], found.rows[violated], family.name
 
 
-def found_by(proofs: Sequence[Proof]) -> Violated:
-    """Return the largest violations that proofs have found and excuse."""
+def list_violated(found: Found) -> Violated:
+    """Return all constraints that a search has found to be violated, by however little."""
     return [
-        (proof.index[None], np.array([proof.row]), proof.family)
-        for proof in proofs
-        if proof.index is not None and proof.violation > 0.0
+        (separation.indices[separation.violations > 0.0], separation.rows[separation.violations > 0.0], family.name)
+        for family, separation in found
     ]
 
 

@@ -34,7 +34,7 @@ FALLS = 1e-7  # of the largest coefficient: fall of the cost per unit of a direc
 # Largest number of moving coordinates for which the first rows are on a grid: two points along each of ten coordinates
 # are a thousand indices.
 FEW = 8
-DENSE = 4  # first rows of a family for every variable: with one, filters take twice as many rounds, eight are slow
+DENSE = 2  # first rows of a family for every variable: with one, polynomials take twice as long, with four filters do
 SHOWN = 6  # largest number of entries of a ray in the message
 
 
@@ -192,8 +192,8 @@ def complete_multipliers(program: SemiInfiniteProgram, dual: Dual, is_priced: bo
     base = program.finite
     free = np.isinf(base.lower) | np.isinf(base.upper)
     if is_priced and base.P is not None:
-        bent = base.curvature if base.curvature is not None else base.P.diagonal()
-        free &= bent == 0.0
+        curvature = base.curvature if base.curvature is not None else base.P.diagonal()
+        free &= curvature == 0.0
     if not free.any() or dual.mu.size != base.b.size:
         return dual
     own = rows_of(program, dual.cuts)

@@ -289,7 +289,7 @@ def test_every_function_of_the_language_is_checked(row: str) -> None:
 
 
 @pytest.mark.parametrize(
-    "row", ["log(t)", "sqrt(t - 0.5)", "1/(t - t)", "tan(4*t)", "(t - 0.25)**-1", "0*log(t - 0.5)"]
+    "row", ["log(t)", "sqrt(t - 0.5)", "1/(t - 0.7)", "tan(4*t)", "(t - 0.25)**-1", "0*log(t - 0.4)"]
 )
 def test_a_row_that_has_no_value_somewhere_does_not_hold(row: str) -> None:
     program = state({"x": None}, "x", f"-1e9*({row}) <= x")

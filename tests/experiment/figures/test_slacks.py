@@ -1,4 +1,4 @@
-"""The figure of a program that is stated as text: slacks over the index, and what is active."""
+"""Guards the figure of a program that is stated as text: slacks over the index, and what is active."""
 
 from __future__ import annotations
 

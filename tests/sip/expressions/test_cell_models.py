@@ -6,11 +6,13 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable
 from fractions import Fraction
+from math import comb
 
 import numpy as np
 import pytest
 from flint import arb, ctx
 
+from sparserob_core.sip.expressions import cell_models
 from sparserob_core.sip.expressions.cell_models import CellModels, bound_polynomials
 from sparserob_core.sip.expressions.taylor import TaylorSpace, taylor_space
 
@@ -210,6 +212,30 @@ def test_columns_may_have_powers_of_their_own() -> None:
         for column, power in enumerate((3.0, 0.0, 1.0)):
             picked = result[:, np.array([column])]
             assert_contains(picked, lambda x, p=power: x ** arb(p), t)
+
+
+def test_equal_powers_of_different_columns_are_those_of_each() -> None:
+    (t,) = CellModels.variables(taylor_space(1, 4), np.array([[0.9]]), np.array([[1.0]]))
+    scaled = t * np.array([[0.0, 1.0, 2.0]])
+    for power in (2.0, 0.5):
+        result = (scaled + 1.0) ** np.full((1, 3), power)
+        for column, factor in enumerate((0.0, 1.0, 2.0)):
+            picked = result[:, np.array([column])]
+            assert_contains(picked, lambda x, f=factor, p=power: (f * x + 1) ** arb(p), t)
+
+
+def test_the_matrix_of_bernsteins_form_is_rounded_once() -> None:
+    for degree in range(15):
+        orders = range(degree + 1)
+        for i, row in enumerate(cell_models._conversion(degree).tolist()):
+            for j, entry in enumerate(row):
+                terms = [Fraction(comb(i, k) * comb(j, k) * 2**k * (-1) ** (j + k), comb(degree, k)) for k in orders]
+                assert entry == float(sum(terms))
+
+
+def test_a_power_of_a_number_counts_its_logarithm() -> None:
+    (t,) = CellModels.variables(taylor_space(1, 8), np.array([[300.0]]), np.array([[300.0]]))
+    assert_contains(np.power(np.array([[3.0]]), t), lambda x: arb(3) ** x, t)
 
 
 UNDEFINED = {

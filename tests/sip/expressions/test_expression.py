@@ -1,4 +1,4 @@
-"""Guards control/problem/expression: expressions: arithmetic as written, and nothing else."""
+"""Guards sip/expressions/expression: expressions: arithmetic as written, and nothing else."""
 
 from __future__ import annotations
 

@@ -3,6 +3,8 @@ where there is none."""
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -89,6 +91,40 @@ def test_a_row_without_an_enclosure_has_an_infinite_bound_and_no_other_row_has(t
         rows = ExpressionRows.parse({"t": (0.0, 1.0)}, row, Decisions({"x": None}), {})
         for x in (1.0, -1e9, 1e9):
             assert rows.enclose(np.array([x]), np.array([[0.0]]), np.array([[1.0]]))[0][0] == np.inf
+
+
+def test_arithmetic_on_the_decision_alone_is_rounded_outwards() -> None:
+    rows = ExpressionRows.parse({"t": (0.0, 1.0)}, "1e10*(a[0] + a[1]) - 1e10 + t*0 <= 0", Decisions({"a": 2}), {})
+    bound = rows.enclose(np.array([1.0, 1e-16]), np.array([[0.0]]), np.array([[1.0]]))[0][0]
+    assert 1e-6 <= bound <= 1e-4
+
+
+@pytest.mark.parametrize(
+    ("index", "row", "decision"),
+    [
+        ({"t": 5}, "x <= t", {"x": None}),
+        ({"t": ("a", "b")}, "x <= t", {"x": None}),
+        ({1: (0, 1)}, "x <= 1", {"x": None}),
+        ([("t", (0, 1))], "x <= 1", {"x": None}),
+        ({"t": (0, 1)}, 5, {"x": None}),
+        ({"t": (0, 1)}, [5], {"x": None}),
+        ({"t": (0, 1)}, None, {"x": None}),
+        ({"t": (0, 1)}, "x <= 1", {1: 3}),
+        ({"t": (0, 1)}, "x <= 1", ["x"]),
+        ({"t": (0, 1)}, "sum(x for k in range(1e19)) <= 1", {"x": None}),
+    ],
+)
+def test_arguments_of_other_kinds_are_refused(index: Any, row: Any, decision: Any) -> None:
+    with pytest.raises(InputError):
+        sr.ConstraintFamily.from_expressions("f", index=index, rows=row, decision=decision)
+
+
+def test_tables_of_other_kinds_are_refused() -> None:
+    for tables in (None, [1.0], {3: [1.0]}, {"c": [[1.0], [1.0, 2.0]]}, {"c": "a"}):
+        with pytest.raises(InputError):
+            sr.ConstraintFamily.from_expressions(
+                "f", index={"t": (0, 1)}, rows="x <= t", decision={"x": None}, tables=tables
+            )
 
 
 def test_cells_of_no_width_and_rows_without_an_index_have_bounds() -> None:

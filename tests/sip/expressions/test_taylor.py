@@ -1,4 +1,4 @@
-"""Guards control/enclosures/taylor: taylor models: the remainder holds what the polynomial leaves out."""
+"""Guards sip/expressions/taylor: taylor models: the remainder holds what the polynomial leaves out."""
 
 from __future__ import annotations
 
