@@ -22,7 +22,7 @@ from sparserob_core.checker.arithmetic.balls import ball, largest, smallest
 from sparserob_core.checker.outcome import Broken, Unchecked
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.stated.statement import StatedProgram
-from sparserob_core.sip.stated.terms import Term
+from sparserob_core.sip.stated.terms import AffineFunction
 
 MAX_ENTRIES = 300  # in products with each other: twice as many take eight times as long, a minute
 INDEPENDENT = 1e-11  # of the largest entry: a smaller pivot is rounding, and a larger one gives wide balls at worst
@@ -39,7 +39,7 @@ class WeightedRow:
     is_free: bool = False
 
 
-def row_of_term(term: Term, multiplier: float, n: int, is_free: bool = False) -> WeightedRow:
+def row_of_term(term: AffineFunction, multiplier: float, n: int, is_free: bool = False) -> WeightedRow:
     """Return a row of numbers with its multiplier."""
     coefficients = [ball(0.0)] * n
     for position, value in zip(term.positions.tolist(), term.coefficients.tolist(), strict=True):

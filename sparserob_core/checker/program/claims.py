@@ -18,7 +18,7 @@ from sparserob_core.checker.program.rows import bound_violation, coefficients_at
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.expressions.rows import ExpressionRows
 from sparserob_core.sip.stated.statement import StatedProgram
-from sparserob_core.sip.stated.terms import Term
+from sparserob_core.sip.stated.terms import AffineFunction
 
 CLAIMS = ("certified", "verified")
 EQUALITY = 1e-12  # of the terms of an equality: the largest residual that double precision may leave
@@ -79,7 +79,7 @@ def check_program(case: ProgramCase, gap_tolerance: float | None) -> list[Findin
         return [*claims, judged("status", lambda: _verify_status(case, gap_tolerance, claims))]
 
 
-def _evaluate_term(term: Term, x: Array) -> tuple[arb, float]:
+def _evaluate_term(term: AffineFunction, x: Array) -> tuple[arb, float]:
     """Return a ball with the value of an affine function, and the size of its terms."""
     products = [ball(c) * ball(x[j]) for j, c in zip(term.positions.tolist(), term.coefficients.tolist(), strict=True)]
     size = abs(term.constant) + sum(abs(float(product.mid())) for product in products)

@@ -20,7 +20,7 @@ from sparserob_core.checker.outcome import Broken, Clock, Unchecked
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.expressions.expression import Value
 from sparserob_core.sip.expressions.rows import ExpressionRows
-from sparserob_core.sip.expressions.statements import Row
+from sparserob_core.sip.expressions.statements import StatedRow
 
 DEGREES = {1: (14, 0), 2: (7, 7), 3: (4, 4)}
 """Orders in the first coordinate and in the others, for so many of them; 2 for more. Half of them need ten times as
@@ -30,7 +30,7 @@ SHARPENED = 5  # halvings for that: ten times as many follow what really violate
 MAX_CELLS = 20_000  # of one row: ten times as many take hours, a tenth refuses filters of a thousand taps
 
 
-def bound_violation(rows: ExpressionRows, row: Row, x: Array, limit: float, clock: Clock) -> float:
+def bound_violation(rows: ExpressionRows, row: StatedRow, x: Array, limit: float, clock: Clock) -> float:
     """Return a proven upper bound of the violation of a row at a decision, over all indices.
 
     Raises `Broken` where an index violates it by more than the ``limit``, and `Unchecked` where too many cells are
@@ -70,7 +70,7 @@ def _make_frame(dimension: int) -> Frame:
 
 
 def _bound_cell(
-    rows: ExpressionRows, row: Row, frame: Frame, decision: np.ndarray, lower: Array, upper: Array
+    rows: ExpressionRows, row: StatedRow, frame: Frame, decision: np.ndarray, lower: Array, upper: Array
 ) -> float:
     """Return an upper bound of the violation over one cell; infinite where the row has no enclosure there."""
     values: dict[str, Value] = {}
@@ -103,7 +103,7 @@ def _separate_errors(frame: Frame, value: Value) -> tuple[Array, float]:
     return coefficients, above(error)
 
 
-def _require_kept(rows: ExpressionRows, row: Row, x: Array, index: Array, limit: float) -> None:
+def _require_kept(rows: ExpressionRows, row: StatedRow, x: Array, index: Array, limit: float) -> None:
     """Raise `Broken` where a row is violated by more than the ``limit`` at one index."""
     violation = evaluate_row(rows, row, x, index)
     if violation > limit:
@@ -111,13 +111,13 @@ def _require_kept(rows: ExpressionRows, row: Row, x: Array, index: Array, limit:
         raise Broken(f"{row.text!r} is violated by {float(violation):.3g} at {at}")
 
 
-def evaluate_row(rows: ExpressionRows, row: Row, x: Array, index: Array) -> arb:
+def evaluate_row(rows: ExpressionRows, row: StatedRow, x: Array, index: Array) -> arb:
     """Return a ball with the violation of a row at a decision and an index."""
     decision = np.array([ball(value) for value in x], dtype=object)
     return arb(row.value(_list_values(rows, index), decision[None])[0, 0])
 
 
-def coefficients_at(rows: ExpressionRows, row: Row, index: Array, n: int) -> tuple[list[arb], arb]:
+def coefficients_at(rows: ExpressionRows, row: StatedRow, index: Array, n: int) -> tuple[list[arb], arb]:
     """Return balls with the coefficients ``(n,)`` of a row at an index, and its constant."""
     form = row.form(_list_values(rows, index), ball(1.0))
     coefficients = [ball(0.0)] * n

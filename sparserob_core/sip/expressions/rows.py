@@ -12,7 +12,7 @@ from sparserob_core.errors import InputError
 from sparserob_core.shapes import Array, Float, shaped
 from sparserob_core.sip.expressions.cell_models import CellModels, bound_polynomials
 from sparserob_core.sip.expressions.forms import Numbers
-from sparserob_core.sip.expressions.statements import Decisions, Row, Tables, Words, parse_rows
+from sparserob_core.sip.expressions.statements import Decisions, StatedRow, Tables, Words, parse_rows
 from sparserob_core.sip.expressions.taylor import TaylorSpace, taylor_space
 
 DEGREES = {1: 10, 2: 6, 3: 4, 4: 3}
@@ -30,14 +30,14 @@ class ExpressionRows:
     ----------
     words : Words
         The names.
-    rows : tuple of Row
+    rows : tuple of StatedRow
         The rows, each ``form(index) <= 0``.
     lower, upper : array (d,)
         Corners of the index set.
     """
 
     words: Words
-    rows: tuple[Row, ...]
+    rows: tuple[StatedRow, ...]
     lower: Array
     upper: Array
 
@@ -77,7 +77,7 @@ class ExpressionRows:
             self._require_values(row, indices, np.isfinite(G[:, i]).all(axis=1) & np.isfinite(h[:, i]))
         return G, h
 
-    def _require_values(self, row: Row, indices: Array, has_value: np.ndarray) -> None:
+    def _require_values(self, row: StatedRow, indices: Array, has_value: np.ndarray) -> None:
         """Raise `InputError` where a row has no finite value at an index."""
         if not has_value.all():
             index = indices[int(np.argmin(has_value))].tolist()

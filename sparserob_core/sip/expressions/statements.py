@@ -145,7 +145,7 @@ class Words:
 
 @final
 @dataclass(frozen=True, eq=False)
-class Row:
+class StatedRow:
     """A row ``form(index) <= 0``, or ``= 0``, as it was written.
 
     Parameters
@@ -185,7 +185,7 @@ class Row:
             return np.subtract(self.left(scope), self.right(scope))
 
 
-def parse_rows(text: str, words: Words, equalities: bool = False) -> list[Row]:
+def parse_rows(text: str, words: Words, equalities: bool = False) -> list[StatedRow]:
     """Return the rows that a text states.
 
     Parameters
@@ -201,7 +201,7 @@ def parse_rows(text: str, words: Words, equalities: bool = False) -> list[Row]:
 
     Returns
     -------
-    list of Row
+    list of StatedRow
         One row for every comparison.
 
     Raises
@@ -218,11 +218,11 @@ def parse_rows(text: str, words: Words, equalities: bool = False) -> list[Row]:
     rows = []
     for left, right, operator in zip(sides, sides[1:], tree.ops, strict=False):
         if isinstance(operator, ast.LtE):
-            rows.append(Row(text, left, right))
+            rows.append(StatedRow(text, left, right))
         elif isinstance(operator, ast.GtE):
-            rows.append(Row(text, right, left))
+            rows.append(StatedRow(text, right, left))
         elif isinstance(operator, ast.Eq) and equalities:
-            rows.append(Row(text, left, right, True))
+            rows.append(StatedRow(text, left, right, True))
         else:
             raise InputError(f"row {text!r}: expected {comparisons} between its expressions")
     return rows

@@ -14,9 +14,9 @@ from sparserob_core.errors import InputError
 from sparserob_core.sip.convex_set import Array, as_bound
 from sparserob_core.sip.convexity import require_convex
 from sparserob_core.sip.expressions.rows import ExpressionRows
-from sparserob_core.sip.expressions.statements import Decisions, Row, Words, parse_cost, parse_rows, read_tables
+from sparserob_core.sip.expressions.statements import Decisions, StatedRow, Words, parse_cost, parse_rows, read_tables
 from sparserob_core.sip.program import ConstraintFamily, SemiInfiniteProgram
-from sparserob_core.sip.stated.terms import Objective, Term
+from sparserob_core.sip.stated.terms import AffineFunction, StatedObjective
 
 RESERVED = ("config", "objective", "lower bound", "bounds and rows", "infeasibility", "violation", "status")
 """Names of claims about a program, which no family may have."""
@@ -100,15 +100,15 @@ class StatedProgram:
         return Words(Decisions(sizes), (), read_tables(self.tables))
 
     @cached_property
-    def objective(self) -> Objective:
+    def objective(self) -> StatedObjective:
         """The objective, term by term."""
         try:
-            return Objective.of(parse_cost(self.minimise, self._words))
+            return StatedObjective.of(parse_cost(self.minimise, self._words))
         except InputError as error:
             raise error.under("minimise") from None
 
     @cached_property
-    def residuals(self) -> tuple[Term, ...]:
+    def residuals(self) -> tuple[AffineFunction, ...]:
         """Affine functions of which the objective takes squares or absolute values, and that are more than one entry:
         each is a further entry of the decision, so that no condition is squared."""
         objective = self.objective
@@ -124,9 +124,9 @@ class StatedProgram:
         return tuple(distinct.values())
 
     @cached_property
-    def finite_rows(self) -> tuple[Row, ...]:
+    def finite_rows(self) -> tuple[StatedRow, ...]:
         """Rows without an index."""
-        rows: list[Row] = []
+        rows: list[StatedRow] = []
         for i, text in enumerate(self.rows):
             try:
                 rows += parse_rows(text, self._words, equalities=True)
@@ -135,9 +135,9 @@ class StatedProgram:
         return tuple(rows)
 
     @cached_property
-    def finite_terms(self) -> tuple[tuple[Term, bool], ...]:
+    def finite_terms(self) -> tuple[tuple[AffineFunction, bool], ...]:
         """Rows without an index, in numbers, and whether each is an equality."""
-        return tuple((Term.list_terms(row.form({}))[0], row.is_equality) for row in self.finite_rows)
+        return tuple((AffineFunction.list_terms(row.form({}))[0], row.is_equality) for row in self.finite_rows)
 
     @cached_property
     def decisions(self) -> Decisions:
@@ -200,7 +200,7 @@ class StatedProgram:
         return [(weight, _locate(inner, self._places)) for weight, inner in self.objective.absolutes]
 
     @property
-    def definitions(self) -> list[Term]:
+    def definitions(self) -> list[AffineFunction]:
         """Affine functions that are 0: the `residuals`, each minus its entry of the decision."""
         return [_subtract_entry(term, self._places[id(term)]) for term in self.residuals]
 
@@ -240,19 +240,19 @@ class StatedProgram:
         return program
 
 
-def _is_entry(term: Term) -> bool:
+def _is_entry(term: AffineFunction) -> bool:
     """Return whether an affine function is a multiple of one entry of the decision."""
     return term.positions.size == 1 and term.constant == 0.0
 
 
-def _locate(term: Term, places: Mapping[int, int]) -> Multiple:
+def _locate(term: AffineFunction, places: Mapping[int, int]) -> Multiple:
     """Return the entry of the decision whose multiple an affine function is, and the factor."""
     return (int(term.positions[0]), float(term.coefficients[0])) if _is_entry(term) else (places[id(term)], 1.0)
 
 
-def _subtract_entry(term: Term, place: int) -> Term:
+def _subtract_entry(term: AffineFunction, place: int) -> AffineFunction:
     """Return an affine function minus an entry of the decision."""
-    return Term(term.constant, np.append(term.positions, place), np.append(term.coefficients, -1.0))
+    return AffineFunction(term.constant, np.append(term.positions, place), np.append(term.coefficients, -1.0))
 
 
 def _build_quadratic(entries: Sequence[tuple[int, int, float]], n: int) -> object:
@@ -262,7 +262,7 @@ def _build_quadratic(entries: Sequence[tuple[int, int, float]], n: int) -> objec
     return csc_array((values, (rows, columns)), shape=(n, n))
 
 
-def _build_matrix(terms: Sequence[Term], n: int) -> Array | None:
+def _build_matrix(terms: Sequence[AffineFunction], n: int) -> Array | None:
     """Return the matrix of rows ``term(x) <= 0``; ``None`` where there are none."""
     if not terms:
         return None
@@ -272,6 +272,6 @@ def _build_matrix(terms: Sequence[Term], n: int) -> Array | None:
     return matrix
 
 
-def _list_right_sides(terms: Sequence[Term]) -> Array | None:
+def _list_right_sides(terms: Sequence[AffineFunction]) -> Array | None:
     """Return the right-hand sides of rows ``term(x) <= 0``; ``None`` where there are none."""
     return np.array([-term.constant for term in terms]) if terms else None

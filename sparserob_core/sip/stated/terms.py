@@ -13,7 +13,7 @@ from sparserob_core.sip.expressions.forms import AffineForm, ConvexCost
 
 @final
 @dataclass(frozen=True, eq=False)
-class Term:
+class AffineFunction:
     """Affine function ``constant + coefficients x[positions]`` of a decision, in numbers."""
 
     constant: float
@@ -26,7 +26,7 @@ class Term:
         return self.constant, tuple(self.positions.tolist()), tuple(self.coefficients.tolist())
 
     @staticmethod
-    def list_terms(form: AffineForm) -> list[Term]:
+    def list_terms(form: AffineForm) -> list[AffineFunction]:
         """Return every affine function of a form of numbers."""
         count = int(form.constant.shape[1])
         constants = np.asarray(form.constant, dtype=float)[0]
@@ -39,37 +39,39 @@ class Term:
             positions, inverse = np.unique(form.position[part], return_inverse=True)
             sums = np.zeros(positions.size)
             np.add.at(sums, inverse.reshape(-1), coefficients[part])
-            terms.append(Term(float(constants[j]), positions[sums != 0.0], sums[sums != 0.0]))
+            terms.append(AffineFunction(float(constants[j]), positions[sums != 0.0], sums[sums != 0.0]))
         return terms
 
-    def plus(self, term: Term, factor: float) -> Term:
+    def plus(self, term: AffineFunction, factor: float) -> AffineFunction:
         """Return the sum of this function and a multiple of another one."""
         positions = np.union1d(self.positions, term.positions).astype(int)
         coefficients = np.zeros(positions.size)
         coefficients[np.searchsorted(positions, self.positions)] = self.coefficients
         coefficients[np.searchsorted(positions, term.positions)] += factor * term.coefficients
-        return Term(self.constant + factor * term.constant, positions, coefficients)
+        return AffineFunction(self.constant + factor * term.constant, positions, coefficients)
 
 
 @final
 @dataclass(frozen=True, eq=False)
-class Objective:
+class StatedObjective:
     """Cost ``constant + linear + sum weight left right + sum weight |inner|``, term by term."""
 
-    linear: Term
-    products: tuple[tuple[float, Term, Term], ...]
-    absolutes: tuple[tuple[float, Term], ...]
+    linear: AffineFunction
+    products: tuple[tuple[float, AffineFunction, AffineFunction], ...]
+    absolutes: tuple[tuple[float, AffineFunction], ...]
 
     @staticmethod
-    def of(cost: ConvexCost) -> Objective:
+    def of(cost: ConvexCost) -> StatedObjective:
         """Return the terms of a parsed cost; products with numbers, and absolute values of numbers, are affine."""
-        distinct: dict[object, Term] = {}
+        distinct: dict[object, AffineFunction] = {}
 
-        def list_terms(form: AffineForm) -> list[Term]:  # functions that are equal are one, however they are written
-            return [distinct.setdefault(term.key, term) for term in Term.list_terms(form)]
+        def list_terms(
+            form: AffineForm,
+        ) -> list[AffineFunction]:  # functions that are equal are one, however they are written
+            return [distinct.setdefault(term.key, term) for term in AffineFunction.list_terms(form)]
 
-        linear = Term.list_terms(cost.affine)[0]
-        products = list[tuple[float, Term, Term]]()
+        linear = AffineFunction.list_terms(cost.affine)[0]
+        products = list[tuple[float, AffineFunction, AffineFunction]]()
         for block in cost.products:
             left = list_terms(block.left)
             right = left if block.right is block.left else list_terms(block.right)
@@ -79,11 +81,11 @@ class Objective:
                 else:
                     number, affine = (b.constant, a) if a.positions.size else (a.constant, b)
                     linear = linear.plus(affine, weight * number)
-        absolutes = list[tuple[float, Term]]()
+        absolutes = list[tuple[float, AffineFunction]]()
         for absolute in cost.absolutes:
             for weight, inner in zip(absolute.weight.tolist(), list_terms(absolute.form), strict=True):
                 if inner.positions.size:
                     absolutes.append((weight, inner))
                 else:
                     linear = replace(linear, constant=linear.constant + weight * abs(inner.constant))
-        return Objective(linear, tuple(products), tuple(absolutes))
+        return StatedObjective(linear, tuple(products), tuple(absolutes))

@@ -17,7 +17,7 @@ from sparserob_core.sip.expressions.statements import (
     parse_rows,
     read_tables,
 )
-from sparserob_core.sip.stated.terms import Objective
+from sparserob_core.sip.stated.terms import StatedObjective
 
 DECISIONS = Decisions({"a": 4, "x": None})
 TABLES = read_tables({"c": [1.0, 2.0, 3.0, 4.0], "F": [[1.0, 2.0], [3.0, 4.0], [5.0, 6.0]]})
@@ -325,7 +325,7 @@ COSTS: dict[str, Callable[[np.ndarray, float], float]] = {
 
 @pytest.mark.parametrize("text", COSTS)
 def test_an_objective_means_what_numpy_computes(text: str) -> None:
-    cost = Objective.of(parse_cost(text, Words(DECISIONS, (), TABLES)))
+    cost = StatedObjective.of(parse_cost(text, Words(DECISIONS, (), TABLES)))
 
     def value(term, point):
         return term.constant + term.coefficients @ point[term.positions]
