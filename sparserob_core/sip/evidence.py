@@ -70,6 +70,10 @@ class Dual:
 
     __repr__ = brief
 
+    def of_fixed_rows(self, count: int) -> Array:
+        """Return the multipliers ``(count,)`` of the fixed rows; 0 where none are given."""
+        return self.fixed if self.fixed.size else np.zeros(count)
+
 
 NO_BOUND = Dual(-np.inf, (), np.zeros(0))
 

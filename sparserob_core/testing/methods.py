@@ -452,7 +452,7 @@ def _derive_bound(program: SemiInfiniteProgram, result: Result) -> float | None:
         rows.append(G[0, cut.row])
         sides.append(h[0, cut.row])
         y.append(cut.multiplier)
-    fixed = result.dual.fixed if result.dual.fixed.size else np.zeros(base.h.size)
+    fixed = result.dual.of_fixed_rows(base.h.size)
     mu = result.dual.mu if result.dual.mu.size else np.zeros(base.b.size)
     G = np.vstack([base.G, np.array(rows).reshape(-1, program.n)])
     finite: FiniteProgram = replace(base, G=G, h=np.concatenate([base.h, np.array(sides)]))

@@ -31,7 +31,7 @@ def certify(program: StatedProgram, seconds: float = 20.0, **changes: Any) -> di
     built = program.build()
     result = sr.solve(built, tolerance=GAP, seconds=seconds)
     dual = result.dual
-    rows = dual.fixed if dual.fixed.size else np.zeros(built.finite.h.size)
+    rows = dual.of_fixed_rows(built.finite.h.size)
     constraints = [
         {"family": cut.family, "index": cut.index, "row": cut.row, "multiplier": cut.multiplier} for cut in dual.cuts
     ]

@@ -129,7 +129,6 @@ def _certify_program(experiment: PlainExperiment, result: Result) -> dict[str, A
         return None
     dual, worst = complete_multipliers(experiment.program, result.dual, result.status != "infeasible"), result.worst
     has_multipliers = dual.mu.size == experiment.program.finite.b.size
-    rows = dual.fixed if dual.fixed.size else np.zeros(experiment.program.finite.h.size)
     witness = (
         None
         if result.status != "refuted" or worst is None
@@ -150,7 +149,7 @@ def _certify_program(experiment: PlainExperiment, result: Result) -> dict[str, A
                 {"family": cut.family, "index": cut.index, "row": cut.row, "multiplier": cut.multiplier}
                 for cut in dual.cuts
             ],
-            "rows": rows,
+            "rows": dual.of_fixed_rows(experiment.program.finite.h.size),
             "equalities": dual.mu,
             "tangent": dual.at,
         },

@@ -24,7 +24,7 @@ from sparserob_core.sip.methods.exchange import Exchange
 from sparserob_core.sip.methods.own_units import answered_in_own_units
 from sparserob_core.sip.program import SemiInfiniteProgram
 from sparserob_core.sip.relaxed.parametric import ParametricProgram
-from sparserob_core.sip.relaxed.relaxed import RelaxedProgram, Rows, rows_at
+from sparserob_core.sip.relaxed.relaxed import RelaxedProgram, rows_of
 from sparserob_core.sip.result import Result, Status
 from sparserob_core.sip.working.ledger import prover_of
 
@@ -312,9 +312,7 @@ class MarginSearch:
             return False
         program = self.programs.program(factor)
         program = program if program.own_units is None else program.own_units.program
-        rows = Rows.none(program.n)
-        for index, row, family in shifted(self.cuts, 0.0, program):
-            rows = rows.joined(rows_at(program, family, index, row))
+        rows = rows_of(program, shifted(self.cuts, 0.0, program))
         relaxed = RelaxedProgram(program, self.tools.solver, deadline=self.tools.deadline)
         return relaxed.solve(rows, 0.0).status == "infeasible"
 

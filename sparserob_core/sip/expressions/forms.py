@@ -38,11 +38,14 @@ class Operand(NDArrayOperatorsMixin):
         return operation(*inputs)
 
 
+def widen(value: Value, count: int) -> Value:
+    """Return a value of one column as one of ``count``; another value is returned as it is."""
+    return value[:, np.zeros(count, dtype=int)] if _size(value) == 1 != count else value
+
+
 def take_columns(value: Value, columns: Numbers) -> Value:
     """Return some columns of a value; a value of one column has this one everywhere."""
-    if value.shape[1] == 1:
-        return value if columns.size == 1 else value[:, np.zeros(columns.size, dtype=int)]
-    return value[:, columns]
+    return widen(value, columns.size) if _size(value) == 1 else value[:, columns]
 
 
 def join_columns(values: Sequence[Value]) -> Value:
@@ -121,21 +124,16 @@ class AffineForm(Operand):
 
     def scale(self, factor: Value) -> AffineForm:
         """Return the forms times numbers."""
-        form = _widen(self, _size(factor))
+        form = widen(self, _size(factor))
         return AffineForm(
             form.constant * factor, form.owner, form.position, form.coefficient * take_columns(factor, form.owner)
         )
 
 
-def _widen(value: Value, count: int) -> Value:
-    """Return a value of one column as one of ``count``."""
-    return value[:, np.zeros(count, dtype=int)] if _size(value) == 1 and count > 1 else value
-
-
 def _add_forms(left: Value, right: Value) -> AffineForm:
     a, b = AffineForm.of(left), AffineForm.of(right)
     count = max(_size(a), _size(b))
-    a, b = _widen(a, count), _widen(b, count)
+    a, b = widen(a, count), widen(b, count)
     return AffineForm(
         a.constant + b.constant,
         np.concatenate([a.owner, b.owner]),
@@ -155,10 +153,11 @@ def _multiply_forms(left: Value, right: Value) -> Value:
     return form.scale(factor)
 
 
-def _divide_form(left: Value, right: Value) -> AffineForm:
-    if isinstance(right, AffineForm):
-        raise InputError("a decision stands in a divisor; a row is affine in the decisions")
-    return left.scale(1.0 / right)  # type: ignore[no-any-return]
+def _divide(left: Value, right: Value) -> Value:
+    """Return a form or a cost divided by numbers."""
+    if isinstance(right, AffineForm | ConvexCost):
+        raise InputError("a decision stands in a divisor")
+    return left.scale(1.0 / right)
 
 
 def _raise_form(left: Value, right: Value) -> Value:
@@ -207,8 +206,8 @@ class ConvexCost(Operand):
     def of_product(left: AffineForm, right: AffineForm) -> ConvexCost:
         """Return the products of forms."""
         count = max(_size(left), _size(right))
-        is_square, left = right is left, _widen(left, count)
-        right = left if is_square else _widen(right, count)
+        is_square, left = right is left, widen(left, count)
+        right = left if is_square else widen(right, count)
         products = Products(np.arange(count), np.ones(count), left, right)
         return ConvexCost(AffineForm.of(np.zeros((1, count))), (products,))
 
@@ -240,8 +239,8 @@ class ConvexCost(Operand):
 
     def scale(self, factor: Array) -> ConvexCost:
         """Return the costs times numbers."""
-        cost = _widen(self, _size(factor))
-        weights = _widen(factor, _size(cost))[0]
+        cost = widen(self, _size(factor))
+        weights = widen(factor, _size(cost))[0]
         return ConvexCost(
             cost.affine.scale(factor),
             tuple(replace(block, weight=block.weight * weights[block.owner]) for block in cost.products),
@@ -252,7 +251,7 @@ class ConvexCost(Operand):
 def _add_costs(left: Value, right: Value) -> ConvexCost:
     a, b = ConvexCost.of(left), ConvexCost.of(right)
     count = max(_size(a), _size(b))
-    a, b = _widen(a, count), _widen(b, count)
+    a, b = widen(a, count), widen(b, count)
     return ConvexCost(_add_forms(a.affine, b.affine), a.products + b.products, a.absolutes + b.absolutes)
 
 
@@ -263,18 +262,12 @@ def _multiply_cost(left: Value, right: Value) -> ConvexCost:
     return cost.scale(factor)
 
 
-def _divide_cost(left: Value, right: Value) -> ConvexCost:
-    if isinstance(right, Operand):
-        raise InputError("a decision stands in a divisor")
-    return left.scale(1.0 / right)  # type: ignore[no-any-return]
-
-
 ConvexCost.operations = {
     np.add: _add_costs,
     np.subtract: lambda left, right: _add_costs(left, np.negative(right)),
     np.negative: lambda cost: cost.scale(np.full((1, 1), -1.0)),
     np.multiply: _multiply_cost,
-    np.true_divide: _divide_cost,
+    np.true_divide: _divide,
 }
 
 AffineForm.operations = {
@@ -282,7 +275,7 @@ AffineForm.operations = {
     np.subtract: lambda left, right: _add_forms(left, np.negative(right)),
     np.negative: lambda form: form.scale(np.full((1, 1), -1.0)),
     np.multiply: _multiply_forms,
-    np.true_divide: _divide_form,
+    np.true_divide: _divide,
     np.power: _raise_form,
     np.absolute: ConvexCost.of_absolute,
 }

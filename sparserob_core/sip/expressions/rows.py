@@ -94,10 +94,8 @@ class ExpressionRows:
         """
         space = taylor_space(self.dimension, DEGREES.get(self.dimension, 2))
         bounds, split = np.full(len(lower), -np.inf), (upper - lower).argmax(axis=1)
-        size, decision = (
-            max(1, MAX_NUMBERS // (space.products[0].size * (x.size + 1))),
-            CellModels.constant(space, x[None]),
-        )
+        size = max(1, MAX_NUMBERS // (space.products[0].size * (x.size + 1)))
+        decision = CellModels.constant(space, x[None])
         for row in self.rows:
             for start in range(0, len(lower), size):
                 part = slice(start, start + size)

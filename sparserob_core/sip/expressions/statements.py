@@ -23,6 +23,7 @@ from sparserob_core.sip.expressions.forms import (
     add_columns,
     join_columns,
     take_columns,
+    widen,
 )
 
 CHEBYSHEV = "chebyshev"
@@ -370,9 +371,7 @@ class _Statement(Parser):
                 owner = owner[turn_owner]
             if not owner.size:
                 return np.zeros((1, count))
-            value = body(scope)
-            value = value if value.shape[1] == owner.size else value[:, np.zeros(owner.size, dtype=int)]
-            return add_columns(value, owner, count)
+            return add_columns(widen(body(scope), owner.size), owner, count)
 
         return evaluate
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from copy import copy
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -93,6 +93,14 @@ def rows_at(
     form = constraints.formulation
     cuts = tuple(Cut(family, indices[i], int(r), formulation=form) for i, r in zip(where, row_numbers, strict=True))
     return Rows(np.asarray(G, dtype=float), np.asarray(h, dtype=float), cuts)
+
+
+def rows_of(program: SemiInfiniteProgram, groups: Iterable[tuple[Array, np.ndarray, str]]) -> Rows:
+    """Return the constraints of several groups: indices ``(k, d)``, a row ``(k,)`` for each, and a family."""
+    rows = Rows.none(program.n)
+    for indices, numbers, family in groups:
+        rows = rows.joined(rows_at(program, family, indices, numbers))
+    return rows
 
 
 @dataclass(frozen=True, eq=False)

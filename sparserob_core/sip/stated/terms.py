@@ -65,9 +65,8 @@ class StatedObjective:
         """Return the terms of a parsed cost; products with numbers, and absolute values of numbers, are affine."""
         distinct: dict[object, AffineFunction] = {}
 
-        def list_terms(
-            form: AffineForm,
-        ) -> list[AffineFunction]:  # functions that are equal are one, however they are written
+        def list_terms(form: AffineForm) -> list[AffineFunction]:
+            """Return the functions of a form; equal ones are one, however they are written."""
             return [distinct.setdefault(term.key, term) for term in AffineFunction.list_terms(form)]
 
         linear = AffineFunction.list_terms(cost.affine)[0]

@@ -45,6 +45,12 @@ class Prover(Protocol):
     def __call__(self, x: Array, cells: int = CELLS) -> Sequence[Proof]: ...
 
 
+class Close(Protocol):
+    """Exchange that closes the gap of a program, from constraints that are imposed at the start."""
+
+    def __call__(self, program: SemiInfiniteProgram, tools: Tools, prover: Prover, start: Violated = ()) -> Result: ...
+
+
 Found: TypeAlias = Sequence[tuple[ConstraintFamily, Separation]]
 
 
@@ -176,17 +182,8 @@ class Ledger:
         if self.program.lengths is not None:
             return 0.0
         excused = {proof.family: max(proof.bound, 0.0) for proof in proofs if proof.verdict == "proven"}
-        return sum(cut.multiplier * excused.get(cut.family, 0.0) for cut in self.dual.cuts) + self._price_rows(x)
-
-    def _price_rows(self, x: Array) -> float:
-        """Return the same for the rows and equalities without an index, at ``x (n,)``."""
-        base, dual = self.program.finite, self.dual
-        if dual.mu.size != base.b.size or dual.fixed.size not in (0, base.h.size):
-            return 0.0
-        fixed = dual.fixed if dual.fixed.size else np.zeros(base.h.size)
-        used = fixed > 0.0
-        over = np.maximum(base.G[used] @ x - base.h[used], 0.0)
-        return float(fixed[used] @ over + np.abs(dual.mu) @ np.abs(base.A @ x - base.b))
+        price = sum(cut.multiplier * excused.get(cut.family, 0.0) for cut in self.dual.cuts)
+        return price + _price_residuals(self.program.finite, self.dual, x)
 
     def tell(self, number: int, answer: CheckedAnswer, found: Found, upper: float, kept: int) -> None:
         """Record a round, and send its event.
@@ -501,10 +498,7 @@ def alarm(program: SemiInfiniteProgram, dual: Dual, x: Array) -> str:
         allowed += float(
             np.abs(dual.z) @ np.minimum(violations, TOLERANCE * _choose_units(base.lower, base.upper) + rounding)
         )
-    if dual.mu.size:
-        allowed += float(np.abs(dual.mu) @ np.abs(base.A @ x - base.b))
-    if dual.fixed.size:
-        allowed += float(dual.fixed @ np.maximum(base.G @ x - base.h, 0.0))
+    allowed += _price_residuals(base, dual, x)
     if dual.bound - cost <= allowed:
         return ""
     unit = program.cost_unit
@@ -513,6 +507,16 @@ def alarm(program: SemiInfiniteProgram, dual: Dual, x: Array) -> str:
         f" by more than the {allowed * unit:.1e} that the tolerances of the proofs allow: one of the two is wrong, and"
         f" neither is claimed; {ADVICE}"
     )
+
+
+def _price_residuals(base: FiniteProgram, dual: Dual, x: Array) -> float:
+    """Return what the residuals of fixed rows and equalities at ``x (n,)`` are worth, by their multipliers."""
+    price = 0.0
+    if dual.mu.size:
+        price += float(np.abs(dual.mu) @ np.abs(base.A @ x - base.b))
+    if dual.fixed.size:
+        price += float(dual.fixed @ np.maximum(base.G @ x - base.h, 0.0))
+    return price
 
 
 def _measure_bound_violations(base: FiniteProgram, x: Array) -> tuple[Array, Array]:

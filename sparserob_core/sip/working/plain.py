@@ -5,9 +5,8 @@ Idle rows are dropped. The relaxed program is solved with a regulariser whose we
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from typing import TypeAlias, final
+from typing import final
 
 import numpy as np
 
@@ -18,11 +17,11 @@ from sparserob_core.sip.inner.vertex import MANY, vertex
 from sparserob_core.sip.method import Tools
 from sparserob_core.sip.program import SemiInfiniteProgram
 from sparserob_core.sip.proof.verdict import worst_of
-from sparserob_core.sip.relaxed.relaxed import Rows, rows_at
+from sparserob_core.sip.relaxed.relaxed import Rows, rows_at, rows_of
 from sparserob_core.sip.result import Result
 from sparserob_core.sip.separation.separation import separate
 from sparserob_core.sip.working.counting import count, met, tidied
-from sparserob_core.sip.working.ledger import ALLOWED, CheckedAnswer, Found, Ledger, Prover, Violated, above
+from sparserob_core.sip.working.ledger import ALLOWED, CheckedAnswer, Close, Found, Ledger, Prover, Violated, above
 from sparserob_core.sip.working.working import LargestViolation, Working, fits
 
 # Number of rounds without a multiplier after which a row is dropped. With 1, rows are dropped and imposed in turn; with
@@ -36,8 +35,6 @@ DROPPING_ROUNDS = 40
 FASTEST = 1 / 8
 CRUDE = 1e-4  # residual and relative gap of a relaxed solution that is accurate enough for a round
 SPARSIFYING = 60  # number of rounds after which no vertex is sought
-
-Close: TypeAlias = Callable[[SemiInfiniteProgram, Tools, Prover], Result]  # an exchange that closes the gap
 
 
 @final
@@ -106,15 +103,15 @@ class PlainRows(Working):
         Without enough rows the cost may fall without bound. Then rows that prevent this are imposed, where there are
         any.
         """
-        from sparserob_core.sip.working.unbounded import bounding_rows, falls_for_ever, first_rows
-
         base = self.program.finite
         if not self.size and base.S is None and base.P is None and not base.bounded:
-            self.impose(first_rows(self.program))
+            self._impose_first_rows()
         answer = self._solve_regularised(ledger)
         while answer.solution.status == "failed" and not usable(answer.solution) and not last:
+            from sparserob_core.sip.working.unbounded import bounding_rows, falls_for_ever
+
             self.sheds = self.sheds and not self.size  # a dropped row may be the one that bounds the program
-            if self.impose(first_rows(self.program)):
+            if self._impose_first_rows():
                 answer = self._solve_regularised(ledger)
                 continue
             assert self.close is not None
@@ -125,6 +122,12 @@ class PlainRows(Working):
                 break
             answer = self._solve_regularised(ledger)
         return answer if usable(answer.solution) else ledger.without(answer)
+
+    def _impose_first_rows(self) -> int:
+        """Impose the rows that usually bound a program without bounds; return the number of new rows."""
+        from sparserob_core.sip.working.unbounded import first_rows
+
+        return self.impose(first_rows(self.program))
 
     def _solve_regularised(self, ledger: Ledger) -> CheckedAnswer:
         """Return the optimum of the relaxed program with decreasing weights of the regulariser.
@@ -212,15 +215,15 @@ class PlainRows(Working):
 
     def _find_new_rows(self, violated: Violated) -> Rows:
         """Return the rows of violated constraints that are not imposed."""
-        keys, fresh = {(cut.family, cut.row, cut.index.tobytes()) for cut in self.rows.cuts}, Rows.none(self.program.n)
+        keys = {(cut.family, cut.row, cut.index.tobytes()) for cut in self.rows.cuts}
+        fresh: list[tuple[Array, np.ndarray, str]] = []
         for indices, rows, family in violated:
             is_new = np.array(
                 [(family, int(r), i.tobytes()) not in keys for i, r in zip(indices, rows, strict=True)],
                 dtype=bool,
             )
-            if is_new.any():
-                fresh = fresh.joined(rows_at(self.program, family, indices[is_new], rows[is_new]))
-        return fresh
+            fresh.append((indices[is_new], rows[is_new], family))
+        return rows_of(self.program, fresh)
 
     def priced(self, answer: CheckedAnswer) -> float:
         """Return the increase of an answer's cost when all rows are moved by 1 along their normals, to first order."""

@@ -27,8 +27,17 @@ from sparserob_core.sip.relaxed.relaxed import Rows
 from sparserob_core.sip.result import Result
 from sparserob_core.sip.separation.separation import separate
 from sparserob_core.sip.solver import AccountedSolver
-from sparserob_core.sip.working.ledger import ALLOWED, CheckedAnswer, Found, Ledger, Prover, Violated, above, unproven
-from sparserob_core.sip.working.plain import Close
+from sparserob_core.sip.working.ledger import (
+    ALLOWED,
+    CheckedAnswer,
+    Close,
+    Found,
+    Ledger,
+    Prover,
+    Violated,
+    above,
+    unproven,
+)
 from sparserob_core.sip.working.tightening import GLANCE, SPARED
 from sparserob_core.sip.working.working import LargestViolation, Working, size_of
 

@@ -9,9 +9,8 @@ program too.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
-from typing import TypeAlias
 
 import numpy as np
 
@@ -21,12 +20,11 @@ from sparserob_core.sip.evidence import Cut, Dual
 from sparserob_core.sip.inner.vertex import simplex
 from sparserob_core.sip.method import Tools
 from sparserob_core.sip.program import ConstraintFamily, SemiInfiniteProgram
-from sparserob_core.sip.relaxed.relaxed import Rows, rows_at
+from sparserob_core.sip.relaxed.relaxed import rows_of
 from sparserob_core.sip.result import Result, Status
 from sparserob_core.sip.separation.separation import separate
-from sparserob_core.sip.working.ledger import ALLOWED, Ledger, Prover, Violated, above, unproven
+from sparserob_core.sip.working.ledger import ALLOWED, Close, Ledger, Prover, Violated, above, unproven
 
-Close: TypeAlias = Callable[..., Result]  # an exchange that closes the gap of (program, tools, prover, start)
 SPENT = 1e-12  # of a bound: what it loses for multipliers of rows without one; ten times less is lost in rounding
 NO_FALL = 1e-12  # of the largest coefficient: fall of the cost per unit of a direction that is certainly rounding
 ROUNDS = 200  # of collecting rows that bound a program; a fifth serve quadratic forms in three coordinates
@@ -102,8 +100,8 @@ def first_rows(program: SemiInfiniteProgram) -> list[tuple[Array, np.ndarray, st
         lines = [share if i in free_axes else np.zeros(1) for i in range(box.dimension)]
         unit = np.stack(np.meshgrid(*lines, indexing="ij"), axis=-1).reshape(-1, box.dimension)
         indices = np.clip(box.lower + unit * (box.upper - box.lower), box.lower, box.upper)
-        count = family.violations(np.zeros(program.n), indices[:1]).shape[1]
-        rows.append((np.repeat(indices, count, axis=0), np.tile(np.arange(count), len(indices)), family.name))
+        each = family.violations(np.zeros(program.n), indices[:1]).shape[1]
+        rows.append((np.repeat(indices, each, axis=0), np.tile(np.arange(each), len(indices)), family.name))
     return rows
 
 
@@ -152,9 +150,7 @@ def _collect_rows(
     chosen = list(start)
     if recession.finite.blocks is not None:
         return chosen, False
-    rows = Rows.none(recession.n)
-    for indices, numbers, name in chosen:
-        rows = rows.joined(rows_at(recession, name, indices, numbers))
+    rows = rows_of(recession, chosen)
     for number in range(ROUNDS):
         tools.deadline.check()
         base = recession.finite
@@ -167,8 +163,7 @@ def _collect_rows(
         fresh = [entry for entry in violated if entry[1].size]
         if not fresh:
             return chosen, False
-        for indices, numbers, name in fresh:
-            rows = rows.joined(rows_at(recession, name, indices, numbers))
+        rows = rows.joined(rows_of(recession, fresh))
         chosen += fresh
     return chosen, False
 
@@ -196,14 +191,12 @@ def complete_multipliers(program: SemiInfiniteProgram, dual: Dual, is_priced: bo
         free &= curvature == 0.0
     if not free.any() or dual.mu.size != base.b.size:
         return dual
-    own = rows_of(program, dual.cuts)
-    fixed = dual.fixed if dual.fixed.size else np.zeros(base.h.size)
+    own_cuts = sorted(dual.cuts, key=lambda cut: cut.family)
+    own, fixed = rows_of(program, _group_by_family(own_cuts)), dual.of_fixed_rows(base.h.size)
     used = np.vstack([own.G, base.G[fixed > 0.0], base.A])[:, free]
     if np.linalg.matrix_rank(used) == int(free.sum()):
         return dual
-    rows = own
-    for indices, numbers, name in first_rows(program):
-        rows = rows.joined(rows_at(program, name, indices, numbers))
+    rows = own.joined(rows_of(program, first_rows(program)))
     finite = np.isfinite(base.h)
     table = np.vstack([rows.G, base.G[finite]])
     right, count = np.concatenate([rows.h, base.h[finite]]), len(table)
@@ -231,20 +224,12 @@ def complete_multipliers(program: SemiInfiniteProgram, dual: Dual, is_priced: bo
     size = abs(dual.bound) if is_priced else float(sum(cut.multiplier for cut in dual.cuts))
     loss = float(np.abs(added) @ np.abs(right) + np.abs(moved) @ np.abs(base.b)) or 1.0
     share = SPENT * (size or 1.0) / loss
-    y = np.concatenate([[cut.multiplier for cut in dual.cuts], np.zeros(rows.h.size - own.h.size)])
+    y = np.concatenate([[cut.multiplier for cut in own_cuts], np.zeros(rows.h.size - own.h.size)])
     y = y + share * added[: rows.h.size]
     fixed = fixed.copy()
     fixed[finite] += share * added[rows.h.size :]
     cuts = tuple(replace(cut, multiplier=float(value)) for cut, value in zip(rows.cuts, y, strict=True))
     return replace(dual, cuts=cuts, fixed=fixed, mu=dual.mu + share * moved)
-
-
-def rows_of(program: SemiInfiniteProgram, cuts: Sequence[Cut]) -> Rows:
-    """Return the rows of cuts, in their order."""
-    rows = Rows.none(program.n)
-    for cut in cuts:
-        rows = rows.joined(rows_at(program, cut.family, cut.index[None], np.array([cut.row])))
-    return rows
 
 
 def _group_by_family(cuts: Sequence[Cut]) -> list[tuple[Array, np.ndarray, str]]:
