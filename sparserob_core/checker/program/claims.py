@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any, final
 
 import numpy as np
@@ -12,16 +13,16 @@ from flint import arb, ctx
 from sparserob_core.checker.arithmetic.balls import above, ball, below, largest
 from sparserob_core.checker.claims.case import listed, number, shaped
 from sparserob_core.checker.claims.claims import PRECISION, SMALL_COST, SMALL_GAP, judged
-from sparserob_core.checker.outcome import FIGURES, TOLERANCE, Broken, Clock, Finding, Unchecked
+from sparserob_core.checker.outcome import EQUALITY, FIGURES, TOLERANCE, Broken, Clock, Finding, Unchecked
 from sparserob_core.checker.program.bound import Lagrangian, WeightedRow, row_of_term
 from sparserob_core.checker.program.rows import bound_violation, coefficients_at, evaluate_row
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.expressions.rows import ExpressionRows
+from sparserob_core.sip.expressions.statements import StatedRow
 from sparserob_core.sip.stated.statement import StatedProgram
 from sparserob_core.sip.stated.terms import AffineFunction
 
 CLAIMS = ("certified", "verified")
-EQUALITY = 1e-12  # of the terms of an equality: the largest residual that double precision may leave
 
 
 @final
@@ -42,7 +43,7 @@ class ProgramCase:
         """Status that the certificate claims."""
         return str(self.certificate.get("status"))
 
-    @property
+    @cached_property
     def decision(self) -> Array:
         """The decision, of which the entries after the named ones are `StatedProgram.residuals`."""
         return shaped(self.certificate, "decision", (self.program.decisions.n,))
@@ -53,6 +54,17 @@ class ProgramCase:
             if family_name == name:
                 return rows
         raise Broken(f"the program has no family {name!r}")
+
+    def locate(self, entry: Mapping[str, Any]) -> tuple[ExpressionRows, StatedRow, Array]:
+        """Return the family, the row and the index that an entry of the certificate names; raise `Broken` where there
+        are none."""
+        family, place = self.family(entry.get("family")), entry.get("row")
+        if type(place) is not int or not 0 <= place < len(family.rows):
+            raise Broken(f"the family {entry.get('family')!r} has no row {place!r}")
+        index = shaped(entry, "index", (family.dimension,))
+        if (index < family.lower).any() or (index > family.upper).any():
+            raise Broken(f"the index {index.tolist()} is outside of the index set")
+        return family, family.rows[place], index
 
 
 def check_program(case: ProgramCase, gap_tolerance: float | None) -> list[Finding]:
@@ -118,16 +130,10 @@ def _list_rows(case: ProgramCase) -> tuple[list[WeightedRow], Array | None]:
     for entry in listed(data, "constraints"):
         if not isinstance(entry, Mapping):
             raise Broken("constraints: expected a list of multipliers with their families and indices")
-        family = case.family(entry.get("family"))
-        place, multiplier = entry.get("row"), number(entry, "multiplier")
-        if type(place) is not int or not 0 <= place < len(family.rows):
-            raise Broken(f"the family {entry.get('family')!r} has no row {place!r}")
+        (family, row, index), multiplier = case.locate(entry), number(entry, "multiplier")
         if multiplier < 0.0:
             raise Broken(f"a multiplier is {multiplier!r}, expected a number that is not negative")
-        index = shaped(entry, "index", (family.dimension,))
-        if (index < family.lower).any() or (index > family.upper).any():
-            raise Broken(f"the index {index.tolist()} is outside of the index set")
-        coefficients, constant = coefficients_at(family, family.rows[place], index, n)
+        coefficients, constant = coefficients_at(family, row, index, n)
         rows.append(WeightedRow(coefficients, constant, ball(multiplier)))
     inequalities = [term for term, is_equality in program.finite_terms if not is_equality]
     equalities = [term for term, is_equality in program.finite_terms if is_equality] + program.definitions
@@ -219,17 +225,11 @@ def _verify_witness(case: ProgramCase) -> str:
     witness = case.certificate.get("witness")
     if not isinstance(witness, Mapping):
         raise Broken("there is no witness")
-    family = case.family(witness.get("family"))
-    place = witness.get("row")
-    if type(place) is not int or not 0 <= place < len(family.rows):
-        raise Broken(f"the family has no row {place!r}")
-    index = shaped(witness, "index", (family.dimension,))
-    if (index < family.lower).any() or (index > family.upper).any():
-        raise Broken(f"the index {index.tolist()} is outside of the index set")
-    violation = evaluate_row(family, family.rows[place], case.decision, index)
+    family, row, index = case.locate(witness)
+    violation = evaluate_row(family, row, case.decision, index)
     if not violation > TOLERANCE:
         raise Broken(f"the witness violates its row by {float(violation):.3g}")
-    return f"{family.rows[place].text!r} is violated by {below(violation):.3g} at {index.tolist()}"
+    return f"{row.text!r} is violated by {below(violation):.3g} at {index.tolist()}"
 
 
 def _verify_status(case: ProgramCase, gap_tolerance: float | None, claims: list[Finding]) -> str:

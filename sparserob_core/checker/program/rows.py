@@ -38,7 +38,7 @@ def bound_violation(rows: ExpressionRows, row: StatedRow, x: Array, limit: float
     """
     work, worst = [(rows.lower, rows.upper, 0)], -np.inf
     frame = _make_frame(rows.dimension)
-    decision = np.array([frame.number(ball(value)) for value in x] or [frame.number(ball(0.0))], dtype=object)
+    decision = np.array([frame.number(ball(value)) for value in x], dtype=object)
     for number in count():
         if not work:
             return worst
@@ -57,10 +57,9 @@ def bound_violation(rows: ExpressionRows, row: StatedRow, x: Array, limit: float
         axis = int(shares.argmax())
         if not lower[axis] < middle[axis] < upper[axis]:
             raise Unchecked(f"no cell around the index {middle.tolist()} is short enough for {row.text!r}")
-        for side, corner in ((0, middle[axis]), (1, middle[axis])):
-            low, high = lower.copy(), upper.copy()
-            (high if side == 0 else low)[axis] = corner
-            work.append((low, high, sharpened))
+        low, high = lower.copy(), upper.copy()
+        high[axis] = low[axis] = middle[axis]
+        work += [(lower, high, sharpened), (low, upper, sharpened)]
     return worst
 
 

@@ -107,10 +107,9 @@ def check(directory: GivenRun, plugins: Iterable[str | Path] = (), seconds: floa
         raise InputError(f"{path}: expected the directory of a finished run, got one without certificate.json")
     data, summary = read_json(path / "certificate.json"), read_json(path / "result.json")
     loaded = stored.config(plugins)
-    stated = problem_of(loaded)
-    if isinstance(stated, SemiInfiniteProgram):
-        return _check_program(stored, loaded, stated, data, summary, clock, started)
-    problem = stated
+    problem = problem_of(loaded)
+    if isinstance(problem, SemiInfiniteProgram):
+        return _check_program(stored, loaded, problem, data, summary, clock, started)
     control, disturbance = dictionaries_of(loaded, problem.horizon)
     policy = _find_policy(loaded, data, control, problem.measurements)
     title = loaded.config.title or path.name
