@@ -224,8 +224,10 @@ def test_errors_at_one_parameter_and_over_cells_are_those_of_the_plant_there() -
             excess.append((bound - truth).max())
         most.append(max(excess))
         excess.clear()
-    # at a corner only what polynomials in the time are off by is left, once for each coefficient on the cell
-    left = float(support.every.execution.kernel.error.max()) * leg.space.size
+    # at a corner only what polynomials in the time are off by is left, in each second of a row, once for each
+    # coefficient on the cell
+    per_second = np.abs(rows).sum(axis=1).max() * support.every.execution.kernel.errors.max()
+    left = float(per_second * times.max()) * leg.space.size
     assert most[0] < 1e-3 and most[2] < left < 1e-10
     seen = execution.extend_directions(np.tile(rows, (4, 1)), np.tile([0.03, 0.01], (8, 1)))
     found = execution.added(control, np.repeat(times, 2), seen).reshape(4, 2)

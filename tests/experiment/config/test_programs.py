@@ -94,8 +94,9 @@ def test_every_command_takes_the_run_of_a_program_or_refuses_it_in_one_sentence(
     assert command("check", "out").returncode == 0
     compared = command("compare", "out", "out")
     assert compared.returncode == 0, compared.stderr
+    drawn = command("figures", "out")
+    assert drawn.returncode == 0 and "slacks" in drawn.stdout
     for arguments in (
-        ["figures", "out"],
         ["simulate", "out"],
         ["bound", "out"],
         ["bound", config],
