@@ -132,6 +132,27 @@ class _Case:
         return None
 
 
+@dataclass
+class _TranslatedCase(_Case):
+    """State of the same call in ``easier`` variables: answers are judged by what they are worth in those of the
+    ``outer`` program, whose bounds are tighter where a variable has none."""
+
+    outer: FiniteProgram | None = None
+    easier: NewVariables | None = None
+
+    def judge(self, solution: FiniteSolution, name: str, by: str = "") -> FiniteSolution | None:
+        assert self.outer is not None and self.easier is not None
+        worth = _measure_translated(self.outer, self.easier, solution)
+        lower, gap = worth.lower_bound, worth.gap
+        return super().judge(replace(solution, lower_bound=lower, gap=gap, residual=worth.residual), name, by)
+
+
+def _measure_translated(program: FiniteProgram, easier: NewVariables, solution: FiniteSolution) -> FiniteSolution:
+    """Return a solution in easier variables as one of the ``program``, with its value and its bound."""
+    x, mu = easier.back(solution.x), easier.equality_prices(solution)
+    return measure(program, x, solution.y, mu, easier.dual(solution.z), solution.message)
+
+
 def solve_finite(
     program: FiniteProgram,
     solver: Solver,
@@ -413,18 +434,19 @@ def _refine_digits(case: _Case, claim: Claim | None) -> FiniteSolution | None:
 def _solve_in_new_variables(case: _Case, easier: NewVariables, guess: FiniteSolution | None) -> FiniteSolution | None:
     """Return the answer found in easier variables, checked in those of the program."""
     program = case.program
-    start = guess if guess is None or guess.x.size != program.n else replace(guess, x=easier.to(guess.x))
-    inner = _Case(easier.program, case.solver, case.tolerance, case.small)
+    fits = guess is not None and guess.x.size == program.n and guess.mu.size == program.b.size
+    start = easier.translate(guess) if guess is not None and fits and guess.y.size == program.h.size else guess
+    inner = _TranslatedCase(easier.program, case.solver, case.tolerance, case.small, outer=program, easier=easier)
     easier.program.validate()
     solution = _solve_case(inner, start)
     case.crude = inner.crude
     case.attempts += inner.attempts
     case.lost = inner.lost
-    x = easier.back(solution.x)
     if solution.status == "infeasible":
-        proof = _check_proof(case, (x, solution.y, solution.mu, None), "the program in other variables")
+        x, mu = easier.back(solution.x), easier.equality_prices(solution)
+        proof = _check_proof(case, (x, solution.y, mu, None), "the program in other variables")
         return proof if proof is None else replace(proof, by=solution.by)
-    measured = measure(program, x, solution.y, solution.mu, easier.dual(solution.z), solution.message)
+    measured = _measure_translated(program, easier, solution)
     return case.judge(replace(measured, by=solution.by), "new variables") or case.blunt
 
 

@@ -228,9 +228,15 @@ class RelaxedProgram:
         self, rows: Rows, epsilon: float, margin: float = 0.0, guess: FiniteSolution | None = None
     ) -> FiniteSolution:
         """Solve with all of these rows at once, each tightened by ``margin`` times its norm; ``guess`` is a solution
-        with the same rows."""
+        with the same rows. The decision is settled, where the program has a way to do that."""
         h = rows.h - margin * rows.norms if margin else rows.h
-        return self._solve_rows(rows.G, h, epsilon, guess)
+        solution, settle = self._solve_rows(rows.G, h, epsilon, guess), self.program.settle
+        if settle is None or solution.status == "infeasible":
+            return solution
+        x, finite = settle(solution.x), self.finite(rows.G, h, epsilon)
+        value = finite.objective(x)
+        residual, gap = finite.residual(x), value - solution.lower_bound
+        return replace(solution, x=x, value=value, residual=residual, gap=gap)
 
     def lower_bound(self, rows: Rows, solution: FiniteSolution) -> Dual:
         """A lower bound of the *unregularised* semi-infinite program, from the multipliers of any solution with these
