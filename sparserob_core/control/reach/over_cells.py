@@ -61,7 +61,7 @@ class FunctionalsOverCells:
             elif response.grid.varying:
                 legs = (VaryingMotion(response.propagator, response.initial_state),)
             else:
-                legs = lift_legs(response.system, response.grid, response.initial_state, *cell)
+                legs = lift_legs(response, *cell)
             remember(self._cached_phases, key, legs, LEGS_KEPT)
         return self._cached_phases[key]
 

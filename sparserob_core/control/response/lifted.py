@@ -42,7 +42,8 @@ from sparserob_core.control.enclosures.decoupling import (
 )
 from sparserob_core.control.enclosures.flows import Flows
 from sparserob_core.control.problem.phase import Phase
-from sparserob_core.control.problem.system import LinearSystem, System
+from sparserob_core.control.problem.system import LinearSystem
+from sparserob_core.control.response.orbit import Orbit
 from sparserob_core.control.response.response import TINY, Response, TimeGrid
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.expressions.rounding import rounding
@@ -100,7 +101,7 @@ class LiftedSystem:
     ``A (M, d, d)``, ``B (M, d, m)``, ``W (M, d, mw)`` are the coefficients. ``slack_A (q, q)``, ``slack_B (q, m)``,
     ``slack_W (q, mw)``, ``slack_x (q,)`` bound, block by block, the remainders of these and of ``initial_state``.
     ``past``: for a later phase of a switched system, the phase before it, at whose end this one begins; time 0 is then
-    there.
+    there. ``orbit``: the states at the breakpoints, of a plant that grows by much.
     """
 
     space: TaylorSpace
@@ -115,6 +116,7 @@ class LiftedSystem:
     slack_W: Array
     slack_x: Array
     past: Past | None = None
+    orbit: Orbit | None = None
 
     @property
     def first(self) -> int:
@@ -196,7 +198,7 @@ class LiftedSystem:
         """First piece of the fine grid in every span, ``(S,)``. Remainders are bounded span by span. For a known
         system, whose remainder is rounding only, a span may be many pieces on which the system moves little."""
         pieces = self.fine.pieces
-        if self.space.nu or pieces < 4 * SPANS:
+        if self.space.nu or self.orbit is not None or pieces < 4 * SPANS:
             return np.arange(pieces)
         growth = float(np.abs(np.linalg.eigvals(self.comparison.rising)).max()) * float(self.fine.lengths.max())
         count = int(max(1.0, min(pieces // SPANS, SHORT / max(growth, TINY))))
@@ -393,7 +395,8 @@ class LiftedSystem:
         forcing_norms, drive = block_norms((size @ inputs).T, self.starts), (self.slack_B @ inputs).T[None]
         begin = block_norms(nodes[:, :-1], self.starts).sum(axis=2)
         residual = self._bound_residual(sizes, rows=False) + drive
-        neglected, bounds, _ = self._bound_error(begin, forcing_norms, residual, slack, rows=False)
+        errors = None if self.orbit is None else self._transform_orbit(self.orbit, control)[1][None]
+        neglected, bounds, _ = self._bound_error(begin, forcing_norms, residual, slack, rows=False, ends=errors)
         first = self.ends[:-1]
         remainders: Array = np.maximum.reduceat(neglected[0], first, axis=0)
         return remainders, np.maximum.reduceat(sizes[0].sum(axis=1), first, axis=0), bounds[0, -1]
@@ -423,6 +426,9 @@ class LiftedSystem:
             capacity = max(1, min(PATHS_KEPT, PATHS_SIZE // ((self.fine.pieces + 1) * self.matrix.shape[0])))
             while len(self._path_cache) >= capacity:  # before the new one is made: either may be large
                 self._path_cache.pop(next(iter(self._path_cache)))
+            if self.orbit is not None:
+                self._path_cache[key] = self._transform_orbit(self.orbit, control)[0][:, None]
+                return self._path_cache[key]
             forward = self.forward
             if self.past is not None:
                 final_coefficients = self.past.lifted.nodes(control)[-1]
@@ -430,6 +436,15 @@ class LiftedSystem:
             states = forward.states(control, KNOWN)[0]
             self._path_cache[key] = states.reshape(-1, self.space.size, self.states)
         return self._path_cache[key]
+
+    def _transform_orbit(self, orbit: Orbit, control: Array) -> tuple[Array, Array]:
+        """Return the states of an orbit in the coordinates of this system, ``(L+1, d)``, and norm bounds ``(L+1, q)``
+        of their errors."""
+        states, errors = orbit.states(control)
+        coordinates, rounded = self.decoupling.vector(states.T)
+        size = np.abs(self.decoupling.inverse).astype(float)
+        errors = rounded + (np.eye(size.shape[0]) + self.decoupling.defect) @ size @ errors.T
+        return coordinates.T, block_norms(errors.T, self.starts)
 
     @cached_property
     def _path_cache(self) -> dict[bytes, Array]:
@@ -538,9 +553,10 @@ class LiftedSystem:
         rows: bool,
         jumps: Array | float = 0.0,
         by_age: bool = False,
+        ends: Array | None = None,
     ) -> tuple[Array, Array, Array]:
         """Return bounds of the error by Gronwall's inequality: ``|e|' <= M |e| + residual`` block by block, from
-        ``|e(0)| <= start (r, q)``.
+        ``|e(0)| <= start (r, q)``, or from bounds at the ``ends (r, S+1, q)`` of the spans, where these are known.
 
         The three results are the bounds on the spans, ``(r, S, q)``, the bounds at the ends of the spans, ``(r, S+1,
         q)``, and bounds of the quantity of which ``e`` is the error, ``(r, S, q)``.
@@ -581,7 +597,7 @@ class LiftedSystem:
 
         residual_effect = integral.on(residual)
         increments = residual_effect + end_rounding + np.minimum(end_slips, largest_slips)
-        bounds = growth.summed(np.broadcast_to(start, begin[:, 0].shape), increments)
+        bounds = growth.summed(np.broadcast_to(start, begin[:, 0].shape), increments) if ends is None else ends
         propagated = peak.on(bounds[:, :-1])
         if growth is not flow:
             propagated = propagated + error_gain.on(propagated)
@@ -711,13 +727,12 @@ def lift(phase: Phase, grid: TimeGrid, initial_state: Array, centre: Array, radi
     )
 
 
-def lift_legs(
-    system: System, grid: TimeGrid, initial_state: Array, centre: Array, radius: Array
-) -> tuple[LiftedSystem, ...]:
+def lift_legs(response: Response, centre: Array, radius: Array) -> tuple[LiftedSystem, ...]:
     """Return the lifted systems of the modes of a switched system, each from where it begins; a single one where the
     system does not switch."""
+    system, grid, initial_state = response.system, response.grid, response.initial_state
     if grid.mode is None:
-        return (lift(system.modes[0], grid, initial_state, centre, radius),)
+        return (replace(lift(system.modes[0], grid, initial_state, centre, radius), orbit=response.orbit),)
     lifted_phases: list[LiftedSystem] = []
     for number, mode in enumerate(system.modes):
         lifted = lift(mode, grid.leg(number), initial_state, centre, radius)

@@ -69,7 +69,8 @@ class OpenLoopModel(Acting):
                 families.append(ControlConstraint.of(name, convex, places, control, extra).family())
         if self.formulation == "literal":
             families = [family.literal or family for family in families]
-        return ProgramPart(families=families, activity=np.outer(problem.counts, control.lengths).ravel())
+        activity = np.outer(problem.counts, control.lengths).ravel()
+        return ProgramPart(families=families, activity=activity, settle=_land(posed))
 
     def from_state(self, model: Transcription, posed: Posed) -> Transcription:
         """Return the program of the same problem from another initial state. Everything that does not depend on this
@@ -292,6 +293,20 @@ def slanted(bound: ConvexSet) -> tuple[Array, Array]:
         return np.zeros((0, bound.dimension)), np.zeros(0)
     is_slanted = np.count_nonzero(flat[0], axis=1) > 1
     return flat[0][is_slanted], flat[1][is_slanted]
+
+
+def _land(posed: Posed) -> Callable[[Array], Array] | None:
+    """Return the function that lets a decision meet the fixed final states to the last digits of the control; ``None``
+    where there are none, or where rounding is not amplified."""
+    functionals, (H, values) = posed.functionals, fixed(posed.held)
+    orbit = functionals.response.orbit
+    if orbit is None or not values.size or not posed.control.is_indicators or functionals.execution is not None:
+        return None
+
+    def land(x: Array) -> Array:
+        return orbit.landed(functionals.control(x), H, values).ravel()
+
+    return land
 
 
 def _build_scaled_equalities(posed: Posed) -> tuple[Array, Array]:

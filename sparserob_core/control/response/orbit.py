@@ -1,0 +1,211 @@
+"""States of a known plant at the breakpoints, in more digits than doubles have.
+
+A plant that grows by ``e^18`` over its horizon multiplies what is rounded at the beginning by as much. Where a control
+ends then depends on its last digits. They are followed by balls, whose radii are proven (Johansson 2017, "Arb:
+efficient arbitrary-precision midpoint-radius interval arithmetic", IEEE Trans. Comput. 66).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from fractions import Fraction
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from sparserob_core.control.enclosures.cache import remember
+from sparserob_core.control.problem.system import System
+from sparserob_core.shapes import Float, shaped
+from sparserob_core.sip.convex_set import Array
+
+if TYPE_CHECKING:
+    from flint import arb_mat
+
+    from sparserob_core.control.response.response import TimeGrid
+
+# Logarithm of a growth from which states are followed so: of sixteen digits a plant then keeps fewer than twelve. With
+# half of it plants take longer that lose nothing, with twice as much a certificate is lost at the end of a horizon.
+NOTABLE = 10.0
+BITS, MORE, TRIES = 192, 2, 5  # of a number at first, by what factor there are more, and how often
+SMALL = 2.0**-52  # of the largest state: errors that are rounding
+NEARLY = 1e-6  # of the largest entry of a control: a change that is for more than rounding
+OUTWARD = 1.0 + 2.0**-50  # for what a conversion to a double rounds
+
+
+def growth(matrices: Array, horizon: float) -> float:
+    """Return the exponent of ``e`` by which states can grow over a horizon: the largest real part of an eigenvalue of
+    ``matrices (v, d, d)`` times the horizon; 0 where nothing grows."""
+    return max(0.0, float(np.linalg.eigvals(matrices).real.max()) * horizon)
+
+
+@contextmanager
+def precision(bits: int) -> Iterator[None]:
+    """Compute with so many bits in every number of a ball."""
+    from flint import ctx
+
+    before, ctx.prec = ctx.prec, bits
+    try:
+        yield
+    finally:
+        ctx.prec = before
+
+
+def column(entries: Array) -> arb_mat:
+    """Return exact numbers ``(k,)`` as a column."""
+    from flint import arb, arb_mat
+
+    return arb_mat(entries.size, 1, [arb(entry) for entry in entries.tolist()])
+
+
+@dataclass(frozen=True, eq=False)
+class Orbit:
+    """States of the plant ``x' = A x + B u`` at the breakpoints of a grid, from ``initial_state (d,)``.
+
+    ``A (d, d)`` and ``B (d, m)``, with the columns of constant inputs after those of the control, are exact.
+    """
+
+    A: Array
+    B: Array
+    grid: TimeGrid
+    initial_state: Array
+
+    @staticmethod
+    def of(system: System, grid: TimeGrid, initial_state: Array) -> Orbit | None:
+        """Return the orbit of a plant that grows by ``e`` to the power of `NOTABLE` and more; ``None`` of others.
+
+        Plants with parameters, with phases, or with entries in time have none.
+        """
+        if system.varies or system.parameters is not None or len(system.modes) > 1:
+            return None
+        A, B, _ = (matrices[0] for matrices in system.modes[0].matrices(np.zeros((1, 0))))
+        rates = growth(A[None], float(grid.breakpoints[-1]))
+        return Orbit(A, B, grid, initial_state) if rates >= NOTABLE else None
+
+    @shaped
+    def states(self, control: Float[Array, "m K"]) -> tuple[Float[Array, "points d"], Float[Array, "points d"]]:
+        """Return the states at the breakpoints ``(L + 1, d)`` under a control on its own pieces, and bounds of their
+        errors; remembered for the last control."""
+        key = control.tobytes()
+        if key not in self._states:
+            inputs, bits = self.grid.inputs(control), BITS
+            for _ in range(TRIES):
+                states, errors = self._follow(inputs, bits)
+                if (errors <= SMALL * np.abs(states).max()).all():
+                    break
+                bits *= MORE
+            remember(self._states, key, (states, errors), 1)
+        return self._states[key]
+
+    @cached_property
+    def _states(self) -> dict[bytes, tuple[Array, Array]]:
+        return {}
+
+    def _follow(self, inputs: Array, bits: int) -> tuple[Array, Array]:
+        """Return `states` under ``inputs (m, L)`` on the pieces, with so many bits in every number."""
+        with precision(bits):
+            steps, state = self._compute_steps(bits), column(self.initial_state)
+            path = [state]
+            for length, entries in zip(self._lengths, inputs.T, strict=True):
+                flow, response = steps[length]
+                state = flow * state + response * column(entries)
+                path.append(state)
+            rounded = [[float(entry.mid()) for entry in state.entries()] for state in path]
+            distances = [
+                [float(abs(entry - middle).upper()) for entry, middle in zip(state.entries(), middles, strict=True)]
+                for state, middles in zip(path, rounded, strict=True)
+            ]
+        return np.array(rounded), np.array(distances) * OUTWARD
+
+    @shaped
+    def landed(
+        self, control: Float[Array, "m K"], H: Float[Array, "e d"], values: Float[Array, " e"]
+    ) -> Float[Array, "m K"]:
+        """Return a control whose final state ``x`` has ``H x = values`` as nearly as doubles allow.
+
+        Only entries that are not 0 move, by what rounding may have done to them. The early ones are rounded first, and
+        the later ones make up for that: their last digits move the final state by less. The control itself is returned
+        where more than rounding is missing.
+        """
+        entries = control.T.ravel()  # by pieces
+        moving, landed, most = np.flatnonzero(entries), entries.copy(), NEARLY * np.abs(entries).max(initial=0.0)
+        with precision(BITS):
+            effects, missing = self._find_effects(control, H, values)
+            effects = [effects[number] for number in moving.tolist()]
+            squares = _sum_squares(effects, len(values))
+            for number, place in enumerate(moving.tolist()):
+                change = _find_first_change(effects[number:], squares[number], missing)
+                if not abs(change) <= most:
+                    return control
+                landed[place] = entries[place] + change
+                missing = (missing - effects[number] * column(landed[place : place + 1] - entries[place])).mid()
+        return np.ascontiguousarray(landed.reshape(control.T.shape).T)
+
+    def _find_effects(self, control: Array, H: Array, values: Array) -> tuple[list[arb_mat], arb_mat]:
+        """Return the effect ``(e, 1)`` of every entry of a control on ``H x`` at the end, piece after piece, and what
+        ``H x`` misses of ``values (e,)``."""
+        from flint import arb_mat
+
+        steps, inputs = self._compute_steps(BITS), self.grid.inputs(control)
+        rows, missing = arb_mat(H.tolist()), column(values)
+        effects = [arb_mat(len(values), 1) for _ in range(control.size)]
+        pieces = zip(self._lengths, inputs.T, self.grid.control_piece.tolist(), strict=True)
+        for length, entries, piece in reversed(list(pieces)):
+            flow, response = steps[length]
+            weights = rows * response
+            missing, rows = missing - weights * column(entries), rows * flow
+            for channel in range(len(control) if piece >= 0 else 0):
+                effect = arb_mat([[row[channel]] for row in weights.tolist()])
+                effects[piece * len(control) + channel] = effects[piece * len(control) + channel] + effect
+        return [effect.mid() for effect in effects], (missing - rows * column(self.initial_state)).mid()
+
+    @cached_property
+    def _lengths(self) -> list[Fraction]:
+        """Exact lengths of the pieces, ``(L,)``."""
+        ends = [Fraction(end) for end in self.grid.breakpoints.tolist()]
+        return [stop - start for start, stop in zip(ends[:-1], ends[1:], strict=True)]
+
+    def _compute_steps(self, bits: int) -> dict[Fraction, tuple[arb_mat, arb_mat]]:
+        """Return the transition over every length and the response to inputs on it; remembered for so many bits."""
+        from flint import arb, arb_mat
+
+        if bits not in self._steps:
+            (d, m), steps = self.B.shape, {}
+            generator = np.zeros((d + m, d + m))
+            generator[:d] = np.hstack([self.A, self.B])
+            matrix = arb_mat(generator.tolist())
+            for length in set(self._lengths):
+                flow = (matrix * (arb(length.numerator) / arb(length.denominator))).exp().tolist()
+                steps[length] = arb_mat([row[:d] for row in flow[:d]]), arb_mat([row[d:] for row in flow[:d]])
+            self._steps[bits] = steps
+        return self._steps[bits]
+
+    @cached_property
+    def _steps(self) -> dict[int, dict[Fraction, tuple[arb_mat, arb_mat]]]:
+        return {}
+
+
+def _sum_squares(effects: list[arb_mat], count: int) -> list[arb_mat]:
+    """Return the sums ``(e, e)`` of ``c c'`` over every effect ``c (e, 1)`` and those after it; ``count`` is ``e``."""
+    from flint import arb_mat
+
+    sums = [arb_mat(count, count)]
+    for effect in reversed(effects):
+        sums.append((sums[-1] + effect * effect.transpose()).mid())
+    return sums[:0:-1]
+
+
+def _find_first_change(effects: list[arb_mat], squares: arb_mat, missing: arb_mat) -> float:
+    """Return the change of the first of several entries that together, and changed by least, make up for what is
+    ``missing (e, 1)``; or that leave least of it, where they are few."""
+    from flint import arb_mat
+
+    try:
+        if len(effects) >= squares.nrows():
+            return float((effects[0].transpose() * squares.solve(missing))[0, 0].mid())
+        C = arb_mat([list(row) for row in zip(*(effect.entries() for effect in effects), strict=True)])
+        return float(((C.transpose() * C).mid().solve(C.transpose() * missing))[0, 0].mid())
+    except ZeroDivisionError:  # some of the values do not depend on these entries
+        return 0.0
