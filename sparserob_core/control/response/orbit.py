@@ -12,12 +12,14 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from fractions import Fraction
 from functools import cached_property
+from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from sparserob_core.control.enclosures.cache import remember
 from sparserob_core.control.problem.system import System
+from sparserob_core.control.response.parameters import ParameterIndex
 from sparserob_core.shapes import Float, shaped
 from sparserob_core.sip.convex_set import Array
 
@@ -35,10 +37,12 @@ NEARLY = 1e-6  # of the largest entry of a control: a change that is for more th
 OUTWARD = 1.0 + 2.0**-50  # for what a conversion to a double rounds
 
 
-def growth(matrices: Array, horizon: float) -> float:
-    """Return the exponent of ``e`` by which states can grow over a horizon: the largest real part of an eigenvalue of
-    ``matrices (v, d, d)`` times the horizon; 0 where nothing grows."""
-    return max(0.0, float(np.linalg.eigvals(matrices).real.max()) * horizon)
+def growth(system: System, horizon: float) -> float:
+    """Return the exponent of ``e`` by which the state can grow over the horizon: the largest real part of an eigenvalue
+    of ``A(p)``, at a lattice of parameters, times the horizon; 0 where nothing grows."""
+    points = ParameterIndex(system.parameters).lattice()[0]
+    rate = max(float(np.linalg.eigvals(mode.matrices(points)[0]).real.max()) for mode in system.modes)
+    return max(0.0, rate * horizon)
 
 
 @contextmanager
@@ -80,9 +84,10 @@ class Orbit:
         """
         if system.varies or system.parameters is not None or len(system.modes) > 1:
             return None
+        if growth(system, float(grid.breakpoints[-1])) < NOTABLE:
+            return None
         A, B, _ = (matrices[0] for matrices in system.modes[0].matrices(np.zeros((1, 0))))
-        rates = growth(A[None], float(grid.breakpoints[-1]))
-        return Orbit(A, B, grid, initial_state) if rates >= NOTABLE else None
+        return Orbit(A, B, grid, initial_state)
 
     @shaped
     def states(self, control: Float[Array, "m K"]) -> tuple[Float[Array, "points d"], Float[Array, "points d"]]:
@@ -165,7 +170,7 @@ class Orbit:
     def _lengths(self) -> list[Fraction]:
         """Exact lengths of the pieces, ``(L,)``."""
         ends = [Fraction(end) for end in self.grid.breakpoints.tolist()]
-        return [stop - start for start, stop in zip(ends[:-1], ends[1:], strict=True)]
+        return [stop - start for start, stop in pairwise(ends)]
 
     def _compute_steps(self, bits: int) -> dict[Fraction, tuple[arb_mat, arb_mat]]:
         """Return the transition over every length and the response to inputs on it; remembered for so many bits."""

@@ -9,8 +9,10 @@ import numpy as np
 from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.control.problem.system import System
 from sparserob_core.control.reach.support import WITHOUT_PROOF
+from sparserob_core.control.response.orbit import NOTABLE, growth
 from sparserob_core.control.response.parameters import ParameterIndex
 from sparserob_core.control.sets.strangers import strangers
+from sparserob_core.control.transcription.record import Transcription
 from sparserob_core.control.transcription.terms.in_time import within_reach
 from sparserob_core.control.transcription.terms.superposed import superposed
 from sparserob_core.errors import NotEnclosable
@@ -19,7 +21,6 @@ from sparserob_core.sip.result import Result
 
 SECONDS = 30.0  # that the search takes for a problem that cannot be proven, unless a limit is given: for a witness
 TINY = 1e-6  # of the parameters: a cell on which a system that can be enclosed at all will be
-NOTABLE = 10.0  # logarithm of a growth from which rounding may be what hinders a proof
 
 
 def unprovable(problem: OptimalControlProblem) -> str | None:
@@ -60,13 +61,19 @@ def announced(why: str, limited: bool) -> str:
     return f"{why}{ends}"
 
 
-def remarked(problem: OptimalControlProblem, result: Result) -> Result:
-    """Return the same result with a note on the unproven assumptions of its claim. Nothing is added where there is no
-    claim, or no such assumption."""
-    assumptions = remark(problem)
-    if not assumptions or assumptions in result.message or result.status not in ("certified", "verified"):
-        return result
-    return replace(result, message=f"{result.message}; {assumptions}")
+def remarked(model: Transcription, result: Result) -> Result:
+    """Return the same result with what its reader has to know beside it.
+
+    A claim gets its unproven assumptions, and what rounding does to a control in open loop. A result without a claim
+    gets the property of the plant that may be the reason. Nothing is added twice.
+    """
+    if result.status in ("certified", "verified"):
+        remarks = [remark(model.problem), *promised(model)]
+    else:
+        advice = hindrance(model.problem.system, model.problem.horizon)
+        remarks = [] if result.status == "infeasible" or advice in result.message else [advice]
+    added = [text for text in remarks if text and text not in result.message]
+    return replace(result, message="; ".join([result.message, *added])) if added else result
 
 
 def remark(problem: OptimalControlProblem) -> str:
@@ -76,12 +83,21 @@ def remark(problem: OptimalControlProblem) -> str:
     return f"what sets of the kind {', '.join(kinds)} say of themselves is believed" if kinds else ""
 
 
-def growth(system: System, horizon: float) -> float:
-    """Return the exponent of ``e`` by which the state can grow over the horizon: the largest real part of an eigenvalue
-    of ``A(p)``, at a lattice of parameters, times the horizon; 0 where nothing grows."""
-    points = ParameterIndex(system.parameters).lattice()[0]
-    rate = max(float(np.linalg.eigvals(mode.matrices(points)[0]).real.max()) for mode in system.modes)
-    return max(0.0, rate * horizon)
+def promised(model: Transcription) -> list[str]:
+    """Return what a control in open loop can promise on a plant that amplifies: where the last digits of doubles move
+    the end. Nothing is returned under feedback, and for plants that amplify little."""
+    problem = model.problem
+    if model.acting.answers_by is not None or growth(problem.system, problem.horizon) < NOTABLE:
+        return []
+    d, middle = problem.system.states, model.parameters.middle
+    weights = model.response.weights(np.full(d, problem.horizon), np.eye(d), np.tile(middle, (d, 1))).control
+    reach = problem.control.reach(np.eye(problem.system.controls))
+    moved = np.abs(weights[..., : reach.size]).sum(axis=1) @ reach * np.finfo(float).eps / 2.0
+    state = int(np.argmax(moved))
+    name, units = problem.names.state(state), problem.names.state_units
+    off = f"{moved[state]:.1g} {units[state]}" if state < len(units) else f"{moved[state]:.1g}"
+    digits = f"in open loop an error in the last digit of the control ends up to {off} off in {name}"
+    return [f"{digits}; feedback does not let it grow"]
 
 
 def hindrance(system: System, horizon: float) -> str:
@@ -93,5 +109,5 @@ def hindrance(system: System, horizon: float) -> str:
     size = f"e^{exponent:.0f} = {np.exp(min(exponent, 700.0)):.1g}"
     return (
         f"the plant amplifies by {size} over the horizon, and double precision resolves {np.finfo(float).eps:.0e} of"
-        " that; a shorter horizon, wider sets, or a plant that is stabilised before would help"
+        " that; a shorter horizon, wider sets, or feedback on a plant that is stabilised before would help"
     )

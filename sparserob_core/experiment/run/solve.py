@@ -180,7 +180,7 @@ def solve(
     from sparserob_core.experiment.run.outcome import SolveArguments, SolvedProblem
 
     result = with_final_states(model, result, getattr(chosen, "tolerance", None))
-    result = remarked(model.problem, result)
+    result = remarked(model, result)
     arguments = SolveArguments(
         problem=model.stated,
         choices={

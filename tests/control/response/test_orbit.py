@@ -113,8 +113,8 @@ def test_plants_that_do_not_grow_or_are_not_one_known_plant_have_no_orbit(system
 
 
 def test_growth_is_the_largest_rate_times_the_horizon() -> None:
-    assert growth(SADDLE[None], 3.0) == pytest.approx(15.0)
-    assert growth(-np.eye(2)[None], 3.0) == 0.0
+    assert growth(LinearSystem(SADDLE, PUSH), 3.0) == pytest.approx(15.0)
+    assert growth(LinearSystem(-np.eye(2), PUSH), 3.0) == 0.0
     assert Orbit.of(LinearSystem(SADDLE, PUSH), grid_of(NOTABLE / RATE * 0.99), np.zeros(2)) is None
 
 

@@ -39,7 +39,7 @@ def bounded(experiment: ControlExperiment, result: Result, deadline: Deadline) -
     if result.status == "undecided" and not np.isfinite(result.dual.bound):
         result = replace(result, lower_bound=0.0)  # no term of a cost is negative, and nothing else is proven
     proven = with_final_states(model, result, experiment.gap_tolerance)
-    return remarked(experiment.problem, _derive_bound(experiment, proven, deadline))
+    return remarked(model, _derive_bound(experiment, proven, deadline))
 
 
 def unbounded(result: Result) -> Result:
