@@ -134,8 +134,12 @@ class _Case:
 
 @dataclass
 class _TranslatedCase(_Case):
-    """State of the same call in ``easier`` variables: answers are judged by what they are worth in those of the
-    ``outer`` program, whose bounds are tighter where a variable has none."""
+    """State of the same call in ``easier`` variables.
+
+    Answers are judged by their residual and bound in the ``outer`` program, where no variable lacks its bounds. Where
+    the outer program has equalities, the bound of the easier one counts if it is better: multipliers of equalities that
+    are nearly parallel cancel, and doubles do not hold what is left.
+    """
 
     outer: FiniteProgram | None = None
     easier: NewVariables | None = None
@@ -143,8 +147,9 @@ class _TranslatedCase(_Case):
     def judge(self, solution: FiniteSolution, name: str, by: str = "") -> FiniteSolution | None:
         assert self.outer is not None and self.easier is not None
         worth = _measure_translated(self.outer, self.easier, solution)
-        lower, gap = worth.lower_bound, worth.gap
-        return super().judge(replace(solution, lower_bound=lower, gap=gap, residual=worth.residual), name, by)
+        lower = max(worth.lower_bound, solution.lower_bound) if self.outer.b.size else worth.lower_bound
+        judged = replace(solution, lower_bound=lower, gap=solution.value - lower, residual=worth.residual)
+        return super().judge(judged, name, by)
 
 
 def _measure_translated(program: FiniteProgram, easier: NewVariables, solution: FiniteSolution) -> FiniteSolution:
@@ -446,8 +451,11 @@ def _solve_in_new_variables(case: _Case, easier: NewVariables, guess: FiniteSolu
         x, mu = easier.back(solution.x), easier.equality_prices(solution)
         proof = _check_proof(case, (x, solution.y, mu, None), "the program in other variables")
         return proof if proof is None else replace(proof, by=solution.by)
-    measured = _measure_translated(program, easier, solution)
-    return case.judge(replace(measured, by=solution.by), "new variables") or case.blunt
+    measured = replace(_measure_translated(program, easier, solution), by=solution.by)
+    believed = case.judge(measured, "new variables") or case.blunt
+    if believed is None and easier.divided is not None and solution.status == "optimal":
+        return replace(measured, status="optimal", attempts=tuple(case.attempts))  # its bound is the one of this program
+    return believed
 
 
 def cost_scale(program: FiniteProgram, value: float) -> float:
