@@ -26,6 +26,8 @@ EXPECTED: dict[str, tuple[str, float | None, float]] = {
     "ion_trap": ("certified", 1.9118966, 1e-7),
     "breakpoints": ("certified", None, 0.0),
     "cart_pendulum": ("certified", 0.3281469, 2e-7),
+    "libration_point": ("certified", 6.30650562, 1e-7),
+    "pendulum_transfer": ("certified", 0.17286876, 1e-7),
     "coupled_masses": ("certified", 1.057952, 5e-6),
     "coupled_masses_feedback": ("certified", 1.16782006, 2e-6),
     "double_integrator": ("certified", 1.6, 1e-6),

@@ -126,16 +126,21 @@ class Orbit:
 
     @shaped
     def landed(
-        self, control: Float[Array, "m K"], H: Float[Array, "e d"], values: Float[Array, " e"]
+        self,
+        control: Float[Array, "m K"],
+        H: Float[Array, "e d"],
+        values: Float[Array, " e"],
+        limits: tuple[Float[Array, " m"], Float[Array, " m"]],
     ) -> Float[Array, "m K"]:
         """Return a control whose final state ``x`` has ``H x = values`` as nearly as doubles allow.
 
-        Only entries that are not 0 move, by what rounding may have done to them. The early ones are rounded first, and
-        the later ones make up for that: their last digits move the final state by less. The control itself is returned
-        where more than rounding is missing.
+        Only entries that are neither 0 nor at one of their ``limits`` move, by what rounding may have done to them. The
+        early ones are rounded first, and the later ones make up for that: their last digits move the final state by
+        less. The control itself is returned where more than rounding is missing.
         """
-        entries = control.T.ravel()  # by pieces
-        moving, landed, most = np.flatnonzero(entries), entries.copy(), NEARLY * np.abs(entries).max(initial=0.0)
+        entries, (lower, upper) = control.T.ravel(), (np.tile(limit, control.shape[1]) for limit in limits)  # by pieces
+        landed, most = entries.copy(), NEARLY * np.abs(entries).max(initial=0.0)
+        moving = np.flatnonzero((entries != 0.0) & (entries > lower + most) & (entries < upper - most))
         with precision(BITS):
             effects, missing = self._find_effects(control, H, values)
             effects = [effects[number] for number in moving.tolist()]

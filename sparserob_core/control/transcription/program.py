@@ -303,8 +303,10 @@ def _land(posed: Posed) -> Callable[[Array], Array] | None:
     if orbit is None or not values.size or not posed.control.is_indicators or functionals.execution is not None:
         return None
 
+    limits = ranges(posed.held.control)
+
     def land(x: Array) -> Array:
-        return orbit.landed(functionals.control(x), H, values).ravel()
+        return orbit.landed(functionals.control(x), H, values, limits).ravel()
 
     return land
 

@@ -454,7 +454,9 @@ def _solve_in_new_variables(case: _Case, easier: NewVariables, guess: FiniteSolu
     measured = replace(_measure_translated(program, easier, solution), by=solution.by)
     believed = case.judge(measured, "new variables") or case.blunt
     if believed is None and easier.divided is not None and solution.status == "optimal":
-        return replace(measured, status="optimal", attempts=tuple(case.attempts))  # its bound is the one of this program
+        return replace(
+            measured, status="optimal", attempts=tuple(case.attempts)
+        )  # its bound is the one of this program
     return believed
 
 

@@ -15,6 +15,7 @@ from sparserob_core.sip.convex_set import Box
 RATE, DIGITS = 5, 80
 SADDLE = np.array([[0.0, 1.0], [float(RATE**2), 0.0]])  # x'' = 25 x + u, which grows by e^{5 T}
 PUSH = np.array([[0.0], [1.0]])
+WIDE = np.full(1, -1e3), np.full(1, 1e3)
 
 
 def grid_of(horizon: float, pieces: int = 40) -> TimeGrid:
@@ -62,7 +63,7 @@ def test_states_are_within_their_errors_which_are_rounding(horizon: float) -> No
 def test_doubles_alone_lose_what_the_plant_amplifies() -> None:
     """The reason for more digits: the recursion in doubles ends where the control does not."""
     orbit, control = orbit_of(6.0), np.random.default_rng(0).uniform(-5.0, 5.0, (1, 40))
-    landed = orbit.landed(control * 0.0 + _rest(orbit), np.eye(2), np.zeros(2))
+    landed = orbit.landed(control * 0.0 + _rest(orbit), np.eye(2), np.zeros(2), WIDE)
     x, v = (float(entry) for entry in exact(orbit, landed)[-1])
     response = Response(LinearSystem(SADDLE, PUSH), orbit.grid, orbit.initial_state)
     in_doubles = response.states(landed, np.zeros((1, 0)))[0, -1]
@@ -74,18 +75,27 @@ def test_a_control_lands_to_its_last_digits_and_what_is_0_stays_0() -> None:
     orbit = orbit_of(5.0)
     control = _rest(orbit)
     control[0, [3, 7, 30]] = 0.0
-    control = orbit.landed(control, np.eye(2), np.array([0.0, 0.0]))  # too far off: returned as it is
+    control = orbit.landed(control, np.eye(2), np.array([0.0, 0.0]), WIDE)  # too far off: returned as it is
     assert (control == np.where(control == 0.0, 0.0, control)).all() and not control[0, [3, 7, 30]].any()
     near = _rest(orbit)
     before = max(abs(float(entry)) for entry in exact(orbit, near)[-1])
-    landed = orbit.landed(near, np.eye(2), np.zeros(2))
+    landed = orbit.landed(near, np.eye(2), np.zeros(2), WIDE)
     after = max(abs(float(entry)) for entry in exact(orbit, landed)[-1])
     assert after < 1e-14 < before and np.abs(landed - near).max() < 1e-9
 
 
 def test_a_control_that_misses_by_more_than_rounding_is_returned() -> None:
     orbit, control = orbit_of(5.0), np.ones((1, 40))
-    assert orbit.landed(control, np.eye(2), np.zeros(2)) is control
+    assert orbit.landed(control, np.eye(2), np.zeros(2), WIDE) is control
+
+
+def test_entries_at_their_limits_do_not_move() -> None:
+    orbit, near = orbit_of(5.0), _rest(orbit_of(5.0))
+    limits = np.full(1, near.min()), np.full(1, near.max())
+    landed = orbit.landed(near, np.eye(2), np.zeros(2), limits)
+    ends = (near == near.min()) | (near == near.max())
+    assert (landed[ends] == near[ends]).all() and (landed >= limits[0]).all() and (landed <= limits[1]).all()
+    assert max(abs(float(entry)) for entry in exact(orbit, landed)[-1]) < 1e-14
 
 
 def test_entries_that_no_control_reaches_are_left_alone() -> None:
@@ -95,7 +105,7 @@ def test_entries_that_no_control_reaches_are_left_alone() -> None:
     assert orbit is not None
     control = np.zeros((1, 40))
     control[0, :3] = 1e-3
-    landed = orbit.landed(control, np.eye(4)[2:], np.zeros(2))
+    landed = orbit.landed(control, np.eye(4)[2:], np.zeros(2), WIDE)
     assert (landed == control).all()
 
 
