@@ -9,10 +9,11 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from functools import cached_property
 from itertools import pairwise
+from math import ceil, log
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -31,8 +32,9 @@ if TYPE_CHECKING:
 # Logarithm of a growth from which states are followed so: of sixteen digits a plant then keeps fewer than twelve. With
 # half of it plants take longer that lose nothing, with twice as much a certificate is lost at the end of a horizon.
 NOTABLE = 10.0
-BITS, MORE, TRIES = 192, 2, 5  # of a number at first, by what factor there are more, and how often
-SMALL = 2.0**-52  # of the largest state: errors that are rounding
+# Bits of a number beside those that the growth takes twice: once for the states, once for what lands on the last digits
+# of a double. With half of them errors are no longer those of rounding to doubles; twice as many take as long.
+BITS = 128
 NEARLY = 1e-6  # of the largest entry of a control: a change that is for more than rounding
 OUTWARD = 1.0 + 2.0**-50  # for what a conversion to a double rounds
 
@@ -68,26 +70,35 @@ def column(entries: Array) -> arb_mat:
 class Orbit:
     """States of the plant ``x' = A x + B u`` at the breakpoints of a grid, from ``initial_state (d,)``.
 
-    ``A (d, d)`` and ``B (d, m)``, with the columns of constant inputs after those of the control, are exact.
+    ``A (d, d)`` and ``B (d, m)``, with the columns of constant inputs after those of the control, are exact. ``bits``:
+    those of every number.
     """
 
     A: Array
     B: Array
     grid: TimeGrid
+    bits: int
     initial_state: Array
+    _steps: dict[Fraction, tuple[arb_mat, arb_mat]] = field(default_factory=dict, repr=False)
+    _states: dict[bytes, tuple[Array, Array]] = field(default_factory=dict, repr=False)
 
     @staticmethod
-    def of(system: System, grid: TimeGrid, initial_state: Array) -> Orbit | None:
-        """Return the orbit of a plant that grows by ``e`` to the power of `NOTABLE` and more; ``None`` of others.
+    def of(system: System, grid: TimeGrid) -> Orbit | None:
+        """Return the orbit from 0 of a plant that grows by ``e`` to the power of `NOTABLE`; ``None`` of others.
 
         Plants with parameters, with phases, or with entries in time have none.
         """
         if system.varies or system.parameters is not None or len(system.modes) > 1:
             return None
-        if growth(system, float(grid.breakpoints[-1])) < NOTABLE:
+        exponent = growth(system, float(grid.breakpoints[-1]))
+        if exponent < NOTABLE:
             return None
         A, B, _ = (matrices[0] for matrices in system.modes[0].matrices(np.zeros((1, 0))))
-        return Orbit(A, B, grid, initial_state)
+        return Orbit(A, B, grid, BITS + ceil(2.0 * exponent / log(2.0)), np.zeros(len(A)))
+
+    def from_state(self, initial_state: Array) -> Orbit:
+        """Return the states from another initial state ``(d,)``; what does not depend on it is shared."""
+        return replace(self, initial_state=initial_state, _states={})
 
     @shaped
     def states(self, control: Float[Array, "m K"]) -> tuple[Float[Array, "points d"], Float[Array, "points d"]]:
@@ -95,23 +106,13 @@ class Orbit:
         errors; remembered for the last control."""
         key = control.tobytes()
         if key not in self._states:
-            inputs, bits = self.grid.inputs(control), BITS
-            for _ in range(TRIES):
-                states, errors = self._follow(inputs, bits)
-                if (errors <= SMALL * np.abs(states).max()).all():
-                    break
-                bits *= MORE
-            remember(self._states, key, (states, errors), 1)
+            remember(self._states, key, self._follow(self.grid.inputs(control)), 1)
         return self._states[key]
 
-    @cached_property
-    def _states(self) -> dict[bytes, tuple[Array, Array]]:
-        return {}
-
-    def _follow(self, inputs: Array, bits: int) -> tuple[Array, Array]:
-        """Return `states` under ``inputs (m, L)`` on the pieces, with so many bits in every number."""
-        with precision(bits):
-            steps, state = self._compute_steps(bits), column(self.initial_state)
+    def _follow(self, inputs: Array) -> tuple[Array, Array]:
+        """Return `states` under ``inputs (m, L)`` on the pieces."""
+        with precision(self.bits):
+            steps, state = self._compute_steps(), column(self.initial_state)
             path = [state]
             for length, entries in zip(self._lengths, inputs.T, strict=True):
                 flow, response = steps[length]
@@ -141,7 +142,7 @@ class Orbit:
         entries, (lower, upper) = control.T.ravel(), (np.tile(limit, control.shape[1]) for limit in limits)  # by pieces
         landed, most = entries.copy(), NEARLY * np.abs(entries).max(initial=0.0)
         moving = np.flatnonzero((entries != 0.0) & (entries > lower + most) & (entries < upper - most))
-        with precision(BITS):
+        with precision(self.bits):
             effects, missing = self._find_effects(control, H, values)
             effects = [effects[number] for number in moving.tolist()]
             squares = _sum_squares(effects, len(values))
@@ -158,7 +159,7 @@ class Orbit:
         ``H x`` misses of ``values (e,)``."""
         from flint import arb_mat
 
-        steps, inputs = self._compute_steps(BITS), self.grid.inputs(control)
+        steps, inputs = self._compute_steps(), self.grid.inputs(control)
         rows, missing = arb_mat(H.tolist()), column(values)
         effects = [arb_mat(len(values), 1) for _ in range(control.size)]
         pieces = zip(self._lengths, inputs.T, self.grid.control_piece.tolist(), strict=True)
@@ -177,24 +178,19 @@ class Orbit:
         ends = [Fraction(end) for end in self.grid.breakpoints.tolist()]
         return [stop - start for start, stop in pairwise(ends)]
 
-    def _compute_steps(self, bits: int) -> dict[Fraction, tuple[arb_mat, arb_mat]]:
-        """Return the transition over every length and the response to inputs on it; remembered for so many bits."""
+    def _compute_steps(self) -> dict[Fraction, tuple[arb_mat, arb_mat]]:
+        """Return the transition over every length of a piece and the response to inputs on it; remembered."""
         from flint import arb, arb_mat
 
-        if bits not in self._steps:
-            (d, m), steps = self.B.shape, {}
+        if not self._steps:
+            d, m = self.B.shape
             generator = np.zeros((d + m, d + m))
             generator[:d] = np.hstack([self.A, self.B])
             matrix = arb_mat(generator.tolist())
             for length in set(self._lengths):
                 flow = (matrix * (arb(length.numerator) / arb(length.denominator))).exp().tolist()
-                steps[length] = arb_mat([row[:d] for row in flow[:d]]), arb_mat([row[d:] for row in flow[:d]])
-            self._steps[bits] = steps
-        return self._steps[bits]
-
-    @cached_property
-    def _steps(self) -> dict[int, dict[Fraction, tuple[arb_mat, arb_mat]]]:
-        return {}
+                self._steps[length] = arb_mat([row[:d] for row in flow[:d]]), arb_mat([row[d:] for row in flow[:d]])
+        return self._steps
 
 
 def _sum_squares(effects: list[arb_mat], count: int) -> list[arb_mat]:

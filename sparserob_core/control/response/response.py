@@ -405,6 +405,11 @@ class Propagator:
         return np.asarray(indices.reshape(-1))
 
     @cached_property
+    def orbit(self) -> Orbit | None:
+        """The states from 0 of a plant that grows by much, in more digits; ``None`` for others."""
+        return Orbit.of(self.system, self.grid)
+
+    @cached_property
     def lengths(self) -> Array:
         """Lengths ``(q,)`` of the distinct modes and lengths, as means over their pieces, so that rounding errors do
         not add up."""
@@ -1113,7 +1118,8 @@ class Response:
     @cached_property
     def orbit(self) -> Orbit | None:
         """The states of a plant that grows by much, in more digits; ``None`` for others."""
-        return Orbit.of(self.system, self.grid, self.initial_state)
+        orbit = self.propagator.orbit
+        return None if orbit is None else orbit.from_state(self.initial_state)
 
     @cached_property
     def _node_cache(self) -> dict[bytes, Array]:

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from decimal import Decimal, localcontext
+from fractions import Fraction
 
 import numpy as np
 import pytest
 
 from sparserob_core.control.problem.system import LinearSystem, SwitchedSystem, System
+from sparserob_core.control.response.lifted import lift_legs
 from sparserob_core.control.response.orbit import NOTABLE, Orbit, growth
 from sparserob_core.control.response.response import Response, TimeGrid, merge_grids
 from sparserob_core.sip.convex_set import Box
@@ -24,9 +27,9 @@ def grid_of(horizon: float, pieces: int = 40) -> TimeGrid:
 
 
 def orbit_of(horizon: float, start: tuple[float, float] = (0.2, -0.1)) -> Orbit:
-    orbit = Orbit.of(LinearSystem(SADDLE, PUSH), grid_of(horizon), np.array(start))
+    orbit = Orbit.of(LinearSystem(SADDLE, PUSH), grid_of(horizon))
     assert orbit is not None
-    return orbit
+    return orbit.from_state(np.array(start))
 
 
 def exact(orbit: Orbit, control: np.ndarray) -> list[tuple[Decimal, Decimal]]:
@@ -71,17 +74,15 @@ def test_doubles_alone_lose_what_the_plant_amplifies() -> None:
     assert response.nodes(landed, np.zeros((1, 0)))[0, -1] == pytest.approx([x, v], abs=1e-16)
 
 
-def test_a_control_lands_to_its_last_digits_and_what_is_0_stays_0() -> None:
+@pytest.mark.parametrize("idle", [(), (0, 3, 7, 30)])
+def test_a_control_lands_to_its_last_digits_and_what_is_0_stays_0(idle: tuple[int, ...]) -> None:
     orbit = orbit_of(5.0)
-    control = _rest(orbit)
-    control[0, [3, 7, 30]] = 0.0
-    control = orbit.landed(control, np.eye(2), np.array([0.0, 0.0]), WIDE)  # too far off: returned as it is
-    assert (control == np.where(control == 0.0, 0.0, control)).all() and not control[0, [3, 7, 30]].any()
-    near = _rest(orbit)
+    near = _rest(orbit, idle)
     before = max(abs(float(entry)) for entry in exact(orbit, near)[-1])
     landed = orbit.landed(near, np.eye(2), np.zeros(2), WIDE)
     after = max(abs(float(entry)) for entry in exact(orbit, landed)[-1])
     assert after < 1e-14 < before and np.abs(landed - near).max() < 1e-9
+    assert not landed[0, list(idle)].any() and np.count_nonzero(landed) == 40 - len(idle)
 
 
 def test_a_control_that_misses_by_more_than_rounding_is_returned() -> None:
@@ -101,7 +102,7 @@ def test_entries_at_their_limits_do_not_move() -> None:
 def test_entries_that_no_control_reaches_are_left_alone() -> None:
     """Of two plants side by side the second has no input: its rows are 0, and no control can land it."""
     A, B = np.kron(np.eye(2), SADDLE), np.vstack([PUSH, 0.0 * PUSH])
-    orbit = Orbit.of(LinearSystem(A, B), grid_of(5.0), np.zeros(4))
+    orbit = Orbit.of(LinearSystem(A, B), grid_of(5.0))
     assert orbit is not None
     control = np.zeros((1, 40))
     control[0, :3] = 1e-3
@@ -119,16 +120,16 @@ def test_entries_that_no_control_reaches_are_left_alone() -> None:
     ],
 )
 def test_plants_that_do_not_grow_or_are_not_one_known_plant_have_no_orbit(system: System) -> None:
-    assert Orbit.of(system, grid_of(4.0), np.zeros(system.states)) is None
+    assert Orbit.of(system, grid_of(4.0)) is None
 
 
 def test_growth_is_the_largest_rate_times_the_horizon() -> None:
     assert growth(LinearSystem(SADDLE, PUSH), 3.0) == pytest.approx(15.0)
     assert growth(LinearSystem(-np.eye(2), PUSH), 3.0) == 0.0
-    assert Orbit.of(LinearSystem(SADDLE, PUSH), grid_of(NOTABLE / RATE * 0.99), np.zeros(2)) is None
+    assert Orbit.of(LinearSystem(SADDLE, PUSH), grid_of(NOTABLE / RATE * 0.99)) is None
 
 
-def _rest(orbit: Orbit) -> np.ndarray:
+def _rest(orbit: Orbit, idle: tuple[int, ...] = ()) -> np.ndarray:
     """A control in doubles that ends at rest but for rounding: pieces with the least sum of squares, found through the
     backward flow, in which nothing grows."""
     times = orbit.grid.breakpoints
@@ -138,4 +139,78 @@ def _rest(orbit: Orbit) -> np.ndarray:
         shift = 1.0 if rate > 0 else np.exp(rate * times[-1])
         rows.append((weight * shift, -(orbit.initial_state[1] + rate * orbit.initial_state[0]) * shift))
     matrix, wanted = np.array([row for row, _ in rows]), np.array([value for _, value in rows])
+    matrix[:, list(idle)] = 0.0
+    return np.asarray(np.linalg.lstsq(matrix, wanted, rcond=None)[0])[None]
+
+
+def test_coordinates_of_states_are_within_their_bounds_which_no_growth_widens() -> None:
+    """In the coordinates of the modes a state is rounded once: bounds at the end are as narrow as at the beginning."""
+    orbit, control = orbit_of(5.0), np.random.default_rng(3).uniform(-5.0, 5.0, (1, 40))
+    response = Response(LinearSystem(SADDLE, PUSH), orbit.grid, orbit.initial_state)
+    (lifted,) = lift_legs(response, np.zeros(0), np.zeros(0))
+    found = lifted.nodes(control)[:, 0]
+    _, bounds = lifted._transform_orbit(orbit, control)
+    (a, b), (c, d) = ([Fraction(entry) for entry in row] for row in lifted.transform.tolist())
+    determinant = a * d - b * c
+    off = []
+    for (x, v), coordinates in zip(exact(orbit, control), found.tolist(), strict=True):
+        truth = ((d * Fraction(x) - b * Fraction(v)) / determinant, (a * Fraction(v) - c * Fraction(x)) / determinant)
+        off.append([float(abs(Fraction(got) - true)) for got, true in zip(coordinates, truth, strict=True)])
+    assert lifted.starts.tolist() == [0, 1] and (np.array(off) <= bounds).all()
+    assert (bounds <= 64 * 2.0**-52 * np.abs(found).max(axis=1, keepdims=True) + 1e-300).all() and np.array(off).any()
+
+
+def test_bounds_on_pieces_begin_with_those_of_their_states(monkeypatch: pytest.MonkeyPatch) -> None:
+    orbit = orbit_of(5.0)
+    control = orbit.landed(_rest(orbit), np.eye(2), np.zeros(2), WIDE)
+    response = Response(LinearSystem(SADDLE, PUSH), orbit.grid, orbit.initial_state)
+    (lifted,) = lift_legs(response, np.zeros(0), np.zeros(0))
+    none = np.zeros((2, lifted.starts.size))
+    remainders = lifted.along(control, np.eye(2), none)
+    assert remainders.max() < 1e-9
+    blind = replace(lifted, orbit=None)
+    assert remainders[0].max() < 1e-6 * blind.along(control, np.eye(2), none)[0].max()  # what amplifies is gone
+    wide = replace(lifted)
+    monkeypatch.setattr(type(wide), "_transform_orbit", lambda *_: (np.zeros((41, 2)), np.full((41, 2), 0.125)))
+    assert (wide.along(control, np.eye(2), none) >= 0.125).all()
+
+
+def test_every_piece_begins_anew_however_many_there_are() -> None:
+    grid = grid_of(5.0, 1100)
+    (lifted,) = lift_legs(Response(LinearSystem(SADDLE, PUSH), grid, np.zeros(2)), np.zeros(0), np.zeros(0))
+    assert lifted.spans.size == 1100
+
+
+def test_errors_count_the_radii_of_balls_with_few_bits() -> None:
+    orbit, control = orbit_of(5.0), np.random.default_rng(4).uniform(-5.0, 5.0, (1, 40))
+    orbit = replace(orbit, bits=60, _steps={})
+    states, errors = orbit.states(control)
+    off = np.array(
+        [
+            [float(abs(Decimal(found) - truth)) for found, truth in zip(row, pair, strict=True)]
+            for row, pair in zip(states.tolist(), exact(orbit, control), strict=True)
+        ]
+    )
+    assert (off <= errors).all() and (off > 0.0).any() and errors.max() > 0.5 * 2.0**-52 * np.abs(states).max()
+
+
+def test_numbers_have_as_many_bits_as_the_growth_takes() -> None:
+    orbit = orbit_of(40.0)  # e^200: the late pieces of a control move the end by as little as those of a short one
+    landed = orbit.landed(_rest(orbit), np.eye(2), np.zeros(2), WIDE)
+    _, errors = orbit.states(landed)
+    assert orbit.bits > 700 and (errors <= 2.0**-52).all()
+    assert (replace(orbit, bits=192, _steps={}, _states={}).states(landed)[1] > 1.0).any()
+
+
+def _rest(orbit: Orbit, idle: tuple[int, ...] = ()) -> np.ndarray:
+    """A control in doubles that ends at rest but for rounding: pieces with the least sum of squares, found through the
+    backward flow, in which nothing grows."""
+    times = orbit.grid.breakpoints
+    rows = []
+    for rate in (RATE, -RATE):  # (v + rate x) e^{-rate t} changes by the integral of e^{-rate s} u
+        weight = (np.exp(-rate * times[:-1]) - np.exp(-rate * times[1:])) / rate
+        shift = 1.0 if rate > 0 else np.exp(rate * times[-1])
+        rows.append((weight * shift, -(orbit.initial_state[1] + rate * orbit.initial_state[0]) * shift))
+    matrix, wanted = np.array([row for row, _ in rows]), np.array([value for _, value in rows])
+    matrix[:, list(idle)] = 0.0
     return np.asarray(np.linalg.lstsq(matrix, wanted, rcond=None)[0])[None]

@@ -114,9 +114,19 @@ def test_a_variable_with_a_wide_bound_is_no_direction() -> None:
     assert easier is None or easier.divided is None
 
 
-def test_many_directions_are_no_few() -> None:
-    rng, n = np.random.default_rng(1), 60
-    G = LARGE * rng.standard_normal((DIRECTIONS + 12, n))
+def test_a_variable_with_large_coefficients_is_no_direction() -> None:
+    rng, n = np.random.default_rng(4), 40
+    G = rng.standard_normal((20, n))
+    G[:, -1] = -1e4 * LARGE
+    one = np.ones(n)
+    program = FiniteProgram(one, 0.0 * one, -one, one, G, np.ones(20), np.zeros((0, n)), np.zeros(0))
+    assert in_new_variables(program) is None
+
+
+@pytest.mark.parametrize(("n", "count"), [(60, DIRECTIONS + 12), (8, 3)])
+def test_many_directions_are_no_few(n: int, count: int) -> None:
+    rng = np.random.default_rng(1)
+    G = LARGE * rng.standard_normal((count, n))
     one, h = np.ones(n), np.ones(len(G))
     assert in_new_variables(FiniteProgram(one, 0.0 * one, -one, one, G, h, np.zeros((0, n)), np.zeros(0))) is None
 
