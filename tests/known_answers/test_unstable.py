@@ -9,10 +9,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-import yaml
-from scipy.linalg import expm
-from scipy.optimize import linprog
-from scipy.sparse import csr_array
 
 import sparserob_core as sr
 from sparserob_core.control.feedback.closed_loop import ClosedLoop
@@ -20,8 +16,8 @@ from sparserob_core.experiment.terminal.table import result_rows
 from sparserob_core.sip.program import TOLERANCE, ConstraintFamily, SemiInfiniteProgram
 from tests.support.amplified import Amplified, drawn, exceeded
 from tests.support.draws import taken
+from tests.support.nodes import CONFIGS, at_nodes
 
-CONFIGS = Path(__file__).parents[2] / "configs"
 PENDULUM = np.array([[0.0, 1.0], [9.0, 0.0]])
 CHEAP = (4, 10, 14, 18, 31, 32, 36, 38, 107)  # of less than a second each; the checker could not tell the last one
 COUNT = taken(200)
@@ -146,62 +142,12 @@ def test_no_claim_of_a_random_plant_is_wrong_by_more_than_its_excuse(number: int
     if outcome.status != "failed":
         assert "fails" not in verdicts(outcome).values()
 
-def at_nodes(config: str) -> float:
-    """The value of a shipped config by HiGHS with the states at the ends of pieces as variables, in which nothing grows
-    by much (multiple shooting); states are bounded at their nodes, and at four times between them."""
-    options = yaml.safe_load((CONFIGS / f"{config}.yaml").read_text())
-    problem, pieces = options["problem"], options["dictionaries"]["control"]["pieces"]
-    A, B = (np.array(problem["system"][name], dtype=float) for name in ("A", "B"))
-    (d, m), step = B.shape, problem["horizon"] / pieces
-    generator = np.zeros((d + m, d + m))
-    generator[:d] = np.hstack([A, B])
-    parts = [expm(generator * step * share)[:d] for share in (0.25, 0.5, 0.75, 1.0)]
-    walls = np.array([np.inf if entry is None else entry for entry in problem["path"][0]["box"]])
-    size = np.where(np.isfinite(walls), walls, 1.0)  # states in units of their walls
-    of_u, of_x, n = 2 * m * pieces, d * (pieces + 1), 2 * m * pieces + d * (pieces + 1)
-    rows, right, walled, most = [], [], [], []
-    for k in range(pieces):
-        for number, part in enumerate(parts):
-            row = np.zeros((d, n))
-            row[:, of_u + d * k : of_u + d * (k + 1)] = part[:, :d] * size / size[:, None]
-            row[:, 2 * m * k : 2 * m * k + m] = part[:, d:] / size[:, None]
-            row[:, 2 * m * k + m : 2 * m * (k + 1)] = -part[:, d:] / size[:, None]
-            if number == 3:
-                row[:, of_u + d * (k + 1) : of_u + d * (k + 2)] -= np.eye(d)
-                rows.append(row)
-                right.append(np.zeros(d))
-            elif np.isfinite(walls).any():
-                walled += [row[np.isfinite(walls)], -row[np.isfinite(walls)]]
-                most += 2 * [np.ones(int(np.isfinite(walls).sum()))]
-    bounds = [(0.0, problem["control"]["box"])] * of_u
-    states = np.where(np.isfinite(np.tile(walls, pieces + 1)), 1.0, np.inf)
-    fixed = {0: problem["initial_state"], pieces: problem["terminal"][0]["equals"]}
-    for k in range(pieces + 1):
-        if k in fixed:
-            bounds += [(value, value) for value in np.array(fixed[k]) / size]
-        else:
-            bounds += [(-most_, most_) for most_ in states[d * k : d * (k + 1)]]
-    assert len(bounds) == of_u + of_x == n
-    cost = np.concatenate([np.full(of_u, step), np.zeros(of_x)])
-    found = linprog(
-        cost,
-        A_ub=csr_array(np.vstack(walled)),
-        b_ub=np.concatenate(most),
-        A_eq=csr_array(np.vstack(rows)),
-        b_eq=np.concatenate(right),
-        bounds=bounds,
-        method="highs-ds",
-        options={"primal_feasibility_tolerance": 1e-10, "dual_feasibility_tolerance": 1e-10},
-    )
-    assert found.status == 0, found.message
-    return float(found.fun)
-
 
 @pytest.mark.parametrize("config", ["pendulum_transfer", "libration_point"])
 def test_values_of_plants_that_grow_are_those_of_states_at_nodes(config: str, tmp_path: Path) -> None:
     """Walls of the reference hold at some times only, so that it may cost a little less."""
     outcome = sr.run(CONFIGS / f"{config}.yaml", out=tmp_path / "run", quiet=True, figures=False)
-    reference, cost = at_nodes(config), outcome.summary["cost"]
+    reference, cost = at_nodes(config, parts=4).cost, outcome.summary["cost"]
     assert outcome.status == "certified"
     assert reference * (1.0 - 1e-7) <= cost <= reference * (1.0 + 1e-6), (reference, cost)
     assert set(verdicts(outcome).values()) == {"holds"}
