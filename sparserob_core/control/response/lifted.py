@@ -440,7 +440,8 @@ class LiftedSystem:
     def _transform_orbit(self, orbit: Orbit, control: Array) -> tuple[Array, Array]:
         """Return the states of an orbit in the coordinates of this system, ``(L+1, d)``, and norm bounds ``(L+1, q)``
         of their errors."""
-        states, errors = orbit.states(control)
+        here = slice(self.first, self.first + self.grid.pieces + 1)
+        states, errors = (table[here] for table in orbit.states(control))
         coordinates, rounded = self.decoupling.vector(states.T)
         size = np.abs(self.decoupling.inverse).astype(float)
         errors = rounded + (np.eye(size.shape[0]) + self.decoupling.defect) @ size @ errors.T
@@ -730,12 +731,12 @@ def lift(phase: Phase, grid: TimeGrid, initial_state: Array, centre: Array, radi
 def lift_legs(response: Response, centre: Array, radius: Array) -> tuple[LiftedSystem, ...]:
     """Return the lifted systems of the modes of a switched system, each from where it begins; a single one where the
     system does not switch."""
-    system, grid, initial_state = response.system, response.grid, response.initial_state
+    system, grid, initial_state, orbit = response.system, response.grid, response.initial_state, response.orbit
     if grid.mode is None:
-        return (replace(lift(system.modes[0], grid, initial_state, centre, radius), orbit=response.orbit),)
+        return (replace(lift(system.modes[0], grid, initial_state, centre, radius), orbit=orbit),)
     lifted_phases: list[LiftedSystem] = []
     for number, mode in enumerate(system.modes):
-        lifted = lift(mode, grid.leg(number), initial_state, centre, radius)
+        lifted = replace(lift(mode, grid.leg(number), initial_state, centre, radius), orbit=orbit)
         if lifted_phases:
             transform, slip = lifted.decoupling.vector(lifted_phases[-1].transform)
             lifted = replace(lifted, past=Past(lifted_phases[-1], transform, slip, lifted.starts))

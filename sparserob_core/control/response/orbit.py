@@ -1,8 +1,10 @@
 """States of a known plant at the breakpoints, in more digits than doubles have.
 
 A plant that grows by ``e^18`` over its horizon multiplies what is rounded at the beginning by as much. Where a control
-ends then depends on its last digits. They are followed by balls, whose radii are proven (Johansson 2017, "Arb:
-efficient arbitrary-precision midpoint-radius interval arithmetic", IEEE Trans. Comput. 66).
+ends then depends on its last digits. States are points with more bits. What a step from one to the next misses is
+bounded by balls (Johansson 2017, "Arb: efficient arbitrary-precision midpoint-radius interval arithmetic", IEEE Trans.
+Comput. 66), and grows by the logarithmic norm in the coordinates of the modes (Dahlquist 1958). Balls alone would grow
+by the norms of all steps, however the plant turns them.
 """
 
 from __future__ import annotations
@@ -19,6 +21,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sparserob_core.control.enclosures.cache import remember
+from sparserob_core.control.enclosures.decoupling import decoupled
 from sparserob_core.control.problem.system import System
 from sparserob_core.control.response.parameters import ParameterIndex
 from sparserob_core.shapes import Float, shaped
@@ -36,7 +39,9 @@ NOTABLE = 10.0
 # of a double. With half of them errors are no longer those of rounding to doubles; twice as many take as long.
 BITS = 128
 NEARLY = 1e-6  # of the largest entry of a control: a change that is for more than rounding
-OUTWARD = 1.0 + 2.0**-50  # for what a conversion to a double rounds
+FASTEST = 300.0  # logarithm of the growth of errors up to which states are followed so: bounds are doubles
+TINY = float(np.finfo(float).tiny)  # what a conversion to a double may lose of the smallest numbers
+OUTWARD = 1.0 + 2.0**-44  # for what a conversion to a double rounds
 
 
 def growth(system: System, horizon: float) -> float:
@@ -66,35 +71,85 @@ def column(entries: Array) -> arb_mat:
     return arb_mat(entries.size, 1, [arb(entry) for entry in entries.tolist()])
 
 
+def _bound_entries(matrix: arb_mat) -> Array:
+    """Return upper bounds of the absolute values of the entries of a matrix, row after row."""
+    return np.array([float(abs(entry).upper()) for entry in matrix.entries()]) * OUTWARD + TINY
+
+
+@dataclass(frozen=True, eq=False)
+class Measure:
+    """Norm ``|T^-1 x|`` of states in which a plant grows by at most ``e^{rate t}``: ``transform (d, d)`` is ``T``, and
+    ``size (d, d)`` bounds the entries of its inverse."""
+
+    transform: Array
+    size: Array
+    rate: float
+
+    @staticmethod
+    def of(A: Array) -> Measure:
+        """Return the norm in the coordinates of the modes of ``A (d, d)``, with its logarithmic norm."""
+        from flint import arb_mat
+
+        T = decoupled(A).transform
+        with precision(BITS):
+            exact = arb_mat(T.tolist())
+            inverse = exact.inv()
+            moved = inverse * arb_mat(A.tolist()) * exact
+            symmetric = ((moved + moved.transpose()) / 2).tolist()
+            ends = [
+                sum((abs(entry) for j, entry in enumerate(row) if j != i), row[i]) for i, row in enumerate(symmetric)
+            ]
+            rate = max(float(end.upper()) for end in ends)  # Gershgorin 1931
+            size = _bound_entries(inverse).reshape(T.shape)
+        return Measure(T, size, max(rate, 0.0) * OUTWARD)
+
+    def pass_by(self, error: float, length: float, missed: Array) -> float:
+        """Return the norm of an error after a piece of some length, at whose end states are ``missed (d,)`` too."""
+        exponent = self.rate * length
+        grown = float(np.exp(exponent)) * (1.0 + (exponent + 1.0) * (OUTWARD - 1.0)) * error
+        return OUTWARD * (grown + float(np.linalg.norm(self.size @ missed)) * OUTWARD)
+
+    def enter(self, before: Measure, error: float) -> float:
+        """Return the norm of an error of which the norm of the phase before is ``error``."""
+        return float(np.linalg.norm(self.size @ np.abs(before.transform))) * error * OUTWARD
+
+    def entries(self, error: float) -> Array:
+        """Return bounds ``(d,)`` of the entries of an error of a norm."""
+        return np.asarray(np.linalg.norm(self.transform, axis=1) * error * OUTWARD)
+
+
 @dataclass(frozen=True, eq=False)
 class Orbit:
     """States of the plant ``x' = A x + B u`` at the breakpoints of a grid, from ``initial_state (d,)``.
 
-    ``A (d, d)`` and ``B (d, m)``, with the columns of constant inputs after those of the control, are exact. ``bits``:
-    those of every number.
+    ``modes``: ``A (d, d)`` and ``B (d, m)`` of every phase, with the columns of constant inputs after those of the
+    control; they are exact. ``bits``: those of every number.
     """
 
-    A: Array
-    B: Array
+    modes: tuple[tuple[Array, Array], ...]
     grid: TimeGrid
     bits: int
     initial_state: Array
-    _steps: dict[Fraction, tuple[arb_mat, arb_mat]] = field(default_factory=dict, repr=False)
+    _steps: dict[tuple[int, Fraction], tuple[arb_mat, arb_mat]] = field(default_factory=dict, repr=False)
     _states: dict[bytes, tuple[Array, Array]] = field(default_factory=dict, repr=False)
 
     @staticmethod
     def of(system: System, grid: TimeGrid) -> Orbit | None:
         """Return the orbit from 0 of a plant that grows by ``e`` to the power of `NOTABLE`; ``None`` of others.
 
-        Plants with parameters, with phases, or with entries in time have none.
+        Plants with parameters, or with entries in time, have none.
         """
-        if system.varies or system.parameters is not None or len(system.modes) > 1:
+        if system.varies or system.parameters is not None:
             return None
         exponent = growth(system, float(grid.breakpoints[-1]))
         if exponent < NOTABLE:
             return None
-        A, B, _ = (matrices[0] for matrices in system.modes[0].matrices(np.zeros((1, 0))))
-        return Orbit(A, B, grid, BITS + ceil(2.0 * exponent / log(2.0)), np.zeros(len(A)))
+        every = [mode.matrices(np.zeros((1, 0))) for mode in system.modes]
+        modes = tuple((A[0], B[0]) for A, B, _ in every)
+        orbit = Orbit(modes, grid, BITS + ceil(2.0 * exponent / log(2.0)), np.zeros(system.states))
+        rate = max(measure.rate for measure in orbit._measures)
+        exponent = max(exponent, rate * float(grid.breakpoints[-1]))
+        return replace(orbit, bits=BITS + ceil(2.0 * exponent / log(2.0))) if exponent <= FASTEST else None
 
     def from_state(self, initial_state: Array) -> Orbit:
         """Return the states from another initial state ``(d,)``; what does not depend on it is shared."""
@@ -111,19 +166,29 @@ class Orbit:
 
     def _follow(self, inputs: Array) -> tuple[Array, Array]:
         """Return `states` under ``inputs (m, L)`` on the pieces."""
+        modes = [mode for mode, _ in self._pieces]
         with precision(self.bits):
             steps, state = self._compute_steps(), column(self.initial_state)
-            path = [state]
-            for length, entries in zip(self._lengths, inputs.T, strict=True):
-                flow, response = steps[length]
-                state = flow * state + response * column(entries)
+            path, missed = [state], []
+            for step, entries in zip(self._pieces, inputs.T, strict=True):
+                flow, response = steps[step]
+                ball = flow * state + response * column(entries)
+                state = ball.mid()
                 path.append(state)
-            rounded = [[float(entry.mid()) for entry in state.entries()] for state in path]
-            distances = [
-                [float(abs(entry - middle).upper()) for entry, middle in zip(state.entries(), middles, strict=True)]
-                for state, middles in zip(path, rounded, strict=True)
-            ]
-        return np.array(rounded), np.array(distances) * OUTWARD
+                missed.append(_bound_entries(ball - state))
+            rounded = np.array([[float(entry) for entry in state.entries()] for state in path])
+            off = np.array([_bound_entries(state - column(own)) for state, own in zip(path, rounded, strict=True)])
+        errors, before, error = [np.zeros(len(off[0]))], modes[0], 0.0
+        for mode, length, miss in zip(modes, self.grid.lengths.tolist(), missed, strict=True):
+            measure = self._measures[mode]
+            error = error if mode == before else measure.enter(self._measures[before], error)
+            error, before = measure.pass_by(error, length, miss), mode
+            errors.append(measure.entries(error))
+        return rounded, OUTWARD * (off + np.array(errors))
+
+    @cached_property
+    def _measures(self) -> list[Measure]:
+        return [Measure.of(A) for A, _ in self.modes]
 
     @shaped
     def landed(
@@ -162,9 +227,9 @@ class Orbit:
         steps, inputs = self._compute_steps(), self.grid.inputs(control)
         rows, missing = arb_mat(H.tolist()), column(values)
         effects = [arb_mat(len(values), 1) for _ in range(control.size)]
-        pieces = zip(self._lengths, inputs.T, self.grid.control_piece.tolist(), strict=True)
-        for length, entries, piece in reversed(list(pieces)):
-            flow, response = steps[length]
+        pieces = zip(self._pieces, inputs.T, self.grid.control_piece.tolist(), strict=True)
+        for step, entries, piece in reversed(list(pieces)):
+            flow, response = steps[step]
             weights = rows * response
             missing, rows = missing - weights * column(entries), rows * flow
             for channel in range(len(control) if piece >= 0 else 0):
@@ -173,23 +238,24 @@ class Orbit:
         return [effect.mid() for effect in effects], (missing - rows * column(self.initial_state)).mid()
 
     @cached_property
-    def _lengths(self) -> list[Fraction]:
-        """Exact lengths of the pieces, ``(L,)``."""
+    def _pieces(self) -> list[tuple[int, Fraction]]:
+        """Mode and exact length of every piece, ``(L,)``."""
         ends = [Fraction(end) for end in self.grid.breakpoints.tolist()]
-        return [stop - start for start, stop in pairwise(ends)]
+        lengths = [stop - start for start, stop in pairwise(ends)]
+        return list(zip(self.grid.modes.tolist(), lengths, strict=True))
 
-    def _compute_steps(self) -> dict[Fraction, tuple[arb_mat, arb_mat]]:
-        """Return the transition over every length of a piece and the response to inputs on it; remembered."""
+    def _compute_steps(self) -> dict[tuple[int, Fraction], tuple[arb_mat, arb_mat]]:
+        """Return the transition over every kind of piece and the response to inputs on it; remembered."""
         from flint import arb, arb_mat
 
-        if not self._steps:
-            d, m = self.B.shape
-            generator = np.zeros((d + m, d + m))
-            generator[:d] = np.hstack([self.A, self.B])
-            matrix = arb_mat(generator.tolist())
-            for length in set(self._lengths):
-                flow = (matrix * (arb(length.numerator) / arb(length.denominator))).exp().tolist()
-                self._steps[length] = arb_mat([row[:d] for row in flow[:d]]), arb_mat([row[d:] for row in flow[:d]])
+        for mode, length in set(self._pieces) - set(self._steps):
+            A, B = self.modes[mode]
+            (d, m), generator = B.shape, np.zeros((sum(B.shape), sum(B.shape)))
+            generator[:d] = np.hstack([A, B])
+            seconds = arb(length.numerator) / arb(length.denominator)
+            flow = (arb_mat(generator.tolist()) * seconds).exp().tolist()
+            table = arb_mat([row[:d] for row in flow[:d]]), arb_mat([row[d : d + m] for row in flow[:d]])
+            self._steps[mode, length] = table
         return self._steps
 
 

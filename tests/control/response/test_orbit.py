@@ -8,10 +8,11 @@ from fractions import Fraction
 
 import numpy as np
 import pytest
+from scipy.linalg import expm
 
 from sparserob_core.control.problem.system import LinearSystem, SwitchedSystem, System
 from sparserob_core.control.response.lifted import lift_legs
-from sparserob_core.control.response.orbit import NOTABLE, Orbit, growth
+from sparserob_core.control.response.orbit import NOTABLE, Measure, Orbit, growth
 from sparserob_core.control.response.response import Response, TimeGrid, merge_grids
 from sparserob_core.sip.convex_set import Box
 
@@ -32,16 +33,18 @@ def orbit_of(horizon: float, start: tuple[float, float] = (0.2, -0.1)) -> Orbit:
     return orbit.from_state(np.array(start))
 
 
-def exact(orbit: Orbit, control: np.ndarray) -> list[tuple[Decimal, Decimal]]:
+def exact(orbit: Orbit, control: np.ndarray, rates: tuple[int, ...] = (RATE,)) -> list[tuple[Decimal, Decimal]]:
     """The states by ``cosh`` and ``sinh`` in eighty digits, from the very doubles of the control and its times."""
     with localcontext() as context:
         context.prec = DIGITS
         x, v = (Decimal(entry) for entry in orbit.initial_state.tolist())
         states, times = [(x, v)], [Decimal(time) for time in orbit.grid.breakpoints.tolist()]
-        for begin, end, u in zip(times[:-1], times[1:], control[0].tolist(), strict=True):
-            up, down = ((RATE * (end - begin) * sign).exp() for sign in (1, -1))
-            c, s, rest = (up + down) / 2, (up - down) / 2, Decimal(u) / RATE**2
-            x, v = c * (x + rest) + s * v / RATE - rest, RATE * s * (x + rest) + c * v
+        pieces = zip(times[:-1], times[1:], orbit.grid.modes.tolist(), control[0].tolist(), strict=True)
+        for begin, end, mode, u in pieces:
+            rate = rates[mode]
+            up, down = ((rate * (end - begin) * sign).exp() for sign in (1, -1))
+            c, s, rest = (up + down) / 2, (up - down) / 2, Decimal(u) / rate**2
+            x, v = c * (x + rest) + s * v / rate - rest, rate * s * (x + rest) + c * v
             states.append((x, v))
         return states
 
@@ -116,10 +119,9 @@ def test_entries_that_no_control_reaches_are_left_alone() -> None:
         LinearSystem([[-1.0]], [[1.0]]),
         LinearSystem([[0.0, 1.0], [0.0, 0.0]], [[0.0], [1.0]]),
         LinearSystem(lambda p: np.array([[5.0 + p[0]]]), [[1.0]], parameters=Box([-0.1], [0.1])),
-        SwitchedSystem([(2.0, LinearSystem([[5.0]], [[1.0]])), (4.0, LinearSystem([[4.0]], [[1.0]]))]),
     ],
 )
-def test_plants_that_do_not_grow_or_are_not_one_known_plant_have_no_orbit(system: System) -> None:
+def test_plants_that_do_not_grow_or_are_not_known_have_no_orbit(system: System) -> None:
     assert Orbit.of(system, grid_of(4.0)) is None
 
 
@@ -173,6 +175,61 @@ def test_bounds_on_pieces_begin_with_those_of_their_states(monkeypatch: pytest.M
     wide = replace(lifted)
     monkeypatch.setattr(type(wide), "_transform_orbit", lambda *_: (np.zeros((41, 2)), np.full((41, 2), 0.125)))
     assert (wide.along(control, np.eye(2), none) >= 0.125).all()
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_errors_grow_by_no_more_than_their_norm_says(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    A = rng.standard_normal((4, 4)) * np.array([1.0, 30.0, 0.1, 5.0])
+    measure, scale = Measure.of(A), 1.0 + np.abs(np.linalg.eigvals(A)).max()
+    inverse = np.linalg.inv(measure.transform)
+    assert (np.abs(inverse) <= measure.size).all()
+    for share, x in zip(rng.uniform(0.0, 3.0, 40), rng.standard_normal((40, 4)), strict=True):
+        t, before = share / scale, float(np.linalg.norm(inverse @ x))
+        after = expm(A * t) @ x
+        bound = measure.pass_by(before, t, np.zeros(4))
+        assert np.linalg.norm(inverse @ after) <= bound * (1.0 + 1e-12)
+        assert (np.abs(after) <= measure.entries(bound) * (1.0 + 1e-12)).all()
+        assert measure.pass_by(before, t, np.abs(x)) >= bound + float(np.linalg.norm(inverse @ x))
+    fastest = max(0.0, float(np.linalg.eigvals(A).real.max()))
+    assert fastest * (1.0 - 1e-9) <= measure.rate <= fastest + 1e-6 * scale
+
+
+def test_a_rotated_stiff_plant_has_errors_that_do_not_grow_with_its_steps() -> None:
+    """In balls every step would multiply errors by the norm of its absolute values."""
+    turned = np.linalg.qr(np.random.default_rng(6).standard_normal((4, 4)))[0]
+    A = (turned * [3.0, 0.0, -1.0, -2500.0]) @ turned.T
+    grid = grid_of(4.0, 1531)
+    orbit = Orbit.of(LinearSystem(A, turned[:, :1]), grid)
+    assert orbit is not None
+    control = np.random.default_rng(7).uniform(-1.0, 1.0, (1, 1531))
+    states, errors = orbit.states(control)
+    assert (errors <= 2.0**-51 * np.abs(states).max()).all()
+    in_doubles = Response(LinearSystem(A, turned[:, :1]), grid, np.zeros(4)).states(control, np.zeros((1, 0)))[0]
+    assert states == pytest.approx(in_doubles, rel=1e-9, abs=1e-9 * np.abs(states).max())
+
+
+def test_phases_follow_each_other(monkeypatch: pytest.MonkeyPatch) -> None:
+    slower = np.array([[0.0, 1.0], [9.0, 0.0]])
+    system = SwitchedSystem([(2.0, LinearSystem(SADDLE, PUSH)), (5.0, LinearSystem(slower, PUSH))])
+    times = np.linspace(0.0, 5.0, 41)
+    grid, control = merge_grids(times, times, switches=(2.0,)), np.random.default_rng(5).uniform(-5.0, 5.0, (1, 40))
+    response = Response(system, grid, np.array([0.2, -0.1]))
+    assert response.orbit is not None
+    states, errors = response.orbit.states(control)
+    truth = exact(response.orbit, control, (RATE, 3))
+    off = [
+        [abs(Decimal(entry) - true) for entry, true in zip(*pair, strict=True)]
+        for pair in zip(states.tolist(), truth, strict=True)
+    ]
+    assert (np.array(off, dtype=float) <= errors).all() and (errors <= 2.0**-52 * np.abs(states).max()).all()
+    first, second = lift_legs(response, np.zeros(0), np.zeros(0))
+    for leg, part in ((first, slice(0, 17)), (second, slice(16, 41))):
+        found = leg.nodes(control)[:, 0] @ leg.transform.T
+        assert found == pytest.approx(states[part], rel=1e-12)
+    wide = lambda leg, *_: (np.zeros((leg.grid.pieces + 1, 2)), np.full((leg.grid.pieces + 1, 2), 0.125))  # noqa: E731
+    monkeypatch.setattr(type(first), "_transform_orbit", wide)
+    assert (second.along(control, np.eye(2), np.zeros((2, 2))) >= 0.125).all()
 
 
 def test_every_piece_begins_anew_however_many_there_are() -> None:
