@@ -141,7 +141,6 @@ def test_combined_policies_meet_extreme_disturbances(spring: sr.InitialStates) -
 
 KINDS: dict[str, dict[str, Any]] = {
     "a path": {**SPRING, "path": [{"box": [1.2, None]}]},
-    "a ball at the end": {**SPRING, "terminal": [BALL]},
     "a round disturbance": {
         **SPRING,
         "disturbance": {"ellipsoid": {"centre": [0, 0], "shape": [[0.01, 0], [0, 0.01]]}},

@@ -281,7 +281,6 @@ MORE: dict[str, dict[str, Any]] = {
     "initial set": {"initial_state": {"centre": [0.3, 0.0], "box": [0.02, 0.01]}},
     "steps": {"control_step": {"box": 0.8}, "initial_control": [0.0]},
     "mixed": {"path": [{"mixed": {"H": [[0, 1]], "G": [[0.2]], "h": [0.6]}}, {"box": [1.0, 1.0]}]},
-    "curved": {"terminal": [{"norm": {"p": 2, "radius": 0.25}}]},
     "curved control": {"control": {"norm": {"p": 2, "radius": 2.0}}},
     "fixed": {"terminal": [{"equals": [None, None]}, {"box": [0.2, 0.2]}]},
     "moving": {"path": [{"box": [1.0, 1.0], "relative_to": [[0, 0, 0], [2, 0.1, 0]]}]},
