@@ -128,7 +128,7 @@ def test_everything_together_keeps_every_guarantee(cost: str, tmp_path: Path) ->
         **STEPS,
         "initial_state": {"centre": [-1, 1], "box": [0.05, 0.05]},
         "path": [MOVING, MIXED],
-        "terminal": [{"norm": {"p": 2, "radius": 0.35}}],
+        "terminal": [{"box": [0.35, 0.35]}],
     }
     proven(run(together, tmp_path / "run", cost, pieces=8))
 

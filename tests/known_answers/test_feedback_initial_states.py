@@ -30,7 +30,6 @@ SPRING: dict[str, Any] = {
     "terminal": [{"box": [SIDE, SIDE]}],
 }
 OFF = {"name": "open_loop"}
-BALL = {"ellipsoid": {"centre": [0, 0], "shape": [[0.25, 0], [0, 0.25]]}}
 
 
 def config(problem: dict[str, Any], policy: dict[str, Any] | None = None) -> dict[str, Any]:
