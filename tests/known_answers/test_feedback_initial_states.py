@@ -194,7 +194,7 @@ def test_a_plane_under_feedback_agrees_with_the_problem_transcribed_afresh(cost:
             control=sr.Box([-1], [1]),
             disturbance=sr.Box([-0.05, -0.02], [0.05, 0.08]),
             path=[sr.PathConstraint(sr.Box([-1, -9], [1, 9]), 0.0)],
-            terminal=[sr.Ellipsoid(centre=[0, 0], shape=[[0.25, 0], [0, 0.25]])],
+            terminal=[sr.Box([-0.5, -0.5], [0.5, 0.5])],
         )
 
     control, policy = uniform(4, 2.0), sr.AffinePolicy(cost=cost)  # type: ignore[arg-type]
