@@ -64,7 +64,7 @@ def test_the_effects_of_gains_are_gains_of_what_was_seen(name):
 
 @pytest.mark.parametrize("name", ["box", "fast", "ball and begun"])
 def test_rows_of_a_tree_are_those_of_states_under_any_control_and_signal(name):
-    """Controls of their own for the signal: the loop does not answer; initial states stay in the middle of their set."""
+    """Controls of their own for the signal: the loop does not answer. Initial states are the middle of their set."""
     case, loop = made(name)
     rng, times = np.random.default_rng(4), np.array([0.0, 0.3, 1.1, 2.0])
     constraints = [(H, rng.normal(size=4), times[1:]), (H[:0], np.zeros(0), times), (H[:1], np.ones(1), times[:2])]
