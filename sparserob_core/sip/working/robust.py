@@ -119,10 +119,9 @@ class RobustRows(Working):
             The working set.
         """
         assert program.spread is not None
-        solver = ledger.relaxed.counted
-        asked = None if solver.instead is None else solver
-        counterpart = Counterpart(program.finite, program.spread, asked=asked)
-        working = RobustRows(program, counterpart=counterpart, close=close, tolerance=ledger.tolerance, asked=asked)
+        solver = None if ledger.relaxed.counted.instead is None else ledger.relaxed.counted
+        counterpart = Counterpart(program.finite, program.spread, asked=solver)
+        working = RobustRows(program, counterpart=counterpart, close=close, tolerance=ledger.tolerance, asked=solver)
         for family in program.families:
             assert family.start is not None
             working.add(family, family.start)
